@@ -1,0 +1,25 @@
+.PHONY: demo test bench clean
+
+VENV := .venv
+PYTHON := $(VENV)/bin/python
+
+# One stamp per environment: pip runs again only when pyproject.toml changed.
+$(VENV)/ready: pyproject.toml
+	test -x $(PYTHON) || python3 -m venv $(VENV)
+	$(PYTHON) -m pip install --quiet --disable-pip-version-check --editable ".[test]"
+	touch $@
+
+demo: $(VENV)/ready
+	$(VENV)/bin/drake-pose demo
+
+test: $(VENV)/ready
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/mypy
+	$(PYTHON) -m pytest
+
+bench: $(VENV)/ready
+	$(PYTHON) -m drake_pose.apps.benchmark
+
+clean:
+	rm -rf $(VENV) results

@@ -1,0 +1,249 @@
+"""Kameda's experiment A: random poses of the female body, matched by one silhouette each."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from rich.table import Table
+
+from drake_pose.body import PoseTree, bundled_model, load_model
+from drake_pose.camera import ParallelCamera
+from drake_pose.errors import SettingsError
+from drake_pose.matching import MatchResult, PaperSearch, PaperSearchSettings, View
+from drake_pose.silhouette import draw_mask
+
+PAPER = {
+    "images": 219,
+    "mean_e_total": 0.0227,
+    "exact": 135,
+    "pose_equal": 101,
+    "improved": 75,
+    "mean_runs": 26.2,
+    "mean_runs_without_worst_seven": 20.1,
+    "min_runs": 15,
+}
+"""The figures of section 6.1. The paper states no seconds."""
+
+# World x faces the camera (the way the body looks), y is the picture's right, z its up.
+_R_WC = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+_SIDE = 700
+_PIXELS_PER_METRE = 226.0
+# Where the head's joint is seen: arms reach about as far above it as the legs reach below when
+# the trunk leans, so that few bodies leave the picture.
+_ROOT_PIXEL = (349.5, 260.0)
+_DISTANCE = 5.0
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One image of the experiment.
+
+    Args:
+        true_values: the angles drawn, one array for each node [rad].
+        inside: whether the whole body is inside the picture.
+        result: what the search found.
+        pose_equal: whether the silhouette is matched exactly and every angle is the true one.
+    """
+
+    true_values: tuple[np.ndarray, ...]
+    inside: bool
+    result: MatchResult
+    pose_equal: bool
+
+    @property
+    def E_total(self) -> float:
+        """E_total (9); 1 where no pose was found, as if nothing had been drawn."""
+        return self.result.E_total if self.result.found else 1.0
+
+    @property
+    def exact(self) -> bool:
+        """Whether J = 0."""
+        return self.result.found and self.result.J == 0
+
+
+@dataclass(frozen=True)
+class ExperimentResult:
+    """All images of the experiment, and how they were made."""
+
+    trials: tuple[Trial, ...]
+    camera: ParallelCamera
+    search: PaperSearch
+    seed: int
+    angles: str
+
+    def as_json(self) -> dict[str, float | int | str]:
+        """The figures under the names of ``PAPER``, counts and fractions as there."""
+        runs = np.sort([trial.result.runs for trial in self.trials])
+        seconds = [trial.result.seconds for trial in self.trials]
+        improved = [
+            t.result.found and t.result.E_total < t.result.first_E_total for t in self.trials
+        ]
+        return {
+            "images": len(self.trials),
+            "mean_e_total": float(np.mean([trial.E_total for trial in self.trials])),
+            "exact": sum(trial.exact for trial in self.trials),
+            "pose_equal": sum(trial.pose_equal for trial in self.trials),
+            "improved": int(sum(improved)),
+            "mean_runs": float(np.mean(runs)),
+            "mean_runs_without_worst_seven": float(np.mean(runs[:-7] if len(runs) > 7 else runs)),
+            "min_runs": int(runs[0]),
+            "median_seconds": float(np.median(seconds)),
+            "total_seconds": float(np.sum(seconds)),
+            "not_found": sum(not trial.result.found for trial in self.trials),
+            "stopped_by_run_limit": sum(t.result.stopped_by == "run_limit" for t in self.trials),
+            "leaving_the_picture": sum(not trial.inside for trial in self.trials),
+            "seed": self.seed,
+            "angles": self.angles,
+            "method": "paper",
+        }
+
+    def table(self) -> Table:
+        """The paper's figures and these, side by side."""
+        ours = self.as_json()
+        table = Table(title="Kameda, experiment A: one silhouette of a female body")
+        for heading in ("figure", "paper", "this run"):
+            table.add_column(heading, justify="left" if heading == "figure" else "right")
+        rows = {
+            "images": "{}",
+            "mean_e_total": "{:.2%}",
+            "exact": "{}",
+            "pose_equal": "{}",
+            "improved": "{}",
+            "mean_runs": "{:.1f}",
+            "mean_runs_without_worst_seven": "{:.1f}",
+            "min_runs": "{}",
+            "median_seconds": "{:.3f}",
+            "not_found": "{}",
+            "leaving_the_picture": "{}",
+        }
+        labels = {
+            "images": "silhouettes",
+            "mean_e_total": "mean E_total",
+            "exact": "matched exactly (J = 0)",
+            "pose_equal": "of these, every joint angle right",
+            "improved": "improved by re-estimation",
+            "mean_runs": "runs of step 3, mean",
+            "mean_runs_without_worst_seven": "  mean without the worst seven",
+            "min_runs": "  minimum",
+            "median_seconds": "seconds an image, median",
+            "not_found": "no pose found (counted as E_total = 1)",
+            "leaving_the_picture": "bodies that leave the picture",
+        }
+        for key, form in rows.items():
+            paper = form.format(PAPER[key]) if key in PAPER else "-"
+            table.add_row(labels[key], paper, form.format(ours[key]))
+        return table
+
+
+def experiment_camera() -> ParallelCamera:
+    """The paper's camera: 700 x 700, parallel, 2.26 pixels a centimetre.
+
+    The world's origin, where the head's joint is, lies right above the picture's middle.
+    """
+    X_WC = np.eye(4)
+    X_WC[:3, :3] = _R_WC
+    X_WC[:3, 3] = [_DISTANCE, 0.0, 0.0]
+    return ParallelCamera(
+        name="front",
+        width=_SIDE,
+        height=_SIDE,
+        pixels_per_metre=_PIXELS_PER_METRE,
+        center_x=_ROOT_PIXEL[0],
+        center_y=_ROOT_PIXEL[1],
+        X_WC=X_WC,
+    )
+
+
+def experiment_search() -> PaperSearch:
+    """The paper's search for its female body: root = head, 20 degrees, K = 5, r = 200 pixels."""
+    tree = load_model(bundled_model("woman")).pose_tree(root_position=np.zeros(3))
+    return PaperSearch(tree, PaperSearchSettings(outside_limit=200.0))
+
+
+def draw_values(
+    tree: PoseTree, search: PaperSearch, angles: str, generator: np.random.Generator
+) -> list[np.ndarray]:
+    """Draw every node's angles at random.
+
+    Args:
+        tree: the pose tree.
+        search: gives the sampling grid.
+        angles: "lattice": from the grid, as the paper; "continuous": anywhere inside the limits.
+        generator: the source of chance.
+
+    Returns:
+        One array of values for each node [rad or m].
+    """
+    values = []
+    lower, upper = tree.model.lower, tree.model.upper
+    for i, node in enumerate(tree.nodes):
+        grid = search.sampled.values[i]
+        drawn = grid[generator.integers(len(grid))].copy()
+        if angles == "continuous":
+            # A position with one grid value only is known, not searched.
+            moving = np.ptp(grid, axis=0) > 0
+            indices = np.array(node.positions)
+            uniform = generator.uniform(lower[indices], upper[indices])
+            drawn[moving] = uniform[moving]
+        values.append(drawn)
+    return values
+
+
+def run_experiment(
+    images: int = 219,
+    seed: int = 0,
+    method: str = "paper",
+    angles: str = "lattice",
+    progress: Callable[[int], None] | None = None,
+) -> ExperimentResult:
+    """Draw and match the silhouettes of experiment A.
+
+    Args:
+        images: how many; the paper's 219 if not given.
+        seed: of the random angles.
+        method: "paper".
+        angles: "lattice" (multiples of 20 degrees, as the paper) or "continuous".
+        progress: called with the number of images done after each.
+
+    Raises:
+        SettingsError: if an argument is not one of these.
+    """
+    if images < 1:
+        raise SettingsError(f"images must be 1 or more, not {images}")
+    if method != "paper":
+        raise SettingsError(f"method must be 'paper', not '{method}'")
+    if angles not in ("lattice", "continuous"):
+        raise SettingsError(f"angles must be 'lattice' or 'continuous', not '{angles}'")
+    search, camera = experiment_search(), experiment_camera()
+    generator = np.random.default_rng(seed)
+    trials = []
+    for done in range(1, images + 1):
+        values = draw_values(search.tree, search, angles, generator)
+        trials.append(_match_one(search, camera, values))
+        if progress is not None:
+            progress(done)
+    return ExperimentResult(tuple(trials), camera, search, seed, angles)
+
+
+def _match_one(search: PaperSearch, camera: ParallelCamera, values: list[np.ndarray]) -> Trial:
+    X_CN = camera.X_CW @ search.tree.node_poses(values)
+    outlines = search.sampled.outlines
+    mask = draw_mask(outlines, X_CN, camera)
+    wide = ParallelCamera(
+        name="wide",
+        width=3 * _SIDE,
+        height=3 * _SIDE,
+        pixels_per_metre=_PIXELS_PER_METRE,
+        center_x=camera.center_x + _SIDE,
+        center_y=camera.center_y + _SIDE,
+        X_WC=camera.X_WC,
+    )
+    inside = int(draw_mask(outlines, X_CN, wide).sum()) == int(mask.sum())
+    result = search.match([View(camera, mask)])
+    equal = result.found and result.J == 0
+    equal = equal and all(
+        np.allclose(found, true, atol=math.radians(0.01))
+        for found, true in zip(result.node_values, values, strict=True)
+    )
+    return Trial(tuple(values), inside, result, bool(equal))

@@ -1,0 +1,102 @@
+"""Pictures of experiment A in the manner of the paper's figures 7 to 12."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+
+from drake_pose.apps.kameda import ExperimentResult, Trial
+from drake_pose.silhouette import LabelRenderer
+
+_EXAMPLES = 4
+_BACKGROUND = (1.0, 1.0, 1.0)
+
+_KINDS: dict[str, tuple[str, Callable[[Trial], bool]]] = {
+    "figure_07_exact_and_pose_right": (
+        "silhouette matched exactly, every angle right (figure 7)",
+        lambda trial: trial.pose_equal,
+    ),
+    "figure_08_09_exact_but_another_pose": (
+        "silhouette matched exactly by another pose (figures 8 and 9)",
+        lambda trial: trial.exact and not trial.pose_equal,
+    ),
+    "figure_10_improved_by_re_estimation": (
+        "improved by re-estimation (figure 10)",
+        lambda trial: trial.result.found and trial.result.E_total < trial.result.first_E_total,
+    ),
+    "figure_12_not_matched": (
+        "not matched exactly (figure 12)",
+        lambda trial: trial.result.found and not trial.exact,
+    ),
+}
+
+
+def save_pictures(result: ExperimentResult, folder: Path) -> list[Path]:
+    """Draw examples of each kind of outcome, and the histogram of the runs of step 3.
+
+    Args:
+        result: the experiment.
+        folder: where the PNG files go; made if it is not there.
+
+    Returns:
+        The files written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    renderer = LabelRenderer(result.search.tree.model, result.camera)
+    files = []
+    for name, (title, belongs) in _KINDS.items():
+        trials = [trial for trial in result.trials if belongs(trial)][:_EXAMPLES]
+        if trials:
+            files.append(_save_examples(folder / f"{name}.png", title, trials, result, renderer))
+    files.append(_save_histogram(folder / "figure_11_runs_of_step_3.png", result))
+    return files
+
+
+def _save_examples(
+    path: Path, title: str, trials: list[Trial], result: ExperimentResult, renderer: LabelRenderer
+) -> Path:
+    tree = result.search.tree
+    colours = plt.get_cmap("tab20")(np.arange(64) % 20)[:, :3]
+    figure, axes = plt.subplots(3, len(trials), figsize=(3 * len(trials), 9), squeeze=False)
+    for column, trial in zip(axes.T, trials, strict=True):
+        q_true, _ = tree.positions_from(trial.true_values)
+        pictures = [renderer.segments(q) for q in (q_true, trial.result.q)]
+        for axis, segments in zip(column, pictures, strict=False):
+            axis.imshow(np.where(segments[..., None] >= 0, colours[segments], _BACKGROUND))
+        column[2].imshow(_compare(pictures[0] >= 0, pictures[1] >= 0))
+        column[0].set_title(f"E_total {trial.E_total:.2%}, {trial.result.runs} runs", fontsize=9)
+    for axis, label in zip(axes[:, 0], ("true pose", "estimate", "silhouettes"), strict=True):
+        axis.set_ylabel(label)
+    for axis in axes.ravel():
+        axis.set_xticks([])
+        axis.set_yticks([])
+    figure.suptitle(f"{title}\ngrey: agreement, blue: missing, orange: excess", fontsize=10)
+    figure.tight_layout()
+    figure.savefig(path, dpi=80)
+    plt.close(figure)
+    return path
+
+
+def _compare(true: np.ndarray, estimate: np.ndarray) -> np.ndarray:
+    picture = np.ones((*true.shape, 3))
+    picture[true & estimate] = 0.6
+    picture[true & ~estimate] = (0.0, 0.45, 0.70)
+    picture[~true & estimate] = (0.90, 0.62, 0.0)
+    return picture
+
+
+def _save_histogram(path: Path, result: ExperimentResult) -> Path:
+    runs = [trial.result.runs for trial in result.trials]
+    figure, axis = plt.subplots(figsize=(6, 4))
+    axis.hist(np.minimum(runs, 100), bins=np.arange(0, 105, 5), color="0.4")
+    axis.set_xlabel("runs of step 3 (100: 100 or more)")
+    axis.set_ylabel("images")
+    axis.set_title(f"{len(runs)} images, mean {np.mean(runs):.1f}, minimum {min(runs)}")
+    figure.tight_layout()
+    figure.savefig(path, dpi=80)
+    plt.close(figure)
+    return path

@@ -1,0 +1,112 @@
+"""Checks of camera parameters; every message names the camera and the field."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from drake_pose.errors import CameraError
+
+LARGEST_SIDE = 16384
+"""The largest supported width or height [pixel]."""
+
+_ROTATION_TOLERANCE = 1e-4
+_EXACT_ROTATION = 1e-13
+
+
+def check_side(value: Any, field: str, where: str) -> int:
+    """Returns a width or height [pixel] as an int.
+
+    Raises:
+        CameraError: when it is not a whole number from 1 to LARGEST_SIDE.
+    """
+    number = check_number(value, field, where)
+    if number != math.floor(number) or not 1 <= number <= LARGEST_SIDE:
+        raise CameraError(
+            f"{where}: {field} must be a whole number of pixels from 1 to {LARGEST_SIDE}, "
+            f"not {value!r}"
+        )
+    return int(number)
+
+
+def check_number(value: Any, field: str, where: str, *, positive: bool = False) -> float:
+    """Returns a finite (and on request positive) number as a float.
+
+    YAML 1.1 reads ``1e-3`` as text, so text that spells a number is accepted.
+
+    Raises:
+        CameraError: when it is none.
+    """
+    kind = "a finite positive number" if positive else "a finite number"
+    accepted = isinstance(value, int | float | str | np.integer | np.floating)
+    if not accepted or isinstance(value, bool):
+        raise CameraError(f"{where}: {field} must be {kind}, not {_short(value)}")
+    try:
+        number = float(value)
+    except (ValueError, OverflowError):
+        raise CameraError(f"{where}: {field} must be {kind}, not {_short(value)}") from None
+    if not math.isfinite(number) or (positive and number <= 0.0):
+        raise CameraError(f"{where}: {field} must be {kind}, not {_short(value)}")
+    return number
+
+
+def check_pose(value: Any, field: str, where: str) -> np.ndarray:
+    """Returns a rigid transform as a read-only (4, 4) float64 array.
+
+    A rotation that was rounded when it was written is replaced by the nearest exact one, so that
+    the kernel and Drake (which insists on an exact one) look through the same camera.
+
+    Raises:
+        CameraError: when it is not a finite 4 x 4 matrix, its last row is not 0 0 0 1, or its
+            upper left 3 x 3 block is not a rotation.
+    """
+    matrix = _read_matrix(value, field, where)
+    if not np.all(np.isfinite(matrix)):
+        raise CameraError(f"{where}: {field} has entries that are not finite")
+    if not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0], rtol=0.0, atol=1e-12):
+        raise CameraError(f"{where}: the last row of {field} must be 0 0 0 1")
+    R = matrix[:3, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        deviation = np.abs(R @ R.T - np.eye(3)).max()
+    if not deviation <= _ROTATION_TOLERANCE:
+        raise CameraError(
+            f"{where}: the upper left 3 x 3 block of {field} is not a rotation (R R^T differs from "
+            f"the identity by {deviation:.3g}); its columns must be the camera's axes in the world"
+        )
+    if np.linalg.det(R) < 0.0:
+        raise CameraError(
+            f"{where}: the upper left 3 x 3 block of {field} is a reflection, not a rotation; "
+            "a camera's axes are x right, y down, z forward"
+        )
+    if deviation > _EXACT_ROTATION:
+        U, _, Vt = np.linalg.svd(R)
+        matrix[:3, :3] = U @ Vt
+    matrix[3] = [0.0, 0.0, 0.0, 1.0]
+    matrix.flags.writeable = False
+    return matrix
+
+
+def _read_matrix(value: Any, field: str, where: str) -> np.ndarray:
+    """Returns the 4 x 4 numbers as a fresh array; lists from a file are checked entry by entry."""
+    if isinstance(value, np.ndarray):
+        if value.shape == (4, 4) and value.dtype.kind in "fiu":
+            return np.array(value, dtype=np.float64)
+    elif _is_list_of_four(value) and all(_is_list_of_four(row) for row in value):
+        rows = [[check_number(entry, field, where) for entry in row] for row in value]
+        return np.array(rows, dtype=np.float64)
+    raise CameraError(f"{where}: {field} must be a 4 x 4 matrix of numbers, not {_short(value)}")
+
+
+def _is_list_of_four(value: Any) -> bool:
+    """Whether a value is a list or tuple of four entries."""
+    return isinstance(value, list | tuple) and len(value) == 4
+
+
+def _short(value: Any) -> str:
+    """Returns a value as text that cannot flood a message."""
+    if isinstance(value, dict | list | tuple | set):
+        return f"a {type(value).__name__} of {len(value)}"
+    if isinstance(value, np.ndarray):
+        return f"an array of shape {value.shape}"
+    text = repr(value)
+    return text if len(text) <= 40 else text[:37] + "..."

@@ -1,0 +1,121 @@
+"""Cameras to and from Drake's render cameras.
+
+Drake's value type CameraInfo lives in pydrake.systems.sensors; it alone is taken from there.
+Drake puts pixel centres at i + 0.5, drake_pose at i: principal points differ by half a pixel.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from pydrake.geometry import (
+    ClippingRange,
+    ColorRenderCamera,
+    DepthRange,
+    DepthRenderCamera,
+    RenderCameraCore,
+)
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.sensors import CameraInfo
+
+from drake_pose.errors import CameraError
+
+if TYPE_CHECKING:
+    from drake_pose.camera.models import ParallelCamera, PinholeCamera
+
+HALF_PIXEL = 0.5
+"""What Drake's principal point has more than ours [pixel]."""
+
+_FARTHEST = 1000.0
+_TELE_DISTANCE = 1.0e4
+
+
+def pinhole_to_drake(
+    camera: PinholeCamera, renderer_name: str, depth_range: tuple[float, float] | None
+) -> tuple[ColorRenderCamera, DepthRenderCamera, RigidTransform]:
+    """See PinholeCamera.to_drake."""
+    near, far = (camera.near, max(_FARTHEST, 2.0 * camera.near))
+    if depth_range is not None:
+        near, far = depth_range
+    center_x, center_y = camera.center_x + HALF_PIXEL, camera.center_y + HALF_PIXEL
+    if not (0.0 < center_x < camera.width and 0.0 < center_y < camera.height):
+        raise CameraError(
+            f"camera '{camera.name}': Drake's renderer needs the principal point inside the "
+            f"picture, but it is at ({camera.center_x:g}, {camera.center_y:g}) of "
+            f"{camera.width} x {camera.height}"
+        )
+    intrinsics = CameraInfo(
+        camera.width, camera.height, camera.focal_x, camera.focal_y, center_x, center_y
+    )
+    color, depth = _render_cameras(camera.name, renderer_name, intrinsics, near, far)
+    return color, depth, _rigid_transform(camera.X_WC)
+
+
+def parallel_to_drake(
+    camera: ParallelCamera, renderer_name: str, depth_range: tuple[float, float]
+) -> tuple[ColorRenderCamera, DepthRenderCamera, RigidTransform]:
+    """See ParallelCamera.to_drake."""
+    nearest, farthest = depth_range
+    middle, half = 0.5 * (nearest + farthest), 0.5 * (farthest - nearest)
+    distance = max(_TELE_DISTANCE, 10.0 * half)
+    focal = camera.pixels_per_metre * distance
+    # Drake's principal point must lie inside the picture: stand behind the picture's middle.
+    intrinsics = CameraInfo(
+        camera.width, camera.height, focal, focal, 0.5 * camera.width, 0.5 * camera.height
+    )
+    p_CT = np.array(
+        [
+            (0.5 * camera.width - HALF_PIXEL - camera.center_x) / camera.pixels_per_metre,
+            (0.5 * camera.height - HALF_PIXEL - camera.center_y) / camera.pixels_per_metre,
+            middle - distance,
+        ]
+    )
+    color, depth = _render_cameras(
+        camera.name, renderer_name, intrinsics, distance - half, distance + half
+    )
+    return color, depth, _rigid_transform(camera.X_WC) @ RigidTransform(p_CT)
+
+
+def pinhole_from_drake(
+    name: str, source: CameraInfo | RenderCameraCore, X_WC: np.ndarray | RigidTransform
+) -> PinholeCamera:
+    """See PinholeCamera.from_drake."""
+    from drake_pose.camera.models import PinholeCamera
+
+    pose = X_WC.GetAsMatrix4() if isinstance(X_WC, RigidTransform) else np.asarray(X_WC)
+    if isinstance(source, CameraInfo):
+        near, intrinsics = {}, source
+    else:
+        near, intrinsics = {"near": source.clipping().near()}, source.intrinsics()
+        pose = pose @ source.sensor_pose_in_camera_body().GetAsMatrix4()
+    return PinholeCamera(
+        name=name,
+        width=intrinsics.width(),
+        height=intrinsics.height(),
+        focal_x=intrinsics.focal_x(),
+        focal_y=intrinsics.focal_y(),
+        center_x=intrinsics.center_x() - HALF_PIXEL,
+        center_y=intrinsics.center_y() - HALF_PIXEL,
+        X_WC=pose,
+        **near,
+    )
+
+
+def _render_cameras(
+    name: str, renderer_name: str, intrinsics: CameraInfo, near: float, far: float
+) -> tuple[ColorRenderCamera, DepthRenderCamera]:
+    """Returns Drake's two render cameras of the same intrinsics and clipping range [m]."""
+    if not (math.isfinite(far) and 0.0 < near < far):
+        raise CameraError(
+            f"camera '{name}': the depth range must be finite, positive and increasing, "
+            f"not {near:g} to {far:g} m"
+        )
+    core = RenderCameraCore(renderer_name, intrinsics, ClippingRange(near, far), RigidTransform())
+    return ColorRenderCamera(core), DepthRenderCamera(core, DepthRange(near, far))
+
+
+def _rigid_transform(X_AB: np.ndarray) -> RigidTransform:
+    """Returns a pose (4, 4) as Drake's type, its rotation made exact to the last digit."""
+    return RigidTransform(RotationMatrix.ProjectToRotationMatrix(X_AB[:3, :3]), X_AB[:3, 3])

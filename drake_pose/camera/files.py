@@ -1,0 +1,117 @@
+"""Camera files: YAML, one entry a camera, with the field names of Drake's CameraConfig."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from drake_pose.camera.checks import check_number, check_pose, check_side
+from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
+from drake_pose.camera.yaml_files import read_yaml
+from drake_pose.errors import CameraError
+
+_COMMON = ("width", "height", "center_x", "center_y", "X_WC")
+_REQUIRED = {
+    "pinhole": (*_COMMON, "focal_x", "focal_y"),
+    "parallel": (*_COMMON, "pixels_per_metre"),
+}
+_OPTIONAL = {"pinhole": ("projection", "clipping_near"), "parallel": ("projection",)}
+
+
+def load_cameras(path: str | Path) -> dict[str, Camera]:
+    """Reads the cameras of a YAML file, in its order.
+
+    A pinhole camera has `width height focal_x focal_y center_x center_y` [pixel, pixel centres at
+    integers] and `X_WC` (4 x 4) [m], and may have `projection: pinhole` and `clipping_near` [m].
+    A parallel camera has `projection: parallel` and `pixels_per_metre` instead of focal lengths.
+
+    Raises:
+        CameraError: names the file, the camera and the field.
+    """
+    path = Path(path)
+    content = read_yaml(path, CameraError)
+    if not isinstance(content, dict) or not content:
+        raise CameraError(f"{path}: expected a mapping from camera names to their parameters")
+    cameras: dict[str, Camera] = {}
+    for key, entry in content.items():
+        name = _check_name(key, path)
+        if name in cameras:
+            raise CameraError(f"{path}: camera '{name}' is given twice")
+        cameras[name] = _read_camera(name, entry, path)
+    return cameras
+
+
+def save_cameras(path: str | Path, cameras: Mapping[str, Camera] | Iterable[Camera]) -> None:
+    """Writes cameras to a YAML file that load_cameras reads back to the last digit.
+
+    Raises:
+        CameraError: when the file cannot be written.
+    """
+    path = Path(path)
+    listed = cameras.values() if isinstance(cameras, Mapping) else cameras
+    content = {camera.name: _write_camera(camera) for camera in listed}
+    try:
+        path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+    except OSError as error:
+        raise CameraError(f"{path}: cannot write the cameras: {error.strerror}") from error
+
+
+def _check_name(key: Any, path: Path) -> str:
+    """Returns a camera's name, which must be fit for a folder's name."""
+    name = str(key)
+    if not isinstance(key, str | int) or name in ("", ".", "..") or set(name) & set("/\\\0"):
+        raise CameraError(f"{path}: {name[:40]!r} is not fit for a camera's name")
+    return name
+
+
+def _read_camera(name: str, entry: Any, path: Path) -> Camera:
+    """Returns the camera of one entry of a file."""
+    where = f"{path}: camera '{name}'"
+    if not isinstance(entry, dict):
+        raise CameraError(f"{where}: expected a mapping from field names to values")
+    projection = entry.get("projection", "pinhole")
+    if not isinstance(projection, str) or projection not in _REQUIRED:
+        raise CameraError(f"{where}: projection must be pinhole or parallel")
+    required, optional = _REQUIRED[projection], _OPTIONAL[projection]
+    missing = [field for field in required if field not in entry]
+    if missing:
+        raise CameraError(f"{where}: a {projection} camera needs {', '.join(missing)}")
+    unknown = [str(field)[:40] for field in entry if field not in (*required, *optional)]
+    if unknown:
+        raise CameraError(
+            f"{where}: unknown field {', '.join(unknown)}; a {projection} camera has: "
+            f"{', '.join((*required, *optional))}"
+        )
+    common: dict[str, Any] = {
+        "name": name,
+        "width": check_side(entry["width"], "width", where),
+        "height": check_side(entry["height"], "height", where),
+        "center_x": check_number(entry["center_x"], "center_x", where),
+        "center_y": check_number(entry["center_y"], "center_y", where),
+        "X_WC": check_pose(entry["X_WC"], "X_WC", where),
+    }
+
+    def positive(field: str) -> float:
+        return check_number(entry[field], field, where, positive=True)
+
+    if projection == "parallel":
+        return ParallelCamera(pixels_per_metre=positive("pixels_per_metre"), **common)
+    if "clipping_near" in entry:
+        common["near"] = positive("clipping_near")
+    return PinholeCamera(focal_x=positive("focal_x"), focal_y=positive("focal_y"), **common)
+
+
+def _write_camera(camera: Camera) -> dict[str, Any]:
+    """Returns the entry of a camera in a file."""
+    entry: dict[str, Any] = {"width": camera.width, "height": camera.height}
+    if isinstance(camera, ParallelCamera):
+        entry = {"projection": "parallel", **entry, "pixels_per_metre": camera.pixels_per_metre}
+    else:
+        entry |= {"focal_x": camera.focal_x, "focal_y": camera.focal_y}
+    entry |= {"center_x": camera.center_x, "center_y": camera.center_y}
+    if isinstance(camera, PinholeCamera):
+        entry["clipping_near"] = camera.near
+    return entry | {"X_WC": camera.X_WC.tolist()}

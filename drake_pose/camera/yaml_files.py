@@ -1,0 +1,49 @@
+"""Reading small YAML files that others wrote."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from drake_pose.errors import DrakePoseError
+
+_LARGEST_FILE = 1 << 20
+
+
+class _UniqueKeyLoader(yaml.SafeLoader):
+    """A safe loader that refuses a key given twice (PyYAML silently keeps the last one)."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        mapping = super().construct_mapping(node, deep=deep)
+        if len(mapping) != len(node.value):
+            raise yaml.constructor.ConstructorError(
+                None, None, "a key is given twice (or merged with <<)", node.start_mark
+            )
+        return mapping
+
+
+def read_yaml(path: Path, error_type: type[DrakePoseError]) -> Any:
+    """Returns a YAML file's content, plain values only.
+
+    The file's size is limited. An alias stays a reference, so a small file cannot fill the memory
+    unless its reader walks through every copy.
+
+    Raises:
+        error_type: names the file; when it cannot be read, is too large, or is no YAML file.
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(_LARGEST_FILE + 1)
+    except OSError as error:
+        raise error_type(f"{path}: cannot read it: {error.strerror}") from error
+    if len(data) > _LARGEST_FILE:
+        raise error_type(f"{path}: larger than {_LARGEST_FILE} bytes, which is not expected here")
+    try:
+        # The loader derives from yaml.SafeLoader.
+        return yaml.load(data, Loader=_UniqueKeyLoader)
+    except (yaml.YAMLError, ValueError, TypeError) as error:
+        raise error_type(f"{path}: not a YAML file: {' '.join(str(error).split())}") from error
+    except RecursionError:
+        raise error_type(f"{path}: nested too deeply") from None

@@ -1,0 +1,88 @@
+"""What a search is given and what it answers."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_pose.camera import Camera
+from drake_pose.errors import MaskError
+
+
+@dataclass(frozen=True)
+class View:
+    """What one calibrated camera sees of the body.
+
+    Args:
+        camera: the camera.
+        mask: the silhouette S, (height, width) bool.
+
+    Raises:
+        MaskError: if the mask is not of the camera's size, or is empty.
+    """
+
+    camera: Camera
+    mask: np.ndarray
+
+    def __post_init__(self) -> None:
+        expected = (self.camera.height, self.camera.width)
+        if self.mask.shape != expected:
+            raise MaskError(
+                f"mask of camera '{self.camera.name}' is {self.mask.shape[::-1]} pixels (width, "
+                f"height), but the camera's picture is {expected[::-1]}; give the mask at the "
+                "size the camera was calibrated for"
+            )
+        if not self.mask.any():
+            raise MaskError(
+                f"mask of camera '{self.camera.name}' is empty; leave this view out, or give a "
+                "mask that shows the body"
+            )
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Joint angle candidates JAC_i(t) of one node that were not adopted.
+
+    Args:
+        value_names: the k positions that the values are of (or a root's angles).
+        values: (n, k), the candidates in the order of the list [rad or m].
+        scores: (n,), their scores e_i(t) [pixel] when the list was made (5).
+    """
+
+    value_names: tuple[str, ...]
+    values: np.ndarray
+    scores: np.ndarray
+
+
+@dataclass(frozen=True)
+class MatchResult:
+    """The pose that a search found.
+
+    Args:
+        found: False if the search ended without any whole pose; q is NaN then.
+        q: (nq,), the positions in the plant's order [rad, m].
+        X_WB: (4, 4), pose of the plant's world frame B in the scene's world W; the identity
+            unless the plant's own joints cannot place the body.
+        node_values: the values of each node of the pose tree.
+        J: area of the exclusive or of body and silhouette, summed over the views (1) [pixel].
+        E_total: J over the silhouette's area (9).
+        first_E_total: E_total of the first whole pose, before the re-estimation of section 5.2.
+        runs: how often step 3 was run.
+        outside_limit: the threshold r that was used in each view [pixel].
+        untried: the candidates not adopted in the answer, by node name.
+        stopped_by: "end" if the search ran to its end, "run_limit" if the limit stopped it.
+        seconds: wall time of the search [s].
+    """
+
+    found: bool
+    q: np.ndarray
+    X_WB: np.ndarray
+    node_values: tuple[np.ndarray, ...]
+    J: float
+    E_total: float
+    first_E_total: float
+    runs: int
+    outside_limit: tuple[float, ...]
+    untried: Mapping[str, Candidates]
+    stopped_by: str
+    seconds: float

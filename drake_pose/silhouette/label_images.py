@@ -1,0 +1,47 @@
+"""Masks to and from Drake's label images.
+
+Drake's value type ImageLabel16I lives in pydrake.systems.sensors; it alone is taken from there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import numpy as np
+from pydrake.geometry import RenderLabel
+from pydrake.systems.sensors import ImageLabel16I
+
+EMPTY = int(RenderLabel.kEmpty)
+"""The label of a pixel that shows nothing."""
+
+OBJECT = 1
+"""The label that mask_to_label_image gives the object."""
+
+
+def mask_to_label_image(mask: np.ndarray) -> ImageLabel16I:
+    """Returns a mask (H, W) as a label image: OBJECT on the object, EMPTY elsewhere."""
+    height, width = mask.shape
+    image = ImageLabel16I(width, height)
+    image.mutable_data[:, :, 0] = np.where(mask, OBJECT, EMPTY)
+    return image
+
+
+def label_image_to_mask(
+    image: ImageLabel16I | np.ndarray, labels: Collection[int] | None = None
+) -> np.ndarray:
+    """Returns the mask (H, W) bool of a label image.
+
+    Args:
+        image: a label image, or its data (H, W) or (H, W, 1).
+        labels: the labels that count as the object; left out, all but EMPTY.
+    """
+    data = label_data(image)
+    if labels is None:
+        return data != EMPTY
+    return np.isin(data, list(labels))
+
+
+def label_data(image: ImageLabel16I | np.ndarray) -> np.ndarray:
+    """Returns the labels (H, W) int16 of a label image or of its data, without a copy."""
+    data = image.data if isinstance(image, ImageLabel16I) else np.asarray(image)
+    return data[:, :, 0] if data.ndim == 3 else data

@@ -1,0 +1,111 @@
+"""Mask files: two-valued PNG pictures, black background."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from drake_pose.camera.checks import LARGEST_SIDE
+from drake_pose.errors import MaskError
+
+_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
+
+def read_mask(path: str | Path, width: int | None = None, height: int | None = None) -> np.ndarray:
+    """Reads a mask: a PNG picture of black (0) and one other value or colour, the object.
+
+    Args:
+        path: the file.
+        width, height: the size the mask must have [pixel], where known.
+
+    Returns:
+        (H, W) bool, True on the object.
+
+    Raises:
+        MaskError: names the file; when it cannot be read, is no whole PNG picture, has another
+            size, is empty or full, or has more than two values.
+    """
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise MaskError(f"{path}: cannot read the mask: {error.strerror}") from error
+    found = _check_png(data, path)
+    if max(found) > LARGEST_SIDE:
+        raise MaskError(f"{path}: {found[0]} x {found[1]} pixels are too many")
+    expected = (found[0] if width is None else width, found[1] if height is None else height)
+    if found != expected:
+        raise MaskError(
+            f"{path}: the mask has {found[0]} x {found[1]} pixels (width x height), but its camera "
+            f"has {expected[0]} x {expected[1]}"
+        )
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if picture is None:
+        raise MaskError(f"{path}: the PNG picture is damaged")
+    return _to_mask(picture, path)
+
+
+def write_mask(path: str | Path, mask: np.ndarray) -> None:
+    """Writes a mask (H, W) bool as a grey PNG picture, 255 on the object.
+
+    Raises:
+        MaskError: names the file; when it cannot be written.
+    """
+    path = Path(path)
+    done, data = cv2.imencode(".png", np.where(mask, 255, 0).astype(np.uint8))
+    if not done:
+        raise MaskError(f"{path}: cannot encode a mask of shape {mask.shape}")
+    try:
+        path.write_bytes(data.tobytes())
+    except OSError as error:
+        raise MaskError(f"{path}: cannot write the mask: {error.strerror}") from error
+
+
+def _check_png(data: bytes, path: Path) -> tuple[int, int]:
+    """Returns a PNG picture's width and height; refuses one that is cut short or damaged.
+
+    OpenCV's decoders differ from version to version in what they make of half a picture.
+    """
+    if not data.startswith(_SIGNATURE):
+        raise MaskError(f"{path}: not a PNG picture")
+    position, kind = len(_SIGNATURE), b""
+    while kind != b"IEND":
+        header = data[position : position + 8]
+        if len(header) < 8:
+            raise MaskError(f"{path}: the PNG picture is cut short")
+        length, kind = struct.unpack(">I4s", header)
+        end = position + 8 + length
+        checksum = data[end : end + 4]
+        if len(checksum) < 4:
+            raise MaskError(f"{path}: the PNG picture is cut short")
+        if struct.unpack(">I", checksum)[0] != zlib.crc32(data[position + 4 : end]):
+            raise MaskError(f"{path}: the PNG picture is damaged")
+        if position == len(_SIGNATURE) and (kind != b"IHDR" or length != 13):
+            raise MaskError(f"{path}: the PNG picture is damaged")
+        position = end + 4
+    width, height = struct.unpack(">II", data[16:24])
+    return width, height
+
+
+def _to_mask(picture: np.ndarray, path: Path) -> np.ndarray:
+    """Returns the mask of a decoded picture (H, W) or (H, W, channels)."""
+    layers = picture[:, :, None] if picture.ndim == 2 else picture
+    if layers.shape[2] == 4 and (layers[:, :, 3] == layers[0, 0, 3]).all():
+        layers = layers[:, :, :3]  # an alpha channel that says nothing
+    mask: np.ndarray = np.any(layers, axis=2)
+    if not mask.any():
+        raise MaskError(f"{path}: the mask is empty (all black): no object to be seen")
+    if mask.all():
+        raise MaskError(f"{path}: the mask is full (no black pixel): no background to be seen")
+    first = layers[np.unravel_index(mask.argmax(), mask.shape)]
+    if (layers[mask] != first).any():
+        values = len(np.unique(layers.reshape(-1, layers.shape[2]), axis=0))
+        raise MaskError(
+            f"{path}: the mask has {values} values, but must have two: black, and one other on the "
+            "object; threshold it first"
+        )
+    return mask

@@ -1,0 +1,165 @@
+"""A rigid surface made ready for the span kernel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from drake_pose.body import TriangleMesh
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """A triangle surface and its edges, each with the one or two triangles it bounds.
+
+    Any set of triangles will do: holes, inner parts and edges of three triangles included. An
+    edge of more than two triangles has several records.
+
+    Args:
+        vertices: (n, 3) float64 points in the surface's own frame N [m].
+        triangles: (m, 3) int32 vertex indices, in any orientation.
+        edges: (e, 6) int32 records v0, v1, t0, s0, t1, s1: s is +1 where the triangle t runs from
+            v0 to v1 and -1 where it runs back; t1 = -1 and s1 = 0 where there is no second
+            triangle.
+    """
+
+    vertices: np.ndarray
+    triangles: np.ndarray
+    edges: np.ndarray
+
+    @cached_property
+    def planes(self) -> np.ndarray:
+        """(m, 4) twice the area times the unit normal [m^2], and its product with a corner."""
+        corners = self.vertices[self.triangles]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        offsets = np.einsum("ij,ij->i", normals, corners[:, 0])
+        return np.column_stack([normals, offsets])
+
+    @cached_property
+    def ball(self) -> np.ndarray:
+        """(4,) centre of a ball around the vertices, and its radius [m]."""
+        if len(self.vertices) == 0:
+            return np.zeros(4)
+        center = 0.5 * (self.vertices.min(axis=0) + self.vertices.max(axis=0))
+        radius = np.sqrt(((self.vertices - center) ** 2).sum(axis=1).max())
+        return np.append(center, radius)
+
+
+class PackedOutlines(NamedTuple):
+    """Several outlines one after the other, in the arrays that the kernel walks.
+
+    points: (3, n) float64; planes: (4, m) float64; balls: (nodes, 4) float64;
+    triangles: (m, 3) int32; edges: (4, e) uint32 rows v0, v1, t0, t1, where indices count from
+    the outline's own first vertex and triangle and t1 = the outline's number of triangles where
+    there is none; sides: (e,) int8 s1; starts: (nodes + 1, 3) int64 first vertex, triangle and edge
+    of each outline; ordinary_ends: (nodes,) int64 where the edges end whose triangles run in
+    opposite directions (s1 = -1); they come first.
+    """
+
+    points: np.ndarray
+    planes: np.ndarray
+    balls: np.ndarray
+    triangles: np.ndarray
+    edges: np.ndarray
+    sides: np.ndarray
+    starts: np.ndarray
+    ordinary_ends: np.ndarray
+
+
+def outline_from_mesh(mesh: TriangleMesh) -> Outline:
+    """Returns the outline of a mesh; vertices at equal places are merged, null triangles left out.
+
+    Args:
+        mesh: vertices (n, 3) [m] and triangles (m, 3).
+    """
+    places = np.asarray(mesh.vertices, dtype=np.float64).reshape(-1, 3) + 0.0  # -0.0 becomes 0.0
+    vertices, renumbered = np.unique(places, axis=0, return_inverse=True)
+    triangles = renumbered.reshape(-1)[np.asarray(mesh.triangles, dtype=np.int64).reshape(-1, 3)]
+    a, b, c = triangles.T
+    triangles = triangles[(a != b) & (b != c) & (c != a)]
+    used, renumbered = np.unique(triangles, return_inverse=True)
+    triangles = renumbered.reshape(-1, 3).astype(np.int32)
+    return Outline(
+        vertices=np.ascontiguousarray(vertices[used]),
+        triangles=triangles,
+        edges=_edge_records(triangles),
+    )
+
+
+def _edge_records(triangles: np.ndarray) -> np.ndarray:
+    """Returns the records of Outline.edges."""
+    heads = triangles.T.reshape(-1).astype(np.int64)
+    tails = triangles[:, [1, 2, 0]].T.reshape(-1).astype(np.int64)
+    owners = np.tile(np.arange(len(triangles)), 3)
+    forward = heads < tails
+    low, high = np.minimum(heads, tails), np.maximum(heads, tails)
+    # Order the uses of an edge forward, backward, forward, backward, ..., then what is left over,
+    # and pair them from the start: as many pairs as can be run in opposite directions, which
+    # cancel wherever both triangles face the same way.
+    order = np.lexsort((owners, ~forward, high, low))
+    rank = _position_in_run(low[order], high[order], forward[order])
+    order = order[np.lexsort((~forward[order], rank, high[order], low[order]))]
+    low, high, owners, forward = low[order], high[order], owners[order], forward[order]
+    position = _position_in_run(low, high)
+    first = np.flatnonzero(position % 2 == 0)
+    following = np.minimum(first + 1, len(order) - 1)
+    paired = position[following] == position[first] + 1
+    side = np.where(forward[following] == forward[first], 1, -1)
+    records = [
+        np.where(forward[first], low[first], high[first]),
+        np.where(forward[first], high[first], low[first]),
+        owners[first],
+        np.ones_like(first),
+        np.where(paired, owners[following], -1),
+        np.where(paired, side, 0),
+    ]
+    return np.ascontiguousarray(np.column_stack(records), dtype=np.int32)
+
+
+def _position_in_run(*keys: np.ndarray) -> np.ndarray:
+    """Returns each entry's position in its run of equal keys."""
+    index = np.arange(len(keys[0]))
+    begins = np.ones(len(index), dtype=bool)
+    begins[1:] = np.any([key[1:] != key[:-1] for key in keys], axis=0)
+    return index - np.maximum.accumulate(np.where(begins, index, 0))
+
+
+@lru_cache(maxsize=256)
+def pack(outlines: tuple[Outline, ...]) -> PackedOutlines:
+    """Returns outlines in the kernel's arrays (remembered: outlines are immutable)."""
+    starts = np.zeros((len(outlines) + 1, 3), dtype=np.int64)
+    sizes = [(len(o.vertices), len(o.triangles), len(o.edges)) for o in outlines]
+    starts[1:] = np.cumsum(np.array(sizes, dtype=np.int64).reshape(-1, 3), axis=0)
+    records = [_kernel_edges(outline) for outline in outlines]
+    ordinary = [np.count_nonzero(record[:, 4] == -1) for record in records]
+    edges = _stacked(records, 5, np.int32)
+    return PackedOutlines(
+        points=_stacked([o.vertices for o in outlines], 3, np.float64).T.copy(),
+        planes=_stacked([o.planes for o in outlines], 4, np.float64).T.copy(),
+        balls=_stacked([o.ball[None] for o in outlines], 4, np.float64),
+        triangles=_stacked([o.triangles for o in outlines], 3, np.int32),
+        edges=edges[:, :4].T.astype(np.uint32, order="C"),
+        sides=edges[:, 4].astype(np.int8),
+        starts=starts,
+        ordinary_ends=starts[:-1, 2] + np.array(ordinary, dtype=np.int64),
+    )
+
+
+def _kernel_edges(outline: Outline) -> np.ndarray:
+    """Returns (e, 5) v0, v1, t0, t1, s1 turned so that s0 = +1, those with s1 = -1 first."""
+    v0, v1, t0, s0, t1, s1 = outline.edges.T
+    start, end = np.where(s0 > 0, v0, v1), np.where(s0 > 0, v1, v0)
+    other = np.where(s1 == 0, len(outline.triangles), t1)
+    side = s0 * s1
+    order = np.lexsort((t0, side != -1))  # neighbours in memory, too
+    return np.column_stack([start, end, t0, other, side])[order]
+
+
+def _stacked(parts: Sequence[np.ndarray], columns: int, dtype: type) -> np.ndarray:
+    """Returns arrays (k, columns) below each other; none gives (0, columns)."""
+    return np.ascontiguousarray(np.vstack([np.empty((0, columns), dtype), *parts]), dtype=dtype)

@@ -1,0 +1,151 @@
+"""Scenes: a folder of cameras and recorded masks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from drake_pose.camera import Camera, load_cameras
+from drake_pose.camera.yaml_files import read_yaml
+from drake_pose.errors import SceneError, UnknownNameError
+from drake_pose.silhouette.masks import read_mask
+
+_FIELDS = ("sequence", "frame_rate_hz")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A folder of masks, and the cameras that took them.
+
+    Args:
+        path: the folder.
+        cameras: the cameras by name, in the camera file's order.
+        frames: the frames' names, sorted; a frame may lack some cameras.
+        masks: the mask file of (camera, frame).
+        sequence: whether the frames follow each other in time.
+        frame_rate_hz: frames a second, where the scene says.
+    """
+
+    path: Path
+    cameras: Mapping[str, Camera]
+    frames: tuple[str, ...]
+    masks: Mapping[tuple[str, str], Path]
+    sequence: bool = False
+    frame_rate_hz: float | None = None
+
+    def cameras_of(self, frame: str) -> tuple[str, ...]:
+        """Returns the names of the cameras that have a mask of a frame.
+
+        Raises:
+            UnknownNameError: when there is no such frame.
+        """
+        if frame not in self.frames:
+            raise UnknownNameError("frame", frame, self.frames, str(self.path))
+        return tuple(camera for camera in self.cameras if (camera, frame) in self.masks)
+
+    def mask_path(self, camera: str, frame: str) -> Path:
+        """Returns the mask file of a camera's frame.
+
+        Raises:
+            UnknownNameError: when there is no such camera, or it has no such frame.
+        """
+        if camera not in self.cameras:
+            raise UnknownNameError("camera", camera, self.cameras, str(self.path))
+        if (camera, frame) not in self.masks:
+            known = sorted(name for owner, name in self.masks if owner == camera)
+            raise UnknownNameError("frame", frame, known, f"{self.path}: camera '{camera}'")
+        return self.masks[camera, frame]
+
+    def read(self, camera: str, frame: str) -> np.ndarray:
+        """Returns the mask (H, W) bool of a camera's frame.
+
+        Raises:
+            UnknownNameError: when there is no such camera, or it has no such frame.
+            MaskError: when the file is not a mask of the camera's size.
+        """
+        path = self.mask_path(camera, frame)
+        size = self.cameras[camera]
+        return read_mask(path, size.width, size.height)
+
+
+def load_scene(path: str | Path, cameras: Mapping[str, Camera] | None = None) -> Scene:
+    """Reads what a scene's folder holds; masks are read when they are asked for.
+
+    The folder has `cameras.yaml`, `masks/<camera>/<frame>.png` and perhaps `scene.yaml`
+    (`sequence: true|false`, `frame_rate_hz`). With a single camera the masks may lie in
+    `masks/<frame>.png`.
+
+    Args:
+        path: the folder.
+        cameras: the cameras, where the folder has no `cameras.yaml`, or to be used instead of it.
+
+    Raises:
+        SceneError: names the folder and what is missing or wrong in it.
+        CameraError: when the camera file is wrong.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        raise SceneError(f"{folder}: no such folder; a scene has cameras.yaml and masks")
+    sequence, frame_rate_hz = _read_settings(folder / "scene.yaml")
+    if cameras is None:
+        if not (folder / "cameras.yaml").is_file():
+            raise SceneError(f"{folder}: has no cameras.yaml, so its cameras must be given")
+        cameras = load_cameras(folder / "cameras.yaml")
+    masks = _find_masks(folder, cameras)
+    frames = tuple(sorted({frame for _, frame in masks}))
+    return Scene(folder, dict(cameras), frames, masks, sequence, frame_rate_hz)
+
+
+def _find_masks(folder: Path, cameras: Mapping[str, Camera]) -> dict[tuple[str, str], Path]:
+    """Returns the mask files of (camera, frame)."""
+    root = folder / "masks"
+    if not root.is_dir():
+        raise SceneError(f"{folder}: has no folder masks/<camera>/<frame>.png")
+    flat = sorted(root.glob("*.png"))
+    if flat:
+        if len(cameras) != 1:
+            raise SceneError(
+                f"{root}: masks that lie in no camera's folder need exactly one camera, but there "
+                f"are {len(cameras)}: {', '.join(cameras)}"
+            )
+        (name,) = cameras
+        return {(name, file.stem): file for file in flat}
+    strangers = sorted(p.name for p in root.iterdir() if p.is_dir() and p.name not in cameras)
+    if strangers:
+        raise SceneError(
+            f"{root}: folder {', '.join(strangers)} belongs to no camera; there are: "
+            f"{', '.join(cameras)}"
+        )
+    masks = {
+        (name, file.stem): file for name in cameras for file in sorted((root / name).glob("*.png"))
+    }
+    if not masks:
+        raise SceneError(f"{root}: holds no mask <camera>/<frame>.png of: {', '.join(cameras)}")
+    return masks
+
+
+def _read_settings(path: Path) -> tuple[bool, float | None]:
+    """Returns sequence and frame_rate_hz of a scene.yaml, which may be missing."""
+    if not path.exists():
+        return False, None
+    content = read_yaml(path, SceneError)
+    if not isinstance(content, dict):
+        raise SceneError(f"{path}: expected a mapping with {', '.join(_FIELDS)}")
+    unknown = [str(field)[:40] for field in content if field not in _FIELDS]
+    if unknown:
+        raise SceneError(
+            f"{path}: unknown field {', '.join(unknown)}; a scene has: {', '.join(_FIELDS)}"
+        )
+    sequence = content.get("sequence", False)
+    if not isinstance(sequence, bool):
+        raise SceneError(f"{path}: sequence must be true or false")
+    rate = content.get("frame_rate_hz")
+    if rate is None:
+        return sequence, None
+    if isinstance(rate, bool) or not isinstance(rate, int | float) or not 0.0 < rate < math.inf:
+        raise SceneError(f"{path}: frame_rate_hz must be a finite positive number")
+    return sequence, float(rate)

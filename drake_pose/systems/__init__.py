@@ -1,0 +1,18 @@
+"""The estimators as Drake systems, and ready diagrams of them."""
+
+from drake_pose.systems.diagrams import (
+    MatchingDiagram,
+    build_recorded_matching,
+    build_simulated_matching,
+)
+from drake_pose.systems.mask_player import MaskPlayer
+from drake_pose.systems.silhouette_matcher import STATISTICS, SilhouetteMatcher
+
+__all__ = [
+    "STATISTICS",
+    "MaskPlayer",
+    "MatchingDiagram",
+    "SilhouetteMatcher",
+    "build_recorded_matching",
+    "build_simulated_matching",
+]

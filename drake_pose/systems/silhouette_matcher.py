@@ -1,0 +1,149 @@
+"""The matcher as a Drake system: label images in, estimated positions out."""
+
+from collections.abc import Collection, Sequence
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, EventStatus, LeafSystem
+from pydrake.systems.sensors import ImageLabel16I
+
+from drake_pose.camera import Camera
+from drake_pose.errors import SettingsError
+from drake_pose.matching import MatchResult, PaperSearch, View
+from drake_pose.silhouette import label_image_to_mask
+
+STATISTICS = ("found", "J", "E_total", "first_E_total", "runs", "outside_limit", "seconds")
+"""What the elements of the output ``statistics`` are."""
+
+
+def label_image_port(camera: Camera, cameras: Sequence[Camera]) -> str:
+    """Name of the port that carries a camera's label image, where there are ``cameras``."""
+    return "label_image" if len(cameras) == 1 else f"label_image_{camera.name}"
+
+
+class SilhouetteMatcher(LeafSystem):
+    """Estimates the positions of an articulated body from label images.
+
+    .. pydrake_system::
+
+        name: SilhouetteMatcher
+        input_ports:
+        - label_image
+        - root_position (optional)
+        output_ports:
+        - estimated_positions
+        - error
+        - base_pose
+        - statistics
+
+    With several cameras the input ports are ``label_image_<camera>``; an unconnected one, or an
+    image without any pixel of the body, is left out of the match. All pixels with a label other
+    than Drake's reserved ones belong to the body, or those with the given labels.
+
+    The match is made in a periodic update. Until the first one, and where no pose is found, the
+    estimated positions are the last ones (at first the model's default), and the error is infinite.
+
+    Args:
+        search: the search, made for the body's pose tree.
+        cameras: the calibrated cameras, in the order of the input ports.
+        period: time between two matches [s].
+        offset: time of the first match [s].
+        labels: the labels that belong to the body; None: all that are not reserved.
+
+    Raises:
+        SettingsError: if there is no camera, two cameras share a name, or the period is not
+            positive.
+    """
+
+    def __init__(
+        self,
+        search: PaperSearch,
+        cameras: Sequence[Camera],
+        period: float,
+        offset: float = 0.0,
+        labels: Collection[int] | None = None,
+    ) -> None:
+        super().__init__()
+        names = [camera.name for camera in cameras]
+        if not cameras or len(set(names)) != len(names):
+            raise SettingsError(f"a matcher needs one or more cameras of different names: {names}")
+        if not period > 0:
+            raise SettingsError(f"the matcher's period must be positive, not {period}")
+        self._search = search
+        self._cameras = tuple(cameras)
+        self._labels = None if labels is None else frozenset(labels)
+        model = search.tree.model
+        position_count = model.plant.num_positions()
+        for camera in cameras:
+            image = ImageLabel16I(camera.width, camera.height)
+            self.DeclareAbstractInputPort(
+                label_image_port(camera, cameras), AbstractValue.Make(image)
+            )
+        self._root_position = self.DeclareVectorInputPort("root_position", 3)
+        no_match = np.zeros(len(STATISTICS))
+        no_match[[1, 2, 3]] = np.inf
+        self._positions = self.DeclareDiscreteState(model.default_positions)
+        self._base_pose = self.DeclareDiscreteState(np.eye(4)[:3].ravel())
+        self._statistics = self.DeclareDiscreteState(no_match)
+        states = {self.discrete_state_ticket(self._positions)}
+        self.DeclareVectorOutputPort(
+            "estimated_positions", position_count, self._calc_positions, states
+        )
+        statistics_ticket = {self.discrete_state_ticket(self._statistics)}
+        self.DeclareVectorOutputPort("error", 1, self._calc_error, statistics_ticket)
+        self.DeclareAbstractOutputPort(
+            "base_pose",
+            lambda: AbstractValue.Make(RigidTransform()),
+            self._calc_base_pose,
+            {self.discrete_state_ticket(self._base_pose)},
+        )
+        self.DeclareVectorOutputPort(
+            "statistics", len(STATISTICS), self._calc_statistics, statistics_ticket
+        )
+        self.DeclarePeriodicDiscreteUpdateEvent(period, offset, self._match)
+        self.last_result: MatchResult | None = None
+
+    def _views(self, context: Context) -> list[View]:
+        views = []
+        for index, camera in enumerate(self._cameras):
+            port = self.get_input_port(index)
+            if not port.HasValue(context):
+                continue
+            mask = label_image_to_mask(port.Eval(context), self._labels)
+            if mask.any():
+                views.append(View(camera, mask))
+        return views
+
+    def _match(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        views = self._views(context)
+        statistics = np.zeros(len(STATISTICS))
+        statistics[[1, 2, 3]] = np.inf
+        self.last_result = None
+        if views:
+            root_position = None
+            if self._root_position.HasValue(context):
+                root_position = self._root_position.Eval(context)
+            result = self._search.match(views, root_position)
+            self.last_result = result
+            statistics[4:] = result.runs, max(result.outside_limit), result.seconds
+            if result.found:
+                statistics[:4] = 1.0, result.J, result.E_total, result.first_E_total
+                discrete_state.set_value(self._positions, result.q)
+                discrete_state.set_value(self._base_pose, result.X_WB[:3].ravel())
+        discrete_state.set_value(self._statistics, statistics)
+        return EventStatus.Succeeded()
+
+    def _calc_positions(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(context.get_discrete_state(self._positions).value())
+
+    def _calc_error(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(context.get_discrete_state(self._statistics).value()[2:3])
+
+    def _calc_statistics(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(context.get_discrete_state(self._statistics).value())
+
+    def _calc_base_pose(self, context: Context, output: AbstractValue) -> None:
+        X_WB = np.eye(4)
+        X_WB[:3] = context.get_discrete_state(self._base_pose).value().reshape(3, 4)
+        output.set_value(RigidTransform(X_WB))

@@ -1,0 +1,205 @@
+"""Shapes of the chest and of the waist (belly, hips and buttocks), each in its link frame [m]."""
+
+from collections.abc import Iterable
+
+from .measures import Build, Measures, joint_positions
+from .shapes import Bump, EllipsoidBump, Loft, Section, Shell, SwellingBump, mirrored_angles
+
+TORSO_ANGLES = (0, 13, 26, 40, 55, 72, 90, 108, 125, 140, 154, 167, 180)
+
+
+def _pair(bump: Bump) -> list[Bump]:
+    """Return a bump and its mirror image."""
+    x, y, z = bump.centre
+    if isinstance(bump, EllipsoidBump):
+        return [bump, EllipsoidBump((-x, y, z), bump.radii, bump.blend)]
+    return [bump, SwellingBump((-x, y, z), bump.widths, bump.amount)]
+
+
+def _section(y: float, half: float, front: float, back: float, power: float = 2.2) -> Section:
+    """Return a symmetric section of half breadth half that reaches from z = back to z = front."""
+    z = 0.5 * (front + back)
+    depth = front - z
+    return Section(y, half, half, depth, depth, z=z, front_power=power, back_power=power)
+
+
+def _in_link(loft_sections: Iterable[Section], origin_y: float) -> list[Section]:
+    """Return sections given by height above the floor, by height above the joint."""
+    return [
+        Section(
+            c.y - origin_y,
+            c.left,
+            c.right,
+            c.front,
+            c.back,
+            c.x,
+            c.z,
+            c.front_power,
+            c.back_power,
+        )
+        for c in loft_sections
+    ]
+
+
+def _waist_sections(m: Measures, build: Build) -> list[Section]:
+    """Return the torso from the navel to its narrowest place at the tenth rib, above the floor.
+
+    Chest and waist share these sections, so that they meet flush where they join.
+    """
+    navel_half, navel_depth = 0.5 * m.waistbreadth, m.waistdepth
+    joint = joint_positions(m)["waist"][1]
+    low, high = m.waistheightomphalion, m.tenthribheight
+    narrow = build.natural_waist
+    sections = []
+    for y, share in ((low, 1.0), (joint, 0.38 + 0.62 * narrow), (high, narrow)):
+        depth = share * navel_depth
+        lean = -0.006 * (y - low) / (high - low)
+        sections.append(
+            _section(y, share * navel_half, 0.50 * depth + lean, -0.50 * depth + lean, 2.25)
+        )
+    return sections
+
+
+def chest(m: Measures, build: Build) -> list[Shell]:
+    """Return the chest: ribs, breasts, shoulder blades, shoulders sloping to the neck."""
+    s = m.stature / 1.6285
+    origin = joint_positions(m)["chest"]
+    _, seam, narrow = _waist_sections(m, build)
+    ribs = 0.5 * m.chestbreadth
+    back = -0.118 * s
+    front = m.chestdepth + back - (0.052 * s if build.bust else 0.008 * s)
+    shoulder = 0.5 * m.biacromialbreadth
+    neck = m.neckcircumferencebase / 6.283
+    top = m.acromialheight
+    neck_z = origin[2]
+    sections = [
+        seam,
+        narrow,
+        _section(
+            0.45 * narrow.y + 0.55 * m.chestheight,
+            0.5 * narrow.left + 0.49 * ribs,
+            0.5 * (narrow.z + narrow.front + front) + 0.004 * s,
+            0.5 * (narrow.z - narrow.back + back) - 0.003 * s,
+        ),
+        _section(m.chestheight, ribs, front, back, 2.3),
+        _section(m.axillaheight - 0.012 * s, 1.05 * ribs, front - 0.006 * s, back - 0.006 * s, 2.3),
+        _section(m.axillaheight + 0.035 * s, 0.90 * shoulder, 0.052 * s, -0.116 * s, 2.4),
+        _section(top - 0.030 * s, 0.95 * shoulder, 0.034 * s, -0.098 * s, 2.3),
+        _section(top - 0.005 * s, 0.84 * shoulder, 0.024 * s, -0.084 * s, 2.1),
+        _section(top + 0.016 * s, 0.60 * shoulder, neck_z + 0.72 * neck, neck_z - 0.90 * neck, 2.0),
+        _section(top + 0.034 * s, 1.30 * neck, neck_z + 0.78 * neck, neck_z - 0.92 * neck, 2.0),
+        _section(top + 0.052 * s, 1.04 * neck, neck_z + 0.82 * neck, neck_z - 0.92 * neck, 2.0),
+    ]
+    y0 = origin[1]
+    bumps: list[Bump] = []
+    if build.bust:
+        bust = m.chestheight - y0
+        reach = m.chestdepth + back
+        bumps += _pair(
+            EllipsoidBump(
+                (0.072 * s, bust - 0.004 * s, reach - 0.060 * s),
+                (0.060 * s, 0.060 * s, 0.060 * s),
+                0.034 * s,
+            )
+        )
+        bumps += _pair(
+            EllipsoidBump(
+                (0.076 * s, bust + 0.030 * s, reach - 0.066 * s),
+                (0.052 * s, 0.070 * s, 0.046 * s),
+                0.034 * s,
+            )
+        )
+    else:
+        bumps += _pair(
+            EllipsoidBump(
+                (0.082 * s, m.chestheight + 0.012 * s - y0, front - 0.040 * s),
+                (0.072 * s, 0.052 * s, 0.050 * s),
+                0.03 * s,
+            )
+        )
+    blade_y = 0.5 * (m.axillaheight + m.chestheight) - y0
+    bumps += _pair(
+        SwellingBump(
+            (0.08 * s, blade_y + 0.02 * s, -0.12 * s), (0.03 * s, 0.05 * s, 0.03 * s), 0.006 * s
+        )
+    )
+    bumps.append(
+        SwellingBump(
+            (0.0, blade_y - 0.03 * s, -0.12 * s), (0.014 * s, 0.12 * s, 0.03 * s), -0.008 * s
+        )
+    )
+    sections_here = _in_link(sections, y0)
+    knots = [section.y for section in sections_here]
+    rings = [
+        *knots,
+        *(0.5 * (a + b) for a, b in zip(knots[1:6], knots[2:7], strict=True)),
+        m.chestheight - y0 - 0.055 * s,
+        m.chestheight - y0 - 0.035 * s,
+        m.chestheight - y0 - 0.018 * s,
+        m.chestheight - y0 + 0.018 * s,
+        m.chestheight - y0 + 0.040 * s,
+    ]
+    loft = Loft(
+        sections_here,
+        rings=rings,
+        low_cap=0.62 * seam.left,
+        high_cap=0.020 * s,
+        angles=mirrored_angles(TORSO_ANGLES),
+        bumps=bumps,
+        cap_rings=4,
+    )
+    shell = loft.shell("suit").painted_above(sections_here[-2].y, "skin")
+    return [shell.moved((0.0, 0.0, -origin[2]))]
+
+
+def waist(m: Measures, build: Build) -> list[Shell]:
+    """Return belly, hips and buttocks, from the narrow waist down to the crotch."""
+    s = m.stature / 1.6285
+    joints = joint_positions(m)
+    origin = joints["waist"]
+    y0 = origin[1]
+    belly, seam, _ = _waist_sections(m, build)
+    navel, seat, crotch = m.waistheightomphalion, m.buttockheight, m.crotchheight
+    hips = 0.5 * m.hipbreadth
+    front_navel, back_navel = belly.z + belly.front, belly.z - belly.back
+    front_hip, back_hip = 0.43 * m.buttockdepth, -0.50 * m.buttockdepth
+    middle = 0.5 * (navel + seat)
+    sections = [
+        _section(crotch, 0.80 * hips, 0.70 * front_hip, 0.72 * back_hip),
+        _section(0.5 * (crotch + seat), 0.95 * hips, 0.90 * front_hip, 0.94 * back_hip, 2.3),
+        _section(seat, hips, front_hip, back_hip, 2.3),
+        _section(seat + 0.35 * (navel - seat), 0.98 * hips, 1.04 * front_hip, back_hip, 2.3),
+        _section(
+            middle + 0.15 * (navel - seat),
+            0.5 * (belly.left + hips),
+            0.5 * (front_navel + 1.05 * front_hip),
+            0.55 * back_navel + 0.45 * back_hip,
+            2.3,
+        ),
+        belly,
+        seam,
+    ]
+    hip_x = joints["thigh"][0]
+    bumps: list[Bump] = []
+    bumps += _pair(
+        EllipsoidBump(
+            (0.80 * hip_x, seat + 0.006 * s - y0, -0.57 * m.buttockdepth + 0.058 * s),
+            (0.074 * s, 0.082 * s, 0.058 * s),
+            0.022 * s,
+        )
+    )
+    bumps.append(
+        SwellingBump(
+            (0.0, seat - 0.012 * s - y0, -0.13 * s), (0.011 * s, 0.05 * s, 0.05 * s), -0.016 * s
+        )
+    )
+    loft = Loft(
+        _in_link(sections, y0),
+        rings=18,
+        low_cap=0.028 * s,
+        high_cap=0.62 * seam.left,
+        angles=mirrored_angles(TORSO_ANGLES),
+        bumps=bumps,
+        cap_rings=4,
+    )
+    return [loft.shell("suit").moved((0.0, 0.0, -origin[2]))]

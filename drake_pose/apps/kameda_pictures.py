@@ -92,7 +92,7 @@ def _compare(true: np.ndarray, estimate: np.ndarray) -> np.ndarray:
 def _save_histogram(path: Path, result: ExperimentResult) -> Path:
     runs = [trial.result.runs for trial in result.trials]
     figure, axis = plt.subplots(figsize=(6, 4))
-    axis.hist(np.minimum(runs, 100), bins=np.arange(0, 105, 5), color="0.4")
+    axis.hist(np.minimum(runs, 100), bins=list(range(0, 105, 5)), color="0.4")
     axis.set_xlabel("runs of step 3 (100: 100 or more)")
     axis.set_ylabel("images")
     axis.set_title(f"{len(runs)} images, mean {np.mean(runs):.1f}, minimum {min(runs)}")

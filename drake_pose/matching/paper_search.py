@@ -153,7 +153,7 @@ class _Run:
             made = self.make_list(node, uncovered)
             if made is not None:
                 self.lists[node] = made
-                uncovered.subtract(node, made.X_WN[0])
+                uncovered.subtract([node], made.X_WN[:1])
             elif self._backtrack(node):
                 uncovered = None
             else:
@@ -174,12 +174,12 @@ class _Run:
         parent = self.nodes[node].parent
         X_WP = np.eye(4) if parent < 0 else self._adopted_pose(parent)
         X_WN = self.scoring.candidate_poses(node, X_WP)
-        outside = self.scoring.outside(node, X_WN)
+        outside, covered = self.scoring.candidate_areas(node, X_WN, uncovered)
         limits = np.array(self.outside_limit)[:, None]
         inside = np.flatnonzero((outside <= limits).all(axis=0))
         if len(inside) == 0:
             return None
-        scores = self.scoring.covered(node, X_WN[inside], uncovered)
+        scores = covered[inside]
         # A stable sort: equal scores keep the grid's order, which begins nearest to zero.
         order = np.argsort(-scores, kind="stable")
         if len(self.nodes[node].mesh.triangles):
@@ -239,7 +239,7 @@ class _Run:
                 continue
             others = [k for k in range(len(self.nodes)) if k != i]
             exposed = self.scoring.uncovered(others, poses)
-            cover = self.scoring.covered(i, current.X_WN[current.adopted :], exposed)
+            _, cover = self.scoring.candidate_areas(i, current.X_WN[current.adopted :], exposed)
             # argmax takes the first of equals: the adopted candidate stays unless one is better.
             best = int(np.argmax(cover))
             covers.append((cover[best], i, current.adopted + best))

@@ -65,46 +65,41 @@ class Scoring:
         self.views = tuple(views)
         self.silhouette_prefixes = [prefix_sums(view.mask)[None] for view in self.views]
         self.silhouette_area = float(sum(int(view.mask.sum()) for view in self.views))
-        self._X_CW = [np.asarray(view.camera.X_CW) for view in self.views]
+        self.X_CW = [np.asarray(view.camera.X_CW) for view in self.views]
 
     def candidate_poses(self, node: int, X_WP: np.ndarray) -> np.ndarray:
         """Poses X_WN of a node at all its samples, (n, 4, 4), for a pose of its parent."""
         return X_WP @ self.sampled.X_PN[node]
 
-    def outside(self, node: int, X_WN: np.ndarray) -> np.ndarray:
-        """area(P_i minus S) in each view, (views, n), at poses X_WN (n, 4, 4) (4)."""
-        rows = []
-        for view, prefixes, X_CW in zip(
-            self.views, self.silhouette_prefixes, self._X_CW, strict=True
-        ):
-            areas = score_candidates(
-                self.sampled.outlines[node], X_CW @ X_WN, view.camera, prefixes
-            )
-            rows.append(areas[:, 0] - areas[:, 1])
-        return np.array(rows)
+    def candidate_areas(
+        self, node: int, X_WN: np.ndarray, regions: "Regions"
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Areas of a node at poses X_WN (n, 4, 4) outside the silhouette and in a region of it.
 
-    def covered(self, node: int, X_WN: np.ndarray, regions: "Regions") -> np.ndarray:
-        """area(region and P_i) summed over the views, (n,), at poses X_WN (n, 4, 4) (5), (7)."""
-        total = np.zeros(len(X_WN))
-        for view, prefixes, X_CW in zip(self.views, regions.prefixes, self._X_CW, strict=True):
-            areas = score_candidates(
-                self.sampled.outlines[node], X_CW @ X_WN, view.camera, prefixes[None]
-            )
-            total += areas[:, 1]
-        return total
+        Returns:
+            area(P_i minus S) in each view, (views, n) (4), and area(region and P_i) summed over
+            the views, (n,) (5), (7).
+        """
+        outside, covered = [], np.zeros(len(X_WN))
+        for view, prefixes, X_CW in zip(self.views, regions.prefixes, self.X_CW, strict=True):
+            outline = self.sampled.outlines[node]
+            areas = score_candidates(outline, X_CW @ X_WN, view.camera, prefixes)
+            outside.append(areas[:, 0] - areas[:, 1])
+            covered += areas[:, 2]
+        return np.array(outside), covered
 
     def uncovered(self, nodes: Sequence[int], X_WN: np.ndarray) -> "Regions":
         """S minus the projections of some nodes at poses X_WN (all nodes, 4, 4) (3), (6)."""
         regions = Regions(self)
-        for node in nodes:
-            regions.subtract(node, X_WN[node])
+        if nodes:
+            regions.subtract(nodes, X_WN[list(nodes)])
         return regions
 
     def J(self, X_WN: np.ndarray) -> np.ndarray:
         """The objective (1) of whole poses X_WN (n, nodes, 4, 4), (n,) [pixel]."""
         total = np.full(len(X_WN), self.silhouette_area)
         for view, prefixes, X_CW in zip(
-            self.views, self.silhouette_prefixes, self._X_CW, strict=True
+            self.views, self.silhouette_prefixes, self.X_CW, strict=True
         ):
             areas = score_bodies(self.sampled.outlines, X_CW @ X_WN, view.camera, prefixes)
             total += areas[:, 0] - 2.0 * areas[:, 1]
@@ -113,14 +108,14 @@ class Scoring:
     def draw(self, nodes: Sequence[int], X_WN: np.ndarray, view: int) -> np.ndarray:
         """The union of some nodes' projections in one view, bool; X_WN: (len(nodes), 4, 4)."""
         outlines = [self.sampled.outlines[node] for node in nodes]
-        return draw_mask(outlines, self._X_CW[view] @ X_WN, self.views[view].camera)
+        return draw_mask(outlines, self.X_CW[view] @ X_WN, self.views[view].camera)
 
     def mean_node_areas(self, X_WN: np.ndarray) -> list[float]:
         """Mean projected area of a node with geometry in each view [pixel], at one pose."""
         solid = [i for i, node in enumerate(self.sampled.tree.nodes) if len(node.mesh.triangles)]
         means = []
         for view, prefixes, X_CW in zip(
-            self.views, self.silhouette_prefixes, self._X_CW, strict=True
+            self.views, self.silhouette_prefixes, self.X_CW, strict=True
         ):
             areas = [
                 score_candidates(
@@ -135,6 +130,10 @@ class Scoring:
 class Regions:
     """A region of the picture in each view that begins as the silhouette and only shrinks.
 
+    Attributes:
+        masks: for each view (H, W) uint8, the region.
+        prefixes: for each view (2, H, W + 1), prefix sums of the silhouette and of the region.
+
     Args:
         scoring: the silhouettes.
     """
@@ -142,13 +141,13 @@ class Regions:
     def __init__(self, scoring: Scoring) -> None:
         self._scoring = scoring
         self.masks = [view.mask.astype(np.uint8) for view in scoring.views]
-        self.prefixes = [prefixes[0].copy() for prefixes in scoring.silhouette_prefixes]
+        self.prefixes = [np.repeat(sums, 2, axis=0) for sums in scoring.silhouette_prefixes]
 
-    def subtract(self, node: int, X_WN: np.ndarray) -> None:
-        """Take the projection of a node at pose X_WN (4, 4) out of the region."""
+    def subtract(self, nodes: Sequence[int], X_WN: np.ndarray) -> None:
+        """Take the projections of nodes at poses X_WN (len(nodes), 4, 4) out of the region."""
         scoring = self._scoring
+        outlines = [scoring.sampled.outlines[node] for node in nodes]
         for view, X_CW, mask, prefixes in zip(
-            scoring.views, scoring._X_CW, self.masks, self.prefixes, strict=True
+            scoring.views, scoring.X_CW, self.masks, self.prefixes, strict=True
         ):
-            outline = scoring.sampled.outlines[node]
-            subtract_body(mask, prefixes, outline, X_CW @ X_WN, view.camera)
+            subtract_body(mask, prefixes[1], outlines, X_CW @ X_WN, view.camera)

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydrake.geometry import (
+    ColorRenderCamera,
+    DepthRenderCamera,
     IllustrationProperties,
     MakeRenderEngineVtk,
     Meshcat,
@@ -15,6 +17,7 @@ from pydrake.geometry import (
     RoleAssign,
     SceneGraph,
 )
+from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
@@ -24,7 +27,7 @@ from pydrake.systems.sensors import RgbdSensor
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 from drake_pose.body import ArticulatedModel
-from drake_pose.camera import Camera
+from drake_pose.camera import Camera, PinholeCamera
 from drake_pose.matching import PaperSearch
 from drake_pose.silhouette import Scene
 from drake_pose.systems.mask_player import MaskPlayer
@@ -130,14 +133,14 @@ def build_simulated_matching(
     truth = builder.AddNamedSystem("true_positions", TrajectorySource(true_positions))
     plant = MultibodyPlant(0.0)
     plant.RegisterAsSourceForSceneGraph(scene_graph)
-    model.add_to(plant, scene_graph, prefix="true_")
+    model.add_to(plant, scene_graph, prefix="true")
     scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(RenderEngineVtkParams()))
     _pose_plant(builder, scene_graph, plant, truth.get_output_port(), "true")
     matcher = builder.AddNamedSystem(
         "silhouette_matcher", SilhouetteMatcher(search, cameras, period)
     )
     for camera in cameras:
-        colour_camera, depth_camera, X_WC = camera.to_drake(renderer_name=_RENDERER)
+        colour_camera, depth_camera, X_WC = _drake_camera(camera, model, true_positions)
         sensor = builder.AddNamedSystem(
             f"camera_{camera.name}",
             RgbdSensor(scene_graph.world_frame_id(), X_WC, colour_camera, depth_camera),
@@ -151,6 +154,30 @@ def build_simulated_matching(
         add_posed_body(builder, scene_graph, model, matcher, "estimated", ESTIMATE_COLOUR)
         MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
     return _finish(builder, matcher, period, None)
+
+
+def _drake_camera(
+    camera: Camera, model: ArticulatedModel, true_positions: Trajectory
+) -> tuple[ColorRenderCamera, DepthRenderCamera, RigidTransform]:
+    """Drake's cameras; a parallel one becomes a tele camera that is clipped about the body."""
+    if isinstance(camera, PinholeCamera):
+        return camera.to_drake(renderer_name=_RENDERER)
+    start, end = true_positions.start_time(), true_positions.end_time()
+    # A constant has no end.
+    times = np.linspace(start, end, 100) if np.isfinite([start, end]).all() else np.zeros(1)
+    tree = model.pose_tree()
+    depths = []
+    for time in times:
+        values = tree.values_from_positions(true_positions.value(time).ravel())
+        for node, X_WN in zip(tree.nodes, tree.node_poses(values), strict=True):
+            if len(node.mesh.vertices):
+                points = node.mesh.vertices @ X_WN[:3, :3].T + X_WN[:3, 3]
+                depths.append(camera.project(points)[1])
+    everything = np.concatenate(depths)
+    # A body that moves fast may reach further between the times looked at.
+    margin = 0.5 + 0.1 * float(np.ptp(everything))
+    depth_range = (float(everything.min()) - margin, float(everything.max()) + margin)
+    return camera.to_drake(renderer_name=_RENDERER, depth_range=depth_range)
 
 
 def add_posed_body(
@@ -176,7 +203,7 @@ def add_posed_body(
     """
     plant = MultibodyPlant(0.0)
     plant.RegisterAsSourceForSceneGraph(scene_graph)
-    model.add_to(plant, scene_graph, prefix=f"{name}_")
+    model.add_to(plant, scene_graph, prefix=name)
     _pose_plant(builder, scene_graph, plant, matcher.GetOutputPort("estimated_positions"), name)
     source = plant.get_source_id()
     inspector = scene_graph.model_inspector()
@@ -202,7 +229,8 @@ def _pose_plant(
     """Finalize a plant, and let positions in its own order pose its geometry."""
     plant.Finalize()
     poser = builder.AddNamedSystem(
-        f"{name}_geometry_pose", MultibodyPositionToGeometryPose(plant, input_multibody_state=False)
+        f"{name}_geometry_pose",
+        MultibodyPositionToGeometryPose(plant, input_multibody_state=False),
     )
     builder.Connect(positions, poser.get_input_port())
     builder.Connect(

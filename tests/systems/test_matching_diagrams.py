@@ -1,0 +1,195 @@
+import math
+
+import numpy as np
+import pytest
+from pydrake.geometry import Meshcat, MeshcatParams
+from pydrake.math import RigidTransform
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.trajectories import PiecewisePolynomial
+
+from drake_pose.camera import PinholeCamera, save_cameras
+from drake_pose.errors import SettingsError
+from drake_pose.matching import PaperSearch, PaperSearchSettings
+from drake_pose.silhouette import LabelRenderer, load_scene, mask_to_label_image, write_mask
+from drake_pose.systems import (
+    STATISTICS,
+    MaskPlayer,
+    SilhouetteMatcher,
+    build_recorded_matching,
+    build_simulated_matching,
+)
+from tests.matching.bodies import box_link, front_camera, joint, load_body, swinging_chain
+
+PERIOD = 0.1
+
+
+@pytest.fixture
+def chain(tmp_path):
+    return swinging_chain(tmp_path, 3)
+
+
+def search_for(model, **settings):
+    settings = {"interval": math.radians(30), "outside_limit": 6.0} | settings
+    return PaperSearch(model.pose_tree(), PaperSearchSettings(**settings))
+
+
+def pinhole(shift=0.1234):
+    return PinholeCamera("front", 200, 200, 900.0, 900.0, 99.5 + shift, 99.5, front_camera().X_WC)
+
+
+@pytest.mark.parametrize("camera", [pinhole(), front_camera(200, shift=0.1234)])
+def test_simulated_camera_to_estimated_positions(chain, camera):
+    """Drake's own renderer draws the truth; the kernel of the matcher must find it again."""
+    truth = np.radians([[30.0, -60.0, 0.0], [-30.0, 60.0, 90.0], [60.0, 30.0, -30.0]])
+    trajectory = PiecewisePolynomial.ZeroOrderHold(
+        PERIOD * np.arange(4) - 0.01, np.vstack([truth, truth[-1:]]).T
+    )
+    built = build_simulated_matching(search_for(chain), [camera], trajectory, PERIOD)
+    simulator = Simulator(built.diagram)
+    simulator.AdvanceTo(3 * PERIOD + 0.01)
+    context = simulator.get_context()
+    log = built.positions_log.FindLog(context)
+    # The log samples just before each update: the first sample is the default pose.
+    np.testing.assert_allclose(log.sample_times()[:4], PERIOD * np.arange(4))
+    np.testing.assert_allclose(log.data().T[1:4], truth, atol=1e-9)
+    errors = built.error_log.FindLog(context).data()[0]
+    assert np.isinf(errors[0])
+    assert (errors[1:4] < 0.02).all()
+
+
+def test_two_cameras_and_a_missing_one(chain):
+    cameras = [front_camera(200, "left", 0.12), front_camera(200, "right", 0.34)]
+    search = search_for(chain)
+    truth = np.radians([30.0, -60.0, 0.0])
+    built = build_simulated_matching(search, cameras, truth, PERIOD)
+    simulator = Simulator(built.diagram)
+    simulator.AdvanceTo(0.01)
+    port = built.matcher.GetOutputPort("estimated_positions")
+    matcher_context = built.matcher.GetMyContextFromRoot(simulator.get_context())
+    np.testing.assert_allclose(port.Eval(matcher_context), truth, atol=1e-9)
+
+    alone = SilhouetteMatcher(search, cameras, PERIOD)
+    context = alone.CreateDefaultContext()
+    image = mask_to_label_image(LabelRenderer(chain, cameras[1]).mask(truth))
+    alone.GetInputPort("label_image_right").FixValue(context, image)
+    Simulator(alone, context).AdvanceTo(0.01)
+    found = alone.GetOutputPort("estimated_positions").Eval(context)
+    np.testing.assert_allclose(found, truth, atol=1e-9)
+
+
+def test_output_goes_straight_into_drakes_geometry_pose(chain):
+    """The estimated body is shown in Meshcat beside the true one, and no sensor sees it."""
+    meshcat = Meshcat(MeshcatParams(host="localhost"))
+    truth = np.radians([30.0, -60.0, 0.0])
+    camera = pinhole()
+    built = build_simulated_matching(search_for(chain), [camera], truth, PERIOD, meshcat)
+    simulator = Simulator(built.diagram)
+    simulator.AdvanceTo(0.25)
+    assert meshcat.HasPath("/drake/visualizer/true/body")
+    assert meshcat.HasPath("/drake/visualizer/estimated/body")
+    errors = built.error_log.FindLog(simulator.get_context()).data()[0]
+    # Were the estimate seen by the sensor, the default pose of the first image would be too.
+    assert (errors[1:] < 0.02).all()
+
+
+def test_no_pose_keeps_the_last_estimate_and_says_so(chain):
+    search = search_for(chain, outside_limit=0.0)
+    matcher = SilhouetteMatcher(search, [front_camera()], PERIOD)
+    context = matcher.CreateDefaultContext()
+    blot = np.zeros((100, 100), dtype=bool)
+    blot[:2, :2] = True
+    matcher.GetInputPort("label_image").FixValue(context, mask_to_label_image(blot))
+    Simulator(matcher, context).AdvanceTo(0.01)
+    np.testing.assert_array_equal(
+        matcher.GetOutputPort("estimated_positions").Eval(context), chain.default_positions
+    )
+    statistics = dict(
+        zip(STATISTICS, matcher.GetOutputPort("statistics").Eval(context), strict=True)
+    )
+    assert statistics["found"] == 0
+    assert statistics["runs"] == 1
+    assert np.isinf(matcher.GetOutputPort("error").Eval(context)).all()
+
+
+def test_labels_choose_the_body(chain):
+    """Other things in the label image do not disturb where the body's labels are given."""
+    camera = front_camera(200, shift=0.12)
+    truth = np.radians([30.0, -60.0, 0.0])
+    labels = LabelRenderer(chain, camera).label_image(truth)
+    own = {int(label) for label in np.unique(labels)} - {32766}
+    labels[5:60, 5:60] = 999
+    matcher = SilhouetteMatcher(search_for(chain), [camera], PERIOD, labels=own)
+    context = matcher.CreateDefaultContext()
+    image = mask_to_label_image(np.ones((200, 200), dtype=bool))
+    image.mutable_data[..., 0] = labels
+    matcher.GetInputPort("label_image").FixValue(context, image)
+    Simulator(matcher, context).AdvanceTo(0.01)
+    found = matcher.GetOutputPort("estimated_positions").Eval(context)
+    np.testing.assert_allclose(found, truth, atol=1e-9)
+
+
+def write_scene(folder, model, camera, poses):
+    folder.mkdir()
+    save_cameras(folder / "cameras.yaml", {camera.name: camera})
+    (folder / "scene.yaml").write_text("sequence: true\nframe_rate_hz: 30\n")
+    renderer = LabelRenderer(model, camera)
+    (folder / "masks" / camera.name).mkdir(parents=True)
+    for k, q in enumerate(poses):
+        write_mask(folder / "masks" / camera.name / f"{k:04d}.png", renderer.mask(q))
+    return load_scene(folder)
+
+
+def test_recorded_masks_with_a_root_position_for_each_frame(tmp_path):
+    """A slider on rails carries a turning box; the rails' place is told frame by frame."""
+    model = load_body(
+        tmp_path,
+        "".join(f'<link name="rail_{i}"/>' for i in range(2)),
+        joint("along_x", "prismatic", "world", "rail_0", (-1, 1), axis="1 0 0"),
+        joint("along_y", "prismatic", "rail_0", "rail_1", (-1, 1), axis="0 1 0"),
+        box_link("box", 12, 30, y=3.0),
+        '<link name="carriage"/>',
+        joint("along_z", "prismatic", "rail_1", "carriage", (-1, 1), axis="0 0 1"),
+        joint("turn", "revolute", "carriage", "box", (-1.5, 1.5)),
+    )
+    camera = front_camera(200, shift=0.12)
+    poses = np.array([[0, y, 0, turn] for y, turn in ((-0.3, 0.5), (0.0, -1.0), (0.35, 1.5))])
+    scene = write_scene(tmp_path / "scene", model, camera, poses)
+    tree = model.pose_tree(root_position=np.zeros(3))
+    search = PaperSearch(tree, PaperSearchSettings(interval=0.5, outside_limit=5.0))
+    roots = {f"{k:04d}": pose[:3] for k, pose in enumerate(poses)}
+    built = build_recorded_matching(scene, search, [camera], root_positions=roots)
+    simulator = Simulator(built.diagram)
+    simulator.Initialize()
+    context = built.matcher.GetMyContextFromRoot(simulator.get_context())
+    for k, pose in enumerate(poses):
+        simulator.AdvanceTo(k / 30 + 1e-4)
+        found = built.matcher.GetOutputPort("estimated_positions").Eval(context)
+        np.testing.assert_allclose(found, pose, atol=1e-9)
+        X_WB = built.matcher.GetOutputPort("base_pose").Eval(context)
+        assert X_WB.IsExactlyEqualTo(RigidTransform())
+
+
+def test_mask_player_plays_frame_by_frame(tmp_path, chain):
+    camera = front_camera()
+    poses = np.radians([[30.0, -60.0, 0.0], [-30.0, 60.0, 90.0]])
+    scene = write_scene(tmp_path / "scene", chain, camera, poses)
+    player = MaskPlayer(scene, [camera])
+    builder = DiagramBuilder()
+    builder.AddSystem(player)
+    context = player.CreateDefaultContext()
+    for time, frame in ((-1.0, 0), (0.0, 0), (0.02, 0), (1 / 30, 1), (5.0, 1)):
+        context.SetTime(time)
+        assert player.GetOutputPort("frame_index").Eval(context)[0] == frame
+        image = player.GetOutputPort("label_image").Eval(context).data[..., 0]
+        np.testing.assert_array_equal(image == 1, scene.read("front", f"{frame:04d}"))
+
+
+def test_a_matcher_refuses_bad_settings(chain):
+    search = search_for(chain)
+    with pytest.raises(SettingsError, match="period"):
+        SilhouetteMatcher(search, [front_camera()], 0.0)
+    with pytest.raises(SettingsError, match="cameras"):
+        SilhouetteMatcher(search, [], PERIOD)
+    with pytest.raises(SettingsError, match=r"front.*front"):
+        SilhouetteMatcher(search, [front_camera(), front_camera()], PERIOD)

@@ -1,8 +1,7 @@
 """Shapes of the left hand and the left foot, each in its link frame [m]."""
 
-from collections.abc import Sequence
-
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .measures import Build, Measures
 from .shapes import EllipsoidBump, Loft, Section, Shell, SwellingBump
@@ -16,12 +15,12 @@ FINGER_CURLS = (0.14, 0.18, 0.22, 0.26)
 
 
 def _digit(
-    base: Sequence[float],
-    direction: Sequence[float],
+    base: ArrayLike,
+    direction: ArrayLike,
     length: float,
     radius: float,
     curl: float,
-    bend: Sequence[float],
+    bend: ArrayLike,
 ) -> Shell:
     """Return a finger or thumb.
 
@@ -81,8 +80,7 @@ def hand(m: Measures, build: Build) -> list[Shell]:
         cap_rings=2,
     ).shell("skin")
     shells = [palm_shell]
-    breadth = 2.0 * half / 4.0
-    middle = m.handlength - palm
+    breadth, middle = 0.5 * half, m.handlength - palm
     for index in range(4):
         z = half - breadth * (index + 0.5)
         overlap = 0.016 * s + (0.010 * s if index == 3 else 0.0)

@@ -1,5 +1,7 @@
 """Shape of the head with face, ears, hair and neck, in its link frame [m]."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from .measures import Build, Measures, joint_positions
@@ -14,59 +16,94 @@ from .shapes import (
     mirrored_angles,
 )
 
-FACE_ANGLES = (0, 6, 13, 21, 31, 44, 62, 88, 128, 180)
-HAIR_RINGS = (0.18, 0.26, 0.35, 0.44, 0.52, 0.59, 0.66, 0.72, 0.78, 0.84, 0.90, 0.95)
-HAIR_ANGLES = (0, 24, 46, 66, 88, 112, 144, 180)
-
+FACE_ANGLES = (0, 6, 13, 21, 31, 46, 70, 105, 180)
+# Heights of the rings of the face and of the hair, as shares of the way from chin to crown.
+FACE_RINGS = (0.052, 0.095, 0.145, 0.185, 0.22, 0.27, 0.31, 0.35, 0.385, 0.43, 0.475)
+SKULL_RINGS = (0.515, 0.555, 0.61, 0.70, 0.82)
+HAIR_ANGLES = (0, 15, 32, 50, 72, 100, 138, 180)
+HAIR_RINGS = (0.22, 0.32, 0.42, 0.51, 0.60, 0.69, 0.79, 0.885)
+# Hairline: degrees from straight ahead, and its height there as a share of chin to crown: over
+# the forehead, down in front of the ears, round them, to the nape.
+HAIRLINE = (
+    (0.0, 25.0, 48.0, 66.0, 84.0, 100.0, 125.0, 180.0),
+    (0.800, 0.785, 0.725, 0.62, 0.49, 0.36, 0.20, 0.14),
+)
 # Eyes and brows: share of the way from chin to sellion, distance from the middle, radii and depth
 # of the centre under the skin [m for the mean woman], material.
 FACE_DETAILS = (
-    (0.985, 0.0315, (0.0135, 0.0062, 0.0060), 0.0030, "eye"),
-    (1.105, 0.0330, (0.0175, 0.0030, 0.0060), 0.0042, "hair"),
+    (0.985, 0.0310, (0.0155, 0.0068, 0.0065), 0.0028, "eye"),
+    (1.150, 0.0325, (0.0195, 0.0028, 0.0060), 0.0040, "hair"),
 )
 
 
 def _sections(m: Measures, build: Build) -> list[Section]:
-    """Return neck, face and skull from the base of the neck to the crown, above the floor."""
+    """Return face and skull from the chin to the crown, by height above the floor."""
     s = m.stature / 1.6285
     chin = m.stature - _face_height(m)
     height = m.stature - chin
     half, cheek = 0.5 * m.headbreadth, 0.5 * m.bizygomaticbreadth
     jaw = build.jaw * cheek
     front, back = 0.535 * m.headlength, -0.465 * m.headlength
-    base = joint_positions(m)["chest"]
-    neck, low_neck = m.neckcircumference / 6.283, m.neckcircumferencebase / 6.283
-
-    def section(share: float, side: float, fore: float, aft: float, power: float = 2.1) -> Section:
-        """Return a section at a share of the face-to-crown height."""
-        return Section(chin + share * height, side, side, fore, -aft, front_power=power)
-
     head_z = 0.004 * s
-    skull = [
-        section(0.004, 0.80 * jaw, 0.80 * front, -0.058 * s, build.chin),
-        section(0.06, 0.92 * jaw, 0.92 * front, -0.062 * s, build.chin + 0.10),
-        section(0.18, 1.02 * jaw, 0.955 * front, -0.068 * s, build.chin + 0.30),
-        section(0.32, 0.5 * (jaw + cheek), 0.955 * front, 0.86 * back, 2.05),
-        section(0.44, 0.99 * cheek, 0.95 * front, 0.93 * back, 2.2),
+
+    def section(
+        share: float, side: float, fore: float, aft: float, power: float, middle: float = 0.0
+    ) -> Section:
+        """Return a section at a share of chin to crown, its axis at z = middle."""
+        return Section(
+            chin + share * height,
+            side,
+            side,
+            fore - middle,
+            middle - aft,
+            z=head_z + middle,
+            front_power=power,
+        )
+
+    square = build.chin
+    return [
+        section(0.026, 0.58 * square * jaw, 0.875 * front, 0.16 * front, 2.0, 0.056 * s),
+        section(0.07, 0.72 * square * jaw, 0.945 * front, -0.15 * front, 2.0, 0.048 * s),
+        section(0.13, (0.40 + 0.48 * square) * jaw, 0.935 * front, -0.5 * front, 2.0, 0.034 * s),
+        section(0.20, jaw, 0.955 * front, 0.74 * back, 2.0, 0.018 * s),
+        section(0.32, 0.5 * (jaw + cheek) + 0.002 * s, 0.95 * front, 0.86 * back, 2.05, 0.006 * s),
+        section(0.44, 0.99 * cheek, 0.945 * front, 0.93 * back, 2.15),
         section(0.53, 1.00 * cheek, 0.94 * front, 0.98 * back, 2.2),
-        section(0.61, 0.97 * half, 0.99 * front, back, 2.25),
-        section(0.70, half, 0.985 * front, 0.99 * back, 2.25),
-        section(0.80, 0.95 * half, 0.93 * front, 0.93 * back, 2.2),
-        section(0.87, 0.85 * half, 0.82 * front, 0.83 * back, 2.1),
-        section(0.92, 0.72 * half, 0.69 * front, 0.71 * back, 2.0),
-        section(0.96, 0.53 * half, 0.50 * front, 0.52 * back, 2.0),
-        section(0.985, 0.33 * half, 0.31 * front, 0.33 * back, 2.0),
+        section(0.61, 0.97 * half, 0.985 * front, back, 2.25),
+        section(0.70, half, 0.98 * front, 0.99 * back, 2.25),
+        section(0.80, 0.94 * half, 0.92 * front, 0.93 * back, 2.2),
+        section(0.87, 0.825 * half, 0.80 * front, 0.815 * back, 2.1),
+        section(0.92, 0.68 * half, 0.66 * front, 0.675 * back, 2.0),
+        section(0.96, 0.49 * half, 0.47 * front, 0.49 * back, 2.0),
     ]
-    skull = [
-        Section(c.y, c.left, c.right, c.front, c.back, 0.0, head_z, c.front_power, c.back_power)
-        for c in skull
+
+
+def _neck(m: Measures) -> Shell:
+    """Return the neck, from inside the chest to inside the skull, leaning forward."""
+    s = m.stature / 1.6285
+    chin = m.stature - _face_height(m)
+    base = joint_positions(m)["chest"]
+    neck, low = m.neckcircumference / 6.283, m.neckcircumferencebase / 6.283
+    side = 0.92 * neck  # the neck is deeper than broad
+    sections = [
+        Section(base[1] - 0.004 * s, 0.92 * low, 0.92 * low, 0.84 * low, low, z=base[2]),
+        Section(base[1] + 0.020 * s, side, side, 0.98 * neck, 1.10 * neck, z=base[2] + 0.003 * s),
+        Section(chin - 0.004 * s, 0.97 * side, 0.97 * side, neck, 1.04 * neck, z=-0.012 * s),
+        Section(chin + 0.034 * s, 0.95 * side, 0.95 * side, 0.9 * neck, 0.98 * neck, z=-0.010 * s),
     ]
-    neck_sections = [
-        Section(base[1], low_neck, low_neck, 0.95 * low_neck, 1.0 * low_neck, z=base[2]),
-        Section(base[1] + 0.022 * s, neck, neck, 0.97 * neck, 1.02 * neck, z=base[2] + 0.006 * s),
-        Section(chin - 0.010 * s, neck, neck, 1.04 * neck, 1.0 * neck, z=-0.010 * s),
-    ]
-    return neck_sections + skull
+    throat = SwellingBump(
+        (0.0, base[1] + 0.034 * s, 0.04 * s), (0.016 * s, 0.012 * s, 0.02 * s), 0.0015 * s
+    )
+    loft = Loft(
+        sections,
+        rings=4,
+        low_cap=0.85 * low,
+        high_cap=0.02 * s,
+        angles=10,
+        bumps=[throat],
+        cap_rings=2,
+    )
+    return loft.shell("skin")
 
 
 def _face_height(m: Measures) -> float:
@@ -98,20 +135,20 @@ def _features(m: Measures, build: Build) -> list[Bump]:
     swell(0.034 * s, 0.985, (0.014, 0.010), -0.008)
     swell(0.032 * s, 1.16, (0.020, 0.008), build.brow / s)
     swell(0.040 * s, 0.72, (0.016, 0.014), 0.004)
-    swell(0.0, 0.28, (0.020, 0.012), 0.003)
-    swell(0.0, 0.17, (0.022, 0.006), -0.004)
-    swell(0.0, 0.04, (0.016, 0.011), 0.006)
+    swell(0.0, 0.30, (0.020, 0.012), 0.003)
+    swell(0.0, 0.19, (0.022, 0.006), -0.003)
+    swell(0.0, 0.06, (0.015, 0.010), 0.004)
     bumps.append(
         EllipsoidBump(
             (0.0, chin + 0.66 * face, front - 0.006 * s),
-            (0.0135 * s, 0.011 * s, 0.0225 * s),
+            (0.0125 * s, 0.0105 * s, 0.0205 * s),
             0.006 * s,
         )
     )
     bumps.append(
         EllipsoidBump(
             (0.0, chin + 0.80 * face, front - 0.008 * s),
-            (0.0085 * s, 0.027 * s, 0.0165 * s),
+            (0.0080 * s, 0.027 * s, 0.0150 * s),
             0.008 * s,
         )
     )
@@ -128,52 +165,54 @@ def _surface_z(loft: Loft, x: float, y: float) -> float:
     return float(np.sum(near[best, 2] * weight) / np.sum(weight))
 
 
+def _detail(size: np.ndarray, material: str, around: int = 6) -> Shell:
+    """Return a small spindle lying along x, pointed at its ends: an eye, a brow, the lips."""
+    standing = ellipsoid((0.0, 0.0, 0.0), (size[1], size[0], size[2]), material, around, rings=3)
+    return standing.transformed(np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
+
+
 def head(m: Measures, build: Build) -> list[Shell]:
     """Return the head with its neck; the hair is a shell that leaves the face free."""
     s = m.stature / 1.6285
-    sections, bumps = _sections(m, build), _features(m, build)
+    sections = _sections(m, build)
     chin = m.stature - _face_height(m)
     height = m.stature - chin
     face = m.mentonsellionlength
-    shares = (0.05, 0.11, 0.155, 0.20, 0.26, 0.30, 0.34, 0.38, 0.43, 0.475, 0.515, 0.55, 0.60)
-    more = (0.67, 0.76, 0.85, 0.93)
-    rings = [sections[1].y, sections[2].y, chin + 0.004 * height]
-    rings += [chin + share * height for share in shares + more]
     loft = Loft(
         sections,
-        rings=rings,
-        low_cap=0.9 * m.neckcircumferencebase / 6.283,
-        high_cap=0.015 * height,
+        rings=[chin + share * height for share in FACE_RINGS + SKULL_RINGS],
+        low_cap=0.024 * height,
+        high_cap=0.035 * height,
         angles=mirrored_angles(FACE_ANGLES),
-        bumps=bumps,
-        cap_rings=2,
+        bumps=_features(m, build),
+        cap_rings=1,
     )
-    shells = [loft.shell("skin")]
-    for side in (1.0, -1.0):
-        ear = ellipsoid(
-            (0.0, 0.0, 0.0), (0.007 * s, 0.48 * m.earlength, 0.016 * s), "skin", around=6, rings=3
-        )
-        turn = np.array([[0.92, 0.0, 0.39], [0.0, 1.0, 0.0], [-0.39, 0.0, 0.92]])
-        ear = ear.transformed(turn)
-        ear = ear.moved((0.5 * m.headbreadth - 0.005 * s, 0.0, -0.004 * s))
-        ear = ear.moved((0.0, m.stature - m.tragiontopofhead + 0.004 * s, 0.0))
-        shells.append(ear if side > 0.0 else ear.mirrored())
-        for share, x, radii, sink, material in FACE_DETAILS:
-            y = chin + share * face
-            size = np.asarray(radii) * s
-            z = _surface_z(loft, x * s, y) - sink * s
-            shells.append(ellipsoid((side * x * s, y, z), size, material, around=6, rings=2))
-    lip_y = chin + 0.285 * face
-    lip_z = _surface_z(loft, 0.0, lip_y)
-    shells.append(
-        ellipsoid(
-            (0.0, lip_y, lip_z - 0.0060 * s),
-            (0.0235 * s, 0.0080 * s, 0.0085 * s),
-            "lips",
-            around=8,
-            rings=2,
+    shells = [loft.shell("skin"), _neck(m)]
+    for share, x, radii, sink, material in FACE_DETAILS:
+        y = chin + share * face
+        z = _surface_z(loft, x * s, y) - sink * s
+        detail = _detail(np.asarray(radii) * s, material, 6 if material == "eye" else 4)
+        detail = detail.moved((x * s, y, z))
+        shells += [detail, detail.mirrored()]
+    ear = ellipsoid((0.0, 0.0, 0.0), (0.007 * s, 0.48 * m.earlength, 0.016 * s), "skin", 6, 2)
+    turn, lean = np.radians(22.0), np.radians(8.0)
+    outwards = np.array(
+        [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]
+    )
+    backwards = np.array(
+        [[1, 0, 0], [0, np.cos(lean), np.sin(lean)], [0, -np.sin(lean), np.cos(lean)]]
+    )
+    ear = ear.transformed(backwards @ outwards).moved(
+        (
+            0.5 * m.headbreadth - 0.006 * s,
+            m.stature - m.tragiontopofhead + 0.004 * s,
+            -0.004 * s,
         )
     )
+    shells += [ear, ear.mirrored()]
+    lip_y = chin + 0.30 * face
+    lips = _detail(np.array([0.0240, 0.0088, 0.0090]) * s, "lips")
+    shells.append(lips.moved((0.0, lip_y, _surface_z(loft, 0.0, lip_y) - 0.0048 * s)))
     shells += _hair(m, build, sections)
     origin = joint_positions(m)["head"]
     return [shell.moved(-origin) for shell in shells]
@@ -185,29 +224,30 @@ def _hair(m: Measures, build: Build, sections: list[Section]) -> list[Shell]:
     chin = m.stature - _face_height(m)
     height = m.stature - chin
     thick = (0.011 if build.ponytail else 0.009) * s
-    skull = [c for c in sections if c.y > chin + 0.15 * height]
+    # Above the widest part the skull is stretched, so that the hair is as thick on top.
+    widest = chin + 0.68 * height
+    stretch = 1.0 + thick / (m.stature - widest)
+
+    def lifted(y: float) -> float:
+        """Return the height of the hair over a height of the skull [m]."""
+        return widest + max(y - widest, 0.0) * stretch + min(y - widest, 0.0)
 
     def grow(axis: np.ndarray, direction: np.ndarray, radius: np.ndarray) -> np.ndarray:
         """Return the radius of the hair: out over the scalp, in under the face and nape."""
         share = (axis[:, 1] - chin) / height
         forward = np.degrees(np.arccos(np.clip(direction[:, 2], -1.0, 1.0)))
-        # Hairline: over the forehead, down in front of the ears, round them, to the nape.
-        line = np.interp(
-            forward,
-            [0.0, 30.0, 50.0, 68.0, 84.0, 100.0, 125.0, 180.0],
-            [0.80, 0.775, 0.72, 0.60, 0.50, 0.38, 0.20, 0.14],
-        )
-        over = np.clip((share - line) / 0.11 + 0.5, 0.0, 1.0)
-        over = over * over * (3.0 - 2.0 * over)
-        return radius - 0.012 * s + over * (thick + 0.012 * s)
+        over = (share - np.interp(forward, *HAIRLINE)) / 0.11
+        fade = np.clip((m.stature + thick - axis[:, 1]) / (0.25 * height), 0.3, 1.0)
+        return np.maximum(radius + np.clip(over, -1.3, 1.0) * thick * fade, 0.003 * s)
 
+    skull = [replace(c, y=lifted(c.y)) for c in sections if c.y > chin + 0.15 * height]
     cap = Loft(
         skull,
-        rings=[chin + f * height for f in HAIR_RINGS],
+        rings=[lifted(chin + share * height) for share in HAIR_RINGS],
         low_cap=0.002 * s,
-        high_cap=0.015 * height + 0.9 * thick,
+        high_cap=0.044 * height,
         angles=mirrored_angles(HAIR_ANGLES),
-        cap_rings=1,
+        cap_rings=2,
         rule=grow,
     )
     shells = [cap.shell("hair")]
@@ -217,15 +257,20 @@ def _hair(m: Measures, build: Build, sections: list[Section]) -> list[Shell]:
 
 
 def _ponytail(m: Measures, chin: float, height: float, s: float) -> Shell:
-    """Return the tail of hair, tied behind the crown and hanging to the shoulders."""
-    tie = chin + 0.66 * height
+    """Return the tail of hair, tied behind the crown and hanging to the nape."""
+    tie = chin + 0.70 * height
     rear = -0.465 * m.headlength
+    profile = (
+        (-0.200, 0.008, 0.007, -0.012),
+        (-0.155, 0.020, 0.015, -0.020),
+        (-0.090, 0.027, 0.020, -0.032),
+        (-0.030, 0.025, 0.021, -0.034),
+        (0.000, 0.019, 0.018, -0.022),
+        (0.016, 0.013, 0.014, -0.008),
+    )
     sections = [
-        Section(tie - 0.205 * s, 0.008 * s, 0.008 * s, 0.007 * s, 0.007 * s, z=rear - 0.022 * s),
-        Section(tie - 0.155 * s, 0.021 * s, 0.021 * s, 0.016 * s, 0.015 * s, z=rear - 0.028 * s),
-        Section(tie - 0.085 * s, 0.027 * s, 0.027 * s, 0.020 * s, 0.018 * s, z=rear - 0.034 * s),
-        Section(tie - 0.025 * s, 0.025 * s, 0.025 * s, 0.022 * s, 0.020 * s, z=rear - 0.030 * s),
-        Section(tie + 0.012 * s, 0.018 * s, 0.018 * s, 0.024 * s, 0.018 * s, z=rear - 0.018 * s),
+        Section(tie + y * s, side * s, side * s, deep * s, deep * s, z=rear + z * s)
+        for y, side, deep, z in profile
     ]
-    loft = Loft(sections, rings=7, low_cap=0.010 * s, high_cap=0.014 * s, angles=7, cap_rings=1)
+    loft = Loft(sections, rings=6, low_cap=0.010 * s, high_cap=0.010 * s, angles=6, cap_rings=1)
     return loft.shell("hair")

@@ -5,8 +5,7 @@ import numpy as np
 from .measures import Build, Measures, joint_positions
 from .shapes import EllipsoidBump, Loft, Section, Shell, SwellingBump
 
-
-SLEEVE = 0.36  # where the shirt's sleeve ends, as a share of the upper arm
+SLEEVE = 0.30  # where the shirt's sleeve ends, as a share of the upper arm
 HEM = 0.55  # where the shorts end, as a share of the thigh
 
 
@@ -47,8 +46,8 @@ def upper_arm(m: Measures, build: Build) -> list[Shell]:
     elbow = 0.84 * girth
     out = 0.5 * m.bideltoidbreadth - joints["upper_arm"][0]
     sections = [
-        _limb_section(end, 0.0, 1.10 * girth, (1.00, 0.92, 1.0, 1.02), (0.002 * s, 0.0)),
-        _limb_section(end, 0.16, 1.13 * girth, (1.00, 0.86, 1.05, 1.08), (0.002 * s, 0.0)),
+        _limb_section(end, 0.0, 0.94 * girth, (0.94, 0.94, 1.0, 1.02), (-0.004 * s, 0.0)),
+        _limb_section(end, 0.16, 1.07 * girth, (1.00, 0.86, 1.05, 1.08), (0.002 * s, 0.0)),
         _limb_section(end, 0.36, 1.02 * girth, (0.92, 0.88, 1.08, 1.14), (0.0, -0.001 * s)),
         _limb_section(end, 0.55, 1.0 * girth, (0.88, 0.90, 1.18, 1.06), (0.0, 0.003 * s)),
         _limb_section(end, 0.78, 0.90 * girth, (0.98, 0.96, 1.08, 0.98), (0.0, 0.002 * s)),
@@ -56,8 +55,8 @@ def upper_arm(m: Measures, build: Build) -> list[Shell]:
         _limb_section(end, 1.0, elbow, (1.06, 1.06, 0.96, 0.96)),
     ]
     deltoid = EllipsoidBump(
-        (0.3 * out, 0.18 * end[1], -0.001 * s),
-        (0.7 * out, 0.075 * s, 0.044 * s),
+        (0.32 * out, 0.20 * end[1], -0.001 * s),
+        (0.68 * out, 0.085 * s, 0.044 * s),
         0.03 * s,
     )
     biceps = SwellingBump(
@@ -75,7 +74,7 @@ def upper_arm(m: Measures, build: Build) -> list[Shell]:
         sections,
         rings=_rings(end, 14, SLEEVE),
         low_cap=radius,
-        high_cap=0.78 * girth / (2.0 * np.pi),
+        high_cap=0.54 * girth / (2.0 * np.pi),
         angles=18,
         bumps=[deltoid, biceps, triceps],
         cap_rings=5,
@@ -92,8 +91,8 @@ def forearm(m: Measures, build: Build) -> list[Shell]:
     full = 0.97 * m.forearmcircumferenceflexed
     sections = [
         _limb_section(end, 0.0, 0.99 * elbow, (1.08, 1.06, 0.95, 0.97)),
-        _limb_section(end, 0.12, full, (1.18, 0.98, 1.02, 0.92), (0.002 * s, 0.001 * s)),
-        _limb_section(end, 0.28, full, (1.14, 1.00, 1.10, 0.90), (0.002 * s, 0.001 * s)),
+        _limb_section(end, 0.12, full, (1.10, 1.00, 1.02, 0.92), (0.0, 0.001 * s)),
+        _limb_section(end, 0.28, full, (1.06, 1.02, 1.10, 0.90), (0.0, 0.001 * s)),
         _limb_section(end, 0.55, 0.82 * full, (0.96, 0.98, 1.12, 0.94), (0.001 * s, 0.0)),
         _limb_section(
             end, 0.80, 0.5 * (0.72 * full + m.wristcircumference), (0.84, 0.88, 1.12, 1.04)
@@ -104,11 +103,9 @@ def forearm(m: Measures, build: Build) -> list[Shell]:
     outer = SwellingBump(
         (0.045 * s, 0.17 * end[1], 0.02 * s),
         (0.022 * s, 0.045 * s, 0.026 * s),
-        0.006 * s * build.muscle,
+        0.004 * s * build.muscle,
     )
-    point = SwellingBump(
-        (0.0, -0.004 * s, -0.04 * s), (0.014 * s, 0.016 * s, 0.02 * s), 0.004 * s
-    )
+    point = SwellingBump((0.0, -0.004 * s, -0.04 * s), (0.014 * s, 0.016 * s, 0.02 * s), 0.004 * s)
     loft = Loft(
         sections,
         rings=15,
@@ -130,8 +127,8 @@ def thigh(m: Measures, build: Build) -> list[Shell]:
     knee = 0.93 * low
     sections = [
         _limb_section(end, 0.0, 0.93 * top, (0.94, 0.88, 0.98, 1.12), (-0.002 * s, 0.002 * s)),
-        _limb_section(end, 0.16, top, (0.92, 0.96, 1.02, 1.12), (-0.002 * s, 0.004 * s)),
-        _limb_section(end, 0.34, 0.95 * top, (0.94, 0.92, 1.12, 1.02), (0.0, 0.006 * s)),
+        _limb_section(end, 0.16, top, (0.96, 0.94, 1.02, 1.16), (0.0, -0.004 * s)),
+        _limb_section(end, 0.34, 0.95 * top, (0.95, 0.91, 1.10, 1.08), (0.0, 0.002 * s)),
         _limb_section(end, 0.55, 0.83 * top, (0.97, 0.90, 1.16, 0.98), (0.0, 0.006 * s)),
         _limb_section(end, 0.75, 0.5 * (0.74 * top + 1.06 * low), (0.98, 0.96, 1.06, 0.98)),
         _limb_section(end, 0.88, low, (1.00, 0.98, 1.02, 0.98)),

@@ -20,7 +20,6 @@ class Measures:
     bicristalbreadth: float
     bideltoidbreadth: float
     bizygomaticbreadth: float
-    buttockcircumference: float
     buttockdepth: float
     buttockheight: float
     calfcircumference: float
@@ -71,7 +70,7 @@ class Build:
         name: of the model, the URDF file and the .mtl file.
         bust: whether there are breasts.
         jaw: breadth of the lower jaw, as a share of the bizygomatic breadth.
-        chin: exponent of the chin's cross section; 1.6 is pointed, 2.2 is square.
+        chin: breadth of the chin; 1 is the woman's.
         brow: prominence of the brow ridge [m].
         natural_waist: breadth and depth of the narrowest waist as a share of those at the navel.
         ponytail: long hair, tied behind the head; otherwise short hair.
@@ -105,9 +104,9 @@ def joint_positions(m: Measures) -> dict[str, np.ndarray]:
     neck = m.stature - m.tragiontopofhead - 0.015 * scale
     shoulder = np.array([0.46 * m.biacromialbreadth, 0.0, -0.022 * scale])
     shoulder[1] = m.acromialheight - 0.104 * m.acromionradialelength
-    elbow = shoulder + [0.034 * scale, 0.0, -0.004 * scale]
+    elbow = shoulder + np.array([0.034 * scale, 0.0, -0.004 * scale])
     elbow[1] = m.acromialheight - m.acromionradialelength
-    wrist = elbow + [0.016 * scale, -m.radialestylionlength, 0.022 * scale]
+    wrist = elbow + np.array([0.016 * scale, -m.radialestylionlength, 0.022 * scale])
     hip = np.array([0.32 * m.bicristalbreadth, m.trochanterionheight, -0.004 * scale])
     knee = np.array([0.92 * hip[0], m.lateralfemoralepicondyleheight, 0.004 * scale])
     ankle = np.array([0.84 * hip[0], m.lateralmalleolusheight, -0.022 * scale])

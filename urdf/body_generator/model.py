@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from . import extremities, head, limbs, torso
 from .measures import Build, Measures, joint_positions
@@ -59,6 +60,7 @@ SHAPES: dict[str, Shape] = {
     "foot": extremities.foot,
 }
 AXES = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
+INERTIA_NAMES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 WORLD_REACH = 10.0  # how far the root may go along each axis of the world [m]
 TINY_MASS = 0.001  # of the links between two axes of one joint [kg]
 DECIMALS = 5  # of the coordinates in the .obj files: 0.01 mm
@@ -125,23 +127,23 @@ def mass_properties(shells: Sequence[Shell], mass: float) -> tuple[np.ndarray, n
     return centre, mass * (np.trace(moments) * np.eye(3) - moments)
 
 
-def _numbers(values: Sequence[float]) -> str:
+def _numbers(values: ArrayLike) -> str:
     """Return numbers for the URDF, with 0.01 mm or the like, and no minus zero."""
-    return " ".join(f"{value + 0.0:.6g}" for value in np.round(values, 8))
+    return " ".join(f"{value + 0.0:.6g}" for value in np.round(np.asarray(values), 8))
 
 
 def _joint(
     name: str, parent: str, child: str, axis: str, limits: tuple[float, float], xyz: str
 ) -> str:
     """Return a revolute joint; limits in degrees."""
-    lower, upper = np.radians(limits)
+    lower, upper = (float(limit) for limit in np.radians(limits))
     return (
         f'  <joint name="{name}" type="revolute">\n'
         f'    <parent link="{parent}"/>\n    <child link="{child}"/>\n'
         f'    <origin xyz="{xyz}" rpy="0 0 0"/>\n    <axis xyz="{AXES[axis]}"/>\n'
-        f'    <limit lower="{lower + 0.0!r}" upper="{upper + 0.0!r}" effort="100" velocity="20"/>\n'
+        f'    <limit lower="{lower!r}" upper="{upper!r}" effort="100" velocity="20"/>\n'
         "  </joint>\n"
-    ).replace("np.float64(", "").replace(')"', '"')
+    )
 
 
 def _tiny_link(name: str) -> str:
@@ -151,9 +153,6 @@ def _tiny_link(name: str) -> str:
         f'  <link name="{name}">\n    <inertial>\n      <mass value="{TINY_MASS}"/>\n'
         f"      <inertia {inertia}/>\n    </inertial>\n  </link>\n"
     )
-
-
-INERTIA_NAMES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 def _root_joints() -> str:

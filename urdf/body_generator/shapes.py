@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.interpolate import PchipInterpolator
 
 
@@ -27,7 +28,7 @@ class Shell:
     triangles: np.ndarray
     materials: np.ndarray
 
-    def moved(self, offset: Sequence[float]) -> "Shell":
+    def moved(self, offset: ArrayLike) -> "Shell":
         """Return the shell shifted by offset (3,) [m]."""
         return replace(self, vertices=self.vertices + np.asarray(offset, dtype=float))
 
@@ -69,8 +70,9 @@ class EllipsoidBump:
         b = np.einsum("ij,ij->i", start, step)
         c = np.einsum("ij,ij->i", start, start) - 1.0
         root = b * b - a * c
-        hit = (-b + np.sqrt(np.maximum(root, 0.0))) / a
-        return smooth_maximum(radius, np.where(root > 0.0, hit, 0.0), self.blend)
+        # A ray that misses gets a value that goes on falling smoothly from the tangent's.
+        hit = (-b + np.sign(root) * np.sqrt(np.abs(root))) / a
+        return smooth_maximum(radius, hit, self.blend)
 
 
 @dataclass(frozen=True)
@@ -159,7 +161,7 @@ class Loft:
     rings: int | Sequence[float]
     low_cap: float
     high_cap: float
-    angles: int | Sequence[float] = 16
+    angles: int | np.ndarray = 16
     bumps: Sequence[Bump] = ()
     cap_rings: int = 4
     rule: RadiusRule | None = None
@@ -174,7 +176,9 @@ class Loft:
         values = np.repeat(table(heights), angles.size, axis=0)
         around = np.tile(angles, heights.size)
         direction = np.stack([np.sin(around), np.zeros_like(around), np.cos(around)], axis=1)
-        axis = np.stack([values[:, 4], np.repeat(heights + drop, angles.size), values[:, 5]], axis=1)
+        axis = np.stack(
+            [values[:, 4], np.repeat(heights + drop, angles.size), values[:, 5]], axis=1
+        )
         radius = section_radius(values, around) * np.repeat(shrink, angles.size)
         for bump in self.bumps:
             radius = bump.apply(radius, axis, direction)
@@ -209,11 +213,11 @@ class Loft:
         return heights, shrink, drop
 
 
-def ring_angles(angles: int | Sequence[float]) -> np.ndarray:
+def ring_angles(angles: int | np.ndarray) -> np.ndarray:
     """Return directions round an axis [rad]: n evenly spread ones, or those given."""
     if isinstance(angles, int):
         return np.arange(angles) * (2.0 * np.pi / angles)
-    return np.asarray(angles, dtype=float)
+    return angles
 
 
 def mirrored_angles(half_degrees: Iterable[float]) -> np.ndarray:
@@ -239,8 +243,8 @@ def smooth_maximum(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
 
 
 def ellipsoid(
-    centre: Sequence[float],
-    radii: Sequence[float],
+    centre: ArrayLike,
+    radii: ArrayLike,
     material: str,
     around: int = 8,
     rings: int = 5,

@@ -1,9 +1,21 @@
 """Shapes of the chest and of the waist (belly, hips and buttocks), each in its link frame [m]."""
 
 from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
 
 from .measures import Build, Measures, joint_positions
-from .shapes import Bump, EllipsoidBump, Loft, Section, Shell, SwellingBump, mirrored_angles
+from .shapes import (
+    Bump,
+    EllipsoidBump,
+    Loft,
+    Section,
+    Shell,
+    SwellingBump,
+    ellipsoid,
+    mirrored_angles,
+)
 
 TORSO_ANGLES = (0, 13, 26, 40, 55, 72, 90, 108, 125, 140, 154, 167, 180)
 
@@ -25,20 +37,7 @@ def _section(y: float, half: float, front: float, back: float, power: float = 2.
 
 def _in_link(loft_sections: Iterable[Section], origin_y: float) -> list[Section]:
     """Return sections given by height above the floor, by height above the joint."""
-    return [
-        Section(
-            c.y - origin_y,
-            c.left,
-            c.right,
-            c.front,
-            c.back,
-            c.x,
-            c.z,
-            c.front_power,
-            c.back_power,
-        )
-        for c in loft_sections
-    ]
+    return [replace(section, y=section.y - origin_y) for section in loft_sections]
 
 
 def _waist_sections(m: Measures, build: Build) -> list[Section]:
@@ -55,25 +54,30 @@ def _waist_sections(m: Measures, build: Build) -> list[Section]:
         depth = share * navel_depth
         lean = -0.006 * (y - low) / (high - low)
         sections.append(
-            _section(y, share * navel_half, 0.50 * depth + lean, -0.50 * depth + lean, 2.25)
+            _section(y, share * navel_half, 0.50 * depth + lean, -0.50 * depth + lean, 2.55)
         )
     return sections
 
 
-def chest(m: Measures, build: Build) -> list[Shell]:
-    """Return the chest: ribs, breasts, shoulder blades, shoulders sloping to the neck."""
+def _chest_front(m: Measures, build: Build) -> tuple[float, float]:
+    """Return how far forward the ribs reach, without the breasts, and how far back [m]."""
+    s = m.stature / 1.6285
+    back = -0.118 * s
+    return m.chestdepth + back - (0.052 * s if build.bust else 0.010 * s), back
+
+
+def _chest_sections(m: Measures, build: Build) -> list[Section]:
+    """Return ribs and shoulders from the hem to the collar, by height above the floor."""
     s = m.stature / 1.6285
     origin = joint_positions(m)["chest"]
     _, seam, narrow = _waist_sections(m, build)
-    ribs = 0.5 * m.chestbreadth
-    back = -0.118 * s
-    front = m.chestdepth + back - (0.052 * s if build.bust else 0.008 * s)
-    shoulder = 0.5 * m.biacromialbreadth
-    neck = m.neckcircumferencebase / 6.283
+    hem = 0.002 * s  # the shirt hangs over the shorts
+    ribs, shoulder = 0.5 * m.chestbreadth, 0.5 * m.biacromialbreadth
+    front, back = _chest_front(m, build)
+    neck, neck_z = m.neckcircumferencebase / 6.283, origin[2]
     top = m.acromialheight
-    neck_z = origin[2]
-    sections = [
-        seam,
+    return [
+        replace(seam, left=seam.left + hem, right=seam.right + hem, front=seam.front + hem),
         narrow,
         _section(
             0.45 * narrow.y + 0.55 * m.chestheight,
@@ -81,40 +85,56 @@ def chest(m: Measures, build: Build) -> list[Shell]:
             0.5 * (narrow.z + narrow.front + front) + 0.004 * s,
             0.5 * (narrow.z - narrow.back + back) - 0.003 * s,
         ),
-        _section(m.chestheight, ribs, front, back, 2.3),
-        _section(m.axillaheight - 0.012 * s, 1.05 * ribs, front - 0.006 * s, back - 0.006 * s, 2.3),
-        _section(m.axillaheight + 0.035 * s, 0.90 * shoulder, 0.052 * s, -0.116 * s, 2.4),
-        _section(top - 0.030 * s, 0.95 * shoulder, 0.034 * s, -0.098 * s, 2.3),
-        _section(top - 0.005 * s, 0.84 * shoulder, 0.024 * s, -0.084 * s, 2.1),
-        _section(top + 0.016 * s, 0.60 * shoulder, neck_z + 0.72 * neck, neck_z - 0.90 * neck, 2.0),
-        _section(top + 0.034 * s, 1.30 * neck, neck_z + 0.78 * neck, neck_z - 0.92 * neck, 2.0),
-        _section(top + 0.052 * s, 1.04 * neck, neck_z + 0.82 * neck, neck_z - 0.92 * neck, 2.0),
+        _section(m.chestheight, ribs, front, back, 2.7),
+        _section(
+            m.axillaheight - 0.012 * s,
+            0.91 * ribs + 0.10 * shoulder,
+            front - 0.006 * s,
+            back - 0.002 * s,
+            2.5,
+        ),
+        _section(
+            m.axillaheight + 0.035 * s,
+            0.45 * ribs + 0.52 * shoulder,
+            0.056 * s,
+            -0.116 * s,
+            2.4,
+        ),
+        _section(top - 0.021 * s, 0.985 * shoulder, 0.040 * s, -0.098 * s, 2.3),
+        _section(top - 0.004 * s, 0.92 * shoulder, 0.037 * s, -0.090 * s, 2.1),
+        _section(top + 0.008 * s, 0.74 * shoulder, neck_z + 1.00 * neck, neck_z - 1.12 * neck, 2.0),
+        _section(top + 0.017 * s, 0.53 * shoulder, neck_z + 0.97 * neck, neck_z - 1.12 * neck, 2.0),
+        _section(origin[1], 1.12 * neck, neck_z + 0.92 * neck, neck_z - 1.10 * neck, 2.0),
     ]
-    y0 = origin[1]
+
+
+def _chest_bumps(m: Measures, build: Build, y0: float) -> list[Bump]:
+    """Return breasts or chest muscles, shoulder blades and the groove of the spine.
+
+    Args:
+        m: the measures.
+        build: the build.
+        y0: height of the link's origin [m].
+    """
+    s = m.stature / 1.6285
+    front, back = _chest_front(m, build)
     bumps: list[Bump] = []
     if build.bust:
         bust = m.chestheight - y0
         reach = m.chestdepth + back
         bumps += _pair(
             EllipsoidBump(
-                (0.072 * s, bust - 0.004 * s, reach - 0.060 * s),
-                (0.060 * s, 0.060 * s, 0.060 * s),
-                0.034 * s,
-            )
-        )
-        bumps += _pair(
-            EllipsoidBump(
-                (0.076 * s, bust + 0.030 * s, reach - 0.066 * s),
-                (0.052 * s, 0.070 * s, 0.046 * s),
-                0.034 * s,
+                (0.073 * s, bust + 0.004 * s, reach - 0.058 * s),
+                (0.058 * s, 0.068 * s, 0.058 * s),
+                0.036 * s,
             )
         )
     else:
         bumps += _pair(
             EllipsoidBump(
-                (0.082 * s, m.chestheight + 0.012 * s - y0, front - 0.040 * s),
-                (0.072 * s, 0.052 * s, 0.050 * s),
-                0.03 * s,
+                (0.066 * s, m.chestheight + 0.026 * s - y0, front - 0.042 * s),
+                (0.064 * s, 0.062 * s, 0.043 * s),
+                0.04 * s,
             )
         )
     blade_y = 0.5 * (m.axillaheight + m.chestheight) - y0
@@ -125,31 +145,31 @@ def chest(m: Measures, build: Build) -> list[Shell]:
     )
     bumps.append(
         SwellingBump(
-            (0.0, blade_y - 0.03 * s, -0.12 * s), (0.014 * s, 0.12 * s, 0.03 * s), -0.008 * s
+            (0.0, blade_y - 0.01 * s, -0.12 * s), (0.014 * s, 0.06 * s, 0.03 * s), -0.008 * s
         )
     )
-    sections_here = _in_link(sections, y0)
-    knots = [section.y for section in sections_here]
-    rings = [
-        *knots,
-        *(0.5 * (a + b) for a, b in zip(knots[1:6], knots[2:7], strict=True)),
-        m.chestheight - y0 - 0.055 * s,
-        m.chestheight - y0 - 0.035 * s,
-        m.chestheight - y0 - 0.018 * s,
-        m.chestheight - y0 + 0.018 * s,
-        m.chestheight - y0 + 0.040 * s,
-    ]
+    return bumps
+
+
+def chest(m: Measures, build: Build) -> list[Shell]:
+    """Return the chest: ribs, breasts, shoulder blades, shoulders sloping to the neck."""
+    s = m.stature / 1.6285
+    origin = joint_positions(m)["chest"]
+    sections = _in_link(_chest_sections(m, build), origin[1])
+    knots = [section.y for section in sections]
     loft = Loft(
-        sections_here,
-        rings=rings,
-        low_cap=0.62 * seam.left,
-        high_cap=0.020 * s,
+        sections,
+        rings=[*np.linspace(knots[0], knots[5], 16), *knots[6:]],
+        low_cap=0.62 * _waist_sections(m, build)[1].left,
+        high_cap=0.014 * s,
         angles=mirrored_angles(TORSO_ANGLES),
-        bumps=bumps,
+        bumps=_chest_bumps(m, build, origin[1]),
         cap_rings=4,
     )
-    shell = loft.shell("suit").painted_above(sections_here[-2].y, "skin")
-    return [shell.moved((0.0, 0.0, -origin[2]))]
+    # The shoulders' balls keep the arms attached wherever they turn.
+    ball = ellipsoid((0.0, -0.004 * s, 0.0), (0.034 * s, 0.026 * s, 0.034 * s), "suit", 8, 3)
+    ball = ball.moved(joint_positions(m)["upper_arm"] - origin)
+    return [loft.shell("suit").moved((0.0, 0.0, -origin[2])), ball, ball.mirrored()]
 
 
 def waist(m: Measures, build: Build) -> list[Shell]:
@@ -166,15 +186,15 @@ def waist(m: Measures, build: Build) -> list[Shell]:
     middle = 0.5 * (navel + seat)
     sections = [
         _section(crotch, 0.80 * hips, 0.70 * front_hip, 0.72 * back_hip),
-        _section(0.5 * (crotch + seat), 0.95 * hips, 0.90 * front_hip, 0.94 * back_hip, 2.3),
-        _section(seat, hips, front_hip, back_hip, 2.3),
-        _section(seat + 0.35 * (navel - seat), 0.98 * hips, 1.04 * front_hip, back_hip, 2.3),
+        _section(0.5 * (crotch + seat), 0.95 * hips, 0.90 * front_hip, 0.94 * back_hip, 2.35),
+        _section(seat, hips, front_hip, back_hip, 2.5),
+        _section(seat + 0.35 * (navel - seat), 0.98 * hips, 1.04 * front_hip, back_hip, 2.7),
         _section(
             middle + 0.15 * (navel - seat),
             0.5 * (belly.left + hips),
             0.5 * (front_navel + 1.05 * front_hip),
             0.55 * back_navel + 0.45 * back_hip,
-            2.3,
+            2.7,
         ),
         belly,
         seam,
@@ -183,9 +203,9 @@ def waist(m: Measures, build: Build) -> list[Shell]:
     bumps: list[Bump] = []
     bumps += _pair(
         EllipsoidBump(
-            (0.80 * hip_x, seat + 0.006 * s - y0, -0.57 * m.buttockdepth + 0.058 * s),
-            (0.074 * s, 0.082 * s, 0.058 * s),
-            0.022 * s,
+            (0.80 * hip_x, seat + 0.014 * s - y0, -0.57 * m.buttockdepth + 0.058 * s),
+            (0.074 * s, 0.080 * s, 0.058 * s),
+            0.030 * s,
         )
     )
     bumps.append(
@@ -197,9 +217,9 @@ def waist(m: Measures, build: Build) -> list[Shell]:
         _in_link(sections, y0),
         rings=18,
         low_cap=0.028 * s,
-        high_cap=0.62 * seam.left,
+        high_cap=0.42 * seam.left,
         angles=mirrored_angles(TORSO_ANGLES),
         bumps=bumps,
         cap_rings=4,
     )
-    return [loft.shell("suit").moved((0.0, 0.0, -origin[2]))]
+    return [loft.shell("shorts").moved((0.0, 0.0, -origin[2]))]

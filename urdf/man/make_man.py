@@ -1,4 +1,4 @@
-"""Writes man.urdf and its meshes: python man/make_man.py [--stature METRES] [--out FOLDER]."""
+"""Writes man.urdf and its meshes; see --help."""
 
 import argparse
 import sys
@@ -17,7 +17,6 @@ MEASURES = {
     "bicristalbreadth": 0.2754,
     "bideltoidbreadth": 0.5104,
     "bizygomaticbreadth": 0.1426,
-    "buttockcircumference": 1.0195,
     "buttockdepth": 0.2458,
     "buttockheight": 0.8879,
     "calfcircumference": 0.3923,
@@ -54,7 +53,7 @@ MEASURES = {
     "waistheightomphalion": 1.0565,
     "wristcircumference": 0.1759,
 }
-# Whole mass: the same survey's mean.  Shares: de Leva 1996, table 4; the trunk's middle part is
+# Whole mass: the same survey's mean.  Shares: de Leva 1996; the trunk's middle part is
 # halved between chest and waist.
 MASS = 85.52
 MASS_SHARES = {
@@ -94,7 +93,7 @@ def main() -> None:
         name="man",
         bust=False,
         jaw=0.92,
-        chin=1.95,
+        chin=1.2,
         brow=0.003,
         natural_waist=0.95,
         ponytail=False,

@@ -1,4 +1,4 @@
-"""Writes woman.urdf and its meshes: python woman/make_woman.py [--stature METRES] [--out FOLDER]."""
+"""Writes woman.urdf and its meshes; see --help."""
 
 import argparse
 import sys
@@ -17,7 +17,6 @@ MEASURES = {
     "bicristalbreadth": 0.2733,
     "bideltoidbreadth": 0.4503,
     "bizygomaticbreadth": 0.1338,
-    "buttockcircumference": 1.0212,
     "buttockdepth": 0.2329,
     "buttockheight": 0.8337,
     "calfcircumference": 0.3733,
@@ -54,7 +53,7 @@ MEASURES = {
     "waistheightomphalion": 0.9801,
     "wristcircumference": 0.1548,
 }
-# Whole mass: the same survey's mean.  Shares: de Leva 1996, table 4; the trunk's middle part is
+# Whole mass: the same survey's mean.  Shares: de Leva 1996; the trunk's middle part is
 # halved between chest and waist.
 MASS = 67.76
 MASS_SHARES = {
@@ -73,8 +72,8 @@ COLOURS = {
     "hair": (0.26, 0.15, 0.09),
     "eye": (0.16, 0.10, 0.08),
     "lips": (0.70, 0.32, 0.32),
-    "suit": (0.10, 0.38, 0.44),
-    "shorts": (0.10, 0.38, 0.44),
+    "suit": (0.12, 0.45, 0.50),
+    "shorts": (0.17, 0.19, 0.25),
 }
 
 
@@ -94,9 +93,9 @@ def main() -> None:
         name="woman",
         bust=True,
         jaw=0.80,
-        chin=1.65,
+        chin=1.0,
         brow=0.0,
-        natural_waist=0.88,
+        natural_waist=0.86,
         ponytail=True,
         muscle=1.0,
         mass=MASS * (arguments.stature / measures.stature) ** 3,

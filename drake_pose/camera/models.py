@@ -172,7 +172,7 @@ class ParallelCamera:
     ) -> tuple[ColorRenderCamera, DepthRenderCamera, RigidTransform]:
         """Returns a tele camera for Drake's renderer and the pose X_WC its sensor must have.
 
-        Drake knows pinholes only. The tele camera stands 10 km behind the middle of the depth
+        Drake knows pinholes only. The tele camera stands 30 km behind the middle of the depth
         range.
 
         Args:

@@ -117,31 +117,19 @@ def _project(
     """Projects the points of one surface to u, v."""
     fx, fy, cx, cy = camera[1], camera[2], camera[3], camera[4]
     begin, end = packed.starts[node, 0], packed.starts[node + 1, 0]
-    x, y, z = (
-        packed.points[0, begin:end],
-        packed.points[1, begin:end],
-        packed.points[2, begin:end],
-    )
+    x, y = packed.points[0, begin:end], packed.points[1, begin:end]
+    z = packed.points[2, begin:end]
     u, v = work.u, work.v
-    a0, a1, a2, a3 = (
-        fx * X_CN[node, 0, 0],
-        fx * X_CN[node, 0, 1],
-        fx * X_CN[node, 0, 2],
-        fx * X_CN[node, 0, 3],
-    )
-    b0, b1, b2, b3 = (
-        fy * X_CN[node, 1, 0],
-        fy * X_CN[node, 1, 1],
-        fy * X_CN[node, 1, 2],
-        fy * X_CN[node, 1, 3],
-    )
+    X = X_CN[node]
+    a0, a1, a2, a3 = fx * X[0, 0], fx * X[0, 1], fx * X[0, 2], fx * X[0, 3]
+    b0, b1, b2, b3 = fy * X[1, 0], fy * X[1, 1], fy * X[1, 2], fy * X[1, 3]
     if camera[0] == 1.0:
         a3, b3 = a3 + cx, b3 + cy
         for i in range(x.shape[0]):
             u[i] = a0 * x[i] + a1 * y[i] + a2 * z[i] + a3
             v[i] = b0 * x[i] + b1 * y[i] + b2 * z[i] + b3
         return
-    d0, d1, d2, d3 = X_CN[node, 2, 0], X_CN[node, 2, 1], X_CN[node, 2, 2], X_CN[node, 2, 3]
+    d0, d1, d2, d3 = X[2, 0], X[2, 1], X[2, 2], X[2, 3]
     for i in range(x.shape[0]):
         inverse = 1.0 / (d0 * x[i] + d1 * y[i] + d2 * z[i] + d3)
         u[i] = (a0 * x[i] + a1 * y[i] + a2 * z[i] + a3) * inverse + cx
@@ -155,12 +143,13 @@ def _find_facings(
     """Writes which side of each triangle the camera sees: +1, 0 or -1; 0 after the last."""
     # The parallel camera looks along (e0, e1, e2), the pinhole stands there: opposite signs, which
     # only turn the winding number's sign.
-    e0, e1, e2, share = X_CN[node, 2, 0], X_CN[node, 2, 1], X_CN[node, 2, 2], 0.0
+    X = X_CN[node]
+    e0, e1, e2, share = X[2, 0], X[2, 1], X[2, 2], 0.0
     if camera[0] == 0.0:
-        t0, t1, t2, share = X_CN[node, 0, 3], X_CN[node, 1, 3], X_CN[node, 2, 3], 1.0
-        e0 = -(X_CN[node, 0, 0] * t0 + X_CN[node, 1, 0] * t1 + X_CN[node, 2, 0] * t2)
-        e1 = -(X_CN[node, 0, 1] * t0 + X_CN[node, 1, 1] * t1 + X_CN[node, 2, 1] * t2)
-        e2 = -(X_CN[node, 0, 2] * t0 + X_CN[node, 1, 2] * t1 + X_CN[node, 2, 2] * t2)
+        t0, t1, t2, share = X[0, 3], X[1, 3], X[2, 3], 1.0
+        e0 = -(X[0, 0] * t0 + X[1, 0] * t1 + X[2, 0] * t2)
+        e1 = -(X[0, 1] * t0 + X[1, 1] * t1 + X[2, 1] * t2)
+        e2 = -(X[0, 2] * t0 + X[1, 2] * t1 + X[2, 2] * t2)
     begin, end = packed.starts[node, 1], packed.starts[node + 1, 1]
     n0, n1 = packed.planes[0, begin:end], packed.planes[1, begin:end]
     n2, offset = packed.planes[2, begin:end], packed.planes[3, begin:end]
@@ -177,14 +166,14 @@ def _walk_clipped(
 ) -> None:
     """Walks the part of one triangle (3, 3) [m, camera frame] beyond the near plane."""
     fx, fy, cx, cy, near = camera[1], camera[2], camera[3], camera[4], camera[5]
-    polygon = np.empty((4, 2))
-    size = 0
+    width, height, counts, reach = camera[6], camera[7], work.counts, work.reach
+    pu, pv, size = np.empty(4), np.empty(4), 0
     for a in range(3):
         b = (a + 1) % 3
         visible = corners[a, 2] >= near
         if visible:
-            polygon[size, 0] = fx * corners[a, 0] / corners[a, 2] + cx
-            polygon[size, 1] = fy * corners[a, 1] / corners[a, 2] + cy
+            pu[size] = fx * corners[a, 0] / corners[a, 2] + cx
+            pv[size] = fy * corners[a, 1] / corners[a, 2] + cy
             size += 1
         if visible != (corners[b, 2] >= near):
             # From the visible end to the hidden one, whichever way the triangle runs.
@@ -192,23 +181,12 @@ def _walk_clipped(
             share = (near - corners[i, 2]) / (corners[o, 2] - corners[i, 2])
             x = corners[i, 0] + share * (corners[o, 0] - corners[i, 0])
             y = corners[i, 1] + share * (corners[o, 1] - corners[i, 1])
-            polygon[size, 0] = fx * x / near + cx
-            polygon[size, 1] = fy * y / near + cy
+            pu[size] = fx * x / near + cx
+            pv[size] = fy * y / near + cy
             size += 1
     for a in range(size):
         b = (a + 1) % size
-        _walk_edge(
-            polygon[a, 0],
-            polygon[a, 1],
-            polygon[b, 0],
-            polygon[b, 1],
-            weight,
-            camera[6],
-            camera[7],
-            crossings,
-            work.counts,
-            work.reach,
-        )
+        _walk_edge(pu[a], pv[a], pu[b], pv[b], weight, width, height, crossings, counts, reach)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -221,14 +199,12 @@ def _clip_near(
     work: _Work,
 ) -> None:
     """Takes triangles nearer than the near plane out of facings, and walks those it cuts."""
-    near = camera[5]
+    near, X, points = camera[5], X_CN[node], packed.points
     begin, first = packed.starts[node, 0], packed.starts[node, 1]
-    points = packed.points
     hidden = np.empty(packed.starts[node + 1, 0] - begin, dtype=np.bool_)
     for i in range(hidden.shape[0]):
         x, y, z = points[0, begin + i], points[1, begin + i], points[2, begin + i]
-        depth = X_CN[node, 2, 0] * x + X_CN[node, 2, 1] * y + X_CN[node, 2, 2] * z
-        hidden[i] = depth + X_CN[node, 2, 3] < near
+        hidden[i] = X[2, 0] * x + X[2, 1] * y + X[2, 2] * z + X[2, 3] < near
     corners = np.empty((3, 3))
     for t in range(packed.starts[node + 1, 1] - first):
         lost = 0
@@ -243,13 +219,8 @@ def _clip_near(
         for k in range(3):
             i = begin + packed.triangles[first + t, k]
             x, y, z = points[0, i], points[1, i], points[2, i]
-            for axis in range(3):
-                corners[k, axis] = (
-                    X_CN[node, axis, 0] * x
-                    + X_CN[node, axis, 1] * y
-                    + X_CN[node, axis, 2] * z
-                    + X_CN[node, axis, 3]
-                )
+            for j in range(3):
+                corners[k, j] = X[j, 0] * x + X[j, 1] * y + X[j, 2] * z + X[j, 3]
         _walk_clipped(corners, facing, camera, crossings, work)
 
 
@@ -258,10 +229,8 @@ def _walk_contour(
     packed: PackedOutlines, node: int, camera: np.ndarray, crossings: np.ndarray, work: _Work
 ) -> None:
     """Walks the contour edges of one projected surface."""
-    width, height = camera[6], camera[7]
-    u, v, facings = work.u, work.v, work.facings
-    counts, reach = work.counts, work.reach
-    edges = packed.edges
+    width, height, counts, reach = camera[6], camera[7], work.counts, work.reach
+    u, v, facings, edges = work.u, work.v, work.facings, packed.edges
     begin, end = packed.starts[node, 2], packed.starts[node + 1, 2]
     ordinary_end = packed.ordinary_ends[node]
     for e in range(begin, ordinary_end):
@@ -287,10 +256,9 @@ def _fill_rows(
             continue
         cut = False
         if camera[0] == 0.0:
-            depth = X_CN[node, 2, 3]
-            for axis in range(3):
-                depth += X_CN[node, 2, axis] * packed.balls[node, axis]
-            radius = 1.000001 * packed.balls[node, 3]
+            X, ball = X_CN[node], packed.balls[node]
+            depth = X[2, 0] * ball[0] + X[2, 1] * ball[1] + X[2, 2] * ball[2] + X[2, 3]
+            radius = 1.000001 * ball[3]
             if depth + radius < camera[5]:
                 continue
             cut = depth - radius < camera[5]
@@ -317,18 +285,6 @@ def _fill_safely(
     return crossings
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _sort(crossings: np.ndarray, row: int, count: int) -> None:
-    """Sorts one row's crossings in place; rows are short."""
-    for i in range(1, count):
-        moving = crossings[row, i]
-        k = i
-        while k > 0 and crossings[row, k - 1] > moving:
-            crossings[row, k] = crossings[row, k - 1]
-            k -= 1
-        crossings[row, k] = moving
-
-
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _find_spans(
     row: int, crossings: np.ndarray, counts: np.ndarray, changes: np.ndarray, spans: np.ndarray
@@ -349,7 +305,12 @@ def _find_spans(
 @njit(cache=True, nogil=True, error_model="numpy")
 def _find_some_spans(row: int, count: int, crossings: np.ndarray, spans: np.ndarray) -> int:
     """As _find_spans by sorting the row's crossings."""
-    _sort(crossings, row, count)
+    for i in range(1, count):
+        moving, k = crossings[row, i], i
+        while k > 0 and crossings[row, k - 1] > moving:
+            crossings[row, k] = crossings[row, k - 1]
+            k -= 1
+        crossings[row, k] = moving
     found, winding, start = 0, 0, 0
     for k in range(count):
         pixel = crossings[row, k] >> _SHIFT
@@ -435,14 +396,3 @@ def paint(
         for k in range(_find_spans(row, crossings, work.counts, work.changes, spans)):
             mask[row, spans[k, 0] : spans[k, 1]] = value
     return work.reach[:2]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def sum_rows(mask: np.ndarray, prefix: np.ndarray, first: int, end: int) -> None:
-    """Writes the prefix sums of rows first to end of mask (H, W) uint8 to prefix (H, W + 1)."""
-    for row in range(first, end):
-        total = 0
-        prefix[row, 0] = 0
-        for pixel in range(mask.shape[1]):
-            total += mask[row, pixel] != 0
-            prefix[row, pixel + 1] = total

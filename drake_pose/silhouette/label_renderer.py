@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,15 +32,19 @@ _DEPTH_MARGIN = 0.01
 class LabelRenderer:
     """Renders label images of a model with RenderEngineVtk, without a display or a diagram.
 
-    Use a renderer in the thread that made it: an engine used in two threads gives wrong images.
-
     Args:
         model: the model.
         camera: the camera.
+
+    Raises:
+        CameraError: on rendering, when Drake cannot draw for the camera.
+        RuntimeError: on rendering in another thread than the one that made the renderer: the
+            engine would give wrong images.
     """
 
     def __init__(self, model: ArticulatedModel, camera: Camera) -> None:
         self.camera = camera
+        self._thread = threading.get_ident()
         self._scene_graph = SceneGraph()
         self._plant = MultibodyPlant(time_step=0.0)
         self._source = self._plant.RegisterAsSourceForSceneGraph(self._scene_graph)
@@ -67,7 +72,10 @@ class LabelRenderer:
         Returns:
             (H, W) int16 labels; EMPTY where there is no body.
         """
-        poses = self._pose_vector(q)
+        if threading.get_ident() != self._thread:
+            raise RuntimeError("a LabelRenderer must be used in the thread that made it")
+        self._set_positions(q)
+        poses = self._plant.get_geometry_pose_output_port().Eval(self._plant_context)
         X_BW = RigidTransform()
         if X_WB is not None:
             rotation = RotationMatrix.ProjectToRotationMatrix(np.asarray(X_WB)[:3, :3])
@@ -93,7 +101,7 @@ class LabelRenderer:
 
     def link_poses(self, q: np.ndarray) -> np.ndarray:
         """Returns (bodies, 4, 4) the links' poses in the plant's world, by body index."""
-        self._plant.SetPositions(self._plant_context, np.asarray(q, dtype=np.float64))
+        self._set_positions(q)
         count = self._plant.num_bodies()
         bodies = [self._plant.get_body(BodyIndex(i)) for i in range(count)]
         return np.array(
@@ -103,14 +111,13 @@ class LabelRenderer:
             ]
         )
 
-    def _pose_vector(self, q: np.ndarray) -> FramePoseVector:
-        """Returns the poses of the plant's frames as the scene graph takes them."""
+    def _set_positions(self, q: np.ndarray) -> None:
+        """Puts the plant at positions q (nq,)."""
         positions = np.asarray(q, dtype=np.float64)
         if positions.shape != (self._plant.num_positions(),) or not np.isfinite(positions).all():
             # Drake ends the whole process here.
             raise ValueError(f"q must be ({self._plant.num_positions()},) finite numbers")
         self._plant.SetPositions(self._plant_context, positions)
-        return self._plant.get_geometry_pose_output_port().Eval(self._plant_context)
 
     def _find_corners(self) -> list[tuple[FrameId, np.ndarray]]:
         """Returns the corners (8, 3) of a box around every drawn shape, in its frame."""

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from drake_pose.camera import Camera
-from drake_pose.silhouette.kernel import paint, score, sum_rows
+from drake_pose.silhouette.kernel import paint, score
 from drake_pose.silhouette.outline import Outline, PackedOutlines, pack
+from drake_pose.silhouette.prefixes import sum_rows
 
 
 def prefix_sums(mask: np.ndarray) -> np.ndarray:
@@ -85,13 +86,22 @@ def subtract_body(
         outlines: the body's surfaces, or its only one.
         X_CN: (nodes, 4, 4) their poses in the camera (one surface: (4, 4) will do).
         camera: the camera.
+
+    Raises:
+        ValueError: when an array has the wrong shape or type, or cannot be changed in place.
     """
     surfaces = [outlines] if isinstance(outlines, Outline) else outlines
     poses = np.asarray(X_CN)
     packed, poses = _check_body(surfaces, poses.reshape(1, len(surfaces), *poses.shape[-2:]))
+    size = (camera.height, camera.width)
+    for name, array, shape in (("mask", mask, size), ("prefix", prefix, (size[0], size[1] + 1))):
+        if array.shape != shape or not (array.flags.c_contiguous and array.flags.writeable):
+            raise ValueError(
+                f"{name} of camera '{camera.name}' must be {shape}, C-contiguous and writeable"
+            )
+    if prefix.dtype != np.int32:
+        raise ValueError(f"prefix of camera '{camera.name}' must be int32, not {prefix.dtype}")
     pixels = _as_bytes(mask)
-    if pixels.shape != (camera.height, camera.width) or prefix.dtype != np.int32:
-        raise ValueError(f"mask or prefix does not fit camera '{camera.name}'")
     first, end = paint(packed, poses[0], camera.kernel_parameters(), pixels, 0)
     sum_rows(pixels, prefix, first, end)
 

@@ -1,0 +1,92 @@
+"""Triangle meshes: what a link looks like, as plain arrays."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class TriangleMesh:
+    """A surface of triangles; not necessarily closed, not necessarily connected.
+
+    Attributes:
+        vertices: (n, 3) float64 [m], read-only, expressed in the frame of the link that owns it.
+        triangles: (m, 3) int32, read-only, indices into ``vertices``.
+    """
+
+    vertices: NDArray[np.float64]
+    triangles: NDArray[np.int32]
+
+    def __post_init__(self) -> None:
+        """Make private read-only copies, so that nobody can change a mesh that others hold."""
+        vertices = np.array(self.vertices, dtype=np.float64).reshape(-1, 3)
+        triangles = np.array(self.triangles, dtype=np.int32).reshape(-1, 3)
+        vertices.setflags(write=False)
+        triangles.setflags(write=False)
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "triangles", triangles)
+
+    @staticmethod
+    def empty() -> "TriangleMesh":
+        """A mesh without triangles: a link that is not seen."""
+        return TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32))
+
+    @property
+    def is_empty(self) -> bool:
+        """True where there is nothing to draw."""
+        return len(self.triangles) == 0
+
+    def transformed(self, X_AB: NDArray[np.float64]) -> "TriangleMesh":
+        """The same surface seen from frame A, given this mesh in frame B.
+
+        Args:
+            X_AB: (4, 4) pose of B in A.
+        """
+        vertices_A = self.vertices @ X_AB[:3, :3].T + X_AB[:3, 3]
+        return TriangleMesh(vertices_A, self.triangles)
+
+
+def merge_duplicate_vertices(mesh: TriangleMesh) -> TriangleMesh:
+    """Join vertices that lie at exactly the same place and drop triangles without area by index.
+
+    Files repeat a vertex wherever its normal or texture coordinate changes. Two triangles share an
+    edge, which an outline needs to know, only when they share the vertices too.
+    """
+    if mesh.is_empty:
+        return TriangleMesh.empty()
+    _, first, inverse = np.unique(mesh.vertices, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first, kind="stable")
+    rank = np.empty(len(order), dtype=np.int32)
+    rank[order] = np.arange(len(order), dtype=np.int32)
+    triangles = rank[inverse.reshape(-1)][mesh.triangles]
+    a, b, c = triangles.T
+    triangles = triangles[(a != b) & (b != c) & (c != a)]
+    vertices = mesh.vertices[first[order]]
+    used = np.zeros(len(vertices), dtype=bool)
+    used[triangles] = True
+    renumbered = np.cumsum(used, dtype=np.int32) - 1
+    return TriangleMesh(vertices[used], renumbered[triangles].astype(np.int32))
+
+
+def join_meshes(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
+    """All triangles of several meshes that are given in one common frame."""
+    parts = [mesh for mesh in meshes if not mesh.is_empty]
+    if not parts:
+        return TriangleMesh.empty()
+    offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in parts[:-1]])
+    triangles = [mesh.triangles + offset for mesh, offset in zip(parts, offsets, strict=True)]
+    return TriangleMesh(np.concatenate([m.vertices for m in parts]), np.concatenate(triangles))
+
+
+def is_watertight(mesh: TriangleMesh) -> bool:
+    """True where every edge is used exactly once in each of its two directions."""
+    if mesh.is_empty:
+        return False
+    edges = np.concatenate([mesh.triangles[:, [0, 1]], mesh.triangles[:, [1, 2]]])
+    edges = np.concatenate([edges, mesh.triangles[:, [2, 0]]]).astype(np.int64)
+    count = len(mesh.vertices)
+    forward = np.sort(edges[:, 0] * count + edges[:, 1])
+    backward = np.sort(edges[:, 1] * count + edges[:, 0])
+    return bool(np.all(np.diff(forward) > 0) and np.array_equal(forward, backward))

@@ -1,0 +1,182 @@
+"""Is this model fit for use, and if not, why: the facts behind ``drake-pose check FILE``."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from drake_pose.body.link_graph import build_link_graph
+from drake_pose.body.mesh import TriangleMesh, is_watertight
+from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body.parsing import count_mimic_joints
+from drake_pose.body.pose_tree import PoseTree, PoseTreeNode
+from drake_pose.errors import DrakePoseError
+
+_SYMMETRY_TOLERANCE = 0.03
+_LEVELS = 12
+# Seven, so that a square or hexagonal cross-section does not pass for round.
+_SECTORS = 7
+
+
+@dataclass(frozen=True)
+class JointReport:
+    """One position: its name, kind, and limits in degrees (angles) or metres (lengths)."""
+
+    name: str
+    kind: str
+    lower: float
+    upper: float
+
+
+@dataclass(frozen=True)
+class NodeReport:
+    """One node of the pose tree."""
+
+    name: str
+    parent: str
+    joints: tuple[JointReport, ...]
+    triangles: int
+    watertight: bool
+
+
+@dataclass(frozen=True)
+class ModelReport:
+    """What was found in a model file.
+
+    Attributes:
+        path: the file.
+        name: the model's name; empty where it cannot be read.
+        nodes: the nodes of the plant's own pose tree.
+        warnings: what may surprise, but does not hinder.
+        errors: why the model cannot be used.
+    """
+
+    path: Path
+    name: str
+    nodes: tuple[NodeReport, ...]
+    warnings: tuple[str, ...]
+    errors: tuple[str, ...]
+
+    @property
+    def usable(self) -> bool:
+        """True where there is no error."""
+        return not self.errors
+
+
+def describe_model(
+    path: Path | str, *, package_paths: Mapping[str, Path | str] | None = None
+) -> ModelReport:
+    """Read a model and report on it; problems of the model become ``errors``, never exceptions."""
+    path = Path(path)
+    try:
+        model = load_model(path, package_paths=package_paths)
+        tree = model.pose_tree()
+    except DrakePoseError as error:
+        return ModelReport(path, "", (), (), (str(error),))
+    return ModelReport(
+        path=path,
+        name=model.name,
+        nodes=tuple(_node_report(tree, node) for node in tree.nodes),
+        warnings=tuple(_warnings(model, tree)),
+        errors=(),
+    )
+
+
+def _node_report(tree: PoseTree, node: PoseTreeNode) -> NodeReport:
+    """The facts of one node."""
+    model = tree.model
+    joints = []
+    for position, name in zip(node.positions, node.position_names, strict=True):
+        kind = model.position_kinds[position]
+        scale = 180.0 / math.pi if kind == "angle" else 1.0
+        lower, upper = model.lower[position] * scale, model.upper[position] * scale
+        joints.append(JointReport(name, kind, float(lower), float(upper)))
+    return NodeReport(
+        name=node.name,
+        parent=tree.nodes[node.parent].name if node.parent >= 0 else "world",
+        joints=tuple(joints),
+        triangles=len(node.mesh.triangles),
+        watertight=is_watertight(node.mesh),
+    )
+
+
+def _warnings(model: ArticulatedModel, tree: PoseTree) -> list[str]:
+    """Everything worth knowing before the model is used."""
+    warnings = list(model.warnings)
+    mimics = max(count_mimic_joints(model.path), model.plant.num_constraints())
+    if mimics:
+        warnings.append(
+            f"{mimics} joints are written to follow others (<mimic>, or a constraint); this is not "
+            "enforced: every joint is searched by itself"
+        )
+    if tree.unobserved_positions and tree.root == "world":
+        warnings.append(
+            "these joints move nothing that is seen and keep their default values: "
+            + ", ".join(tree.unobserved_positions)
+        )
+    warnings += [
+        f"link '{node.name}' is not watertight: its silhouette may have gaps"
+        for node in tree.nodes
+        if not node.mesh.is_empty and not is_watertight(node.mesh)
+    ]
+    return warnings + _symmetry_warnings(model)
+
+
+def _symmetry_warnings(model: ArticulatedModel) -> list[str]:
+    """Joints that turn a leaf of the plant about its own axis of symmetry: they cannot be seen."""
+    graph = build_link_graph(model, None)
+    warnings = []
+    for edge in graph.edges:
+        group = graph.groups[edge.outer]
+        last = not any(other.inner == edge.outer for other in graph.edges)
+        if not last or edge.joint_map is None or group.mesh.is_empty:
+            continue
+        for column, position in enumerate(edge.positions):
+            if model.position_kinds[position] != "angle":
+                continue
+            values = np.zeros((2, len(edge.positions)))
+            values[1, column] = math.pi / 2.0
+            X = edge.joint_map.transforms(values)
+            if _is_symmetric(group.mesh, np.linalg.inv(X[0]) @ X[1]):
+                warnings.append(
+                    f"joint '{model.position_names[position]}' turns link '{group.name}' about the "
+                    "link's own axis of symmetry: no silhouette can show its angle"
+                )
+    return warnings
+
+
+def _is_symmetric(mesh: TriangleMesh, X_turn: NDArray[np.float64]) -> bool:
+    """Whether a surface looks the same from all around the axis of a quarter turn X_turn.
+
+    Points spread evenly over the surface are sorted by height along the axis and by direction about
+    it; the largest distance from the axis must be the same in every direction at each height.
+    """
+    axis = Rotation.from_matrix(X_turn[:3, :3]).as_rotvec()
+    axis /= np.linalg.norm(axis)
+    center = np.linalg.lstsq(np.eye(3) - X_turn[:3, :3], X_turn[:3, 3], rcond=None)[0]
+    side = np.linalg.svd(axis[None])[2][1]
+    points = _spread_points(mesh, 40_000) - center
+    height, x, y = points @ axis, points @ side, points @ np.cross(axis, side)
+    radius = np.hypot(x, y)
+    level = (height - height.min()) / max(float(np.ptp(height)), 1e-12) * _LEVELS
+    sector = (np.arctan2(y, x) + np.pi) / (2.0 * np.pi) * _SECTORS
+    outline = np.zeros((_LEVELS, _SECTORS))
+    row = np.clip(level.astype(int), 0, _LEVELS - 1)
+    column = np.clip(sector.astype(int), 0, _SECTORS - 1)
+    np.maximum.at(outline, (row, column), radius)
+    return bool(np.ptp(outline, axis=1).max() < _SYMMETRY_TOLERANCE * radius.max())
+
+
+def _spread_points(mesh: TriangleMesh, count: int) -> NDArray[np.float64]:
+    """Points (count, 3) spread evenly over a surface, always the same ones."""
+    a, b, c = (mesh.vertices[mesh.triangles[:, corner]] for corner in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    random = np.random.default_rng(0)
+    face = random.choice(len(area), size=count, p=area / area.sum())
+    u, v = np.sqrt(random.random(count)), random.random(count)
+    weights = np.stack([1.0 - u, u * (1.0 - v), u * v], axis=-1)[:, :, None]
+    return (weights * np.stack([a[face], b[face], c[face]], axis=1)).sum(axis=1)

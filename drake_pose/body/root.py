@@ -1,0 +1,180 @@
+"""How the root of a pose tree may be turned, and how its rotations are sampled."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from drake_pose.errors import SettingsError
+
+Axis = Literal["x", "y", "z"]
+
+
+@dataclass(frozen=True, eq=False)
+class RootRotation:
+    """The rotation R_WR of the root link R in the world W: fixed, limited, or free.
+
+    Make one with ``fixed``, ``free`` or ``limited``. The rotation's values are an array (k,):
+    nothing when fixed; a rotation vector [rad] relative to R_W0 when free; one angle [rad] for each
+    axis, in order of rotation, when limited: R_WR = R_W0 R(axis 1) R(axis 2) ...
+
+    Attributes:
+        kind: "fixed", "free" or "limited".
+        R_W0: (3, 3) the rotation at values of zero, read-only.
+        axes: the letters of the axes when limited.
+        lower, upper: (k,) limits [rad], read-only.
+        interval: sampling interval [rad]; None for the search's general one.
+    """
+
+    kind: Literal["fixed", "free", "limited"]
+    R_W0: NDArray[np.float64]
+    axes: tuple[Axis, ...]
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+    interval: float | None
+
+    @staticmethod
+    def fixed(rotation: ArrayLike | None = None) -> "RootRotation":
+        """Always R_W0 (3, 3); None for the identity.
+
+        Raises:
+            SettingsError: not a rotation matrix.
+        """
+        return RootRotation("fixed", _rotation_matrix(rotation), (), *_limits([]), None)
+
+    @staticmethod
+    def free(
+        interval_deg: float | None = None, rotation: ArrayLike | None = None
+    ) -> "RootRotation":
+        """Any rotation, sampled evenly; R_W0 (3, 3) is one of the samples.
+
+        Raises:
+            SettingsError: not a rotation matrix, or an interval that is not positive.
+        """
+        limits = _limits([(-math.pi, math.pi)] * 3)
+        return RootRotation(
+            "free", _rotation_matrix(rotation), (), *limits, _interval(interval_deg)
+        )
+
+    @staticmethod
+    def limited(
+        ranges_deg: Sequence[tuple[Axis, float, float]],
+        *,
+        rotation: ArrayLike | None = None,
+        interval_deg: float | None = None,
+    ) -> "RootRotation":
+        """Rotations about one to three different axes, each within limits.
+
+        Args:
+            ranges_deg: (axis letter, lower, upper) [deg] in order of rotation, for example
+                ``[("y", -180, 180), ("z", -10, 10)]``; each axis is the one already turned by
+                those before it.
+            rotation: R_W0 (3, 3); None for the identity.
+            interval_deg: sampled at the multiples of this; None for the search's general one.
+
+        Raises:
+            SettingsError: repeated or unknown axes, crossed limits, or not a rotation matrix.
+        """
+        axes = tuple(axis for axis, _, _ in ranges_deg)
+        if not axes or len(set(axes)) != len(axes) or not set(axes) <= {"x", "y", "z"}:
+            raise SettingsError(
+                f"root rotation axes {axes}: give one to three different of x, y, z"
+            )
+        for axis, lower, upper in ranges_deg:
+            if not -360.0 <= lower <= upper <= 360.0:
+                raise SettingsError(
+                    f"root rotation axis {axis}: limits {lower:g}, {upper:g}: give the lower first,"
+                    " in degrees between -360 and 360"
+                )
+        limits = _limits([(math.radians(low), math.radians(high)) for _, low, high in ranges_deg])
+        return RootRotation(
+            "limited", _rotation_matrix(rotation), axes, *limits, _interval(interval_deg)
+        )
+
+    @property
+    def value_names(self) -> tuple[str, ...]:
+        """A name for each value."""
+        if self.kind == "free":
+            return ("root_rotation_x", "root_rotation_y", "root_rotation_z")
+        return tuple(f"root_{axis}" for axis in self.axes)
+
+    def rotations(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """R_WR (n, 3, 3) at values (n, k) [rad]."""
+        if self.kind == "fixed":
+            return np.broadcast_to(self.R_W0, (len(values), 3, 3)).copy()
+        if self.kind == "free":
+            return self.R_W0 @ Rotation.from_rotvec(values).as_matrix()
+        return self.R_W0 @ Rotation.from_euler("".join(self.axes).upper(), values).as_matrix()
+
+    def values_from(self, R_WR: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The values (k,) [rad] of a rotation (3, 3), the nearest there are where it is limited."""
+        rotation = Rotation.from_matrix(self.R_W0.T @ R_WR)
+        if self.kind == "fixed":
+            return np.zeros(0)
+        if self.kind == "free":
+            return np.asarray(rotation.as_rotvec())
+        sequence = "".join(self.axes).upper()
+        completed = sequence + "".join(axis for axis in "XYZ" if axis not in sequence)
+        return np.asarray(rotation.as_euler(completed))[: len(sequence)]
+
+
+def even_rotations(interval: float) -> NDArray[np.float64]:
+    """Rotation vectors (n, 3) [rad] spread evenly over all rotations, nearest to none first.
+
+    Directions lie on circles of latitude ``interval`` apart, about ``interval`` apart on each;
+    every direction is taken with turns about itself that are multiples of the interval. The
+    rotation is Rz(azimuth) Ry(polar) Rz(turn - azimuth), so that the samples hold the identity.
+
+    Args:
+        interval: angle between neighbours [rad].
+    """
+    angles = []
+    turns = _full_turn(interval)
+    circles = max(1, round(math.pi / interval))
+    for polar in np.linspace(0.0, math.pi, circles + 1):
+        count = max(1, round(2.0 * math.pi * math.sin(polar) / interval))
+        for azimuth in np.arange(count) * (2.0 * math.pi / count):
+            angles += [(azimuth, polar, turn - azimuth) for turn in turns]
+    vectors = np.asarray(Rotation.from_euler("ZYZ", np.array(angles)).as_rotvec())
+    order = np.argsort(np.round(np.linalg.norm(vectors, axis=1), 9), kind="stable")
+    return vectors[order]
+
+
+def _full_turn(interval: float) -> NDArray[np.float64]:
+    """Angles [rad] of a full turn, evenly spaced by about the interval, zero first."""
+    count = max(1, round(2.0 * math.pi / interval))
+    return np.asarray(np.arange(count) * (2.0 * math.pi / count), dtype=np.float64)
+
+
+def _rotation_matrix(rotation: ArrayLike | None) -> NDArray[np.float64]:
+    """A checked, read-only copy of a rotation matrix; None is the identity."""
+    R = np.eye(3) if rotation is None else np.array(rotation, dtype=np.float64)
+    orthonormal = R.shape == (3, 3) and np.allclose(R @ R.T, np.eye(3), atol=1e-6)
+    if not orthonormal or np.linalg.det(R) < 0.0:
+        raise SettingsError(f"root rotation {R.tolist()} is not a 3 x 3 rotation matrix")
+    R.setflags(write=False)
+    return R
+
+
+def _limits(
+    ranges: Sequence[tuple[float, float]],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Read-only lower and upper limits."""
+    array = np.array(ranges, dtype=np.float64).reshape(-1, 2)
+    array.setflags(write=False)
+    return array[:, 0], array[:, 1]
+
+
+def _interval(interval_deg: float | None) -> float | None:
+    """A checked sampling interval [rad]."""
+    if interval_deg is None:
+        return None
+    if not 0.0 < interval_deg <= 180.0:
+        raise SettingsError(
+            f"root rotation interval {interval_deg:g} deg: give 0 < interval <= 180"
+        )
+    return math.radians(interval_deg)

@@ -1,0 +1,259 @@
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from pydrake.geometry import MakeRenderEngineVtk, RenderEngineVtkParams, Role, SceneGraph
+from pydrake.multibody.plant import MultibodyPlant
+
+from drake_pose.body import bundled_model, describe_model, load_model, package_map
+from drake_pose.body.mesh import TriangleMesh, is_watertight, merge_duplicate_vertices
+from drake_pose.errors import ModelError, UnknownNameError
+
+from .models import FLOATING_URDF, WELDED_URDF, cube_obj, joint, link, urdf, write
+
+CUBE_GLTF_ROTATION = [0.0, 0.0, np.sin(np.pi / 8.0), np.cos(np.pi / 8.0)]
+
+
+def mesh_urdf(*files: str, scale: str = "1 1 1") -> str:
+    visuals = "".join(
+        f'<visual><geometry><mesh filename="{file}" scale="{scale}"/></geometry></visual>'
+        for file in files
+    )
+    return urdf(link("a", visuals), joint("j", "fixed", "world", "a", limits=None))
+
+
+def test_positions_limits_and_defaults(tmp_path):
+    text = FLOATING_URDF.replace('lower="-0.2" upper="0.3"', 'lower="0.1" upper="0.3"')
+    model = load_model(write(tmp_path, text), check=False)
+    names = dict(zip(model.position_names, range(13), strict=False))
+    assert model.position_names[:7] == tuple(
+        f"trunk_{suffix}" for suffix in ("qw", "qx", "qy", "qz", "x", "y", "z")
+    )
+    assert model.position_kinds[0] == "quaternion"
+    assert model.position_kinds[names["hip"]] == "angle"
+    assert model.position_kinds[names["slide"]] == "length"
+    assert (model.lower[names["hip"]], model.upper[names["hip"]]) == (-np.pi, np.pi)
+    assert model.default_positions[names["slide"]] == 0.1
+    with pytest.raises(ValueError, match="read-only"):
+        model.lower[0] = 0.0
+    with pytest.raises(UnknownNameError, match="shoulder_x"):
+        model.position_index("nose")
+
+
+def test_shapes_are_the_sizes_they_say(tmp_path):
+    shapes = {
+        '<box size="1 2 3"/>': (6.0, [1, 2, 3]),
+        '<sphere radius="0.5"/>': (4 / 3 * np.pi / 8, [1, 1, 1]),
+        '<cylinder radius="0.5" length="2"/>': (np.pi / 2, [1, 1, 2]),
+        '<capsule radius="0.5" length="2"/>': (np.pi / 2 + 4 / 3 * np.pi / 8, [1, 1, 3]),
+        '<drake:ellipsoid a="1" b="2" c="3"/>': (4 / 3 * np.pi * 6, [2, 4, 6]),
+    }
+    for shape, (volume, extent) in shapes.items():
+        visual = f"<visual><geometry>{shape}</geometry></visual>"
+        text = urdf(link("a", visual))
+        mesh = load_model(write(tmp_path, text), check=False).link_meshes["a"]
+        assert is_watertight(mesh)
+        a, b, c = (mesh.vertices[mesh.triangles[:, i]] for i in range(3))
+        measured = np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0
+        assert 0.99 * volume < measured < 1.0001 * volume
+        np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), extent, rtol=3e-3)
+
+
+@pytest.mark.parametrize("extension", ["obj", "gltf", "glb", "stl", "dae"])
+def test_every_mesh_format_shows_the_same_cube(tmp_path, extension):
+    cube = trimesh.creation.box((1.0, 2.0, 3.0))
+    if extension in ("gltf", "glb"):
+        # A glTF file's y is up, Drake's z: write what Drake shall see turned back.
+        cube.vertices = cube.vertices @ np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+    cube.export(tmp_path / f"cube.{extension}")
+    text = mesh_urdf(f"cube.{extension}", scale="2 1 1")
+    model = load_model(write(tmp_path, text), check=False)
+    mesh = model.link_meshes["a"]
+    assert (len(mesh.vertices), len(mesh.triangles)) == (8, 12)
+    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [2, 2, 3], atol=1e-6)
+
+
+def test_split_vertices_are_merged(tmp_path):
+    (tmp_path / "cube.obj").write_text(cube_obj(normals=True))
+    model = load_model(write(tmp_path, mesh_urdf("cube.obj")), check=False)
+    mesh = model.link_meshes["a"]
+    assert len(mesh.vertices) == 8
+    assert is_watertight(mesh)
+
+
+def test_merging_drops_what_has_no_area_and_is_not_used():
+    vertices = np.array([[0.0, 0, 0], [9, 9, 9], [1, 0, 0], [0, 1, 0], [0, 0, 0]])
+    mesh = TriangleMesh(vertices, np.array([[0, 2, 3], [4, 0, 2], [4, 2, 3]], dtype=np.int32))
+    merged = merge_duplicate_vertices(mesh)
+    np.testing.assert_array_equal(merged.vertices, [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    np.testing.assert_array_equal(merged.triangles, [[0, 1, 2], [0, 1, 2]])
+
+
+def test_meshes_drake_would_not_draw_are_replaced(tmp_path):
+    trimesh.creation.box((1.0, 2.0, 3.0)).export(tmp_path / "cube.stl")
+    (tmp_path / "bare.obj").write_text(cube_obj(normals=False))
+    (tmp_path / "good.obj").write_text(cube_obj(normals=True))
+    text = mesh_urdf("cube.stl", "bare.obj", "good.obj")
+    model = load_model(write(tmp_path, text), check=False)
+    plant, scene_graph = MultibodyPlant(0.0), SceneGraph()
+    model.add_to(plant, scene_graph, prefix="copy")
+    scene_graph.AddRenderer("vtk", MakeRenderEngineVtk(RenderEngineVtkParams()))
+    inspector = scene_graph.model_inspector()
+    shapes = [inspector.GetShape(i) for i in inspector.GetAllGeometryIds(Role.kPerception)]
+    paths = [shape.source().path() for shape in shapes]
+    assert [str(path).endswith(".obj") for path in paths] == [True] * 3
+    assert sum(str(path) == str(tmp_path / "good.obj") for path in paths) == 1
+
+
+def test_model_can_be_added_twice_and_without_geometry(tmp_path):
+    model = load_model(write(tmp_path, WELDED_URDF), check=False)
+    plant, scene_graph = MultibodyPlant(0.0), SceneGraph()
+    first = model.add_to(plant, scene_graph)
+    second = model.add_to(plant, scene_graph)
+    assert first != second
+    plant.Finalize()
+    assert plant.num_positions() == 2 * len(model.position_names)
+    bare = MultibodyPlant(0.0)
+    model.add_to(bare)
+    registered = MultibodyPlant(0.0)
+    registered.RegisterAsSourceForSceneGraph(scene_graph)
+    with pytest.raises(ModelError, match="scene_graph"):
+        model.add_to(registered)
+
+
+def test_bundled_models_are_found_through_drakes_package_map():
+    assert bundled_model("woman").is_file()
+    assert package_map().Contains("drake_pose")
+    with pytest.raises(UnknownNameError, match=r"'goblin'.*woman"):
+        bundled_model("goblin")
+    with pytest.raises(ModelError, match="package 'mine'"):
+        package_map({"mine": "/nowhere"})
+
+
+def bad_models() -> dict[str, tuple[str, str]]:
+    def one(kind: str, limits: str | None) -> str:
+        return urdf(link("a"), link("b"), joint("elbow", kind, "a", "b", limits=limits))
+
+    return {
+        "crossed": (one("revolute", 'lower="1" upper="-1"'), "joint 'elbow': lower limit 1"),
+        "nan": (one("revolute", 'lower="nan" upper="1"'), "joint 'elbow'"),
+        "word": (one("revolute", 'lower="low" upper="1"'), "joint 'elbow'"),
+        "unlimited slide": (one("prismatic", None), "joint 'elbow' has no limits"),
+        "one side": (one("revolute", 'lower="-1"'), "joint 'elbow'"),
+        "no visual": (urdf(link("a", "")), "no visual geometry"),
+        "no mesh": (mesh_urdf("gone.obj"), "gone.obj"),
+        "unknown package": (mesh_urdf("package://nope/a.obj"), "nope"),
+        "no xml": ("<robot", "thing.urdf"),
+        "nothing": ("", "thing.urdf"),
+        "no link": ("<robot name='r'/>", "thing.urdf"),
+    }
+
+
+@pytest.mark.parametrize("name", bad_models())
+def test_bad_models_name_the_culprit(tmp_path, name):
+    text, message = bad_models()[name]
+    path = write(tmp_path, text)
+    with pytest.raises(ModelError, match=message) as caught:
+        load_model(path, check=False)
+    assert "thing.urdf" in str(caught.value)
+    report = describe_model(path)
+    assert not report.usable
+    assert message.split(":")[0] in report.errors[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.obj", b"hello\n", "a.obj"),
+        ("a.obj", b"", "a.obj"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 0 0 1\n", "a.obj"),
+        ("a.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "a.obj"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "a.obj"),
+        ("a.stl", b"solid nothing\nendsolid nothing\n", "a.stl"),
+        ("a.stl", b"\x00\x01", "a.stl"),
+        ("a.dae", b"<COLLADA", "a.dae"),
+        ("a.gltf", b"{}", "a.gltf"),
+        ("a.glb", b"glTF", "a.glb"),
+        ("a.ply", b"ply\n", "a.ply"),
+    ],
+)
+def test_broken_meshes_name_the_file_and_the_link(tmp_path, name, content, message):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ModelError, match=message) as caught:
+        load_model(write(tmp_path, mesh_urdf(name)), check=True)
+    assert "thing.urdf" in str(caught.value)
+
+
+def test_missing_and_foreign_files(tmp_path):
+    with pytest.raises(ModelError, match="does not exist"):
+        load_model(tmp_path / "gone.urdf")
+    with pytest.raises(ModelError, match="is not a file"):
+        load_model(tmp_path)
+    with pytest.raises(ModelError, match="not a kind of file"):
+        load_model(write(tmp_path, "x", "model.txt"))
+
+
+@pytest.mark.slow
+def test_files_that_crash_drake_do_not_crash_us(tmp_path):
+    loop = '<sdf version="1.9"><model name="m"><include><uri>package://mine/loop.sdf</uri>'
+    path = write(tmp_path, loop + "</include></model></sdf>", "loop.sdf")
+    with pytest.raises(ModelError, match=r"loop\.sdf"):
+        load_model(path, package_paths={"mine": tmp_path})
+    text = "directives:\n- add_directives:\n    file: package://mine/loop.dmd.yaml\n"
+    path = write(tmp_path, text, "loop.dmd.yaml")
+    with pytest.raises(ModelError, match=r"loop\.dmd\.yaml"):
+        load_model(path, package_paths={"mine": tmp_path})
+
+
+@pytest.mark.slow
+def test_gltf_with_an_accessor_out_of_bounds(tmp_path):
+    trimesh.creation.box().export(tmp_path / "cube.gltf")
+    document = json.loads((tmp_path / "cube.gltf").read_text())
+    for accessor in document["accessors"]:
+        accessor["count"] = 100_000_000
+    (tmp_path / "cube.gltf").write_text(json.dumps(document))
+    with pytest.raises(ModelError, match=r"thing\.urdf"):
+        load_model(write(tmp_path, mesh_urdf("cube.gltf")))
+
+
+@pytest.mark.slow
+def test_a_yaml_alias_bomb_is_stopped(tmp_path):
+    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
+    for level in range(1, 10):
+        aliases = ", ".join([f"*a{level - 1}"] * 10)
+        lines.append(f"a{level}: &a{level} [{aliases}]")
+    path = write(tmp_path, "\n".join(lines) + "\ndirectives: []\n", "bomb.dmd.yaml")
+    with pytest.raises(ModelError, match=r"bomb\.dmd\.yaml"):
+        load_model(path)
+
+
+def test_report_says_what_may_surprise(tmp_path):
+    round_ = '<visual><geometry><cylinder radius="0.1" length="0.3"/></geometry></visual>'
+    text = urdf(
+        link("a"),
+        link("b"),
+        link("c", round_),
+        link("d", ""),
+        joint("lead", "revolute", "world", "a"),
+        joint("follow", "revolute", "a", "b", more='<mimic joint="lead"/>'),
+        joint("spin", "revolute", "b", "c", axis="0 0 1"),
+        joint("nod", "revolute", "b", "d", axis="0 0 1"),
+    )
+    report = describe_model(write(tmp_path, text))
+    assert report.usable
+    assert [node.name for node in report.nodes] == ["a", "b", "c"]
+    np.testing.assert_allclose(report.nodes[0].joints[0].upper, np.degrees(1.0))
+    assert all(node.watertight for node in report.nodes)
+    warnings = "\n".join(report.warnings)
+    assert "'spin' turns link 'c' about the link's own axis" in warnings
+    assert "nod" in warnings
+    assert "<mimic>" in warnings
+    assert "'follow' turns" not in warnings
+
+
+def test_woman_has_no_warnings():
+    report = describe_model(bundled_model("woman"))
+    assert report.usable
+    assert report.warnings == ()
+    assert all(node.watertight for node in report.nodes)

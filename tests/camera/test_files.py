@@ -1,0 +1,123 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drake_pose.camera import ParallelCamera, PinholeCamera, load_cameras, save_cameras
+from drake_pose.errors import CameraError
+
+EYE = "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
+SIDES = "width: 64, height: 48, center_x: 31.5, center_y: 23.5"
+GOOD = f"{{{SIDES}, focal_x: 60, focal_y: 61, X_WC: {EYE}}}"
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "cameras.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_recorded_cameras(shared_data: Path) -> None:
+    cameras = load_cameras(shared_data / "human_four_views" / "cameras.yaml")
+    assert list(cameras) == ["cam01", "cam02", "cam03", "cam04"]
+    camera = cameras["cam01"]
+    assert isinstance(camera, PinholeCamera)
+    assert (camera.width, camera.height, camera.focal_x) == (1088, 1920, 1681.244873046875)
+    np.testing.assert_allclose(camera.X_WC[:3, 3], [1.45029317, -1.95591596, 1.85377211])
+
+
+def test_round_trip_is_exact(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    X_WC = np.eye(4)
+    X_WC[:3, :3] = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    X_WC[:3, :3] *= np.linalg.det(X_WC[:3, :3])
+    X_WC[:3, 3] = rng.normal(size=3)
+    written = {
+        "a": PinholeCamera("a", 64, 48, 60.0, 1e-7, 1 / 3, 23.5, X_WC, near=1e-3),
+        "b": ParallelCamera("b", 700, 701, 226.0, 350.0, -12.25, X_WC),
+    }
+    save_cameras(tmp_path / "c.yaml", written)
+    read = load_cameras(tmp_path / "c.yaml")
+    assert list(read) == ["a", "b"]
+    for name, camera in read.items():
+        assert type(camera) is type(written[name])
+        np.testing.assert_array_equal(camera.kernel_parameters(), written[name].kernel_parameters())
+        np.testing.assert_array_equal(camera.X_WC, written[name].X_WC)
+
+
+def test_projection_may_be_spelled_out(tmp_path: Path) -> None:
+    text = f"7: {{projection: parallel, {SIDES}, pixels_per_metre: 1e2, X_WC: {EYE}}}"
+    camera = load_cameras(write(tmp_path, text))["7"]
+    assert isinstance(camera, ParallelCamera)
+    assert camera.pixels_per_metre == 100.0
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "mapping from camera names"),
+        ("[1, 2]", "mapping from camera names"),
+        ("cam: 3", "'cam'.*mapping from field names"),
+        ("cam: [", "not a YAML file"),
+        ("cam: !!python/object/apply:os.system [ls]", "not a YAML file"),
+        (f"cam: {GOOD}\ncam: {GOOD}", "given twice"),
+        (f"1: {GOOD}\n'1': {GOOD}", "given twice"),
+        (f"../up: {GOOD}", "camera's name"),
+        (f"? [1, 2]\n: {GOOD}", "not a YAML file"),
+        (f"cam: {{{SIDES}, focal_x: 60, X_WC: {EYE}}}", "'cam'.*needs focal_y"),
+        (f"cam: {{{SIDES}, projection: parallel, X_WC: {EYE}}}", "'cam'.*needs pixels_per_metre"),
+        (GOOD.join(["cam: ", ""]).replace("focal_x", "fx: 1, focal_x"), "'cam'.*unknown field fx"),
+        ("cam: {projection: fisheye}", "'cam'.*projection"),
+        ("cam: {projection: [1]}", "'cam'.*projection"),
+        (f"cam: {GOOD}".replace("width: 64", "width: .nan"), "'cam'.*width"),
+        (f"cam: {GOOD}".replace("width: 64", "width: true"), "'cam'.*width"),
+        (f"cam: {GOOD}".replace("height: 48", "height: 4.5"), "'cam'.*height"),
+        (f"cam: {GOOD}".replace("focal_x: 60", "focal_x: -60"), "'cam'.*focal_x"),
+        (f"cam: {GOOD}".replace("focal_y: 61", "focal_y: [61]"), "'cam'.*focal_y"),
+        (f"cam: {GOOD}".replace("center_x: 31.5", "center_x: .inf"), "'cam'.*center_x"),
+        (f"cam: {GOOD}".replace("[0, 1, 0, 0]", "[0, 2, 0, 0]"), "'cam'.*X_WC.*not a rotation"),
+        (f"cam: {GOOD}".replace("[0, 1, 0, 0]", "[0, -1, 0, 0]"), "'cam'.*X_WC.*reflection"),
+        (f"cam: {GOOD}".replace("[0, 0, 0, 1]", "[0, 0, 1, 1]"), "'cam'.*last row of X_WC"),
+        (f"cam: {GOOD}".replace("[0, 0, 0, 1]", "[0, 0, 1]"), "'cam'.*X_WC.*4 x 4"),
+        (f"cam: {GOOD}".replace("[0, 1, 0, 0]", "[0, .nan, 0, 0]"), "'cam'.*X_WC"),
+        ("[" * 5000, "YAML|deeply"),
+    ],
+)
+def test_bad_files_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    path = write(tmp_path, text)
+    with pytest.raises(CameraError, match=message) as caught:
+        load_cameras(path)
+    assert str(path) in str(caught.value)
+    assert len(str(caught.value)) < 1000
+
+
+def test_unreadable_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(CameraError, match=r"missing\.yaml"):
+        load_cameras(tmp_path / "missing.yaml")
+    with pytest.raises(CameraError, match=str(tmp_path)):
+        load_cameras(tmp_path)
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00\x80")
+    with pytest.raises(CameraError, match=r"binary\.yaml"):
+        load_cameras(tmp_path / "binary.yaml")
+
+
+def test_alias_bombs_are_refused_quickly(tmp_path: Path) -> None:
+    lines = ["a0: &a0 [x, x, x, x]"]
+    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 40)]
+    with pytest.raises(CameraError, match="a0"):
+        load_cameras(write(tmp_path, "\n".join(lines)))
+    bomb = f"cam: {{{SIDES}, focal_x: 1, focal_y: 1, X_WC: *b}}"
+    head = "\n".join(
+        ["b0: &b0 [[1]]", *[f"b{i}: &b{i} [*b{i - 1}, *b{i - 1}]" for i in range(1, 40)]]
+    )
+    text = head.replace("&b39", "&b") + "\n" + bomb
+    with pytest.raises(CameraError):
+        load_cameras(write(tmp_path, text))
+    with pytest.raises(CameraError, match="larger than"):
+        load_cameras(write(tmp_path, "# " + "x" * (1 << 21)))
+
+
+def test_a_folder_that_does_not_exist_cannot_be_written_to(tmp_path: Path) -> None:
+    camera = PinholeCamera("a", 64, 48, 60.0, 60.0, 31.0, 23.0, np.eye(4))
+    with pytest.raises(CameraError, match="nowhere"):
+        save_cameras(tmp_path / "nowhere" / "c.yaml", [camera])

@@ -1,0 +1,177 @@
+from typing import Any
+
+import numpy as np
+import pytest
+from pydrake.geometry import ClippingRange, RenderCameraCore
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.systems.sensors import CameraInfo
+
+from drake_pose.camera import Camera, ParallelCamera, PinholeCamera
+from drake_pose.errors import CameraError
+
+
+def pose(rpy: tuple[float, float, float], p: tuple[float, float, float]) -> np.ndarray:
+    return RigidTransform(RollPitchYaw(*rpy), np.array(p)).GetAsMatrix4()
+
+
+X_WC = pose((0.3, -0.8, 1.1), (0.5, -2.0, 1.5))
+
+
+def pinhole(**changes: object) -> PinholeCamera:
+    fields: dict[str, Any] = dict(
+        name="cam",
+        width=640,
+        height=480,
+        focal_x=600.0,
+        focal_y=610.0,
+        center_x=300.0,
+        center_y=250.0,
+        X_WC=X_WC,
+    )
+    return PinholeCamera(**(fields | changes))
+
+
+def parallel(**changes: object) -> ParallelCamera:
+    fields: dict[str, Any] = dict(
+        name="flat",
+        width=700,
+        height=500,
+        pixels_per_metre=226.0,
+        center_x=350.0,
+        center_y=200.0,
+        X_WC=X_WC,
+    )
+    return ParallelCamera(**(fields | changes))
+
+
+def test_pinhole_projects_as_opencv_does() -> None:
+    import cv2
+
+    camera = pinhole()
+    rng = np.random.default_rng(0)
+    p_C = rng.uniform([-1, -1, 0.5], [1, 1, 4], (50, 3))
+    p_W = p_C @ X_WC[:3, :3].T + X_WC[:3, 3]
+    K = np.array([[600.0, 0, 300], [0, 610, 250], [0, 0, 1]])
+    rotation, _ = cv2.Rodrigues(X_WC[:3, :3].T)
+    expected, _ = cv2.projectPoints(p_W, rotation, -X_WC[:3, :3].T @ X_WC[:3, 3], K, None)
+    uv, depth = camera.project(p_W)
+    np.testing.assert_allclose(uv, expected[:, 0], atol=1e-8)
+    np.testing.assert_allclose(depth, p_C[:, 2], atol=1e-12)
+
+
+def test_points_behind_a_pinhole_have_no_pixel() -> None:
+    uv, depth = pinhole(X_WC=np.eye(4)).project(np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 2.0]]))
+    assert np.isnan(uv[0]).all()
+    np.testing.assert_allclose(uv[1], [300.0, 250.0])
+    np.testing.assert_allclose(depth, [-1.0, 2.0])
+
+
+def test_parallel_scale_does_not_depend_on_depth() -> None:
+    uv, depth = parallel(X_WC=np.eye(4)).project(np.array([[1.0, 0.5, -7.0], [1.0, 0.5, 9.0]]))
+    np.testing.assert_allclose(uv, [[576.0, 313.0]] * 2)
+    np.testing.assert_allclose(depth, [-7.0, 9.0])
+
+
+@pytest.mark.parametrize("camera", [pinhole(), parallel()])
+def test_poses(camera: Camera) -> None:
+    np.testing.assert_allclose(camera.X_CW @ camera.X_WC, np.eye(4), atol=1e-14)
+    assert not camera.X_WC.flags.writeable
+    moved = camera.with_pose(np.eye(4))
+    assert np.array_equal(moved.X_WC, np.eye(4))
+    assert (moved.name, moved.width, moved.center_y) == (
+        camera.name,
+        camera.width,
+        camera.center_y,
+    )
+
+
+def test_kernel_parameters() -> None:
+    np.testing.assert_array_equal(
+        pinhole(near=0.2).kernel_parameters(), [0, 600, 610, 300, 250, 0.2, 640, 480]
+    )
+    np.testing.assert_array_equal(
+        parallel().kernel_parameters(), [1, 226, 226, 350, 200, 0, 700, 500]
+    )
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("width", 0),
+        ("width", 12.5),
+        ("height", -3),
+        ("height", 10**9),
+        ("focal_x", 0.0),
+        ("focal_y", -1.0),
+        ("focal_x", float("nan")),
+        ("center_x", float("inf")),
+        ("center_y", "here"),
+        ("near", 0.0),
+        ("near", True),
+        ("X_WC", np.eye(3)),
+        ("X_WC", np.diag([1.0, 1.0, 2.0, 1.0])),
+        ("X_WC", np.diag([1.0, 1.0, -1.0, 1.0])),
+        ("X_WC", np.diag([1.0, 1.0, 1.0, 2.0])),
+        ("X_WC", np.full((4, 4), np.nan)),
+        ("X_WC", np.array([["a"] * 4] * 4)),
+    ],
+)
+def test_bad_parameters_are_named(field: str, value: object) -> None:
+    with pytest.raises(CameraError, match=f"'cam'.*{field}"):
+        pinhole(**{field: value})
+
+
+def test_parallel_scale_must_be_positive() -> None:
+    with pytest.raises(CameraError, match=r"'flat'.*pixels_per_metre"):
+        parallel(pixels_per_metre=-1.0)
+
+
+def test_rounded_rotation_becomes_exact() -> None:
+    camera = pinhole(X_WC=np.round(X_WC, 6))
+    R = camera.X_WC[:3, :3]
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-14)
+    np.testing.assert_allclose(R, X_WC[:3, :3], atol=2e-6)
+
+
+def test_drake_and_back() -> None:
+    camera = pinhole(near=0.05)
+    color, depth, X_WS = camera.to_drake(renderer_name="vtk")
+    info = color.core().intrinsics()
+    assert (info.center_x(), info.center_y()) == (300.5, 250.5)
+    assert color.core().renderer_name() == depth.core().renderer_name() == "vtk"
+    assert color.core().clipping().near() == 0.05
+    again = PinholeCamera.from_drake("again", color.core(), X_WS)
+    np.testing.assert_array_equal(again.kernel_parameters(), camera.kernel_parameters())
+    np.testing.assert_allclose(again.X_WC, camera.X_WC, atol=1e-14)
+    plain = PinholeCamera.from_drake("plain", CameraInfo(100, 80, 1.0), np.eye(4))
+    assert (plain.center_x, plain.center_y) == (49.0, 39.0)
+
+
+def test_sensor_offset_of_a_drake_core_is_kept() -> None:
+    X_BS = RigidTransform(RollPitchYaw(0.1, 0.2, 0.3), np.array([0.1, 0.0, -0.2]))
+    core = RenderCameraCore("vtk", CameraInfo(100, 80, 1.0), ClippingRange(0.3, 9.0), X_BS)
+    X_WB = RigidTransform(X_WC)
+    camera = PinholeCamera.from_drake("c", core, X_WB)
+    np.testing.assert_allclose(camera.X_WC, (X_WB @ X_BS).GetAsMatrix4(), atol=1e-14)
+    assert camera.near == 0.3
+
+
+def test_tele_camera_projects_as_the_parallel_one() -> None:
+    for camera in (parallel(), parallel(center_x=-40.0, center_y=900.0)):
+        color, _, X_WS = camera.to_drake(renderer_name="vtk", depth_range=(-1.0, 3.0))
+        tele = PinholeCamera.from_drake("tele", color.core(), X_WS)
+        p_C = np.random.default_rng(1).uniform([-1, -1, -1], [1, 1, 3], (50, 3))
+        p_W = p_C @ X_WC[:3, :3].T + X_WC[:3, 3]
+        # 2 m off the middle depth at 30 km: 7e-5 of at most 700 pixels from the picture's middle.
+        np.testing.assert_allclose(tele.project(p_W)[0], camera.project(p_W)[0], atol=0.1)
+        depth = tele.project(p_W)[1]
+        clipping = color.core().clipping()
+        assert clipping.near() <= depth.min()
+        assert depth.max() <= clipping.far()
+
+
+def test_drake_needs_the_principal_point_inside() -> None:
+    with pytest.raises(CameraError, match=r"'cam'.*principal point"):
+        pinhole(center_x=-3.0).to_drake(renderer_name="vtk")
+    with pytest.raises(CameraError, match=r"'cam'.*depth range"):
+        pinhole().to_drake(renderer_name="vtk", depth_range=(2.0, 1.0))

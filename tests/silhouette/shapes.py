@@ -1,0 +1,54 @@
+"""Small surfaces and an independent, slow way to draw them."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from drake_pose.body import TriangleMesh
+from drake_pose.camera import Camera
+
+
+def random_pose(rng: np.random.Generator, position: tuple[float, float, float]) -> np.ndarray:
+    """A random rotation (4, 4) about a position."""
+    X = np.eye(4)
+    X[:3, :3] = Rotation.random(random_state=rng).as_matrix()
+    X[:3, 3] = position
+    return X
+
+
+def soup(rng: np.random.Generator, vertices: int, triangles: int, size: float) -> TriangleMesh:
+    """Random triangles between random points: nothing closed, nothing oriented."""
+    points = rng.normal(size=(vertices, 3)) * size
+    return TriangleMesh(points, rng.integers(0, vertices, (triangles, 3)).astype(np.int32))
+
+
+def box(size: float) -> TriangleMesh:
+    """A closed cube about the origin, triangles counter-clockwise seen from outside."""
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) - 0.5
+    quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    triangles = [[q[0], q[k], q[k + 1]] for q in quads for k in (1, 2)]
+    return TriangleMesh(corners * size, np.array(triangles, dtype=np.int32))
+
+
+def brute_force_mask(mesh: TriangleMesh, X_CN: np.ndarray, camera: Camera) -> np.ndarray:
+    """Casts the ray of every pixel centre at every triangle (Moeller and Trumbore 1997)."""
+    kind, fx, fy, cx, cy, near = camera.kernel_parameters()[:6]
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    x, y = ((u - cx) / fx).ravel(), ((v - cy) / fy).ravel()
+    one, nought = np.ones_like(x), np.zeros_like(x)
+    if kind == 0:
+        origins, directions = np.zeros((len(x), 3)), np.column_stack([x, y, one])
+    else:
+        origins = np.column_stack([x, y, nought - 100.0])
+        directions = np.column_stack([nought, nought, one])
+    mask = np.zeros(len(x), dtype=bool)
+    corners = (mesh.vertices @ X_CN[:3, :3].T + X_CN[:3, 3])[mesh.triangles]
+    for a, b, c in corners:
+        p = np.cross(directions, c - a)
+        determinant = p @ (b - a)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            s = np.einsum("ij,ij->i", origins - a, p) / determinant
+            q = np.cross(origins - a, b - a)
+            t = np.einsum("ij,ij->i", directions, q) / determinant
+            depth = q @ (c - a) / determinant  # along z, as every direction has z = 1
+        mask |= (s >= 0) & (t >= 0) & (s + t <= 1) & ((kind == 1) | (depth >= near))
+    return mask.reshape(camera.height, camera.width)

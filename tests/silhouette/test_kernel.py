@@ -1,0 +1,201 @@
+import numpy as np
+import pytest
+
+from drake_pose.body import TriangleMesh
+from drake_pose.camera import Camera, ParallelCamera, PinholeCamera
+from drake_pose.silhouette import (
+    draw_mask,
+    outline_from_mesh,
+    prefix_sums,
+    score_bodies,
+    score_candidates,
+    subtract_body,
+)
+from tests.silhouette.shapes import box, brute_force_mask, random_pose, soup
+
+CAMERAS: list[Camera] = [
+    ParallelCamera("parallel", 90, 70, 60.0, 44.3, 33.1, np.eye(4)),
+    PinholeCamera("pinhole", 90, 70, 100.0, 110.0, 44.3, 33.1, np.eye(4), near=0.1),
+    PinholeCamera("off_centre", 61, 83, 150.0, 140.0, -20.3, 91.7, np.eye(4), near=0.1),
+]
+
+
+def name_of(camera: Camera) -> str:
+    return camera.name
+
+
+def draw(mesh: TriangleMesh, X_CN: np.ndarray, camera: Camera) -> np.ndarray:
+    return draw_mask([outline_from_mesh(mesh)], X_CN[None], camera)
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=name_of)
+def test_any_triangle_soup_is_drawn_exactly(camera: Camera) -> None:
+    rng = np.random.default_rng(1)
+    covered = 0
+    for _ in range(40):
+        mesh = soup(rng, 12, int(rng.integers(1, 30)), 0.4)
+        X_CN = random_pose(rng, (0.1, -0.1, 3.0))
+        mask = brute_force_mask(mesh, X_CN, camera)
+        np.testing.assert_array_equal(draw(mesh, X_CN, camera), mask)
+        covered += mask.sum()
+    assert covered > 1000
+
+
+def test_triangles_through_the_near_plane_are_cut_exactly() -> None:
+    rng = np.random.default_rng(2)
+    covered = 0
+    for camera in CAMERAS[1:]:
+        for _ in range(60):
+            mesh = soup(rng, 12, int(rng.integers(1, 20)), 0.4)
+            X_CN = random_pose(rng, (0.0, 0.0, rng.uniform(-0.6, 0.8)))
+            mask = brute_force_mask(mesh, X_CN, camera)
+            np.testing.assert_array_equal(draw(mesh, X_CN, camera), mask)
+            covered += 0 < mask.sum() < mask.size
+    assert covered > 30
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=name_of)
+def test_orientation_of_triangles_does_not_matter(camera: Camera) -> None:
+    rng = np.random.default_rng(3)
+    mesh = box(0.8)
+    for _ in range(20):
+        X_CN = random_pose(rng, (0.1, -0.1, 2.0))
+        mask = draw(mesh, X_CN, camera)
+        turned = mesh.triangles.copy()
+        some = rng.random(len(turned)) < 0.5
+        turned[some] = turned[some][:, ::-1]
+        np.testing.assert_array_equal(draw(TriangleMesh(mesh.vertices, turned), X_CN, camera), mask)
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=name_of)
+def test_scores_are_sums_over_masks(camera: Camera) -> None:
+    rng = np.random.default_rng(4)
+    size = (camera.height, camera.width)
+    sets = rng.random((3, *size)) < np.array([0.1, 0.5, 0.9])[:, None, None]
+    prefixes = np.array([prefix_sums(region) for region in sets])
+    outlines = [outline_from_mesh(soup(rng, 20, 25, 0.3)) for _ in range(4)]
+    X_CN = np.array(
+        [[random_pose(rng, (*rng.uniform(-0.5, 0.5, 2), 2.0)) for _ in outlines] for _ in range(15)]
+    )
+    whole = score_bodies(outlines, X_CN, camera, prefixes)
+    single = score_candidates(outlines[1], X_CN[:, 1], camera, prefixes)
+    assert whole.dtype == single.dtype == np.int64
+    for n in range(len(X_CN)):
+        parts = [draw_mask([o], X[None], camera) for o, X in zip(outlines, X_CN[n], strict=True)]
+        union = np.any(parts, axis=0)
+        np.testing.assert_array_equal(draw_mask(outlines, X_CN[n], camera), union)
+        assert whole[n].tolist() == [union.sum(), *((union & region).sum() for region in sets)]
+        assert single[n].tolist() == [
+            parts[1].sum(),
+            *((parts[1] & region).sum() for region in sets),
+        ]
+
+
+def test_rows_with_very_many_crossings() -> None:
+    rng = np.random.default_rng(5)
+    for camera in CAMERAS[:2]:
+        for triangles in (60, 400, 3000):
+            mesh = soup(rng, 300, triangles, 0.3)
+            small = TriangleMesh(
+                (
+                    mesh.vertices[mesh.triangles] * 0.1 + rng.normal(size=(triangles, 1, 3)) * 0.4
+                ).reshape(-1, 3),
+                np.arange(3 * triangles, dtype=np.int32).reshape(-1, 3),
+            )
+            X_CN = random_pose(rng, (0.0, 0.0, 3.0))
+            np.testing.assert_array_equal(
+                draw(small, X_CN, camera), brute_force_mask(small, X_CN, camera)
+            )
+
+
+def test_a_known_square() -> None:
+    # Corners at 10.5 and 20.5: pixels 11 to 20 in both directions.
+    camera = ParallelCamera("c", 40, 30, 10.0, 15.5, 15.5, np.eye(4))
+    mask = draw(box(1.0), np.eye(4), camera)
+    expected = np.zeros((30, 40), dtype=bool)
+    expected[11:21, 11:21] = True
+    np.testing.assert_array_equal(mask, expected)
+
+
+@pytest.mark.parametrize("far", [1e3, 1e9, 1e300])
+def test_far_outside_the_picture(far: float) -> None:
+    camera = CAMERAS[0]
+    outline = outline_from_mesh(box(1.0))
+    X_CN = np.tile(np.eye(4), (5, 1, 1))
+    X_CN[:4, :2, 3] = [[far, 0], [-far, 0], [0, far], [0, -far]]
+    full = np.ones((1, camera.height, camera.width), dtype=bool)
+    areas = score_candidates(outline, X_CN, camera, np.array([prefix_sums(m) for m in full]))
+    assert (areas[:4] == 0).all()
+    assert areas[4, 0] == areas[4, 1] > 3000
+
+
+def test_a_surface_much_greater_than_the_picture() -> None:
+    for camera in CAMERAS:
+        X_CN = np.eye(4)
+        X_CN[2, 3] = 600.0
+        assert draw(box(1000.0), X_CN, camera).all()
+
+
+def test_inside_a_box_every_pixel_is_covered() -> None:
+    assert draw(box(4.0), random_pose(np.random.default_rng(6), (0.1, 0.2, 0.3)), CAMERAS[1]).all()
+
+
+def test_nothing_behind_the_camera_is_seen() -> None:
+    X_CN = np.eye(4)
+    X_CN[2, 3] = -3.0
+    assert not draw(box(1.0), X_CN, CAMERAS[1]).any()
+    assert draw(box(1.0), X_CN, CAMERAS[0]).any()  # rays of a parallel camera have no beginning
+
+
+def test_empty_surfaces() -> None:
+    empty = outline_from_mesh(TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32)))
+    cube = outline_from_mesh(box(0.5))
+    camera = CAMERAS[0]
+    assert not draw_mask([empty], np.eye(4)[None], camera).any()
+    assert not draw_mask([], np.zeros((0, 4, 4)), camera).any()
+    both = draw_mask([empty, cube], np.tile(np.eye(4), (2, 1, 1)), camera)
+    np.testing.assert_array_equal(both, draw_mask([cube], np.eye(4)[None], camera))
+    none = np.zeros((0, camera.height, camera.width + 1), dtype=np.int32)
+    assert score_candidates(cube, np.zeros((0, 4, 4)), camera, none).shape == (0, 1)
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=name_of)
+def test_subtracting_a_body_keeps_the_prefix_sums(camera: Camera) -> None:
+    rng = np.random.default_rng(7)
+    mask = rng.random((camera.height, camera.width)) < 0.7
+    prefix = prefix_sums(mask)
+    expected = mask.copy()
+    for _ in range(6):
+        outline = outline_from_mesh(soup(rng, 8, 6, 0.3))
+        X_CN = random_pose(rng, (*rng.uniform(-0.6, 0.6, 2), 2.0))
+        subtract_body(mask, prefix, outline, X_CN, camera)
+        expected &= ~draw_mask([outline], X_CN[None], camera)
+        np.testing.assert_array_equal(mask, expected)
+        np.testing.assert_array_equal(prefix[:, 1:], np.cumsum(expected, axis=1))
+        assert not prefix[:, 0].any()
+
+
+def test_wrong_shapes_are_refused() -> None:
+    camera = CAMERAS[0]
+    outline = outline_from_mesh(box(1.0))
+    none = np.zeros((0, camera.height, camera.width + 1), dtype=np.int32)
+    with pytest.raises(ValueError, match="prefixes of camera 'parallel'"):
+        score_candidates(outline, np.eye(4)[None], camera, none[:, :-1])
+    with pytest.raises(ValueError, match="poses"):
+        score_candidates(outline, np.eye(4)[None, :3, :3], camera, none)
+    with pytest.raises(ValueError, match="poses"):
+        draw_mask([outline], np.tile(np.eye(4), (2, 1, 1)), camera)
+    with pytest.raises(ValueError, match="finite"):
+        draw_mask([outline], np.full((1, 4, 4), np.nan), camera)
+    with pytest.raises(ValueError, match="mask"):
+        prefix_sums(np.zeros((3, 4)))
+    mask = np.ones((camera.height, camera.width), dtype=bool)
+    prefix = prefix_sums(mask)
+    frozen = mask.copy()
+    frozen.flags.writeable = False
+    for bad in (mask[:-1], np.asfortranarray(mask), frozen):
+        with pytest.raises(ValueError, match="mask of camera 'parallel'"):
+            subtract_body(bad, prefix, outline, np.eye(4), camera)
+    for bad in (prefix[:, :-1], prefix.astype(np.int64)):
+        with pytest.raises(ValueError, match="prefix of camera 'parallel'"):
+            subtract_body(mask, bad, outline, np.eye(4), camera)

@@ -1,0 +1,106 @@
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from drake_pose.errors import MaskError
+from drake_pose.silhouette import read_mask, write_mask
+
+MASK = np.zeros((20, 30), dtype=bool)
+MASK[4:9, 3:20] = True
+
+
+def save(folder: Path, picture: np.ndarray, name: str = "0007.png") -> Path:
+    path = folder / name
+    cv2.imwrite(str(path), picture)
+    return path
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    write_mask(tmp_path / "m.png", MASK)
+    assert cv2.imread(str(tmp_path / "m.png"), cv2.IMREAD_UNCHANGED).max() == 255
+    mask = read_mask(tmp_path / "m.png", 30, 20)
+    assert mask.dtype == np.bool_
+    np.testing.assert_array_equal(mask, MASK)
+
+
+@pytest.mark.parametrize("value", [1, 128, 255])
+def test_grey_masks(tmp_path: Path, value: int) -> None:
+    path = save(tmp_path, MASK.astype(np.uint8) * np.uint8(value))
+    np.testing.assert_array_equal(read_mask(path), MASK)
+
+
+def test_deep_colour_and_transparent_masks(tmp_path: Path) -> None:
+    grey = MASK.astype(np.uint16) * np.uint16(65535)
+    np.testing.assert_array_equal(read_mask(save(tmp_path, grey)), MASK)
+    colour = np.where(MASK[..., None], np.array([0, 200, 17]), 0).astype(np.uint8)
+    np.testing.assert_array_equal(read_mask(save(tmp_path, colour)), MASK)
+    opaque = np.dstack([colour, np.full(MASK.shape, 255, dtype=np.uint8)])
+    np.testing.assert_array_equal(read_mask(save(tmp_path, opaque)), MASK)
+
+
+def test_recorded_masks(shared_data: Path) -> None:
+    mask = read_mask(shared_data / "human_four_views" / "masks" / "cam01" / "0000.png", 1088, 1920)
+    assert 20_000 < mask.sum() < 400_000
+
+
+def bad_pictures() -> dict[str, tuple[np.ndarray, str]]:
+    grey = MASK.astype(np.uint8) * 255
+    soft = cv2.GaussianBlur(grey, (5, 5), 0)
+    two_colours = np.dstack([grey, grey, np.roll(grey, 3, axis=1)])
+    return {
+        "empty": (np.zeros_like(grey), "empty"),
+        "full": (np.full_like(grey, 255), "full"),
+        "soft": (soft, "values"),
+        "two colours": (two_colours, "values"),
+        "no black": (np.where(MASK, 255, 3).astype(np.uint8), "full"),
+        "wrong size": (grey.T.copy(), r"20 x 30 pixels.*30 x 20"),
+    }
+
+
+@pytest.mark.parametrize("case", list(bad_pictures()))
+def test_bad_masks_are_refused(tmp_path: Path, case: str) -> None:
+    picture, message = bad_pictures()[case]
+    path = save(tmp_path, picture)
+    with pytest.raises(MaskError, match=rf"0007\.png.*{message}"):
+        read_mask(path, 30, 20)
+
+
+def test_damaged_files_are_refused(tmp_path: Path) -> None:
+    path = save(tmp_path, MASK.astype(np.uint8) * 255)
+    data = path.read_bytes()
+    for end in (0, 5, 8, 20, 40, len(data) - 13, len(data) - 1):
+        path.write_bytes(data[:end])
+        with pytest.raises(MaskError, match=r"0007\.png: .*(not a PNG|cut short)"):
+            read_mask(path)
+    for place in (9, 14, 18, 30, len(data) - 20):
+        path.write_bytes(data[:place] + bytes([data[place] ^ 0x55]) + data[place + 1 :])
+        with pytest.raises(MaskError, match=r"0007\.png: "):
+            read_mask(path)
+
+
+def test_a_picture_that_would_fill_the_memory_is_refused(tmp_path: Path) -> None:
+    header = struct.pack(">IIBBBBB", 60_000, 60_000, 8, 0, 0, 0, 0)
+    data = b"\x89PNG\r\n\x1a\n"
+    for kind, content in ((b"IHDR", header), (b"IEND", b"")):
+        checksum = struct.pack(">I", zlib.crc32(kind + content))
+        data += struct.pack(">I", len(content)) + kind + content + checksum
+    (tmp_path / "bomb.png").write_bytes(data)
+    with pytest.raises(MaskError, match=r"bomb\.png.*60000"):
+        read_mask(tmp_path / "bomb.png")
+
+
+def test_unreadable_files_are_refused(tmp_path: Path) -> None:
+    for path in (tmp_path / "missing.png", tmp_path):
+        with pytest.raises(MaskError, match=str(path)):
+            read_mask(path)
+    with pytest.raises(MaskError, match="nowhere"):
+        write_mask(tmp_path / "nowhere" / "m.png", MASK)
+    picture = tmp_path / "photo.png"
+    cv2.imwrite(str(tmp_path / "photo.jpg"), MASK.astype(np.uint8) * 255)
+    picture.write_bytes((tmp_path / "photo.jpg").read_bytes())
+    with pytest.raises(MaskError, match="not a PNG"):
+        read_mask(picture)

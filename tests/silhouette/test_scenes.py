@@ -1,0 +1,118 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drake_pose.camera import ParallelCamera, save_cameras
+from drake_pose.errors import CameraError, MaskError, SceneError, UnknownNameError
+from drake_pose.silhouette import load_scene, write_mask
+
+MASK = np.zeros((20, 30), dtype=bool)
+MASK[4:9, 3:20] = True
+
+
+def camera(name: str) -> ParallelCamera:
+    return ParallelCamera(name, 30, 20, 10.0, 15.0, 10.0, np.eye(4))
+
+
+def make_scene(folder: Path) -> Path:
+    save_cameras(folder / "cameras.yaml", [camera("left"), camera("right")])
+    for name, frames in {"left": ("0002", "0001"), "right": ("0002", "0003")}.items():
+        (folder / "masks" / name).mkdir(parents=True)
+        for frame in frames:
+            write_mask(folder / "masks" / name / f"{frame}.png", MASK)
+    return folder
+
+
+def test_a_scene(tmp_path: Path) -> None:
+    scene = load_scene(make_scene(tmp_path))
+    assert list(scene.cameras) == ["left", "right"]
+    assert scene.frames == ("0001", "0002", "0003")
+    assert scene.cameras_of("0002") == ("left", "right")
+    assert scene.cameras_of("0003") == ("right",)
+    assert scene.mask_path("left", "0001") == tmp_path / "masks" / "left" / "0001.png"
+    np.testing.assert_array_equal(scene.read("right", "0003"), MASK)
+    assert (scene.sequence, scene.frame_rate_hz) == (False, None)
+
+
+def test_names_that_do_not_exist(tmp_path: Path) -> None:
+    scene = load_scene(make_scene(tmp_path))
+    with pytest.raises(UnknownNameError, match=r"camera 'middle'.*left, right"):
+        scene.mask_path("middle", "0001")
+    with pytest.raises(UnknownNameError, match=r"camera 'left' has no frame '0003'.*0001, 0002"):
+        scene.read("left", "0003")
+    with pytest.raises(UnknownNameError, match=r"frame '9'.*0001, 0002, 0003"):
+        scene.cameras_of("9")
+
+
+def test_settings(tmp_path: Path) -> None:
+    make_scene(tmp_path)
+    (tmp_path / "scene.yaml").write_text("sequence: true\nframe_rate_hz: 60\n")
+    scene = load_scene(tmp_path)
+    assert (scene.sequence, scene.frame_rate_hz) == (True, 60.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("sequence: maybe", "sequence"),
+        ("frame_rate_hz: 0", "frame_rate_hz"),
+        ("frame_rate_hz: .inf", "frame_rate_hz"),
+        ("frame_rate_hz: fast", "frame_rate_hz"),
+        ("frame_rate_hz: true", "frame_rate_hz"),
+        ("speed: 3", "unknown field speed"),
+        ("- 1", "mapping"),
+        ("{", "not a YAML file"),
+    ],
+)
+def test_bad_settings(tmp_path: Path, text: str, message: str) -> None:
+    make_scene(tmp_path)
+    (tmp_path / "scene.yaml").write_text(text)
+    with pytest.raises(SceneError, match=rf"scene\.yaml: .*{message}"):
+        load_scene(tmp_path)
+
+
+def test_a_flat_folder_needs_one_camera(tmp_path: Path) -> None:
+    (tmp_path / "masks").mkdir()
+    write_mask(tmp_path / "masks" / "0000.png", MASK)
+    with pytest.raises(SceneError, match=r"no cameras\.yaml"):
+        load_scene(tmp_path)
+    with pytest.raises(SceneError, match="exactly one camera"):
+        load_scene(tmp_path, {"a": camera("a"), "b": camera("b")})
+    scene = load_scene(tmp_path, {"a": camera("a")})
+    np.testing.assert_array_equal(scene.read("a", "0000"), MASK)
+
+
+def test_what_is_missing_is_named(tmp_path: Path) -> None:
+    with pytest.raises(SceneError, match="nowhere: no such folder"):
+        load_scene(tmp_path / "nowhere")
+    with pytest.raises(SceneError, match=r"no cameras\.yaml"):
+        load_scene(tmp_path)
+    save_cameras(tmp_path / "cameras.yaml", [camera("left")])
+    with pytest.raises(SceneError, match="no folder masks"):
+        load_scene(tmp_path)
+    (tmp_path / "masks" / "left").mkdir(parents=True)
+    with pytest.raises(SceneError, match=r"no mask.*left"):
+        load_scene(tmp_path)
+    (tmp_path / "masks" / "rihgt").mkdir()
+    with pytest.raises(SceneError, match="rihgt belongs to no camera"):
+        load_scene(tmp_path)
+    (tmp_path / "cameras.yaml").write_text("left: 3")
+    with pytest.raises(CameraError, match="left"):
+        load_scene(tmp_path)
+
+
+def test_masks_must_fit_their_camera(tmp_path: Path) -> None:
+    make_scene(tmp_path)
+    write_mask(tmp_path / "masks" / "left" / "0001.png", MASK.T)
+    with pytest.raises(MaskError, match=r"left/0001\.png.*20 x 30"):
+        load_scene(tmp_path).read("left", "0001")
+
+
+def test_recorded_scenes(shared_data: Path) -> None:
+    human = load_scene(shared_data / "human_four_views")
+    assert (len(human.frames), human.sequence, human.frame_rate_hz) == (50, True, 60.0)
+    arm = load_scene(shared_data / "arm_two_views")
+    for frame in arm.frames:
+        for name in arm.cameras_of(frame):
+            assert arm.read(name, frame).any()

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from rich.table import Table
 
-from drake_pose.body import PoseTree, bundled_model, load_model
+from drake_pose.body import bundled_model, load_model
 from drake_pose.camera import ParallelCamera
 from drake_pose.errors import SettingsError
 from drake_pose.matching import MatchResult, PaperSearch, PaperSearchSettings, View
@@ -96,6 +96,8 @@ class ExperimentResult:
             "seed": self.seed,
             "angles": self.angles,
             "method": "paper",
+            "outside_limit": self.search.settings.outside_limit or 0.0,
+            "candidate_limit": self.search.settings.candidate_limit,
         }
 
     def table(self) -> Table:
@@ -155,20 +157,26 @@ def experiment_camera() -> ParallelCamera:
     )
 
 
-def experiment_search() -> PaperSearch:
-    """The paper's search for its female body: root = head, 20 degrees, K = 5, r = 200 pixels."""
+def experiment_search(
+    outside_limit: float = 200.0, candidate_limit: int = 5, interval_deg: float = 20.0
+) -> PaperSearch:
+    """The paper's search for its female body: root = head, r = 200 pixels, K = 5, 20 degrees."""
     tree = load_model(bundled_model("woman")).pose_tree(root_position=np.zeros(3))
-    return PaperSearch(tree, PaperSearchSettings(outside_limit=200.0))
+    settings = PaperSearchSettings(
+        interval=math.radians(interval_deg),
+        outside_limit=outside_limit,
+        candidate_limit=candidate_limit,
+    )
+    return PaperSearch(tree, settings)
 
 
 def draw_values(
-    tree: PoseTree, search: PaperSearch, angles: str, generator: np.random.Generator
+    search: PaperSearch, angles: str, generator: np.random.Generator
 ) -> list[np.ndarray]:
     """Draw every node's angles at random.
 
     Args:
-        tree: the pose tree.
-        search: gives the sampling grid.
+        search: gives the pose tree and its sampling grid.
         angles: "lattice": from the grid, as the paper; "continuous": anywhere inside the limits.
         generator: the source of chance.
 
@@ -176,6 +184,7 @@ def draw_values(
         One array of values for each node [rad or m].
     """
     values = []
+    tree = search.tree
     lower, upper = tree.model.lower, tree.model.upper
     for i, node in enumerate(tree.nodes):
         grid = search.sampled.values[i]
@@ -196,6 +205,7 @@ def run_experiment(
     method: str = "paper",
     angles: str = "lattice",
     progress: Callable[[int], None] | None = None,
+    search: PaperSearch | None = None,
 ) -> ExperimentResult:
     """Draw and match the silhouettes of experiment A.
 
@@ -205,6 +215,7 @@ def run_experiment(
         method: "paper".
         angles: "lattice" (multiples of 20 degrees, as the paper) or "continuous".
         progress: called with the number of images done after each.
+        search: the search of ``experiment_search`` where it is not the paper's.
 
     Raises:
         SettingsError: if an argument is not one of these.
@@ -215,11 +226,11 @@ def run_experiment(
         raise SettingsError(f"method must be 'paper', not '{method}'")
     if angles not in ("lattice", "continuous"):
         raise SettingsError(f"angles must be 'lattice' or 'continuous', not '{angles}'")
-    search, camera = experiment_search(), experiment_camera()
+    search, camera = search or experiment_search(), experiment_camera()
     generator = np.random.default_rng(seed)
     trials = []
     for done in range(1, images + 1):
-        values = draw_values(search.tree, search, angles, generator)
+        values = draw_values(search, angles, generator)
         trials.append(_match_one(search, camera, values))
         if progress is not None:
             progress(done)

@@ -23,6 +23,9 @@ def axis_samples(lower: float, upper: float, interval: float, *, is_angle: bool)
         lower, upper: finite limits [rad or m].
         interval: spacing [rad or m].
         is_angle: whether values a full turn apart mean the same.
+
+    Raises:
+        SettingsError: more samples than memory should hold.
     """
     first = math.ceil(lower / interval - _ROUNDING)
     last = math.floor(upper / interval + _ROUNDING)
@@ -30,6 +33,11 @@ def axis_samples(lower: float, upper: float, interval: float, *, is_angle: bool)
         first = last - math.ceil(2.0 * math.pi / interval - _ROUNDING) + 1
     if last < first:
         return [0.5 * (lower + upper)]
+    if last - first >= MAXIMUM_GRID_SIZE:
+        raise SettingsError(
+            f"a sampling interval of {interval:g} makes {last - first + 1} samples of one joint, "
+            f"at most {MAXIMUM_GRID_SIZE} are allowed: use a larger interval"
+        )
     multiples = sorted(range(first, last + 1), key=lambda multiple: (abs(multiple), multiple))
     return [min(max(multiple * interval, lower), upper) for multiple in multiples]
 

@@ -92,3 +92,8 @@ def test_limited_rotation_is_applied_in_order():
 def test_bad_rotations_are_refused(make, message):
     with pytest.raises(SettingsError, match=message):
         make()
+
+
+def test_a_tiny_interval_is_refused_before_memory_is_taken():
+    with pytest.raises(SettingsError, match=r"1e-12.*larger interval"):
+        axis_samples(-1.0, 1.0, 1e-12, is_angle=True)

@@ -1,0 +1,1 @@
+"""The command line, and whole jobs in one call. Nothing heavy is imported here."""

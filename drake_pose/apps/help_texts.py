@@ -1,0 +1,89 @@
+"""The commands' help: the ideas in a few lines, and examples that can be pasted."""
+
+from __future__ import annotations
+
+
+def _help(text: str) -> str:
+    """Returns a text for rich: paragraphs are unfolded, indented examples stay line by line."""
+    paragraphs = []
+    for paragraph in text.strip().split("\n\n"):
+        lines = paragraph.split("\n")
+        is_example = lines[0].startswith("    ")
+        paragraphs.append("\n".join(lines) if is_example else " ".join(lines))
+    return "\n\n".join(paragraphs)
+
+
+PROGRAM = _help("""
+Joint angles of articulated objects from silhouettes.
+
+Give the body as any model file that Drake reads (URDF, SDFormat, MJCF), and the pictures as a
+scene: a folder with [bold]cameras.yaml[/bold] and black and white
+[bold]masks/<camera>/<frame>.png[/bold]. No training, no graphics card. Begin with
+[bold]drake-pose demo[/bold].
+
+Exit status: 0 done, 1 failed (the message says what is at fault), 2 wrong usage.
+""")
+
+ESTIMATE = _help(r"""
+Estimate the joint angles in every frame of a scene.
+
+The body is placed segment by segment from the root outwards. A segment's joint angles are sampled
+on a grid inside their limits; what leaves the silhouette is thrown away, and what covers most of it
+is kept, with a way back where the search gets stuck (Kameda, Minoh and Ikeda). Several cameras are
+matched together.
+
+DIR gets poses.csv (a row a frame: every joint's position in rad or m, E_total, seconds),
+summary.json, overlay/<camera>/<frame>.png to judge by, and replay.html. E_total is the area where
+body and silhouette differ over the silhouette's area. Ctrl-C keeps the finished frames; --resume
+goes on.
+
+[bold]A robot arm bolted to the world's origin, seen by two cameras:[/bold]
+
+    drake-pose estimate ../shared/data/arm_two_views --out results/arm \
+      --model ../shared/data/arm_two_views/med7/med7.urdf
+
+[bold]A man who stands on a foot whose position is known, seen by one camera:[/bold]
+
+    drake-pose estimate ../shared/data/human_four_views --out results/man \
+      --model urdf/man/man.urdf --camera cam04 --frame 0:9 --root right_foot \
+      --root-position ../shared/data/human_four_views/joint_centres.csv:right_ankle \
+      --root-rotation y=-180:180,x=-20:20,z=-20:20
+""")
+
+DEMO = _help("""
+Estimate a stored real picture: a man balancing on a beam, seen by one camera.
+
+Only the position of his right ankle is known. The search begins at that foot and finds all other
+joint angles: the recipe of Kameda, Minoh and Ikeda for real people, with their sampling of
+10 degrees. The model is a man of average measures, not made from this man.
+
+[bold]Example:[/bold]
+
+    drake-pose demo --out results/demo
+""")
+
+CHECK = _help("""
+Say whether a model is fit for pose estimation, and if not, why.
+
+A fit model has visual geometry to be seen, and limits on every joint that could otherwise go on for
+ever. Shown are the segments of the pose tree: the link each one is, what it hangs on, its joints in
+the order of rotation with their limits, and its triangles. Exit status 1: not fit.
+
+[bold]Example:[/bold]
+
+    drake-pose check urdf/woman/woman.urdf
+""")
+
+REPRODUCE = "Run a paper's experiment: its figures beside ours."
+
+KAMEDA = _help("""
+Kameda, Minoh and Ikeda, experiment A: random poses of a woman from one silhouette each.
+
+Every angle is drawn at random inside its limits, her silhouette is drawn (700 x 700 pixels,
+parallel projection, 2.26 pixels a centimetre), and her pose is searched for with no knowledge but
+the position of her head. The paper's figures stand beside ours.
+
+[bold]Example:[/bold]
+
+    drake-pose reproduce kameda --images 20
+""")

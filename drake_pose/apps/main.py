@@ -1,0 +1,239 @@
+"""The command line `drake-pose`. Heavy modules are imported inside the commands."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from drake_pose import __version__
+from drake_pose.apps import help_texts
+from drake_pose.apps.estimate_options import (
+    CameraOption,
+    CandidatesOption,
+    FrameOption,
+    HoldOption,
+    IntervalOption,
+    JointIntervalOption,
+    JsonOption,
+    LengthIntervalOption,
+    MethodOption,
+    ModelOption,
+    OutOption,
+    OutsideLimitOption,
+    ReplayOption,
+    ResumeOption,
+    RootOption,
+    RootPositionOption,
+    RootRotationOption,
+    RunLimitOption,
+    SceneArgument,
+    TruthOption,
+)
+from drake_pose.apps.options import (
+    parse_assignments,
+    parse_root_position,
+    parse_root_rotation,
+)
+from drake_pose.apps.settings import EstimateSettings
+from drake_pose.apps.terminal import (
+    FAILED,
+    errors_as_messages,
+    print_json,
+    say,
+    usage_errors,
+    warn,
+)
+from drake_pose.errors import ModelError
+
+app = typer.Typer(
+    name="drake-pose",
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    help=help_texts.PROGRAM,
+)
+reproduce_app = typer.Typer(
+    no_args_is_help=True, rich_markup_mode="rich", help=help_texts.REPRODUCE
+)
+app.add_typer(reproduce_app, name="reproduce")
+
+
+def main() -> None:
+    """Run the command line."""
+    app()
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"drake-pose {__version__}")
+        raise typer.Exit()
+
+
+@app.callback()
+def prepare(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_print_version, is_eager=True, help="Print it."),
+    ] = False,
+) -> None:
+    """Options of the program itself."""
+
+
+@app.command(help=help_texts.ESTIMATE)
+def estimate(
+    scene: SceneArgument,
+    model: ModelOption,
+    out: OutOption,
+    camera: CameraOption = None,
+    frame: FrameOption = None,
+    hold: HoldOption = None,
+    truth: TruthOption = None,
+    root: RootOption = None,
+    root_position: RootPositionOption = None,
+    root_rotation: RootRotationOption = None,
+    interval: IntervalOption = 10.0,
+    length_interval: LengthIntervalOption = 0.05,
+    joint_interval: JointIntervalOption = None,
+    outside_limit: OutsideLimitOption = None,
+    candidates: CandidatesOption = 5,
+    run_limit: RunLimitOption = 10_000,
+    method: MethodOption = "paper",
+    resume: ResumeOption = False,
+    replay: ReplayOption = True,
+    json: JsonOption = False,
+) -> None:
+    """See help_texts.ESTIMATE."""
+    with usage_errors():
+        settings = EstimateSettings(
+            cameras=tuple(camera or ()),
+            frames=tuple(frame or ()),
+            root=root,
+            root_position=None if root_position is None else parse_root_position(root_position),
+            root_rotation=None if root_rotation is None else parse_root_rotation(root_rotation),
+            interval=interval,
+            length_interval=length_interval,
+            joint_intervals=parse_assignments(joint_interval or (), "--joint-interval"),
+            outside_limit=outside_limit,
+            candidates=candidates,
+            run_limit=run_limit,
+            hold=parse_assignments(hold or (), "--hold"),
+            method=method,
+        )
+    interrupted = f"interrupted; the finished frames are in {out}; go on with --resume"
+    with errors_as_messages(interrupted):
+        from drake_pose.apps.estimate import estimate_scene
+        from drake_pose.apps.report import FrameProgress, print_estimate
+
+        with FrameProgress() as progress:
+            result = estimate_scene(
+                scene, model, out, settings, truth=truth, resume=resume, replay=replay,
+                on_frame=progress,
+            )  # fmt: skip
+        if json:
+            print_json(result.summary)
+        else:
+            print_estimate(result)
+        if result.found_count == 0:
+            say("drake-pose: error: no pose was found in any frame")
+            raise typer.Exit(FAILED)
+
+
+@app.command(help=help_texts.DEMO)
+def demo(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the result.")] = Path(
+        "results/demo"
+    ),
+    json: JsonOption = False,
+) -> None:
+    """See help_texts.DEMO."""
+    with errors_as_messages():
+        from drake_pose.apps.demo import run_demo
+        from drake_pose.apps.report import FrameProgress, print_demo
+
+        with FrameProgress() as progress:
+            result = run_demo(out, on_frame=progress)
+        if json:
+            print_json(result.summary)
+        else:
+            print_demo(result)
+        if result.found_count == 0:
+            raise typer.Exit(FAILED)
+
+
+@app.command(help=help_texts.CHECK)
+def check(
+    file: Annotated[Path, typer.Argument(help="The model: URDF, SDFormat, MJCF or .dmd.yaml.")],
+    json: JsonOption = False,
+) -> None:
+    """See help_texts.CHECK."""
+    with errors_as_messages():
+        from drake_pose.apps.check import report_as_json, report_as_table
+        from drake_pose.apps.report import output_console
+        from drake_pose.body import describe_model
+
+        report = describe_model(file)
+        if json:
+            print_json(report_as_json(report))
+        elif report.usable:
+            output_console().print(report_as_table(report))
+        for text in report.warnings:
+            warn(text)
+        if report.errors:
+            raise ModelError("; ".join(report.errors))
+        say("drake-pose: fit for use")
+
+
+@reproduce_app.command(help=help_texts.KAMEDA)
+def kameda(
+    images: Annotated[int, typer.Option(min=1, help="How many silhouettes are drawn.")] = 219,
+    seed: Annotated[int, typer.Option(min=0, help="Another seed draws other poses.")] = 0,
+    method: Annotated[str, typer.Option(help="How to search: paper.")] = "paper",
+    angles: Annotated[
+        str, typer.Option(help="lattice: multiples of 20 degrees, as in the paper; continuous.")
+    ] = "lattice",
+    outside_limit: Annotated[
+        float, typer.Option(min=0.0, help=r"r \[pixel]; the paper's is 200.", metavar="R")
+    ] = 200.0,
+    candidates: Annotated[
+        int,
+        typer.Option(
+            min=1, help="How many candidates a node keeps; the paper's is 5.", metavar="K"
+        ),
+    ] = 5,
+    interval: Annotated[
+        float, typer.Option(min=1.0, max=90.0, help=r"Sampling interval \[deg]; the paper's is 20.")
+    ] = 20.0,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for pictures; none without it.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """See help_texts.KAMEDA."""
+    with usage_errors():
+        EstimateSettings(method=method)
+    if angles not in ("lattice", "continuous"):
+        raise typer.BadParameter("must be lattice or continuous", param_hint="--angles")
+    with errors_as_messages():
+        from drake_pose.apps.kameda import experiment_search, run_experiment
+        from drake_pose.apps.kameda_pictures import save_pictures
+        from drake_pose.apps.report import count_progress, output_console
+        from drake_pose.apps.result_folder import require_empty
+
+        if out is not None:
+            require_empty(out)
+        with count_progress("silhouettes", images) as advance:
+            search = experiment_search(outside_limit, candidates, interval)
+            result = run_experiment(images, seed, method, angles, advance, search)
+        if out is not None:
+            save_pictures(result, out)
+        if json:
+            print_json(result.as_json())
+        else:
+            output_console().print(result.table())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,139 @@
+"""Command line texts to plain values: `NAME=VALUE`, `X,Y,Z`, frame ranges, root rotations."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Literal
+
+from drake_pose.errors import SettingsError, UnknownNameError
+
+Axis = Literal["x", "y", "z"]
+AXES: tuple[Axis, ...] = ("x", "y", "z")
+RotationLimits = dict[Axis, tuple[float, float]]
+
+
+def parse_number(text: str, what: str) -> float:
+    """Returns a finite number.
+
+    Raises:
+        SettingsError: naming ``what`` the text was given for.
+    """
+    try:
+        number = float(text)
+    except ValueError:
+        raise SettingsError(f"{what}: '{text}' is not a number") from None
+    if not math.isfinite(number):
+        raise SettingsError(f"{what}: '{text}' is not a finite number")
+    return number
+
+
+def parse_assignments(texts: Iterable[str], option: str) -> dict[str, float]:
+    """Returns the values of ``NAME=NUMBER`` texts by name.
+
+    Raises:
+        SettingsError: if a text has another form, or a name is given twice.
+    """
+    values: dict[str, float] = {}
+    for text in texts:
+        name, equals, number = text.rpartition("=")
+        if not equals or not name:
+            raise SettingsError(f"{option}: '{text}' must have the form NAME=NUMBER")
+        if name in values:
+            raise SettingsError(f"{option}: '{name}' is given twice")
+        values[name] = parse_number(number, f"{option} {name}")
+    return values
+
+
+def parse_root_position(text: str) -> tuple[float, float, float] | tuple[Path, str]:
+    """Returns a position ``X,Y,Z`` [m], or the file and the joint of ``FILE.csv:JOINT``.
+
+    Raises:
+        SettingsError: if the text has neither form.
+    """
+    parts = text.split(",")
+    if len(parts) == 3:
+        x, y, z = (parse_number(part, "--root-position") for part in parts)
+        return x, y, z
+    file, colon, joint = text.rpartition(":")
+    if not (colon and file and joint):
+        raise SettingsError(
+            f"--root-position: '{text}' must be X,Y,Z in metres, or FILE.csv:JOINT for one "
+            "position a frame"
+        )
+    return Path(file), joint
+
+
+def parse_root_rotation(text: str) -> Literal["fixed", "free"] | RotationLimits:
+    """Returns ``fixed``, ``free``, or limits of the angles about the root's axes [deg].
+
+    The limits' text is like ``y=-180:180,z=-10:10``; the order is the order of rotation.
+
+    Raises:
+        SettingsError: if the text has another form, or a lower limit exceeds the upper one.
+    """
+    if text == "fixed":
+        return "fixed"
+    if text == "free":
+        return "free"
+    limits: RotationLimits = {}
+    for part in text.split(","):
+        letter, equals, span = part.strip().partition("=")
+        lower_text, colon, upper_text = span.partition(":")
+        axis = next((axis for axis in AXES if axis == letter), None)
+        if axis is None or axis in limits or not (equals and colon):
+            raise SettingsError(
+                f"--root-rotation: '{text}' must be fixed, free, or limits in degrees about the "
+                "axes x, y, z in the order of rotation, like y=-180:180,z=-10:10"
+            )
+        what = f"--root-rotation {axis}"
+        lower, upper = parse_number(lower_text, what), parse_number(upper_text, what)
+        if lower > upper:
+            raise SettingsError(f"{what}: the lower limit {lower:g} exceeds the upper {upper:g}")
+        limits[axis] = (lower, upper)
+    return limits
+
+
+def select_frames(known: Sequence[str], wanted: Sequence[str], where: str) -> tuple[str, ...]:
+    """Returns the frames that were asked for, in the scene's order.
+
+    Args:
+        known: the frames' names, in order.
+        wanted: names, or ranges ``FIRST:LAST`` that include both ends; all frames where empty.
+            A number stands for the frame whose name is that number, with or without zeros before.
+        where: the scene, for messages.
+
+    Raises:
+        UnknownNameError: if there is no such frame.
+        SettingsError: if a range ends before it begins.
+    """
+    if not wanted:
+        return tuple(known)
+    chosen: set[int] = set()
+    for text in wanted:
+        if text in known:
+            chosen.add(known.index(text))
+            continue
+        first_text, colon, last_text = text.partition(":")
+        first = _frame_index(known, first_text, where)
+        last = _frame_index(known, last_text, where) if colon else first
+        if last < first:
+            raise SettingsError(f"--frame: the range '{text}' ends before it begins")
+        chosen.update(range(first, last + 1))
+    return tuple(frame for index, frame in enumerate(known) if index in chosen)
+
+
+def frame_number(frame: str) -> int | None:
+    """Returns the number that a frame's name is, or None."""
+    return int(frame) if frame.isascii() and frame.isdigit() else None
+
+
+def _frame_index(known: Sequence[str], name: str, where: str) -> int:
+    if name in known:
+        return known.index(name)
+    number = frame_number(name)
+    same = [i for i, frame in enumerate(known) if frame_number(frame) == number]
+    if number is None or len(same) != 1:
+        raise UnknownNameError("frame", name, known, where)
+    return same[0]

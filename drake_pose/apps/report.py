@@ -1,0 +1,174 @@
+"""What commands show on the terminal: progress on stderr, tables on stdout."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from drake_pose.apps.result_folder import OVERLAY, POSES, REPLAY
+from drake_pose.apps.summary import FrameRecord
+from drake_pose.apps.terminal import warn
+
+if TYPE_CHECKING:
+    from drake_pose.apps.estimate import SceneEstimate
+
+
+def output_console() -> Console:
+    """Returns the console for results; a file or pipe gets lines that are not folded."""
+    console = Console(highlight=False)
+    return console if console.is_terminal else Console(highlight=False, width=160)
+
+
+def _progress() -> Progress:
+    """A bar on stderr; nothing where stderr is no terminal."""
+    console = Console(stderr=True)
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=console,
+        disable=not console.is_terminal,
+    )
+
+
+@contextmanager
+def count_progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
+    """A progress bar; the value is a function to call with how many are done."""
+    with _progress() as progress:
+        task = progress.add_task(what, total=total)
+        yield lambda done: progress.update(task, completed=done)
+
+
+class FrameProgress:
+    """A progress bar over frames that also says where no pose was found."""
+
+    def __init__(self) -> None:
+        self._progress = _progress()
+        self._task = self._progress.add_task("reading", total=None)
+
+    def __enter__(self) -> FrameProgress:
+        """Show the bar."""
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Take the bar away."""
+        self._progress.stop()
+
+    def __call__(self, finished: int, total: int, frame: str, record: FrameRecord | None) -> None:
+        """Show that a frame is finished."""
+        self._progress.update(self._task, description="frames", completed=finished, total=total)
+        if record is None:
+            return
+        if not record.found:
+            warn(f"frame '{frame}': no pose was found")
+        elif record.stopped_by == "run_limit":
+            warn(f"frame '{frame}': the search was stopped by the run limit")
+
+
+def print_estimate(result: SceneEstimate) -> None:
+    """Prints a row a frame, the joint errors where the truth is known, and where the result is."""
+    console = output_console()
+    table = Table("frame", "E_total", "before", "runs", "seconds", title="Estimate")
+    with_truth = any(record.joint_errors for record in result.records.values())
+    if with_truth:
+        table.add_column("mean joint error")
+    for frame, record in result.records.items():
+        cells = [
+            escape(frame),
+            percent(record.E_total),
+            percent(record.first_E_total),
+            "" if record.runs is None else str(record.runs),
+            f"{record.seconds:.2f}",
+        ]
+        if with_truth:
+            cells.append(_mean_angle_error(result, record))
+        table.add_row(*cells)
+    console.print(table)
+    if with_truth:
+        console.print(_error_table(result))
+    _print_totals(console, result)
+
+
+def print_demo(result: SceneEstimate) -> None:
+    """Prints the only frame's joint angles, the error, the seconds and where the picture is."""
+    console = output_console()
+    row = result.rows[0]
+    table = Table("joint", "value", title="Joint angles of the man in the picture")
+    for name, kind, value in zip(result.position_names, result.position_kinds, row.q, strict=True):
+        table.add_row(escape(name), position_text(kind, value))
+    console.print(table)
+    _print_totals(console, result)
+    if result.folder is not None:
+        for overlay in sorted((result.folder / OVERLAY).glob("*/*.png")):
+            console.print(f"overlay        {escape(str(overlay))}", soft_wrap=True)
+    console.print(
+        "The picture tells agreement (light grey), missing (blue) and excess (orange) apart. "
+        "Kameda, Minoh and Ikeda report 22.3 % for six pictures of a woman, with a model of her."
+    )
+
+
+def percent(share: float | None) -> str:
+    """Returns a share in percent, or a dash."""
+    return "-" if share is None else f"{100.0 * share:.2f} %"
+
+
+def position_text(kind: str, value: float) -> str:
+    """Returns a position in degrees or metres."""
+    if not np.isfinite(value):
+        return "-"
+    if kind == "angle":
+        return f"{math.degrees(value):.1f} deg"
+    return f"{value:.3f} m" if kind == "length" else f"{value:.4f}"
+
+
+def _print_totals(console: Console, result: SceneEstimate) -> None:
+    summary = result.summary
+    console.print(f"found          {result.found_count} of {len(result.records)} frames")
+    console.print(f"E_total        {percent(summary['mean_E_total'])} in the mean")
+    console.print(f"seconds        {summary['median_seconds']:.2f} a frame in the median")
+    if result.folder is not None:
+        console.print(f"poses          {escape(str(result.folder / POSES))}", soft_wrap=True)
+        if (result.folder / REPLAY).is_file():
+            console.print(f"replay         {escape(str(result.folder / REPLAY))}", soft_wrap=True)
+
+
+def _angle_errors(result: SceneEstimate, record: FrameRecord) -> list[float]:
+    kinds = dict(zip(result.position_names, result.position_kinds, strict=True))
+    return [abs(e) for name, e in record.joint_errors.items() if kinds[name] == "angle"]
+
+
+def _mean_angle_error(result: SceneEstimate, record: FrameRecord) -> str:
+    errors = _angle_errors(result, record)
+    return f"{np.mean(errors):.1f} deg" if errors else "-"
+
+
+def _error_table(result: SceneEstimate) -> Table:
+    """Estimate minus truth: a row a joint, a column a frame."""
+    kinds = dict(zip(result.position_names, result.position_kinds, strict=True))
+    compared = {
+        frame: record.joint_errors
+        for frame, record in result.records.items()
+        if record.joint_errors
+    }
+    shown = list(compared)[:8]
+    table = Table("joint", "mean", "greatest", *map(escape, shown), title="Joint errors")
+    for name, errors in result.summary["joint_errors"].items():
+        unit, digits = ("deg", 1) if kinds[name] == "angle" else ("m", 3)
+        each = [f"{compared[frame][name]:+.{digits}f}" for frame in shown]
+        table.add_row(
+            escape(name),
+            f"{errors['mean']:.{digits}f} {unit}",
+            f"{errors['greatest']:.{digits}f} {unit}",
+            *each,
+        )
+    return table

@@ -1,0 +1,255 @@
+"""The result folder: poses.csv, summary.json, overlay pictures and replay.html.
+
+Every finished frame is on the disk before the next one begins, and every other file is written
+beside its place and then moved there, so that an interruption never leaves half a file.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+
+from drake_pose.errors import OutputError
+
+POSES = "poses.csv"
+SUMMARY = "summary.json"
+REPLAY = "replay.html"
+OVERLAY = "overlay"
+
+BASE_COLUMNS = ("base_x", "base_y", "base_z", "base_qw", "base_qx", "base_qy", "base_qz")
+"""Columns of the plant's world in the scene's world: position [m] and unit quaternion."""
+
+
+@dataclass(frozen=True, eq=False)
+class PoseRow:
+    """One row of poses.csv.
+
+    Args:
+        frame: the frame's name.
+        q: (nq,) positions [rad or m]; NaN where no pose was found.
+        base: (7,) BASE_COLUMNS; None where the model's own joints place it in the world.
+        error: E_total; NaN where no pose was found.
+        seconds: the search's wall time [s].
+    """
+
+    frame: str
+    q: np.ndarray
+    base: np.ndarray | None
+    error: float
+    seconds: float
+
+    @property
+    def found(self) -> bool:
+        """Whether a pose was found."""
+        return bool(np.isfinite(self.error))
+
+
+class ResultFolder:
+    """Writes a result, frame by frame.
+
+    Args:
+        path: the folder.
+        position_names: the plant's positions, in its order.
+        with_base: whether the base's pose is written too.
+        resume: go on with a folder that holds a part of the result.
+
+    Raises:
+        OutputError: if the folder is not empty and ``resume`` is not given, or cannot be written,
+            or what it holds cannot be resumed.
+    """
+
+    def __init__(
+        self, path: Path, position_names: Sequence[str], with_base: bool, resume: bool = False
+    ) -> None:
+        self.path = path
+        self.position_names = tuple(position_names)
+        self.with_base = with_base
+        self.rows: list[PoseRow] = []
+        self._file: TextIO | None = None
+        if path.exists() and not path.is_dir():
+            raise OutputError(f"{path}: is a file, but the result is a folder; name another one")
+        if not resume:
+            require_empty(path)
+        if resume and (path / POSES).is_file():
+            self.rows = self._read_rows()
+
+    @property
+    def header(self) -> list[str]:
+        """The columns of poses.csv."""
+        base = BASE_COLUMNS if self.with_base else ()
+        return ["frame", *self.position_names, *base, "error", "seconds"]
+
+    def open(self) -> None:
+        """Begin poses.csv, with the rows that were read for a resumption.
+
+        Raises:
+            OutputError: if it cannot be written.
+        """
+        self._write_rows()
+        try:
+            self._file = (self.path / POSES).open("a", newline="", encoding="utf-8")
+        except OSError as error:
+            raise _cannot_write(self.path / POSES, error) from error
+
+    def sort(self, frames: Sequence[str]) -> None:
+        """Close poses.csv and put its rows in the order of ``frames``.
+
+        A job that was resumed for other frames has written them behind the earlier ones.
+
+        Raises:
+            OutputError: if it cannot be written.
+        """
+        self.close()
+        in_order = sorted(self.rows, key=lambda row: frames.index(row.frame))
+        if in_order != self.rows:
+            self.rows = in_order
+            self._write_rows()
+
+    def close(self) -> None:
+        """Close poses.csv."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def add(self, row: PoseRow) -> None:
+        """Write the row of a finished frame.
+
+        Raises:
+            OutputError: if it cannot be written, or the folder is not open.
+        """
+        if self._file is None:
+            raise OutputError(f"{self.path / POSES}: is not open")
+        try:
+            csv.writer(self._file, lineterminator="\n").writerow(self._cells(row))
+            self._file.flush()
+        except OSError as error:
+            raise _cannot_write(self.path / POSES, error) from error
+        self.rows.append(row)
+
+    def write_summary(self, summary: Mapping[str, Any]) -> None:
+        """Write summary.json; numbers that are not finite become null.
+
+        Raises:
+            OutputError: if it cannot be written.
+        """
+        text = json.dumps(without_nan(summary), indent=2, allow_nan=False, ensure_ascii=False)
+        self.write(SUMMARY, (text + "\n").encode())
+
+    def write(self, name: str, data: bytes) -> Path:
+        """Write a file in the folder all at once, making the folders it needs.
+
+        Args:
+            name: the file's path within the folder.
+            data: its content.
+
+        Returns:
+            The file's path.
+
+        Raises:
+            OutputError: if it cannot be written.
+        """
+        path = self.path / name
+        temporary = path.with_name(path.name + ".part")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            temporary.write_bytes(data)
+            os.replace(temporary, path)
+        except OSError as error:
+            raise _cannot_write(path, error) from error
+        return path
+
+    def _write_rows(self) -> None:
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(self.header)
+        writer.writerows(self._cells(row) for row in self.rows)
+        self.write(POSES, text.getvalue().encode())
+
+    def _cells(self, row: PoseRow) -> list[str]:
+        base: Sequence[float] | np.ndarray = ()
+        if self.with_base:
+            base = np.full(len(BASE_COLUMNS), np.nan) if row.base is None else row.base
+        numbers = [*row.q, *base, row.error]
+        cells = [f"{number:.9g}" if np.isfinite(number) else "" for number in numbers]
+        return [row.frame, *cells, f"{row.seconds:.4f}"]
+
+    def _read_rows(self) -> list[PoseRow]:
+        path = self.path / POSES
+        try:
+            text = path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise OutputError(f"{path}: cannot be read, so not be resumed") from error
+        # What follows the last line break is a row that an interruption cut off.
+        lines = list(csv.reader(text[: text.rfind("\n") + 1].splitlines()))
+        if lines and lines[0] != self.header:
+            raise OutputError(f"{path}: was written for another model; name another folder")
+        try:
+            return [self._row(cells) for cells in lines[1:]]
+        except ValueError:
+            raise OutputError(f"{path}: is damaged, so it cannot be resumed") from None
+
+    def _row(self, cells: Sequence[str]) -> PoseRow:
+        if len(cells) != len(self.header):
+            raise ValueError(len(cells))
+        numbers = np.array([float(cell) if cell else np.nan for cell in cells[1:]])
+        count = len(self.position_names)
+        base = numbers[count:-2] if self.with_base and np.isfinite(numbers[-2]) else None
+        return PoseRow(cells[0], numbers[:count], base, float(numbers[-2]), float(numbers[-1]))
+
+
+def require_empty(path: Path) -> None:
+    """Refuses a folder that exists and holds something.
+
+    Raises:
+        OutputError: names the folder.
+    """
+    if path.is_dir() and any(path.iterdir()):
+        raise OutputError(
+            f"{path}: the output folder exists and is not empty; name another one with --out, or "
+            "go on with an interrupted result in it with --resume"
+        )
+
+
+def read_summary(path: Path) -> dict[str, Any]:
+    """Reads the summary.json of a result folder.
+
+    Raises:
+        OutputError: if there is none, or it is damaged.
+    """
+    file = path / SUMMARY
+    try:
+        summary = json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise OutputError(f"{file}: cannot be read ({error.strerror}): no result folder") from error
+    except ValueError as error:
+        raise OutputError(f"{file}: is damaged; it is not JSON") from error
+    if not isinstance(summary, dict):
+        raise OutputError(f"{file}: is damaged; it is not a JSON object")
+    return summary
+
+
+def without_nan(value: Any) -> Any:
+    """Returns plain JSON values: arrays become lists, numbers that are not finite become None."""
+    if isinstance(value, Mapping):
+        return {str(key): without_nan(entry) for key, entry in value.items()}
+    if isinstance(value, np.ndarray):
+        return without_nan(value.tolist())
+    if isinstance(value, list | tuple):
+        return [without_nan(entry) for entry in value]
+    if isinstance(value, np.generic):
+        return without_nan(value.item())
+    if isinstance(value, float):
+        return value if np.isfinite(value) else None
+    return value
+
+
+def _cannot_write(path: Path, error: OSError) -> OutputError:
+    return OutputError(f"{path}: cannot be written: {error.strerror}")

@@ -1,0 +1,75 @@
+"""What an estimate of a scene is made with; plain values only."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from drake_pose.apps.options import Axis
+from drake_pose.errors import SettingsError
+
+METHODS = ("paper",)
+RootTurns = Literal["fixed", "free"] | Mapping[Axis, tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class EstimateSettings:
+    """Settings of an estimate.
+
+    Args:
+        cameras: names of the cameras to match together; all where empty.
+        frames: the frames: names, or ranges ``FIRST:LAST``; all where empty.
+        root: the link the pose tree begins at; the model's own root where None.
+        root_position: where the root's origin is in the world [m], or the file of joint centres
+            and the joint in it that is the root in each frame; the model's own where None.
+        root_rotation: ``fixed``, ``free``, or limits of the angles about the root's axes by name,
+            in the order of rotation [deg]. At angles of zero the root stands in the world as it
+            does at the model's default positions. None: the model's own joints tell, or free.
+        interval: sampling interval of every angle [deg]; the paper took 10 for real pictures.
+        length_interval: sampling interval of every length [m].
+        joint_intervals: sampling intervals of single positions by name [deg or m].
+        outside_limit: the paper's r, the area of a segment that may lie outside the silhouette
+            [pixel]; None: found automatically.
+        candidates: the paper's K, how many candidates of a segment are kept.
+        run_limit: after so many runs of step 3 the search of a frame answers with what it has.
+        hold: positions that are known, by name [deg or m].
+        method: ``paper``: the search as it was published.
+
+    Raises:
+        SettingsError: if there is no such method.
+    """
+
+    cameras: tuple[str, ...] = ()
+    frames: tuple[str, ...] = ()
+    root: str | None = None
+    root_position: tuple[float, float, float] | tuple[Path, str] | None = None
+    root_rotation: RootTurns | None = None
+    interval: float = 10.0
+    length_interval: float = 0.05
+    joint_intervals: Mapping[str, float] = field(default_factory=dict)
+    outside_limit: float | None = None
+    candidates: int = 5
+    run_limit: int = 10_000
+    hold: Mapping[str, float] = field(default_factory=dict)
+    method: str = "paper"
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise SettingsError(
+                f"there is no method '{self.method}'; there is: {', '.join(METHODS)}"
+            )
+
+    def as_json(self) -> dict[str, Any]:
+        """Returns the settings as plain JSON values."""
+        values = asdict(self)
+        if self.root_position is not None:
+            values["root_position"] = [
+                str(part) if isinstance(part, Path) else part for part in self.root_position
+            ]
+        if isinstance(self.root_rotation, Mapping):
+            values["root_rotation"] = [
+                [axis, lower, upper] for axis, (lower, upper) in self.root_rotation.items()
+            ]
+        return values | {"cameras": list(self.cameras), "frames": list(self.frames)}

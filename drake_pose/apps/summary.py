@@ -1,0 +1,139 @@
+"""summary.json: what was asked, what came out, and whether an interrupted job can go on."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drake_pose import __version__
+from drake_pose.apps.settings import EstimateSettings
+from drake_pose.errors import OutputError
+
+_PACKAGES = ("drake", "numpy", "numba", "opencv-python-headless")
+
+
+@dataclass(frozen=True)
+class FrameRecord:
+    """What the search said about one frame.
+
+    Args:
+        found: whether a pose was found.
+        E_total: J over the silhouettes' area; None where no pose was found.
+        seconds: the search's wall time [s].
+        first_E_total: before the re-estimation.
+        runs: how often step 3 was run.
+        stopped_by: "end" or "run_limit".
+        outside_limit: r in each view [pixel].
+        joint_errors: estimate minus truth by position [deg or m], where the truth is known.
+    """
+
+    found: bool
+    E_total: float | None
+    seconds: float
+    first_E_total: float | None = None
+    runs: int | None = None
+    stopped_by: str | None = None
+    outside_limit: tuple[float, ...] | None = None
+    joint_errors: Mapping[str, float] = field(default_factory=dict)
+
+    @staticmethod
+    def from_json(values: Mapping[str, Any]) -> FrameRecord:
+        """Returns the record that as_json described."""
+        limits = values.get("outside_limit")
+        return FrameRecord(**{**values, "outside_limit": None if limits is None else tuple(limits)})
+
+    def as_json(self) -> dict[str, Any]:
+        """Returns plain JSON values."""
+        return asdict(self)
+
+
+def describe_job(scene: Path, model: Path, settings: EstimateSettings) -> dict[str, Any]:
+    """Returns what is estimated from what and how, as plain JSON values.
+
+    The files' SHA-256 tell whether a job that is resumed is still the same.
+    """
+    return {
+        "scene": str(scene),
+        "model": str(model),
+        "settings": settings.as_json(),
+        "sha256": {
+            "model": _digest(model),
+            "cameras": _digest(scene / "cameras.yaml"),
+        },
+    }
+
+
+def check_same_job(job: Mapping[str, Any], recorded: Mapping[str, Any], folder: Path) -> None:
+    """Refuses to resume a job with other files or settings; other frames are allowed.
+
+    Raises:
+        OutputError: names the folder and what differs.
+    """
+    for name in ("model", "cameras"):
+        if recorded.get("sha256", {}).get(name) != job["sha256"][name]:
+            raise OutputError(
+                f"{folder}: was made with another {name} file, so it cannot be resumed; "
+                "name another folder"
+            )
+    before = recorded.get("settings", {})
+    for name, value in job["settings"].items():
+        if name != "frames" and before.get(name) != value:
+            raise OutputError(
+                f"{folder}: was made with {name} = {before.get(name)}, not {value}, so it cannot "
+                "be resumed; name another folder, or give the same options"
+            )
+
+
+def summarize(
+    job: Mapping[str, Any], records: Mapping[str, FrameRecord], complete: bool
+) -> dict[str, Any]:
+    """Returns the content of summary.json."""
+    errors = [record.E_total for record in records.values() if record.E_total is not None]
+    seconds = [record.seconds for record in records.values()]
+    return {
+        "complete": complete,
+        "frame_count": len(records),
+        "found_count": sum(record.found for record in records.values()),
+        "mean_E_total": float(np.mean(errors)) if errors else None,
+        "median_seconds": float(np.median(seconds)) if seconds else None,
+        "joint_errors": _joint_errors(records),
+        **job,
+        "versions": _versions(),
+        "frames": {name: record.as_json() for name, record in records.items()},
+    }
+
+
+def _joint_errors(records: Mapping[str, FrameRecord]) -> dict[str, dict[str, float]]:
+    """Mean and greatest absolute error of each position over the frames [deg or m]."""
+    by_name: dict[str, list[float]] = {}
+    for record in records.values():
+        for name, error in record.joint_errors.items():
+            by_name.setdefault(name, []).append(abs(error))
+    return {
+        name: {"mean": float(np.mean(errors)), "greatest": float(np.max(errors))}
+        for name, errors in by_name.items()
+    }
+
+
+def _versions() -> dict[str, str]:
+    versions = {"drake_pose": __version__, "python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return versions
+
+
+def _digest(path: Path) -> str | None:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError:
+        return None

@@ -1,0 +1,25 @@
+import shutil
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from tests.apps.scenes import TinyScene, write_scene
+
+
+@pytest.fixture(scope="session")
+def tiny_scene(tmp_path_factory: pytest.TempPathFactory) -> TinyScene:
+    """Three frames of one camera; shared, so do not change it."""
+    return write_scene(tmp_path_factory.mktemp("tiny") / "scene")
+
+
+@pytest.fixture
+def own_scene(tiny_scene: TinyScene, tmp_path: Path) -> TinyScene:
+    """A copy to be spoilt."""
+    shutil.copytree(tiny_scene.folder, tmp_path / "scene")
+    return TinyScene(tmp_path / "scene", tiny_scene.model, tiny_scene.truth)
+
+
+@pytest.fixture(scope="session")
+def runner() -> CliRunner:
+    return CliRunner()

@@ -1,6 +1,5 @@
 """Writes man.urdf and its meshes; see --help."""
 
-import argparse
 import sys
 from pathlib import Path
 
@@ -81,15 +80,12 @@ def main() -> None:
     """Read the command line and write the model."""
     here = Path(__file__).resolve().parent
     sys.path.insert(0, str(here.parent))
-    from body_generator.measures import Build, Measures
-    from body_generator.model import write_body
+    from body_generator.script import run
 
-    parser = argparse.ArgumentParser(description="Write man.urdf and its meshes.")
-    parser.add_argument("--stature", type=float, default=MEASURES["stature"], help="in metres")
-    parser.add_argument("--out", type=Path, default=here, help="folder to write into")
-    arguments = parser.parse_args()
-    measures = Measures(**MEASURES)
-    build = Build(
+    run(
+        here,
+        MEASURES,
+        MASS,
         name="man",
         bust=False,
         jaw=0.92,
@@ -98,11 +94,9 @@ def main() -> None:
         natural_waist=0.95,
         ponytail=False,
         muscle=1.5,
-        mass=MASS * (arguments.stature / measures.stature) ** 3,
         mass_shares=MASS_SHARES,
         colours=COLOURS,
     )
-    write_body(arguments.out, measures.scaled_to(arguments.stature), build)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from drake_pose.apps.kameda import ExperimentResult, Trial
 from drake_pose.silhouette import LabelRenderer
 
 _EXAMPLES = 4
+_MARGIN = 20
 _BACKGROUND = (1.0, 1.0, 1.0)
 
 _KINDS: dict[str, tuple[str, Callable[[Trial], bool]]] = {
@@ -64,7 +65,7 @@ def _save_examples(
     figure, axes = plt.subplots(3, len(trials), figsize=(3 * len(trials), 9), squeeze=False)
     for column, trial in zip(axes.T, trials, strict=True):
         q_true, _ = tree.positions_from(trial.true_values)
-        pictures = [renderer.segments(q) for q in (q_true, trial.result.q)]
+        pictures = _crop([renderer.segments(q) for q in (q_true, trial.result.q)])
         for axis, segments in zip(column, pictures, strict=False):
             axis.imshow(np.where(segments[..., None] >= 0, colours[segments], _BACKGROUND))
         column[2].imshow(_compare(pictures[0] >= 0, pictures[1] >= 0))
@@ -79,6 +80,19 @@ def _save_examples(
     figure.savefig(path, dpi=80)
     plt.close(figure)
     return path
+
+
+def _crop(pictures: list[np.ndarray]) -> list[np.ndarray]:
+    """Cut pictures of segments (H, W) to the square about what any of them shows."""
+    rows, columns = np.nonzero(np.logical_or.reduce([picture >= 0 for picture in pictures]))
+    side = _MARGIN + max(np.ptp(rows), np.ptp(columns))
+    square = []
+    for picture in pictures:
+        framed = np.pad(picture, side, constant_values=-1)
+        top = (rows.min() + rows.max() - side) // 2 + side
+        left = (columns.min() + columns.max() - side) // 2 + side
+        square.append(framed[top : top + side, left : left + side])
+    return square
 
 
 def _compare(true: np.ndarray, estimate: np.ndarray) -> np.ndarray:

@@ -68,7 +68,8 @@ class MatchResult:
         E_total: J over the silhouette's area (9).
         first_E_total: E_total of the first whole pose, before the re-estimation of section 5.2.
         runs: how often step 3 was run.
-        outside_limit: the threshold r that was used in each view [pixel].
+        outside_limit: the threshold r that was used in each view [pixel]; () where the search
+            has none.
         untried: the candidates not adopted in the answer, by node name.
         stopped_by: "end" if the search ran to its end, "run_limit" if the limit stopped it.
         seconds: wall time of the search [s].

@@ -28,7 +28,7 @@ from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 from drake_pose.body import ArticulatedModel
 from drake_pose.camera import Camera, PinholeCamera
-from drake_pose.matching import PaperSearch
+from drake_pose.matching import PoseSearch
 from drake_pose.silhouette import Scene
 from drake_pose.systems.mask_player import MaskPlayer
 from drake_pose.systems.silhouette_matcher import SilhouetteMatcher, label_image_port
@@ -58,7 +58,7 @@ class MatchingDiagram:
 
 def build_recorded_matching(
     scene: Scene,
-    search: PaperSearch,
+    search: PoseSearch,
     cameras: Sequence[Camera],
     frames: Sequence[str] | None = None,
     root_positions: Mapping[str, np.ndarray] | None = None,
@@ -104,7 +104,7 @@ def build_recorded_matching(
 
 
 def build_simulated_matching(
-    search: PaperSearch,
+    search: PoseSearch,
     cameras: Sequence[Camera],
     true_positions: Trajectory | np.ndarray,
     period: float,

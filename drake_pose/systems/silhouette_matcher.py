@@ -10,7 +10,7 @@ from pydrake.systems.sensors import ImageLabel16I
 
 from drake_pose.camera import Camera
 from drake_pose.errors import SettingsError
-from drake_pose.matching import MatchResult, PaperSearch, View
+from drake_pose.matching import MatchResult, PoseSearch, View
 from drake_pose.silhouette import label_image_to_mask
 
 STATISTICS = ("found", "J", "E_total", "first_E_total", "runs", "outside_limit", "seconds")
@@ -58,7 +58,7 @@ class SilhouetteMatcher(LeafSystem):
 
     def __init__(
         self,
-        search: PaperSearch,
+        search: PoseSearch,
         cameras: Sequence[Camera],
         period: float,
         offset: float = 0.0,
@@ -126,7 +126,7 @@ class SilhouetteMatcher(LeafSystem):
                 root_position = self._root_position.Eval(context)
             result = self._search.match(views, root_position)
             self.last_result = result
-            statistics[4:] = result.runs, max(result.outside_limit), result.seconds
+            statistics[4:] = result.runs, max(result.outside_limit, default=0.0), result.seconds
             if result.found:
                 statistics[:4] = 1.0, result.J, result.E_total, result.first_E_total
                 discrete_state.set_value(self._positions, result.q)

@@ -26,7 +26,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from drake_pose.apps.kameda import experiment_camera, run_experiment
+from drake_pose.apps.kameda import experiment_camera, experiment_search, run_experiment
 from drake_pose.body import TriangleMesh, bundled_model, load_model
 from drake_pose.camera import Camera, ParallelCamera, PinholeCamera
 from drake_pose.silhouette import (
@@ -180,7 +180,7 @@ def main() -> None:
     console.print(table)
     console.print(_agreement_table())
     start = time.process_time()
-    result = run_experiment()
+    result = run_experiment(experiment_search())
     seconds = time.process_time() - start
     console.print(result.table())
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

@@ -16,7 +16,13 @@ from drake_pose.apps.settings import EstimateSettings, RootTurns
 from drake_pose.body import ArticulatedModel, PoseTree, RootRotation, load_model
 from drake_pose.camera import Camera
 from drake_pose.errors import SceneError, SettingsError, UnknownNameError
-from drake_pose.matching import PaperSearch, PaperSearchSettings
+from drake_pose.matching import (
+    PaperSearch,
+    PaperSearchSettings,
+    PoseSearch,
+    WideSearch,
+    WideSearchSettings,
+)
 from drake_pose.silhouette import Scene, load_scene, require_visible
 
 TRUTH_FILE = "joint_angles.csv"
@@ -40,7 +46,7 @@ class Inputs:
     model: ArticulatedModel
     cameras: tuple[Camera, ...]
     frames: tuple[str, ...]
-    search: PaperSearch
+    search: PoseSearch
     root_positions: Mapping[str, np.ndarray] | None
     truth: TrueAngles | None
 
@@ -73,7 +79,7 @@ def read_inputs(
     elif settings.root_position is not None:
         position = np.array(settings.root_position)
     tree = _make_tree(model, settings, position)
-    search = PaperSearch(tree, _search_settings(settings, model))
+    search = _make_search(tree, settings, model)
     _check_pictures(scene, cameras, frames, search)
     return Inputs(scene, model, cameras, frames, search, root_positions, truth)
 
@@ -165,19 +171,30 @@ def _in_plant_units(model: ArticulatedModel, values: Mapping[str, float]) -> dic
     }
 
 
-def _search_settings(settings: EstimateSettings, model: ArticulatedModel) -> PaperSearchSettings:
-    return PaperSearchSettings(
-        interval=math.radians(settings.interval),
+def _make_search(tree: PoseTree, settings: EstimateSettings, model: ArticulatedModel) -> PoseSearch:
+    interval = math.radians(settings.interval)
+    intervals = _in_plant_units(model, settings.joint_intervals)
+    if settings.method == "wide":
+        wide = WideSearchSettings(
+            interval=interval,
+            length_interval=settings.length_interval,
+            intervals=intervals,
+            time_limit=settings.time_limit,
+        )
+        return WideSearch(tree, wide)
+    paper = PaperSearchSettings(
+        interval=interval,
         length_interval=settings.length_interval,
-        intervals=_in_plant_units(model, settings.joint_intervals),
+        intervals=intervals,
         outside_limit=settings.outside_limit,
         candidate_limit=settings.candidates,
         run_limit=settings.run_limit,
     )
+    return PaperSearch(tree, paper)
 
 
 def _check_pictures(
-    scene: Scene, cameras: Sequence[Camera], frames: Sequence[str], search: PaperSearch
+    scene: Scene, cameras: Sequence[Camera], frames: Sequence[str], search: PoseSearch
 ) -> None:
     """Reads every mask once, and looks whether every camera can see the body in a first pose.
 

@@ -108,24 +108,42 @@ OutsideLimitOption = Annotated[
     typer.Option(
         metavar="R",
         help=r"How much of a segment may lie outside the silhouette \[pixel]. Default: as "
-        "little as is possible, found by doubling.",
+        "little as is possible, found by doubling. Method paper only.",
         rich_help_panel=_SEARCH,
     ),
 ]
 CandidatesOption = Annotated[
     int,
-    typer.Option(metavar="K", help="How many candidates a segment keeps.", rich_help_panel=_SEARCH),
+    typer.Option(
+        metavar="K",
+        help="How many candidates a segment keeps; method paper.",
+        rich_help_panel=_SEARCH,
+    ),
 ]
 RunLimitOption = Annotated[
     int,
     typer.Option(
         metavar="N",
-        help="Stop a frame's search after placing so many segments.",
+        help="Stop a frame's search after placing so many segments; method paper.",
+        rich_help_panel=_SEARCH,
+    ),
+]
+TimeLimitOption = Annotated[
+    float | None,
+    typer.Option(
+        metavar="SECONDS",
+        min=0.0,
+        help="Answer with the best pose so far after this time a frame; method wide.",
         rich_help_panel=_SEARCH,
     ),
 ]
 MethodOption = Annotated[
-    str, typer.Option(metavar="NAME", help="paper: as published.", rich_help_panel=_SEARCH)
+    str,
+    typer.Option(
+        metavar="NAME",
+        help="paper: as published; wide: many hypotheses side by side, slower and far surer.",
+        rich_help_panel=_SEARCH,
+    ),
 ]
 ResumeOption = Annotated[
     bool,

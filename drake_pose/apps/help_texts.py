@@ -87,3 +87,16 @@ the position of her head. The paper's figures stand beside ours.
 
     drake-pose reproduce kameda --images 20
 """)
+
+SHIMADA = _help("""
+Shimada, Shirai, Kuno and Miura: joint angles and segment lengths of a synthetic hand, one camera.
+
+A two-finger hand moves, turns and flexes for 55 frames; joints, fingertips and segment axes are
+seen with noise. A Kalman filter begins with wrong angles and wrong lengths and corrects both,
+inside the limits and couplings of the paper's table 1. Over all sequences: errors, and whether the
+filter's own deviations are honest.
+
+[bold]Example:[/bold]
+
+    drake-pose reproduce shimada --runs 20 --observed lines --out results/shimada
+""")

@@ -7,10 +7,18 @@ from dataclasses import dataclass
 import numpy as np
 from rich.table import Table
 
-from drake_pose.body import bundled_model, load_model
+from drake_pose.body import PoseTree, bundled_model, load_model
 from drake_pose.camera import ParallelCamera
 from drake_pose.errors import SettingsError
-from drake_pose.matching import MatchResult, PaperSearch, PaperSearchSettings, View
+from drake_pose.matching import (
+    MatchResult,
+    PaperSearch,
+    PaperSearchSettings,
+    PoseSearch,
+    View,
+    WideSearch,
+    WideSearchSettings,
+)
 from drake_pose.silhouette import draw_mask
 
 PAPER = {
@@ -68,7 +76,7 @@ class ExperimentResult:
 
     trials: tuple[Trial, ...]
     camera: ParallelCamera
-    search: PaperSearch
+    search: PoseSearch
     seed: int
     angles: str
 
@@ -95,9 +103,7 @@ class ExperimentResult:
             "leaving_the_picture": sum(not trial.inside for trial in self.trials),
             "seed": self.seed,
             "angles": self.angles,
-            "method": "paper",
-            "outside_limit": self.search.settings.outside_limit or 0.0,
-            "candidate_limit": self.search.settings.candidate_limit,
+            "method": "paper" if isinstance(self.search, PaperSearch) else "wide",
         }
 
     def table(self) -> Table:
@@ -161,17 +167,26 @@ def experiment_search(
     outside_limit: float = 200.0, candidate_limit: int = 5, interval_deg: float = 20.0
 ) -> PaperSearch:
     """The paper's search for its female body: root = head, r = 200 pixels, K = 5, 20 degrees."""
-    tree = load_model(bundled_model("woman")).pose_tree(root_position=np.zeros(3))
     settings = PaperSearchSettings(
         interval=math.radians(interval_deg),
         outside_limit=outside_limit,
         candidate_limit=candidate_limit,
     )
-    return PaperSearch(tree, settings)
+    return PaperSearch(_experiment_tree(), settings)
+
+
+def wide_experiment_search(interval_deg: float = 20.0) -> WideSearch:
+    """The wide search for the same body, which is told no r."""
+    settings = WideSearchSettings(interval=math.radians(interval_deg))
+    return WideSearch(_experiment_tree(), settings)
+
+
+def _experiment_tree() -> PoseTree:
+    return load_model(bundled_model("woman")).pose_tree(root_position=np.zeros(3))
 
 
 def draw_values(
-    search: PaperSearch, angles: str, generator: np.random.Generator
+    search: PoseSearch, angles: str, generator: np.random.Generator
 ) -> list[np.ndarray]:
     """Draw every node's angles at random.
 
@@ -200,33 +215,29 @@ def draw_values(
 
 
 def run_experiment(
+    search: PoseSearch,
     images: int = 219,
     seed: int = 0,
-    method: str = "paper",
     angles: str = "lattice",
     progress: Callable[[int], None] | None = None,
-    search: PaperSearch | None = None,
 ) -> ExperimentResult:
     """Draw and match the silhouettes of experiment A.
 
     Args:
+        search: the search, of ``experiment_search`` or ``wide_experiment_search``.
         images: how many; the paper's 219 if not given.
         seed: of the random angles.
-        method: "paper".
         angles: "lattice" (multiples of 20 degrees, as the paper) or "continuous".
         progress: called with the number of images done after each.
-        search: the search of ``experiment_search`` where it is not the paper's.
 
     Raises:
         SettingsError: if an argument is not one of these.
     """
     if images < 1:
         raise SettingsError(f"images must be 1 or more, not {images}")
-    if method != "paper":
-        raise SettingsError(f"method must be 'paper', not '{method}'")
     if angles not in ("lattice", "continuous"):
         raise SettingsError(f"angles must be 'lattice' or 'continuous', not '{angles}'")
-    search, camera = search or experiment_search(), experiment_camera()
+    camera = experiment_camera()
     generator = np.random.default_rng(seed)
     trials = []
     for done in range(1, images + 1):
@@ -237,7 +248,7 @@ def run_experiment(
     return ExperimentResult(tuple(trials), camera, search, seed, angles)
 
 
-def _match_one(search: PaperSearch, camera: ParallelCamera, values: list[np.ndarray]) -> Trial:
+def _match_one(search: PoseSearch, camera: ParallelCamera, values: list[np.ndarray]) -> Trial:
     X_CN = camera.X_CW @ search.tree.node_poses(values)
     outlines = search.sampled.outlines
     mask = draw_mask(outlines, X_CN, camera)

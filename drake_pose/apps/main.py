@@ -29,6 +29,7 @@ from drake_pose.apps.estimate_options import (
     RootRotationOption,
     RunLimitOption,
     SceneArgument,
+    TimeLimitOption,
     TruthOption,
 )
 from drake_pose.apps.options import (
@@ -100,6 +101,7 @@ def estimate(
     outside_limit: OutsideLimitOption = None,
     candidates: CandidatesOption = 5,
     run_limit: RunLimitOption = 10_000,
+    time_limit: TimeLimitOption = None,
     method: MethodOption = "paper",
     resume: ResumeOption = False,
     replay: ReplayOption = True,
@@ -119,6 +121,7 @@ def estimate(
             outside_limit=outside_limit,
             candidates=candidates,
             run_limit=run_limit,
+            time_limit=time_limit,
             hold=parse_assignments(hold or (), "--hold"),
             method=method,
         )
@@ -190,7 +193,7 @@ def check(
 def kameda(
     images: Annotated[int, typer.Option(min=1, help="How many silhouettes are drawn.")] = 219,
     seed: Annotated[int, typer.Option(min=0, help="Another seed draws other poses.")] = 0,
-    method: Annotated[str, typer.Option(help="How to search: paper.")] = "paper",
+    method: Annotated[str, typer.Option(help="How to search: paper or wide.")] = "paper",
     angles: Annotated[
         str, typer.Option(help="lattice: multiples of 20 degrees, as in the paper; continuous.")
     ] = "lattice",
@@ -217,16 +220,60 @@ def kameda(
     if angles not in ("lattice", "continuous"):
         raise typer.BadParameter("must be lattice or continuous", param_hint="--angles")
     with errors_as_messages():
-        from drake_pose.apps.kameda import experiment_search, run_experiment
+        from drake_pose.apps.kameda import (
+            experiment_search,
+            run_experiment,
+            wide_experiment_search,
+        )
         from drake_pose.apps.kameda_pictures import save_pictures
         from drake_pose.apps.report import count_progress, output_console
         from drake_pose.apps.result_folder import require_empty
+        from drake_pose.matching import PoseSearch
 
         if out is not None:
             require_empty(out)
         with count_progress("silhouettes", images) as advance:
-            search = experiment_search(outside_limit, candidates, interval)
-            result = run_experiment(images, seed, method, angles, advance, search)
+            if method == "wide":
+                search: PoseSearch = wide_experiment_search(interval)
+            else:
+                search = experiment_search(outside_limit, candidates, interval)
+            result = run_experiment(search, images, seed, angles, advance)
+        if out is not None:
+            save_pictures(result, out)
+        if json:
+            print_json(result.as_json())
+        else:
+            output_console().print(result.table())
+
+
+@reproduce_app.command(help=help_texts.SHIMADA)
+def shimada(
+    runs: Annotated[
+        int, typer.Option(min=1, help="Sequences for each of r_13 = 35 and 40, other noise each.")
+    ] = 50,
+    seed: Annotated[int, typer.Option(min=0, help="Another seed draws other sequences.")] = 0,
+    truncation: Annotated[
+        str, typer.Option(help="sequential (the paper's), joint, clip or none.")
+    ] = "joint",
+    observed: Annotated[
+        str, typer.Option(help="full: all points and lines; lines: knuckles hidden.")
+    ] = "full",
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for plots; none without it.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """See help_texts.SHIMADA."""
+    with errors_as_messages():
+        from drake_pose.apps.report import count_progress, output_console
+        from drake_pose.apps.result_folder import require_empty
+        from drake_pose.apps.shimada import CASES, run_experiment
+        from drake_pose.apps.shimada_pictures import save_pictures
+
+        if out is not None:
+            require_empty(out)
+        with count_progress("sequences", runs * len(CASES)) as advance:
+            result = run_experiment(runs, seed, truncation, observed, advance)
         if out is not None:
             save_pictures(result, out)
         if json:

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from drake_pose.apps.options import Axis
 from drake_pose.errors import SettingsError
 
-METHODS = ("paper",)
+METHODS = ("paper", "wide")
 RootTurns = Literal["fixed", "free"] | Mapping[Axis, tuple[float, float]]
 
 
@@ -31,14 +31,17 @@ class EstimateSettings:
         length_interval: sampling interval of every length [m].
         joint_intervals: sampling intervals of single positions by name [deg or m].
         outside_limit: the paper's r, the area of a segment that may lie outside the silhouette
-            [pixel]; None: found automatically.
-        candidates: the paper's K, how many candidates of a segment are kept.
-        run_limit: after so many runs of step 3 the search of a frame answers with what it has.
+            [pixel]; None: found automatically. Of the method ``paper`` alone.
+        candidates: the paper's K, how many candidates of a segment are kept; ``paper`` alone.
+        run_limit: after so many runs of step 3 the search of a frame answers with what it has;
+            ``paper`` alone.
+        time_limit: after so many seconds the search of a frame answers with what it has; None: no
+            limit. Of the method ``wide`` alone.
         hold: positions that are known, by name [deg or m].
-        method: ``paper``: the search as it was published.
+        method: ``paper``: the search as it was published; ``wide``: many hypotheses side by side.
 
     Raises:
-        SettingsError: if there is no such method.
+        SettingsError: if there is no such method, or a limit belongs to the other one.
     """
 
     cameras: tuple[str, ...] = ()
@@ -52,6 +55,7 @@ class EstimateSettings:
     outside_limit: float | None = None
     candidates: int = 5
     run_limit: int = 10_000
+    time_limit: float | None = None
     hold: Mapping[str, float] = field(default_factory=dict)
     method: str = "paper"
 
@@ -60,6 +64,11 @@ class EstimateSettings:
             raise SettingsError(
                 f"there is no method '{self.method}'; there is: {', '.join(METHODS)}"
             )
+
+        if self.method == "wide" and self.outside_limit is not None:
+            raise SettingsError("the wide search has no outside limit r; leave it out")
+        if self.method == "paper" and self.time_limit is not None:
+            raise SettingsError("the paper's search has no time limit; give a run limit instead")
 
     def as_json(self) -> dict[str, Any]:
         """Returns the settings as plain JSON values."""

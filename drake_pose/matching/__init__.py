@@ -1,8 +1,19 @@
-"""Kameda's matching: silhouettes in, poses out, with no Drake framework in it."""
+"""Silhouettes in, poses out: Kameda's search and the wide search, no Drake framework in them."""
 
 from drake_pose.matching.paper_search import PaperSearch
 from drake_pose.matching.pose_search import PoseSearch
 from drake_pose.matching.result import Candidates, MatchResult, View
 from drake_pose.matching.settings import PaperSearchSettings
+from drake_pose.matching.wide_search import WideSearch
+from drake_pose.matching.wide_settings import WideSearchSettings
 
-__all__ = ["Candidates", "MatchResult", "PaperSearch", "PaperSearchSettings", "PoseSearch", "View"]
+__all__ = [
+    "Candidates",
+    "MatchResult",
+    "PaperSearch",
+    "PaperSearchSettings",
+    "PoseSearch",
+    "View",
+    "WideSearch",
+    "WideSearchSettings",
+]

@@ -12,8 +12,9 @@ MAY_KNOW = {
     "camera": set(),
     "silhouette": {"body", "camera"},
     "matching": {"silhouette", "body", "camera"},
-    "systems": {"matching", "silhouette", "body", "camera"},
-    "apps": {"systems", "matching", "silhouette", "body", "camera"},
+    "filtering": {"matching", "silhouette", "body", "camera"},
+    "systems": {"filtering", "matching", "silhouette", "body", "camera"},
+    "apps": {"systems", "filtering", "matching", "silhouette", "body", "camera"},
 }
 # Drake keeps two plain value types, ImageLabel16I and CameraInfo, in pydrake.systems.sensors.
 VALUE_TYPES = {"camera/models.py", "camera/drake.py", "silhouette/label_images.py"}

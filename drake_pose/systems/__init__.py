@@ -7,12 +7,14 @@ from drake_pose.systems.diagrams import (
 )
 from drake_pose.systems.mask_player import MaskPlayer
 from drake_pose.systems.silhouette_matcher import STATISTICS, SilhouetteMatcher
+from drake_pose.systems.truncated_ekf import TruncatedEkf
 
 __all__ = [
     "STATISTICS",
     "MaskPlayer",
     "MatchingDiagram",
     "SilhouetteMatcher",
+    "TruncatedEkf",
     "build_recorded_matching",
     "build_simulated_matching",
 ]

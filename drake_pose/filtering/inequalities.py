@@ -1,0 +1,294 @@
+"""Linear inequalities phi^T x <= b on a state, each with a name: (14) to (18) of Shimada et al."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.solvers import Binding, MathematicalProgram
+from scipy.optimize import linprog
+
+from drake_pose.body import ArticulatedModel
+from drake_pose.errors import SettingsError, UnknownNameError
+
+# Rows are scaled to unit length, so this is a length in the space of states.
+_SMALLEST_ROOM = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Inequalities:
+    """A stack of rows phi_k^T x <= b_k (18).
+
+    Attributes:
+        columns: (n) the names of the elements of x.
+        rows: (K) what each row says, for messages and logs.
+        phi: (K, n) the rows, read-only.
+        b: (K,) the bounds, read-only.
+    """
+
+    columns: tuple[str, ...]
+    rows: tuple[str, ...]
+    phi: NDArray[np.float64]
+    b: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def margins(self, x: ArrayLike) -> NDArray[np.float64]:
+        """(K,) b - phi x: how far x (n,) is from each bound, negative where it is beyond."""
+        return self.b - self.phi @ np.asarray(x, dtype=np.float64)
+
+    def take(self, indices: Iterable[int]) -> "Inequalities":
+        """The rows of these indices, in that order."""
+        chosen = list(indices)
+        rows = [self.rows[index] for index in chosen]
+        return make_inequalities(self.columns, rows, self.phi[chosen], self.b[chosen])
+
+    def for_columns(self, columns: Sequence[str]) -> "Inequalities":
+        """The same rows for a state with these elements, for example one with rates too.
+
+        Raises:
+            UnknownNameError: a row uses an element that is not there.
+        """
+        known = list(columns)
+        phi = np.zeros((len(self), len(known)))
+        for index, name in enumerate(self.columns):
+            if name in known:
+                phi[:, known.index(name)] = self.phi[:, index]
+            elif self.phi[:, index].any():
+                row = self.rows[int(np.flatnonzero(self.phi[:, index])[0])]
+                raise UnknownNameError("element", name, known, f"the state (row '{row}')")
+        return make_inequalities(known, self.rows, phi, self.b)
+
+    def only_of(self, columns: Sequence[str]) -> "Inequalities":
+        """The rows that use none but these elements, for a state that has these."""
+        absent = [i for i, name in enumerate(self.columns) if name not in columns]
+        kept = np.flatnonzero(~self.phi[:, absent].any(axis=1))
+        return self.take(kept).for_columns(columns)
+
+
+def make_inequalities(
+    columns: Sequence[str], rows: Sequence[str], phi: ArrayLike, b: ArrayLike
+) -> Inequalities:
+    """Inequalities from plain arrays.
+
+    Args:
+        columns: (n) the names of the elements of x.
+        rows: (K) a name for each row.
+        phi: (K, n) the rows.
+        b: (K,) the bounds.
+
+    Raises:
+        SettingsError: sizes that do not fit, a number that is not finite, or a row of zeros.
+    """
+    matrix = np.array(phi, dtype=np.float64).reshape(-1, len(columns))
+    bounds = np.array(b, dtype=np.float64).ravel()
+    if not len(rows) == len(matrix) == len(bounds):
+        raise SettingsError(
+            f"{len(rows)} names, {len(matrix)} rows and {len(bounds)} bounds: give one of each"
+        )
+    for name, row, bound in zip(rows, matrix, bounds, strict=True):
+        if not (np.isfinite(row).all() and np.isfinite(bound)):
+            raise SettingsError(f"inequality '{name}': a number is not finite; leave the row out")
+        if not row.any():
+            raise SettingsError(f"inequality '{name}': all factors are zero; leave the row out")
+    matrix.setflags(write=False)
+    bounds.setflags(write=False)
+    return Inequalities(tuple(columns), tuple(rows), matrix, bounds)
+
+
+def two_sided(
+    columns: Sequence[str],
+    name: str,
+    phi: ArrayLike,
+    lower: float,
+    upper: float,
+) -> Inequalities:
+    """Bounds lower <= phi^T x <= upper as two rows, or as one where the other bound is infinite.
+
+    Args:
+        columns: (n) the names of the elements of x.
+        name: what is bounded.
+        phi: (n,) its factors.
+        lower, upper: the bounds; -inf and inf mean none.
+
+    Raises:
+        SettingsError: the bounds are crossed or NaN, or phi is zero.
+    """
+    if np.isnan(lower) or np.isnan(upper) or lower > upper:
+        raise SettingsError(
+            f"inequality '{name}': lower bound {lower:g} and upper bound {upper:g} are crossed; "
+            "give the lower one first"
+        )
+    row = np.asarray(phi, dtype=np.float64)
+    sides = []
+    if np.isfinite(lower):
+        sides.append((f"{name} >= {lower:.6g}", -row, -lower))
+    if np.isfinite(upper):
+        sides.append((f"{name} <= {upper:.6g}", row, upper))
+    return make_inequalities(
+        columns,
+        [side[0] for side in sides],
+        np.reshape([side[1] for side in sides], (-1, len(columns))),
+        [side[2] for side in sides],
+    )
+
+
+def stack(parts: Sequence[Inequalities], columns: Sequence[str] | None = None) -> Inequalities:
+    """All rows of several sets, over the union of their columns or those given.
+
+    Raises:
+        UnknownNameError: a row uses an element that is not among the given columns.
+    """
+    union = dict.fromkeys(name for part in parts for name in part.columns)
+    names = list(union if columns is None else columns)
+    fitted = [part.for_columns(names) for part in parts]
+    return make_inequalities(
+        names,
+        [row for part in fitted for row in part.rows],
+        np.concatenate([part.phi for part in fitted] or [np.zeros((0, len(names)))]),
+        np.concatenate([part.b for part in fitted] or [np.zeros(0)]),
+    )
+
+
+def from_bounds(
+    names: Sequence[str], lower: ArrayLike, upper: ArrayLike, columns: Sequence[str] | None = None
+) -> Inequalities:
+    """Bounds lower <= x <= upper, element by element; infinite bounds make no row.
+
+    Args:
+        names: (n) the names of the bounded elements.
+        lower, upper: (n,) their bounds.
+        columns: the names of all elements of x; the bounded ones if not given.
+
+    Raises:
+        SettingsError: bounds are crossed.
+        UnknownNameError: a name is not among the columns.
+    """
+    low, high = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
+    unit = np.eye(len(names))
+    parts = [
+        two_sided(names, name, unit[i], float(low[i]), float(high[i]))
+        for i, name in enumerate(names)
+    ]
+    return stack(parts, names if columns is None else columns)
+
+
+def from_model(model: ArticulatedModel) -> Inequalities:
+    """Every finite position limit of a model [rad or m]: (14), and with shape joints (16).
+
+    A joint that turns freely (limits of a full turn, -pi to pi) has no limit to give. A model
+    without any limit gives an empty set.
+    """
+    full_turn = (
+        (np.array(model.position_kinds) == "angle")
+        & (model.lower == -np.pi)
+        & (model.upper == np.pi)
+    )
+    lower = np.where(full_turn, -np.inf, model.lower)
+    upper = np.where(full_turn, np.inf, model.upper)
+    return from_bounds(model.position_names, lower, upper)
+
+
+def from_plant(plant: MultibodyPlant) -> Inequalities:
+    """Every finite position limit of a finalized plant, under the plant's own position names."""
+    names = plant.GetPositionNames(add_model_instance_prefix=False, always_add_suffix=False)
+    if len(set(names)) < len(names):
+        names = plant.GetPositionNames(add_model_instance_prefix=True, always_add_suffix=False)
+    return from_bounds(names, plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits())
+
+
+def from_program(
+    program: MathematicalProgram, columns: Sequence[str] | None = None
+) -> Inequalities:
+    """The linear and bounding-box constraints of a MathematicalProgram.
+
+    Args:
+        program: its decision variables are the elements of x.
+        columns: names for them in the program's order; the variables' own if not given.
+
+    Raises:
+        SettingsError: it has linear equalities (they leave no room to truncate), or there are
+            more or fewer names than variables.
+    """
+    variables = program.decision_variables()
+    names = [v.get_name() for v in variables] if columns is None else list(columns)
+    if len(names) != len(variables):
+        raise SettingsError(
+            f"the program has {len(variables)} decision variables, but {len(names)} names are given"
+        )
+    if program.linear_equality_constraints():
+        raise SettingsError(
+            "the program has linear equality constraints, which leave no room for a covariance; "
+            "eliminate a variable for each"
+        )
+    bindings: list[tuple[str, Binding]] = [
+        *(("linear", binding) for binding in program.linear_constraints()),
+        *(("bounds", binding) for binding in program.bounding_box_constraints()),
+    ]
+    parts = []
+    for number, (kind, binding) in enumerate(bindings):
+        evaluator = binding.evaluator()
+        indices = program.FindDecisionVariableIndices(binding.variables())
+        dense = evaluator.GetDenseA()
+        phi = np.zeros((len(dense), len(names)))
+        for column, index in enumerate(indices):
+            # A variable may occur twice in a binding.
+            phi[:, index] += dense[:, column]
+        label = evaluator.get_description() or f"{kind} {number}"
+        for i, row in enumerate(phi):
+            name = label if len(phi) == 1 else f"{label}[{i}]"
+            lower, upper = evaluator.lower_bound()[i], evaluator.upper_bound()[i]
+            parts.append(two_sided(names, name, row, lower, upper))
+    return stack(parts, names)
+
+
+def row_from_terms(columns: Sequence[str], terms: Mapping[str, float], where: str) -> NDArray:
+    """(n,) the factors of a row given by names.
+
+    Raises:
+        UnknownNameError: a name is not among the columns.
+    """
+    row = np.zeros(len(columns))
+    for name, factor in terms.items():
+        if name not in columns:
+            raise UnknownNameError("joint", name, columns, where)
+        row[list(columns).index(name)] += factor
+    return row
+
+
+def inner_point(inequalities: Inequalities) -> NDArray[np.float64]:
+    """(n,) a point inside all rows, far from each if that is possible.
+
+    The linear program that finds the largest ball inside; where there is none its dual names the
+    rows that clash.
+
+    Raises:
+        SettingsError: no point satisfies all rows with room to spare; the message names the rows
+            that exclude each other.
+    """
+    count, n = inequalities.phi.shape
+    if count == 0:
+        return np.zeros(n)
+    norms = np.linalg.norm(inequalities.phi, axis=1)
+    unit_phi, unit_b = inequalities.phi / norms[:, None], inequalities.b / norms
+    solution = linprog(
+        c=np.r_[np.zeros(n), -1.0],
+        A_ub=np.c_[unit_phi, np.ones(count)],
+        b_ub=unit_b,
+        # A radius above 1 buys nothing and may be unbounded.
+        bounds=[(None, None)] * n + [(None, 1.0)],
+        method="highs",
+    )
+    if solution.x is None:
+        raise SettingsError(f"the inequalities cannot be checked: {solution.message}")
+    radius = float(solution.x[-1])
+    if radius > _SMALLEST_ROOM * max(1.0, float(np.abs(unit_b).max())):
+        return solution.x[:n]
+    weights = np.abs(solution.ineqlin.marginals)
+    clashing = [inequalities.rows[i] for i in np.flatnonzero(weights > 1e-9)]
+    verb = "exclude each other" if radius < 0 else "leave no room between them"
+    raise SettingsError(
+        f"the inequalities {verb}: {'; '.join(clashing)}. Loosen or remove one of them"
+    )

@@ -1,0 +1,130 @@
+"""What a state vector means, and how it moves: (5), (6) and (8) of Shimada et al."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drake_pose.body import ArticulatedModel
+from drake_pose.errors import SettingsError, UnknownNameError
+from drake_pose.filtering.factors import check_moments, factor_of
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class StateLayout:
+    """The elements of a state: what moves, its rates, and what never changes.
+
+    Args:
+        moving: (m) names of what moves at constant velocity but for noise.
+        constant: (k) names of what never changes, for example lengths.
+
+    Raises:
+        SettingsError: a name is given twice.
+    """
+
+    moving: tuple[str, ...]
+    constant: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        repeated = [name for name in self.names if self.names.count(name) > 1]
+        if repeated:
+            raise SettingsError(f"the state's element '{repeated[0]}' is given twice")
+
+    @staticmethod
+    def from_model(model: ArticulatedModel, constant: Sequence[str] = ()) -> "StateLayout":
+        """All positions of a model in the plant's order, those of its shape joints constant.
+
+        Raises:
+            UnknownNameError: a constant is no position of the model.
+        """
+        for name in constant:
+            model.position_index(name)
+        moving = tuple(name for name in model.position_names if name not in constant)
+        return StateLayout(moving, tuple(constant))
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """(n) moving elements, their rates as ``rate_<name>``, constants; n = 2 m + k."""
+        rates = tuple(f"rate_{name}" for name in self.moving)
+        return (*self.moving, *rates, *self.constant)
+
+    def __len__(self) -> int:
+        return 2 * len(self.moving) + len(self.constant)
+
+    def index(self, name: str) -> int:
+        """Where an element stands.
+
+        Raises:
+            UnknownNameError: there is none of that name.
+        """
+        if name not in self.names:
+            raise UnknownNameError("element", name, self.names, "the state")
+        return self.names.index(name)
+
+    def indices(self, names: Sequence[str]) -> NDArray[np.intp]:
+        """Where these elements stand."""
+        return np.array([self.index(name) for name in names], dtype=np.intp)
+
+    def transition(self) -> Array:
+        """(n, n) A of (8): one step at constant velocity."""
+        m = len(self.moving)
+        A = np.eye(len(self))
+        A[:m, m : 2 * m] = np.eye(m)
+        return A
+
+    def process_noise(self, accelerations: Mapping[str, float]) -> Array:
+        """(n, n) U of (6): an acceleration that is constant during each step; 0 for constants.
+
+        Args:
+            accelerations: standard deviation for each moving element [unit per step^2].
+
+        Raises:
+            UnknownNameError: a name does not move.
+            SettingsError: an element is missing, or its deviation is negative or not finite.
+        """
+        m = len(self.moving)
+        U = np.zeros((len(self), len(self)))
+        for name in accelerations:
+            if name not in self.moving:
+                raise UnknownNameError("moving element", name, self.moving, "the state")
+        for i, name in enumerate(self.moving):
+            deviation = accelerations.get(name, -1.0)
+            if not 0 <= deviation < np.inf:
+                raise SettingsError(
+                    f"'{name}' needs the standard deviation of its acceleration, 0 or more"
+                )
+            pair = [i, m + i]
+            U[np.ix_(pair, pair)] = deviation**2 * np.array([[0.25, 0.5], [0.5, 1.0]])
+        return U
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """A normal distribution over a state.
+
+    Attributes:
+        mean: (n,).
+        covariance: (n, n).
+    """
+
+    mean: Array
+    covariance: Array
+
+    def deviations(self) -> Array:
+        """(n,) standard deviations."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+
+def make_belief(mean: ArrayLike, covariance: ArrayLike) -> Belief:
+    """A belief from arrays that are checked.
+
+    Raises:
+        SettingsError: sizes that do not fit, NaN, or a covariance that is indefinite.
+    """
+    q, Q = check_moments(mean, covariance)
+    factor_of(Q)
+    return Belief(q, Q)

@@ -1,0 +1,211 @@
+"""The truncated filter as a Drake system: measurements in, a belief within limits out."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, EventStatus, LeafSystem
+from scipy.stats import chi2
+
+from drake_pose.errors import SettingsError
+from drake_pose.filtering import Belief, FilterState, Hypothesis, TruncatedFilter, make_belief
+
+Array = NDArray[np.float64]
+
+STATISTICS = ("step", "hypotheses", "distance", "count", "lost")
+"""What the elements of the output ``statistics`` are."""
+
+_LOSS_PROBABILITY = 1e-6
+
+
+class TruncatedEkf(LeafSystem):
+    """Estimates a state from measurements, inside linear inequalities.
+
+    .. pydrake_system::
+
+        name: TruncatedEkf
+        input_ports:
+        - measurement (optional)
+        - reset_state (optional)
+        output_ports:
+        - estimated_state
+        - covariance
+        - hypothesis_weights
+        - hypothesis_states
+        - active_limits
+        - statistics
+
+    A periodic update predicts and uses the measurement: NaN where something is occluded; all NaN,
+    or an unconnected port, where a camera is late or missing, which leaves the prediction.
+
+    - ``estimated_state`` (n), ``covariance`` (n x n, row by row): of the heaviest hypothesis.
+    - ``hypothesis_weights`` (cap), ``hypothesis_states`` (cap x n, row by row): the heaviest
+      first, weights 0 and states NaN where there are fewer.
+    - ``active_limits`` (K): 1 where that row of ``filter.inequalities`` cut the best belief.
+    - ``statistics``: see ``STATISTICS``. ``lost`` is 1 while measurements have been as unlikely
+      as one in a million for several steps.
+
+    At the first update, and while the track is lost, the filter starts again from ``reset_state``
+    (n), for example from a matcher, if all its elements are finite; with the covariance of the
+    belief given here.
+
+    Args:
+        belief_filter: says what is estimated, from what, and inside which limits.
+        start: the belief before the first measurement.
+        period: time between two updates [s]; one step of the filter's prediction.
+        offset: time of the first update [s].
+        patience: so many unlikely measurements in a row make a loss.
+
+    Raises:
+        SettingsError: a start that does not fit, a period or patience that is not positive,
+            or a filter that keeps views.
+    """
+
+    def __init__(
+        self,
+        belief_filter: TruncatedFilter,
+        start: Belief,
+        period: float,
+        offset: float = 0.0,
+        patience: int = 3,
+    ) -> None:
+        super().__init__()
+        if not 0 < period < math.inf:
+            raise SettingsError(f"the filter's period must be positive, not {period}")
+        if patience < 1:
+            raise SettingsError(f"patience must be 1 or more, not {patience}")
+        if belief_filter.settings.novelty > 0:
+            raise SettingsError("TruncatedEkf keeps no views: give its filter novelty = 0")
+        self.filter = belief_filter
+        self._start = make_belief(start.mean, start.covariance)
+        self._patience = patience
+        n, m = len(belief_filter.layout), len(belief_filter.observation.names)
+        self._n, self._cap = n, belief_filter.settings.hypothesis_cap
+        first = belief_filter.start(self._start)
+        self._site_shape = first.hypotheses[0].sites.shape
+        self._measurement = self.DeclareVectorInputPort("measurement", m)
+        self._reset = self.DeclareVectorInputPort("reset_state", n)
+        self._belief = self.DeclareDiscreteState(self._pack(first).ravel())
+        # The statistics, and how many unlikely measurements there were in a row.
+        self._record = self.DeclareDiscreteState(np.r_[0.0, 1.0, 0.0, 0.0, 0.0, 0.0])
+        self._active = self.DeclareDiscreteState(np.zeros(max(len(belief_filter.inequalities), 1)))
+        belief = {self.discrete_state_ticket(self._belief)}
+        for name, size, calculate in (
+            ("estimated_state", n, self._calc_state),
+            ("covariance", n * n, self._calc_covariance),
+            ("hypothesis_weights", self._cap, self._calc_weights),
+            ("hypothesis_states", self._cap * n, self._calc_states),
+        ):
+            self.DeclareVectorOutputPort(name, size, calculate, belief)
+        self.DeclareVectorOutputPort(
+            "active_limits",
+            max(len(belief_filter.inequalities), 1),
+            self._calc_active,
+            {self.discrete_state_ticket(self._active)},
+        )
+        self.DeclareVectorOutputPort(
+            "statistics",
+            len(STATISTICS),
+            self._calc_statistics,
+            {self.discrete_state_ticket(self._record)},
+        )
+        self.DeclarePeriodicDiscreteUpdateEvent(period, offset, self._update)
+
+    def filter_state(self, context: Context) -> FilterState:
+        """The filter's state in a context, without its rejections."""
+        step, _, distance, count, _, _ = context.get_discrete_state(self._record).value()
+        hypotheses = []
+        for row in self._rows(context):
+            if row[0] > 0:
+                parts = np.split(row, np.cumsum([1, 1, 1, self._n, self._n**2]))
+                covariance = parts[4].reshape(self._n, self._n)
+                hypotheses.append(
+                    Hypothesis(
+                        Belief(parts[3], covariance),
+                        float(parts[1][0]),
+                        int(parts[2][0]),
+                        parts[5].reshape(self._site_shape),
+                    )
+                )
+        return FilterState(int(step), tuple(hypotheses), (), float(distance), int(count))
+
+    def _pack(self, state: FilterState) -> Array:
+        """(cap, width): alive, log weight, born, mean, covariance, sites of each hypothesis."""
+        width = 3 + self._n + self._n**2 + int(np.prod(self._site_shape))
+        packed = np.zeros((self._cap, width))
+        for row, hypothesis in zip(packed, state.hypotheses, strict=False):
+            belief = hypothesis.belief
+            row[:] = np.concatenate(
+                [
+                    [1.0, hypothesis.log_weight, hypothesis.born],
+                    belief.mean,
+                    belief.covariance.ravel(),
+                    hypothesis.sites.ravel(),
+                ]
+            )
+        return packed
+
+    def _rows(self, context: Context) -> Array:
+        return np.array(context.get_discrete_state(self._belief).value()).reshape(self._cap, -1)
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        state = self.filter_state(context)
+        record = context.get_discrete_state(self._record).value()
+        first, lost, unlikely = record[0] == 0, record[4] > 0, int(record[5])
+        fresh = first
+        if (first or lost) and self._reset.HasValue(context):
+            mean = np.array(self._reset.Eval(context))
+            if np.isfinite(mean).all():
+                state = self.filter.start(Belief(mean, self._start.covariance))
+                fresh, unlikely = True, 0
+        if not fresh:
+            state = self.filter.predict(state)
+        y = np.full(len(self.filter.observation.names), np.nan)
+        if self._measurement.HasValue(context):
+            y = np.array(self._measurement.Eval(context))
+        state = self.filter.update(state, y)
+        if state.count:
+            limit = chi2.ppf(1 - _LOSS_PROBABILITY, state.count)
+            unlikely = unlikely + 1 if state.distance > limit else 0
+        discrete_state.set_value(self._belief, self._pack(state).ravel())
+        discrete_state.set_value(
+            self._record,
+            np.array(
+                [
+                    record[0] + 1,
+                    len(state.hypotheses),
+                    state.distance,
+                    state.count,
+                    float(unlikely >= self._patience),
+                    unlikely,
+                ]
+            ),
+        )
+        names = self.filter.inequalities.rows
+        active = np.isin(names, state.hypotheses[0].active) if names else np.zeros(1)
+        discrete_state.set_value(self._active, active.astype(np.float64))
+        return EventStatus.Succeeded()
+
+    def _calc_state(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._rows(context)[0, 3 : 3 + self._n])
+
+    def _calc_covariance(self, context: Context, output: BasicVector) -> None:
+        start = 3 + self._n
+        output.SetFromVector(self._rows(context)[0, start : start + self._n**2])
+
+    def _calc_weights(self, context: Context, output: BasicVector) -> None:
+        rows = self._rows(context)
+        output.SetFromVector(np.where(rows[:, 0] > 0, np.exp(rows[:, 1]), 0.0))
+
+    def _calc_states(self, context: Context, output: BasicVector) -> None:
+        rows = self._rows(context)
+        states = rows[:, 3 : 3 + self._n]
+        states[rows[:, 0] == 0] = np.nan
+        output.SetFromVector(states.ravel())
+
+    def _calc_active(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(context.get_discrete_state(self._active).value())
+
+    def _calc_statistics(self, context: Context, output: BasicVector) -> None:
+        record = context.get_discrete_state(self._record).value()
+        output.SetFromVector(record[: len(STATISTICS)])

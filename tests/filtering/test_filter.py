@@ -1,0 +1,260 @@
+import numpy as np
+import pytest
+
+from drake_pose.body import bundled_model, load_model
+from drake_pose.errors import SettingsError, UnknownNameError
+from drake_pose.filtering import (
+    Belief,
+    FilterSettings,
+    StateLayout,
+    TruncatedFilter,
+    from_bounds,
+    make_belief,
+    stack,
+    truncate_joint,
+    two_sided,
+    update,
+)
+
+LAYOUT = StateLayout(("angle",), ("length",))
+NAMES = LAYOUT.names  # angle, rate_angle, length
+
+
+class Segment:
+    """A segment seen from the side it swings to: its end at length * (cos, sin) of the angle.
+
+    With ``depth_only`` its end's height alone is seen: length * cos(angle), the same at -angle.
+    """
+
+    def __init__(self, depth_only=False, deviation=0.01):
+        self.depth_only = depth_only
+        self.names = ("u",) if depth_only else ("u", "v")
+        self.variances = np.full(len(self.names), deviation**2)
+        self.wraps = np.zeros(len(self.names), dtype=bool)
+
+    def predict(self, x):
+        angle, _, length = x
+        h = length * np.array([np.cos(angle), np.sin(angle)])
+        H = np.zeros((2, 3))
+        H[:, 0] = length * np.array([-np.sin(angle), np.cos(angle)])
+        H[:, 2] = np.cos(angle), np.sin(angle)
+        return h[: len(self.names)], H[: len(self.names)]
+
+    def mirrors(self, belief):
+        """(30): near angle 0 the end's height hardly depends on the angle."""
+        if not self.depth_only or abs(belief.mean[0]) < 0.02:
+            return []
+        mirrored = belief.mean.copy()
+        mirrored[0] *= -1
+        return [mirrored]
+
+
+class Linear:
+    names = ("a", "b")
+    variances = np.array([0.5, 2.0])
+    wraps = np.zeros(2, dtype=bool)
+    H = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, -1.0]])
+
+    def predict(self, x):
+        return self.H @ x, self.H
+
+    def mirrors(self, belief):
+        return []
+
+
+def random_belief(seed):
+    generator = np.random.default_rng(seed)
+    A = generator.normal(size=(3, 3))
+    return make_belief(generator.normal(size=3), A @ A.T + 0.1 * np.eye(3))
+
+
+@pytest.mark.parametrize("iterations", [1, 10])
+def test_a_linear_measurement_gives_bayes_rule_in_information_form(iterations):
+    for seed in range(5):
+        prior, y = random_belief(seed), np.array([1.0, -2.0])
+        result = update(prior, y, Linear(), iterations)
+        information = (
+            np.linalg.inv(prior.covariance) + Linear.H.T @ np.diag(1 / Linear.variances) @ Linear.H
+        )
+        covariance = np.linalg.inv(information)
+        mean = covariance @ (
+            np.linalg.solve(prior.covariance, prior.mean) + Linear.H.T @ (y / Linear.variances)
+        )
+        np.testing.assert_allclose(result.belief.mean, mean, atol=1e-9)
+        np.testing.assert_allclose(result.belief.covariance, covariance, atol=1e-9)
+        S = Linear.H @ prior.covariance @ Linear.H.T + np.diag(Linear.variances)
+        r = y - Linear.H @ prior.mean
+        expected = -0.5 * (r @ np.linalg.solve(S, r) + np.linalg.slogdet(2 * np.pi * S)[1])
+        assert result.log_likelihood == pytest.approx(expected)
+
+
+def test_what_is_occluded_is_left_out():
+    prior = random_belief(1)
+    one = update(prior, np.array([1.0, np.nan]), Linear())
+    assert one.count == 1
+    nothing = update(prior, np.array([np.nan, np.nan]), Linear())
+    np.testing.assert_allclose(nothing.belief.covariance, prior.covariance, atol=1e-12)
+    np.testing.assert_allclose(nothing.belief.mean, prior.mean)
+
+
+def test_iteration_finds_the_posteriors_largest_density():
+    model = Segment()
+    prior = Belief(np.array([0.2, 0.0, 1.0]), np.diag([1.0, 0.1, 0.3]))
+    y = np.array([0.3, 1.1])
+
+    def cost(x):
+        r = (y - model.predict(x)[0]) / 0.01
+        return r @ r + (x - prior.mean) ** 2 @ (1 / np.diag(prior.covariance))
+
+    result = update(prior, y, model, iterations=20)
+    best = cost(result.belief.mean)
+    generator = np.random.default_rng(0)
+    for size in (1e-1, 1e-2, 1e-3):
+        for step in generator.normal(size=(200, 3)) * size:
+            assert cost(result.belief.mean + step) > best - 1e-3
+    assert cost(update(prior, y, model, 1).belief.mean) > best + 10
+    assert result.distance == pytest.approx(best, rel=1e-3)
+
+
+def test_covariances_stay_positive_definite_when_measurements_are_nearly_exact():
+    model = Segment(deviation=1e-9)
+    belief = Belief(np.array([0.2, 0.0, 1.0]), np.diag([1e4, 1e2, 1e4]))
+    for _ in range(20):
+        belief = update(belief, np.array([np.cos(0.3), np.sin(0.3)]), model, 10).belief
+        np.testing.assert_array_equal(belief.covariance, belief.covariance.T)
+        assert np.linalg.eigvalsh(belief.covariance).min() > -1e-12
+        assert (belief.deviations() > 0).all()
+
+
+def make_filter(model=None, rows=None, **settings):
+    rows = rows or from_bounds(["angle", "length"], [0.0, 0.5], [1.5, 1.5])
+    noise = LAYOUT.process_noise({"angle": 0.02})
+    return TruncatedFilter(LAYOUT, model or Segment(), rows, noise, FilterSettings(**settings))
+
+
+@pytest.mark.parametrize("truncation", ["joint", "sequential", "clip"])
+def test_the_estimate_stays_inside_and_none_does_not(truncation):
+    """A segment that swings against its stop: noise would carry the estimate beyond."""
+    generator = np.random.default_rng(3)
+    hand = make_filter(Segment(deviation=0.2), truncation=truncation)
+    plain = make_filter(Segment(deviation=0.2), truncation="none")
+    start = Belief(np.array([0.3, 0.0, 1.0]), np.diag([0.5, 0.01, 0.2]))
+    states = [hand.start(start), plain.start(start)]
+    beyond = 0
+    for _ in range(60):
+        y = np.array([1.0, 0.0]) + 0.2 * generator.normal(size=2)
+        states = [f.update(f.predict(s), y) for f, s in zip((hand, plain), states, strict=True)]
+        assert (hand.inequalities.margins(states[0].best.mean) > -1e-9).all()
+        beyond += (plain.inequalities.margins(states[1].best.mean) < 0).any()
+    assert beyond > 10
+    assert truncation == "clip" or states[0].hypotheses[0].active
+
+
+def test_figure_9_two_hypotheses_are_born_and_a_constraint_kills_the_wrong_one():
+    """The angle's sign cannot be seen; a limit on the angle knows it, once it is far enough."""
+    rows = from_bounds(["angle", "length"], [-0.15, 0.9], [1.5, 1.1])
+    f = make_filter(Segment(depth_only=True, deviation=0.002), rows, reject_below=-2.0)
+    state = f.start(Belief(np.array([0.05, 0.02, 1.0]), np.diag([0.02, 1e-3, 1e-6])))
+    history, killed = [], []
+    for t in range(1, 26):
+        angle = 0.05 + 0.02 * t
+        state = f.update(f.predict(state), np.array([np.cos(angle)]))
+        history.append(len(state.hypotheses))
+        killed += [r for r in state.rejections if r.reason == "constraint"]
+    assert max(history) >= 2
+    assert history[-1] == 1
+    assert state.best.mean[0] == pytest.approx(angle, abs=0.05)
+    assert killed
+    assert all(r.row.startswith("angle >= -0.15") and r.c < -2 for r in killed)
+
+
+def test_weights_add_up_and_the_cap_holds():
+    rows = from_bounds(["angle", "length"], [-1.5, 0.9], [1.5, 1.1])
+    f = make_filter(Segment(depth_only=True, deviation=0.002), rows, hypothesis_cap=2)
+    state = f.start(Belief(np.array([0.3, 0.0, 1.0]), np.diag([0.2, 1e-3, 1e-6])))
+    for _ in range(10):
+        state = f.update(f.predict(state), np.array([np.cos(0.4)]))
+        assert sum(h.weight for h in state.hypotheses) == pytest.approx(1.0)
+        assert len(state.hypotheses) <= 2
+    assert len(state.hypotheses) == 2
+    angles = sorted(h.belief.mean[0] for h in state.hypotheses)
+    np.testing.assert_allclose(angles, [-0.4, 0.4], atol=0.05)
+    assert make_filter(hypothesis_cap=1).update(state, np.full(2, np.nan)).hypotheses
+
+
+def test_what_limits_say_of_a_constant_is_counted_once():
+    """Nothing is measured: however many steps, the belief about the length stays as it was."""
+    f = make_filter(rows=from_bounds(["length"], [0.9], [1.1]))
+    start = Belief(np.array([0.0, 0.0, 1.05]), np.diag([0.1, 0.01, 0.04]))
+    state = f.start(start)
+    once = truncate_joint(start.mean, start.covariance, f.inequalities)
+    for _ in range(30):
+        state = f.update(f.predict(state), np.full(2, np.nan))
+    assert state.best.mean[2] == pytest.approx(once.mean[2], abs=1e-6)
+    assert state.best.covariance[2, 2] == pytest.approx(once.covariance[2, 2], rel=1e-4)
+    paper = make_filter(rows=from_bounds(["length"], [0.9], [1.1]), truncation="sequential")
+    shrinking = paper.start(start)
+    for _ in range(30):
+        shrinking = paper.update(paper.predict(shrinking), np.full(2, np.nan))
+    assert shrinking.best.covariance[2, 2] < 0.5 * once.covariance[2, 2]
+
+
+def test_transition_and_noise():
+    layout = StateLayout(("a", "b"), ("c",))
+    x = np.array([1.0, 2, 0.1, 0.2, 5])
+    np.testing.assert_allclose(layout.transition() @ x, [1.1, 2.2, 0.1, 0.2, 5])
+    U = layout.process_noise({"a": 2.0, "b": 0.0})
+    # An acceleration u over one step moves a by u / 2 and its rate by u.
+    g = np.array([0.5, 0, 1, 0, 0])
+    np.testing.assert_allclose(U, 4 * np.outer(g, g))
+
+
+def test_a_layout_from_a_model():
+    model = load_model(bundled_model("two_finger_hand"), check=False)
+    layout = StateLayout.from_model(model, constant=["length_11", "palm_width"])
+    assert layout.constant == ("length_11", "palm_width")
+    assert "rate_flexion_11" in layout.names
+    assert "rate_length_11" not in layout.names
+    assert len(layout) == 2 * (len(model.position_names) - 2) + 2
+    with pytest.raises(UnknownNameError, match="length_99"):
+        StateLayout.from_model(model, constant=["length_99"])
+
+
+@pytest.mark.parametrize(
+    ("make", "word"),
+    [
+        (lambda: update(random_belief(0), np.zeros(3), Linear()), "measures 2"),
+        (lambda: update(random_belief(0), np.array([0, np.inf]), Linear()), "'b' is infinite"),
+        (lambda: make_filter().start(Belief(np.zeros(3), np.full((3, 3), np.nan))), "NaN"),
+        (lambda: make_filter().start(Belief(np.zeros(2), np.eye(2))), "3"),
+        (lambda: make_filter().start(Belief(np.ones(3), -np.eye(3))), "indefinite"),
+        (lambda: make_filter(truncation="x"), "truncation"),
+        (lambda: make_filter(iterations=0), "iterations"),
+        (lambda: make_filter(reject_below=1.0), "reject_below"),
+        (lambda: LAYOUT.process_noise({"angle": -1.0}), "'angle'"),
+        (lambda: LAYOUT.process_noise({}), "'angle'"),
+        (lambda: LAYOUT.process_noise({"length": 1.0}), "length"),
+        (lambda: StateLayout(("a", "a"), ()), "'a'"),
+        (
+            lambda: TruncatedFilter(
+                LAYOUT, Segment(), from_bounds(["angle"], [0], [1]), -np.eye(3)
+            ),
+            "indefinite",
+        ),
+        (
+            lambda: make_filter(
+                rows=stack(
+                    [
+                        from_bounds(["angle"], [0], [1]),
+                        two_sided(["angle"], "stop", [1.0], 2.0, np.inf),
+                    ]
+                )
+            ),
+            "stop",
+        ),
+        (lambda: make_filter(rows=from_bounds(["elbow"], [0], [1])), "elbow"),
+    ],
+)
+def test_bad_input_is_named(make, word):
+    with pytest.raises((SettingsError, UnknownNameError), match=word):
+        make()

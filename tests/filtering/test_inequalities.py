@@ -1,0 +1,224 @@
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.solvers import MathematicalProgram
+
+from drake_pose.body import bundled_model, load_model
+from drake_pose.errors import ModelError, SettingsError, UnknownNameError
+from drake_pose.filtering import (
+    couplings_file,
+    from_bounds,
+    from_model,
+    from_plant,
+    from_program,
+    inner_point,
+    load_couplings,
+    make_inequalities,
+    model_inequalities,
+    stack,
+    two_sided,
+)
+
+HAND = bundled_model("two_finger_hand")
+FREE_AND_LIMITED = """<robot name="r">
+<link name="base"><visual><geometry><box size="1 1 1"/></geometry></visual></link>
+<link name="free"/><link name="limited"/>
+<joint name="turns" type="continuous"><parent link="base"/><child link="free"/>
+<axis xyz="0 0 1"/></joint>
+<joint name="bends" type="revolute"><parent link="base"/><child link="limited"/>
+<axis xyz="0 0 1"/><limit lower="-1" upper="2" effort="1" velocity="1"/></joint></robot>"""
+
+
+@pytest.fixture(scope="module")
+def hand():
+    return load_model(HAND)
+
+
+def test_every_limit_of_the_hand_is_a_pair_of_rows_named_after_its_joint(hand):
+    rows = from_model(hand)
+    # The palm floats: its pose has no limits.
+    assert hand.position_names[:7] == tuple(f"palm_{c}" for c in ("qw", "qx", "qy", "qz", *"xyz"))
+    assert len(rows) == 2 * (len(hand.position_names) - 7)
+    inside = np.r_[np.zeros(7), 0.5 * (hand.lower[7:] + hand.upper[7:])]
+    assert (rows.margins(inside) > 0).all()
+    for index, name in list(enumerate(hand.position_names))[7:]:
+        beyond = inside.copy()
+        beyond[index] = hand.upper[index] + 0.01
+        margins = rows.margins(beyond)
+        (k,) = np.flatnonzero(margins < 0)
+        assert rows.rows[k].startswith(f"{name} <=")
+        assert margins[k] == pytest.approx(-0.01)
+
+
+def test_table_1(hand):
+    """Every row of table 1, by poses and lengths just inside and just outside of it."""
+    rows = model_inequalities(hand)
+    # 10 couplings: 2 flexion pairs and one across, 2 + 2 + 3 of lengths; each two-sided.
+    assert len(rows) == 2 * (len(hand.position_names) - 7) + 20
+    inside = np.r_[np.zeros(7), 0.5 * (hand.lower[7:] + hand.upper[7:])]
+    middle = dict(zip(rows.columns, inside, strict=True))
+    # Lengths in the middle of the set, not of each interval.
+    middle.update(
+        {f"length_{i}{j}": [0.062, 0.040, 0.037][j - 1] for i in (1, 2) for j in (1, 2, 3)}
+    )
+    degree = np.pi / 180
+    cases = [
+        ("flexion_12", "flexion_13", -10 * degree, 10 * degree),
+        ("flexion_22", "flexion_23", -10 * degree, 10 * degree),
+        ("flexion_11", "flexion_21", -35 * degree, 35 * degree),
+        ("length_21", "length_22", 0.0, 0.030),
+        ("length_12", "length_13", -0.010, 0.010),
+        ("length_13", "length_23", -0.005, 0.005),
+    ]
+
+    def satisfied(changes):
+        x = np.array([{**middle, **changes}[name] for name in rows.columns])
+        names = set(changes)
+        chosen = [k for k, row in enumerate(rows.phi) if np.count_nonzero(row) == 2]
+        used = [{rows.columns[i] for i in np.flatnonzero(rows.phi[k])} for k in chosen]
+        mine = [k for k, columns in zip(chosen, used, strict=True) if columns == names]
+        assert len(mine) == 2
+        return bool((rows.margins(x)[mine] >= 0).all())
+
+    for first, second, lower, upper in cases:
+        for bound, outward in ((lower, -1), (upper, 1)):
+            base = middle[second]
+            assert satisfied({first: base + bound - outward * 1e-6, second: base})
+            assert not satisfied({first: base + bound + outward * 1e-6, second: base})
+
+
+def test_model_and_plant_give_the_same_rows(hand):
+    plant = MultibodyPlant(0.0)
+    Parser(plant).AddModels(str(HAND))
+    plant.Finalize()
+    ours, theirs = from_model(hand), from_plant(plant)
+    assert set(ours.rows) == set(theirs.rows)
+
+
+def test_a_joint_that_turns_freely_has_no_row(tmp_path):
+    file = tmp_path / "r.urdf"
+    file.write_text(FREE_AND_LIMITED)
+    rows = from_model(load_model(file))
+    assert rows.rows == ("bends >= -1", "bends <= 2")
+
+
+def test_a_program_gives_its_linear_and_bounding_box_rows():
+    program = MathematicalProgram()
+    x = program.NewContinuousVariables(3, "x")
+    program.AddBoundingBoxConstraint([-1, -np.inf], [2, 3], x[[2, 0]])
+    program.AddLinearConstraint(np.array([[1.0, -2.0]]), [-np.inf], [0.5], x[[1, 2]])
+    program.AddLinearConstraint(x[0] + x[1] <= 4)
+    rows = from_program(program)
+    generator = np.random.default_rng(0)
+    for point in generator.uniform(-4, 5, size=(500, 3)):
+        expected = program.CheckSatisfied(program.GetAllConstraints(), point)
+        assert (rows.margins(point) >= 0).all() == expected
+
+
+def test_a_program_with_equalities_is_refused():
+    program = MathematicalProgram()
+    x = program.NewContinuousVariables(2, "x")
+    program.AddLinearEqualityConstraint(x[0] + x[1], 1)
+    with pytest.raises(SettingsError, match="equality"):
+        from_program(program)
+
+
+def test_the_rows_that_clash_are_named_and_no_others():
+    rows = stack(
+        [
+            from_bounds(["a", "b", "c"], [0, 0, 0], [1, 1, 1]),
+            two_sided(["a", "b"], "a + b", [1, 1], 2.5, np.inf),
+            two_sided(["b", "c"], "b - c", [1, -1], -0.5, 0.5),
+        ]
+    )
+    with pytest.raises(SettingsError) as caught:
+        inner_point(rows)
+    message = str(caught.value)
+    assert "exclude each other" in message
+    for name in ("a <= 1", "b <= 1", "a + b >= 2.5"):
+        assert name in message
+    assert "b - c" not in message
+    assert ">= 0" not in message
+
+
+def test_rows_without_room_are_refused():
+    with pytest.raises(SettingsError, match="leave no room"):
+        inner_point(from_bounds(["a", "b"], [0, 1], [1, 1]))
+
+
+def test_the_inner_point_is_inside_and_no_rows_are_allowed():
+    rows = from_bounds(["a", "b"], [0, -np.inf], [1, -5])
+    assert (rows.margins(inner_point(rows)) > 0).all()
+    np.testing.assert_array_equal(inner_point(from_bounds(["a"], [-np.inf], [np.inf])), [0.0])
+
+
+def test_a_larger_state_and_a_smaller_one():
+    rows = from_bounds(["a", "b"], [0, 1], [2, 3])
+    larger = rows.for_columns(["rate", "b", "a"])
+    np.testing.assert_allclose(larger.margins([99, 1.5, 0.5]), rows.margins([0.5, 1.5]))
+    assert rows.only_of(["b", "c"]).rows == ("b >= 1", "b <= 3")
+    with pytest.raises(UnknownNameError, match="'a'"):
+        rows.for_columns(["b"])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("differences: [{first: a, second: x, within: 1}]", ["no joint 'x'"]),
+        ("differences: [{first: a, second: a, within: 1}]", ["two different"]),
+        ("differences: [{first: a, second: b}]", ["nothing is bounded"]),
+        ("differences: [{first: a, second: b, within: 1, lower: 0}]", ["either within"]),
+        ("differences: [{first: a, second: b, lower: 1, upper: 0}]", ["a - b", "crossed"]),
+        ("differences: [{first: a, second: b, within: 1, unit: ft}]", ["'ft'", "deg"]),
+        ("differences: [{first: a, other: b, within: 1}]", ["not a couplings file"]),
+        ("rows: [{name: r, terms: {a: .nan}, upper: 1}]", ["'r'", "finite"]),
+        ("rows: 3", ["not a couplings file"]),
+        ("- [", ["not a couplings file"]),
+        ("3", ["not a couplings file"]),
+    ],
+)
+def test_bad_couplings_files_are_named(tmp_path, text, words):
+    file = tmp_path / "bad.couplings.yaml"
+    file.write_text(text)
+    with pytest.raises((ModelError, UnknownNameError)) as caught:
+        load_couplings(file, ["a", "b"])
+    for word in ["bad.couplings.yaml", *words]:
+        assert word in str(caught.value)
+
+
+def test_units_of_couplings(tmp_path):
+    file = tmp_path / "c.yaml"
+    file.write_text("rows: [{name: r, terms: {a: 2, b: 1}, lower: -90, unit: deg}]")
+    rows = load_couplings(file, ["a", "b"])
+    np.testing.assert_allclose(rows.phi, [[-2, -1]])
+    np.testing.assert_allclose(rows.b, [np.pi / 2])
+
+
+def test_crossed_couplings_of_a_model_are_refused(tmp_path):
+    file = tmp_path / "r.urdf"
+    file.write_text(FREE_AND_LIMITED)
+    couplings_file(file).write_text("rows: [{name: far, terms: {bends: 1}, lower: 3}]")
+    with pytest.raises(SettingsError, match=r"bends <= 2; far >= 3|far >= 3; bends <= 2"):
+        model_inequalities(load_model(file))
+
+
+def test_bad_arrays_are_refused():
+    with pytest.raises(SettingsError, match=r"'r'.*finite"):
+        make_inequalities(["a"], ["r"], [[1.0]], [np.inf])
+    with pytest.raises(SettingsError, match=r"'r'.*zero"):
+        make_inequalities(["a"], ["r"], [[0.0]], [1.0])
+    with pytest.raises(SettingsError, match="give one of each"):
+        make_inequalities(["a"], ["r"], [[0.0]], [1.0, 2.0])
+    with pytest.raises(SettingsError, match="crossed"):
+        from_bounds(["a"], [2], [1])
+
+
+def test_the_hand_is_what_its_script_writes(tmp_path):
+    script = HAND.parent / "make_two_finger_hand.py"
+    subprocess.run([sys.executable, str(script), "--out", str(tmp_path)], check=True)
+    for name in ("two_finger_hand.urdf", "two_finger_hand.couplings.yaml"):
+        assert (tmp_path / name).read_bytes() == (HAND.parent / name).read_bytes()

@@ -1,5 +1,12 @@
 """What is looked at: links, joints, limits and surfaces of an articulated object."""
 
+from drake_pose.body.landmarks import (
+    Landmark,
+    NodeLandmarks,
+    landmark_positions,
+    landmarks_of_nodes,
+    load_landmarks,
+)
 from drake_pose.body.mesh import TriangleMesh
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.body.packages import bundled_model, package_map
@@ -10,7 +17,9 @@ from drake_pose.body.root import RootRotation
 __all__ = [
     "ArticulatedModel",
     "JointReport",
+    "Landmark",
     "ModelReport",
+    "NodeLandmarks",
     "NodeReport",
     "PoseTree",
     "PoseTreeNode",
@@ -18,6 +27,9 @@ __all__ = [
     "TriangleMesh",
     "bundled_model",
     "describe_model",
+    "landmark_positions",
+    "landmarks_of_nodes",
+    "load_landmarks",
     "load_model",
     "package_map",
 ]

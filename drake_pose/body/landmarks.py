@@ -1,0 +1,198 @@
+"""Anatomical landmarks of a model: named points fixed to its links, from ``landmarks.yaml``."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from drake_pose.body.link_graph import PlantKinematics, build_link_graph
+from drake_pose.body.model import ArticulatedModel
+from drake_pose.body.pose_tree import PoseTree
+from drake_pose.errors import ModelError, SettingsError, UnknownNameError
+
+_LARGEST_FILE = 1 << 20
+
+
+class Landmark(NamedTuple):
+    """A point of the object.
+
+    Attributes:
+        link: the link it is fixed to.
+        point: (3,) where it is in the link's frame [m].
+    """
+
+    link: str
+    point: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class NodeLandmarks:
+    """Landmarks given in the frames of a pose tree's nodes.
+
+    Attributes:
+        names: of the landmarks.
+        nodes: (n,) index of each one's node.
+        points: (n, 3) where each is in its node's frame N [m].
+    """
+
+    names: tuple[str, ...]
+    nodes: NDArray[np.int64]
+    points: NDArray[np.float64]
+
+    def positions(self, X_WN: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The landmarks (..., n, 3) in the world [m], given X_WN (..., nodes, 4, 4)."""
+        X = np.asarray(X_WN, dtype=np.float64)[..., self.nodes, :, :]
+        turned = np.einsum("...nij,nj->...ni", X[..., :3, :3], self.points)
+        return np.asarray(turned + X[..., :3, 3])
+
+
+class _UniqueKeyLoader(yaml.SafeLoader):
+    """A safe loader that refuses a key given twice (PyYAML silently keeps the last one)."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """The mapping, all of whose keys differ."""
+        mapping = super().construct_mapping(node, deep=deep)
+        if len(mapping) != len(node.value):
+            raise yaml.constructor.ConstructorError(
+                None, None, "a key is given twice", node.start_mark
+            )
+        return mapping
+
+
+def landmarks_file(model_path: Path | str) -> Path:
+    """Where a model's landmarks are looked for: ``landmarks.yaml`` beside the model file."""
+    return Path(model_path).with_name("landmarks.yaml")
+
+
+def load_landmarks(model_path: Path | str) -> dict[str, Landmark]:
+    """Read the landmarks beside a model file.
+
+    The file maps each name to a link and a point in that link's frame [m]::
+
+        landmarks:
+          left_elbow: {link: left_forearm, point: [0, 0, 0]}
+
+    Args:
+        model_path: the model file; the landmarks are in ``landmarks.yaml`` in its folder.
+
+    Raises:
+        ModelError: the file cannot be read; the message names it and the entry.
+    """
+    file = landmarks_file(model_path)
+    content = _read(file)
+    entries = content.get("landmarks") if isinstance(content, dict) else None
+    if not isinstance(entries, dict) or not entries or set(content) != {"landmarks"}:
+        raise ModelError(f"{file}: one mapping 'landmarks' with at least one entry is expected")
+    return {str(name): _landmark(entry, f"{file}: '{name}'") for name, entry in entries.items()}
+
+
+def landmark_positions(
+    model: ArticulatedModel,
+    landmarks: Mapping[str, Landmark],
+    q: NDArray[np.float64],
+    X_WB: NDArray[np.float64] | None = None,
+) -> NDArray[np.float64]:
+    """The landmarks (n, 3) in the world [m], in the mapping's order.
+
+    Args:
+        model: the model.
+        landmarks: as load_landmarks gives them.
+        q: (nq,) the plant's positions.
+        X_WB: (4, 4) pose of the plant's world frame in the world; None for the identity.
+
+    Raises:
+        SettingsError: q of the wrong size or not finite.
+        UnknownNameError: a landmark's link does not exist.
+    """
+    positions = np.asarray(q, dtype=np.float64)
+    count = len(model.position_names)
+    if positions.shape != (count,) or not np.all(np.isfinite(positions)):
+        raise SettingsError(f"{model.path}: q must be {count} finite numbers")
+    bodies = [_body(model, name, landmark.link) for name, landmark in landmarks.items()]
+    kinematics = PlantKinematics(model)
+    points = np.empty((len(landmarks), 3))
+    for row, (body, landmark) in enumerate(zip(bodies, landmarks.values(), strict=True)):
+        X = kinematics.pose_at(body, positions)
+        points[row] = X[:3, :3] @ landmark.point + X[:3, 3]
+    return points if X_WB is None else points @ X_WB[:3, :3].T + X_WB[:3, 3]
+
+
+def landmarks_of_nodes(tree: PoseTree, landmarks: Mapping[str, Landmark]) -> NodeLandmarks:
+    """The landmarks in the frames of a tree's nodes, for many poses at little cost.
+
+    Args:
+        tree: the tree.
+        landmarks: as load_landmarks gives them; a link may be welded to a node's link.
+
+    Raises:
+        UnknownNameError: a landmark's link does not exist.
+        ModelError: it moves with no node of the tree, because nothing of it is seen.
+    """
+    model = tree.model
+    graph = build_link_graph(model, tree.root if tree.root in model.link_meshes else None)
+    node_of_group = {graph.group_of(node.name): index for index, node in enumerate(tree.nodes)}
+    kinematics = PlantKinematics(model)
+    nodes, points = [], []
+    for name, landmark in landmarks.items():
+        body = _body(model, name, landmark.link)
+        group = graph.group_of(landmark.link)
+        if group not in node_of_group:
+            raise ModelError(
+                f"{model.path}: landmark '{name}' is on link '{landmark.link}', which moves with "
+                f"no part that is seen; use one of {', '.join(node.name for node in tree.nodes)}"
+            )
+        nodes.append(node_of_group[group])
+        X_BN = kinematics.pose(model.link_index(tree.nodes[nodes[-1]].name))
+        X_BL = kinematics.pose(body)
+        p_B = X_BL[:3, :3] @ landmark.point + X_BL[:3, 3]
+        points.append(X_BN[:3, :3].T @ (p_B - X_BN[:3, 3]))
+    return NodeLandmarks(
+        tuple(landmarks), np.array(nodes, dtype=np.int64), np.array(points).reshape(-1, 3)
+    )
+
+
+def _body(model: ArticulatedModel, name: str, link: str) -> int:
+    """The index of a landmark's link among the plant's bodies."""
+    if link not in model.link_names:
+        where = f"{landmarks_file(model.path)}: '{name}': {model.path.name}"
+        raise UnknownNameError("link", link, model.link_names, where)
+    return model.link_index(link)
+
+
+def _read(file: Path) -> Any:
+    """The file's content, plain values only."""
+    try:
+        with file.open("rb") as stream:
+            data = stream.read(_LARGEST_FILE + 1)
+    except OSError as error:
+        raise ModelError(f"{file}: cannot read the landmarks: {error.strerror}") from error
+    if len(data) > _LARGEST_FILE:
+        raise ModelError(f"{file}: larger than {_LARGEST_FILE} bytes, which is no landmarks file")
+    try:
+        # The loader derives from yaml.SafeLoader.
+        return yaml.load(data, Loader=_UniqueKeyLoader)
+    except (yaml.YAMLError, ValueError, TypeError) as error:
+        raise ModelError(f"{file}: not a YAML file: {' '.join(str(error).split())}") from error
+    except RecursionError:
+        raise ModelError(f"{file}: nested too deeply") from None
+
+
+def _landmark(entry: Any, where: str) -> Landmark:
+    """One entry, after checks."""
+    if not isinstance(entry, dict) or set(entry) != {"link", "point"}:
+        raise ModelError(f"{where}: give {{link: NAME, point: [x, y, z]}}")
+    link, point = entry["link"], entry["point"]
+    if not isinstance(link, str) or not link:
+        raise ModelError(f"{where}: link must be a link's name, not {link!r}")
+    numbers = isinstance(point, list) and all(
+        isinstance(value, int | float) and not isinstance(value, bool) for value in point
+    )
+    if not numbers or len(point) != 3 or not np.all(np.isfinite(np.array(point, dtype=float))):
+        raise ModelError(f"{where}: point must be three finite numbers [m], not {point!r}")
+    array = np.array(point, dtype=np.float64)
+    array.setflags(write=False)
+    return Landmark(link, array)

@@ -1,0 +1,179 @@
+"""Landmarks: the bundled models' against Drake, in pose trees, and files that are wrong."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drake_pose.body import bundled_model, load_model
+from drake_pose.body.landmarks import (
+    Landmark,
+    landmark_positions,
+    landmarks_file,
+    landmarks_of_nodes,
+    load_landmarks,
+)
+from drake_pose.errors import ModelError, SettingsError, UnknownNameError
+from tests.body.models import FLOATING_URDF, write
+
+JOINT_CENTRES = {
+    "head_top",
+    "neck",
+    *(
+        f"{side}_{name}"
+        for side in ("left", "right")
+        for name in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+    ),
+}
+BODIES = [
+    bundled_model("woman"),
+    bundled_model("man"),
+    bundled_model("person"),
+    bundled_model("person").with_name("person_shape.urdf"),
+]
+# ANSUR II means of women and men, and half-way between [mm]: lengths that landmarks span.
+LENGTHS = {
+    "woman": {"forearm": 241.3, "stature": 1628.5, "ankle": 62.7, "knee": 465.9},
+    "man": {"forearm": 267.9, "stature": 1756.2, "ankle": 72.9, "knee": 491.7},
+    "person": {"forearm": 254.6, "stature": 1692.35, "ankle": 67.8, "knee": 478.8},
+}
+
+
+def by_drake(path: Path, q: np.ndarray) -> dict[str, np.ndarray]:
+    """Each landmark by Drake's own CalcPointsPositions."""
+    plant = load_model(path, check=False).plant
+    context = plant.CreateDefaultContext()
+    plant.SetPositions(context, q)
+    return {
+        name: plant.CalcPointsPositions(
+            context, plant.GetBodyByName(link).body_frame(), point, plant.world_frame()
+        ).ravel()
+        for name, (link, point) in load_landmarks(path).items()
+    }
+
+
+@pytest.mark.parametrize("path", BODIES, ids=lambda path: path.stem)
+def test_bundled_landmarks_are_where_drake_puts_them(path: Path) -> None:
+    model = load_model(path, check=False)
+    landmarks = load_landmarks(path)
+    assert set(landmarks) == JOINT_CENTRES
+    rng = np.random.default_rng(1)
+    for _ in range(3):
+        q = rng.uniform(model.lower, model.upper)
+        found = landmark_positions(model, landmarks, q)
+        np.testing.assert_allclose(found, list(by_drake(path, q).values()), atol=1e-12)
+
+
+def test_names_are_those_of_the_recorded_truth(shared_data: Path) -> None:
+    with (shared_data / "human_four_views" / "joint_centres.csv").open() as file:
+        recorded = {row["joint"] for row in csv.DictReader(file)}
+    assert recorded == JOINT_CENTRES
+
+
+@pytest.mark.parametrize("path", BODIES, ids=lambda path: path.stem)
+def test_bundled_landmarks_span_the_measured_lengths(path: Path) -> None:
+    model = load_model(path, check=False)
+    landmarks = load_landmarks(path)
+    zero = np.zeros(len(model.position_names))
+    at = dict(zip(landmarks, landmark_positions(model, landmarks, zero) * 1e3, strict=True))
+    measured = LENGTHS[path.parent.name]
+    floor = at["head_top"][2] - measured["stature"]
+    for side in ("left", "right"):
+        assert at[f"{side}_ankle"][2] - floor == pytest.approx(measured["ankle"], abs=2.0)
+        assert at[f"{side}_knee"][2] - floor == pytest.approx(measured["knee"], abs=2.0)
+        drop = at[f"{side}_elbow"][2] - at[f"{side}_wrist"][2]
+        assert drop == pytest.approx(measured["forearm"], abs=2.0)
+    assert at["left_wrist"][1] > 100 > -100 > at["right_wrist"][1]
+
+
+@pytest.mark.parametrize("root", [None, "left_shin"])
+def test_a_tree_carries_them_like_the_plant(root: str | None) -> None:
+    path = BODIES[2]
+    model = load_model(path, check=False)
+    landmarks = load_landmarks(path)
+    tree = model.pose_tree(root, root_position=None if root is None else [0.3, -0.2, 0.5])
+    placed = landmarks_of_nodes(tree, landmarks)
+    assert placed.names == tuple(landmarks)
+    rng = np.random.default_rng(2)
+    values = tree.default_values()
+    if root is None:
+        values = tree.values_from_positions(rng.uniform(model.lower, model.upper))
+    X_WN = tree.node_poses(values)
+    q, X_WB = tree.positions_from(values)
+    expected = landmark_positions(model, landmarks, q, X_WB)
+    np.testing.assert_allclose(placed.positions(X_WN), expected, atol=1e-9)
+    batch = placed.positions(np.stack([X_WN, X_WN]))
+    np.testing.assert_allclose(batch, [expected, expected], atol=1e-9)
+
+
+def test_welded_links_and_a_moved_world(tmp_path: Path) -> None:
+    model = load_model(write(tmp_path, FLOATING_URDF), check=False)
+    landmarks = {"tip": Landmark("welded", np.array([0.1, 0.0, 0.2]))}
+    tree = model.pose_tree()
+    placed = landmarks_of_nodes(tree, landmarks)
+    assert tree.nodes[placed.nodes[0]].name == "hand"
+    q = np.array(model.default_positions)
+    here = landmark_positions(model, landmarks, q)
+    X_WB = np.array([[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
+    moved = landmark_positions(model, landmarks, q, X_WB)
+    np.testing.assert_allclose(moved[0], [1 - here[0, 1], 2 + here[0, 0], 3 + here[0, 2]])
+    assert landmark_positions(model, {}, q).shape == (0, 3)
+    assert landmarks_of_nodes(tree, {}).positions(tree.node_poses(tree.default_values())).size == 0
+
+
+def test_what_moves_with_nothing_seen_is_refused(tmp_path: Path) -> None:
+    model = load_model(write(tmp_path, FLOATING_URDF), check=False)
+    with pytest.raises(ModelError, match="'end' is on link 'toe', which moves with no part"):
+        landmarks_of_nodes(model.pose_tree(), {"end": Landmark("toe", np.zeros(3))})
+
+
+def test_unknown_links_and_bad_positions_are_named(tmp_path: Path) -> None:
+    model = load_model(write(tmp_path, FLOATING_URDF), check=False)
+    wrong = {"elbow": Landmark("elbow_link", np.zeros(3))}
+    q = np.array(model.default_positions)
+    with pytest.raises(UnknownNameError, match=r"landmarks.yaml: 'elbow'.*no link 'elbow_link'"):
+        landmark_positions(model, wrong, q)
+    with pytest.raises(UnknownNameError, match=r"'elbow'.*no link 'elbow_link'"):
+        landmarks_of_nodes(model.pose_tree(), wrong)
+    for bad in (q[:-1], np.full_like(q, np.nan)):
+        with pytest.raises(SettingsError, match="finite numbers"):
+            landmark_positions(model, {}, bad)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("", "one mapping 'landmarks'"),
+        ("landmarks: {}", "one mapping 'landmarks'"),
+        ("landmarks: [1, 2]", "one mapping 'landmarks'"),
+        ("landmarks: {a: {link: b, point: [0, 0, 0]}}\nother: 1", "one mapping 'landmarks'"),
+        ("landmarks: {a: 3}", "'a': give"),
+        ("landmarks: {a: {link: b}}", "'a': give"),
+        ("landmarks: {a: {link: b, point: [0, 0, 0], more: 1}}", "'a': give"),
+        ("landmarks: {a: {link: 3, point: [0, 0, 0]}}", "'a': link"),
+        ("landmarks: {a: {link: '', point: [0, 0, 0]}}", "'a': link"),
+        ("landmarks: {a: {link: b, point: [0, 0]}}", "'a': point"),
+        ("landmarks: {a: {link: b, point: [0, 0, .nan]}}", "'a': point"),
+        ("landmarks: {a: {link: b, point: [0, 0, true]}}", "'a': point"),
+        ("landmarks: {a: {link: b, point: 3}}", "'a': point"),
+        ("landmarks: {a: {link: b, point: [0, 0, 0]}, a: 3}", "given twice"),
+        ("landmarks: {a: !!python/object:os.system x}", "not a YAML file"),
+        ("landmarks: [", "not a YAML file"),
+        ("\x00", "not a YAML file"),
+        ("[" * 5000, "YAML file|nested too deeply"),
+        ("#" * (1 << 20) + "\n", "larger than"),
+    ],
+)
+def test_bad_files_are_named(text: str, complaint: str, tmp_path: Path) -> None:
+    file = tmp_path / "landmarks.yaml"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(ModelError, match=complaint) as caught:
+        load_landmarks(tmp_path / "thing.urdf")
+    assert str(file) in str(caught.value)
+
+
+def test_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match=r"landmarks.yaml: cannot read the landmarks: No such"):
+        load_landmarks(tmp_path / "thing.urdf")
+    assert landmarks_file("a/thing.urdf") == Path("a/landmarks.yaml")

@@ -1,0 +1,113 @@
+"""What the tests of bundled models share: reading .obj files, and what is inside a surface."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import trimesh
+
+from drake_pose.body import ArticulatedModel
+from drake_pose.camera import ParallelCamera
+from drake_pose.silhouette import draw_mask, outline_from_mesh
+
+URDF = Path(__file__).resolve().parents[2] / "urdf"
+
+
+def written_again(name: str, folder: Path, *options: str) -> list[Path]:
+    """Runs a model's script into a folder; returns the files, relative to it."""
+    script = URDF / name / f"make_{name}.py"
+    subprocess.run([sys.executable, "-B", str(script), "--out", str(folder), *options], check=True)
+    return sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
+
+
+def committed(name: str) -> list[Path]:
+    """The model's files that its script writes, relative to the model's folder."""
+    folder = URDF / name
+    kinds = (".obj", ".urdf", ".yaml")
+    return sorted(p.relative_to(folder) for p in folder.rglob("*") if p.suffix in kinds)
+
+
+def read_obj(path: Path) -> trimesh.Trimesh:
+    """A surface as the file says, nothing merged; checks that normals point outwards."""
+    vertices, normals, triangles = [], [], []
+    for line in path.read_text().splitlines():
+        kind, *rest = line.split()
+        if kind == "v":
+            vertices.append([float(value) for value in rest])
+        elif kind == "vn":
+            normals.append([float(value) for value in rest])
+        elif kind == "f":
+            corners = [corner.split("//") for corner in rest]
+            assert all(vertex == normal for vertex, normal in corners)
+            triangles.append([int(vertex) - 1 for vertex, _ in corners])
+    mesh = trimesh.Trimesh(np.array(vertices), np.array(triangles), process=False)
+    unit = np.array(normals)
+    np.testing.assert_allclose(np.linalg.norm(unit, axis=1), 1.0, atol=2e-3)
+    corner_normals = unit[mesh.faces].mean(axis=1)
+    assert np.mean(np.einsum("ij,ij->i", corner_normals, mesh.face_normals) > 0.0) > 0.99
+    return mesh
+
+
+def assert_closed(mesh: trimesh.Trimesh) -> None:
+    """Every shell is closed and faces outwards."""
+    assert np.all(mesh.area_faces > 0.0)
+    for shell in mesh.split(only_watertight=False):
+        assert shell.is_watertight
+        assert shell.is_winding_consistent
+        assert shell.volume > 0.0
+
+
+def winding_numbers(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
+    """How often the mesh winds round each point (n, 3): at least 1 inside some shell."""
+    corners = mesh.triangles[None] - points[:, None, None]
+    lengths = np.linalg.norm(corners, axis=-1)
+    a, b, c = corners[..., 0, :], corners[..., 1, :], corners[..., 2, :]
+    volume = np.einsum("nij,nij->ni", a, np.cross(b, c))
+    below = (
+        lengths.prod(axis=-1)
+        + np.einsum("nij,nij->ni", a, b) * lengths[..., 2]
+        + np.einsum("nij,nij->ni", b, c) * lengths[..., 0]
+        + np.einsum("nij,nij->ni", c, a) * lengths[..., 1]
+    )
+    return np.arctan2(volume, below).sum(axis=1) / (2.0 * np.pi)
+
+
+def sphere_points(radius: float, count: int = 60) -> np.ndarray:
+    """Points (count, 3) on a sphere round the origin, always the same ones."""
+    directions = np.random.default_rng(3).normal(size=(count, 3))
+    return radius * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+class Silhouettes:
+    """Masks of a model, seen by a parallel camera from any side."""
+
+    def __init__(self, model: ArticulatedModel):
+        self.tree = model.pose_tree()
+        self.outlines = [outline_from_mesh(node.mesh) for node in self.tree.nodes]
+
+    def mask(
+        self, q: np.ndarray, towards: np.ndarray, target: np.ndarray, size: float, pixels: int = 400
+    ) -> np.ndarray:
+        """(pixels, pixels) bool, seen from direction towards (3,); size [m] fills the picture."""
+        z = -np.asarray(towards, dtype=float) / np.linalg.norm(towards)
+        x = np.cross(z, [0.0, 0.0, 1.0])
+        x /= np.linalg.norm(x)
+        X_WC = np.eye(4)
+        X_WC[:3, :3] = np.column_stack([x, np.cross(z, x), z])
+        X_WC[:3, 3] = target - 10.0 * z
+        middle = 0.5 * (pixels - 1)
+        camera = ParallelCamera("side", pixels, pixels, pixels / size, middle, middle, X_WC)
+        X_WN = self.tree.node_poses(self.tree.values_from_positions(q))
+        return draw_mask(self.outlines, camera.X_CW @ X_WN, camera)
+
+
+def pieces(mask: np.ndarray) -> int:
+    """How many connected pieces a mask has."""
+    return cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)[0] - 1
+
+
+def spans(row: np.ndarray) -> int:
+    """How many runs of True a row has."""
+    return int(np.count_nonzero(np.diff(np.concatenate([[0], row.astype(int)])) == 1))

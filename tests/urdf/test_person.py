@@ -1,0 +1,316 @@
+"""The bundled person: 23 degrees of freedom, coloured for skin blobs, and its shape joints."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.geometry import (
+    ClippingRange,
+    ColorRenderCamera,
+    MakeRenderEngineVtk,
+    RenderCameraCore,
+    RenderEngineVtkParams,
+)
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.sensors import CameraInfo
+
+from drake_pose.body import ArticulatedModel, load_model
+from drake_pose.body.landmarks import landmark_positions, load_landmarks
+from drake_pose.filtering.couplings import model_inequalities
+from tests.urdf.surfaces import (
+    URDF,
+    Silhouettes,
+    assert_closed,
+    committed,
+    pieces,
+    read_obj,
+    written_again,
+)
+
+PERSON = URDF / "person" / "person.urdf"
+SHAPE = URDF / "person" / "person_shape.urdf"
+STATURE = 0.5 * (1.6285 + 1.7562)
+# Date et al., figure 5: head 3 + 2, neck base 2, shoulders 3, elbows 1, hips 3, knees 1.
+LIMITS = {
+    "position_x": (-10, 10),
+    "position_y": (-10, 10),
+    "position_z": (-10, 10),
+    "head_y": (-180, 180),
+    "head_x": (-60, 90),
+    "neck_base_x": (-50, 75),
+    "neck_base_z": (-45, 45),
+    "left_upper_arm_x": (-180, 60),
+    "left_upper_arm_z": (-45, 180),
+    "left_upper_arm_y": (-70, 90),
+    "right_upper_arm_x": (-180, 60),
+    "right_upper_arm_z": (-180, 45),
+    "right_upper_arm_y": (-90, 70),
+    "left_forearm_x": (-150, 0),
+    "right_forearm_x": (-150, 0),
+    "left_thigh_y": (-45, 45),
+    "left_thigh_z": (-30, 45),
+    "left_thigh_x": (-120, 30),
+    "right_thigh_y": (-45, 45),
+    "right_thigh_z": (-45, 30),
+    "right_thigh_x": (-120, 30),
+    "left_shin_x": (0, 150),
+    "right_shin_x": (0, 150),
+}
+SKIN = ("head", "left_hand", "right_hand", "left_foot", "right_foot")
+# Shape joint -> the landmarks whose distance it changes one for one.
+LENGTHS = {
+    **{
+        f"{side}_{part}_stretch": (f"{side}_{start}", f"{side}_{end}")
+        for side in ("left", "right")
+        for part, start, end in (
+            ("upper_arm", "shoulder", "elbow"),
+            ("forearm", "elbow", "wrist"),
+            ("thigh", "hip", "knee"),
+            ("shin", "knee", "ankle"),
+        )
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def person() -> ArticulatedModel:
+    return load_model(PERSON, check=False)
+
+
+@pytest.fixture(scope="module")
+def shape() -> ArticulatedModel:
+    return load_model(SHAPE, check=False)
+
+
+def stretches(model: ArticulatedModel) -> list[int]:
+    return [i for i, name in enumerate(model.position_names) if name.endswith("_stretch")]
+
+
+def same_angles(
+    person: ArticulatedModel, shape: ArticulatedModel, q: np.ndarray, lengths: np.ndarray
+) -> np.ndarray:
+    """The shape model's positions at the plain model's q."""
+    whole = np.zeros(len(shape.position_names))
+    for name, value in zip(person.position_names, q, strict=True):
+        whole[shape.position_index(name)] = value
+    whole[stretches(shape)] = lengths
+    return whole
+
+
+def random_pose(model: ArticulatedModel, rng: np.random.Generator) -> np.ndarray:
+    q = rng.uniform(model.lower, model.upper)
+    q[:3] = 0.0
+    q[stretches(model)] = 0.0
+    return q
+
+
+def marks(model: ArticulatedModel, q: np.ndarray) -> dict[str, np.ndarray]:
+    landmarks = load_landmarks(model.path)
+    return dict(zip(landmarks, landmark_positions(model, landmarks, q), strict=True))
+
+
+def test_script_writes_the_committed_files(tmp_path: Path) -> None:
+    written = written_again("person", tmp_path)
+    assert written == committed("person")
+    for path in written:
+        assert (tmp_path / path).read_bytes() == (URDF / "person" / path).read_bytes(), path
+
+
+def test_script_changes_lengths_and_girths(person: ArticulatedModel, tmp_path: Path) -> None:
+    written_again("person", tmp_path, "--lengths", "thigh=1.1", "--girths", "thigh=0.9")
+    other = load_model(tmp_path / "person.urdf", check=False)
+    zero = np.zeros(23)
+    before, after = marks(person, zero), marks(other, zero)
+
+    def distance(found: dict[str, np.ndarray], a: str, b: str) -> float:
+        return float(np.linalg.norm(found[a] - found[b]))
+
+    for side in ("left", "right"):
+        for a, b, factor in (("hip", "knee", 1.1), ("knee", "ankle", 1.0)):
+            names = (f"{side}_{a}", f"{side}_{b}")
+            assert distance(after, *names) == pytest.approx(factor * distance(before, *names))
+    sizes = [
+        np.ptp(read_obj(folder / "meshes" / "left_thigh.obj").vertices, axis=0)
+        for folder in (URDF / "person", tmp_path)
+    ]
+    np.testing.assert_allclose(sizes[1] / sizes[0], [0.9, 1.1, 0.9], atol=0.01)
+
+
+@pytest.mark.parametrize("word", ["arm=1.1", "thigh", "thigh=3", "thigh=nan"])
+def test_script_refuses_bad_factors(word: str, tmp_path: Path) -> None:
+    with pytest.raises(Exception, match="exit status 2"):
+        written_again("person", tmp_path, "--lengths", word)
+
+
+@pytest.mark.parametrize("path", sorted((URDF / "person" / "meshes").glob("*.obj")), ids=str)
+def test_surfaces_are_closed(path: Path) -> None:
+    assert_closed(read_obj(path))
+
+
+def test_degrees_of_freedom_are_those_of_figure_5(person: ArticulatedModel) -> None:
+    assert len(person.position_names) == 23
+    assert set(person.position_names) == set(LIMITS)
+    for name, limits in LIMITS.items():
+        index = person.position_index(name)
+        scale = np.pi / 180.0 if person.position_kinds[index] == "angle" else 1.0
+        found = [person.lower[index], person.upper[index]]
+        np.testing.assert_allclose(found, np.array(limits) * scale, atol=1e-12)
+
+
+def test_stands_upright_facing_forward(person: ArticulatedModel) -> None:
+    found = marks(person, np.zeros(23))
+    points = [
+        person.plant.EvalBodyPoseInWorld(context, person.plant.GetBodyByName(link))
+        .multiply(mesh.vertices.T)
+        .T
+        for context in [person.plant.CreateDefaultContext()]
+        for link, mesh in person.link_meshes.items()
+    ]
+    heights = np.concatenate(points)[:, 2]
+    assert np.ptp(heights) == pytest.approx(STATURE, rel=0.005)
+    assert found["head_top"][2] == pytest.approx(heights.max(), abs=0.004)
+    order = ("ankle", "knee", "hip", "wrist", "elbow", "shoulder")
+    levels = [found[f"left_{name}"][2] for name in order]
+    assert np.argsort(levels).tolist()[:2] == [0, 1]
+    assert levels[5] == max(levels)
+    for name in order:
+        left, right = found[f"left_{name}"], found[f"right_{name}"]
+        np.testing.assert_allclose(left, right * [1, -1, 1], atol=1e-6)
+        assert left[1] > 0.05
+    assert person.link_meshes["head"].vertices[:, 2].max() > 0.1  # the nose: z is forward
+
+
+def test_positive_angles_move_as_told(person: ArticulatedModel) -> None:
+    rest = marks(person, np.zeros(23))
+
+    def moved(name: str, degrees: float, landmark: str) -> np.ndarray:
+        q = np.zeros(23)
+        q[person.position_index(name)] = np.radians(degrees)
+        return np.asarray(marks(person, q)[landmark] - rest[landmark])
+
+    assert moved("left_upper_arm_x", -60, "left_wrist")[0] > 0.3  # forward
+    assert moved("left_upper_arm_z", 60, "left_wrist")[1] > 0.3  # out to the left
+    assert moved("right_upper_arm_z", -60, "right_wrist")[1] < -0.3
+    assert moved("left_forearm_x", -90, "left_wrist")[0] > 0.15
+    assert moved("left_thigh_x", -60, "left_knee")[0] > 0.25
+    assert moved("left_shin_x", 90, "left_ankle")[0] < -0.25
+    assert moved("neck_base_x", 40, "left_hip")[0] < -0.2  # the hips go back: leaning forward
+    assert moved("head_x", 40, "head_top")[0] > 0.05  # looking down
+
+
+def test_shape_model_at_zero_is_the_plain_person(
+    person: ArticulatedModel, shape: ArticulatedModel
+) -> None:
+    rng = np.random.default_rng(5)
+    pictures = Silhouettes(person), Silhouettes(shape)
+    for _ in range(6):
+        q = random_pose(person, rng)
+        whole = same_angles(person, shape, q, np.zeros(len(stretches(shape))))
+        for name, point in marks(person, q).items():
+            np.testing.assert_allclose(marks(shape, whole)[name], point, atol=1e-6)
+        towards = rng.normal(size=3) * [1, 1, 0.3]
+        view = (towards, np.array([0, 0, -0.6]), 2.6)
+        masks = [pictures[0].mask(q, *view), pictures[1].mask(whole, *view)]
+        assert np.count_nonzero(masks[0] != masks[1]) <= 0.002 * np.count_nonzero(masks[0])
+
+
+def test_shape_joints_change_the_lengths_one_for_one(shape: ArticulatedModel) -> None:
+    rng = np.random.default_rng(6)
+    q = random_pose(shape, rng)
+    before = marks(shape, q)
+    for joint, (start, end) in LENGTHS.items():
+        longer = q.copy()
+        longer[shape.position_index(joint)] = 0.02
+        after = marks(shape, longer)
+        change = np.linalg.norm(after[end] - after[start])
+        change -= np.linalg.norm(before[end] - before[start])
+        assert change == pytest.approx(0.02, abs=1e-6)
+    zero = np.zeros(len(shape.position_names))
+    upright = marks(shape, zero)
+    for joint, landmark, axis, sign in (
+        ("neck_stretch", "neck", 2, -1),
+        ("trunk_stretch", "left_hip", 2, -1),
+        ("left_shoulder_stretch", "left_shoulder", 1, 1),
+        ("right_shoulder_stretch", "right_shoulder", 1, -1),
+        ("left_hip_stretch", "left_hip", 1, 1),
+        ("right_hip_stretch", "right_hip", 1, -1),
+    ):
+        q = zero.copy()
+        q[shape.position_index(joint)] = 0.02
+        change = marks(shape, q)[landmark] - upright[landmark]
+        np.testing.assert_allclose(change, 0.02 * sign * np.eye(3)[axis], atol=1e-6)
+
+
+@pytest.mark.parametrize("which", ["person", "shape"])
+def test_no_pose_falls_apart(which: str, request: pytest.FixtureRequest) -> None:
+    model = request.getfixturevalue(which)
+    pictures = Silhouettes(model)
+    rng = np.random.default_rng(7)
+    for index in range(24):
+        q = random_pose(model, rng)
+        shape_joints = stretches(model)
+        ends = (model.upper if index % 2 else model.lower)[shape_joints]
+        q[shape_joints] = ends if index < 4 else rng.uniform(model.lower, model.upper)[shape_joints]
+        mask = pictures.mask(q, rng.normal(size=3) * [1, 1, 0.3], np.array([0, 0, -0.5]), 3.6)
+        assert pieces(mask) == 1
+        rim = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
+        assert not rim.any()
+
+
+def test_couplings_keep_the_sides_alike(shape: ArticulatedModel) -> None:
+    inequalities = model_inequalities(shape)
+    q = np.zeros(len(shape.position_names))
+    assert np.all(inequalities.margins(q) >= 0.0)
+    q[shape.position_index("left_thigh_stretch")] = 0.012
+    assert np.any(inequalities.margins(q) < 0.0)
+    q[shape.position_index("right_thigh_stretch")] = 0.005
+    assert np.all(inequalities.margins(q) >= 0.0)
+
+
+def test_skin_is_where_skin_should_be(person: ArticulatedModel) -> None:
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
+    person.add_to(plant, scene_graph)
+    plant.Finalize()
+    scene_graph.AddRenderer("vtk", MakeRenderEngineVtk(RenderEngineVtkParams()))
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    q = np.zeros(23)
+    q[[plant.GetJointByName(f"{s}_upper_arm_z").position_start() for s in ("left", "right")]] = (
+        np.radians([80, -80])
+    )
+    plant.SetPositions(plant.GetMyContextFromRoot(context), q)
+    query = scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(context))
+    core = RenderCameraCore(
+        "vtk",
+        CameraInfo(480, 480, 480.0, 480.0, 239.5, 239.5),
+        ClippingRange(0.1, 10.0),
+        RigidTransform(),
+    )
+    R_WC = RotationMatrix(np.array([[0.0, 0, -1], [1, 0, 0], [0, -1, 0]]))
+    view = (
+        ColorRenderCamera(core),
+        scene_graph.world_frame_id(),
+        RigidTransform(R_WC, [2, 0, -0.6]),
+    )
+    colour = query.RenderColorImage(*view).data[:, :, :3].astype(int)
+    labels = query.RenderLabelImage(*view).data[:, :, 0]
+    red_over_blue = colour[:, :, 0] - colour[:, :, 2]
+    for link in person.link_meshes:
+        seen = labels == int(plant.GetBodyByName(link).index())
+        assert np.count_nonzero(seen) > 30, link
+        share = np.mean(red_over_blue[seen & (colour.max(axis=2) > 50)] > 15)
+        if link in SKIN:
+            assert share > 0.9, link  # the rest: eyes, brows and lips
+        else:
+            assert share < 0.01, link
+
+
+def test_masses_make_a_valid_simulation(person: ArticulatedModel, shape: ArticulatedModel) -> None:
+    for model in (person, shape):
+        context = model.plant.CreateDefaultContext()
+        assert model.plant.CalcTotalMass(context) == pytest.approx(76.64, rel=0.01)
+        model.plant.SetPositions(context, np.zeros(len(model.position_names)))
+        assert np.linalg.eigvalsh(model.plant.CalcMassMatrix(context))[0] > 0.0

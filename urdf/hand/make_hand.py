@@ -1,0 +1,254 @@
+"""Writes hand.urdf (left), right_hand.urdf, their meshes and couplings; see --help."""
+
+import argparse
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+if TYPE_CHECKING:
+    from body_generator.shapes import Shell
+    from body_generator.writing import Joint
+    from hand.hand_shapes import HandMeasures
+
+# ANSUR II, 2012 [m]: half the sum of the women's and the men's mean (Gordon et al. 2014).
+MEASURES = {
+    "handlength": 0.18720,
+    "handbreadth": 0.08325,
+    "wristcircumference": 0.16535,
+    "forearmcircumferenceflexed": 0.28710,
+    "bicepscircumferenceflexed": 0.33185,
+    "radialestylionlength": 0.25460,
+}
+AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+TOWARDS_LITTLE = (0.0, 0.0, -1.0)
+Limits = tuple[float, float]
+DENSITY = 1100.0  # [kg/m^3]
+COLOURS = {"skin": (0.87, 0.67, 0.56)}
+# Limits [deg]; the README tells whose.
+ROOT_LIMITS = {"z": (-180, 180), "x": (-90, 90), "y": (-180, 180)}
+WRIST_LIMITS = {"flexion": (-70, 80), "deviation": (-20, 35)}
+ABDUCTION_LIMITS = {
+    "index": (-15, 30),
+    "middle": (-20, 20),
+    "ring": (-15, 25),
+    "little": (-15, 45),
+}
+FLEXION_LIMITS = {"mcp": (-30, 90), "pip": (-10, 110), "dip": (-10, 90)}
+THUMB_LIMITS = {
+    "cmc_flexion": (-40, 40),
+    "cmc_abduction": (-35, 40),
+    "mcp_flexion": (-10, 55),
+    "ip_flexion": (-50, 80),
+}
+# How the thumb's metacarpal stands in the palm when its angles are 0 [deg]: turned away from the
+# index finger in the palm's plane, raised out of it, and turned about itself.
+THUMB_REST = (40.0, 20.0, 55.0)
+COUPLINGS = """# Loose couplings, written by make_hand.py; the README tells their sources.
+differences:
+  - {first: index_mcp_flexion, second: middle_mcp_flexion, within: 70, unit: deg}
+  - {first: middle_mcp_flexion, second: ring_mcp_flexion, within: 50, unit: deg}
+  - {first: ring_mcp_flexion, second: little_mcp_flexion, within: 60, unit: deg}
+  - {first: middle_pip_flexion, second: ring_pip_flexion, within: 70, unit: deg}
+  - {first: ring_pip_flexion, second: little_pip_flexion, within: 70, unit: deg}
+rows:
+"""
+DISTAL_BAND = 30.0  # |DIP - 2/3 PIP| [deg]
+GAPS = (("index", "middle", 30.0), ("middle", "ring", 28.0), ("ring", "little", 50.0))
+LEAST_GAP = -8.0  # fingers may lean on one another, but not cross [deg]
+
+
+def main() -> None:
+    """Read the command line and write both hands."""
+    here = Path(__file__).resolve().parent
+    sys.path.insert(0, str(here.parent))
+    from hand.hand_shapes import HandMeasures
+
+    parser = argparse.ArgumentParser(description=__doc__)
+    published = MEASURES["handlength"]
+    parser.add_argument("--handlength", type=float, default=published, help="in metres")
+    parser.add_argument("--out", type=Path, default=here, help="folder to write into")
+    options = parser.parse_args()
+    measures = HandMeasures(**MEASURES).scaled_to(options.handlength)
+    options.out.mkdir(parents=True, exist_ok=True)
+    for name, side in (("hand", "left"), ("right_hand", "right")):
+        write_hand(options.out, name, side, measures)
+
+
+def write_hand(folder: Path, name: str, side: str, measures: "HandMeasures") -> None:
+    """Write one hand's URDF, meshes and couplings."""
+    from body_generator.writing import (
+        joint_chain,
+        materials_text,
+        root_joints,
+        solid_link,
+        write_meshes,
+    )
+
+    shells = {
+        link: shell if side == "left" else shell.mirrored()
+        for link, shell in hand_shells(measures).items()
+    }
+    chains = hand_joints(measures)
+    if side == "right":
+        chains = [[mirrored_joint(joint) for joint in chain] for chain in chains]
+    text = '<?xml version="1.0"?>\n<!-- Written by make_hand.py: do not edit. -->\n'
+    text += f'<robot name="{name}">\n' + materials_text(COLOURS) + root_joints(root_turns())
+
+    def link(part: str) -> str:
+        """Return a part's link."""
+        mass = DENSITY * volume(shells[part])
+        return solid_link(part, {f"{side}_{part}": [shells[part]]}, mass)
+
+    text += link("forearm")
+    for chain in chains:
+        text += joint_chain(chain) + link(chain[-1].child)
+    (folder / f"{name}.urdf").write_text(text + "</robot>\n", encoding="ascii")
+    write_meshes(folder, {f"{side}_{part}": [shell] for part, shell in shells.items()})
+    (folder / f"{name}.couplings.yaml").write_text(couplings_text(), encoding="ascii")
+
+
+def hand_shells(measures: "HandMeasures") -> "dict[str, Shell]":
+    """Return the left hand's surfaces by link."""
+    from hand import hand_shapes as shapes
+
+    shells = {"forearm": shapes.forearm(measures), "palm": shapes.palm(measures)}
+    for part in ("metacarpal", "proximal", "distal"):
+        shells[f"thumb_{part}"] = getattr(shapes, f"thumb_{part}")(measures)
+    for finger in shapes.FINGERS:
+        for part in ("proximal", "middle", "distal"):
+            shells[f"{finger}_{part}"] = getattr(shapes, part)(finger, measures)
+    return shells
+
+
+def hand_joints(measures: "HandMeasures") -> "list[list[Joint]]":
+    """Return the left hand's joints beyond the forearm, a list for each link that is seen."""
+    from body_generator.writing import Joint
+    from hand import hand_shapes as shapes
+
+    wrist = hinge("wrist_flexion", "forearm", "wrist_link", WRIST_LIMITS["flexion"])
+    limits = WRIST_LIMITS["deviation"]
+    sideways = Joint("wrist_deviation", "wrist_link", "palm", "revolute", TOWARDS_LITTLE, limits)
+    chains = [[wrist, sideways], *thumb_joints(measures)]
+    for finger in shapes.FINGERS:
+        chains += finger_joints(finger, measures)
+    return chains
+
+
+def root_turns() -> "list[Joint]":
+    """Return the joints that turn the forearm in the world."""
+    from body_generator.writing import Joint
+
+    joints, before = [], "root_axes_link"
+    for axis, limits in ROOT_LIMITS.items():
+        child = "forearm" if axis == "y" else f"forearm_{axis}_link"
+        joints.append(Joint(f"forearm_{axis}", before, child, "revolute", AXES[axis], limits))
+        before = child
+    return joints
+
+
+def hinge(name: str, parent: str, child: str, limits: Limits, y: float = 0.0) -> "Joint":
+    """Return a joint that bends towards the palm, y [m] along its parent."""
+    from body_generator.writing import Joint
+
+    return Joint(name, parent, child, "revolute", AXES["x"], limits, (0.0, y, 0.0))
+
+
+def thumb_joints(measures: "HandMeasures") -> "list[list[Joint]]":
+    """Return the left thumb's joints."""
+    from body_generator.writing import Joint
+    from hand import hand_shapes as shapes
+
+    rest = Rotation.from_euler("ZXY", THUMB_REST, degrees=True).as_euler("xyz")
+    flexion = Joint(
+        "thumb_cmc_flexion",
+        "palm",
+        "thumb_cmc_link",
+        "revolute",
+        AXES["x"],
+        THUMB_LIMITS["cmc_flexion"],
+        shapes.thumb_base(measures),
+        np.round(rest, 9),
+    )
+    names = ("thumb_cmc_abduction", "thumb_cmc_link", "thumb_metacarpal")
+    abduction = Joint(*names, "revolute", AXES["z"], THUMB_LIMITS["cmc_abduction"])
+    lengths = shapes.thumb_lengths(measures)
+    return [
+        [flexion, abduction],
+        *[
+            [hinge(f"thumb_{joint}", parent, child, THUMB_LIMITS[joint], y)]
+            for joint, parent, child, y in (
+                ("mcp_flexion", "thumb_metacarpal", "thumb_proximal", lengths[0]),
+                ("ip_flexion", "thumb_proximal", "thumb_distal", lengths[1]),
+            )
+        ],
+    ]
+
+
+def finger_joints(finger: str, measures: "HandMeasures") -> "list[list[Joint]]":
+    """Return a left finger's joints."""
+    from body_generator.writing import Joint
+    from hand import hand_shapes as shapes
+
+    away = AXES["z"] if finger in ("index", "middle") else TOWARDS_LITTLE
+    lengths = shapes.finger_lengths(finger, measures)
+    proximal, middle, distal = (f"{finger}_{part}" for part in ("proximal", "middle", "distal"))
+    base = f"{finger}_mcp_link"
+    abduction = Joint(
+        f"{finger}_mcp_abduction",
+        "palm",
+        base,
+        "revolute",
+        away,
+        ABDUCTION_LIMITS[finger],
+        shapes.knuckle(finger, measures),
+    )
+    name, limits = f"{finger}_{{}}_flexion", FLEXION_LIMITS
+    return [
+        [abduction, hinge(name.format("mcp"), base, proximal, limits["mcp"])],
+        [hinge(name.format("pip"), proximal, middle, limits["pip"], lengths[0])],
+        [hinge(name.format("dip"), middle, distal, limits["dip"], lengths[1])],
+    ]
+
+
+def mirrored_joint(joint: "Joint") -> "Joint":
+    """Return the right hand's joint: the same angle means the same movement."""
+    flip, turn = np.array([-1.0, 1.0, 1.0]), np.array([1.0, -1.0, -1.0])
+    axis = tuple(float(value) for value in turn * joint.axis + 0.0)
+    return replace(joint, axis=axis, xyz=flip * joint.xyz, rpy=turn * joint.rpy)
+
+
+def volume(shell: "Shell") -> float:
+    """Return the volume inside a closed surface [m^3]."""
+    corners = shell.vertices[shell.triangles]
+    cross = np.cross(corners[:, 1], corners[:, 2])
+    return abs(float(np.einsum("ij,ij->", corners[:, 0], cross))) / 6.0
+
+
+def couplings_text() -> str:
+    """Return the couplings, the same for both hands."""
+    rows = [
+        f"  - {{name: {finger}_distal,"
+        f" terms: {{{finger}_dip_flexion: 3, {finger}_pip_flexion: -2}},"
+        f" lower: {-3 * DISTAL_BAND:g}, upper: {3 * DISTAL_BAND:g}, unit: deg}}"
+        for finger in ABDUCTION_LIMITS
+    ]
+    for first, second, most in GAPS:
+        # Index and middle count away from the little finger, ring and little towards it.
+        terms = {
+            ("index", "middle"): "index_mcp_abduction: 1, middle_mcp_abduction: -1",
+            ("middle", "ring"): "middle_mcp_abduction: 1, ring_mcp_abduction: 1",
+            ("ring", "little"): "little_mcp_abduction: 1, ring_mcp_abduction: -1",
+        }[(first, second)]
+        rows.append(
+            f"  - {{name: {first}_to_{second}, terms: {{{terms}}},"
+            f" lower: {LEAST_GAP:g}, upper: {most:g}, unit: deg}}"
+        )
+    return COUPLINGS + "\n".join(rows) + "\n"
+
+
+if __name__ == "__main__":
+    main()

@@ -74,6 +74,33 @@ the order of rotation with their limits, and its triangles. Exit status 1: not f
     drake-pose check urdf/woman/woman.urdf
 """)
 
+CALIBRATE = _help("""
+Calibrate one camera or several from pictures of a checkerboard or a ChArUco board.
+
+Every camera's lens is found from its own pictures, the cameras' places from instants at which two
+or more of them saw the board; at last everything is adjusted at once. Shown is the error of every
+camera. A picture that spoils the calibration is named, and refused unless told otherwise. The
+cameras written are free of distortion: take it out of the pictures with undistort.
+
+The board's file, for 8 by 5 squares of 12 cm:
+
+    kind: checkerboard
+    squares: [8, 5]
+    square_length: 0.12
+
+[bold]Example:[/bold]
+
+    drake-pose calibrate CALIBRATION --board board.yaml --world board:0001 --out SCENE/cameras.yaml
+""")
+
+UNDISTORT = _help("""
+Take the distortion of the lenses out of pictures, as the cameras that calibrate wrote see them.
+
+[bold]Example:[/bold]
+
+    drake-pose undistort RECORDING --lenses SCENE/cameras_lenses.yaml --out SCENE
+""")
+
 REPRODUCE = "Run a paper's experiment: its figures beside ours."
 
 KAMEDA = _help("""

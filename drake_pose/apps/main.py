@@ -189,6 +189,63 @@ def check(
         say("drake-pose: fit for use")
 
 
+@app.command(help=help_texts.CALIBRATE)
+def calibrate(
+    folder: Annotated[
+        Path, typer.Argument(help="Holds images/<camera>/<frame>.png; same frame, same instant.")
+    ],
+    board: Annotated[Path, typer.Option(help="The board's YAML file.")],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="The camera file to write; the lenses go beside it.")
+    ],
+    world: Annotated[
+        str, typer.Option(help="board:FRAME or camera:NAME; the first camera if not given.")
+    ] = "",
+    lens: Annotated[
+        str, typer.Option(help="none, standard (k1, k2, p1, p2) or full (k3 too).")
+    ] = "standard",
+    leave_out: Annotated[
+        list[str] | None, typer.Option(help="A camera, or a picture as CAMERA/FRAME; repeatable.")
+    ] = None,
+    drop_spoilt: Annotated[
+        bool, typer.Option("--drop-spoilt", help="Go on without pictures that spoil it.")
+    ] = False,
+    json: JsonOption = False,
+) -> None:
+    """See help_texts.CALIBRATE."""
+    with errors_as_messages():
+        from drake_pose.apps.calibrate import calibrate_folder
+        from drake_pose.apps.report import output_console
+        from drake_pose.camera.calibration import CalibrationSettings
+
+        settings = CalibrationSettings(
+            world=world, lens=lens, drop_spoilt=drop_spoilt, leave_out=tuple(leave_out or ())
+        )
+        report = calibrate_folder(folder, board, out, settings)
+        if json:
+            print_json(report.as_json())
+        else:
+            output_console().print(report.table())
+        for text in report.warnings:
+            warn(text)
+        say(f"drake-pose: wrote {', '.join(str(path) for path in report.files)}")
+
+
+@app.command(help=help_texts.UNDISTORT)
+def undistort(
+    folder: Annotated[Path, typer.Argument(help="Holds images/<camera>/<frame>.png or .jpg.")],
+    lenses: Annotated[Path, typer.Option(help="The lens file that calibrate wrote.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the pictures.")],
+) -> None:
+    """See help_texts.UNDISTORT."""
+    with errors_as_messages():
+        from drake_pose.apps.calibrate import undistort_pictures
+        from drake_pose.camera.calibration_lens import load_lenses
+
+        written = undistort_pictures(folder, load_lenses(lenses), out)
+        say(f"drake-pose: {len(written)} pictures written to {out}")
+
+
 @reproduce_app.command(help=help_texts.KAMEDA)
 def kameda(
     images: Annotated[int, typer.Option(min=1, help="How many silhouettes are drawn.")] = 219,

@@ -38,7 +38,8 @@ def test_python_examples_run(
 
 def test_there_are_examples() -> None:
     assert len(blocks("python")) == 2
-    assert {words[0] for words in DRAKE_POSE_LINES} == {"check", "estimate", "reproduce"}
+    commands = {"calibrate", "check", "estimate", "reproduce", "undistort"}
+    assert {words[0] for words in DRAKE_POSE_LINES} == commands
 
 
 @pytest.mark.parametrize("words", DRAKE_POSE_LINES, ids=" ".join)

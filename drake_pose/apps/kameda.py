@@ -250,7 +250,7 @@ def run_experiment(
 
 def _match_one(search: PoseSearch, camera: ParallelCamera, values: list[np.ndarray]) -> Trial:
     X_CN = camera.X_CW @ search.tree.node_poses(values)
-    outlines = search.sampled.outlines
+    outlines = search.sampled.surfaces.at(values)
     mask = draw_mask(outlines, X_CN, camera)
     wide = ParallelCamera(
         name="wide",

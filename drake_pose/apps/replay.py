@@ -16,6 +16,7 @@ from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from drake_pose.body import ArticulatedModel
 from drake_pose.camera import Camera, PinholeCamera
+from drake_pose.systems import add_meshcat_skin
 
 _BODY_PATH = "visualizer"
 _CAMERA_COLOUR = Rgba(0.0, 0.45, 0.70, 1.0)
@@ -66,6 +67,9 @@ def make_replay(
         poser.get_output_port(), scene_graph.get_source_pose_port(plant.get_source_id())
     )
     MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
+    add_meshcat_skin(
+        builder, meshcat, model, source.get_output_port(), "body", prefix=_BODY_PATH, recorded=True
+    )
     for camera in cameras:
         _draw_camera(meshcat, camera)
     _look_from(meshcat, cameras[0], _middle_of(plant, positions[0], X_WB[0]))

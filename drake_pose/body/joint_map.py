@@ -7,7 +7,7 @@ thousands of joint values cost one matrix product.
 """
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -78,6 +78,29 @@ class JointMap:
         X = (products @ self.coefficients).reshape(-1, 4, 4)
         X[:, 3] = (0.0, 0.0, 0.0, 1.0)
         return X
+
+
+@dataclass(frozen=True)
+class ChainStep:
+    """One joint on the way from a node's parent to the node; walked inwards if inverted."""
+
+    joint_map: JointMap
+    inverted: bool
+
+
+def chain_transforms(steps: Sequence[ChainStep], values: NDArray[Any]) -> NDArray[Any]:
+    """X (n, 4, 4) over several joints one after the other, at all their values (n, k).
+
+    The values may be complex.
+    """
+    X: NDArray[Any] = np.broadcast_to(np.eye(4), (len(values), 4, 4))
+    start = 0
+    for step in steps:
+        stop = start + step.joint_map.position_count
+        X_step = step.joint_map.transforms(values[:, start:stop])
+        X = X @ (inverse_transforms(X_step) if step.inverted else X_step)
+        start = stop
+    return X
 
 
 def _basis(values: NDArray[Any]) -> NDArray[Any]:

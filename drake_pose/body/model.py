@@ -17,6 +17,7 @@ from drake_pose.body.limits import PositionKind, describe_positions
 from drake_pose.body.mesh import TriangleMesh
 from drake_pose.body.parsing import ModelSource, unread_limits
 from drake_pose.body.safety import check_in_child
+from drake_pose.body.skin import SkinBand, load_skin
 from drake_pose.errors import ModelError, UnknownNameError
 
 if TYPE_CHECKING:
@@ -40,6 +41,8 @@ class ArticulatedModel:
             infinite for the pose of a floating body.
         default_positions: (nq,) Drake's default positions moved inside the limits, read-only.
         link_meshes: the visual geometry of each link that has some, in the link's frame.
+        skin: the bands of surface that bend with the joints, from the file beside the model's
+            (``load_skin``); usually none.
         warnings: what Drake remarked while reading the file.
     """
 
@@ -53,6 +56,7 @@ class ArticulatedModel:
     upper: NDArray[np.float64]
     default_positions: NDArray[np.float64]
     link_meshes: Mapping[str, TriangleMesh]
+    skin: tuple[SkinBand, ...]
     warnings: tuple[str, ...]
     _source: ModelSource = field(repr=False)
 
@@ -205,6 +209,7 @@ def read_model(
         upper=positions.upper,
         default_positions=positions.defaults,
         link_meshes=MappingProxyType(meshes),
+        skin=load_skin(path, link_names(plant)),
         warnings=tuple(warnings),
         _source=source,
     )

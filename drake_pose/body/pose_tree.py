@@ -1,7 +1,8 @@
 """The pose tree: the rigid parts of an object, each placed by its own few joint values.
 
-This is the tree of Kameda, Minoh, Ikeda (section 2): a node has a rigid surface, a parent, and up
-to three rotations (here any number of positions of any joints) inside limits. The tree may start at
+This is the tree of Kameda, Minoh, Ikeda (section 2): a node has a rigid surface, a band of skin
+that bends with its joint (where the model has one), a parent, and up to three rotations (here any
+number of positions of any joints) inside limits. The tree may start at
 any link; its nodes' transforms come from Drake's plant.
 """
 
@@ -13,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.body.base_pose import BasePose
-from drake_pose.body.joint_map import JointMap, inverse_transforms
+from drake_pose.body.joint_map import ChainStep, chain_transforms
 from drake_pose.body.link_graph import PlantKinematics
 from drake_pose.body.mesh import TriangleMesh
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.root import RootRotation, even_rotations
 from drake_pose.body.sampling import axis_samples, product_grid
+from drake_pose.body.skin_motion import NodeSkin, join_surfaces
 from drake_pose.errors import SettingsError, UnknownNameError
 
 DEFAULT_LENGTH_INTERVAL = 0.05
@@ -26,7 +28,7 @@ DEFAULT_LENGTH_INTERVAL = 0.05
 
 @dataclass(frozen=True, eq=False)
 class PoseTreeNode:
-    """One rigid part of the object.
+    """One part of the object: a rigid surface, and a band that bends with its values.
 
     Attributes:
         name: the link that carries the geometry; its frame is the node's frame N.
@@ -40,6 +42,8 @@ class PoseTreeNode:
             RootRotation.
         mesh: the rigid part in frame N, welded links included; empty where several parts hang on
             a link that is not seen.
+        skin: the band of skin between the parent and the node, which bends with the node's values;
+            None where the model declares none.
     """
 
     name: str
@@ -50,14 +54,11 @@ class PoseTreeNode:
     position_names: tuple[str, ...]
     value_names: tuple[str, ...]
     mesh: TriangleMesh
+    skin: NodeSkin | None = None
 
-
-@dataclass(frozen=True)
-class ChainStep:
-    """One joint on the way from a node's parent to the node; walked inwards if inverted."""
-
-    joint_map: JointMap
-    inverted: bool
+    def surface(self, values: NDArray[np.float64]) -> TriangleMesh:
+        """The node's whole surface in frame N at its values (k,): the rigid part, then the band."""
+        return join_surfaces(self.mesh, self.skin, values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +103,11 @@ class PoseTree:
     def __post_init__(self) -> None:
         """Freeze the mapping."""
         object.__setattr__(self, "held", MappingProxyType(dict(self.held)))
+
+    @property
+    def placements(self) -> tuple[NodePlacement, ...]:
+        """How the values of each node place it."""
+        return self._placements
 
     def with_root_position(self, root_position: NDArray[np.float64]) -> "PoseTree":
         """The same tree with the root's origin at another known position (3,) [m].
@@ -197,12 +203,8 @@ class PoseTree:
         X = np.broadcast_to(placement.X_PA, (len(values), 4, 4)).copy()
         if placement.rotation is not None:
             X[:, :3, :3] = X[:, :3, :3] @ placement.rotation.rotations(values)
-        start = 0
-        for step in placement.steps:
-            stop = start + step.joint_map.position_count
-            X_step = step.joint_map.transforms(values[:, start:stop])
-            X = X @ (inverse_transforms(X_step) if step.inverted else X_step)
-            start = stop
+        if placement.steps:
+            X = X @ chain_transforms(placement.steps, values)
         return X
 
     def node_poses(self, values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:

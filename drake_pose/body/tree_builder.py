@@ -7,10 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.body.base_pose import BasePose, base_of_chain, chain_pose
+from drake_pose.body.joint_map import ChainStep
 from drake_pose.body.link_graph import JointEdge, LinkGraph, PlantKinematics, build_link_graph
 from drake_pose.body.model import ArticulatedModel
-from drake_pose.body.pose_tree import ChainStep, NodePlacement, PoseTree, PoseTreeNode
+from drake_pose.body.pose_tree import NodePlacement, PoseTree, PoseTreeNode
 from drake_pose.body.root import RootRotation
+from drake_pose.body.skin_bands import find_skin, require_placed
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
 
 Chain = tuple[JointEdge, ...]
@@ -342,6 +344,7 @@ def _assemble(
         steps, positions = _walk(graph, branches, branch)
         placements.append(NodePlacement(start.X_PA, start.rotation, steps))
         names = tuple(model.position_names[position] for position in positions)
+        inner = branches[branch.parent].group if branch.parent >= 0 else None
         nodes.append(
             PoseTreeNode(
                 name=graph.groups[branch.group].name,
@@ -352,8 +355,12 @@ def _assemble(
                 position_names=names,
                 value_names=names if start.rotation is None else start.rotation.value_names,
                 mesh=graph.groups[branch.group].mesh,
+                skin=None if inner is None else find_skin(model, graph, inner, branch.group, steps),
             )
         )
+    require_placed(
+        model, graph, {(branches[b.parent].group, b.group) for b in branches if b.parent >= 0}
+    )
     moved = {position for node in nodes for position in node.positions} | set(base.positions)
     return PoseTree(
         model=model,

@@ -10,13 +10,16 @@ from drake_pose.matching.scoring import Scoring
 # Combinations times pixel patterns that are looked at in one piece of arrays.
 _BLOCK = 4_000_000
 
+Placed = tuple[np.ndarray, np.ndarray]
+"""Samples of nodes, and the poses there."""
+
 
 def best_leaf_combination(
     scoring: Scoring,
     inner: Sequence[int],
-    X_WI: np.ndarray,
+    inner_poses: Placed,
     leaves: Sequence[int],
-    X_WL: Sequence[np.ndarray],
+    candidates: Sequence[Placed],
     adopted: Sequence[int],
     limit: int,
 ) -> tuple[tuple[int, ...], float]:
@@ -29,9 +32,9 @@ def best_leaf_combination(
     Args:
         scoring: the silhouettes.
         inner: the nodes that are not leaves.
-        X_WI: (len(inner), 4, 4), their poses.
+        inner_poses: their samples (len(inner),) and poses (len(inner), 4, 4).
         leaves: the leaf nodes.
-        X_WL: for each leaf (n, 4, 4), the poses of its candidates.
+        candidates: for each leaf the samples (n,) and poses (n, 4, 4) of its candidates.
         adopted: for each leaf the candidate in use.
         limit: up to so many combinations are all tried; beyond, one leaf after another.
 
@@ -39,8 +42,8 @@ def best_leaf_combination(
         The candidate of each leaf, and by how much its J is below that of ``adopted`` [pixel].
         ``adopted`` itself where nothing is better.
     """
-    counts = [len(poses) for poses in X_WL]
-    patterns, gains = _patterns(scoring, inner, X_WI, leaves, X_WL)
+    counts = [len(samples) for samples, _ in candidates]
+    patterns, gains = _patterns(scoring, inner, inner_poses, leaves, candidates)
     first_columns = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(int)
 
     def worth(choices: np.ndarray) -> np.ndarray:
@@ -92,17 +95,17 @@ def _one_leaf_at_a_time(
 def _patterns(
     scoring: Scoring,
     inner: Sequence[int],
-    X_WI: np.ndarray,
+    inner_poses: Placed,
     leaves: Sequence[int],
-    X_WL: Sequence[np.ndarray],
+    candidates: Sequence[Placed],
 ) -> tuple[np.ndarray, np.ndarray]:
     """The distinct patterns (n, candidates of all leaves) bool, and what covering each is worth."""
     all_patterns, all_gains = [], []
     for v, view in enumerate(scoring.views):
-        base = scoring.draw(inner, X_WI, v)
+        base = scoring.draw(inner, *inner_poses, v)
         masks = [
-            scoring.draw([leaf], poses[t : t + 1], v)
-            for leaf, poses in zip(leaves, X_WL, strict=True)
+            scoring.draw([leaf], samples[t : t + 1], poses[t : t + 1], v)
+            for leaf, (samples, poses) in zip(leaves, candidates, strict=True)
             for t in range(len(poses))
         ]
         open_pixels = np.logical_or.reduce(masks) & ~base

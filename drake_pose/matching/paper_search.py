@@ -148,12 +148,14 @@ class _Run:
                 return False
             if uncovered is None:
                 done = sorted(self.lists)
-                uncovered = self.scoring.uncovered(done, self._adopted_poses())
+                uncovered = self.scoring.uncovered(
+                    done, self._adopted_samples(), self._adopted_poses()
+                )
             self.runs += 1
             made = self.make_list(node, uncovered)
             if made is not None:
                 self.lists[node] = made
-                uncovered.subtract([node], made.X_WN[:1])
+                uncovered.subtract([node], made.samples[:1], made.X_WN[:1])
             elif self._backtrack(node):
                 uncovered = None
             else:
@@ -174,7 +176,8 @@ class _Run:
         parent = self.nodes[node].parent
         X_WP = np.eye(4) if parent < 0 else self._adopted_pose(parent)
         X_WN = self.scoring.candidate_poses(node, X_WP)
-        outside, covered = self.scoring.candidate_areas(node, X_WN, uncovered)
+        everything = np.arange(len(X_WN))
+        outside, covered = self.scoring.candidate_areas(node, everything, X_WN, uncovered)
         limits = np.array(self.outside_limit)[:, None]
         inside = np.flatnonzero((outside <= limits).all(axis=0))
         if len(inside) == 0:
@@ -215,13 +218,12 @@ class _Run:
         inner = [i for i in range(len(self.nodes)) if self.nodes[i].children]
         if all(len(self.lists[leaf].samples) == 1 for leaf in leaves):
             return
-        poses = self._adopted_poses()
         choice, gain = best_leaf_combination(
             self.scoring,
             inner,
-            poses[inner],
+            (self._adopted_samples()[inner], self._adopted_poses()[inner]),
             leaves,
-            [self.lists[leaf].X_WN for leaf in leaves],
+            [(self.lists[leaf].samples, self.lists[leaf].X_WN) for leaf in leaves],
             [self.lists[leaf].adopted for leaf in leaves],
             self.settings.leaf_combination_limit,
         )
@@ -232,14 +234,17 @@ class _Run:
     def _adopt_most_exposed(self) -> bool:
         """Section 5.2.2: adopt the most exposed node's candidate; False if A becomes empty."""
         covers = []
-        poses = self._adopted_poses()
+        samples, poses = self._adopted_samples(), self._adopted_poses()
         for i, node in enumerate(self.nodes):
             current = self.lists[i]
             if not node.children or not current.has_untried:
                 continue
             others = [k for k in range(len(self.nodes)) if k != i]
-            exposed = self.scoring.uncovered(others, poses)
-            _, cover = self.scoring.candidate_areas(i, current.X_WN[current.adopted :], exposed)
+            exposed = self.scoring.uncovered(others, samples, poses)
+            rest = slice(current.adopted, None)
+            _, cover = self.scoring.candidate_areas(
+                i, current.samples[rest], current.X_WN[rest], exposed
+            )
             # argmax takes the first of equals: the adopted candidate stays unless one is better.
             best = int(np.argmax(cover))
             covers.append((cover[best], i, current.adopted + best))
@@ -264,8 +269,16 @@ class _Run:
             poses[node] = self._adopted_pose(node)
         return poses
 
+    def _adopted_samples(self) -> np.ndarray:
+        """(nodes,) int, 0 for nodes that are not done."""
+        samples = np.zeros(len(self.nodes), dtype=np.int64)
+        for node, current in self.lists.items():
+            samples[node] = current.samples[current.adopted]
+        return samples
+
     def _whole_pose_J(self) -> float:
-        return float(self.scoring.J(self._adopted_poses()[None])[0])
+        samples = self._adopted_samples()[None]
+        return float(self.scoring.J(self._adopted_poses()[None], samples)[0])
 
     def _keep_if_better(self, J: float) -> None:
         if self.best is None or J < self.best.J:

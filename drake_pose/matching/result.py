@@ -7,6 +7,7 @@ import numpy as np
 
 from drake_pose.camera import Camera
 from drake_pose.errors import MaskError
+from drake_pose.matching.families import PoseSet
 
 
 @dataclass(frozen=True)
@@ -71,8 +72,13 @@ class MatchResult:
         outside_limit: the threshold r that was used in each view [pixel]; () where the search
             has none.
         untried: the candidates not adopted in the answer, by node name.
-        stopped_by: "end" if the search ran to its end, "run_limit" if the limit stopped it.
+        stopped_by: "end" if the search ran to its end, "exact" if J = 0 ended it, "run_limit" or
+            "time_limit" if a limit stopped it.
         seconds: wall time of the search [s].
+        proved_optimal: whether it is proved that no pose of the search's grid has a smaller J.
+        lower_bound: no pose of the grid has a smaller J than this [pixel]; 0 says nothing.
+        pose_set: all poses found that are as good, and what is known of each joint; None if the
+            search did not ask.
     """
 
     found: bool
@@ -87,3 +93,6 @@ class MatchResult:
     untried: Mapping[str, Candidates]
     stopped_by: str
     seconds: float
+    proved_optimal: bool = False
+    lower_bound: float = 0.0
+    pose_set: PoseSet | None = None

@@ -17,8 +17,8 @@ from drake_pose.silhouette.inscribed_balls import VisualHull
 
 _BALLS = 10
 # Surfaces of more triangles are simplified to fewer for stages that need not be exact.
-_MANY_TRIANGLES = 2000
-_FEW_TRIANGLES = 1000
+_MANY_TRIANGLES = 400
+_FEW_TRIANGLES = 300
 # A node may be nearer to the camera than the nearest root by this factor before its table is too
 # narrow; then it is drawn without one.
 _NEARER = 0.8
@@ -94,8 +94,12 @@ class WideBody:
         coarse = coarse and len(outline.triangles) > _MANY_TRIANGLES
         key = (node, spread, coarse)
         if key not in self._celled:
+            skin, bands = self.sampled.tree.nodes[node].skin, self.sampled.bands[node]
             self._celled[key] = divide_outline(
-                _coarse_outline(outline) if coarse else outline, spread
+                _coarse_outline(outline) if coarse else outline,
+                spread,
+                None if skin is None else skin.mesh,
+                bands,
             )
         return self._celled[key]
 
@@ -146,11 +150,19 @@ class WideBody:
         nodes = self.sampled.tree.nodes
         reaches = np.zeros((len(nodes), 4))
         for i in reversed(range(len(nodes))):
-            balls = np.vstack([self.sampled.outlines[i].ball, reaches[list(nodes[i].children)]])
+            balls = np.vstack([self._whole_ball(i), reaches[list(nodes[i].children)]])
             X_PN = self.sampled.X_PN[i]
             centers = balls[:, :3] @ np.swapaxes(X_PN[:, :3, :3], 1, 2) + X_PN[:, None, :3, 3]
             reaches[i] = _ball_around(centers.reshape(-1, 3), np.tile(balls[:, 3], len(X_PN)))
         return reaches
+
+    def _whole_ball(self, node: int) -> np.ndarray:
+        """A ball (4,) about the node's surface, its band at all samples included."""
+        ball, bands = self.sampled.outlines[node].ball, self.sampled.bands[node]
+        if bands is None:
+            return ball
+        farthest = float(np.linalg.norm(bands - ball[:3], axis=-1).max())
+        return np.append(ball[:3], max(ball[3], farthest))
 
     def _find_order(self, whole_limbs: bool) -> tuple[int, ...]:
         """Trunk first, then limb after limb, the larger before the smaller.

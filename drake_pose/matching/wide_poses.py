@@ -8,18 +8,19 @@ import numpy as np
 from drake_pose.camera import Camera, ParallelCamera, PinholeCamera
 from drake_pose.matching.result import View
 from drake_pose.matching.wide_body import WideBody
-from drake_pose.silhouette.bit_kernel import draw_bits, draw_discs, sift_by_balls
+from drake_pose.silhouette.bit_balls import draw_discs, sift_by_balls
+from drake_pose.silhouette.bit_kernel import draw_bits
 from drake_pose.silhouette.bit_view import WORD, BitView, make_bit_view
 
 _ONE, _ALL = 1, 2
 
 
 def coarsen(view: View, pixels: int) -> View:
-    """The view at the coarsest whole fraction of its size that shows so many silhouette pixels.
+    """The view at the whole fraction of its size that shows about so many silhouette pixels.
 
     A pixel is in the silhouette if at least half of those that it replaces are.
     """
-    factor = int(np.sqrt(view.mask.sum() / pixels))
+    factor = round(float(np.sqrt(view.mask.sum() / pixels)))
     if factor < 2:
         return view
     height, width = (-(-side // factor) for side in view.mask.shape)
@@ -54,6 +55,7 @@ class Pictures:
     """The silhouettes of one instant as bits: parts of one long mask, silhouettes before bands.
 
     Attributes:
+        body, views: what it was made of.
         bit_views: one for each view.
         has_bands: whether pixels outside the silhouettes have bits, too.
         part_starts: (parts + 1,) where each part begins, and the mask's length [word].
@@ -67,6 +69,7 @@ class Pictures:
     """
 
     def __init__(self, body: WideBody, views: Sequence[View], band: int) -> None:
+        self.body = body
         self.views = tuple(views)
         self.has_bands = band > 0
         self.bit_views: list[BitView] = [
@@ -157,9 +160,9 @@ class PoseStore:
         return known[parents, :2]
 
     def samples(self, poses: np.ndarray) -> np.ndarray:
-        """The sample (nodes,) that each node takes at poses (nodes,)."""
-        return np.array(
-            [stored.samples[pose] for stored, pose in zip(self.nodes, poses, strict=True)]
+        """The samples (..., nodes) that the nodes take at poses (..., nodes)."""
+        return np.stack(
+            [stored.samples[poses[..., i]] for i, stored in enumerate(self.nodes)], axis=-1
         )
 
     def reach_rows(self, node: int, parents: np.ndarray) -> np.ndarray:

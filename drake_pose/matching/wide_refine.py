@@ -6,7 +6,14 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from drake_pose.matching.scoring import Scoring
-from drake_pose.matching.wide_beam import Beam
+from drake_pose.matching.wide_beam import Beam, Hypotheses
+from drake_pose.matching.wide_drawing import draw_node
+from drake_pose.matching.wide_poses import Pictures
+
+# What is placed last need not spare the silhouette for what comes after it.
+_OUTSIDE_WEIGHT = 2
+# So many of a node's samples are judged in full.
+_JUDGED = 4
 
 
 def search_limbs_again(
@@ -15,8 +22,8 @@ def search_limbs_again(
     poses: np.ndarray,
     J: float,
     width: int,
-    outside_weight: int,
     proceed: Callable[[int], bool],
+    found: Callable[[Hypotheses], object],
 ) -> np.ndarray:
     """Search limbs again, one or two at a time, until that improves nothing any more.
 
@@ -26,8 +33,8 @@ def search_limbs_again(
         poses: (nodes,) the pose of each node in the PoseStore.
         J: its objective as the beam counts it [pixel].
         width: how many hypotheses are kept.
-        outside_weight: as in Beam.grow.
         proceed: as in Beam.run.
+        found: told of the last hypotheses of every search.
 
     Returns:
         (nodes,) the better poses, or the same.
@@ -40,9 +47,10 @@ def search_limbs_again(
         nodes = set().union(*choice)
         start = beam.without(poses, sorted(nodes))
         part = [node for node in order if node in nodes]
-        last, _ = beam.run(start, part, width, outside_weight, False, proceed)
+        last, _ = beam.run(start, part, width, _OUTSIDE_WEIGHT, False, proceed)
         if last is None:
             return poses
+        found(last)
         Js = area - last.covered + last.outside
         best = int(np.argmin(Js))
         unchanged += 1
@@ -73,28 +81,31 @@ def find_limbs(beam: Beam) -> list[frozenset[int]]:
 
 
 def turn_single_nodes(
-    scoring: Scoring, samples: np.ndarray, proceed: Callable[[], bool]
+    scoring: Scoring, pictures: Pictures, samples: np.ndarray, proceed: Callable[[], bool]
 ) -> np.ndarray:
     """Try all samples of one node after another, all that hangs on it moving along.
 
     Args:
         scoring: gives J.
+        pictures: with bands; in them the samples are compared.
         samples: (nodes,) the sample of each node.
         proceed: asked before each node whether to go on.
 
     Returns:
-        (nodes,) samples no single one of which can be changed for the better, or as far as it got.
+        (nodes,) samples no single one of which can be changed for the better, as far as the
+        pictures show it, or as far as it got.
     """
-    sampled = scoring.sampled
     current = samples.copy()
-    J = float(scoring.J(poses_at(scoring, current[None]))[0])
+    J = float(scoring.J(poses_at(scoring, current[None]), current[None])[0])
     unchanged = 0
     for node in itertools.cycle(range(len(current))):
         if not proceed():
             break
-        tried = np.repeat(current[None], len(sampled.values[node]), axis=0)
+        tried = np.repeat(current[None], len(scoring.sampled.values[node]), axis=0)
         tried[:, node] = np.arange(len(tried))
-        Js = scoring.J(poses_at(scoring, tried))
+        rough = _rough_J(scoring, pictures, tried, node)
+        tried = tried[np.argsort(rough, kind="stable")[:_JUDGED]]
+        Js = scoring.J(poses_at(scoring, tried), tried)
         best = int(np.argmin(Js))
         unchanged += 1
         if Js[best] < J:
@@ -102,6 +113,29 @@ def turn_single_nodes(
         if unchanged >= len(current):
             break
     return current
+
+
+def _rough_J(scoring: Scoring, pictures: Pictures, samples: np.ndarray, node: int) -> np.ndarray:
+    """J (n,) as the pictures show it of samples (n, nodes) that differ in one node's alone.
+
+    Beyond the bands areas are added up, not united.
+    """
+    X_WN = poses_at(scoring, samples)
+    silhouettes = int(pictures.part_starts[len(pictures.views)])
+    moving = {node}
+    still = np.zeros((1, int(pictures.part_starts[-1])), dtype=np.uint64)
+    far = np.zeros(len(samples), dtype=np.int64)
+    for i, other in enumerate(scoring.sampled.tree.nodes):
+        if i in moving or other.parent in moving:
+            moving.add(i)
+        else:
+            far += draw_node(pictures, i, samples[:1, i], X_WN[:1, i], still)[0, 2]
+    masks = np.repeat(still, len(samples), axis=0)
+    for i in sorted(moving):
+        far += draw_node(pictures, i, samples[:, i], X_WN[:, i], masks)[:, 2]
+    covered = np.bitwise_count(masks[:, :silhouettes]).sum(axis=1, dtype=np.int64)
+    outside = np.bitwise_count(masks[:, silhouettes:]).sum(axis=1, dtype=np.int64)
+    return np.asarray(pictures.area - covered + outside + far)
 
 
 def poses_at(scoring: Scoring, samples: np.ndarray) -> np.ndarray:

@@ -13,9 +13,10 @@ import numpy as np
 
 from drake_pose.body import PoseTree
 from drake_pose.errors import SettingsError
+from drake_pose.matching.grid_poses import Gathering, GridPoses, check_choice
 from drake_pose.matching.result import MatchResult, View
 from drake_pose.matching.scoring import Scoring
-from drake_pose.matching.wide_beam import Beam
+from drake_pose.matching.wide_beam import Beam, Hypotheses
 from drake_pose.matching.wide_body import WideBody
 from drake_pose.matching.wide_poses import Pictures, PoseStore, coarsen
 from drake_pose.matching.wide_refine import poses_at, search_limbs_again, turn_single_nodes
@@ -54,29 +55,108 @@ class WideSearch:
         Raises:
             SettingsError: if there is no view.
         """
+        start = time.perf_counter()
+        run = self._run(views, root_position, None)
+        return run.result(time.perf_counter() - start)
+
+    def match_exactly(
+        self, views: Sequence[View], root_position: np.ndarray | None = None
+    ) -> MatchResult | None:
+        """Run the stages that let nothing lie outside; they end at once where nothing fits.
+
+        Args:
+            views: one or several silhouettes of the same instant.
+            root_position: as in match.
+
+        Returns:
+            A pose whose J is 0, or None.
+
+        Raises:
+            SettingsError: if there is no view.
+        """
+        start = time.perf_counter()
+        exact = tuple(stage for stage in self.settings.stages if stage.outside_share == 0.0)
+        run = self._prepare(views, root_position, None)
+        run.run_stages(exact)
+        if run.J > 0:
+            return None
+        run.stopped_by = "exact"
+        return run.result(time.perf_counter() - start)
+
+    def best_poses(
+        self,
+        views: Sequence[View],
+        root_position: np.ndarray | None = None,
+        count: int = 30,
+        alike: float = 0.7,
+    ) -> GridPoses:
+        """The best whole poses that the search came by and that do not look alike.
+
+        Slower than :meth:`match`: the search does not end at J = 0 before it has also looked at
+        poses that leave the silhouette a little.
+
+        Args:
+            views: one or several silhouettes of the same instant.
+            root_position: as in match.
+            count: at most so many.
+            alike: two poses look alike if each node's pictures in both have so much of their union
+                in common in all views, or it is hidden in both, covering nothing that other nodes
+                do not cover. Above 1: all poses of the grid differ.
+
+        Returns:
+            The poses, the smallest J first; an empty list if a limit of the settings left none.
+
+        Raises:
+            SettingsError: if there is no view, count is below 1 or alike is not positive.
+        """
+        check_choice(count, alike)
+        gathering = Gathering()
+        run = self._run(views, root_position, gathering)
+        return gathering.choose(run.scoring, run.pictures(exact=False), count, alike)
+
+    def _run(
+        self,
+        views: Sequence[View],
+        root_position: np.ndarray | None,
+        gathering: Gathering | None,
+    ) -> "_Run":
+        run = self._prepare(views, root_position, gathering)
+        run.search()
+        return run
+
+    def _prepare(
+        self,
+        views: Sequence[View],
+        root_position: np.ndarray | None,
+        gathering: Gathering | None,
+    ) -> "_Run":
         if not views:
             raise SettingsError("a match needs at least one view, but none was given")
-        start = time.perf_counter()
         body = self.body
         if root_position is not None:
             body = body.with_root_position(root_position)
-        run = _Run(body, views, self.settings, start)
-        run.search()
-        return run.result(time.perf_counter() - start)
+        return _Run(body, views, self.settings, gathering)
 
 
 class _Run:
     """One match."""
 
     def __init__(
-        self, body: WideBody, views: Sequence[View], settings: WideSearchSettings, start: float
+        self,
+        body: WideBody,
+        views: Sequence[View],
+        settings: WideSearchSettings,
+        gathering: Gathering | None,
     ) -> None:
+        limit = settings.time_limit
+        self.deadline = np.inf if limit is None else time.perf_counter() + limit
+        self.gathering = gathering
         self.body = body
         self.views = views
         self.settings = settings
-        self.deadline = np.inf if settings.time_limit is None else start + settings.time_limit
         self.scoring = Scoring(body.sampled, views)
         self.samples: np.ndarray | None = None
+        self._pictures: dict[bool, Pictures] = {}
         self.J = np.inf
         self.first_J = np.nan
         self.runs = 0
@@ -84,34 +164,43 @@ class _Run:
         self.stopped_by = ""
 
     def search(self) -> None:
-        """Run stage after stage until J = 0 or a limit is reached."""
-        no_exact_pose = False
-        pictures: dict[bool, Pictures] = {}
-        stores: dict[float, PoseStore] = {}
-        for stage in self.settings.stages:
-            exact = stage.outside_share == 0.0
-            if exact and no_exact_pose:
-                continue
-            if exact not in pictures:
-                pictures[exact] = self._pictures(exact)
-            if stage.outside_share not in stores:
-                stores[stage.outside_share] = PoseStore(
-                    self.body, pictures[exact], stage.outside_share
-                )
-            complete = self._run_stage(Beam(stores[stage.outside_share]), stage)
-            no_exact_pose = no_exact_pose or (exact and complete and self.J > 0)
-            if self.J == 0 or self.stopped_by:
-                break
+        """Run stage after stage until J = 0 or a limit is reached; then polish the answer."""
+        self.run_stages(self.settings.stages)
         if self.samples is None:
             self._answer_somehow()
+        elif self.J > 0 and self.settings.research_hypotheses and not self.stopped_by:
+            turned = turn_single_nodes(
+                self.scoring, self.pictures(exact=False), self.samples, lambda: self.proceed(0)
+            )
+            self._keep_if_better(turned)
         self.stopped_by = "exact" if self.J == 0 else self.stopped_by or "end"
 
-    def _pictures(self, exact: bool) -> Pictures:
+    def run_stages(self, stages: Sequence[Stage]) -> None:
+        """Run stage after stage until J = 0 or a limit is reached."""
+        skip_exact = False
+        stores: dict[float, PoseStore] = {}
+        for stage in stages:
+            exact = stage.outside_share == 0.0
+            if exact and skip_exact:
+                continue
+            if stage.outside_share not in stores:
+                stores[stage.outside_share] = PoseStore(
+                    self.body, self.pictures(exact), stage.outside_share
+                )
+            complete = self._run_stage(Beam(stores[stage.outside_share]), stage)
+            if self.stopped_by or (self.J == 0 and (self.gathering is None or not exact)):
+                break
+            skip_exact = skip_exact or complete or self.J == 0
+
+    def pictures(self, exact: bool) -> Pictures:
         """The silhouettes as bits: coarse ones with a band for stages that are not exact."""
-        if exact:
-            return Pictures(self.body, self.views, 0)
-        views = [coarsen(view, self.settings.coarse_pixels) for view in self.views]
-        return Pictures(self.body, views, self.settings.band)
+        if exact not in self._pictures:
+            views, band = self.views, 0
+            if not exact:
+                views = tuple(coarsen(view, self.settings.coarse_pixels) for view in views)
+                band = self.settings.band
+            self._pictures[exact] = Pictures(self.body, views, band)
+        return self._pictures[exact]
 
     def proceed(self, made: int) -> bool:
         """Whether the limits allow to go on, after one more node with so many hypotheses."""
@@ -133,38 +222,50 @@ class _Run:
         )
         if last is None:
             return complete
-        Js = beam.store.pictures.area - last.covered + last.outside
+        Js = self._gather(beam, last)
         best = int(np.argmin(Js))
         poses = last.poses[best]
         self._keep_if_better(beam.store.samples(poses))
-        if self.J > 0 and self.settings.research_hypotheses:
-            width = self.settings.research_hypotheses
+        if self.settings.research_hypotheses and (self.J > 0 or (self.gathering and not exact)):
             better = search_limbs_again(
-                beam, order, poses, float(Js[best]), width, stage.outside_weight, self.proceed
+                beam,
+                order,
+                poses,
+                float(Js[best]),
+                self.settings.research_hypotheses,
+                self.proceed,
+                lambda hypotheses: self._gather(beam, hypotheses),
             )
             self._keep_if_better(beam.store.samples(better))
-            if self.samples is not None and not self.stopped_by:
-                turned = turn_single_nodes(self.scoring, self.samples, lambda: self.proceed(0))
-                self._keep_if_better(turned)
         return complete
 
     def _answer_somehow(self) -> None:
         """A pose whatever lies outside; found by one hypothesis alone if a limit was reached."""
         width = 1 if self.stopped_by else self.settings.stages[-1].hypotheses
-        store = PoseStore(self.body, self._pictures(exact=False), np.inf)
+        store = PoseStore(self.body, self.pictures(exact=False), np.inf)
         beam = Beam(store)
         last, _ = beam.run(beam.start(), self.body.order, width, 2, False, lambda made: True)
         if last is not None:
-            Js = store.pictures.area - last.covered + last.outside
+            Js = self._gather(beam, last)
             self._keep_if_better(store.samples(last.poses[int(np.argmin(Js))]))
+
+    def _gather(self, beam: Beam, hypotheses: Hypotheses) -> np.ndarray:
+        """What J is (n,) as the beam counts it; whole poses are gathered if that is wanted."""
+        Js = beam.store.pictures.area - hypotheses.covered + hypotheses.outside
+        if self.gathering is not None:
+            self.gathering.add(beam.store.samples(hypotheses.poses), Js / beam.store.pictures.area)
+        return np.asarray(Js)
 
     def _keep_if_better(self, samples: np.ndarray) -> None:
         """Keep samples (nodes,) if their J is the smallest so far."""
-        J = float(self.scoring.J(poses_at(self.scoring, samples[None]))[0])
+        X_WN = poses_at(self.scoring, samples[None])
+        J = float(self.scoring.J(X_WN, samples[None])[0])
         if self.samples is None:
             self.first_J = J
         if J < self.J:
             self.J, self.samples = J, samples
+            if self.gathering is not None:
+                self.gathering.add(samples[None], np.array([J / self.scoring.silhouette_area]))
 
     def _values(self, samples: np.ndarray) -> list[np.ndarray]:
         return [values[t] for values, t in zip(self.body.sampled.values, samples, strict=True)]

@@ -45,7 +45,7 @@ EXACT_STAGES = (
 )
 """For a body that is the object itself: nothing lies outside. They end at once where it is not."""
 
-TOLERANT_STAGES = (Stage(80, 0.5, 2), Stage(400, 1.0, 2))
+TOLERANT_STAGES = (Stage(80, 0.3, 5), Stage(300, 1.0, 2))
 """For a body that fits badly."""
 
 
@@ -64,7 +64,7 @@ class WideSearchSettings:
         band: how far around the silhouette the union of what lies outside is told from its sum
             [pixel].
         coarse_pixels: stages that let something lie outside see the silhouettes no finer than with
-            about so many pixels (up to four times); the best pose is then judged in full.
+            about so many pixels; the best pose is then judged in full.
         research_hypotheses: how many hypotheses are kept when single limbs and pairs of limbs of
             the winner are searched again; 0: they are not.
         time_limit: the search answers with what it has after so many seconds; None: no limit.
@@ -81,7 +81,7 @@ class WideSearchSettings:
     node_order: tuple[str, ...] = ()
     band: int = 24
     coarse_pixels: int = 6000
-    research_hypotheses: int = 100
+    research_hypotheses: int = 30
     time_limit: float | None = None
     hypothesis_limit: int | None = None
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from drake_pose.silhouette.agreement import Agreement, measure_agreement
+    from drake_pose.silhouette.bending import BendingOutline, TreeSurfaces, score_bending
     from drake_pose.silhouette.label_images import label_image_to_mask, mask_to_label_image
     from drake_pose.silhouette.label_renderer import LabelRenderer
     from drake_pose.silhouette.masks import read_mask, write_mask
@@ -27,9 +28,11 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "Agreement": "agreement",
+    "BendingOutline": "bending",
     "LabelRenderer": "label_renderer",
     "Outline": "outline",
     "Scene": "scenes",
+    "TreeSurfaces": "bending",
     "draw_mask": "scoring",
     "label_image_to_mask": "label_images",
     "load_scene": "scenes",
@@ -39,6 +42,7 @@ _HOMES = {
     "prefix_sums": "scoring",
     "read_mask": "masks",
     "require_visible": "visibility",
+    "score_bending": "bending",
     "score_bodies": "scoring",
     "score_candidates": "scoring",
     "subtract_body": "scoring",
@@ -47,9 +51,11 @@ _HOMES = {
 
 __all__ = [
     "Agreement",
+    "BendingOutline",
     "LabelRenderer",
     "Outline",
     "Scene",
+    "TreeSurfaces",
     "draw_mask",
     "label_image_to_mask",
     "load_scene",
@@ -59,6 +65,7 @@ __all__ = [
     "prefix_sums",
     "read_mask",
     "require_visible",
+    "score_bending",
     "score_bodies",
     "score_candidates",
     "subtract_body",

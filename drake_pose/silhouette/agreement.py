@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drake_pose.body import ModelSkin, TriangleMesh
 from drake_pose.camera import Camera
+from drake_pose.silhouette.bending import BendingOutline
 from drake_pose.silhouette.label_renderer import LabelRenderer
 from drake_pose.silhouette.outline import outline_from_mesh
 from drake_pose.silhouette.scoring import draw_mask
@@ -83,6 +85,9 @@ def measure_agreement(
     outlines = {name: outline_from_mesh(mesh) for name, mesh in model.link_meshes.items()}
     links = {name: label for label, name in renderer.link_names.items()}
     bodies = [links[name] for name in outlines]
+    skin = ModelSkin(model)
+    nothing = outline_from_mesh(TriangleMesh.empty())
+    bands = [BendingOutline(nothing, mesh) for mesh in skin.meshes]
     limited = np.isfinite(model.lower) & np.isfinite(model.upper)
     lower = np.where(limited, model.lower, model.default_positions)
     upper = np.where(limited, model.upper, model.default_positions)
@@ -92,7 +97,8 @@ def measure_agreement(
     differing, areas = np.zeros(poses, dtype=np.int64), np.zeros(poses, dtype=np.int64)
     for n, q in enumerate(positions):
         reference = renderer.mask(q)
-        X_CL = camera.X_CW @ renderer.link_poses(q)[bodies]
-        mask = draw_mask(list(outlines.values()), X_CL, camera)
+        bent = [band.at(p_W) for band, p_W in zip(bands, skin.vertices(q), strict=True)]
+        X_WL = [*renderer.link_poses(q)[bodies], *([np.eye(4)] * len(bent))]
+        mask = draw_mask([*outlines.values(), *bent], camera.X_CW @ np.array(X_WL), camera)
         differing[n], areas[n] = np.count_nonzero(mask != reference), reference.sum()
     return Agreement(differing, areas, positions)

@@ -1,4 +1,4 @@
-"""Bit masks of one surface at many poses, and quick tests that leave most of them undrawn.
+"""Bit masks of one surface at many poses.
 
 The pixels are those of the span kernel, decided by the same arithmetic; only the contour edges are
 looked for among the few that can be on the contour (contour_cells).
@@ -12,20 +12,24 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from drake_pose.silhouette.bending_kernel import bend, own_copy
 from drake_pose.silhouette.bit_view import WORD, BitView
 from drake_pose.silhouette.contour_cells import CelledOutline, find_cell
 from drake_pose.silhouette.kernel import (
     _BIAS,
     _SHIFT,
     _fill_safely,
+    _find_facings,
     _find_spans,
     _make_work,
+    _project,
+    _walk_contour,
     _Work,
 )
+from drake_pose.silhouette.outline import PackedOutlines
 
 _FIRST_CAPACITY = 8
 _FULL = np.uint64(0xFFFFFFFFFFFFFFFF)
-_WIDTH_LIMIT = 32768
 
 
 class _Scratch(NamedTuple):
@@ -56,96 +60,7 @@ def _make_scratch(edges: int) -> _Scratch:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def sift_by_balls(
-    view: BitView,
-    X_WP: np.ndarray,
-    p_PB: np.ndarray,
-    radii: np.ndarray,
-    pairs: np.ndarray,
-    limit: float,
-) -> np.ndarray:
-    """Leaves out poses at which a ball inside the surface shows that too much lies outside.
-
-    Args:
-        view: the silhouette.
-        X_WP: (g, 4, 4) poses of the parent.
-        p_PB: (n, k, 3) places of k balls in the parent's frame at each sample of the node [m].
-        radii: (k,) of the balls [m].
-        pairs: (m, 2) int32 parent pose and sample.
-        limit: the area that may lie outside the silhouette [pixel].
-
-    Returns:
-        (m,) bool: the pairs that are left. None is lost whose surface lies outside by the limit or
-        less.
-    """
-    camera, window, X_CW = view.camera, view.window, view.X_CW
-    left = np.ones(pairs.shape[0], dtype=np.bool_)
-    scale, parallel = min(camera[1], camera[2]), camera[0] == 1.0
-    X_CP = np.empty((3, 4))
-    group = -1
-    for i in range(pairs.shape[0]):
-        if pairs[i, 0] != group:
-            group = pairs[i, 0]
-            _multiply(X_CW, X_WP[group], X_CP)
-        sample = pairs[i, 1]
-        for k in range(radii.shape[0]):
-            x, y, z = p_PB[sample, k, 0], p_PB[sample, k, 1], p_PB[sample, k, 2]
-            u = X_CP[0, 0] * x + X_CP[0, 1] * y + X_CP[0, 2] * z + X_CP[0, 3]
-            v = X_CP[1, 0] * x + X_CP[1, 1] * y + X_CP[1, 2] * z + X_CP[1, 3]
-            radius = scale * radii[k]
-            if parallel:
-                u, v = camera[1] * u + camera[3], camera[2] * v + camera[4]
-            else:
-                depth = X_CP[2, 0] * x + X_CP[2, 1] * y + X_CP[2, 2] * z + X_CP[2, 3]
-                if depth - radii[k] < camera[5]:
-                    continue
-                u, v = camera[1] * u / depth + camera[3], camera[2] * v / depth + camera[4]
-                radius /= depth
-            if not (-0.5 < u < camera[6] - 0.5 and -0.5 < v < camera[7] - 0.5):
-                continue
-            if limit < 1.0:
-                if _disc_leaves(view.nearest, window, u, v, radius - 1e-6):
-                    left[i] = False
-                    break
-            elif _square_outside(view.sums, window, camera, u, v, 0.7071 * radius) > limit:
-                left[i] = False
-                break
-    return left
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _disc_leaves(
-    nearest: np.ndarray, window: np.ndarray, u: float, v: float, radius: float
-) -> bool:
-    """Returns whether a disc whose centre is in the picture surely leaves the silhouette."""
-    row, column = round(v), round(u)
-    r, c = row - window[0], column - window[1]
-    if 0 <= r < window[2] and 0 <= c < window[3]:
-        place = nearest[r, c]
-        if place >= 0:
-            row, column = place // _WIDTH_LIMIT, place % _WIDTH_LIMIT
-    return (u - column) ** 2 + (v - row) ** 2 < radius * radius and radius > 0.0
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _square_outside(
-    sums: np.ndarray, window: np.ndarray, camera: np.ndarray, u: float, v: float, half: float
-) -> int:
-    """Returns how many pixels of the picture under a square are not in the silhouette."""
-    a, b = max(0, int(np.ceil(u - half))), min(int(camera[6]), int(np.ceil(u + half)))
-    c, d = max(0, int(np.ceil(v - half))), min(int(camera[7]), int(np.ceil(v + half)))
-    if a >= b or c >= d:
-        return 0
-    area = (b - a) * (d - c)
-    a, b = max(0, a - window[1]), min(window[3], b - window[1])
-    c, d = max(0, c - window[0]), min(window[2], d - window[0])
-    if a >= b or c >= d:
-        return area
-    return area - (sums[d, b] - sums[c, b] - sums[d, a] + sums[c, a])
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _multiply(X_AB: np.ndarray, X_BC: np.ndarray, X_AC: np.ndarray) -> None:
+def multiply(X_AB: np.ndarray, X_BC: np.ndarray, X_AC: np.ndarray) -> None:
     """Writes the upper three rows of X_AB X_BC."""
     for i in range(3):
         for j in range(4):
@@ -168,7 +83,7 @@ def draw_bits(
     """Draws a surface at many poses as bits.
 
     Args:
-        celled: the surface.
+        celled: the surface; if it has a band of skin, the band is that of the pair's sample.
         view: the silhouette.
         X_WP: (g, 4, 4) poses of the parent.
         X_PN: (n, 4, 4) poses of the node in its parent at its samples.
@@ -183,7 +98,11 @@ def draw_bits(
         words, and where they begin in words; words (n,) uint64.
     """
     packed, camera = celled.packed, view.camera
-    work, scratch = _make_work(packed, camera), _make_scratch(packed.edges.shape[1])
+    bends = celled.bands.shape[0] > 0
+    work, scratch = _make_work(celled.whole, camera), _make_scratch(packed.edges.shape[1])
+    band, whole = celled.band, celled.whole
+    if bends:
+        band, whole = own_copy(band), own_copy(whole)
     crossings = np.empty((int(camera[7]), _FIRST_CAPACITY), dtype=np.int32)
     X_WN, X_CN = np.zeros((4, 4)), np.empty((1, 3, 4))
     X_WN[3, 3] = 1.0
@@ -198,10 +117,16 @@ def draw_bits(
     for i in range(pairs.shape[0]):
         if pairs[i, 0] == satisfied:
             continue
-        _multiply(X_WP[pairs[i, 0]], X_PN[pairs[i, 1]], X_WN)
-        _multiply(view.X_CW, X_WN, X_CN[0])
-        if not _fill_celled(celled, X_CN, camera, crossings, work, scratch):
-            crossings = _fill_safely(packed, X_CN, camera, crossings, work)
+        multiply(X_WP[pairs[i, 0]], X_PN[pairs[i, 1]], X_WN)
+        multiply(view.X_CW, X_WN, X_CN[0])
+        filled = _fill_celled(celled, X_CN, camera, crossings, work, scratch)
+        if bends and filled:
+            bend(band, np.zeros(4, dtype=np.int64), celled.bands[pairs[i, 1]])
+            filled = _add_band(band, X_CN, camera, crossings, work)
+        if not filled:
+            if bends:
+                bend(whole, celled.part, celled.bands[pairs[i, 1]])
+            crossings = _fill_safely(whole, X_CN, camera, crossings, work)
         count, spans = _gather_spans(view, crossings, work, limit, spans, areas[found])
         if count < 0:
             continue
@@ -209,9 +134,9 @@ def draw_bits(
             wider = np.empty(2 * words.shape[0] + inside_size + band_size, dtype=np.uint64)
             wider[:used] = words[:used]
             words = wider
-        used = _write_runs(view.inside, view.window, spans, count, words, used, runs[found, 0])
+        used = write_runs(view.inside, view.window, spans, count, words, used, runs[found, 0])
         if band_size:
-            used = _write_runs(view.band, view.window, spans, count, words, used, runs[found, 1])
+            used = write_runs(view.band, view.window, spans, count, words, used, runs[found, 1])
         kept[i] = True
         found += 1
         if one_enough[pairs[i, 0]]:
@@ -258,6 +183,27 @@ def _fill_celled(
             work.counts[row] = 0
         return False
     return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_band(
+    band: PackedOutlines, X_CN: np.ndarray, camera: np.ndarray, crossings: np.ndarray, work: _Work
+) -> bool:
+    """Adds a surface's crossings to those in the rows; False (and the rows empty) if it cannot."""
+    possible = True
+    if camera[0] == 0.0:
+        X, ball = X_CN[0], band.balls[0]
+        depth = X[2, 0] * ball[0] + X[2, 1] * ball[1] + X[2, 2] * ball[2] + X[2, 3]
+        possible = depth - 1.000001 * ball[3] >= camera[5]
+    if possible:
+        _project(band, 0, X_CN, camera, work)
+        _find_facings(band, 0, X_CN, camera, work)
+        _walk_contour(band, 0, camera, crossings, work)
+        possible = work.reach[2] == 0
+    if not possible:
+        for row in range(work.reach[0], work.reach[1]):
+            work.counts[row] = 0
+    return possible
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -396,7 +342,7 @@ def _gather_spans(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _write_runs(
+def write_runs(
     numbers: np.ndarray,
     window: np.ndarray,
     spans: np.ndarray,
@@ -430,52 +376,3 @@ def _write_runs(
             words[used + high - first] |= high_bits
     run[0], run[1], run[2] = max(first, 0), 0 if first < 0 else last - first + 1, used
     return used + run[1]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def draw_discs(
-    view: BitView, X_WP: np.ndarray, p_PB: np.ndarray, radius: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Draws discs that hold the picture of a ball as bits of the silhouette.
-
-    Args:
-        view: the silhouette.
-        X_WP: (g, 4, 4) poses of the frame that the ball is fixed in.
-        p_PB: (3,) its centre [m].
-        radius: its radius [m].
-
-    Returns:
-        runs (g, 3) int64 first word, number of words, where they begin in words; words (n,) uint64.
-    """
-    camera, window = view.camera, view.window
-    height, width = window[2], window[3]
-    size = view.inside[-1, -1] // WORD + 1
-    X_CP = np.empty((3, 4))
-    p_C = np.empty(3)
-    spans = np.empty((height, 3), dtype=np.int32)
-    runs = np.zeros((X_WP.shape[0], 3), dtype=np.int64)
-    words = np.empty(size * X_WP.shape[0], dtype=np.uint64)
-    used = 0
-    for i in range(X_WP.shape[0]):
-        _multiply(view.X_CW, X_WP[i], X_CP)
-        for j in range(3):
-            p_C[j] = X_CP[j, 3]
-            for k in range(3):
-                p_C[j] += X_CP[j, k] * p_PB[k]
-        u, v, reach = camera[1] * p_C[0], camera[2] * p_C[1], max(camera[1], camera[2]) * radius
-        if camera[0] != 1.0:
-            u, v = u / p_C[2], v / p_C[2]
-            distance = np.sqrt((p_C**2).sum())
-            reach *= distance / (p_C[2] * (p_C[2] - radius))
-            if p_C[2] - radius < camera[5]:
-                u, v, reach = 0.0, 0.0, 1e9
-        u, v, reach = u + camera[3] - window[1], v + camera[4] - window[0], reach + 1.0
-        count = 0
-        for row in range(max(0, math.ceil(v - reach)), min(height, math.floor(v + reach) + 1)):
-            half = np.sqrt(max(0.0, reach * reach - (row - v) ** 2))
-            a, b = max(0, math.ceil(u - half)), min(width, math.floor(u + half) + 1)
-            if a < b:
-                spans[count, 0], spans[count, 1], spans[count, 2] = row, a, b
-                count += 1
-        used = _write_runs(view.inside, window, spans, count, words, used, runs[i])
-    return runs, words[:used].copy()

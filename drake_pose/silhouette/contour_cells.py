@@ -15,7 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from drake_pose.silhouette.outline import Outline, PackedOutlines, pack
+from drake_pose.body import TriangleMesh
+from drake_pose.silhouette.bending import BendingOutline
+from drake_pose.silhouette.outline import Outline, PackedOutlines, outline_from_mesh, pack
 
 _CELLS_A_SIDE = 20
 # A little more than rounding can move a direction.
@@ -29,7 +31,10 @@ class CelledOutline(NamedTuple):
     likewise, and a plane that faces nowhere; edges: (e, 5) int32 v0, v1, t0, t1, s1 as in packed;
     cell_starts: (cells + 1,) int64; cell_edges: (k,) int32 indices into edges, cell after cell;
     reach: (1,) the sine of how far the directions in which a camera sees the surface's points may
-    differ from that of its ball's centre.
+    differ from that of its ball's centre; bands: (n, v, 3) the vertices of the surface's band of
+    skin at the samples of its node [m], n = 0 where it has none; band: the band alone, packed;
+    whole: the surface with its band, packed; part: (4,) int64 the band in the latter, as the
+    bending kernel wants it.
     """
 
     packed: PackedOutlines
@@ -39,17 +44,31 @@ class CelledOutline(NamedTuple):
     cell_starts: np.ndarray
     cell_edges: np.ndarray
     reach: np.ndarray
+    bands: np.ndarray
+    band: PackedOutlines
+    whole: PackedOutlines
+    part: np.ndarray
 
 
-def divide_outline(outline: Outline, spread: float = 0.0) -> CelledOutline:
+def divide_outline(
+    outline: Outline,
+    spread: float = 0.0,
+    band: TriangleMesh | None = None,
+    bands: np.ndarray | None = None,
+) -> CelledOutline:
     """Returns the surface with its cells.
 
     Args:
         outline: the surface.
         spread: how far the directions in which a camera sees the surface's points may differ from
             that of its ball's centre [rad]: 0 for parallel rays.
+        band: the band of skin that belongs to the surface, at rest; it gets no cells.
+        bands: (n, v, 3) its vertices at the samples of its node [m].
     """
     packed = pack((outline,))
+    skin = band or TriangleMesh.empty()
+    whole = BendingOutline(outline, skin)
+    alone = BendingOutline(outline_from_mesh(TriangleMesh.empty()), skin)
     starts, edges = _find_cell_edges(packed, _CELLS_A_SIDE, spread)
     points = np.column_stack([packed.points.T, np.ones(packed.points.shape[1])])
     planes = np.vstack([packed.planes.T, np.zeros(4)])
@@ -62,6 +81,10 @@ def divide_outline(outline: Outline, spread: float = 0.0) -> CelledOutline:
         cell_starts=starts,
         cell_edges=edges,
         reach=np.array([math.sin(spread)]),
+        bands=np.ascontiguousarray(np.zeros((0, 0, 3)) if bands is None else bands),
+        band=pack((alone.rest,)),
+        whole=pack((whole.rest,)),
+        part=np.array([0, len(outline.vertices), len(outline.triangles), 0], dtype=np.int64),
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,8 +19,10 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
 
+from drake_pose.body import ModelSkin
 from drake_pose.body.model import link_names
 from drake_pose.camera import Camera, ParallelCamera
+from drake_pose.silhouette.drake_skin import DeformableSkin
 from drake_pose.silhouette.label_images import EMPTY, label_data
 
 if TYPE_CHECKING:
@@ -49,6 +52,8 @@ class LabelRenderer:
         self._plant = MultibodyPlant(time_step=0.0)
         self._source = self._plant.RegisterAsSourceForSceneGraph(self._scene_graph)
         model.add_to(self._plant, self._scene_graph)
+        labels = {name: label for label, name in enumerate(link_names(self._plant))}
+        self._skin = DeformableSkin(ModelSkin(model), self._scene_graph, labels)
         self._scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(RenderEngineVtkParams()))
         self._plant.Finalize()
         self._plant_context = self._plant.CreateDefaultContext()
@@ -81,8 +86,11 @@ class LabelRenderer:
             rotation = RotationMatrix.ProjectToRotationMatrix(np.asarray(X_WB)[:3, :3])
             X_BW = RigidTransform(rotation, np.asarray(X_WB)[:3, 3]).inverse()
         self._scene_graph.get_source_pose_port(self._source).FixValue(self._context, poses)
+        p_B = self._skin.skin.vertices(np.asarray(q, dtype=np.float64))
+        port = self._scene_graph.get_source_configuration_port(self._skin.source)
+        port.FixValue(self._context, self._skin.configuration(p_B))
         if isinstance(self.camera, ParallelCamera):
-            depths = self._depths(poses, X_BW.inverse().GetAsMatrix4())
+            depths = self._depths(poses, p_B, X_BW.inverse().GetAsMatrix4())
             color, _, X_WC = self.camera.to_drake(renderer_name=_RENDERER, depth_range=depths)
         else:
             color, _, X_WC = self.camera.to_drake(renderer_name=_RENDERER)
@@ -133,7 +141,9 @@ class LabelRenderer:
             corners.append((inspector.GetFrameId(shape), points))
         return corners
 
-    def _depths(self, poses: FramePoseVector, X_WB: np.ndarray) -> tuple[float, float]:
+    def _depths(
+        self, poses: FramePoseVector, bands: Sequence[np.ndarray], X_WB: np.ndarray
+    ) -> tuple[float, float]:
         """Returns the least and greatest depth of the body in the camera [m], with a margin."""
         nearest, farthest = np.inf, -np.inf
         X_CB = self.camera.X_CW @ X_WB
@@ -141,6 +151,9 @@ class LabelRenderer:
             X_BF = np.eye(4) if frame == self._world else poses.value(frame).GetAsMatrix4()
             row = (X_CB @ X_BF)[2]
             depth = p_F @ row[:3] + row[3]
+            nearest, farthest = min(nearest, depth.min()), max(farthest, depth.max())
+        for p_B in bands:
+            depth = p_B @ X_CB[2, :3] + X_CB[2, 3]
             nearest, farthest = min(nearest, depth.min()), max(farthest, depth.max())
         if nearest > farthest:
             return -1.0, 1.0

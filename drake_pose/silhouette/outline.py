@@ -1,4 +1,4 @@
-"""A rigid surface made ready for the span kernel."""
+"""A surface made ready for the span kernel."""
 
 from __future__ import annotations
 
@@ -26,11 +26,14 @@ class Outline:
         edges: (e, 6) int32 records v0, v1, t0, s0, t1, s1: s is +1 where the triangle t runs from
             v0 to v1 and -1 where it runs back; t1 = -1 and s1 = 0 where there is no second
             triangle.
+        rest: where this is another surface with some of its vertices moved, that surface: what
+            does not depend on the places of vertices is packed once for both.
     """
 
     vertices: np.ndarray
     triangles: np.ndarray
     edges: np.ndarray
+    rest: Outline | None = None
 
     @cached_property
     def planes(self) -> np.ndarray:
@@ -87,11 +90,11 @@ def outline_from_mesh(mesh: TriangleMesh) -> Outline:
     return Outline(
         vertices=np.ascontiguousarray(vertices[used]),
         triangles=triangles,
-        edges=_edge_records(triangles),
+        edges=edge_records(triangles),
     )
 
 
-def _edge_records(triangles: np.ndarray) -> np.ndarray:
+def edge_records(triangles: np.ndarray) -> np.ndarray:
     """Returns the records of Outline.edges."""
     heads = triangles.T.reshape(-1).astype(np.int64)
     tails = triangles[:, [1, 2, 0]].T.reshape(-1).astype(np.int64)
@@ -129,9 +132,21 @@ def _position_in_run(*keys: np.ndarray) -> np.ndarray:
     return index - np.maximum.accumulate(np.where(begins, index, 0))
 
 
-@lru_cache(maxsize=256)
 def pack(outlines: tuple[Outline, ...]) -> PackedOutlines:
     """Returns outlines in the kernel's arrays (remembered: outlines are immutable)."""
+    packed = _pack_rest(tuple(outline.rest or outline for outline in outlines))
+    if all(outline.rest is None for outline in outlines):
+        return packed
+    return packed._replace(
+        points=np.concatenate([o.vertices for o in outlines]).T.copy(),
+        planes=np.concatenate([o.planes for o in outlines]).T.copy(),
+        balls=np.array([o.ball for o in outlines]),
+    )
+
+
+@lru_cache(maxsize=256)
+def _pack_rest(outlines: tuple[Outline, ...]) -> PackedOutlines:
+    """As pack, for outlines that are at rest."""
     starts = np.zeros((len(outlines) + 1, 3), dtype=np.int64)
     sizes = [(len(o.vertices), len(o.triangles), len(o.edges)) for o in outlines]
     starts[1:] = np.cumsum(np.array(sizes, dtype=np.int64).reshape(-1, 3), axis=0)

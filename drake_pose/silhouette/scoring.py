@@ -53,19 +53,14 @@ def score_bodies(
         (n, 1 + k) int64 area of the union inside the picture, then of its intersection with each
         set [pixel].
     """
-    packed, poses = _check_body(outlines, X_CN)
-    sums = np.require(prefixes, dtype=np.int32, requirements=["C", "W"])
-    if sums.ndim != 3 or sums.shape[1:] != (camera.height, camera.width + 1):
-        raise ValueError(
-            f"prefixes of camera '{camera.name}' must be (k, {camera.height}, {camera.width + 1}), "
-            f"not {sums.shape}"
-        )
+    packed, poses = check_body(outlines, X_CN)
+    sums = check_prefixes(prefixes, camera)
     return score(packed, poses, camera.kernel_parameters(), sums)
 
 
 def draw_mask(outlines: Sequence[Outline], X_CN: np.ndarray, camera: Camera) -> np.ndarray:
     """Returns the mask (H, W) bool of a body at poses X_CN (nodes, 4, 4) in the camera."""
-    packed, poses = _check_body(outlines, np.asarray(X_CN)[None])
+    packed, poses = check_body(outlines, np.asarray(X_CN)[None])
     mask = np.zeros((camera.height, camera.width), dtype=np.uint8)
     paint(packed, poses[0], camera.kernel_parameters(), mask, 1)
     return mask.view(np.bool_)
@@ -92,7 +87,7 @@ def subtract_body(
     """
     surfaces = [outlines] if isinstance(outlines, Outline) else outlines
     poses = np.asarray(X_CN)
-    packed, poses = _check_body(surfaces, poses.reshape(1, len(surfaces), *poses.shape[-2:]))
+    packed, poses = check_body(surfaces, poses.reshape(1, len(surfaces), *poses.shape[-2:]))
     size = (camera.height, camera.width)
     for name, array, shape in (("mask", mask, size), ("prefix", prefix, (size[0], size[1] + 1))):
         if array.shape != shape or not (array.flags.c_contiguous and array.flags.writeable):
@@ -106,8 +101,27 @@ def subtract_body(
     sum_rows(pixels, prefix, first, end)
 
 
-def _check_body(outlines: Sequence[Outline], X_CN: np.ndarray) -> tuple[PackedOutlines, np.ndarray]:
-    """Returns the kernel's arrays and poses (n, nodes, 3, 4)."""
+def check_prefixes(prefixes: np.ndarray, camera: Camera) -> np.ndarray:
+    """Returns prefix sums (k, H, W + 1) int32 as the kernel wants them.
+
+    Raises:
+        ValueError: when they are of another size than the camera's pictures.
+    """
+    sums = np.require(prefixes, dtype=np.int32, requirements=["C", "W"])
+    if sums.ndim != 3 or sums.shape[1:] != (camera.height, camera.width + 1):
+        raise ValueError(
+            f"prefixes of camera '{camera.name}' must be (k, {camera.height}, {camera.width + 1}), "
+            f"not {sums.shape}"
+        )
+    return sums
+
+
+def check_body(outlines: Sequence[Outline], X_CN: np.ndarray) -> tuple[PackedOutlines, np.ndarray]:
+    """Returns the kernel's arrays, and poses (n, nodes, 4, 4) as (n, nodes, 3, 4).
+
+    Raises:
+        ValueError: when the poses have the wrong shape or are not finite.
+    """
     poses = np.asarray(X_CN)
     if poses.ndim != 4 or poses.shape[1] != len(outlines) or poses.shape[2:] != (4, 4):
         raise ValueError(f"poses must be (n, {len(outlines)}, 4, 4), not {poses.shape}")

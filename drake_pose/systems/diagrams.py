@@ -32,6 +32,7 @@ from drake_pose.matching import PoseSearch
 from drake_pose.silhouette import Scene
 from drake_pose.systems.mask_player import MaskPlayer
 from drake_pose.systems.silhouette_matcher import SilhouetteMatcher, label_image_port
+from drake_pose.systems.skin import add_meshcat_skin, add_skin
 
 ESTIMATE_COLOUR = Rgba(0.0, 0.45, 0.70, 0.6)
 _RENDERER = "label_renderer"
@@ -98,8 +99,10 @@ def build_recorded_matching(
         builder.Connect(source.get_output_port(), matcher.GetInputPort("root_position"))
     if meshcat is not None:
         scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
-        add_posed_body(builder, scene_graph, search.tree.model, matcher, "estimated")
+        model, estimate = search.tree.model, matcher.GetOutputPort("estimated_positions")
+        add_posed_body(builder, scene_graph, model, matcher, "estimated")
         MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
+        add_meshcat_skin(builder, meshcat, model, estimate, "estimated")
     return _finish(builder, matcher, player.period, player)
 
 
@@ -136,6 +139,8 @@ def build_simulated_matching(
     model.add_to(plant, scene_graph, prefix="true")
     scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(RenderEngineVtkParams()))
     _pose_plant(builder, scene_graph, plant, truth.get_output_port(), "true")
+    labels = {name: label for label, name in enumerate(model.link_names)}
+    add_skin(builder, scene_graph, model, truth.get_output_port(), "true", labels)
     matcher = builder.AddNamedSystem(
         "silhouette_matcher", SilhouetteMatcher(search, cameras, period)
     )
@@ -153,6 +158,9 @@ def build_simulated_matching(
     if meshcat is not None:
         add_posed_body(builder, scene_graph, model, matcher, "estimated", ESTIMATE_COLOUR)
         MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
+        estimate = matcher.GetOutputPort("estimated_positions")
+        add_meshcat_skin(builder, meshcat, model, truth.get_output_port(), "true")
+        add_meshcat_skin(builder, meshcat, model, estimate, "estimated", ESTIMATE_COLOUR)
     return _finish(builder, matcher, period, None)
 
 
@@ -169,10 +177,9 @@ def _drake_camera(
     depths = []
     for time in times:
         values = tree.values_from_positions(true_positions.value(time).ravel())
-        for node, X_WN in zip(tree.nodes, tree.node_poses(values), strict=True):
-            if len(node.mesh.vertices):
-                points = node.mesh.vertices @ X_WN[:3, :3].T + X_WN[:3, 3]
-                depths.append(camera.project(points)[1])
+        for node, taken, X_WN in zip(tree.nodes, values, tree.node_poses(values), strict=True):
+            p_N = node.surface(taken).vertices
+            depths.append(camera.project(p_N @ X_WN[:3, :3].T + X_WN[:3, 3])[1])
     everything = np.concatenate(depths)
     # A body that moves fast may reach further between the times looked at.
     margin = 0.5 + 0.1 * float(np.ptp(everything))
@@ -210,6 +217,9 @@ def add_posed_body(
     for index in range(plant.num_bodies()):
         frame = plant.GetBodyFrameIdOrThrow(BodyIndex(index))
         for geometry in inspector.GetGeometries(frame):
+            # Other bodies' skin hangs on the world's frame, too.
+            if not inspector.BelongsToSource(geometry, source):
+                continue
             if inspector.GetPerceptionProperties(geometry) is not None:
                 scene_graph.RemoveRole(source, geometry, Role.kPerception)
             if colour is not None and inspector.GetIllustrationProperties(geometry) is not None:

@@ -8,14 +8,14 @@ import itertools
 
 import numpy as np
 
-from drake_pose.silhouette import draw_mask
+from drake_pose.silhouette import TreeSurfaces, draw_mask
 
 
 class NaiveSearch:
     def __init__(self, search, camera, silhouette, r, K):
         self.tree = search.tree
         self.values = search.sampled.values
-        self.outlines = search.sampled.outlines
+        self.surfaces = TreeSurfaces(search.tree)
         self.camera, self.S, self.r, self.K = camera, silhouette, r, K
         self.lists, self.u = {}, {}
         self.runs = 0
@@ -29,7 +29,8 @@ class NaiveSearch:
             full[k] = self.values[k][self.lists[k][t]]
         full[i] = values
         X_CN = self.camera.X_CW @ self.tree.node_poses(full)
-        return draw_mask([self.outlines[i]], X_CN[i : i + 1], self.camera)
+        surface = self.surfaces.node_at(i, full[i])
+        return draw_mask([surface], X_CN[i : i + 1], self.camera)
 
     def adopted_picture(self, i):
         return self.picture(i, self.values[i][self.lists[i][self.u[i]]])

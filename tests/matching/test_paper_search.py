@@ -56,9 +56,9 @@ def test_step_3_keeps_what_stays_inside_and_step_4_scores_it(sliders):
     assert mask.sum() == 200 + 6 * 7
     scoring = Scoring(search.sampled, [View(camera, mask)])
     slides = search.sampled.values[0][:, 0]
-    nothing_covered = scoring.uncovered([], np.empty((0, 4, 4)))
+    nothing_covered = scoring.uncovered([], np.empty(0, dtype=int), np.empty((0, 4, 4)))
     poses = scoring.candidate_poses(0, np.eye(4))
-    outside, covered = scoring.candidate_areas(0, poses, nothing_covered)
+    outside, covered = scoring.candidate_areas(0, np.arange(len(poses)), poses, nothing_covered)
     np.testing.assert_array_equal(outside[0] + covered, 200)
     # To the right of the middle of the picture the small box hides no column of the wide one.
     expected = {-0.10: 150, -0.05: 100, 0.0: 50, 0.05: 0, 0.10: 50}

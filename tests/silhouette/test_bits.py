@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 from drake_pose.body import TriangleMesh
 from drake_pose.camera import Camera, ParallelCamera, PinholeCamera
 from drake_pose.silhouette import Outline, draw_mask, outline_from_mesh
-from drake_pose.silhouette.bit_kernel import draw_bits, draw_discs, sift_by_balls
+from drake_pose.silhouette.bit_balls import draw_discs, sift_by_balls
+from drake_pose.silhouette.bit_kernel import draw_bits
 from drake_pose.silhouette.bit_view import BitView, make_bit_view
 from drake_pose.silhouette.contour_cells import divide_outline
 from drake_pose.silhouette.inscribed_balls import VisualHull

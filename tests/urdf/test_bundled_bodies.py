@@ -166,7 +166,7 @@ def test_script_writes_the_committed_files(name: str, tmp_path: Path) -> None:
     script = URDF / name / f"make_{name}.py"
     subprocess.run([sys.executable, "-B", str(script), "--out", str(tmp_path)], check=True)
     written = {p.relative_to(tmp_path) for p in tmp_path.rglob("*") if p.is_file()}
-    committed = {Path(f"{name}.urdf")}
+    committed = {p.relative_to(URDF / name) for p in (URDF / name).glob(f"{name}.*")}
     committed |= {p.relative_to(URDF / name) for p in (URDF / name / "meshes").iterdir()}
     assert written == committed
     for path in sorted(written):

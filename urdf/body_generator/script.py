@@ -7,12 +7,15 @@ from typing import Any
 
 from body_generator.measures import Build, Measures
 from body_generator.model import write_body
+from body_generator.skin import body_bands, write_skin
 
 
 def run(
     folder: Path,
     measures: Mapping[str, float],
     mass: float,
+    *,
+    skin: bool = False,
     **build: Any,
 ) -> None:
     """Read the command line and write a body.
@@ -21,6 +24,7 @@ def run(
         folder: the script's own folder, where the body is written unless told otherwise.
         measures: the published measures [m].
         mass: the whole mass at the published stature [kg].
+        skin: whether bands of skin are written, too.
         build: the other fields of ``Build``.
     """
     parser = argparse.ArgumentParser(description=f"Write {build['name']}.urdf and its meshes.")
@@ -29,4 +33,8 @@ def run(
     options = parser.parse_args()
     published = Measures(**measures)
     scaled_mass = mass * (options.stature / published.stature) ** 3
-    write_body(options.out, published.scaled_to(options.stature), Build(mass=scaled_mass, **build))
+    scaled, scaled_build = published.scaled_to(options.stature), Build(mass=scaled_mass, **build)
+    write_body(options.out, scaled, scaled_build)
+    if skin:
+        bands = body_bands(scaled, scaled_build)
+        write_skin(options.out, scaled_build.name, f"make_{scaled_build.name}.py", bands)

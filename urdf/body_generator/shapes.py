@@ -188,7 +188,7 @@ class Loft:
         low, high = axis[0].copy(), axis[-1].copy()
         low[1], high[1] = knots[0] - self.low_cap, knots[-1] + self.high_cap
         vertices = np.concatenate([points, low[None], high[None]])
-        return _tube(vertices, heights.size, angles.size, material)
+        return tube(vertices, heights.size, angles.size, material)
 
     def _rings(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return for every ring its height on the sections, shrinking factor and cap offset."""
@@ -262,7 +262,7 @@ def ellipsoid(
     )
     unit = np.concatenate([unit, [[0.0, -1.0, 0.0], [0.0, 1.0, 0.0]]])
     vertices = unit * np.asarray(radii) + np.asarray(centre)
-    return _tube(vertices, rings, around, material)
+    return tube(vertices, rings, around, material)
 
 
 def vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -275,7 +275,7 @@ def vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
-def _tube(vertices: np.ndarray, rings: int, around: int, material: str) -> Shell:
+def tube(vertices: np.ndarray, rings: int, around: int, material: str) -> Shell:
     """Return the shell of rings upwards, closed by two poles that come last (low, high)."""
     index = np.arange(rings * around).reshape(rings, around)
     here, beside = index, np.roll(index, -1, axis=1)

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 if TYPE_CHECKING:
     from body_generator.shapes import Shell
+    from body_generator.skin import LinkBand
     from body_generator.writing import Joint
     from hand.hand_shapes import HandMeasures
 
@@ -56,6 +57,10 @@ differences:
   - {first: ring_pip_flexion, second: little_pip_flexion, within: 70, unit: deg}
 rows:
 """
+# Bands of skin reach so far to both sides of a joint, over the hand's length, and from its axis,
+# over the hand's breadth.
+BAND_LENGTHS = {"wrist": 0.17, "finger": 0.055}
+BAND_REACHES = {"wrist": 0.42, "finger": 0.15}
 DISTAL_BAND = 30.0  # |DIP - 2/3 PIP| [deg]
 GAPS = (("index", "middle", 30.0), ("middle", "ring", 28.0), ("ring", "little", 50.0))
 LEAST_GAP = -8.0  # fingers may lean on one another, but not cross [deg]
@@ -65,6 +70,7 @@ def main() -> None:
     """Read the command line and write both hands."""
     here = Path(__file__).resolve().parent
     sys.path.insert(0, str(here.parent))
+    from body_generator.skin import write_skin
     from hand.hand_shapes import HandMeasures
 
     parser = argparse.ArgumentParser(description=__doc__)
@@ -74,8 +80,13 @@ def main() -> None:
     options = parser.parse_args()
     measures = HandMeasures(**MEASURES).scaled_to(options.handlength)
     options.out.mkdir(parents=True, exist_ok=True)
+    bands = hand_bands(measures)
     for name, side in (("hand", "left"), ("right_hand", "right")):
         write_hand(options.out, name, side, measures)
+        sided = [
+            replace(band, file=f"{side}_{band.file}", mirrored=side == "right") for band in bands
+        ]
+        write_skin(options.out, name, "make_hand.py", sided)
 
 
 def write_hand(folder: Path, name: str, side: str, measures: "HandMeasures") -> None:
@@ -122,6 +133,28 @@ def hand_shells(measures: "HandMeasures") -> "dict[str, Shell]":
         for part in ("proximal", "middle", "distal"):
             shells[f"{finger}_{part}"] = getattr(shapes, part)(finger, measures)
     return shells
+
+
+def hand_bands(measures: "HandMeasures") -> "list[LinkBand]":
+    """Return the left hand's bands of skin: at every joint but the thumb's root."""
+    from body_generator.bands import Band, band_shell
+    from body_generator.skin import LinkBand
+
+    shells = hand_shells(measures)
+    bands = []
+    for chain in hand_joints(measures):
+        parent, child = chain[0].parent, chain[-1].child
+        if np.any([joint.rpy for joint in chain]):
+            # The thumb's root turns in the palm's flesh.
+            continue
+        half = BAND_LENGTHS["wrist" if child == "palm" else "finger"] * measures.handlength
+        reach = BAND_REACHES["wrist" if child == "palm" else "finger"] * measures.handbreadth
+        band = Band(AXES["y"], -half, half, reach, "skin", rings=6, around=12)
+        offset = -np.sum([joint.xyz for joint in chain], axis=0)
+        shell = band_shell(band, [shells[parent].moved(offset), shells[child]])
+        colour = COLOURS["skin"]
+        bands.append(LinkBand(parent, child, f"{child}_skin", band, shell, False, colour))
+    return bands
 
 
 def hand_joints(measures: "HandMeasures") -> "list[list[Joint]]":

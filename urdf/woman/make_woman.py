@@ -86,6 +86,7 @@ def main() -> None:
         here,
         MEASURES,
         MASS,
+        skin=True,
         name="woman",
         bust=True,
         jaw=0.80,

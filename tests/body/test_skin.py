@@ -1,0 +1,236 @@
+"""Bands of skin: where they are, how they move, with which tree, and what is refused."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.multibody.tree import BodyIndex
+from scipy.spatial.transform import Rotation
+
+from drake_pose.body import ModelSkin, RootRotation, describe_model, load_model
+from drake_pose.errors import DrakePoseError, ModelError, UnknownNameError
+from tests.body.skins import (
+    LIMB_URDF,
+    REACH,
+    band_entry,
+    load_limb,
+    tube_obj,
+    write_limb,
+)
+
+WRIST = ("wrist_x", "wrist_z", "wrist_y")
+
+
+def link_pose(model, q, link):
+    """The pose (4, 4) of a link in the world, straight from Drake."""
+    context = model.plant.CreateDefaultContext()
+    model.plant.SetPositions(context, q)
+    body = model.plant.get_body(BodyIndex(model.link_index(link)))
+    return model.plant.EvalBodyPoseInWorld(context, body).GetAsMatrix4()
+
+
+def in_frame(X, points):
+    return points @ X[:3, :3].T + X[:3, 3]
+
+
+def test_at_rest_the_band_is_as_drawn(tmp_path: Path) -> None:
+    model = load_limb(tmp_path)
+    assert [(band.parent, band.child) for band in model.skin] == [
+        ("upper", "lower"),
+        ("lower", "hand"),
+    ]
+    tree = model.pose_tree()
+    drawn = [line.split()[1:] for line in tube_obj().splitlines() if line.startswith("v")]
+    for node in tree.nodes[1:]:
+        k = len(node.value_names)
+        np.testing.assert_allclose(node.skin.vertices(np.zeros((1, k)))[0], node.skin.mesh.vertices)
+        np.testing.assert_allclose(node.skin.mesh.vertices, np.array(drawn, dtype=float))
+        z = node.skin.mesh.vertices[:, 2]
+        np.testing.assert_array_equal(node.skin.weights[z >= REACH - 1e-12], 0.0)
+        np.testing.assert_array_equal(node.skin.weights[z <= -REACH + 1e-12], 1.0)
+        np.testing.assert_allclose(node.skin.weights[np.abs(z) < 1e-12], 0.5)
+    assert tree.nodes[0].skin is None
+
+
+def test_one_joint_turns_a_vertex_by_its_share(tmp_path: Path) -> None:
+    model = load_limb(tmp_path)
+    tree = model.pose_tree()
+    node = tree.nodes[1]
+    angles = np.array([-2.1, -0.4, 0.0, 1.0, 2.4])
+    found = node.skin.vertices(angles[:, None])
+    for angle, p_N in zip(angles, found, strict=True):
+        # Seen from the parent the joint is at the same place; the elbow turns about x.
+        whole = Rotation.from_rotvec([angle, 0, 0]).inv()
+        share = Rotation.from_rotvec(node.skin.weights[:, None] * np.array([angle, 0.0, 0.0]))
+        np.testing.assert_allclose(
+            p_N, (whole * share).apply(np.array(node.skin.mesh.vertices)), atol=1e-14
+        )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_ends_go_with_their_links(tmp_path: Path, seed: int) -> None:
+    """Drake's own poses of the two links carry the band's ends; nothing else moves it."""
+    model = load_limb(tmp_path)
+    skin = ModelSkin(model)
+    rng = np.random.default_rng(seed)
+    q, other = rng.uniform(model.lower, model.upper, (2, 5))
+    rest = np.zeros(5)
+    for band, p_W, p_W0 in zip(skin.bands, skin.vertices(q), skin.vertices(rest), strict=True):
+        for link, weight in ((band.parent, 0.0), (band.child, 1.0)):
+            rigid = band.weights == weight
+            assert rigid.sum() == 5
+            p_L = in_frame(np.linalg.inv(link_pose(model, rest, link)), p_W0[rigid])
+            np.testing.assert_allclose(
+                p_W[rigid], in_frame(link_pose(model, q, link), p_L), atol=1e-14
+            )
+    mixed = other.copy()
+    wrist = [model.position_index(name) for name in WRIST]
+    mixed[wrist] = q[wrist]
+    X = [link_pose(model, at, "hand") for at in (q, mixed)]
+    in_hand = [
+        in_frame(np.linalg.inv(X[i]), skin.vertices(at)[1]) for i, at in enumerate((q, mixed))
+    ]
+    np.testing.assert_allclose(in_hand[0], in_hand[1], atol=1e-12)
+
+
+def test_derivatives_are_those_of_finite_differences(tmp_path: Path) -> None:
+    tree = load_limb(tmp_path).pose_tree()
+    rng = np.random.default_rng(1)
+    for node in tree.nodes[1:]:
+        values = rng.uniform(-2, 2, (4, len(node.value_names)))
+        exact = node.skin.derivatives(values)
+        for k in range(values.shape[1]):
+            step = np.zeros_like(values)
+            step[:, k] = 1e-6
+            difference = node.skin.vertices(values + step) - node.skin.vertices(values - step)
+            np.testing.assert_allclose(exact[..., k], difference / 2e-6, atol=1e-8)
+        assert np.abs(exact).max() > 0.01
+
+
+@pytest.mark.parametrize("root", ["lower", "hand"])
+def test_a_turned_over_tree_has_the_same_band(tmp_path: Path, root: str) -> None:
+    model = load_limb(tmp_path)
+    skin = ModelSkin(model)
+    q = np.random.default_rng(2).uniform(model.lower, model.upper)
+    position = link_pose(model, q, root)[:3, 3]
+    tree = model.pose_tree(root, root_position=position, root_rotation=RootRotation.free())
+    values = tree.values_from_positions(q)
+    X_WN = tree.node_poses(values)
+    found = [
+        in_frame(X, node.skin.vertices(part[None])[0])
+        for node, part, X in zip(tree.nodes, values, X_WN, strict=True)
+        if node.skin is not None
+    ]
+    assert len(found) == 2
+    for expected in skin.vertices(q):
+        assert min(np.abs(p_W - expected).max() for p_W in found) < 1e-12
+    turned = [node.skin.turned for node in tree.nodes if node.skin is not None]
+    assert any(turned)
+
+
+def test_links_welded_to_each_other_share_a_band(tmp_path: Path) -> None:
+    """The band is given in the frame of a link that is welded to the one that names the node."""
+    extra = (
+        '<link name="cuff"/><joint name="fix" type="fixed"><parent link="lower"/>'
+        '<child link="cuff"/><origin xyz="0.01 0 0.02" rpy="0.2 0.3 0.4"/></joint></robot>'
+    )
+    text = LIMB_URDF.replace("</robot>", extra)
+    plain = load_limb(tmp_path)
+    folder = tmp_path / "welded"
+    folder.mkdir()
+    path = write_limb(folder, "bands:\n" + band_entry("upper", "cuff"), text)
+    model = load_model(path, check=False)
+    X_LC = link_pose(plain, np.zeros(5), "lower")
+    X_LC = np.linalg.inv(X_LC) @ link_pose(model, np.zeros(5), "cuff")
+    node = model.pose_tree().nodes[1]
+    assert node.name == "lower"
+    moved = in_frame(X_LC, plain.skin[0].mesh.vertices)
+    np.testing.assert_allclose(node.skin.mesh.vertices, moved)
+    q = np.array([0.3, 1.1, 0.2, 0.1, -0.4])
+    (p_W,) = ModelSkin(model).vertices(q)
+    in_node = node.skin.vertices(q[None, [1]])[0]
+    np.testing.assert_allclose(p_W, in_frame(link_pose(model, q, "lower"), in_node), atol=1e-12)
+
+
+def test_a_surface_is_the_rigid_part_and_the_band(tmp_path: Path) -> None:
+    node = load_limb(tmp_path).pose_tree().nodes[1]
+    surface = node.surface(np.array([0.7]))
+    count = len(node.mesh.vertices)
+    np.testing.assert_array_equal(surface.vertices[:count], node.mesh.vertices)
+    np.testing.assert_array_equal(
+        surface.vertices[count:], node.skin.vertices(np.array([[0.7]]))[0]
+    )
+    assert len(surface.triangles) == len(node.mesh.triangles) + len(node.skin.triangles)
+
+
+def test_a_model_without_a_skin_file_has_none(tmp_path: Path) -> None:
+    model = load_limb(tmp_path, "")
+    assert model.skin == ()
+    tree = model.pose_tree()
+    assert all(node.skin is None for node in tree.nodes)
+    assert tree.nodes[1].surface(np.zeros(1)) is tree.nodes[1].mesh
+    assert ModelSkin(model).vertices(np.zeros(5)) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"mesh": "none.obj"}, "none.obj does not exist"),
+        ({"mesh": None}, "name its mesh"),
+        ({"axis": [0, 0, 0]}, "axis must be three finite numbers"),
+        ({"axis": [0, 1]}, "axis must be three finite numbers"),
+        ({"axis": [0, 1, "nan"]}, "axis must be three finite numbers"),
+        ({"begin": 0.1}, "begin below end"),
+        ({"end": ".inf"}, "begin below end"),
+        ({"colour": [2, 0, 0]}, "colour must be three numbers from 0 to 1"),
+        ({"child": "upper"}, "parent and child must be two links"),
+        ({"length": 3}, "length"),
+        ({"begin": "x"}, "not a skin file"),
+        ({"mesh": "open.obj"}, "not closed"),
+    ],
+)
+def test_a_wrong_band_is_refused(tmp_path: Path, changes: dict[str, object], message: str) -> None:
+    text = tube_obj()
+    (tmp_path / "open.obj").write_text(text[: text.rindex("f ")])
+    with pytest.raises(ModelError, match=message) as caught:
+        load_limb(
+            tmp_path, "bands:\n" + band_entry(**{"parent": "upper", "child": "lower", **changes})
+        )
+    assert "limb.skin.yaml" in str(caught.value) or "none.obj" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["- 1", "3", "bands: 3", "bands: [1", "bands: []", "bands: {a: 1}", "other: 1", "\0", "bands:"],
+)
+def test_a_broken_file_is_refused(tmp_path: Path, text: str) -> None:
+    with pytest.raises(ModelError, match=r"limb\.skin\.yaml"):
+        load_limb(tmp_path, text)
+
+
+def test_names_are_checked(tmp_path: Path) -> None:
+    with pytest.raises(UnknownNameError, match=r"limb\.skin\.yaml has no link 'paw'"):
+        load_limb(tmp_path, "bands:\n" + band_entry("upper", "paw"))
+    entry = band_entry("upper", "lower")
+    with pytest.raises(ModelError, match="two bands between"):
+        load_limb(tmp_path, f"bands:\n{entry}{entry}")
+
+
+@pytest.mark.parametrize(("parent", "child"), [("upper", "hand"), ("world", "lower")])
+def test_a_band_joins_neighbours(tmp_path: Path, parent: str, child: str) -> None:
+    model = load_limb(tmp_path, "bands:\n" + band_entry(parent, child))
+    with pytest.raises(ModelError, match="not neighbours"):
+        model.pose_tree()
+    assert "not neighbours" in describe_model(model.path).errors[0]
+
+
+def test_exchanged_links_are_refused_where_drake_draws(tmp_path: Path) -> None:
+    model = load_limb(tmp_path, "bands:\n" + band_entry("lower", "upper"))
+    with pytest.raises(DrakePoseError, match="exchanged"):
+        ModelSkin(model)
+
+
+def test_the_child_process_reads_the_skin_too(tmp_path: Path) -> None:
+    path = write_limb(tmp_path, "bands:\n" + band_entry("upper", "paw"))
+    with pytest.raises(ModelError, match="paw"):
+        load_model(path)

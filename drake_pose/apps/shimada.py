@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,7 +54,7 @@ class Trial:
         angle_errors: (55,) root mean square error of the eight joint angles [deg].
         inside: (14,) which lengths and angles are within 2 deviations of the truth at the end.
         nees: normalised squared error of the six lengths at the end; 6 on average if honest.
-        milliseconds: (55,) for prediction and update.
+        milliseconds: (55,) of the processor for prediction and update.
         hypotheses: (55,) how many there were.
         bound_length_error: as length_error, for a filter linearised at the truth, without limits:
             what the measurements hold, if nobody had to guess.
@@ -154,15 +154,9 @@ def run_experiment(
     """
     if runs < 1:
         raise SettingsError(f"runs must be 1 or more, not {runs}")
-    if truncation not in TRUNCATIONS:
-        raise SettingsError(
-            f"truncation must be one of {', '.join(TRUNCATIONS)}, not '{truncation}'"
-        )
     if observed not in OBSERVED:
         raise SettingsError(f"observed must be one of {', '.join(OBSERVED)}, not '{observed}'")
-    settings = FilterSettings(truncation=truncation)
-    if iterations is not None:
-        settings = FilterSettings(truncation=truncation, iterations=iterations)
+    settings = experiment_settings(truncation, iterations)
     hand_filter, observation = experiment_filter(settings)
     # The first call of compiled code loads it, which belongs to no update.
     _filter_sequence(
@@ -178,6 +172,19 @@ def run_experiment(
                 progress(place * runs + run + 1)
         trials[key] = tuple(case)
     return ExperimentResult(trials, seed, settings, observed)
+
+
+def experiment_settings(truncation: str, iterations: int | None = None) -> FilterSettings:
+    """The library's own settings, but for these.
+
+    Raises:
+        SettingsError: there is no such truncation, or there are no iterations.
+    """
+    for known in TRUNCATIONS:
+        if truncation == known:
+            settings = FilterSettings(truncation=known)
+            return settings if iterations is None else replace(settings, iterations=iterations)
+    raise SettingsError(f"truncation must be one of {', '.join(TRUNCATIONS)}, not '{truncation}'")
 
 
 def experiment_filter(
@@ -213,11 +220,11 @@ def _filter_sequence(hand_filter: TruncatedFilter, sequence: SyntheticSequence) 
     state = hand_filter.start(sequence.guess)
     broken = False
     for t, y in enumerate(sequence.measurements):
-        begin = time.perf_counter()
+        begin = time.thread_time()
         if not broken:
             try:
                 state = hand_filter.update(hand_filter.predict(state) if t else state, y)
-                milliseconds[t] = 1e3 * (time.perf_counter() - begin)
+                milliseconds[t] = 1e3 * (time.thread_time() - begin)
             except SettingsError:
                 # A plain filter that has run away has no covariance any more: it is lost.
                 broken = True

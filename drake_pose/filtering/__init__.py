@@ -29,6 +29,7 @@ from drake_pose.filtering.truncation import (
     truncate_sequential,
 )
 from drake_pose.filtering.update import ObservationModel, Updated, update
+from drake_pose.filtering.views import Stare, View
 
 __all__ = [
     "Belief",
@@ -39,10 +40,12 @@ __all__ = [
     "JointRows",
     "ObservationModel",
     "Rejection",
+    "Stare",
     "StateLayout",
     "Truncated",
     "TruncatedFilter",
     "Updated",
+    "View",
     "clip",
     "couplings_file",
     "from_bounds",

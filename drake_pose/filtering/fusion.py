@@ -6,6 +6,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from drake_pose.filtering.factors import lower_or_root, outer_product
+
 Array = NDArray[np.float64]
 
 
@@ -26,21 +28,6 @@ def lower_factor(S: Array) -> tuple[Array, bool]:
             else:
                 L[i, j] = total / L[j, j]
     return L, True
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def outer_product(A: Array) -> Array:
-    """A A^T (n, n), exactly symmetric."""
-    n, m = A.shape
-    out = np.empty((n, n))
-    for i in range(n):
-        for j in range(i + 1):
-            total = 0.0
-            for k in range(m):
-                total += A[i, k] * A[j, k]
-            out[i, j] = total
-            out[j, i] = total
-    return out
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -108,23 +95,3 @@ def joseph(P: Array, H: Array, noise: Array) -> tuple[Array, bool]:
             gain[k, i] /= L[k, k]
     rest = np.eye(n) - gain.T @ H
     return outer_product(rest @ lower_or_root(P)) + outer_product(gain.T * np.sqrt(noise)), True
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def lower_or_root(P: Array) -> Array:
-    """(n, n) a root of a semidefinite P: Cholesky's with zeros where nothing is left."""
-    n = P.shape[0]
-    L = np.zeros((n, n))
-    for j in range(n):
-        total = P[j, j]
-        for k in range(j):
-            total -= L[j, k] * L[j, k]
-        if total <= 1e-14 * P[j, j]:
-            continue
-        L[j, j] = math.sqrt(total)
-        for i in range(j + 1, n):
-            value = P[i, j]
-            for k in range(j):
-                value -= L[i, k] * L[j, k]
-            L[i, j] = value / L[j, j]
-    return L

@@ -123,28 +123,14 @@ class HandObservation:
             excluded by the prediction.
         """
         x = belief.mean
-        M, _ = kernel.scaled_rotation(x[_QUATERNION])
-        M = M / float(x[_QUATERNION] @ x[_QUATERNION])
-        variances = np.diag(belief.covariance)
+        reach = self.mirror_reach * np.sqrt(np.diag(belief.covariance)[_FLEXIONS])
+        changes = kernel.mirror_changes(x[_SEEN], reach.ravel(), self.mirror_slope)
         found = []
-        for spread, flexions in zip(x[_SPREADS], _FLEXIONS, strict=True):
-            # Where the finger's plane points in the camera at flexions of 0 and of 90 degrees.
-            forward = math.cos(spread) * M[:, 0] - math.sin(spread) * M[:, 2]
-            normal = M[:, 1]
-            towards_camera = math.atan2(normal[2], forward[2])
-            direction = 0.0
-            for index in flexions:
-                direction += x[index]
-                turned = math.cos(direction) * normal - math.sin(direction) * forward
-                if math.hypot(turned[0], turned[1]) > self.mirror_slope:
-                    continue
-                change = 2 * (towards_camera - direction) + math.pi
-                change = math.remainder(change, 2 * math.pi)
-                reach = self.mirror_reach * math.sqrt(variances[index])
-                if math.radians(8) < abs(change) < reach:
-                    mirrored = x.copy()
-                    mirrored[index] += change
-                    found.append(mirrored)
+        for index, change in zip(_FLEXIONS.ravel(), changes, strict=True):
+            if change != 0.0:
+                mirrored = x.copy()
+                mirrored[index] += change
+                found.append(mirrored)
         return found
 
 

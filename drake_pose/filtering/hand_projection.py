@@ -11,6 +11,8 @@ Array = NDArray[np.float64]
 # Elements of the state that are seen, in the kernel's own order.
 WRIST, QUATERNION, SPREAD, FLEXION, LENGTH, PALM = 0, 2, 6, 8, 14, 20
 SEEN_ELEMENTS = 23
+# A mirrored angle closer than this is the same [rad].
+_SMALLEST_CHANGE = math.radians(8)
 # wrist 2, points 8 x 2, finger lines 6 x 2, palm lines 3 x 2, scale 1
 POINTS, FINGER_LINES, PALM_LINES, SCALE = 2, 18, 30, 36
 MEASUREMENTS = 37
@@ -202,3 +204,36 @@ def project_hand(x: Array, scale: float, shortest: float) -> tuple[Array, Array,
         h[SCALE] += x[QUATERNION + k] ** 2
         H[SCALE, QUATERNION + k] = 2.0 * x[QUATERNION + k]
     return h, H, points
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def mirror_changes(x: Array, reach: Array, slope: float) -> Array:
+    """What to add to each flexion so that its segment looks the same, mirrored in depth.
+
+    Args:
+        x: (23,) as for ``project_hand``.
+        reach: (6,) larger changes are not wanted [rad].
+        slope: nor segments whose end a turn moves by more than this, as a fraction of its length.
+
+    Returns:
+        (6,) [rad], 0 where there is nothing to mirror.
+    """
+    M, _ = scaled_rotation(x[QUATERNION : QUATERNION + 4])
+    M /= (x[QUATERNION : QUATERNION + 4] ** 2).sum()
+    changes = np.zeros(6)
+    for i in range(2):
+        c, s = math.cos(x[SPREAD + i]), math.sin(x[SPREAD + i])
+        # Where the finger's plane points in the camera at flexions of 0 and of 90 degrees.
+        forward, normal = c * M[:, 0] - s * M[:, 2], M[:, 1]
+        towards_camera = math.atan2(normal[2], forward[2])
+        direction = 0.0
+        for j in range(3):
+            direction += x[FLEXION + 3 * i + j]
+            u, v = math.cos(direction), math.sin(direction)
+            if math.hypot(u * normal[0] - v * forward[0], u * normal[1] - v * forward[1]) > slope:
+                continue
+            change = 2 * (towards_camera - direction) + math.pi
+            change -= 2 * math.pi * round(change / (2 * math.pi))
+            if _SMALLEST_CHANGE < abs(change) < reach[3 * i + j]:
+                changes[3 * i + j] = change
+    return changes

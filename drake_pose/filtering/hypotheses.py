@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.filtering.state import Belief
-from drake_pose.filtering.views import AnchoredObservation
+from drake_pose.filtering.views import Stare
 
 Array = NDArray[np.float64]
 
@@ -18,20 +18,26 @@ class Hypothesis:
     """One explanation.
 
     Attributes:
-        belief: mean and covariance.
+        belief: mean and covariance, inside the limits.
+        free: what is believed without the present limits; the next step is predicted from it.
         log_weight: logarithm of its weight among all.
+        log_evidence: the same without what the present limits say of it.
         born: the step it was made at by mirroring; 0 for the first.
-        sites: what the truncation knows of elements that never change (``Truncated.sites``).
         active: names of the rows that cut its belief in the last step.
-        anchor: the tangent that holds while the view stays the same; None before its second frame.
+        sites: of the last truncation, where the next one begins; see ``Truncated``.
+        tangent: (n,) where the first frame of the present view was linearised.
+        stare: what is believed within a view that lasts; None in its first frame.
     """
 
     belief: Belief
+    free: Belief
     log_weight: float = 0.0
+    log_evidence: float = 0.0
     born: int = 0
-    sites: Array = field(default_factory=lambda: np.zeros((0, 2)))
     active: tuple[str, ...] = ()
-    anchor: AnchoredObservation | None = None
+    sites: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    tangent: Array = field(default_factory=lambda: np.zeros(0))
+    stare: Stare | None = None
 
     @property
     def weight(self) -> float:
@@ -63,7 +69,10 @@ def normalise(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     ordered = sorted(hypotheses, key=lambda h: -h.log_weight)
     logs = np.array([h.log_weight for h in ordered])
     total = logs[0] + math.log(np.exp(logs - logs[0]).sum())
-    return [replace(h, log_weight=h.log_weight - total) for h in ordered]
+    return [
+        replace(h, log_weight=h.log_weight - total, log_evidence=h.log_evidence - total)
+        for h in ordered
+    ]
 
 
 def merge_twins(
@@ -83,7 +92,10 @@ def merge_twins(
             scale = np.maximum(other.belief.deviations(), 1e-12)
             if np.abs((candidate.belief.mean - other.belief.mean) / scale).max() < distance:
                 both = float(np.logaddexp(other.log_weight, candidate.log_weight))
-                kept[place] = replace(other, log_weight=both)
+                gain = both - other.log_weight
+                kept[place] = replace(
+                    other, log_weight=both, log_evidence=other.log_evidence + gain
+                )
                 rejected.append(Rejection(step, candidate.born, "twin"))
                 break
         else:

@@ -69,11 +69,16 @@ class StateLayout:
         """Where these elements stand."""
         return np.array([self.index(name) for name in names], dtype=np.intp)
 
-    def transition(self) -> Array:
-        """(n, n) A of (8): one step at constant velocity."""
+    def transition(self, fading: float = 1.0) -> Array:
+        """(n, n) A of (8): one step at constant velocity.
+
+        Args:
+            fading: what is left of a rate after a step; 1 in (8).
+        """
         m = len(self.moving)
         A = np.eye(len(self))
-        A[:m, m : 2 * m] = np.eye(m)
+        A[:m, m : 2 * m] = fading * np.eye(m)
+        A[m : 2 * m, m : 2 * m] = fading * np.eye(m)
         return A
 
     def process_noise(self, accelerations: Mapping[str, float]) -> Array:

@@ -17,6 +17,7 @@ from drake_pose.filtering.hypotheses import (
     prune,
 )
 from drake_pose.filtering.inequalities import Inequalities, inner_point
+from drake_pose.filtering.limited_update import LimitedUpdate, limited_update
 from drake_pose.filtering.state import Belief, StateLayout, make_belief
 from drake_pose.filtering.truncation import (
     Truncated,
@@ -24,17 +25,15 @@ from drake_pose.filtering.truncation import (
     join_rows,
     truncate_joint,
     truncate_sequential,
+    unlimited,
 )
-from drake_pose.filtering.update import (
-    ObservationModel,
-    Updated,
-    check_measurement,
-    update,
-)
-from drake_pose.filtering.views import AnchoredObservation, View, next_view
+from drake_pose.filtering.update import ObservationModel, check_measurement, update
+from drake_pose.filtering.views import AnchoredObservation, View, begin_stare, next_view
 
 Array = NDArray[np.float64]
 Truncation = Literal["joint", "sequential", "clip", "none"]
+Branch = tuple[Hypothesis, LimitedUpdate]
+_NO_SITES = np.zeros((0, 2))
 TRUNCATIONS: tuple[Truncation, ...] = ("joint", "sequential", "clip", "none")
 
 
@@ -51,9 +50,9 @@ class FilterSettings:
         smallest_weight: lighter hypotheses are given up.
         twin_distance: hypotheses closer than this in every element are one [deviations].
         tolerance: of the joint truncation.
-        novelty: a measurement within this many deviations (root mean square, 6 is sensible) of
-            the one that began the view shows nothing new: the frames of a view then count as
-            their mean and are truncated once. 0: every frame is new, as in the paper.
+        novelty: a measurement shows nothing new if noise alone would make it differ as much
+            from the one that began the view with more than this probability, see ``views``. 0:
+            every frame is new, as in the paper; so it is always with "sequential" and "clip".
 
     Raises:
         SettingsError: a value out of its range.
@@ -65,8 +64,8 @@ class FilterSettings:
     reject_below: float = -4.0
     smallest_weight: float = 1e-4
     twin_distance: float = 0.3
-    tolerance: float = 1e-5
-    novelty: float = 0.0
+    tolerance: float = 1e-4
+    novelty: float = 1e-9
 
     def __post_init__(self) -> None:
         if self.truncation not in TRUNCATIONS:
@@ -75,8 +74,8 @@ class FilterSettings:
             )
         if self.iterations < 1 or self.hypothesis_cap < 1:
             raise SettingsError("iterations and hypothesis_cap must be 1 or more")
-        if not 0 <= self.novelty < np.inf:
-            raise SettingsError(f"novelty must be 0 or more, not {self.novelty}")
+        if not 0 <= self.novelty < 1:
+            raise SettingsError(f"novelty must be in [0, 1), not {self.novelty}")
         if not (self.reject_below < 0 and 0 <= self.smallest_weight < 1 and self.tolerance > 0):
             raise SettingsError(
                 "reject_below must be negative, smallest_weight in [0, 1), tolerance positive"
@@ -113,8 +112,11 @@ class TruncatedFilter:
 
     After Shimada, Shirai, Kuno and Miura, sections 4 and 5: prediction at constant velocity,
     update linearised at the prediction and at its mirrored twins (30), truncation. Differences,
-    each of which can be set back: the update iterates; all rows are truncated at once; what the
-    rows said about elements that never change is counted once, not in every step.
+    each of which can be set back: all rows are truncated at once; the update iterates, linearised
+    where the truncated belief lies; and with "joint" the truncated belief is given out and
+    linearised at, but the next step is predicted from the belief without its limits. Truncated
+    again in every step, a belief would be pushed away from its limits ever further, and would
+    become ever surer, though the limits say the same each time.
 
     Args:
         layout: what the state means.
@@ -122,6 +124,11 @@ class TruncatedFilter:
         inequalities: the rows, over any elements of the state.
         process_noise: (n, n) U of (6).
         settings: how to work.
+        transition: (n, n) A of (6); constant velocity (8) if not given.
+
+    Attributes:
+        novelty: of the settings, or 0 where the truncation keeps no views.
+        site_count: how many sites a truncated hypothesis has.
 
     Raises:
         SettingsError: contradictory rows, named; or a process noise that is indefinite.
@@ -135,6 +142,7 @@ class TruncatedFilter:
         inequalities: Inequalities,
         process_noise: Array,
         settings: FilterSettings | None = None,
+        transition: Array | None = None,
     ) -> None:
         self.layout = layout
         self.observation = observation
@@ -143,14 +151,12 @@ class TruncatedFilter:
         inner_point(self.inequalities)
         _, self._U = check_moments(np.zeros(len(layout)), process_noise)
         factor_of(self._U)
-        self._A = layout.transition()
+        self._A = layout.transition() if transition is None else transition
         self._rows = join_rows(self.inequalities)
-        constant = layout.indices(layout.constant)
-        moving = np.setdiff1d(self._rows.used, constant)
-        columns = np.searchsorted(self._rows.used, moving)
-        # Directions among constants: their rows say the same in every step.
-        changing = np.abs(self._rows.directions[:, columns]).sum(axis=1) > 0
-        self._lasting: NDArray[np.bool_] = np.logical_not(changing)
+        self.site_count = len(self._rows.directions) if self.settings.truncation == "joint" else 0
+        # What is truncated and fed back has no offsets to keep.
+        feeds_back = self.settings.truncation in ("sequential", "clip")
+        self.novelty = 0.0 if feeds_back else self.settings.novelty
 
     def start(self, belief: Belief) -> FilterState:
         """The state before the first measurement, truncated (but for "none").
@@ -163,117 +169,147 @@ class TruncatedFilter:
             raise SettingsError(
                 f"the belief has {checked.mean.size} elements, the state {len(self.layout)}"
             )
-        return FilterState(0, (self._truncate(Hypothesis(checked))[0],))
+        truncated = self._truncate(checked, _NO_SITES)
+        return FilterState(0, (self._finish(Hypothesis(checked, checked), checked, truncated),))
 
     def predict(self, state: FilterState) -> FilterState:
         """One step at constant velocity: (6), for every hypothesis."""
         moved = []
-        for hypothesis in state.hypotheses:
-            P = self._A @ hypothesis.belief.covariance @ self._A.T + self._U
-            belief = Belief(self._A @ hypothesis.belief.mean, 0.5 * (P + P.T))
-            moved.append(replace(hypothesis, belief=belief))
+        for h in state.hypotheses:
+            stare = h.stare.moved(self._A, self._U) if h.stare else None
+            free = stare.state() if stare else self._move(h.free)
+            moved.append(replace(h, belief=self._move(h.belief), free=free, stare=stare))
         return replace(state, hypotheses=tuple(moved), rejections=())
 
-    def update(self, state: FilterState, y: Array) -> FilterState:
+    def update(
+        self, state: FilterState, y: Array, observation: ObservationModel | None = None
+    ) -> FilterState:
         """Use a measurement of the predicted moment: section 5, steps 2 to 6.
 
         Args:
             state: the prediction.
             y: (m,) NaN where occluded.
+            observation: what is measured this time, if not what the filter was made with.
 
         Raises:
             SettingsError: the measurement does not fit.
         """
         step = state.step + 1
-        y = check_measurement(y, self.observation)
-        view = next_view(state.view, y, self.observation, self.settings.novelty)
+        model = observation or self.observation
+        y = check_measurement(y, model)
+        view = next_view(state.view, y, model, self.novelty)
         if view.count > 1:
-            branches = [self._repeat(h, y, view.count) for h in state.hypotheses]
+            branches = [self._repeat(h, y, model) for h in state.hypotheses]
         else:
-            branches = [b for h in state.hypotheses for b in self._branches(h, y, step)]
+            branches = [b for h in state.hypotheses for b in self._branches(h, y, model, step)]
         alive, rejected = self._reject(branches, step)
-        truncated = [self._finish(h, updated, view.count == 1) for h, updated in alive]
-        best_updates = {id(h): u for h, (_, u) in zip(truncated, alive, strict=True)}
-        leader = best_updates[id(max(truncated, key=lambda h: h.log_weight))]
-        merged, twins = merge_twins(normalise(truncated), self.settings.twin_distance, step)
+        finished = [self._weigh(h, result) for h, result in alive]
+        leader = max(range(len(finished)), key=lambda i: finished[i].log_weight)
+        merged, twins = merge_twins(normalise(finished), self.settings.twin_distance, step)
         kept, pruned = prune(
             merged, self.settings.hypothesis_cap, self.settings.smallest_weight, step
         )
         rejections = (*rejected, *twins, *pruned)
-        return FilterState(step, tuple(kept), rejections, leader.distance, leader.count, view)
+        updated = alive[leader][1].updated
+        return FilterState(step, tuple(kept), rejections, updated.distance, updated.count, view)
 
-    def inside(self, belief: Belief) -> Belief:
-        """A belief truncated for giving out: within a view the filter's own is not, see novelty."""
-        return self._truncate(Hypothesis(belief))[0].belief
+    def _move(self, belief: Belief) -> Belief:
+        P = self._A @ belief.covariance @ self._A.T + self._U
+        return Belief(self._A @ belief.mean, 0.5 * (P + P.T))
 
     def _branches(
-        self, hypothesis: Hypothesis, y: Array, step: int
-    ) -> list[tuple[Hypothesis, Updated]]:
+        self, hypothesis: Hypothesis, y: Array, model: ObservationModel, step: int
+    ) -> list[Branch]:
         """A hypothesis updated at its prediction, and at each mirrored one."""
-        prediction = hypothesis.belief
-        iterations = self.settings.iterations
-        first = update(prediction, y, self.observation, iterations)
-        found = [(hypothesis, first)]
+        hypothesis = replace(hypothesis, stare=None)
+        found = [(hypothesis, self._update(hypothesis, y, model, hypothesis.belief.mean))]
         if self.settings.hypothesis_cap == 1:
             return found
-        for start in self.observation.mirrors(prediction):
-            other = update(prediction, y, self.observation, iterations, start)
-            found.append((replace(hypothesis, born=step), other))
+        for start in model.mirrors(hypothesis.belief):
+            other = replace(hypothesis, born=step)
+            found.append((other, self._update(other, y, model, start)))
         return found
 
-    def _repeat(self, hypothesis: Hypothesis, y: Array, count: int) -> tuple[Hypothesis, Updated]:
+    def _update(
+        self, hypothesis: Hypothesis, y: Array, model: ObservationModel, start: Array
+    ) -> LimitedUpdate:
+        iterations = self.settings.iterations
+        if self.settings.truncation == "none" or not self.inequalities:
+            updated = update(hypothesis.free, y, model, iterations, start)
+            return LimitedUpdate(updated, unlimited(updated.belief))
+        return limited_update(
+            hypothesis.free, y, model, self._truncate, iterations, start, hypothesis.sites
+        )
+
+    def _repeat(self, hypothesis: Hypothesis, y: Array, model: ObservationModel) -> Branch:
         """A hypothesis updated by a further frame of the same view."""
-        anchor = hypothesis.anchor or AnchoredObservation(self.observation, hypothesis.belief)
-        updated = update(hypothesis.belief, y, anchor.for_frame(count))
-        return replace(hypothesis, anchor=anchor), updated
+        stare = hypothesis.stare
+        if stare is None:
+            stare = begin_stare(model, hypothesis.free, hypothesis.belief, hypothesis.tangent)
+        updated = update(stare.belief, y, AnchoredObservation(model, stare.tangent))
+        stare = replace(stare, belief=updated.belief)
+        updated = replace(updated, belief=stare.state())
+        truncated = self._truncate(updated.belief, hypothesis.sites)
+        return replace(hypothesis, stare=stare), LimitedUpdate(updated, truncated)
 
     def _reject(
-        self, branches: Sequence[tuple[Hypothesis, Updated]], step: int
-    ) -> tuple[list[tuple[Hypothesis, Updated]], list[Rejection]]:
+        self, branches: Sequence[Branch], step: int
+    ) -> tuple[list[Branch], list[Rejection]]:
         """Section 5, step 5: give up what lies far beyond a row, but never all."""
         if len(branches) == 1 or self.settings.truncation == "none" or not self.inequalities:
             return list(branches), []
         alive, rejected, worst_c = [], [], []
-        phi = self.inequalities.phi
-        for hypothesis, updated in branches:
-            P = updated.belief.covariance
-            s = np.sqrt(np.maximum(np.einsum("ki,ki->k", phi @ P, phi), 1e-300))
-            c = self.inequalities.margins(updated.belief.mean) / s
+        for hypothesis, result in branches:
+            c = result.truncated.c
             k = int(np.argmin(c))
             worst_c.append(c[k])
             if c[k] < self.settings.reject_below:
                 name = self.inequalities.rows[k]
                 rejected.append(Rejection(step, hypothesis.born, "constraint", name, float(c[k])))
             else:
-                alive.append((hypothesis, updated))
+                alive.append((hypothesis, result))
         if not alive:
             keep = int(np.argmax(worst_c))
             return [branches[keep]], rejected[:keep] + rejected[keep + 1 :]
         return alive, rejected
 
-    def _finish(self, hypothesis: Hypothesis, updated: Updated, is_new: bool) -> Hypothesis:
-        if not is_new:
-            # The rows have cut this view's belief already; they would cut it ever narrower.
-            weight = hypothesis.log_weight + updated.log_likelihood
-            return replace(hypothesis, belief=updated.belief, log_weight=weight)
-        hypothesis = replace(hypothesis, anchor=None)
-        truncated, result = self._truncate(replace(hypothesis, belief=updated.belief))
-        gain = updated.log_likelihood + (result.log_probability if result else 0.0)
-        return replace(truncated, log_weight=hypothesis.log_weight + gain)
+    def _weigh(self, hypothesis: Hypothesis, result: LimitedUpdate) -> Hypothesis:
+        """The hypothesis after its update, weighed by the measurement and by the limits."""
+        updated = result.updated
+        evidence = hypothesis.log_evidence + updated.log_likelihood
+        weighed = replace(hypothesis, log_evidence=evidence)
+        return self._finish(weighed, updated.belief, result.truncated)
 
-    def _truncate(self, hypothesis: Hypothesis) -> tuple[Hypothesis, Truncated | None]:
-        mean, P = hypothesis.belief.mean, hypothesis.belief.covariance
-        if self.settings.truncation == "none" or not self.inequalities:
-            return hypothesis, None
-        sites = hypothesis.sites
-        if self.settings.truncation == "joint":
-            contained = sites if sites.size else None
-            result = truncate_joint(mean, P, self._rows, contained, self.settings.tolerance)
-            sites = np.where(self._lasting[:, None], result.sites, 0.0)
-        elif self.settings.truncation == "sequential":
-            result = truncate_sequential(mean, P, self.inequalities)
-        else:
-            result = clip(mean, P, self.inequalities)
+    def _finish(self, hypothesis: Hypothesis, free: Belief, result: Truncated) -> Hypothesis:
         active = tuple(self.inequalities.rows[k] for k in np.flatnonzero(result.active))
         belief = Belief(result.mean, result.covariance)
-        return replace(hypothesis, belief=belief, sites=sites, active=active), result
+        weight = hypothesis.log_evidence + result.log_probability
+        evidence = hypothesis.log_evidence
+        if self.settings.truncation != "joint":
+            # The paper's: the next step is predicted from the truncated belief.
+            free, evidence = belief, weight
+        return replace(
+            hypothesis,
+            belief=belief,
+            free=free,
+            log_weight=weight,
+            log_evidence=evidence,
+            active=active,
+            sites=result.sites,
+            tangent=hypothesis.tangent if hypothesis.stare else belief.mean,
+        )
+
+    def _truncate(self, belief: Belief, sites: Array) -> Truncated:
+        if self.settings.truncation == "none" or not self.inequalities:
+            return unlimited(belief)
+        if self.settings.truncation == "sequential":
+            return truncate_sequential(belief.mean, belief.covariance, self.inequalities)
+        if self.settings.truncation == "clip":
+            return clip(belief.mean, belief.covariance, self.inequalities)
+        return truncate_joint(
+            belief.mean,
+            belief.covariance,
+            self._rows,
+            tolerance=self.settings.tolerance,
+            start=sites if sites.size else None,
+        )

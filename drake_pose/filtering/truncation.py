@@ -10,16 +10,22 @@ from drake_pose.filtering.expectation_propagation import apply_sites, propagate
 from drake_pose.filtering.factors import (
     check_moments,
     covariance_from,
-    factor_of,
-    is_definite,
+    factor_and_kind,
+    is_inside,
+    lower_or_root,
+    margins_in_deviations,
+    outer_product,
 )
 from drake_pose.filtering.inequalities import Inequalities
 from drake_pose.filtering.one_by_one import cut_one_by_one
+from drake_pose.filtering.state import Belief
 
 Array = NDArray[np.float64]
 
 SKIP_ABOVE = 5.0
 """Rows with a larger c_k are left out: they would move the mean by less than 2e-6 deviations."""
+
+_PATIENCE = 25
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +65,7 @@ class JointRows:
         directions: (S, m) unit vectors over the used elements.
         lower, upper: (S,) bounds along them, infinite for none.
         group: (K,) the direction of each row.
+        whole: (S, n) the directions over all elements.
     """
 
     inequalities: Inequalities
@@ -67,6 +74,7 @@ class JointRows:
     lower: Array
     upper: Array
     group: NDArray[np.intp]
+    whole: Array
 
 
 def join_rows(inequalities: Inequalities) -> JointRows:
@@ -80,7 +88,8 @@ def join_rows(inequalities: Inequalities) -> JointRows:
     count = len(phi)
     if count == 0:
         nothing = np.zeros(0)
-        return JointRows(inequalities, used, np.zeros((0, 0)), nothing, nothing, used)
+        empty = np.zeros((0, phi.shape[1]))
+        return JointRows(inequalities, used, np.zeros((0, 0)), nothing, nothing, used, empty)
     norms = np.linalg.norm(phi, axis=1)
     unit = phi[:, used] / norms[:, None]
     leading = unit[np.arange(count), np.argmax(np.abs(unit) > 1e-9, axis=1)]
@@ -99,7 +108,9 @@ def join_rows(inequalities: Inequalities) -> JointRows:
         raise SettingsError(
             f"the inequalities leave no room between them: {'; '.join(names)}. Loosen one of them"
         )
-    return JointRows(inequalities, used, directions, lower, upper, group)
+    whole = np.zeros((len(directions), phi.shape[1]))
+    whole[:, used] = directions
+    return JointRows(inequalities, used, directions, lower, upper, group, whole)
 
 
 def normalised_margins(mean: Array, covariance: Array, inequalities: Inequalities) -> Array:
@@ -108,20 +119,13 @@ def normalised_margins(mean: Array, covariance: Array, inequalities: Inequalitie
     Raises:
         SettingsError: a row without variance is not satisfied; it is named.
     """
-    phi = inequalities.phi
-    margins = inequalities.margins(mean)
-    variances = np.sum((phi @ covariance) * phi, axis=1)
-    # What rounding makes of a variance of zero.
-    floor = 1e-30 + 1e-23 * np.square(np.abs(phi) @ np.sqrt(np.abs(np.diag(covariance))))
-    flat = variances <= floor
-    slack = 1e-9 * (np.abs(phi) @ np.abs(mean) + np.abs(inequalities.b))
-    for k in np.flatnonzero(flat & (margins < -slack)):
+    c, beyond = margins_in_deviations(mean, covariance, inequalities.phi, inequalities.b)
+    if beyond >= 0:
+        excess = -inequalities.margins(mean)[beyond]
         raise SettingsError(
-            f"inequality '{inequalities.rows[k]}' is not satisfied by {-margins[k]:.3g}, and the "
+            f"inequality '{inequalities.rows[beyond]}' is not satisfied by {excess:.3g}, and the "
             "belief has no variance along it; start from a belief that allows it"
         )
-    c = np.full(len(phi), np.inf)
-    c[~flat] = margins[~flat] / np.sqrt(variances[~flat])
     return c
 
 
@@ -150,7 +154,7 @@ def truncate_sequential(
             variance that is not satisfied.
     """
     q, Q = _check(mean, covariance, inequalities)
-    factor, definite = factor_of(Q), is_definite(Q)
+    factor, definite = factor_and_kind(Q)
     normalised_margins(q, Q, inequalities)
     c = np.empty(len(inequalities))
     factor = np.ascontiguousarray(factor)
@@ -165,6 +169,7 @@ def truncate_joint(
     contained: ArrayLike | None = None,
     tolerance: float = 1e-9,
     sweep_limit: int = 400,
+    start: Array | None = None,
 ) -> Truncated:
     """Truncate by all rows at once: moments by expectation propagation.
 
@@ -181,6 +186,7 @@ def truncate_joint(
             known about elements that never change is then not counted twice.
         tolerance: of the marginals' change from sweep to sweep.
         sweep_limit: of expectation propagation.
+        start: (S, 2) sites of a similar problem to begin with, which saves sweeps.
 
     Raises:
         SettingsError: as for ``truncate_sequential``, or parallel rows that exclude each other.
@@ -188,25 +194,32 @@ def truncate_joint(
     joint = join_rows(rows) if isinstance(rows, Inequalities) else rows
     q, Q = _check(mean, covariance, joint.inequalities)
     c = normalised_margins(q, Q, joint.inequalities)
-    factor, definite = np.ascontiguousarray(factor_of(Q)), is_definite(Q)
+    factor, definite = factor_and_kind(Q)
+    factor = np.ascontiguousarray(factor)
     sites = np.zeros((len(joint.directions), 2))
     if contained is not None:
         sites[:] = np.asarray(contained, dtype=np.float64)
-    whole = np.zeros((len(joint.directions), q.size))
-    whole[:, joint.used] = joint.directions
-    apply_sites(q, factor, whole, sites, -1, -1.0)
-    base = factor_of(covariance_from(factor[joint.used], definite=False))
-    log_probability, _ = propagate(
-        q[joint.used].copy(),
-        np.ascontiguousarray(base),
-        joint.directions,
-        joint.lower,
-        joint.upper,
-        sites,
-        tolerance,
-        sweep_limit,
-    )
-    apply_sites(q, factor, whole, sites, -1, 1.0)
+        apply_sites(q, factor, joint.whole, sites, -1, -1.0)
+    elif start is not None:
+        sites[:] = start
+    base = lower_or_root(outer_product(factor[joint.used]))
+    free = q, factor
+    for limit in (sweep_limit, _PATIENCE * sweep_limit):
+        log_probability, sweeps = propagate(
+            free[0][joint.used],
+            base,
+            joint.directions,
+            joint.lower,
+            joint.upper,
+            sites,
+            tolerance,
+            limit,
+        )
+        q, factor = free[0].copy(), free[1].copy()
+        apply_sites(q, factor, joint.whole, sites, -1, 1.0)
+        # Rows thousands of deviations away, almost parallel, settle slowly.
+        if sweeps < limit or is_inside(q, joint.inequalities.phi, joint.inequalities.b):
+            break
     active = (c <= SKIP_ABOVE) & (sites[joint.group, 0] > 0)
     covariance_after = covariance_from(factor, definite)
     return Truncated(q, covariance_after, c, active, log_probability, sites)
@@ -232,6 +245,13 @@ def clip(mean: ArrayLike, covariance: ArrayLike, inequalities: Inequalities) -> 
         gain = Q @ row
         q = q + gain * margins[worst] / float(row @ gain)
     return Truncated(q, Q, c, c < 0, 0.0)
+
+
+def unlimited(belief: Belief) -> Truncated:
+    """A belief that no row cuts."""
+    nothing = np.zeros(0)
+    active = np.zeros(0, dtype=np.bool_)
+    return Truncated(belief.mean, belief.covariance, nothing, active, 0.0)
 
 
 def _check(

@@ -15,8 +15,8 @@ Array = NDArray[np.float64]
 
 # A first guess far off is approached with more noise than there is, cooled from step to step:
 # narrow curved valleys, such as that of a known scale, would stop a descent.
-_GOOD_FIT = 9.0
-_COOLING = 6.0
+GOOD_FIT = 9.0
+COOLING = 6.0
 # Steps below this many predicted deviations end the iteration.
 _SETTLED = 0.01
 
@@ -157,7 +157,7 @@ def _iterate(
         noise = model.variances[rows]
         misfit = float(np.sum(residual**2 / noise))
         if attempt == 0 and iterations > 1:
-            temperature = max(1.0, misfit / max(len(residual), 1) / _GOOD_FIT)
+            temperature = max(1.0, misfit / max(len(residual), 1) / GOOD_FIT)
         cost = float(dual @ P @ dual) + misfit
         # What is hidden at one state and seen at another must not decide between them.
         cost += 9.0 * int(np.count_nonzero(seen & ~rows))
@@ -175,7 +175,7 @@ def _iterate(
             break
         made += 1
         dual, _, _, definite = fuse(P, line.H, temperature * noise, line.innovation)
-        temperature = max(1.0, temperature / _COOLING)
+        temperature = max(1.0, temperature / COOLING)
         if temperature == 1.0:
             last_cost = math.inf
         if not definite:

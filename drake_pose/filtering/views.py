@@ -2,17 +2,20 @@
 
 A filter that linearises anew in every frame of a static view intersects tangents at ever other
 points of one curved set, and believes itself ever surer: the flaw that Shimada et al. state in
-their section 7. Here a view keeps the tangent of its first frame, and its frames together count
-as their mean does: noise R / k after k frames, plus the curvature C that no averaging takes away.
+their section 7. Here a view keeps the tangent of its first frame, and what that tangent leaves out
+is an offset of each measurement: unknown, the same in all frames of the view, and estimated beside
+the state. A thousand frames then tell the sum of state and offset exactly, and the state no better
+than the offset's own variance allows.
 """
 
-import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
-from drake_pose.filtering.fusion import lower_or_root
+from drake_pose.filtering.factors import lower_or_root
 from drake_pose.filtering.state import Belief
 from drake_pose.filtering.update import ObservationModel, difference
 
@@ -35,71 +38,116 @@ class View:
     count: int
 
 
-def next_view(view: View | None, y: Array, model: ObservationModel, novelty: float) -> View:
+def next_view(view: View | None, y: Array, model: ObservationModel, chance: float) -> View:
     """The view a measurement belongs to: the one so far, or one that begins with it.
 
     Args:
         view: the one so far.
         y: (m,) measured, NaN where occluded.
         model: gives the noise.
-        novelty: a view is new when its measurement differs from the reference by more than this,
-            in root mean square of standard deviations (noise alone gives 1.4); 0: every one is.
+        chance: a view is new when noise alone would make it differ so much from the reference
+            with no more than this probability; 0: every one is new.
     """
-    if view is None or novelty == 0:
+    if view is None or chance == 0 or len(view.reference) != len(y):
         return View(y, 1)
     change = difference(y, view.reference, model.wraps)
     both = np.isfinite(change)
     new_rows = np.isfinite(y) & ~np.isfinite(view.reference)
     if new_rows.any() or not both.any():
         return View(y, 1)
-    size = math.sqrt(float(np.mean(change[both] ** 2 / model.variances[both])))
-    return View(y, 1) if size > novelty else View(view.reference, view.count + 1)
+    size = float(np.sum(change[both] ** 2 / (2.0 * model.variances[both])))
+    is_new = size > _largest_change(chance, int(np.count_nonzero(both)))
+    return View(y, 1) if is_new else View(view.reference, view.count + 1)
 
 
-class AnchoredObservation:
-    """An observation model held at the tangent of one state.
+@lru_cache(maxsize=1024)
+def _largest_change(chance: float, count: int) -> float:
+    return float(chi2.isf(chance, count))
+
+
+def measure_curvature(model: ObservationModel, belief: Belief) -> Array:
+    """(m,) mean square of what the tangent at a belief's mean leaves out of a measurement.
+
+    By second differences along the columns of the covariance's root.
+    """
+    h, H = model.predict(belief.mean)
+    used = np.flatnonzero(np.abs(H).sum(axis=0) > 0)
+    root = lower_or_root(belief.covariance[np.ix_(used, used)])
+    total = np.zeros(len(h))
+    for column in root.T:
+        step = np.zeros_like(belief.mean)
+        step[used] = column
+        ends = [model.predict(belief.mean + sign * step)[0] for sign in (1.0, -1.0)]
+        bend = 0.5 * sum(difference(end, h, model.wraps) for end in ends)
+        total += _FOURTH_MOMENT * np.nan_to_num(bend) ** 2
+    return total
+
+
+@dataclass(frozen=True, eq=False)
+class Stare:
+    """What is believed within a view: the state, and beside it the tangent's offsets.
+
+    Attributes:
+        tangent: (n,) where the view's first frame was linearised.
+        belief: over n + m numbers: the state, then what the tangent leaves out of each measurement.
+    """
+
+    tangent: Array
+    belief: Belief
+
+    def state(self) -> Belief:
+        """The belief about the state alone."""
+        n = len(self.tangent)
+        return Belief(self.belief.mean[:n].copy(), self.belief.covariance[:n, :n].copy())
+
+    def moved(self, A: Array, U: Array) -> "Stare":
+        """One step at constant velocity; the offsets stay as they are."""
+        n, P = len(self.tangent), self.belief.covariance.copy()
+        mean = np.r_[A @ self.belief.mean[:n], self.belief.mean[n:]]
+        P[:n, :n] = A @ P[:n, :n] @ A.T + U
+        P[:n, :n] = 0.5 * (P[:n, :n] + P[:n, :n].T)
+        P[:n, n:] = A @ P[:n, n:]
+        P[n:, :n] = P[:n, n:].T
+        return Stare(self.tangent, Belief(mean, P))
+
+
+def begin_stare(model: ObservationModel, free: Belief, seen: Belief, tangent: Array) -> Stare:
+    """A view's second frame: nothing is known yet of the offsets but how large they may be.
 
     Args:
         model: what is observed.
-        belief: the tangent is taken at its mean; its covariance says how far the truth may lie
-            from there, and so how much the tangent may be off.
+        free: the prediction of the second frame, without its limits.
+        seen: how far the state may be from the tangent, where the curvature is measured.
+        tangent: (n,) where the first frame was linearised.
+    """
+    curvature = measure_curvature(model, Belief(tangent, seen.covariance))
+    n, m = len(tangent), len(curvature)
+    P = np.zeros((n + m, n + m))
+    P[:n, :n] = free.covariance
+    P[n:, n:] = np.diag(curvature)
+    return Stare(tangent, Belief(np.r_[free.mean, np.zeros(m)], P))
+
+
+class AnchoredObservation:
+    """An observation model held at the tangent of one state, with offsets: linear in both.
+
+    Args:
+        model: what is observed.
+        tangent: (n,) where the model is made linear.
     """
 
-    def __init__(self, model: ObservationModel, belief: Belief) -> None:
-        self._model = model
-        self._x = belief.mean
-        self._h, self._H = model.predict(belief.mean)
-        self._curvature = self._measure_curvature(belief)
-        self.variances = model.variances
+    def __init__(self, model: ObservationModel, tangent: Array) -> None:
+        self._x = tangent
+        self._h, self._H = model.predict(tangent)
+        self._slope = np.hstack([self._H, np.eye(len(self._h))])
         self.names = model.names
         self.wraps = model.wraps
-
-    def _measure_curvature(self, belief: Belief) -> Array:
-        """(m,) mean square of what the tangent leaves out, by second differences."""
-        used = np.flatnonzero(np.abs(self._H).sum(axis=0) > 0)
-        root = lower_or_root(belief.covariance[np.ix_(used, used)])
-        total = np.zeros(len(self._h))
-        for column in root.T:
-            step = np.zeros_like(self._x)
-            step[used] = column
-            ends = [self._model.predict(self._x + sign * step)[0] for sign in (1.0, -1.0)]
-            bend = 0.5 * sum(difference(end, self._h, self._model.wraps) for end in ends)
-            total += _FOURTH_MOMENT * np.nan_to_num(bend) ** 2
-        return total
-
-    def for_frame(self, count: int) -> "AnchoredObservation":
-        """The same, with the noise of a view's frame number ``count`` (2 or more).
-
-        Together with the frames before, it makes the view's noise R / count + C.
-        """
-        R, C = self._model.variances, self._curvature
-        gain = 1.0 / (R / count + C) - 1.0 / (R / (count - 1) + C)
-        self.variances = 1.0 / np.maximum(gain, 1e-12 / R)
-        return self
+        self.variances = model.variances
 
     def predict(self, x: Array) -> tuple[Array, Array]:
-        """The tangent's value at x (m,), and its slope (m, n)."""
-        return self._h + self._H @ (x - self._x), self._H
+        """The tangent's value and offset (m,) at a state and offsets (n + m,), and the slope."""
+        n = len(self._x)
+        return self._h + self._H @ (x[:n] - self._x) + x[n:], self._slope
 
     def mirrors(self, belief: Belief) -> list[Array]:
         """None: what else the view may be was asked when it was new."""

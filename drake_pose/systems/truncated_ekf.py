@@ -8,7 +8,8 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Even
 from scipy.stats import chi2
 
 from drake_pose.errors import SettingsError
-from drake_pose.filtering import Belief, FilterState, Hypothesis, TruncatedFilter, make_belief
+from drake_pose.filtering import Belief, FilterState, ObservationModel, TruncatedFilter, make_belief
+from drake_pose.systems.filter_packing import FilterPacking
 
 Array = NDArray[np.float64]
 
@@ -57,8 +58,7 @@ class TruncatedEkf(LeafSystem):
         patience: so many unlikely measurements in a row make a loss.
 
     Raises:
-        SettingsError: a start that does not fit, a period or patience that is not positive,
-            or a filter that keeps views.
+        SettingsError: a start that does not fit, a period or patience that is not positive.
     """
 
     def __init__(
@@ -74,21 +74,35 @@ class TruncatedEkf(LeafSystem):
             raise SettingsError(f"the filter's period must be positive, not {period}")
         if patience < 1:
             raise SettingsError(f"patience must be 1 or more, not {patience}")
-        if belief_filter.settings.novelty > 0:
-            raise SettingsError("TruncatedEkf keeps no views: give its filter novelty = 0")
         self.filter = belief_filter
         self._start = make_belief(start.mean, start.covariance)
         self._patience = patience
-        n, m = len(belief_filter.layout), len(belief_filter.observation.names)
-        self._n, self._cap = n, belief_filter.settings.hypothesis_cap
-        first = belief_filter.start(self._start)
-        self._site_shape = first.hypotheses[0].sites.shape
-        self._measurement = self.DeclareVectorInputPort("measurement", m)
-        self._reset = self.DeclareVectorInputPort("reset_state", n)
-        self._belief = self.DeclareDiscreteState(self._pack(first).ravel())
+        self._packing = FilterPacking(belief_filter, len(belief_filter.observation.names))
+        self._n, self._cap = self._packing.n, self._packing.cap
+        packed = self._packing.pack(belief_filter.start(self._start))
+        self._declare_measurement()
+        self._reset = self.DeclareVectorInputPort("reset_state", self._n)
+        self._belief, self._stare, self._view = (self.DeclareDiscreteState(p) for p in packed)
         # The statistics, and how many unlikely measurements there were in a row.
         self._record = self.DeclareDiscreteState(np.r_[0.0, 1.0, 0.0, 0.0, 0.0, 0.0])
         self._active = self.DeclareDiscreteState(np.zeros(max(len(belief_filter.inequalities), 1)))
+        self._declare_outputs()
+        self.DeclarePeriodicDiscreteUpdateEvent(period, offset, self._update)
+
+    def _declare_measurement(self) -> None:
+        size = len(self.filter.observation.names)
+        self._measurement = self.DeclareVectorInputPort("measurement", size)
+
+    def _measure(
+        self, context: Context, prediction: FilterState
+    ) -> tuple[Array, ObservationModel | None]:
+        """What is measured now, and with what model if not the filter's own."""
+        if self._measurement.HasValue(context):
+            return np.array(self._measurement.Eval(context)), None
+        return np.full(len(self.filter.observation.names), np.nan), None
+
+    def _declare_outputs(self) -> None:
+        n = self._n
         belief = {self.discrete_state_ticket(self._belief)}
         for name, size, calculate in (
             ("estimated_state", n, self._calc_state),
@@ -99,7 +113,7 @@ class TruncatedEkf(LeafSystem):
             self.DeclareVectorOutputPort(name, size, calculate, belief)
         self.DeclareVectorOutputPort(
             "active_limits",
-            max(len(belief_filter.inequalities), 1),
+            max(len(self.filter.inequalities), 1),
             self._calc_active,
             {self.discrete_state_ticket(self._active)},
         )
@@ -109,41 +123,15 @@ class TruncatedEkf(LeafSystem):
             self._calc_statistics,
             {self.discrete_state_ticket(self._record)},
         )
-        self.DeclarePeriodicDiscreteUpdateEvent(period, offset, self._update)
 
     def filter_state(self, context: Context) -> FilterState:
         """The filter's state in a context, without its rejections."""
         step, _, distance, count, _, _ = context.get_discrete_state(self._record).value()
-        hypotheses = []
-        for row in self._rows(context):
-            if row[0] > 0:
-                parts = np.split(row, np.cumsum([1, 1, 1, self._n, self._n**2]))
-                covariance = parts[4].reshape(self._n, self._n)
-                hypotheses.append(
-                    Hypothesis(
-                        Belief(parts[3], covariance),
-                        float(parts[1][0]),
-                        int(parts[2][0]),
-                        parts[5].reshape(self._site_shape),
-                    )
-                )
-        return FilterState(int(step), tuple(hypotheses), (), float(distance), int(count))
-
-    def _pack(self, state: FilterState) -> Array:
-        """(cap, width): alive, log weight, born, mean, covariance, sites of each hypothesis."""
-        width = 3 + self._n + self._n**2 + int(np.prod(self._site_shape))
-        packed = np.zeros((self._cap, width))
-        for row, hypothesis in zip(packed, state.hypotheses, strict=False):
-            belief = hypothesis.belief
-            row[:] = np.concatenate(
-                [
-                    [1.0, hypothesis.log_weight, hypothesis.born],
-                    belief.mean,
-                    belief.covariance.ravel(),
-                    hypothesis.sites.ravel(),
-                ]
-            )
-        return packed
+        beliefs, stares, view = (
+            np.array(context.get_discrete_state(index).value())
+            for index in (self._belief, self._stare, self._view)
+        )
+        return self._packing.unpack(beliefs, stares, view, int(step), float(distance), int(count))
 
     def _rows(self, context: Context) -> Array:
         return np.array(context.get_discrete_state(self._belief).value()).reshape(self._cap, -1)
@@ -160,14 +148,14 @@ class TruncatedEkf(LeafSystem):
                 fresh, unlikely = True, 0
         if not fresh:
             state = self.filter.predict(state)
-        y = np.full(len(self.filter.observation.names), np.nan)
-        if self._measurement.HasValue(context):
-            y = np.array(self._measurement.Eval(context))
-        state = self.filter.update(state, y)
+        y, model = self._measure(context, state)
+        state = self.filter.update(state, y, model)
         if state.count:
             limit = chi2.ppf(1 - _LOSS_PROBABILITY, state.count)
             unlikely = unlikely + 1 if state.distance > limit else 0
-        discrete_state.set_value(self._belief, self._pack(state).ravel())
+        packed = self._packing.pack(state)
+        for index, vector in zip((self._belief, self._stare, self._view), packed, strict=True):
+            discrete_state.set_value(index, vector)
         discrete_state.set_value(
             self._record,
             np.array(
@@ -187,10 +175,10 @@ class TruncatedEkf(LeafSystem):
         return EventStatus.Succeeded()
 
     def _calc_state(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._rows(context)[0, 3 : 3 + self._n])
+        output.SetFromVector(self._rows(context)[0, 4 : 4 + self._n])
 
     def _calc_covariance(self, context: Context, output: BasicVector) -> None:
-        start = 3 + self._n
+        start = 4 + self._n
         output.SetFromVector(self._rows(context)[0, start : start + self._n**2])
 
     def _calc_weights(self, context: Context, output: BasicVector) -> None:
@@ -199,7 +187,7 @@ class TruncatedEkf(LeafSystem):
 
     def _calc_states(self, context: Context, output: BasicVector) -> None:
         rows = self._rows(context)
-        states = rows[:, 3 : 3 + self._n]
+        states = rows[:, 4 : 4 + self._n]
         states[rows[:, 0] == 0] = np.nan
         output.SetFromVector(states.ravel())
 

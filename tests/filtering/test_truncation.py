@@ -132,7 +132,7 @@ def test_one_row_in_many_dimensions_is_exact(method, c):
         np.testing.assert_array_equal(result.mean, mean)
         np.testing.assert_allclose(result.covariance, covariance, rtol=1e-13)
     np.linalg.cholesky(result.covariance)
-    assert result.c == pytest.approx([c], abs=1e-9)
+    assert result.c == pytest.approx([c], rel=1e-14, abs=1e-9)
 
 
 def test_sequential_is_the_papers_formula():

@@ -80,6 +80,27 @@ def test_in_a_diagram_it_gives_what_the_filter_gives(sequence):
     assert inside.min() > -1e-9
 
 
+def test_a_view_that_lasts_is_kept_in_the_context(sequence):
+    """In the diagram as outside of it: the offsets of a static view are part of the state."""
+    f, observation = experiment_filter()
+    generator = np.random.default_rng(0)
+    noise = np.sqrt(observation.variances)
+    static = sequence.measurements[0] + noise * generator.normal(size=(12, len(noise)))
+    static[1:, -1] = np.nan
+    ekf = TruncatedEkf(f, sequence.guess, PERIOD)
+    _, context = simulate(ekf, static)
+    state = f.start(sequence.guess)
+    for t, y in enumerate(static):
+        state = f.update(f.predict(state) if t else state, y)
+    assert state.view.count == 12
+    kept = ekf.filter_state(context)
+    assert kept.view.count == 12
+    np.testing.assert_allclose(kept.best.covariance, state.best.covariance)
+    np.testing.assert_allclose(
+        kept.hypotheses[0].stare.belief.mean, state.hypotheses[0].stare.belief.mean
+    )
+
+
 def test_without_measurements_it_predicts_and_grows_unsure(sequence):
     f, _ = experiment_filter()
     ekf = TruncatedEkf(f, sequence.guess, PERIOD)

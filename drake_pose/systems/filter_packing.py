@@ -1,0 +1,88 @@
+"""A filter's state as plain vectors, for a Drake context."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.filtering import Belief, FilterState, Hypothesis, Stare, TruncatedFilter, View
+
+Array = NDArray[np.float64]
+
+
+class FilterPacking:
+    """Turns the states of one filter into three vectors, and back.
+
+    Rejections and the names of active rows are left out: they do not decide what comes next.
+
+    Args:
+        belief_filter: its layout and settings decide the sizes.
+        measured: (m) how many numbers a measurement has.
+    """
+
+    def __init__(self, belief_filter: TruncatedFilter, measured: int) -> None:
+        self._filter = belief_filter
+        self.n, self.m = len(belief_filter.layout), measured
+        self.cap = belief_filter.settings.hypothesis_cap
+        self._sites = belief_filter.site_count
+        n, z = self.n, self.n + measured
+        self.belief_width = 4 + 2 * (n + n * n) + 2 * self._sites + n
+        self._stare_width = 1 + z + z * z if belief_filter.novelty > 0 else 0
+
+    def pack(self, state: FilterState) -> tuple[Array, Array, Array]:
+        """Beliefs (cap x belief_width), stares (cap x width), view (1 + m), each flat.
+
+        A belief's row begins with: alive, log weight, log evidence, step of birth, mean.
+        """
+        beliefs = np.zeros((self.cap, self.belief_width))
+        stares = np.zeros((self.cap, self._stare_width))
+        for row, stared, h in zip(beliefs, stares, state.hypotheses, strict=False):
+            sites = np.zeros((self._sites, 2))
+            sites[: len(h.sites)] = h.sites
+            row[:] = np.concatenate(
+                [
+                    [1.0, h.log_weight, h.log_evidence, h.born],
+                    h.belief.mean,
+                    h.belief.covariance.ravel(),
+                    h.free.mean,
+                    h.free.covariance.ravel(),
+                    sites.ravel(),
+                    h.tangent,
+                ]
+            )
+            if h.stare is not None:
+                belief = h.stare.belief
+                stared[:] = np.concatenate([[1.0], belief.mean, belief.covariance.ravel()])
+        view = np.zeros(1 + self.m)
+        if state.view is not None:
+            view[0], view[1:] = state.view.count, state.view.reference
+        return beliefs.ravel(), stares.ravel(), view
+
+    def unpack(
+        self, beliefs: Array, stares: Array, view: Array, step: int, distance: float, count: int
+    ) -> FilterState:
+        """The state that was packed."""
+        n, z = self.n, self.n + self.m
+        ends = np.cumsum([4, n, n * n, n, n * n, 2 * self._sites])
+        hypotheses = []
+        rows = beliefs.reshape(self.cap, -1)
+        for row, stared in zip(rows, stares.reshape(self.cap, -1), strict=True):
+            if row[0] == 0:
+                continue
+            head, mean, P, free_mean, free_P, sites, tangent = np.split(row.copy(), ends)
+            stare = None
+            if stared.size and stared[0] > 0:
+                joint = Belief(stared[1 : 1 + z].copy(), stared[1 + z :].reshape(z, z).copy())
+                stare = Stare(tangent, joint)
+            hypotheses.append(
+                Hypothesis(
+                    belief=Belief(mean, P.reshape(n, n)),
+                    free=Belief(free_mean, free_P.reshape(n, n)),
+                    log_weight=float(head[1]),
+                    log_evidence=float(head[2]),
+                    born=int(head[3]),
+                    sites=sites.reshape(-1, 2),
+                    tangent=tangent,
+                    stare=stare,
+                )
+            )
+        seen = View(view[1:].copy(), int(view[0])) if view[0] > 0 else None
+        return FilterState(step, tuple(hypotheses), (), distance, count, seen)

@@ -13,8 +13,9 @@ MAY_KNOW = {
     "silhouette": {"body", "camera"},
     "matching": {"silhouette", "body", "camera"},
     "filtering": {"matching", "silhouette", "body", "camera"},
-    "systems": {"filtering", "matching", "silhouette", "body", "camera"},
-    "apps": {"systems", "filtering", "matching", "silhouette", "body", "camera"},
+    "multiview": {"filtering", "matching", "silhouette", "body", "camera"},
+    "systems": {"multiview", "filtering", "matching", "silhouette", "body", "camera"},
+    "apps": {"systems", "multiview", "filtering", "matching", "silhouette", "body", "camera"},
 }
 # Drake keeps two plain value types, ImageLabel16I and CameraInfo, in pydrake.systems.sensors.
 VALUE_TYPES = {"camera/models.py", "camera/drake.py", "silhouette/label_images.py"}

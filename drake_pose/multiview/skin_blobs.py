@@ -1,0 +1,125 @@
+"""Skin-coloured blobs inside the person's region, and their centroids (Date et al., 3.1.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.errors import SettingsError
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class SkinColour:
+    """Which colours are skin: a box in the chroma plane, so that shade matters little.
+
+    The defaults are those of Chai and Ngan (1999), found on faces of many origins.
+
+    Args:
+        red: lowest and highest red chroma Cr (0 to 255, 128 is grey).
+        blue: lowest and highest blue chroma Cb.
+        darkest: lowest brightness Y: chroma means nothing in the dark.
+    """
+
+    red: tuple[float, float] = (133.0, 173.0)
+    blue: tuple[float, float] = (77.0, 127.0)
+    darkest: float = 30.0
+
+
+def learn_skin_colour(colours: NDArray[np.uint8], share: float = 0.99) -> SkinColour:
+    """The box that holds a share of sampled skin colours, with a margin of its own size's tenth.
+
+    Args:
+        colours: (n, 3) red, green, blue of skin.
+        share: of the samples in each chroma.
+
+    Raises:
+        SettingsError: fewer than ten samples.
+    """
+    if len(colours) < 10:
+        raise SettingsError(f"skin colour needs ten samples or more, not {len(colours)}")
+    chroma = _chroma(colours.reshape(1, -1, 3))[0].astype(np.float64)
+    low, high = np.quantile(chroma, [0.5 * (1.0 - share), 0.5 * (1.0 + share)], axis=0)
+    margin = np.maximum(2.0, 0.1 * (high - low))
+    low, high = low - margin, high + margin
+    return SkinColour(
+        red=(float(low[1]), float(high[1])),
+        blue=(float(low[2]), float(high[2])),
+        darkest=float(max(0.0, 0.5 * chroma[:, 0].min())),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Blobs:
+    """Patches of skin in one picture, the largest first.
+
+    Args:
+        centroids: (n, 2) [pixel].
+        areas: (n,) [pixel].
+        boxes: (n, 4) left, top, width, height [pixel].
+        mask: (H, W) all of them.
+    """
+
+    centroids: Array
+    areas: NDArray[np.int64]
+    boxes: NDArray[np.int64]
+    mask: Mask
+
+
+def skin_mask(picture: Picture, region: Mask, colour: SkinColour) -> Mask:
+    """Where the region (H, W) of a picture (H, W, 3) in red, green, blue has the colour of skin."""
+    chroma = _chroma(picture)
+    low = (colour.darkest, colour.red[0], colour.blue[0])
+    high = (255.0, colour.red[1], colour.blue[1])
+    return np.asarray((cv2.inRange(chroma, low, high) > 0) & region)
+
+
+def skin_blobs(
+    picture: Picture, region: Mask, colour: SkinColour, smallest: int = 12, most: int = 12
+) -> Blobs:
+    """The skin-coloured blobs of a picture.
+
+    Args:
+        picture: (H, W, 3) red, green, blue.
+        region: (H, W) the person; skin is looked for there only.
+        colour: which colours are skin.
+        smallest: area of the smallest blob [pixel].
+        most: how many are kept.
+    """
+    top, bottom, left, right = _bounds(region)
+    inner = skin_mask(picture[top:bottom, left:right], region[top:bottom, left:right], colour)
+    joined = cv2.morphologyEx(inner.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    count, labels, statistics, middles = cv2.connectedComponentsWithStats(joined, connectivity=8)
+    order = np.argsort(-statistics[1:, cv2.CC_STAT_AREA], kind="stable")[:most] + 1
+    order = order[statistics[order, cv2.CC_STAT_AREA] >= smallest] if count > 1 else order[:0]
+    mask = np.zeros(region.shape, dtype=bool)
+    kept = np.zeros(count, dtype=bool)
+    kept[order] = True
+    mask[top:bottom, left:right] = kept[labels]
+    boxes = statistics[order, :4].astype(np.int64)
+    boxes[:, :2] += [left, top]
+    return Blobs(
+        centroids=middles[order] + [left, top],
+        areas=statistics[order, cv2.CC_STAT_AREA].astype(np.int64),
+        boxes=boxes,
+        mask=mask,
+    )
+
+
+def _chroma(picture: Picture) -> Picture:
+    """Brightness, red and blue chroma of a picture in red, green, blue."""
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_RGB2YCrCb))
+
+
+def _bounds(region: Mask) -> tuple[int, int, int, int]:
+    """Top, bottom, left, right of a region; one pixel where it is empty."""
+    rows, columns = np.flatnonzero(region.any(axis=1)), np.flatnonzero(region.any(axis=0))
+    if not len(rows):
+        return 0, 1, 0, 1
+    return int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1

@@ -27,6 +27,7 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from drake_pose.apps.kameda import experiment_camera, experiment_search, run_experiment
+from drake_pose.apps.kameda_table import experiment_table
 from drake_pose.body import TriangleMesh, bundled_model, load_model
 from drake_pose.camera import Camera, ParallelCamera, PinholeCamera
 from drake_pose.silhouette import (
@@ -182,7 +183,7 @@ def main() -> None:
     start = time.process_time()
     result = run_experiment(experiment_search())
     seconds = time.process_time() - start
-    console.print(result.table())
+    console.print(experiment_table([result]))
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     console.print(f"experiment A: {seconds:.1f} s CPU on one core; peak memory {memory:.0f} MiB")
 

@@ -9,10 +9,13 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
+from drake_pose.apps.family_pictures import save_families
 from drake_pose.apps.kameda import ExperimentResult, Trial
-from drake_pose.silhouette import LabelRenderer
+from drake_pose.matching import PaperSearch, View
+from drake_pose.silhouette import LabelRenderer, draw_mask
 
 _EXAMPLES = 4
+_SETS = 3
 _MARGIN = 20
 _BACKGROUND = (1.0, 1.0, 1.0)
 
@@ -37,7 +40,7 @@ _KINDS: dict[str, tuple[str, Callable[[Trial], bool]]] = {
 
 
 def save_pictures(result: ExperimentResult, folder: Path) -> list[Path]:
-    """Draw examples of each kind of outcome, and the histogram of the runs of step 3.
+    """Draw examples of each kind of outcome, a histogram of the effort, and poses as good.
 
     Args:
         result: the experiment.
@@ -53,7 +56,28 @@ def save_pictures(result: ExperimentResult, folder: Path) -> list[Path]:
         trials = [trial for trial in result.trials if belongs(trial)][:_EXAMPLES]
         if trials:
             files.append(_save_examples(folder / f"{name}.png", title, trials, result, renderer))
-    files.append(_save_histogram(folder / "figure_11_runs_of_step_3.png", result))
+    if isinstance(result.search, PaperSearch):
+        runs = np.array([trial.result.runs for trial in result.trials])
+        path = folder / "figure_11_runs_of_step_3.png"
+        return [*files, _save_histogram(path, runs, 100, "runs of step 3")]
+    milliseconds = np.array([1e3 * trial.seconds for trial in result.trials])
+    path = folder / "figure_11_milliseconds.png"
+    files.append(_save_histogram(path, milliseconds, 200, "processor time of the search [ms]"))
+    return files + _save_sets(folder, result)
+
+
+def _save_sets(folder: Path, result: ExperimentResult) -> list[Path]:
+    """Draw poses that look the same, where there are several families of them."""
+    files: list[Path] = []
+    model = result.search.tree.model
+    for trial in result.trials:
+        answer = trial.result.pose_set
+        if answer is not None and answer.family_count > 1 and len(files) < _SETS:
+            X_CN = result.camera.X_CW @ result.search.tree.node_poses(trial.true_values)
+            outlines = result.search.sampled.surfaces.at(trial.true_values)
+            view = View(result.camera, draw_mask(outlines, X_CN, result.camera))
+            path = folder / f"families_{len(files) + 1}.png"
+            files.append(save_families(path, model, answer, [view]))
     return files
 
 
@@ -103,13 +127,14 @@ def _compare(true: np.ndarray, estimate: np.ndarray) -> np.ndarray:
     return picture
 
 
-def _save_histogram(path: Path, result: ExperimentResult) -> Path:
-    runs = [trial.result.runs for trial in result.trials]
+def _save_histogram(path: Path, values: np.ndarray, end: int, label: str) -> Path:
+    """Draw how often values (n,) occur; what is beyond the end is counted there."""
     figure, axis = plt.subplots(figsize=(6, 4))
-    axis.hist(np.minimum(runs, 100), bins=list(range(0, 105, 5)), color="0.4")
-    axis.set_xlabel("runs of step 3 (100: 100 or more)")
+    axis.hist(np.minimum(values, end), bins=np.linspace(0, end, 21).tolist(), color="0.4")
+    axis.set_xlabel(f"{label} ({end}: {end} or more)")
     axis.set_ylabel("images")
-    axis.set_title(f"{len(runs)} images, mean {np.mean(runs):.1f}, minimum {min(runs)}")
+    title = f"{len(values)} images, mean {values.mean():.1f}, minimum {values.min():.0f}"
+    axis.set_title(title)
     figure.tight_layout()
     figure.savefig(path, dpi=80)
     plt.close(figure)

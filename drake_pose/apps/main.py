@@ -278,29 +278,33 @@ def kameda(
         raise typer.BadParameter("must be lattice or continuous", param_hint="--angles")
     with errors_as_messages():
         from drake_pose.apps.kameda import (
+            PAPER_IMAGES,
             experiment_search,
             run_experiment,
             wide_experiment_search,
         )
         from drake_pose.apps.kameda_pictures import save_pictures
+        from drake_pose.apps.kameda_table import experiment_table
         from drake_pose.apps.report import count_progress, output_console
         from drake_pose.apps.result_folder import require_empty
-        from drake_pose.matching import PoseSearch
 
         if out is not None:
             require_empty(out)
-        with count_progress("silhouettes", images) as advance:
-            if method == "wide":
-                search: PoseSearch = wide_experiment_search(interval)
-            else:
-                search = experiment_search(outside_limit, candidates, interval)
-            result = run_experiment(search, images, seed, angles, advance)
+        paper_images = images if method == "paper" else min(images, PAPER_IMAGES)
+        with count_progress("silhouettes, the paper's method", paper_images) as advance:
+            search = experiment_search(outside_limit, candidates, interval)
+            results = [run_experiment(search, paper_images, seed, angles, advance)]
+        if method == "wide":
+            with count_progress("silhouettes, wide search", images) as advance:
+                wide = wide_experiment_search(interval)
+                results.append(run_experiment(wide, images, seed, angles, advance))
         if out is not None:
-            save_pictures(result, out)
+            save_pictures(results[-1], out)
         if json:
-            print_json(result.as_json())
+            beside = {"paper_method": results[0].as_json()} if method == "wide" else {}
+            print_json({**results[-1].as_json(), **beside})
         else:
-            output_console().print(result.table())
+            output_console().print(experiment_table(results))
 
 
 @reproduce_app.command(help=help_texts.SHIMADA)

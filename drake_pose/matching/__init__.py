@@ -1,5 +1,7 @@
 """Silhouettes in, poses out: Kameda's search and the wide search, no Drake framework in them."""
 
+from drake_pose.matching.examination import ExaminationSettings
+from drake_pose.matching.families import JointEstimate, PoseFamily, PoseSet
 from drake_pose.matching.paper_search import PaperSearch
 from drake_pose.matching.pose_search import PoseSearch
 from drake_pose.matching.result import Candidates, MatchResult, View
@@ -9,10 +11,14 @@ from drake_pose.matching.wide_settings import WideSearchSettings
 
 __all__ = [
     "Candidates",
+    "ExaminationSettings",
+    "JointEstimate",
     "MatchResult",
     "PaperSearch",
     "PaperSearchSettings",
+    "PoseFamily",
     "PoseSearch",
+    "PoseSet",
     "View",
     "WideSearch",
     "WideSearchSettings",

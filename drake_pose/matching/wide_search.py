@@ -8,11 +8,13 @@ end at J = 0, which certifies itself; later ones let more and more, weighed agai
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from drake_pose.body import PoseTree
 from drake_pose.errors import SettingsError
+from drake_pose.matching.examination import ExaminationSettings, examine
 from drake_pose.matching.grid_poses import Gathering, GridPoses, check_choice
 from drake_pose.matching.result import MatchResult, View
 from drake_pose.matching.scoring import Scoring
@@ -31,11 +33,19 @@ class WideSearch:
     Args:
         tree: the pose tree.
         settings: the parameters.
+        examination: how every answer is examined: whether it is proved best, and which other poses
+            look the same; None: it is not.
     """
 
-    def __init__(self, tree: PoseTree, settings: WideSearchSettings | None = None) -> None:
+    def __init__(
+        self,
+        tree: PoseTree,
+        settings: WideSearchSettings | None = None,
+        examination: ExaminationSettings | None = None,
+    ) -> None:
         self.tree = tree
         self.settings = settings or WideSearchSettings()
+        self.examination = examination
         self.body = WideBody(tree, self.settings)
         self.sampled = self.body.sampled
 
@@ -57,7 +67,11 @@ class WideSearch:
         """
         start = time.perf_counter()
         run = self._run(views, root_position, None)
-        return run.result(time.perf_counter() - start)
+        result = run.result(time.perf_counter() - start)
+        if self.examination is not None:
+            result = examine(self.body, views, result, self.examination, root_position)
+            result = replace(result, seconds=time.perf_counter() - start)
+        return result
 
     def match_exactly(
         self, views: Sequence[View], root_position: np.ndarray | None = None

@@ -12,6 +12,7 @@ from drake_pose.apps.kameda import (
     wide_experiment_search,
 )
 from drake_pose.apps.kameda_pictures import save_pictures
+from drake_pose.apps.kameda_table import experiment_table
 from drake_pose.errors import SettingsError
 from drake_pose.silhouette import LabelRenderer
 
@@ -67,7 +68,7 @@ def test_json_has_the_keys_of_the_paper(result):
     assert figures["images"] == 8
     assert figures["mean_e_total"] == pytest.approx(np.mean([t.E_total for t in result.trials]))
     assert figures["min_runs"] <= figures["mean_runs"]
-    assert result.table().row_count >= len(PAPER)
+    assert experiment_table([result]).row_count >= len(PAPER)
 
 
 def test_the_same_seed_gives_the_same_figures(result):
@@ -85,11 +86,42 @@ def test_nothing_outside_allowed_is_exact_far_more_often():
             assert trial.exact
 
 
-def test_the_wide_search_matches_every_silhouette_exactly():
+@pytest.fixture(scope="module")
+def wide_result():
+    return run_experiment(wide_experiment_search(), images=12, seed=5)
+
+
+def test_the_wide_search_matches_every_silhouette_exactly(wide_result):
     """Without being told r, in one run over poses that the paper's search mostly misses."""
-    result = run_experiment(wide_experiment_search(), images=12, seed=5)
-    assert result.as_json()["exact"] == 12
-    assert result.as_json()["method"] == "wide"
+    figures = wide_result.as_json()
+    assert figures["exact"] == figures["proved"] == figures["truth_in_set"] == 12
+    assert figures["method"] == "wide"
+
+
+def test_the_truth_is_in_the_set(wide_result):
+    for trial in wide_result.trials:
+        answer = trial.result.pose_set
+        values = np.concatenate(trial.true_values)
+        for joint, value in zip(answer.joints, values, strict=True):
+            assert joint.holds(value)
+
+
+def test_three_columns_stand_side_by_side(result, wide_result):
+    table = experiment_table([result, wide_result])
+    assert [column.header for column in table.columns] == [
+        "figure",
+        "paper",
+        "the paper's method",
+        "wide search",
+    ]
+    assert table.row_count > experiment_table([result]).row_count
+
+
+def test_the_wide_search_has_its_own_pictures(wide_result, tmp_path):
+    names = {file.name for file in save_pictures(wide_result, tmp_path / "pictures")}
+    assert "figure_11_milliseconds.png" in names
+    ambiguous = any(one.result.pose_set.family_count > 1 for one in wide_result.trials)
+    assert ("families_1.png" in names) == ambiguous
 
 
 def test_pictures_are_written(result, tmp_path):

@@ -57,6 +57,21 @@ class PoseFamily:
     size: float
 
 
+@dataclass(frozen=True, eq=False)
+class PositionEstimates:
+    """What the silhouettes say about each of a plant's positions.
+
+    Args:
+        determined: (nq,) 1: it lies between low and high; 0: it is free, and low and high are the
+            ends of what was seen; NaN: the pose tree has no such value.
+        low, high: (nq,) [rad or m]; NaN likewise.
+    """
+
+    determined: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
 @dataclass(frozen=True)
 class PoseSet:
     """All poses found that are as good as the best within the noise.
@@ -90,4 +105,19 @@ class PoseSet:
         return any(
             all(joint.holds(float(v)) for joint, v in zip(family.joints, values, strict=True))
             for family in self.families
+        )
+
+    def positions(self, names: Sequence[str]) -> PositionEstimates:
+        """What is known of a plant's positions.
+
+        Args:
+            names: (nq,) of the positions, in the plant's order.
+        """
+        known = {joint.name: joint for joint in self.joints}
+        missing = JointEstimate("", 0, False, np.nan, np.nan, np.zeros(0))
+        joints = [known.get(name, missing) for name in names]
+        return PositionEstimates(
+            determined=np.array([float(one.determined) if one.name else np.nan for one in joints]),
+            low=np.array([one.low for one in joints]),
+            high=np.array([one.high for one in joints]),
         )

@@ -5,7 +5,14 @@ from collections.abc import Collection, Sequence
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, EventStatus, LeafSystem
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteStateIndex,
+    DiscreteValues,
+    EventStatus,
+    LeafSystem,
+)
 from pydrake.systems.sensors import ImageLabel16I
 
 from drake_pose.camera import Camera
@@ -36,6 +43,11 @@ class SilhouetteMatcher(LeafSystem):
         - error
         - base_pose
         - statistics
+        - proved_optimal
+        - determined
+        - lower
+        - upper
+        - family_positions
 
     With several cameras the input ports are ``label_image_<camera>``; an unconnected one, or an
     image without any pixel of the body, is left out of the match. All pixels with a label other
@@ -44,16 +56,23 @@ class SilhouetteMatcher(LeafSystem):
     The match is made in a periodic update. Until the first one, and where no pose is found, the
     estimated positions are the last ones (at first the model's default), and the error is infinite.
 
+    What the answer is worth: ``proved_optimal`` is 1 where it is proved that no pose of the grid
+    that was searched fits better. ``determined`` is 1 for each position that the silhouettes
+    determine, 0 for one that is free; ``lower`` and ``upper`` are the ends of its interval, or of
+    the range seen. ``family_positions`` are the positions of the families that look the same, best
+    first, one after another. All are NaN where the search does not say, as one without examination.
+
     Args:
         search: the search, made for the body's pose tree.
         cameras: the calibrated cameras, in the order of the input ports.
         period: time between two matches [s].
         offset: time of the first match [s].
         labels: the labels that belong to the body; None: all that are not reserved.
+        family_limit: so many families are given out at most.
 
     Raises:
-        SettingsError: if there is no camera, two cameras share a name, or the period is not
-            positive.
+        SettingsError: if there is no camera, two cameras share a name, the period is not positive,
+            or the family limit is below 1.
     """
 
     def __init__(
@@ -63,6 +82,7 @@ class SilhouetteMatcher(LeafSystem):
         period: float,
         offset: float = 0.0,
         labels: Collection[int] | None = None,
+        family_limit: int = 4,
     ) -> None:
         super().__init__()
         names = [camera.name for camera in cameras]
@@ -70,6 +90,8 @@ class SilhouetteMatcher(LeafSystem):
             raise SettingsError(f"a matcher needs one or more cameras of different names: {names}")
         if not period > 0:
             raise SettingsError(f"the matcher's period must be positive, not {period}")
+        if family_limit < 1:
+            raise SettingsError(f"the family limit must be 1 or more, not {family_limit}")
         self._search = search
         self._cameras = tuple(cameras)
         self._labels = None if labels is None else frozenset(labels)
@@ -101,8 +123,28 @@ class SilhouetteMatcher(LeafSystem):
         self.DeclareVectorOutputPort(
             "statistics", len(STATISTICS), self._calc_statistics, statistics_ticket
         )
+        self._worth = [
+            self._declare_nan_output(name, size)
+            for name, size in (
+                ("proved_optimal", 1),
+                ("determined", position_count),
+                ("lower", position_count),
+                ("upper", position_count),
+                ("family_positions", family_limit * position_count),
+            )
+        ]
         self.DeclarePeriodicDiscreteUpdateEvent(period, offset, self._match)
         self.last_result: MatchResult | None = None
+
+    def _declare_nan_output(self, name: str, size: int) -> DiscreteStateIndex:
+        """A state, NaN at first, and the output that gives it out."""
+        state = self.DeclareDiscreteState(np.full(size, np.nan))
+
+        def calculate(context: Context, output: BasicVector) -> None:
+            output.SetFromVector(context.get_discrete_state(state).value())
+
+        self.DeclareVectorOutputPort(name, size, calculate, {self.discrete_state_ticket(state)})
+        return state
 
     def _views(self, context: Context) -> list[View]:
         views = []
@@ -120,6 +162,8 @@ class SilhouetteMatcher(LeafSystem):
         statistics = np.zeros(len(STATISTICS))
         statistics[[1, 2, 3]] = np.inf
         self.last_result = None
+        for state in self._worth:
+            discrete_state.set_value(state, np.full(discrete_state.value(state).size, np.nan))
         if views:
             root_position = None
             if self._root_position.HasValue(context):
@@ -131,8 +175,26 @@ class SilhouetteMatcher(LeafSystem):
                 statistics[:4] = 1.0, result.J, result.E_total, result.first_E_total
                 discrete_state.set_value(self._positions, result.q)
                 discrete_state.set_value(self._base_pose, result.X_WB[:3].ravel())
+                self._set_worth(result, discrete_state)
         discrete_state.set_value(self._statistics, statistics)
         return EventStatus.Succeeded()
+
+    def _set_worth(self, result: MatchResult, discrete_state: DiscreteValues) -> None:
+        """Put what the answer is worth into the state."""
+        proved, determined, lower, upper, families = self._worth
+        answer = result.pose_set
+        if answer is None:
+            return
+        names = self._search.tree.model.position_names
+        estimates = answer.positions(names)
+        positions = np.full((discrete_state.value(families).size // len(names), len(names)), np.nan)
+        found = [family.q for family in answer.families[: len(positions)]]
+        positions[: len(found)] = found
+        discrete_state.set_value(proved, np.array([float(result.proved_optimal)]))
+        discrete_state.set_value(determined, estimates.determined)
+        discrete_state.set_value(lower, estimates.low)
+        discrete_state.set_value(upper, estimates.high)
+        discrete_state.set_value(families, positions.ravel())
 
     def _calc_positions(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(context.get_discrete_state(self._positions).value())

@@ -10,7 +10,13 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from drake_pose.camera import PinholeCamera, save_cameras
 from drake_pose.errors import SettingsError
-from drake_pose.matching import PaperSearch, PaperSearchSettings
+from drake_pose.matching import (
+    ExaminationSettings,
+    PaperSearch,
+    PaperSearchSettings,
+    WideSearch,
+    WideSearchSettings,
+)
 from drake_pose.silhouette import LabelRenderer, load_scene, mask_to_label_image, write_mask
 from drake_pose.systems import (
     STATISTICS,
@@ -193,3 +199,40 @@ def test_a_matcher_refuses_bad_settings(chain):
         SilhouetteMatcher(search, [], PERIOD)
     with pytest.raises(SettingsError, match=r"front.*front"):
         SilhouetteMatcher(search, [front_camera(), front_camera()], PERIOD)
+
+
+def test_what_the_answer_is_worth_comes_out(tmp_path):
+    """A lever that turns in depth is seen the same turned towards the camera and away from it."""
+    model = load_body(
+        tmp_path,
+        joint("swing", "revolute", "world", "lever", (-1.0, 1.0), axis="0 1 0"),
+        box_link("lever", 8, 30),
+    )
+    camera = front_camera(160, shift=0.1234)
+    search = WideSearch(model.pose_tree(), WideSearchSettings(interval=0.25), ExaminationSettings())
+    matcher = SilhouetteMatcher(search, [camera], PERIOD, family_limit=3)
+    context = matcher.CreateDefaultContext()
+
+    def output(name):
+        return matcher.GetOutputPort(name).Eval(context)
+
+    assert np.isnan(output("proved_optimal")).all()
+    truth = np.array([0.5])
+    image = mask_to_label_image(LabelRenderer(model, camera).mask(truth))
+    matcher.GetInputPort("label_image").FixValue(context, image)
+    Simulator(matcher, context).AdvanceTo(0.01)
+    assert output("proved_optimal") == 1.0
+    families = output("family_positions")
+    np.testing.assert_allclose(np.sort(families[:2]), [-0.5, 0.5], atol=1e-9)
+    assert np.isnan(families[2])
+    assert output("determined") == 0.0
+    np.testing.assert_allclose([output("lower")[0], output("upper")[0]], [-0.5, 0.5], atol=1e-9)
+
+    # An empty image says nothing, and a search that does not examine leaves it open.
+    matcher.GetInputPort("label_image").FixValue(
+        context, mask_to_label_image(np.zeros((160, 160), bool))
+    )
+    Simulator(matcher, context).AdvanceTo(PERIOD + 0.01)
+    assert np.isnan(output("family_positions")).all()
+    with pytest.raises(SettingsError, match="family limit"):
+        SilhouetteMatcher(search, [camera], PERIOD, family_limit=0)

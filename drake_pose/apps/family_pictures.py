@@ -4,11 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from drake_pose.apps.overlay import paint_agreement
 from drake_pose.body import ArticulatedModel
@@ -43,7 +41,8 @@ def save_families(
     families = answer.families[:most]
     renderers = [LabelRenderer(model, view.camera) for view in views]
     size = (3.2 * len(families), 3.2 * 2 * len(views) + 1.4)
-    figure, axes = plt.subplots(2 * len(views), len(families), figsize=size, squeeze=False)
+    figure = Figure(figsize=size)
+    axes = figure.subplots(2 * len(views), len(families), squeeze=False)
     for column, family in zip(axes.T, families, strict=True):
         for i, (view, renderer) in enumerate(zip(views, renderers, strict=True)):
             segments = renderer.segments(family.q, family.X_WB)
@@ -57,7 +56,6 @@ def save_families(
     figure.tight_layout()
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=80)
-    plt.close(figure)
     return path
 
 
@@ -69,7 +67,7 @@ def _show(coloured: Axes, compared: Axes, mask: np.ndarray, segments: np.ndarray
         slice(max(0, columns.min() - _MARGIN), columns.max() + 1 + _MARGIN),
     )
     mask, segments = mask[window], segments[window]
-    colours = plt.get_cmap("tab20")(np.arange(segments.max() + 2) % 20)[:, :3]
+    colours = matplotlib.colormaps["tab20"](np.arange(segments.max() + 2) % 20)[:, :3]
     coloured.imshow(np.where(segments[..., None] >= 0, colours[segments], _BACKGROUND))
     compared.imshow(paint_agreement(mask, segments >= 0, segments))
 

@@ -4,10 +4,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
 
 from drake_pose.apps.family_pictures import save_families
 from drake_pose.apps.kameda import ExperimentResult, Trial
@@ -85,8 +83,9 @@ def _save_examples(
     path: Path, title: str, trials: list[Trial], result: ExperimentResult, renderer: LabelRenderer
 ) -> Path:
     tree = result.search.tree
-    colours = plt.get_cmap("tab20")(np.arange(64) % 20)[:, :3]
-    figure, axes = plt.subplots(3, len(trials), figsize=(3 * len(trials), 9), squeeze=False)
+    colours = matplotlib.colormaps["tab20"](np.arange(64) % 20)[:, :3]
+    figure = Figure(figsize=(3 * len(trials), 9))
+    axes = figure.subplots(3, len(trials), squeeze=False)
     for column, trial in zip(axes.T, trials, strict=True):
         q_true, _ = tree.positions_from(trial.true_values)
         pictures = _crop([renderer.segments(q) for q in (q_true, trial.result.q)])
@@ -102,7 +101,6 @@ def _save_examples(
     figure.suptitle(f"{title}\ngrey: agreement, blue: missing, orange: excess", fontsize=10)
     figure.tight_layout()
     figure.savefig(path, dpi=80)
-    plt.close(figure)
     return path
 
 
@@ -129,7 +127,8 @@ def _compare(true: np.ndarray, estimate: np.ndarray) -> np.ndarray:
 
 def _save_histogram(path: Path, values: np.ndarray, end: int, label: str) -> Path:
     """Draw how often values (n,) occur; what is beyond the end is counted there."""
-    figure, axis = plt.subplots(figsize=(6, 4))
+    figure = Figure(figsize=(6, 4))
+    axis = figure.subplots()
     axis.hist(np.minimum(values, end), bins=np.linspace(0, end, 21).tolist(), color="0.4")
     axis.set_xlabel(f"{label} ({end}: {end} or more)")
     axis.set_ylabel("images")
@@ -137,5 +136,4 @@ def _save_histogram(path: Path, values: np.ndarray, end: int, label: str) -> Pat
     axis.set_title(title)
     figure.tight_layout()
     figure.savefig(path, dpi=80)
-    plt.close(figure)
     return path

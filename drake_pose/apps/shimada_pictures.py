@@ -2,12 +2,9 @@
 
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from drake_pose.apps.shimada import CASES, PIXELS_PER_METRE, ExperimentResult, Trial
@@ -73,7 +70,8 @@ def _draw_hand(axes: Axes, state: Array, colour: str) -> None:
 
 
 def _save_hands(path: Path, trial: Trial) -> Path:
-    figure, grid = plt.subplots(2, len(_SHOWN_FRAMES), figsize=(15, 5.2), sharex=True, sharey=True)
+    figure = Figure(figsize=(15, 5.2))
+    grid = figure.subplots(2, len(_SHOWN_FRAMES), sharex=True, sharey=True)
     rows = (("true", trial.sequence.states, _TRUE), ("estimate", trial.means, _ESTIMATE))
     for line, (label, states, colour) in zip(grid, rows, strict=True):
         for axes, frame in zip(line, _SHOWN_FRAMES, strict=True):
@@ -87,7 +85,8 @@ def _save_hands(path: Path, trial: Trial) -> Path:
 
 def _save_shapes(path: Path, first: dict[str, Trial]) -> Path:
     """The hand laid flat: the first guess, the estimates and the truths."""
-    figure, grid = plt.subplots(1, 3, figsize=(12, 4), sharex=True, sharey=True)
+    figure = Figure(figsize=(12, 4))
+    grid = figure.subplots(1, 3, sharex=True, sharey=True)
     trial = first["r13_35"]
     _draw_hand(grid[0], _flat(trial.sequence.guess.mean), _ESTIMATE)
     _draw_hand(grid[0], _flat(trial.sequence.states[0]), _TRUE)
@@ -122,7 +121,8 @@ def _save_scale(path: Path, trial: Trial) -> Path:
 
 
 def _save_curve(path: Path, label: str, true: Array, estimate: Array, deviation: Array) -> Path:
-    figure, axes = plt.subplots(figsize=(6, 4))
+    figure = Figure(figsize=(6, 4))
+    axes = figure.subplots()
     frames = np.arange(1, len(true) + 1)
     axes.errorbar(frames, estimate, 2 * deviation, fmt="o", color=_ESTIMATE, mfc="white", ms=4)
     axes.plot(frames, true, color=_TRUE)
@@ -135,8 +135,7 @@ def _save_curve(path: Path, label: str, true: Array, estimate: Array, deviation:
     return _finish(figure, path)
 
 
-def _finish(figure: plt.Figure, path: Path) -> Path:
+def _finish(figure: Figure, path: Path) -> Path:
     figure.tight_layout()
     figure.savefig(path, dpi=80)
-    plt.close(figure)
     return path

@@ -148,6 +148,7 @@ def calibrate_folder(
     if out is not None:
         cameras = Path(out)
         lenses = cameras.with_name(f"{cameras.stem}_lenses.yaml")
+        cameras.parent.mkdir(parents=True, exist_ok=True)
         save_cameras(cameras, calibration.cameras)
         save_lenses(lenses, calibration.lenses)
         files = (cameras, lenses)

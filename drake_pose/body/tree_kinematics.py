@@ -20,7 +20,7 @@ from drake_pose.errors import SettingsError
 _BY_JOINTS, _FREE, _LIMITED = 0, 1, 2
 
 
-class _PackedTree(NamedTuple):
+class PackedTree(NamedTuple):
     """A pose tree in the arrays that the kernel walks.
 
     parents: (n,); X_PA: (n, 4, 4) constant parts, R_W0 of turned roots included; value_starts:
@@ -69,6 +69,7 @@ class TreeKinematics:
         value_nodes: (m,) the node of each value.
         lower, upper: (m,) limits [rad or m]; equal where a value is held.
         is_angle: (m,) whether a value is an angle [rad], else a length [m].
+        packed: the tree as ``find_motions`` takes it.
 
     Args:
         tree: the pose tree.
@@ -89,7 +90,7 @@ class TreeKinematics:
             for node in tree.nodes
         ]
         self.is_angle = np.array([kind for group in kinds for kind in group], dtype=np.bool_)
-        self._packed = _pack_tree(tree)
+        self.packed = _pack_tree(tree)
         self._moves = self._find_moves()
 
     def _find_moves(self) -> np.ndarray:
@@ -117,7 +118,7 @@ class TreeKinematics:
 
     def split(self, values: np.ndarray) -> tuple[np.ndarray, ...]:
         """Each node's values (k_i,) of all values (m,)."""
-        return tuple(np.split(np.asarray(values), self._packed.value_starts[1:-1]))
+        return tuple(np.split(np.asarray(values), self.packed.value_starts[1:-1]))
 
     def poses(self, values: np.ndarray) -> np.ndarray:
         """X_WN (nodes, 4, 4) at values (m,)."""
@@ -136,7 +137,7 @@ class TreeKinematics:
         values = np.ascontiguousarray(values, dtype=np.float64)
         if values.shape != (len(self.names),):
             raise SettingsError(f"{len(self.names)} values expected, got shape {values.shape}")
-        X_WN, turns = _find_motions(self._packed, values)
+        X_WN, turns = find_motions(self.packed, values)
         count = len(values)
         added = 3 * translation + scale
         twists = np.zeros((count + added, 7))
@@ -149,7 +150,7 @@ class TreeKinematics:
         return Motions(X_WN, twists, self._moves[:, : count + added])
 
 
-def _pack_tree(tree: PoseTree) -> _PackedTree:
+def _pack_tree(tree: PoseTree) -> PackedTree:
     """The tree in arrays."""
     X_PA, kinds, axes = [], [], []
     steps = [step for placement in tree.placements for step in placement.steps]
@@ -168,7 +169,7 @@ def _pack_tree(tree: PoseTree) -> _PackedTree:
         axes.append(letters)
     rows = [len(step.joint_map.coefficients) for step in steps]
     counts = [len(node.value_names) for node in tree.nodes]
-    return _PackedTree(
+    return PackedTree(
         parents=np.array([node.parent for node in tree.nodes], dtype=np.int64),
         X_PA=np.array(X_PA),
         value_starts=np.cumsum([0, *counts]),
@@ -186,7 +187,7 @@ def _pack_tree(tree: PoseTree) -> _PackedTree:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _joint_transform(
-    packed: _PackedTree, step: int, values: np.ndarray, first: int, changed: int
+    packed: PackedTree, step: int, values: np.ndarray, first: int, changed: int
 ) -> np.ndarray:
     """A joint's transform (4, 4), or its derivative by its position ``changed`` (-1: none)."""
     size = packed.sizes[step]
@@ -306,7 +307,7 @@ def _turn_about_axis(X_WA: np.ndarray, axis: int, angle: float, twist: np.ndarra
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _find_motions(packed: _PackedTree, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def find_motions(packed: PackedTree, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns X_WN (n, 4, 4) and the twists (m, 6) of all values."""
     count = packed.parents.shape[0]
     X_WN = np.empty((count, 4, 4))

@@ -1,5 +1,11 @@
 """Belief within limits: a Kalman filter whose estimates respect linear inequalities."""
 
+from drake_pose.filtering.contour_observation import (
+    ContourMeasurement,
+    ContourObservation,
+    ContourSettings,
+)
+from drake_pose.filtering.contour_tracking import ContourTracker, Track, TrackingSettings
 from drake_pose.filtering.couplings import (
     couplings_file,
     load_couplings,
@@ -17,7 +23,9 @@ from drake_pose.filtering.inequalities import (
     stack,
     two_sided,
 )
+from drake_pose.filtering.match_and_track import TRACKED, Followed, MatchAndTrack
 from drake_pose.filtering.normal_moments import interval_moments
+from drake_pose.filtering.segment_axes import Axis, AxisObserver, AxisSettings
 from drake_pose.filtering.state import Belief, StateLayout, make_belief
 from drake_pose.filtering.truncated_filter import FilterSettings, FilterState, TruncatedFilter
 from drake_pose.filtering.truncation import (
@@ -32,16 +40,28 @@ from drake_pose.filtering.update import ObservationModel, Updated, update
 from drake_pose.filtering.views import Stare, View
 
 __all__ = [
+    "TRACKED",
+    "Axis",
+    "AxisObserver",
+    "AxisSettings",
     "Belief",
+    "ContourMeasurement",
+    "ContourObservation",
+    "ContourSettings",
+    "ContourTracker",
     "FilterSettings",
     "FilterState",
+    "Followed",
     "Hypothesis",
     "Inequalities",
     "JointRows",
+    "MatchAndTrack",
     "ObservationModel",
     "Rejection",
     "Stare",
     "StateLayout",
+    "Track",
+    "TrackingSettings",
     "Truncated",
     "TruncatedFilter",
     "Updated",

@@ -16,6 +16,7 @@ from drake_pose.filtering.inequalities import (
     from_model,
     inner_point,
     row_from_terms,
+    say_if_unlimited,
     stack,
     two_sided,
 )
@@ -128,7 +129,7 @@ def model_inequalities(model: ArticulatedModel) -> Inequalities:
         parts.append(load_couplings(file, model.position_names))
     whole = stack(parts, model.position_names)
     inner_point(whole)
-    return whole
+    return say_if_unlimited(whole, str(model.path))
 
 
 def _read(file: Path) -> Couplings:

@@ -1,5 +1,6 @@
 """Linear inequalities phi^T x <= b on a state, each with a name: (14) to (18) of Shimada et al."""
 
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -189,6 +190,15 @@ def from_model(model: ArticulatedModel) -> Inequalities:
     lower = np.where(full_turn, -np.inf, model.lower)
     upper = np.where(full_turn, np.inf, model.upper)
     return from_bounds(model.position_names, lower, upper)
+
+
+def say_if_unlimited(inequalities: Inequalities, where: str) -> Inequalities:
+    """The same; a warning where there are none, which is allowed: nothing is truncated then."""
+    if not len(inequalities):
+        warnings.warn(
+            f"{where}: no joint has a limit; nothing will be truncated", UserWarning, stacklevel=3
+        )
+    return inequalities
 
 
 def from_plant(plant: MultibodyPlant) -> Inequalities:

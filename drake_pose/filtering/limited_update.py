@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 Truncate = Callable[[Belief, Array], Truncated]
 
 # Steps below this many deviations end the iteration.
-_SETTLED = 0.1
+_SETTLED = 0.3
 # From this linearisation on the steps are halved: the tangents may point to and fro.
 _PATIENCE = 8
 
@@ -51,6 +51,7 @@ def limited_update(
     iterations: int,
     start: Array,
     sites: Array,
+    heated: bool = True,
 ) -> LimitedUpdate:
     """Fuse a belief with a measurement, and truncate it.
 
@@ -66,6 +67,8 @@ def limited_update(
         iterations: linearisations at most.
         start: (n,) where to linearise first.
         sites: for the first truncation.
+        heated: whether a far start is approached with more noise than there is; a mirrored one
+            would be drawn back to the prediction by it.
 
     Raises:
         SettingsError: the measurement does not fit, or the belief has no density inside.
@@ -77,7 +80,7 @@ def limited_update(
     x, temperature = start, 1.0
     for made in range(iterations):
         line = _linearise(prediction, values, model, x)
-        if made == 0:
+        if made == 0 and heated:
             misfit = float(np.mean(line.residual**2 / line.noise)) if len(line.residual) else 0.0
             temperature = max(1.0, misfit / GOOD_FIT)
         updated = _fuse(prediction, line, temperature, made + 1)

@@ -124,12 +124,51 @@ class Belief:
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
 
-def make_belief(mean: ArrayLike, covariance: ArrayLike) -> Belief:
+def make_belief(
+    mean: ArrayLike, covariance: ArrayLike, layout: StateLayout | None = None
+) -> Belief:
     """A belief from arrays that are checked.
+
+    Args:
+        mean: (n,).
+        covariance: (n, n).
+        layout: names the elements in messages.
 
     Raises:
         SettingsError: sizes that do not fit, NaN, or a covariance that is indefinite.
     """
+    if layout is not None:
+        name_flaws(mean, covariance, layout, "the belief")
     q, Q = check_moments(mean, covariance)
     factor_of(Q)
     return Belief(q, Q)
+
+
+def name_flaws(mean: ArrayLike, covariance: ArrayLike, layout: StateLayout, what: str) -> None:
+    """Refuse moments that are no belief about a layout's elements, and say which element it is.
+
+    Raises:
+        SettingsError: wrong sizes, NaN or infinity, or a covariance that is indefinite.
+    """
+    q, Q = np.asarray(mean, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
+    n = len(layout)
+    if q.shape != (n,) or Q.shape != (n, n):
+        raise SettingsError(
+            f"{what} has a mean {q.shape} and a covariance {Q.shape}; the state has {n} elements"
+        )
+    bad = np.flatnonzero(~np.isfinite(q) | ~np.isfinite(np.diag(Q)))
+    if not bad.size:
+        bad = np.flatnonzero(~np.isfinite(Q).all(axis=1))
+    if bad.size:
+        raise SettingsError(
+            f"{what}: the mean or the covariance of '{layout.names[bad[0]]}' is NaN or infinite"
+        )
+    scale = np.sqrt(np.abs(np.diag(Q)))
+    scale[scale == 0] = 1.0
+    values, vectors = np.linalg.eigh(0.5 * (Q + Q.T) / np.outer(scale, scale))
+    if values[0] < -1e-8:
+        name = layout.names[int(np.argmax(np.abs(vectors[:, 0])))]
+        raise SettingsError(
+            f"{what}: the covariance is indefinite; the lowest eigenvalue of its correlations is "
+            f"{values[0]:.3g}, and '{name}' has the largest part in it"
+        )

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.factors import check_moments, factor_of
+from drake_pose.filtering.factors import check_moments
 from drake_pose.filtering.hypotheses import (
     Hypothesis,
     Rejection,
@@ -18,7 +18,7 @@ from drake_pose.filtering.hypotheses import (
 )
 from drake_pose.filtering.inequalities import Inequalities, inner_point
 from drake_pose.filtering.limited_update import LimitedUpdate, limited_update
-from drake_pose.filtering.state import Belief, StateLayout, make_belief
+from drake_pose.filtering.state import Belief, StateLayout, make_belief, name_flaws
 from drake_pose.filtering.truncation import (
     Truncated,
     clip,
@@ -64,7 +64,7 @@ class FilterSettings:
     reject_below: float = -4.0
     smallest_weight: float = 1e-4
     twin_distance: float = 0.3
-    tolerance: float = 1e-4
+    tolerance: float = 1e-3
     novelty: float = 1e-9
 
     def __post_init__(self) -> None:
@@ -149,8 +149,8 @@ class TruncatedFilter:
         self.settings = settings or FilterSettings()
         self.inequalities = inequalities.for_columns(layout.names)
         inner_point(self.inequalities)
+        name_flaws(np.zeros(len(layout)), process_noise, layout, "the process noise")
         _, self._U = check_moments(np.zeros(len(layout)), process_noise)
-        factor_of(self._U)
         self._A = layout.transition() if transition is None else transition
         self._rows = join_rows(self.inequalities)
         self.site_count = len(self._rows.directions) if self.settings.truncation == "joint" else 0
@@ -164,11 +164,7 @@ class TruncatedFilter:
         Raises:
             SettingsError: a belief that does not fit, or is indefinite.
         """
-        checked = make_belief(belief.mean, belief.covariance)
-        if checked.mean.size != len(self.layout):
-            raise SettingsError(
-                f"the belief has {checked.mean.size} elements, the state {len(self.layout)}"
-            )
+        checked = make_belief(belief.mean, belief.covariance, self.layout)
         truncated = self._truncate(checked, _NO_SITES)
         return FilterState(0, (self._finish(Hypothesis(checked, checked), checked, truncated),))
 
@@ -227,18 +223,23 @@ class TruncatedFilter:
             return found
         for start in model.mirrors(hypothesis.belief):
             other = replace(hypothesis, born=step)
-            found.append((other, self._update(other, y, model, start)))
+            found.append((other, self._update(other, y, model, start, heated=False)))
         return found
 
     def _update(
-        self, hypothesis: Hypothesis, y: Array, model: ObservationModel, start: Array
+        self,
+        hypothesis: Hypothesis,
+        y: Array,
+        model: ObservationModel,
+        start: Array,
+        heated: bool = True,
     ) -> LimitedUpdate:
         iterations = self.settings.iterations
         if self.settings.truncation == "none" or not self.inequalities:
-            updated = update(hypothesis.free, y, model, iterations, start)
+            updated = update(hypothesis.free, y, model, iterations, start, heated)
             return LimitedUpdate(updated, unlimited(updated.belief))
         return limited_update(
-            hypothesis.free, y, model, self._truncate, iterations, start, hypothesis.sites
+            hypothesis.free, y, model, self._truncate, iterations, start, hypothesis.sites, heated
         )
 
     def _repeat(self, hypothesis: Hypothesis, y: Array, model: ObservationModel) -> Branch:

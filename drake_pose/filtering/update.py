@@ -88,6 +88,7 @@ def update(
     model: ObservationModel,
     iterations: int = 1,
     start: Array | None = None,
+    heated: bool = True,
 ) -> Updated:
     """Fuse a belief with a measurement.
 
@@ -102,12 +103,13 @@ def update(
         model: says what was to be expected.
         iterations: linearisations at most.
         start: (n,) where to linearise first; the predicted mean if not given.
+        heated: whether a far start is approached with more noise than there is.
 
     Raises:
         SettingsError: the measurement does not fit.
     """
     values = check_measurement(y, model)
-    line, made = _iterate(prediction, values, model, iterations, start)
+    line, made = _iterate(prediction, values, model, iterations, start, heated)
     if line is None:
         return Updated(prediction, 0.0, 0.0, 0, 0)
     mean, P = prediction.mean, prediction.covariance
@@ -140,6 +142,7 @@ def _iterate(
     model: ObservationModel,
     iterations: int,
     start: Array | None,
+    heated: bool,
 ) -> tuple[_Line | None, int]:
     """Linearise again and again: the last tangent, and how many were made."""
     mean, P = prediction.mean, prediction.covariance
@@ -156,7 +159,7 @@ def _iterate(
         residual = difference(values[rows], h[rows], model.wraps[rows])
         noise = model.variances[rows]
         misfit = float(np.sum(residual**2 / noise))
-        if attempt == 0 and iterations > 1:
+        if attempt == 0 and iterations > 1 and heated:
             temperature = max(1.0, misfit / max(len(residual), 1) / GOOD_FIT)
         cost = float(dual @ P @ dual) + misfit
         # What is hidden at one state and seen at another must not decide between them.

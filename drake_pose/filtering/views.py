@@ -6,6 +6,15 @@ their section 7. Here a view keeps the tangent of its first frame, and what that
 is an offset of each measurement: unknown, the same in all frames of the view, and estimated beside
 the state. A thousand frames then tell the sum of state and offset exactly, and the state no better
 than the offset's own variance allows.
+
+Where it ends. A view is over when the measurement differs from the view's first one by more than
+noise explains; a motion slower than that is noticed late, and by then a little is counted twice.
+Many views that differ little (a hand that trembles by some deviations) are each new, and each adds
+its tangent. The offsets are independent from measurement to measurement, of the size of the
+curvature at the view's first frame, and forgotten when the view ends. What the view does not show
+stays as wrong as it was, and the deviations say so: from table 2's start, with everything seen,
+lengths are 1.4 pixels off after 5,000 frames as after 55; a filter that is linearised at the truth
+is 0.9 off, inside the same limits.
 """
 
 from dataclasses import dataclass

@@ -9,6 +9,9 @@ from drake_pose.camera import Camera
 from drake_pose.errors import MaskError
 from drake_pose.matching.families import PoseSet
 
+UNEXPLAINED = 0.5
+"""From this E_total on, the pose is no explanation of the silhouettes."""
+
 
 @dataclass(frozen=True)
 class View:
@@ -73,7 +76,8 @@ class MatchResult:
             has none.
         untried: the candidates not adopted in the answer, by node name.
         stopped_by: "end" if the search ran to its end, "exact" if J = 0 ended it, "run_limit" or
-            "time_limit" if a limit stopped it.
+            "time_limit" if a limit stopped it; "tracked" for a pose that was tracked from the frame
+            before, which no search found.
         seconds: wall time of the search [s].
         proved_optimal: whether it is proved that no pose of the search's grid has a smaller J.
         lower_bound: no pose of the grid has a smaller J than this [pixel]; 0 says nothing.
@@ -96,3 +100,8 @@ class MatchResult:
     proved_optimal: bool = False
     lower_bound: float = 0.0
     pose_set: PoseSet | None = None
+
+    @property
+    def explained(self) -> bool:
+        """Whether the pose explains the silhouettes at least in the rough (UNEXPLAINED)."""
+        return bool(self.found and self.E_total < UNEXPLAINED)

@@ -72,7 +72,9 @@ def contour_body(
 @lru_cache(maxsize=64)
 def _join(outlines: tuple[Outline, ...], spreads: tuple[float | None, ...]) -> ContourBody:
     """The surfaces with cells of their spreads; None: without."""
-    celled = [_divide(outline, spread or 0.0) for outline, spread in zip(outlines, spreads, strict=True)]
+    celled = [
+        _divide(outline, spread or 0.0) for outline, spread in zip(outlines, spreads, strict=True)
+    ]
     vertices = np.cumsum([0, *(len(outline.vertices) for outline in outlines)])
     triangles = np.cumsum([0, *(len(outline.triangles) for outline in outlines)])
     edge_starts = np.cumsum([0, *(len(part.edges) for part in celled)])

@@ -7,15 +7,18 @@ from drake_pose.systems.diagrams import (
 )
 from drake_pose.systems.mask_player import MaskPlayer
 from drake_pose.systems.silhouette_matcher import STATISTICS, SilhouetteMatcher
+from drake_pose.systems.silhouette_tracker import TRACK, SilhouetteTracker
 from drake_pose.systems.skin import MeshcatSkin, SkinPoser, add_meshcat_skin, add_skin
 from drake_pose.systems.truncated_ekf import TruncatedEkf
 
 __all__ = [
     "STATISTICS",
+    "TRACK",
     "MaskPlayer",
     "MatchingDiagram",
     "MeshcatSkin",
     "SilhouetteMatcher",
+    "SilhouetteTracker",
     "SkinPoser",
     "TruncatedEkf",
     "add_meshcat_skin",

@@ -28,10 +28,12 @@ from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 from drake_pose.body import ArticulatedModel
 from drake_pose.camera import Camera, PinholeCamera
+from drake_pose.filtering.contour_tracking import TrackingSettings
 from drake_pose.matching import PoseSearch
 from drake_pose.silhouette import Scene
 from drake_pose.systems.mask_player import MaskPlayer
 from drake_pose.systems.silhouette_matcher import SilhouetteMatcher, label_image_port
+from drake_pose.systems.silhouette_tracker import SilhouetteTracker
 from drake_pose.systems.skin import add_meshcat_skin, add_skin
 
 ESTIMATE_COLOUR = Rgba(0.0, 0.45, 0.70, 0.6)
@@ -64,6 +66,7 @@ def build_recorded_matching(
     frames: Sequence[str] | None = None,
     root_positions: Mapping[str, np.ndarray] | None = None,
     meshcat: Meshcat | None = None,
+    tracking: TrackingSettings | None = None,
 ) -> MatchingDiagram:
     """Wire recorded masks to the matcher: MaskPlayer -> SilhouetteMatcher -> logs, Meshcat.
 
@@ -75,6 +78,8 @@ def build_recorded_matching(
         root_positions: the root's position (3,) in the world for each frame [m]; the pose tree's
             own where not given.
         meshcat: where to show the estimated body; nowhere where not given.
+        tracking: how the body moves from frame to frame: it is matched in the first one, tracked
+            from there, and matched again after a loss. Every frame is matched where not given.
 
     Returns:
         The diagram; frame k is matched at time k times the player's period.
@@ -82,7 +87,7 @@ def build_recorded_matching(
     builder = DiagramBuilder()
     player = builder.AddNamedSystem("mask_player", MaskPlayer(scene, cameras, frames))
     matcher = builder.AddNamedSystem(
-        "silhouette_matcher", SilhouetteMatcher(search, cameras, player.period)
+        "silhouette_matcher", _make_matcher(search, cameras, player.period, tracking)
     )
     for camera in cameras:
         port = label_image_port(camera, cameras)
@@ -112,6 +117,7 @@ def build_simulated_matching(
     true_positions: Trajectory | np.ndarray,
     period: float,
     meshcat: Meshcat | None = None,
+    tracking: TrackingSettings | None = None,
 ) -> MatchingDiagram:
     """Wire a simulated body and camera to the matcher, and show the estimate beside the truth.
 
@@ -124,6 +130,7 @@ def build_simulated_matching(
         true_positions: the true body's positions (nq,), constant or over time.
         period: time between two images, and two matches [s].
         meshcat: where to show both bodies; nowhere where not given.
+        tracking: as for ``build_recorded_matching``.
 
     Returns:
         The diagram.
@@ -142,7 +149,7 @@ def build_simulated_matching(
     labels = {name: label for label, name in enumerate(model.link_names)}
     add_skin(builder, scene_graph, model, truth.get_output_port(), "true", labels)
     matcher = builder.AddNamedSystem(
-        "silhouette_matcher", SilhouetteMatcher(search, cameras, period)
+        "silhouette_matcher", _make_matcher(search, cameras, period, tracking)
     )
     for camera in cameras:
         colour_camera, depth_camera, X_WC = _drake_camera(camera, model, true_positions)
@@ -162,6 +169,17 @@ def build_simulated_matching(
         add_meshcat_skin(builder, meshcat, model, truth.get_output_port(), "true")
         add_meshcat_skin(builder, meshcat, model, estimate, "estimated", ESTIMATE_COLOUR)
     return _finish(builder, matcher, period, None)
+
+
+def _make_matcher(
+    search: PoseSearch,
+    cameras: Sequence[Camera],
+    period: float,
+    tracking: TrackingSettings | None,
+) -> SilhouetteMatcher:
+    if tracking is None:
+        return SilhouetteMatcher(search, cameras, period)
+    return SilhouetteTracker(search, cameras, period, tracking=tracking)
 
 
 def _drake_camera(

@@ -2,10 +2,26 @@
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.systems.framework import Context, LeafSystem
 
+from drake_pose.errors import SettingsError
 from drake_pose.filtering import Belief, FilterState, Hypothesis, Stare, TruncatedFilter, View
 
 Array = NDArray[np.float64]
+
+
+def require_time_forward(system: LeafSystem, context: Context, last: float) -> None:
+    """Refuse an update that is earlier than the last one, after which a filter knows the future.
+
+    Raises:
+        SettingsError: time ran backwards.
+    """
+    now = context.get_time()
+    if now < last:
+        raise SettingsError(
+            f"{system.get_name()}: time ran backwards, from {last:g} s to {now:g} s; to begin "
+            "anew, set the context to its defaults (SetDefaultContext)"
+        )
 
 
 class FilterPacking:
@@ -52,7 +68,7 @@ class FilterPacking:
                 belief = h.stare.belief
                 stared[:] = np.concatenate([[1.0], belief.mean, belief.covariance.ravel()])
         view = np.zeros(1 + self.m)
-        if state.view is not None:
+        if state.view is not None and self._filter.novelty > 0:
             view[0], view[1:] = state.view.count, state.view.reference
         return beliefs.ravel(), stares.ravel(), view
 

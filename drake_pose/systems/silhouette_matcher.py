@@ -168,7 +168,7 @@ class SilhouetteMatcher(LeafSystem):
             root_position = None
             if self._root_position.HasValue(context):
                 root_position = self._root_position.Eval(context)
-            result = self._search.match(views, root_position)
+            result = self._find(context, discrete_state, views, root_position)
             self.last_result = result
             statistics[4:] = result.runs, max(result.outside_limit, default=0.0), result.seconds
             if result.found:
@@ -178,6 +178,16 @@ class SilhouetteMatcher(LeafSystem):
                 self._set_worth(result, discrete_state)
         discrete_state.set_value(self._statistics, statistics)
         return EventStatus.Succeeded()
+
+    def _find(
+        self,
+        context: Context,
+        discrete_state: DiscreteValues,
+        views: Sequence[View],
+        root_position: np.ndarray | None,
+    ) -> MatchResult:
+        """The pose that the views show."""
+        return self._search.match(views, root_position)
 
     def _set_worth(self, result: MatchResult, discrete_state: DiscreteValues) -> None:
         """Put what the answer is worth into the state."""

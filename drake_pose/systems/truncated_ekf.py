@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from drake_pose.errors import SettingsError
 from drake_pose.filtering import Belief, FilterState, ObservationModel, TruncatedFilter, make_belief
-from drake_pose.systems.filter_packing import FilterPacking
+from drake_pose.systems.filter_packing import FilterPacking, require_time_forward
 
 Array = NDArray[np.float64]
 
@@ -58,7 +58,8 @@ class TruncatedEkf(LeafSystem):
         patience: so many unlikely measurements in a row make a loss.
 
     Raises:
-        SettingsError: a start that does not fit, a period or patience that is not positive.
+        SettingsError: a start that does not fit, a period or patience that is not positive; and,
+            in a simulation, time that runs backwards.
     """
 
     def __init__(
@@ -83,8 +84,8 @@ class TruncatedEkf(LeafSystem):
         self._declare_measurement()
         self._reset = self.DeclareVectorInputPort("reset_state", self._n)
         self._belief, self._stare, self._view = (self.DeclareDiscreteState(p) for p in packed)
-        # The statistics, and how many unlikely measurements there were in a row.
-        self._record = self.DeclareDiscreteState(np.r_[0.0, 1.0, 0.0, 0.0, 0.0, 0.0])
+        # The statistics, how many unlikely measurements there were in a row, the last time.
+        self._record = self.DeclareDiscreteState(np.r_[0.0, 1.0, 0.0, 0.0, 0.0, 0.0, -math.inf])
         self._active = self.DeclareDiscreteState(np.zeros(max(len(belief_filter.inequalities), 1)))
         self._declare_outputs()
         self.DeclarePeriodicDiscreteUpdateEvent(period, offset, self._update)
@@ -126,7 +127,7 @@ class TruncatedEkf(LeafSystem):
 
     def filter_state(self, context: Context) -> FilterState:
         """The filter's state in a context, without its rejections."""
-        step, _, distance, count, _, _ = context.get_discrete_state(self._record).value()
+        step, _, distance, count = context.get_discrete_state(self._record).value()[:4]
         beliefs, stares, view = (
             np.array(context.get_discrete_state(index).value())
             for index in (self._belief, self._stare, self._view)
@@ -139,6 +140,7 @@ class TruncatedEkf(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         state = self.filter_state(context)
         record = context.get_discrete_state(self._record).value()
+        require_time_forward(self, context, record[6])
         first, lost, unlikely = record[0] == 0, record[4] > 0, int(record[5])
         fresh = first
         if (first or lost) and self._reset.HasValue(context):
@@ -166,6 +168,7 @@ class TruncatedEkf(LeafSystem):
                     state.count,
                     float(unlikely >= self._patience),
                     unlikely,
+                    context.get_time(),
                 ]
             ),
         )

@@ -225,9 +225,12 @@ def test_a_layout_from_a_model():
     [
         (lambda: update(random_belief(0), np.zeros(3), Linear()), "measures 2"),
         (lambda: update(random_belief(0), np.array([0, np.inf]), Linear()), "'b' is infinite"),
-        (lambda: make_filter().start(Belief(np.zeros(3), np.full((3, 3), np.nan))), "NaN"),
+        (
+            lambda: make_filter().start(Belief(np.zeros(3), np.full((3, 3), np.nan))),
+            "'angle' is NaN",
+        ),
         (lambda: make_filter().start(Belief(np.zeros(2), np.eye(2))), "3"),
-        (lambda: make_filter().start(Belief(np.ones(3), -np.eye(3))), "indefinite"),
+        (lambda: make_filter().start(Belief(np.ones(3), np.diag([1.0, 1, -1]))), "'length' has"),
         (lambda: make_filter(truncation="x"), "truncation"),
         (lambda: make_filter(iterations=0), "iterations"),
         (lambda: make_filter(reject_below=1.0), "reject_below"),
@@ -239,7 +242,7 @@ def test_a_layout_from_a_model():
             lambda: TruncatedFilter(
                 LAYOUT, Segment(), from_bounds(["angle"], [0], [1]), -np.eye(3)
             ),
-            "indefinite",
+            "process noise: the covariance is indefinite",
         ),
         (
             lambda: make_filter(

@@ -106,6 +106,15 @@ def test_a_joint_that_turns_freely_has_no_row(tmp_path):
     assert rows.rows == ("bends >= -1", "bends <= 2")
 
 
+def test_a_model_without_limits_is_allowed_and_it_is_said(tmp_path):
+    file = tmp_path / "r.urdf"
+    limit = '<limit lower="-1" upper="2" effort="1" velocity="1"/>'
+    file.write_text(FREE_AND_LIMITED.replace("revolute", "continuous").replace(limit, ""))
+    with pytest.warns(UserWarning, match="no joint has a limit"):
+        rows = model_inequalities(load_model(file))
+    assert len(rows) == 0
+
+
 def test_a_program_gives_its_linear_and_bounding_box_rows():
     program = MathematicalProgram()
     x = program.NewContinuousVariables(3, "x")

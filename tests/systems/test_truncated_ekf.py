@@ -145,3 +145,17 @@ def test_bad_settings_are_refused(sequence):
         TruncatedEkf(f, sequence.guess, 0.1, patience=0)
     with pytest.raises(SettingsError, match="NaN"):
         TruncatedEkf(f, Belief(np.full(37, np.nan), np.eye(37)), 0.1)
+
+
+def test_time_that_runs_backwards_is_refused(sequence):
+    f, _ = experiment_filter()
+    ekf = TruncatedEkf(f, sequence.guess, PERIOD)
+    context = ekf.CreateDefaultContext()
+    for t in (0.0, 1.0):
+        context.SetTime(t)
+        context.get_mutable_discrete_state().SetFrom(ekf.EvalUniquePeriodicDiscreteUpdate(context))
+    context.SetTime(0.5)
+    with pytest.raises(SettingsError, match=r"backwards, from 1 s to 0\.5 s"):
+        ekf.EvalUniquePeriodicDiscreteUpdate(context)
+    ekf.SetDefaultContext(context)
+    ekf.EvalUniquePeriodicDiscreteUpdate(context)

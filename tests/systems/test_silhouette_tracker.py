@@ -1,0 +1,110 @@
+import math
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.trajectories import PiecewisePolynomial
+
+from drake_pose.errors import SettingsError
+from drake_pose.filtering import TrackingSettings
+from drake_pose.matching import PaperSearch, PaperSearchSettings
+from drake_pose.silhouette import LabelRenderer, mask_to_label_image
+from drake_pose.systems import TRACK, SilhouetteMatcher, SilhouetteTracker, build_simulated_matching
+from tests.matching.bodies import forked_body, front_camera
+
+PERIOD = 1 / 30
+
+
+@pytest.fixture(scope="module")
+def body(tmp_path_factory):
+    return forked_body(tmp_path_factory.mktemp("body"))
+
+
+@pytest.fixture(scope="module")
+def search(body):
+    settings = PaperSearchSettings(interval=math.radians(20), outside_limit=60.0)
+    return PaperSearch(body.pose_tree(), settings)
+
+
+def motion():
+    """(20, 3) positions; a cut after the twelfth."""
+    t = np.arange(20)[:, None] / 40
+    swing = 0.25 * np.sin(2 * np.pi * t * np.array([1.0, 1.3, 0.8]) + np.array([0.0, 1.0, 2.0]))
+    centre = np.where(t < 12 / 40, [[0.1, 0.4, -0.4]], [[-0.3, 1.7, -1.7]])
+    return centre + swing
+
+
+def test_plant_and_camera_to_tracked_positions(body, search):
+    """In one diagram: Drake's renderer, the search at first and after a cut, the filter between."""
+    truth = motion()
+    trajectory = PiecewisePolynomial.ZeroOrderHold(
+        PERIOD * (np.arange(21) - 0.3), np.vstack([truth, truth[-1:]]).T
+    )
+    camera = front_camera(200, shift=0.2)
+    built = build_simulated_matching(
+        search, [camera], trajectory, PERIOD, tracking=TrackingSettings()
+    )
+    tracker = built.matcher
+    assert isinstance(tracker, SilhouetteTracker)
+    simulator = Simulator(built.diagram)
+    tracks, deviations, positions = [], [], []
+    for k in range(len(truth)):
+        simulator.AdvanceTo((k + 0.5) * PERIOD)
+        context = tracker.GetMyContextFromRoot(simulator.get_context())
+        tracks.append(tracker.GetOutputPort("track").Eval(context))
+        deviations.append(tracker.GetOutputPort("position_deviations").Eval(context))
+        positions.append(tracker.GetOutputPort("estimated_positions").Eval(context))
+    tracks = np.array(tracks)
+    tracked, matches = (tracks[:, TRACK.index(name)] for name in ("tracked", "matches"))
+    np.testing.assert_array_equal(tracked[:12], [0.0] + 11 * [1.0])
+    assert tracked[12] == 0
+    assert (matches[:12] == 1).all()
+    assert matches[12] == 2
+    assert matches[-1] <= 3
+    errors = np.array(positions) - truth
+    assert np.median(np.degrees(np.abs(errors).max(axis=1))) < 3.5
+    assert np.mean(np.abs(errors) < 2 * np.array(deviations)) > 0.9
+    assert (tracks[:, TRACK.index("distance")] < 1.0).all()
+
+
+def test_a_copied_context_goes_on_as_the_first_did(body, search):
+    """All that the tracker remembers is in the context."""
+    camera = front_camera(200, shift=0.2)
+    tracker = SilhouetteTracker(search, [camera], PERIOD)
+    renderer = LabelRenderer(body, camera)
+    truth = motion()
+    context = tracker.CreateDefaultContext()
+    assert np.isnan(tracker.GetOutputPort("position_deviations").Eval(context)).all()
+
+    def step(context, q):
+        image = mask_to_label_image(renderer.mask(q))
+        tracker.GetInputPort("label_image").FixValue(context, image)
+        updates = tracker.EvalUniquePeriodicDiscreteUpdate(context)
+        context.get_mutable_discrete_state().SetFrom(updates)
+
+    for q in truth[:3]:
+        step(context, q)
+    copy = context.Clone()
+    for one in (context, copy):
+        for q in truth[3:6]:
+            step(one, q)
+    for name in ("estimated_positions", "position_deviations", "track"):
+        port = tracker.GetOutputPort(name)
+        np.testing.assert_array_equal(port.Eval(context), port.Eval(copy))
+
+
+def test_without_pictures_nothing_is_estimated(body, search):
+    tracker = SilhouetteTracker(search, [front_camera(200)], PERIOD)
+    context = tracker.CreateDefaultContext()
+    updates = tracker.EvalUniquePeriodicDiscreteUpdate(context)
+    context.get_mutable_discrete_state().SetFrom(updates)
+    np.testing.assert_array_equal(tracker.GetOutputPort("track").Eval(context), 0.0)
+    assert tracker.last_result is None
+
+
+def test_it_is_a_matcher_and_checks_what_a_matcher_checks(search):
+    assert issubclass(SilhouetteTracker, SilhouetteMatcher)
+    with pytest.raises(SettingsError, match="period"):
+        SilhouetteTracker(search, [front_camera()], 0.0)
+    with pytest.raises(SettingsError, match="cameras"):
+        SilhouetteTracker(search, [], PERIOD)

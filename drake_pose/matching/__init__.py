@@ -6,6 +6,8 @@ from drake_pose.matching.paper_search import PaperSearch
 from drake_pose.matching.pose_search import PoseSearch
 from drake_pose.matching.result import Candidates, MatchResult, View
 from drake_pose.matching.settings import PaperSearchSettings
+from drake_pose.matching.whole_search import WholeSearch
+from drake_pose.matching.whole_settings import WholeSearchSettings
 from drake_pose.matching.wide_search import WideSearch
 from drake_pose.matching.wide_settings import WideSearchSettings
 
@@ -20,6 +22,8 @@ __all__ = [
     "PoseSearch",
     "PoseSet",
     "View",
+    "WholeSearch",
+    "WholeSearchSettings",
     "WideSearch",
     "WideSearchSettings",
 ]

@@ -9,12 +9,18 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_pose.camera import Camera, load_cameras
+from drake_pose.camera import Camera, ParallelCamera, load_cameras
 from drake_pose.camera.yaml_files import read_yaml
 from drake_pose.errors import SceneError, UnknownNameError
 from drake_pose.silhouette.masks import read_mask
 
 _FIELDS = ("sequence", "frame_rate_hz")
+
+# A camera nobody knows looks along the world's -x: the picture's right is y, its up is z.
+_LOOKING_BACK = np.array(
+    [[0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+_ANY_SCALE = 1000.0
 
 
 @dataclass(frozen=True)
@@ -28,6 +34,8 @@ class Scene:
         masks: the mask file of (camera, frame).
         sequence: whether the frames follow each other in time.
         frame_rate_hz: frames a second, where the scene says.
+        scale_unknown: whether nobody knows the cameras: each is a parallel camera that looks along
+            the world's -x, and its pixels_per_metre and what it looks at are to be found.
     """
 
     path: Path
@@ -36,6 +44,7 @@ class Scene:
     masks: Mapping[tuple[str, str], Path]
     sequence: bool = False
     frame_rate_hz: float | None = None
+    scale_unknown: bool = False
 
     def cameras_of(self, frame: str) -> tuple[str, ...]:
         """Returns the names of the cameras that have a mask of a frame.
@@ -77,7 +86,8 @@ def load_scene(path: str | Path, cameras: Mapping[str, Camera] | None = None) ->
 
     The folder has `cameras.yaml`, `masks/<camera>/<frame>.png` and perhaps `scene.yaml`
     (`sequence: true|false`, `frame_rate_hz`). With a single camera the masks may lie in
-    `masks/<frame>.png`.
+    `masks/<frame>.png`. Such masks need no camera file: without one they were taken by a camera
+    that nobody knows, or by several where the pictures' sizes differ.
 
     Args:
         path: the folder.
@@ -93,7 +103,9 @@ def load_scene(path: str | Path, cameras: Mapping[str, Camera] | None = None) ->
     sequence, frame_rate_hz = _read_settings(folder / "scene.yaml")
     if cameras is None:
         if not (folder / "cameras.yaml").is_file():
-            raise SceneError(f"{folder}: has no cameras.yaml, so its cameras must be given")
+            cameras, masks = _unknown_cameras(folder)
+            frames = tuple(sorted({frame for _, frame in masks}))
+            return Scene(folder, cameras, frames, masks, sequence, frame_rate_hz, True)
         cameras = load_cameras(folder / "cameras.yaml")
     masks = _find_masks(folder, cameras)
     frames = tuple(sorted({frame for _, frame in masks}))
@@ -126,6 +138,30 @@ def _find_masks(folder: Path, cameras: Mapping[str, Camera]) -> dict[tuple[str, 
     if not masks:
         raise SceneError(f"{root}: holds no mask <camera>/<frame>.png of: {', '.join(cameras)}")
     return masks
+
+
+def _unknown_cameras(
+    folder: Path,
+) -> tuple[dict[str, Camera], dict[tuple[str, str], Path]]:
+    """Returns a camera for every size of picture, and the mask files of (camera, frame)."""
+    files = sorted((folder / "masks").glob("*.png"))
+    if not files:
+        raise SceneError(
+            f"{folder}: has no cameras.yaml, so its cameras must be given; only masks that lie in "
+            "masks/<frame>.png need none"
+        )
+    sizes = [read_mask(file).shape[::-1] for file in files]
+    names = {
+        size: "camera" if len(set(sizes)) == 1 else f"camera_{size[0]}x{size[1]}" for size in sizes
+    }
+    cameras: dict[str, Camera] = {
+        name: ParallelCamera(
+            name, width, height, _ANY_SCALE, (width - 1) / 2, (height - 1) / 2, _LOOKING_BACK
+        )
+        for (width, height), name in names.items()
+    }
+    masks = {(names[size], file.stem): file for size, file in zip(sizes, files, strict=True)}
+    return cameras, masks
 
 
 def _read_settings(path: Path) -> tuple[bool, float | None]:

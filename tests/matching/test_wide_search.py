@@ -16,7 +16,7 @@ from drake_pose.matching.scoring import SampledTree, Scoring
 from drake_pose.matching.settings import PaperSearchSettings
 from drake_pose.matching.wide_search import WideSearch
 from drake_pose.matching.wide_settings import Stage, WideSearchSettings
-from drake_pose.silhouette import draw_mask, outline_from_mesh
+from drake_pose.silhouette import TreeSurfaces, draw_mask
 
 from .bodies import box_link, forked_body, front_camera, joint, load_body, swinging_chain
 
@@ -38,7 +38,7 @@ def all_Js(tree: PoseTree, views: list[View], interval: float = INTERVAL) -> np.
 
 
 def picture(tree: PoseTree, camera: ParallelCamera, values: list[np.ndarray]) -> View:
-    outlines = [outline_from_mesh(node.mesh) for node in tree.nodes]
+    outlines = TreeSurfaces(tree).at(values)
     return View(camera, draw_mask(outlines, camera.X_CW @ tree.node_poses(values), camera))
 
 

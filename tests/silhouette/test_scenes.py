@@ -75,12 +75,27 @@ def test_bad_settings(tmp_path: Path, text: str, message: str) -> None:
 def test_a_flat_folder_needs_one_camera(tmp_path: Path) -> None:
     (tmp_path / "masks").mkdir()
     write_mask(tmp_path / "masks" / "0000.png", MASK)
-    with pytest.raises(SceneError, match=r"no cameras\.yaml"):
-        load_scene(tmp_path)
     with pytest.raises(SceneError, match="exactly one camera"):
         load_scene(tmp_path, {"a": camera("a"), "b": camera("b")})
     scene = load_scene(tmp_path, {"a": camera("a")})
     np.testing.assert_array_equal(scene.read("a", "0000"), MASK)
+
+
+def test_masks_without_a_camera_file(tmp_path: Path) -> None:
+    """They belong to parallel cameras of unknown scale, one for each size of picture."""
+    (tmp_path / "masks").mkdir()
+    for name, mask in (("a", MASK), ("b", MASK)):
+        write_mask(tmp_path / "masks" / f"{name}.png", mask)
+    scene = load_scene(tmp_path)
+    assert scene.scale_unknown
+    assert [scene.cameras_of(frame) for frame in scene.frames] == [("camera",), ("camera",)]
+    write_mask(tmp_path / "masks" / "c.png", MASK[:-1])
+    scene = load_scene(tmp_path)
+    height, width = MASK.shape
+    large, small = f"camera_{width}x{height}", f"camera_{width}x{height - 1}"
+    assert [scene.cameras_of(f) for f in scene.frames] == [(large,), (large,), (small,)]
+    np.testing.assert_array_equal(scene.read(small, "c"), MASK[:-1])
+    assert not load_scene(tmp_path, {large: camera(large)}).scale_unknown
 
 
 def test_what_is_missing_is_named(tmp_path: Path) -> None:

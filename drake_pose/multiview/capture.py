@@ -17,7 +17,7 @@ from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.multiview.contours import Contour, measure_contour
 from drake_pose.multiview.faces import FaceTemplates, cut_face, face_direction, head_angles
 from drake_pose.multiview.features import Features, FeatureSettings, find_features
-from drake_pose.multiview.paper_pose import WAIST_SHARE, PaperPose, estimate_pose
+from drake_pose.multiview.paper_pose import PaperPose, Waist, estimate_pose
 from drake_pose.multiview.recognition import Recognition, RegisteredPose, recognise
 from drake_pose.multiview.regions import Background, person_region
 from drake_pose.multiview.skeleton import Skeleton
@@ -37,7 +37,7 @@ class CaptureSettings:
         features: how 3-D points become features.
         search: whether elbows and knees are searched on their circles.
         recognition: similarity from which the registered pose overwrites the state.
-        head_share: the head's share in the waist's height.
+        waist: the constants of the waist formula.
         farthest_face: how far from the eigenspace a face may be [grey levels].
     """
 
@@ -45,7 +45,7 @@ class CaptureSettings:
     features: FeatureSettings = field(default_factory=FeatureSettings)
     search: bool = True
     recognition: float = 0.93
-    head_share: float = WAIST_SHARE
+    waist: Waist = field(default_factory=Waist)
     farthest_face: float = 30.0
 
 
@@ -202,7 +202,7 @@ def capture_frame(
         setup.settings.features,
     )
     clock.lap("features")
-    angles = _head_angles(setup, features, face)
+    angles = None if face is None else _face_angles(setup, features.places[0], face)
     clock.lap("face")
     pose = estimate_pose(
         setup.skeleton,
@@ -212,17 +212,17 @@ def capture_frame(
         cameras,
         regions,
         search=setup.settings.search,
-        head_share=setup.settings.head_share,
+        waist=setup.settings.waist,
     )
     clock.lap("pose")
     return CapturedFrame(CaptureState(pose.q, features.places), pose, features, None, clock.laps)
 
 
-def _head_angles(
-    setup: CaptureSetup, features: Features, face: tuple[Picture, PersonView] | None
+def _face_angles(
+    setup: CaptureSetup, head: Array, face: tuple[Picture, PersonView]
 ) -> Array | None:
-    """The head's angles (2,) where the face is seen, else None."""
-    if face is None or setup.faces is None or setup.face_camera is None:
+    """The angles (2,) [rad] of a head at (3,) where the face camera sees the face, else None."""
+    if setup.faces is None or setup.face_camera is None:
         return None
     cut = cut_face(face[0], face[1].blobs)
     if cut is None:
@@ -230,7 +230,7 @@ def _head_angles(
     found = face_direction(cut, setup.faces)
     if found.outside > setup.settings.farthest_face:
         return None
-    return head_angles(found.direction, features.places[0], setup.face_camera)
+    return head_angles(found.direction, head, setup.face_camera)
 
 
 class _Clock:

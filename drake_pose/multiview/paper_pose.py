@@ -16,8 +16,43 @@ from drake_pose.multiview.skeleton import LIMBS, Limb, Skeleton, rotation
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-WAIST_SHARE = 0.55
-"""The head's share in the waist's height; the feet share the rest (4.2)."""
+
+@dataclass(frozen=True)
+class Waist:
+    """The constants of the waist formula (4.2). They are a person's; the defaults are the paper's.
+
+    Args:
+        head_share: the head's share in the waist's height.
+        ahead: how far the waist of a person standing upright is ahead of the head's middle [m].
+    """
+
+    head_share: float = 0.55
+    ahead: float = 0.0
+
+    def place(self, features: Array, heading: float) -> Array:
+        """The waist (3,): at the head's place, at a height between head and feet (z upwards).
+
+        Args:
+            features: (5, 3) head, hands and feet in the order of FEATURES [m].
+            heading: where the head looks, from the world's x axis [rad].
+        """
+        head, _, _, left_foot, right_foot = features
+        feet = 0.5 * (right_foot[2] + left_foot[2])
+        height = self.head_share * head[2] + (1.0 - self.head_share) * feet
+        forward = self.ahead * np.array([np.cos(heading), np.sin(heading)])
+        return np.array([*(head[:2] + forward), height])
+
+
+def waist_of(skeleton: Skeleton) -> Waist:
+    """The constants that are right for this person standing upright.
+
+    A centimetre of error here makes the knees of a standing person bend by ten.
+    """
+    q = np.zeros(len(skeleton.lower))
+    head, _, _, left_foot, right_foot = skeleton.features(q)
+    hips = np.mean([skeleton.limb_points(q, name)[0] for name in LIMBS[2:]], axis=0)
+    feet = 0.5 * (left_foot[2] + right_foot[2])
+    return Waist(float((hips[2] - feet) / (head[2] - feet)), float(hips[0] - head[0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,31 +75,6 @@ class PaperPose:
     scores: Mapping[str, float]
 
 
-def waist_place(features: Array, head_share: float = WAIST_SHARE) -> Array:
-    """The waist (3,): below the head, at a height between head and feet (4.2, z upwards).
-
-    Args:
-        features: (5, 3) head, hands and feet in the order of FEATURES [m].
-        head_share: the head's share in the height.
-    """
-    head, _, _, left_foot, right_foot = features
-    feet = 0.5 * (right_foot[2] + left_foot[2])
-    height = head_share * head[2] + (1.0 - head_share) * feet
-    return np.array([head[0], head[1], height])
-
-
-def body_waist_share(skeleton: Skeleton) -> float:
-    """The head's share in the waist's height that is right for this person standing upright.
-
-    A centimetre of error here makes the knees of a standing person bend by ten.
-    """
-    q = np.zeros(len(skeleton.lower))
-    head, _, _, left_foot, right_foot = skeleton.features(q)
-    hips = np.mean([skeleton.limb_points(q, name)[0] for name in LIMBS[2:]], axis=0)
-    feet = 0.5 * (left_foot[2] + right_foot[2])
-    return float((hips[2] - feet) / (head[2] - feet))
-
-
 def estimate_pose(
     skeleton: Skeleton,
     last: Array,
@@ -74,7 +84,7 @@ def estimate_pose(
     regions: Sequence[Mask],
     *,
     search: bool = True,
-    head_share: float = WAIST_SHARE,
+    waist: Waist | None = None,
 ) -> PaperPose:
     """Estimates a frame's pose.
 
@@ -88,7 +98,7 @@ def estimate_pose(
         regions: (H, W) the person in each of their pictures.
         search: whether elbows and knees are searched on their circles; otherwise they stay where
             inverse kinematics puts them.
-        head_share: the head's share in the waist's height: the paper's, or body_waist_share.
+        waist: the constants of the waist formula; the paper's where not given.
     """
     q = np.array(last, dtype=np.float64)
     if head_angles is not None:
@@ -99,10 +109,10 @@ def estimate_pose(
     # Where the head's angles moved, its middle must still be where it was measured.
     q[skeleton.head_positions] = features[0] - skeleton.head_rotation(q) @ skeleton.face_H
     R_WT, neck = skeleton.trunk_pose(q)
-    waist = waist_place(features, head_share)
+    place = (waist or Waist()).place(features, float(q[skeleton.head_angles[0]]))
     # The model's trunk is one piece: it cannot hold shoulders and waist found apart. For its
     # positions the waist counts; so the neck's base cannot wander off from frame to frame either.
-    aimed = aim_trunk(skeleton, q, waist)
+    aimed = aim_trunk(skeleton, q, place)
     R_aimed, _ = skeleton.trunk_pose(aimed)
     limbs, scores = {}, {}
     for k, name in enumerate(LIMBS):
@@ -112,7 +122,7 @@ def estimate_pose(
             found = np.array([root, _middle(limb, R_WT, root, q[limb.positions]), end])
         else:
             outward = R_aimed @ (limb.root_T - skeleton.waist_T)
-            root = waist + outward
+            root = place + outward
             angles = move_limb(limb, R_aimed, root, q[limb.positions], end)
             found = np.array([root, _middle(limb, R_aimed, root, angles), end])
         scores[name] = float("nan")
@@ -126,7 +136,7 @@ def estimate_pose(
         # Where limits forbid that, the hand or foot counts more than the elbow or knee.
         aimed[limb.positions] = move_limb(limb, R_aimed, own_root, angles, end)
         limbs[name] = found
-    return PaperPose(skeleton.clip(aimed), limbs, neck, waist, scores)
+    return PaperPose(skeleton.clip(aimed), limbs, neck, place, scores)
 
 
 def _middle(limb: Limb, R_WT: Array, root: Array, angles: Array) -> Array:

@@ -92,3 +92,16 @@ def meeting_points(
     ]
     points, distance, usable = nearest_points(*parts)
     return points[usable & (distance <= threshold)]
+
+
+def meeting_of_all(cameras: Sequence[Camera], pixels: Sequence[Array]) -> Array:
+    """(3,) the point nearest to the rays of one pixel (2,) in each camera [m]; nan has no say."""
+    A, b = np.zeros((3, 3)), np.zeros(3)
+    for camera, uv in zip(cameras, pixels, strict=True):
+        if np.isnan(uv).any():
+            continue
+        origin, direction = viewing_rays(camera, uv[None])
+        across = np.eye(3) - np.outer(direction[0], direction[0])
+        A += across
+        b += across @ origin[0]
+    return np.asarray(np.linalg.lstsq(A, b, rcond=None)[0])

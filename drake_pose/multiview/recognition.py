@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from drake_pose.camera import Camera
 from drake_pose.multiview.contours import DIRECTIONS, Contour, measure_contour, similarity
-from drake_pose.multiview.rays import viewing_rays
+from drake_pose.multiview.rays import meeting_of_all
 from drake_pose.multiview.skeleton import Skeleton
 
 Array = NDArray[np.float64]
@@ -138,7 +138,9 @@ def recognise(
     q = np.array(registered.q)
     q[registered.heading_position] = _refined_heading(registered.headings, means, best)
     templates_middles = [registered.middles[camera.name][best] for camera in seers]
-    q[skeleton.head_positions] += _meeting(seers, middles) - _meeting(seers, templates_middles)
+    q[skeleton.head_positions] += meeting_of_all(seers, middles) - meeting_of_all(
+        seers, templates_middles
+    )
     return Recognition(skeleton.clip(q), float(means[best]), len(seers))
 
 
@@ -149,16 +151,3 @@ def _refined_heading(headings: Array, scores: Array, best: int) -> float:
     shift = 0.5 * (before - after) / bend if bend < 0.0 else 0.0
     step = 2.0 * np.pi / len(headings)
     return math.remainder(headings[best] + shift * step, 2.0 * math.pi)
-
-
-def _meeting(cameras: Sequence[Camera], pixels: Sequence[Array]) -> Array:
-    """(3,) the point nearest to the rays of one pixel (2,) in each camera [m]; nan has no say."""
-    A, b = np.zeros((3, 3)), np.zeros(3)
-    for camera, uv in zip(cameras, pixels, strict=True):
-        if np.isnan(uv).any():
-            continue
-        origin, direction = viewing_rays(camera, uv[None])
-        across = np.eye(3) - np.outer(direction[0], direction[0])
-        A += across
-        b += across @ origin[0]
-    return np.asarray(np.linalg.lstsq(A, b, rcond=None)[0])

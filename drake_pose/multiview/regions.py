@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -71,24 +72,37 @@ def person_region(
         raise SettingsError(
             f"the picture is {picture.shape}, but its background {background.mean.shape}"
         )
-    off = cv2.absdiff(picture, background.mean)
-    largest = cv2.max(cv2.max(off[:, :, 0], off[:, :, 1]), off[:, :, 2])
-    mask = (largest > deviations * background.deviation).astype(np.uint8)
+    low, high = _background_colours(background, deviations)
+    mask = cv2.bitwise_not(cv2.inRange(picture, low, high))
     kernel = np.ones((3, 3), np.uint8)
     opened = cv2.morphologyEx(mask, cv2.MORPH_OPEN, kernel)
     closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, kernel)
-    return largest_patches(closed.astype(bool), smallest_share)
+    return largest_patches(closed > 0, smallest_share)
+
+
+@lru_cache(maxsize=64)
+def _background_colours(background: Background, deviations: float) -> tuple[Picture, Picture]:
+    """The lowest and highest colours (H, W, 3) that are still the background's."""
+    off = np.floor(deviations * background.deviation)[:, :, None]
+    mean = background.mean.astype(np.float32)
+    low, high = np.clip(mean - off, 0, 255), np.clip(mean + off, 0, 255)
+    return low.astype(np.uint8), high.astype(np.uint8)
 
 
 def largest_patches(mask: Mask, smallest_share: float) -> Mask:
     """A mask (H, W) without patches smaller than a share of its largest one."""
+    picture = np.ascontiguousarray(mask).view(np.uint8)
+    left, top, width, height = cv2.boundingRect(picture)
+    kept = np.zeros(mask.shape, dtype=np.bool_)
+    if not width:
+        return kept
+    inner = (slice(top, top + height), slice(left, left + width))
     count, labels, statistics, _ = cv2.connectedComponentsWithStats(
-        mask.astype(np.uint8), connectivity=8
+        np.ascontiguousarray(picture[inner]), connectivity=8
     )
-    if count <= 1:
-        return np.zeros(mask.shape, dtype=bool)
     areas = statistics[:, cv2.CC_STAT_AREA].copy()
     areas[0] = 0
     keep = areas >= smallest_share * areas.max()
     keep[0] = False
-    return np.asarray(keep[labels])
+    kept[inner] = keep[labels]
+    return kept

@@ -15,7 +15,7 @@ from drake_pose.multiview.limb_search import (
     rectangles,
     search_circle,
 )
-from drake_pose.multiview.paper_pose import estimate_pose, waist_place
+from drake_pose.multiview.paper_pose import Waist, estimate_pose
 from drake_pose.multiview.skeleton import LIMBS, load_skeleton, rotation
 from drake_pose.silhouette import LabelRenderer
 
@@ -259,7 +259,7 @@ class TestPose:
     def test_waist(self):
         features = np.array([[0.1, 0.2, 1.6], [0, 0, 0], [0, 0, 0], [0, 0, 0.04], [0, 0, 0.2]])
         expected = [0.1, 0.2, 0.55 * 1.6 + 0.225 * 0.2 + 0.225 * 0.04]
-        np.testing.assert_allclose(waist_place(features), expected)
+        np.testing.assert_allclose(Waist().place(features, 0.7), expected)
 
     def test_search_finds_elbows_that_inverse_kinematics_misses(self, person, skeleton, views):
         cameras, renderers = views

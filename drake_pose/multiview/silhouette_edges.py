@@ -1,0 +1,89 @@
+"""The edge of the person's region as points with normals: all that the silhouette method needs."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# A chord over so many pixels to both sides gives the edge's direction.
+_CHORD = 3
+
+
+class EdgePoints(NamedTuple):
+    """Points of a region's edge in one picture, from top to bottom.
+
+    Attributes:
+        uv: (n, 2) [pixel].
+        normals: (n, 2) unit normals out of the region.
+        lengths: (n,) the length of edge that each stands for [pixel].
+        middle: (2,) the region's middle [pixel]; nan where it is empty.
+    """
+
+    uv: Array
+    normals: Array
+    lengths: Array
+    middle: Array
+
+
+def find_edge_points(region: Mask, spacing: float) -> EdgePoints:
+    """Points of a region's edge, holes included; the picture's border is no edge.
+
+    Args:
+        region: (H, W).
+        spacing: from point to point [pixel].
+    """
+    contours, _ = cv2.findContours(region.view(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    chains = [chain.reshape(-1, 2) for chain in contours if len(chain) > 2 * _CHORD + 1]
+    if not chains:
+        return EdgePoints(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.full(2, np.nan))
+    starts = np.cumsum([0, *(len(chain) for chain in chains)])
+    moments = [cv2.moments(chain) for chain in chains]
+    # Holes run the other way round, but OpenCV's moments are positive for them, too.
+    largest = max(moments, key=lambda one: one["m00"])
+    area = max(largest["m00"], 1e-9)
+    uv, normals, lengths = _sample(
+        np.concatenate(chains), starts, spacing, region.shape[1], region.shape[0]
+    )
+    return EdgePoints(
+        uv, normals, lengths, np.array([largest["m10"] / area, largest["m01"] / area])
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sample(
+    pixels: NDArray[np.int32], starts: NDArray[np.int64], spacing: float, width: int, height: int
+) -> tuple[Array, Array, Array]:
+    """Points, normals and lengths along closed chains of pixels (n, 2)."""
+    capacity = int(2 * len(pixels) / spacing) + 2 * len(starts)
+    uv, normals, lengths = np.empty((capacity, 2)), np.empty((capacity, 2)), np.empty(capacity)
+    found = 0
+    for c in range(len(starts) - 1):
+        begin, count = starts[c], starts[c + 1] - starts[c]
+        points = max(1, round(1.1 * count / spacing))
+        for k in range(points):
+            i = (k * count) // points
+            x, y = pixels[begin + i]
+            if x == 0 or y == 0 or x == width - 1 or y == height - 1:
+                continue
+            before = pixels[begin + (i - _CHORD) % count]
+            after = pixels[begin + (i + _CHORD) % count]
+            du, dv = float(after[0] - before[0]), float(after[1] - before[1])
+            size = np.sqrt(du * du + dv * dv)
+            if size < 0.5 * _CHORD:
+                continue
+            # OpenCV runs with the region to the left: outwards is to the right, y down.
+            n0, n1 = -dv / size, du / size
+            normals[found, 0], normals[found, 1] = n0, n1
+            # The outermost pixels' centres lie half a pixel inside of the edge.
+            uv[found, 0], uv[found, 1] = x + 0.5 * n0, y + 0.5 * n1
+            lengths[found] = size / (2 * _CHORD) * count / points
+            found += 1
+    order = np.argsort(uv[:found, 1])
+    return uv[order], normals[order], lengths[order]

@@ -1,0 +1,65 @@
+import numpy as np
+import pytest
+from pydrake.geometry import Meshcat, MeshcatParams
+from pydrake.systems.analysis import Simulator
+from pydrake.trajectories import PiecewisePolynomial
+
+from drake_pose.body import bundled_model, load_model
+from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.errors import SettingsError
+from drake_pose.multiview.silhouette_fit import SilhouetteFit
+from drake_pose.multiview.silhouette_tracker import SilhouetteTracker
+from drake_pose.systems.person_tracker import PersonTracker, build_person_capture
+
+
+@pytest.fixture(scope="module")
+def person():
+    return load_model(bundled_model("person"), check=False)
+
+
+@pytest.fixture(scope="module")
+def cameras():
+    return circle_of_cameras(4, size=(320, 240), face_camera=False)
+
+
+def test_moving_person_is_followed_and_shown(person, cameras):
+    start = np.zeros(len(person.position_names))
+    start[person.position_index("position_z")] = 1.55
+    start[person.position_index("left_upper_arm_z")] = np.radians(40.0)
+    start[person.position_index("right_upper_arm_z")] = np.radians(-40.0)
+    end = start.copy()
+    end[person.position_index("left_upper_arm_z")] = np.radians(80.0)
+    end[person.position_index("left_thigh_x")] = np.radians(-40.0)
+    end[person.position_index("left_shin_x")] = np.radians(40.0)
+    path = PiecewisePolynomial.FirstOrderHold([0.0, 0.3], np.column_stack([start, end]))
+    meshcat = Meshcat(MeshcatParams(host="localhost"))
+    diagram = build_person_capture(person, cameras, path, 1 / 30, meshcat)
+    simulator = Simulator(diagram)
+    simulator.AdvanceTo(0.301)
+    context = simulator.get_context()
+    assert diagram.GetOutputPort("share").Eval(context)[0] > 0.8
+    found = diagram.GetOutputPort("estimated_positions").Eval(context)
+    for name in ("left_upper_arm_z", "right_upper_arm_z", "left_thigh_x", "left_shin_x"):
+        index = person.position_index(name)
+        assert np.degrees(found[index]) == pytest.approx(np.degrees(end[index]), abs=8.0), name
+    assert found[:3] == pytest.approx(end[:3], abs=0.02)
+    assert meshcat.HasPath("/drake/avatar") or meshcat.HasPath("avatar")
+
+
+def test_without_pictures_the_default_stays(person, cameras):
+    tracker = SilhouetteTracker(SilhouetteFit(person.pose_tree()))
+    system = PersonTracker(tracker, list(cameras.values()), 0.1)
+    simulator = Simulator(system)
+    simulator.AdvanceTo(0.25)
+    context = simulator.get_context()
+    found = system.GetOutputPort("estimated_positions").Eval(context)
+    np.testing.assert_allclose(found, person.default_positions, atol=1e-12)
+    assert system.GetOutputPort("share").Eval(context)[0] == 0.0
+
+
+def test_arguments_are_checked(person, cameras):
+    tracker = SilhouetteTracker(SilhouetteFit(person.pose_tree()))
+    with pytest.raises(SettingsError, match="two or more"):
+        PersonTracker(tracker, list(cameras.values())[:1], 0.1)
+    with pytest.raises(SettingsError, match="period"):
+        PersonTracker(tracker, list(cameras.values()), 0.0)

@@ -6,7 +6,15 @@ import json
 from pathlib import Path
 
 from drake_pose.apps.estimate import OnFrame, SceneEstimate, estimate_scene
-from drake_pose.apps.result_folder import OVERLAY, POSES, REPLAY, SUMMARY, require_empty
+from drake_pose.apps.result_folder import (
+    FAMILIES,
+    JOINTS,
+    OVERLAY,
+    POSES,
+    REPLAY,
+    SUMMARY,
+    require_empty,
+)
 from drake_pose.apps.settings import EstimateSettings
 from drake_pose.body import bundled_model
 from drake_pose.errors import OutputError, SceneError
@@ -14,6 +22,9 @@ from drake_pose.errors import OutputError, SceneError
 MODEL = "man"
 ROOT = "right_foot"
 ANKLE = "right_ankle"
+
+
+_FILES = (POSES, JOINTS, FAMILIES, REPLAY, SUMMARY)
 
 
 def demo_scene() -> Path:
@@ -35,14 +46,13 @@ def demo_scene() -> Path:
 def demo_settings(scene: Path) -> EstimateSettings:
     """Returns the recipe of Kameda, Minoh and Ikeda (experiment B) for a person who stands.
 
-    One camera; the root is a foot whose position is known; every 10 degrees is a sample. The foot
-    may point anywhere, and be tilted by 20 degrees.
+    One camera; the root is a foot whose position is known. The foot may point anywhere, and be
+    tilted by 20 degrees. The search is the wide one, at continuous angles.
     """
     return EstimateSettings(
         root=ROOT,
         root_position=(scene / "root_position.csv", ANKLE),
         root_rotation={"y": (-180.0, 180.0), "x": (-20.0, 20.0), "z": (-20.0, 20.0)},
-        interval=10.0,
     )
 
 
@@ -68,11 +78,11 @@ def _clear_earlier_demo(out: Path, scene: Path) -> None:
         is_demo = Path(summary["scene"]).resolve() == scene.resolve()
     except (OSError, ValueError, TypeError, KeyError):
         is_demo = False
-    if not is_demo or {file.name for file in out.iterdir()} - {POSES, REPLAY, SUMMARY, OVERLAY}:
+    if not is_demo or {file.name for file in out.iterdir()} - {*_FILES, OVERLAY}:
         require_empty(out)
         return
     try:
-        for file in (out / POSES, out / REPLAY, out / SUMMARY, *(out / OVERLAY).glob("*/*.png")):
+        for file in (*(out / name for name in _FILES), *(out / OVERLAY).glob("*/*.png")):
             file.unlink(missing_ok=True)
         for folder in (*(out / OVERLAY).glob("*"), out / OVERLAY):
             if folder.is_dir():

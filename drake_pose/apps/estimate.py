@@ -14,10 +14,14 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.analysis import Simulator
 
 from drake_pose.apps.estimate_inputs import Inputs, read_inputs
+from drake_pose.apps.estimate_sequence import sequence_tracking
+from drake_pose.apps.joint_tables import family_table, joint_table, record_pose_set
 from drake_pose.apps.measurements import angle_difference
 from drake_pose.apps.overlay import draw_overlay, encode_png
 from drake_pose.apps.replay import make_replay
 from drake_pose.apps.result_folder import (
+    FAMILIES,
+    JOINTS,
     OVERLAY,
     REPLAY,
     PoseRow,
@@ -28,8 +32,11 @@ from drake_pose.apps.result_folder import (
 )
 from drake_pose.apps.settings import EstimateSettings
 from drake_pose.apps.summary import FrameRecord, check_same_job, describe_job, summarize
+from drake_pose.camera import Camera, ParallelCamera
 from drake_pose.errors import SettingsError
 from drake_pose.matching import MatchResult
+from drake_pose.matching.root_placement import scale_camera
+from drake_pose.matching.root_placement_search import PlacedMatch
 from drake_pose.silhouette import LabelRenderer, Scene
 from drake_pose.systems.diagrams import build_recorded_matching
 from drake_pose.systems.mask_player import DEFAULT_FRAME_RATE_HZ
@@ -82,7 +89,8 @@ def estimate_scene(
     """Estimate the positions of a body in every frame of a scene.
 
     Args:
-        scene: the scene's folder: cameras.yaml, masks/<camera>/<frame>.png.
+        scene: the scene's folder: cameras.yaml, masks/<camera>/<frame>.png; or masks/<frame>.png
+            alone, of a camera that nobody knows.
         model: the body's model file.
         out: folder for the result; None writes nothing.
         settings: which cameras and frames, the root, the sampling.
@@ -177,7 +185,12 @@ class _Run:
     ) -> None:
         inputs = self._inputs
         matching = build_recorded_matching(
-            inputs.scene, inputs.search, inputs.cameras, frames, inputs.root_positions
+            inputs.scene,
+            inputs.search,
+            inputs.cameras,
+            frames,
+            inputs.root_positions,
+            tracking=sequence_tracking(inputs.scene, inputs.search),
         )
         period = _period(inputs.scene)
         simulator = Simulator(matching.diagram)
@@ -195,6 +208,7 @@ class _Run:
         if self._with_base and result.found:
             base = _base_cells(result.X_WB)
         row = PoseRow(frame, result.q, base, result.E_total, result.seconds)
+        joints, families = record_pose_set(result.pose_set, self._position_kinds())
         record = FrameRecord(
             found=result.found,
             E_total=result.E_total if result.found else None,
@@ -204,6 +218,11 @@ class _Run:
             stopped_by=result.stopped_by,
             outside_limit=result.outside_limit,
             joint_errors=self._joint_errors(frame, result),
+            camera_scale=self._camera_scale(frame, result),
+            explained=result.explained,
+            joints=joints,
+            families=families,
+            family_count=None if result.pose_set is None else result.pose_set.family_count,
         )
         # Finished is what has its row in poses.csv; all else of a frame comes before it.
         if self._folder is not None:
@@ -212,6 +231,10 @@ class _Run:
         self._rows[frame], self._records[frame] = row, record
         if time.monotonic() - self._summary_time > _SUMMARY_PERIOD:
             self._write_summary()
+
+    def _position_kinds(self) -> dict[str, str]:
+        model = self._inputs.model
+        return dict(zip(model.position_names, model.position_kinds, strict=True))
 
     def _joint_errors(self, frame: str, result: MatchResult) -> dict[str, float]:
         """Estimate minus truth by position [deg or m]."""
@@ -238,14 +261,31 @@ class _Run:
             body, segments = np.zeros_like(mask), None
             error = "no pose found"
             if result.found:
-                if camera.name not in self._renderers:
-                    self._renderers[camera.name] = LabelRenderer(self._inputs.model, camera)
-                segments = self._renderers[camera.name].segments(result.q, result.X_WB)
+                segments = self._renderer(camera, result).segments(result.q, result.X_WB)
                 body = segments >= 0
                 error = f"E_total {100.0 * result.E_total:.1f} %"
             title = [f"{camera.name}  frame {row.frame}  {error}"]
             picture = draw_overlay(mask, body, segments, title)
             folder.write(f"{OVERLAY}/{camera.name}/{row.frame}.png", encode_png(picture))
+
+    def _renderer(self, camera: Camera, result: MatchResult) -> LabelRenderer:
+        """Draws the body in a camera, whose scale may have been found."""
+        scale = result.scale if isinstance(result, PlacedMatch) else 1.0
+        if scale != 1.0 and isinstance(camera, ParallelCamera):
+            return LabelRenderer(self._inputs.model, scale_camera(camera, scale))
+        if camera.name not in self._renderers:
+            self._renderers[camera.name] = LabelRenderer(self._inputs.model, camera)
+        return self._renderers[camera.name]
+
+    def _camera_scale(self, frame: str, result: MatchResult) -> float | None:
+        """Pixels a metre of the frame's camera, where they were not known."""
+        scene = self._inputs.scene
+        if not (scene.scale_unknown and isinstance(result, PlacedMatch) and result.found):
+            return None
+        camera = scene.cameras[scene.cameras_of(frame)[0]]
+        if not isinstance(camera, ParallelCamera):
+            return None
+        return result.scale * camera.pixels_per_metre
 
     def write_replay(self) -> None:
         """Write replay.html of the frames in which a pose was found."""
@@ -286,9 +326,14 @@ class _Run:
         return without_nan(summarize(self._job, records, self._complete))
 
     def _write_summary(self) -> None:
-        if self._folder is not None:
-            self._folder.write_summary(self._summary())
-            self._summary_time = time.monotonic()
+        if self._folder is None:
+            return
+        self._folder.write_summary(self._summary())
+        records = {row.frame: self._records[row.frame] for row in self._ordered_rows()}
+        if any(record.joints for record in records.values()):
+            self._folder.write(JOINTS, joint_table(records).encode())
+            self._folder.write(FAMILIES, family_table(records).encode())
+        self._summary_time = time.monotonic()
 
 
 def _base_cells(X_WB: np.ndarray) -> np.ndarray:

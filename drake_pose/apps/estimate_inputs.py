@@ -20,11 +20,16 @@ from drake_pose.matching import (
     PaperSearch,
     PaperSearchSettings,
     PoseSearch,
-    WideSearch,
     WideSearchSettings,
 )
+from drake_pose.matching.root_placement import PlacementSettings, hub, turns_freely
+from drake_pose.matching.root_placement_search import RootPlacementSearch
+from drake_pose.matching.whole_search import WholeSearch
+from drake_pose.matching.whole_settings import WholeSearchSettings
 from drake_pose.silhouette import Scene, load_scene, require_visible
 
+# Sampling interval of a root that can be turned in all ways, where its position is searched [deg].
+_FREE_ROOT_INTERVAL = 30.0
 TRUTH_FILE = "joint_angles.csv"
 
 
@@ -73,13 +78,20 @@ def read_inputs(
     truth = _read_truth(scene_path, truth_path, model)
     root_positions = None
     position: np.ndarray | None = None
-    if settings.root_position is not None and len(settings.root_position) == 2:
+    anywhere = settings.root_position == "unknown" or (
+        scene.scale_unknown and settings.root_position is None
+    )
+    if settings.root_position is None or settings.root_position == "unknown":
+        pass
+    elif len(settings.root_position) == 2:
         root_positions = read_joint_centres(*settings.root_position, frames)
         position = root_positions[frames[0]]
-    elif settings.root_position is not None:
+    else:
         position = np.array(settings.root_position)
-    tree = _make_tree(model, settings, position)
-    search = _make_search(tree, settings, model)
+    if anywhere or scene.scale_unknown:
+        search = _make_placement_search(model, settings, position, scene.scale_unknown)
+    else:
+        search = _make_search(_make_tree(model, settings, position), settings, model)
     _check_pictures(scene, cameras, frames, search)
     return Inputs(scene, model, cameras, frames, search, root_positions, truth)
 
@@ -181,7 +193,8 @@ def _make_search(tree: PoseTree, settings: EstimateSettings, model: ArticulatedM
             intervals=intervals,
             time_limit=settings.time_limit,
         )
-        return WideSearch(tree, wide)
+        continuous = settings.angles == "continuous"
+        return WholeSearch(tree, WholeSearchSettings(wide, continuous))
     paper = PaperSearchSettings(
         interval=interval,
         length_interval=settings.length_interval,
@@ -191,6 +204,45 @@ def _make_search(tree: PoseTree, settings: EstimateSettings, model: ArticulatedM
         run_limit=settings.run_limit,
     )
     return PaperSearch(tree, paper)
+
+
+def _make_placement_search(
+    model: ArticulatedModel,
+    settings: EstimateSettings,
+    position: np.ndarray | None,
+    scale_unknown: bool,
+) -> PoseSearch:
+    """The search for a root that can be anywhere.
+
+    Where the model's own joints turn its root in all ways, the tree begins at the node with the
+    most neighbours, which a silhouette shows best; its rotations are tried more coarsely then.
+
+    Raises:
+        SettingsError: if the method is the paper's, or angles on the grid are wanted.
+    """
+    if settings.method == "paper":
+        raise SettingsError(
+            "the paper's search must know where the root is and how large it looks; where the "
+            "scene has no cameras.yaml or the root position is unknown, use --method wide"
+        )
+    if settings.angles == "grid":
+        raise SettingsError(
+            "angles on the grid need a known root; where the scene has no cameras.yaml or the root "
+            "position is unknown, angles are continuous"
+        )
+    first = np.zeros(3) if position is None else position
+    tree = _make_tree(model, settings, None if settings.root is None else first)
+    if settings.root is None and settings.root_rotation is None and turns_freely(tree):
+        held = _in_plant_units(model, settings.hold)
+        rotation = RootRotation.free(interval_deg=_FREE_ROOT_INTERVAL)
+        tree = model.pose_tree(hub(tree), root_position=first, root_rotation=rotation, held=held)
+    wide = WideSearchSettings(
+        interval=math.radians(settings.interval),
+        length_interval=settings.length_interval,
+        intervals=_in_plant_units(model, settings.joint_intervals),
+        time_limit=settings.time_limit,
+    )
+    return RootPlacementSearch(tree, wide, PlacementSettings(scale_unknown=scale_unknown))
 
 
 def _check_pictures(
@@ -204,6 +256,8 @@ def _check_pictures(
         for frame in frames:
             if (camera.name, frame) in scene.masks:
                 scene.read(camera.name, frame)
+    if isinstance(search, RootPlacementSearch):
+        return
     X_WN = search.tree.node_poses(search.tree.default_values())
     for camera in cameras:
         require_visible(search.sampled.outlines, camera.X_CW @ X_WN, camera)

@@ -13,7 +13,11 @@ _SEARCH = "How finely and how long it searches"
 RESULT_PANEL = "The result"
 
 SceneArgument = Annotated[
-    Path, typer.Argument(help="Folder with cameras.yaml and masks/<camera>/<frame>.png.")
+    Path,
+    typer.Argument(
+        help="Folder with cameras.yaml and masks/<camera>/<frame>.png; or with masks/<frame>.png "
+        "alone, of a camera that nobody knows."
+    ),
 ]
 ModelOption = Annotated[
     Path,
@@ -71,7 +75,8 @@ RootPositionOption = Annotated[
     typer.Option(
         metavar="POINT",
         help=r"Where its origin is in the world: X,Y,Z \[m], or FILE.csv:JOINT for the rows "
-        "frame,joint,x,y,z of that joint, one a frame.",
+        "frame,joint,x,y,z of that joint, one a frame; or unknown: it is searched, as it is where "
+        "the scene has no cameras.yaml.",
         rich_help_panel=_ROOT,
     ),
 ]
@@ -141,7 +146,16 @@ MethodOption = Annotated[
     str,
     typer.Option(
         metavar="NAME",
-        help="paper: as published; wide: many hypotheses side by side, slower and far surer.",
+        help="wide: many hypotheses side by side; paper: as published.",
+        rich_help_panel=_SEARCH,
+    ),
+]
+AnglesOption = Annotated[
+    str,
+    typer.Option(
+        metavar="KIND",
+        help="continuous: refined to whatever fits; grid: multiples of the interval only. "
+        "Method wide only.",
         rich_help_panel=_SEARCH,
     ),
 ]

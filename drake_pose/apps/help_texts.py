@@ -27,15 +27,19 @@ Exit status: 0 done, 1 failed (the message says what is at fault), 2 wrong usage
 ESTIMATE = _help(r"""
 Estimate the joint angles in every frame of a scene.
 
-The body is placed segment by segment from the root outwards. A segment's joint angles are sampled
-on a grid inside their limits; what leaves the silhouette is thrown away, and what covers most of it
-is kept, with a way back where the search gets stuck (Kameda, Minoh and Ikeda). Several cameras are
-matched together.
+The body is placed segment by segment from the root outwards, in thousands of ways at once; those
+that cover most of the silhouettes are drawn to their edges, at continuous angles. Holes, shadows
+and what stands before the body may spoil the masks. Several cameras are matched together. --method
+paper is the search of Kameda, Minoh and Ikeda as they published it.
 
-DIR gets poses.csv (a row a frame: every joint's position in rad or m, E_total, seconds),
-summary.json, overlay/<camera>/<frame>.png to judge by, and replay.html. E_total is the area where
-body and silhouette differ over the silhouette's area. Ctrl-C keeps the finished frames; --resume
-goes on.
+Where scene.yaml says [bold]sequence: true[/bold], the body is searched in the first frame and
+tracked by its contour from there, inside its limits; it is searched again when the track is lost.
+
+DIR gets poses.csv (a row a frame: every joint's position in rad or m, E_total, seconds), joints.csv
+(which joints the silhouettes determine, and in what interval), families.csv (poses that look the
+same), summary.json, overlay/<camera>/<frame>.png to judge by, and replay.html. E_total is the area
+where body and silhouette differ over the silhouette's area. Ctrl-C keeps the finished frames;
+--resume goes on.
 
 [bold]A robot arm bolted to the world's origin, seen by two cameras:[/bold]
 
@@ -54,8 +58,8 @@ DEMO = _help("""
 Estimate a stored real picture: a man balancing on a beam, seen by one camera.
 
 Only the position of his right ankle is known. The search begins at that foot and finds all other
-joint angles: the recipe of Kameda, Minoh and Ikeda for real people, with their sampling of
-10 degrees. The model is a man of average measures, not made from this man.
+joint angles, as Kameda, Minoh and Ikeda did for real people. The model is a man of average
+measures, not made from this man.
 
 [bold]Example:[/bold]
 
@@ -113,6 +117,11 @@ the position of her head. The paper's figures stand beside ours.
 [bold]Example:[/bold]
 
     drake-pose reproduce kameda --images 20
+
+With --angles continuous --views N she is seen by N cameras, and poses are refined between the
+samples; every angle gets an interval, or is called free. --mismatch adds a body of other widths.
+
+    drake-pose reproduce kameda --angles continuous --views 2 --images 20
 """)
 
 SHIMADA = _help("""
@@ -126,4 +135,33 @@ filter's own deviations are honest.
 [bold]Example:[/bold]
 
     drake-pose reproduce shimada --runs 20 --observed lines --out results/shimada
+
+[bold]One view, stared at for 5,000 frames: the flaw that the authors state:[/bold]
+
+    drake-pose reproduce shimada --runs 10 --static 5000
+""")
+
+DATE = _help("""
+Date, Yoshimatsu, Arita and Taniguchi: a moving person before many calibrated cameras.
+
+A simulated person walks, reaches, leans, crouches, turns and crosses the arms; eight cameras on a
+circle and one at the face see it, 640 x 480 pixels, with noise. Beside each other: the paper's
+inverse kinematics alone, the paper's search for elbows and knees, and one fit to all silhouettes
+at once. A track is destroyed during each motion: frames until it is right again. Times are one
+core's; rendering does not count.
+
+[bold]Example:[/bold]
+
+    drake-pose reproduce date --cameras 5 --frames 120 --out results/date
+""")
+
+CAPTURE = _help("""
+Capture one moving person in a scene with several calibrated cameras, from masks alone.
+
+Nothing need be known of the person: lengths and girths are fitted to the first frames. Writes
+poses.csv, joint_centres.csv, TRC and MOT files, a summary that names bad cameras, and replay.html.
+
+[bold]Example:[/bold]
+
+    drake-pose capture SCENE --out results/person
 """)

@@ -9,7 +9,10 @@ import typer
 
 from drake_pose import __version__
 from drake_pose.apps import help_texts
+from drake_pose.apps.capture_command import capture
+from drake_pose.apps.date_command import date
 from drake_pose.apps.estimate_options import (
+    AnglesOption,
     CameraOption,
     CandidatesOption,
     FrameOption,
@@ -32,12 +35,14 @@ from drake_pose.apps.estimate_options import (
     TimeLimitOption,
     TruthOption,
 )
+from drake_pose.apps.kameda_command import kameda
 from drake_pose.apps.options import (
     parse_assignments,
     parse_root_position,
     parse_root_rotation,
 )
 from drake_pose.apps.settings import EstimateSettings
+from drake_pose.apps.shimada_command import shimada
 from drake_pose.apps.terminal import (
     FAILED,
     errors_as_messages,
@@ -102,7 +107,8 @@ def estimate(
     candidates: CandidatesOption = 5,
     run_limit: RunLimitOption = 10_000,
     time_limit: TimeLimitOption = None,
-    method: MethodOption = "paper",
+    method: MethodOption = "wide",
+    angles: AnglesOption = "continuous",
     resume: ResumeOption = False,
     replay: ReplayOption = True,
     json: JsonOption = False,
@@ -124,6 +130,7 @@ def estimate(
             time_limit=time_limit,
             hold=parse_assignments(hold or (), "--hold"),
             method=method,
+            angles=angles,
         )
     interrupted = f"interrupted; the finished frames are in {out}; go on with --resume"
     with errors_as_messages(interrupted):
@@ -246,101 +253,10 @@ def undistort(
         say(f"drake-pose: {len(written)} pictures written to {out}")
 
 
-@reproduce_app.command(help=help_texts.KAMEDA)
-def kameda(
-    images: Annotated[int, typer.Option(min=1, help="How many silhouettes are drawn.")] = 219,
-    seed: Annotated[int, typer.Option(min=0, help="Another seed draws other poses.")] = 0,
-    method: Annotated[str, typer.Option(help="How to search: paper or wide.")] = "paper",
-    angles: Annotated[
-        str, typer.Option(help="lattice: multiples of 20 degrees, as in the paper; continuous.")
-    ] = "lattice",
-    outside_limit: Annotated[
-        float, typer.Option(min=0.0, help=r"r \[pixel]; the paper's is 200.", metavar="R")
-    ] = 200.0,
-    candidates: Annotated[
-        int,
-        typer.Option(
-            min=1, help="How many candidates a node keeps; the paper's is 5.", metavar="K"
-        ),
-    ] = 5,
-    interval: Annotated[
-        float, typer.Option(min=1.0, max=90.0, help=r"Sampling interval \[deg]; the paper's is 20.")
-    ] = 20.0,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for pictures; none without it.")
-    ] = None,
-    json: JsonOption = False,
-) -> None:
-    """See help_texts.KAMEDA."""
-    with usage_errors():
-        EstimateSettings(method=method)
-    if angles not in ("lattice", "continuous"):
-        raise typer.BadParameter("must be lattice or continuous", param_hint="--angles")
-    with errors_as_messages():
-        from drake_pose.apps.kameda import (
-            PAPER_IMAGES,
-            experiment_search,
-            run_experiment,
-            wide_experiment_search,
-        )
-        from drake_pose.apps.kameda_pictures import save_pictures
-        from drake_pose.apps.kameda_table import experiment_table
-        from drake_pose.apps.report import count_progress, output_console
-        from drake_pose.apps.result_folder import require_empty
-
-        if out is not None:
-            require_empty(out)
-        paper_images = images if method == "paper" else min(images, PAPER_IMAGES)
-        with count_progress("silhouettes, the paper's method", paper_images) as advance:
-            search = experiment_search(outside_limit, candidates, interval)
-            results = [run_experiment(search, paper_images, seed, angles, advance)]
-        if method == "wide":
-            with count_progress("silhouettes, wide search", images) as advance:
-                wide = wide_experiment_search(interval)
-                results.append(run_experiment(wide, images, seed, angles, advance))
-        if out is not None:
-            save_pictures(results[-1], out)
-        if json:
-            beside = {"paper_method": results[0].as_json()} if method == "wide" else {}
-            print_json({**results[-1].as_json(), **beside})
-        else:
-            output_console().print(experiment_table(results))
-
-
-@reproduce_app.command(help=help_texts.SHIMADA)
-def shimada(
-    runs: Annotated[
-        int, typer.Option(min=1, help="Sequences for each of r_13 = 35 and 40, other noise each.")
-    ] = 50,
-    seed: Annotated[int, typer.Option(min=0, help="Another seed draws other sequences.")] = 0,
-    truncation: Annotated[
-        str, typer.Option(help="sequential (the paper's), joint, clip or none.")
-    ] = "joint",
-    observed: Annotated[
-        str, typer.Option(help="full: all points and lines; lines: knuckles hidden.")
-    ] = "full",
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for plots; none without it.")
-    ] = None,
-    json: JsonOption = False,
-) -> None:
-    """See help_texts.SHIMADA."""
-    with errors_as_messages():
-        from drake_pose.apps.report import count_progress, output_console
-        from drake_pose.apps.result_folder import require_empty
-        from drake_pose.apps.shimada import CASES, run_experiment
-        from drake_pose.apps.shimada_pictures import save_pictures
-
-        if out is not None:
-            require_empty(out)
-        with count_progress("sequences", runs * len(CASES)) as advance:
-            result = run_experiment(runs, seed, truncation, observed, advance)
-        if out is not None:
-            save_pictures(result, out)
-        if json:
-            print_json(result.as_json())
-        else:
-            output_console().print(result.table())
+app.command(name="capture", help=help_texts.CAPTURE)(capture)
+reproduce_app.command(name="kameda", help=help_texts.KAMEDA)(kameda)
+reproduce_app.command(name="shimada", help=help_texts.SHIMADA)(shimada)
+reproduce_app.command(name="date", help=help_texts.DATE)(date)
 
 
 if __name__ == "__main__":

@@ -46,12 +46,16 @@ def parse_assignments(texts: Iterable[str], option: str) -> dict[str, float]:
     return values
 
 
-def parse_root_position(text: str) -> tuple[float, float, float] | tuple[Path, str]:
-    """Returns a position ``X,Y,Z`` [m], or the file and the joint of ``FILE.csv:JOINT``.
+def parse_root_position(
+    text: str,
+) -> tuple[float, float, float] | tuple[Path, str] | Literal["unknown"]:
+    """Returns a position ``X,Y,Z`` [m], file and joint of ``FILE.csv:JOINT``, or ``unknown``.
 
     Raises:
-        SettingsError: if the text has neither form.
+        SettingsError: if the text has none of these forms.
     """
+    if text == "unknown":
+        return "unknown"
     parts = text.split(",")
     if len(parts) == 3:
         x, y, z = (parse_number(part, "--root-position") for part in parts)
@@ -59,8 +63,8 @@ def parse_root_position(text: str) -> tuple[float, float, float] | tuple[Path, s
     file, colon, joint = text.rpartition(":")
     if not (colon and file and joint):
         raise SettingsError(
-            f"--root-position: '{text}' must be X,Y,Z in metres, or FILE.csv:JOINT for one "
-            "position a frame"
+            f"--root-position: '{text}' must be X,Y,Z in metres, FILE.csv:JOINT for one "
+            "position a frame, or unknown"
         )
     return Path(file), joint
 

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from drake_pose.apps.estimate import SceneEstimate
 
 
+_LIMITS = {"run_limit": "run limit", "time_limit": "time limit"}
+
+
 def output_console() -> Console:
     """Returns the console for results; a file or pipe gets lines that are not folded."""
     console = Console(highlight=False)
@@ -71,8 +74,13 @@ class FrameProgress:
             return
         if not record.found:
             warn(f"frame '{frame}': no pose was found")
-        elif record.stopped_by == "run_limit":
-            warn(f"frame '{frame}': the search was stopped by the run limit")
+        elif not record.explained:
+            warn(
+                f"frame '{frame}': no pose explains the silhouettes: E_total is "
+                f"{percent(record.E_total)} at best"
+            )
+        elif record.stopped_by in _LIMITS:
+            warn(f"frame '{frame}': the search was stopped by the {_LIMITS[record.stopped_by]}")
 
 
 def print_estimate(result: SceneEstimate) -> None:

@@ -1,4 +1,4 @@
-"""The result folder: poses.csv, summary.json, overlay pictures and replay.html.
+"""The result folder: poses.csv, joints.csv, families.csv, summary.json, overlays and replay.html.
 
 Every finished frame is on the disk before the next one begins, and every other file is written
 beside its place and then moved there, so that an interruption never leaves half a file.
@@ -20,6 +20,8 @@ import numpy as np
 from drake_pose.errors import OutputError
 
 POSES = "poses.csv"
+JOINTS = "joints.csv"
+FAMILIES = "families.csv"
 SUMMARY = "summary.json"
 REPLAY = "replay.html"
 OVERLAY = "overlay"

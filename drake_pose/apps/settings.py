@@ -10,7 +10,8 @@ from typing import Any, Literal
 from drake_pose.apps.options import Axis
 from drake_pose.errors import SettingsError
 
-METHODS = ("paper", "wide")
+METHODS = ("wide", "paper")
+ANGLES = ("continuous", "grid")
 RootTurns = Literal["fixed", "free"] | Mapping[Axis, tuple[float, float]]
 
 
@@ -23,7 +24,8 @@ class EstimateSettings:
         frames: the frames: names, or ranges ``FIRST:LAST``; all where empty.
         root: the link the pose tree begins at; the model's own root where None.
         root_position: where the root's origin is in the world [m], or the file of joint centres
-            and the joint in it that is the root in each frame; the model's own where None.
+            and the joint in it that is the root in each frame; ``unknown``: searched; the model's
+            own where None, but searched where the cameras are not known.
         root_rotation: ``fixed``, ``free``, or limits of the angles about the root's axes by name,
             in the order of rotation [deg]. At angles of zero the root stands in the world as it
             does at the model's default positions. None: the model's own joints tell, or free.
@@ -38,16 +40,19 @@ class EstimateSettings:
         time_limit: after so many seconds the search of a frame answers with what it has; None: no
             limit. Of the method ``wide`` alone.
         hold: positions that are known, by name [deg or m].
-        method: ``paper``: the search as it was published; ``wide``: many hypotheses side by side.
+        method: ``wide``: many hypotheses side by side; ``paper``: the search as it was published.
+        angles: ``continuous``: refined between the samples; ``grid``: multiples of the interval
+            alone, as always with the method ``paper``. Of the method ``wide`` alone.
 
     Raises:
-        SettingsError: if there is no such method, or a limit belongs to the other one.
+        SettingsError: if there is no such method, an option belongs to the other one, or a count
+            is below 1.
     """
 
     cameras: tuple[str, ...] = ()
     frames: tuple[str, ...] = ()
     root: str | None = None
-    root_position: tuple[float, float, float] | tuple[Path, str] | None = None
+    root_position: tuple[float, float, float] | tuple[Path, str] | Literal["unknown"] | None = None
     root_rotation: RootTurns | None = None
     interval: float = 10.0
     length_interval: float = 0.05
@@ -57,14 +62,19 @@ class EstimateSettings:
     run_limit: int = 10_000
     time_limit: float | None = None
     hold: Mapping[str, float] = field(default_factory=dict)
-    method: str = "paper"
+    method: str = "wide"
+    angles: str = "continuous"
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise SettingsError(
                 f"there is no method '{self.method}'; there is: {', '.join(METHODS)}"
             )
-
+        if self.angles not in ANGLES:
+            raise SettingsError(f"angles must be {' or '.join(ANGLES)}, not '{self.angles}'")
+        for name in ("candidates", "run_limit"):
+            if getattr(self, name) < 1:
+                raise SettingsError(f"{name} must be 1 or more, not {getattr(self, name)}")
         if self.method == "wide" and self.outside_limit is not None:
             raise SettingsError("the wide search has no outside limit r; leave it out")
         if self.method == "paper" and self.time_limit is not None:
@@ -73,7 +83,7 @@ class EstimateSettings:
     def as_json(self) -> dict[str, Any]:
         """Returns the settings as plain JSON values."""
         values = asdict(self)
-        if self.root_position is not None:
+        if isinstance(self.root_position, tuple):
             values["root_position"] = [
                 str(part) if isinstance(part, Path) else part for part in self.root_position
             ]

@@ -20,6 +20,22 @@ _PACKAGES = ("drake", "numpy", "numba", "opencv-python-headless")
 
 
 @dataclass(frozen=True)
+class JointRecord:
+    """What is known of one value of the pose tree, as JointEstimate [deg or m].
+
+    Args:
+        determined: whether it lies between low and high; else these are the ends of what was seen.
+        low, high: the interval or range.
+        value: of the pose that stands for a family; None over all families.
+    """
+
+    determined: bool
+    low: float
+    high: float
+    value: float | None = None
+
+
+@dataclass(frozen=True)
 class FrameRecord:
     """What the search said about one frame.
 
@@ -29,9 +45,15 @@ class FrameRecord:
         seconds: the search's wall time [s].
         first_E_total: before the re-estimation.
         runs: how often step 3 was run.
-        stopped_by: "end" or "run_limit".
+        stopped_by: why the search ended: "end", "exact", "run_limit" or "time_limit";
+            "tracked" where the pose was tracked.
         outside_limit: r in each view [pixel].
         joint_errors: estimate minus truth by position [deg or m], where the truth is known.
+        camera_scale: pixels a metre of a parallel camera whose scale was found.
+        explained: whether the pose explains the silhouettes at least in the rough.
+        joints: what is known of each value of the pose tree, by name.
+        families: by name too, in each family of poses that look the same; the first of them.
+        family_count: how many families there are; None where the search does not say.
     """
 
     found: bool
@@ -42,16 +64,33 @@ class FrameRecord:
     stopped_by: str | None = None
     outside_limit: tuple[float, ...] | None = None
     joint_errors: Mapping[str, float] = field(default_factory=dict)
+    camera_scale: float | None = None
+    explained: bool = True
+    joints: Mapping[str, JointRecord] = field(default_factory=dict)
+    families: tuple[Mapping[str, JointRecord], ...] = ()
+    family_count: int | None = None
 
     @staticmethod
     def from_json(values: Mapping[str, Any]) -> FrameRecord:
         """Returns the record that as_json described."""
         limits = values.get("outside_limit")
-        return FrameRecord(**{**values, "outside_limit": None if limits is None else tuple(limits)})
+        families = [_joint_records(family) for family in values.get("families", ())]
+        return FrameRecord(
+            **{
+                **values,
+                "outside_limit": None if limits is None else tuple(limits),
+                "joints": _joint_records(values.get("joints", {})),
+                "families": tuple(families),
+            }
+        )
 
     def as_json(self) -> dict[str, Any]:
         """Returns plain JSON values."""
         return asdict(self)
+
+
+def _joint_records(values: Mapping[str, Any]) -> dict[str, JointRecord]:
+    return {name: JointRecord(**fields) for name, fields in values.items()}
 
 
 def describe_job(scene: Path, model: Path, settings: EstimateSettings) -> dict[str, Any]:

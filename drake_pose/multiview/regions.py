@@ -97,7 +97,7 @@ def largest_patches(mask: Mask, smallest_share: float) -> Mask:
     if not width:
         return kept
     inner = (slice(top, top + height), slice(left, left + width))
-    count, labels, statistics, _ = cv2.connectedComponentsWithStats(
+    _, labels, statistics, _ = cv2.connectedComponentsWithStats(
         np.ascontiguousarray(picture[inner]), connectivity=8
     )
     areas = statistics[:, cv2.CC_STAT_AREA].copy()

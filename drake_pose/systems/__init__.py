@@ -6,6 +6,7 @@ from drake_pose.systems.diagrams import (
     build_simulated_matching,
 )
 from drake_pose.systems.mask_player import MaskPlayer
+from drake_pose.systems.person_tracker import PersonTracker, build_person_capture
 from drake_pose.systems.silhouette_matcher import STATISTICS, SilhouetteMatcher
 from drake_pose.systems.silhouette_tracker import TRACK, SilhouetteTracker
 from drake_pose.systems.skin import MeshcatSkin, SkinPoser, add_meshcat_skin, add_skin
@@ -17,12 +18,14 @@ __all__ = [
     "MaskPlayer",
     "MatchingDiagram",
     "MeshcatSkin",
+    "PersonTracker",
     "SilhouetteMatcher",
     "SilhouetteTracker",
     "SkinPoser",
     "TruncatedEkf",
     "add_meshcat_skin",
     "add_skin",
+    "build_person_capture",
     "build_recorded_matching",
     "build_simulated_matching",
 ]

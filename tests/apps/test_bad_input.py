@@ -1,5 +1,6 @@
 """Bad input on the command line: a message that names the culprit, exit status, no traceback."""
 
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +13,7 @@ from typer.testing import CliRunner, Result
 
 from drake_pose.apps.main import app
 from drake_pose.errors import DrakePoseError
-from tests.apps.scenes import URDF, TinyScene
+from tests.apps.scenes import NAMES, URDF, TinyScene, read_rows
 
 Spoil = Callable[[TinyScene], None]
 
@@ -204,9 +205,13 @@ BAD_VALUES = {
     "root without a position": (["--root", "jib"], "root 'jib'", 1),
     "interval": (["--interval", "0"], "interval", 1),
     "interval NaN": (["--interval", "nan"], "interval", 1),
-    "outside limit": (["--outside-limit", "-1"], "outside_limit", 1),
-    "no candidates": (["--candidates", "0"], "candidate", 1),
-    "no runs": (["--run-limit", "0"], "run_limit", 1),
+    "outside limit": (["--method", "paper", "--outside-limit", "-1"], "outside_limit", 1),
+    "outside limit of the other method": (["--outside-limit", "9"], "outside limit", 2),
+    "no candidates": (["--method", "paper", "--candidates", "0"], "candidates", 2),
+    "no runs": (["--method", "paper", "--run-limit", "0"], "run_limit", 2),
+    "angles": (["--angles", "round"], "angles", 2),
+    "time limit of the other method": (["--method", "paper", "--time-limit", "9"], "time limit", 2),
+    "negative time": (["--time-limit", "-1"], "--time-limit", 2),
 }
 
 
@@ -288,3 +293,32 @@ def test_any_other_error_is_a_bug_and_stays_visible(
     result = run(runner, own_scene)
     assert isinstance(result.exception, ZeroDivisionError)
     assert not isinstance(result.exception, DrakePoseError)
+
+
+def test_a_mask_that_no_pose_explains(own_scene: TinyScene, runner: CliRunner) -> None:
+    picture = np.zeros((160, 200), np.uint8)
+    picture[:6] = 255
+    write_picture(own_scene, picture)
+    result = run(runner, own_scene)
+    assert result.exit_code == 0, result.output
+    assert "frame '0000': no pose explains the silhouettes" in result.stderr
+    summary = json.loads((own_scene.folder.parent / "out" / "summary.json").read_text())
+    assert summary["frames"]["0000"]["explained"] is False
+    assert summary["frames"]["0000"]["E_total"] > 0.5
+
+
+def test_no_time(own_scene: TinyScene, runner: CliRunner) -> None:
+    result = run(runner, own_scene, "--time-limit", "0")
+    assert result.exit_code == 0, result.output
+    assert "stopped by the time limit" in result.stderr
+
+
+def test_salt_noise(own_scene: TinyScene, runner: CliRunner) -> None:
+    picture = cv2.imread(str(mask_path(own_scene)), cv2.IMREAD_GRAYSCALE)
+    picture[np.random.default_rng(6).random(picture.shape) < 0.1] = 255
+    write_picture(own_scene, picture)
+    result = run(runner, own_scene)
+    assert result.exit_code == 0, result.output
+    (row,) = read_rows(own_scene.folder.parent / "out" / "poses.csv")
+    found = [float(row[name]) for name in NAMES]
+    np.testing.assert_allclose(found, own_scene.truth["0000"], atol=np.radians(5.0))

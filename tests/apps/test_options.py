@@ -34,6 +34,7 @@ def test_root_position() -> None:
         Path("dir/centres.csv"),
         "left_ankle",
     )
+    assert parse_root_position("unknown") == "unknown"
 
 
 @pytest.mark.parametrize("text", ["1,2", "1,2,x", "centres.csv", ":joint", "centres.csv:"])

@@ -1,5 +1,8 @@
+import json
+
 import pytest
 
+from drake_pose.apps.main import app
 from drake_pose.apps.shimada import experiment_filter
 from drake_pose.apps.shimada_static import run_static_experiment
 from drake_pose.errors import SettingsError
@@ -55,3 +58,18 @@ def test_the_moving_sequence_is_all_new_views():
 def test_bad_arguments_are_named(bad, word):
     with pytest.raises(SettingsError, match=word):
         run_static_experiment(**bad)
+
+
+def test_the_command_stares(capsys):
+    with pytest.raises(SystemExit) as ended:
+        app(["reproduce", "shimada", "--runs", "1", "--static", "60", "--json"])
+    assert ended.value.code == 0
+    figures = json.loads(capsys.readouterr().out)["static_frames"]
+    assert list(figures) == ["55", "60", "after_new_views"]
+
+
+@pytest.mark.slow
+def test_two_thousand_frames_of_one_view():
+    result = run_static_experiment(runs=3, seed=5, marks=(55, 500, 2000))
+    assert (result.nees.mean(axis=0) <= 2.0).all()
+    assert result.errors_after.mean() < 0.5

@@ -18,7 +18,7 @@ from drake_pose.matching.family_search import (
     samples_at,
 )
 from drake_pose.matching.family_split import cluster_samples
-from drake_pose.matching.joint_estimates import grid_steps, estimate_joints
+from drake_pose.matching.joint_estimates import estimate_joints, grid_steps
 from drake_pose.matching.scoring import Scoring
 from drake_pose.matching.wide_refine import poses_at
 

@@ -1,0 +1,89 @@
+"""What is known of each joint, as rows for people and programs: joints.csv and families.csv."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+
+from drake_pose.apps.summary import FrameRecord, JointRecord
+from drake_pose.matching import JointEstimate, PoseSet
+
+JOINT_COLUMNS = ("frame", "joint", "determined", "low", "high", "families")
+"""A row for each frame and joint, over all families [deg or m]."""
+FAMILY_COLUMNS = ("frame", "family", "joint", "value", "determined", "low", "high")
+"""A row for each frame, family and joint; family 1 holds the answer [deg or m]."""
+
+
+def record_pose_set(
+    pose_set: PoseSet | None, kinds: Mapping[str, str]
+) -> tuple[dict[str, JointRecord], tuple[dict[str, JointRecord], ...]]:
+    """What is known of each joint over all families, and in each of them.
+
+    Args:
+        pose_set: the answer as a set; nothing is known without one.
+        kinds: "length" for each position that is one, by name; all others are angles.
+    """
+    if pose_set is None:
+        return {}, ()
+    families = []
+    for family in pose_set.families:
+        values = [float(value) for node in family.node_values for value in node]
+        families.append(_record(family.joints, kinds, values))
+    return _record(pose_set.joints, kinds, None), tuple(families)
+
+
+def _record(
+    joints: Sequence[JointEstimate], kinds: Mapping[str, str], values: Sequence[float] | None
+) -> dict[str, JointRecord]:
+    records = {}
+    for index, joint in enumerate(joints):
+        unit = 1.0 if kinds.get(joint.name) == "length" else math.degrees(1.0)
+        value = None if values is None else unit * values[index]
+        records[joint.name] = JointRecord(
+            joint.determined, unit * joint.low, unit * joint.high, value
+        )
+    return records
+
+
+def joint_table(records: Mapping[str, FrameRecord]) -> str:
+    """Returns the text of joints.csv."""
+    return _table(
+        JOINT_COLUMNS,
+        [
+            [frame, name, *_ends(joint), record.family_count]
+            for frame, record in records.items()
+            for name, joint in record.joints.items()
+        ],
+    )
+
+
+def family_table(records: Mapping[str, FrameRecord]) -> str:
+    """Returns the text of families.csv."""
+    return _table(
+        FAMILY_COLUMNS,
+        [
+            [frame, number, name, "" if one.value is None else _number(one.value), *_ends(one)]
+            for frame, record in records.items()
+            for number, family in enumerate(record.families, start=1)
+            for name, one in family.items()
+        ],
+    )
+
+
+def _ends(joint: JointRecord) -> list[str]:
+    known = "yes" if joint.determined else "no"
+    return [known, _number(joint.low), _number(joint.high)]
+
+
+def _number(value: float) -> str:
+    return f"{value:.6g}"
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    return text.getvalue()

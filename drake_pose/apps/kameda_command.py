@@ -1,0 +1,131 @@
+"""The command `drake-pose reproduce kameda`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from drake_pose.apps.estimate_options import JsonOption
+from drake_pose.apps.settings import EstimateSettings
+from drake_pose.apps.terminal import errors_as_messages, print_json, say, usage_errors
+
+
+def kameda(
+    images: Annotated[int, typer.Option(min=1, help="How many silhouettes are drawn.")] = 219,
+    seed: Annotated[int, typer.Option(min=0, help="Another seed draws other poses.")] = 0,
+    method: Annotated[str, typer.Option(help="How to search: paper or wide.")] = "paper",
+    angles: Annotated[
+        str, typer.Option(help="lattice: multiples of 20 degrees, as in the paper; continuous.")
+    ] = "lattice",
+    outside_limit: Annotated[
+        float, typer.Option(min=0.0, help=r"r \[pixel]; the paper's is 200.", metavar="R")
+    ] = 200.0,
+    candidates: Annotated[
+        int,
+        typer.Option(
+            min=1, help="How many candidates a node keeps; the paper's is 5.", metavar="K"
+        ),
+    ] = 5,
+    interval: Annotated[
+        float, typer.Option(min=1.0, max=90.0, help=r"Sampling interval \[deg]; the paper's is 20.")
+    ] = 20.0,
+    views: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="With continuous angles, refined between the samples: so many cameras."
+        ),
+    ] = None,
+    mismatch: Annotated[
+        bool,
+        typer.Option(
+            "--mismatch",
+            help="With --views: beside it a body whose widths and joints are not the model's.",
+        ),
+    ] = False,
+    edges: Annotated[
+        bool,
+        typer.Option(
+            "--edges",
+            help="With --method wide: what edges inside the silhouettes settle of what they leave "
+            "open (some seconds for each of these).",
+        ),
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for pictures; none without it.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """See help_texts.KAMEDA."""
+    with usage_errors():
+        EstimateSettings(method=method)
+    if angles not in ("lattice", "continuous"):
+        raise typer.BadParameter("must be lattice or continuous", param_hint="--angles")
+    if views is None and mismatch:
+        raise typer.BadParameter("needs --views", param_hint="--mismatch")
+    if edges and (method != "wide" or views is not None):
+        raise typer.BadParameter("needs --method wide, without --views", param_hint="--edges")
+    if views is None:
+        with errors_as_messages():
+            paper = (outside_limit, candidates)
+            _run_on_grid(images, seed, method, angles, interval, paper, edges, out, json)
+        return
+    if angles != "continuous" or out is not None:
+        raise typer.BadParameter(
+            "needs --angles continuous, and makes no pictures", param_hint="--views"
+        )
+    with errors_as_messages():
+        from drake_pose.apps.kameda_continuous import print_continuous, run_beside
+
+        print_continuous(run_beside(images, seed, views, mismatch), json)
+
+
+def _run_on_grid(
+    images: int,
+    seed: int,
+    method: str,
+    angles: str,
+    interval: float,
+    paper: tuple[float, int],
+    edges: bool,
+    out: Path | None,
+    json: bool,
+) -> None:
+    """Run the searches on a grid, the paper's with its r and K."""
+    from drake_pose.apps.kameda import (
+        PAPER_IMAGES,
+        experiment_search,
+        run_experiment,
+        wide_experiment_search,
+    )
+    from drake_pose.apps.kameda_edges import edge_lines, settle_by_edges
+    from drake_pose.apps.kameda_pictures import save_pictures
+    from drake_pose.apps.kameda_table import experiment_table
+    from drake_pose.apps.report import count_progress, output_console
+    from drake_pose.apps.result_folder import require_empty
+
+    if out is not None:
+        require_empty(out)
+    paper_images = images if method == "paper" else min(images, PAPER_IMAGES)
+    with count_progress("silhouettes, the paper's method", paper_images) as advance:
+        search = experiment_search(*paper, interval)
+        results = [run_experiment(search, paper_images, seed, angles, advance)]
+    beside: dict[str, object] = {}
+    if method == "wide":
+        beside["paper_method"] = results[0].as_json()
+        with count_progress("silhouettes, wide search", images) as advance:
+            wide = wide_experiment_search(interval)
+            results.append(run_experiment(wide, images, seed, angles, advance))
+    settled: dict[str, int] = {}
+    if edges:
+        with count_progress("silhouettes, edges", images) as advance:
+            settled = settle_by_edges(results[-1], advance)
+    if out is not None:
+        save_pictures(results[-1], out)
+    if json:
+        print_json({**results[-1].as_json(), **settled, **beside})
+        return
+    output_console().print(experiment_table(results))
+    if settled:
+        say(edge_lines(settled))

@@ -29,6 +29,9 @@ from drake_pose.matching.refinement_problem import RefinementProblem
 _PIXEL_VARIANCE = 1.0 / 12.0
 # Wrong pixels of a refined true pose, as a share of its contour's length; found on drawn bodies.
 _PIXEL_SHARE = 0.02
+# Other poses that have, after the first pass, more than so many times the tolerance above what they
+# may have are left.
+_HOPEFUL = 4.0
 
 
 @dataclass(frozen=True)
@@ -55,9 +58,9 @@ class IntervalSettings:
     confidence: float = 0.95
     widest_angle: float = np.radians(10.0)
     widest_length: float = 0.02
-    noise_factor: float = 2.0
+    noise_factor: float = 1.7
     tolerance: float = 0.03
-    misfit: float = 0.025
+    misfit: float = 0.03
     alternatives: int = 3
     same: float = 0.1
 
@@ -227,7 +230,10 @@ def _find_alternatives(
     def gather(starts: Sequence[np.ndarray], freedom: Freedom) -> None:
         still = problem.still(parameters, freedom.nodes)
         for start in starts:
-            refined, apart, _ = descend(problem, start, freedom, OTHER_PASSES, still)
+            refined, apart, _ = descend(problem, start, freedom, OTHER_PASSES[:1], still)
+            if apart > limit + _HOPEFUL * tolerance:
+                continue
+            refined, apart, _ = descend(problem, refined, freedom, OTHER_PASSES[1:], still)
             if apart <= 1.5 * limit:
                 J = problem.J(refined)
                 if J <= limit:

@@ -165,29 +165,6 @@ def clear_spans(border: Border, stride: int, free: np.ndarray) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def add_border_near(border: Border, discs: np.ndarray, lengths: np.ndarray) -> None:
-    """Adds about how long the border is within each disc.
-
-    A border crosses |sin| of its length in rows and |cos| in columns: 4 / pi on average.
-
-    Args:
-        border: the border.
-        discs: (n, 3) centres and radii [pixel].
-        lengths: (n,) added to [pixel].
-    """
-    for across in range(2):
-        starts = border.row_starts if across == 0 else border.column_starts
-        places = border.row_places if across == 0 else border.column_places
-        for line in range(starts.shape[0] - 1):
-            for k in range(starts[line], starts[line + 1]):
-                for d in range(discs.shape[0]):
-                    along = places[k] - discs[d, across]
-                    aside = line - discs[d, 1 - across]
-                    if along * along + aside * aside < discs[d, 2] ** 2:
-                        lengths[d] += math.pi / 4.0
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def add_apart_near(
     body: Border, border: Border, discs: np.ndarray, stride: int, areas: np.ndarray
 ) -> None:

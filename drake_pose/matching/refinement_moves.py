@@ -164,10 +164,6 @@ class PartSearch:
         """For each part the area (parts,) wrong in any view within the part's reach [pixel]."""
         return problem.apart_near(parameters, self._reaches(problem, parameters))
 
-    def contours_near(self, problem: RefinementProblem, parameters: np.ndarray) -> np.ndarray:
-        """For each part about the length (parts,) of silhouette borders in its reach [pixel]."""
-        return problem.border_near(self._reaches(problem, parameters))
-
     def _reaches(self, problem: RefinementProblem, parameters: np.ndarray) -> np.ndarray:
         """For each view a disc in the picture that each part stays in (views, parts, 3) [pixel]."""
         X_WN = self.body.poses(parameters)

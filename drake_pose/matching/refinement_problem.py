@@ -18,7 +18,6 @@ from drake_pose.matching.refinement_kernel import (
 from drake_pose.matching.refinement_lines import (
     Border,
     add_apart_near,
-    add_border_near,
     find_border,
 )
 from drake_pose.matching.refinement_placing import place_surfaces
@@ -136,17 +135,6 @@ class RefinementProblem:
         for sight, border, places in zip(self._sights, borders, discs, strict=True):
             add_apart_near(border, sight.border, places, _NEAR_STRIDE, areas)
         return areas
-
-    def border_near(self, discs: np.ndarray) -> np.ndarray:
-        """About the length (n,) of the silhouettes' borders in discs of all views [pixel].
-
-        Args:
-            discs: (views, n, 3) centres and radii [pixel].
-        """
-        lengths = np.zeros(discs.shape[1])
-        for sight, places in zip(self._sights, discs, strict=True):
-            add_border_near(sight.border, places, lengths)
-        return lengths
 
     def J(self, parameters: np.ndarray) -> int:
         """Pixels that body or silhouette covers, but not both, in all views together (1)."""

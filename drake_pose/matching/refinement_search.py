@@ -29,7 +29,6 @@ from drake_pose.matching.wide_settings import Stage, WideSearchSettings
 
 # No other start is searched on where one has led to so many times what is enough.
 _FAIR = 4.0
-_STEP = math.radians(20.0)
 
 
 def _grid(interval_deg: float, stage: Stage) -> WideSearchSettings:
@@ -43,6 +42,7 @@ _GRIDS = (
     _grid(20.0, Stage(60, 0.3, 5)),
     _grid(15.0, Stage(60, 1.0, 2)),
     _grid(15.0, Stage(60, 1.0, 2, whole_limbs=True)),
+    _grid(15.0, Stage(60, 0.3, 5, whole_limbs=True)),
 )
 
 
@@ -145,7 +145,7 @@ class Refiner:
         self.settings = settings or RefinementSettings()
         self.body = RefinementBody(tree)
         if grids is None:
-            grids = [tree.grid(i, _STEP) for i in range(len(tree.nodes))]
+            grids = [tree.grid(i, math.radians(20.0)) for i in range(len(tree.nodes))]
         self._parts = PartSearch(self.body, grids)
 
     def refine(

@@ -104,9 +104,45 @@ def test_refining_from_a_given_pose(tree):
         refiner.refine([view_of(tree, values)], [])
 
 
+def test_more_starts_are_asked_for_only_where_none_is_good(tree):
+    values = drawn_values(tree, np.random.default_rng(5))
+    view = view_of(tree, values)
+    bounds = [tree.value_bounds(i) for i in range(len(values))]
+    far = [np.where(2.0 * v > a + b, a, b) for v, (a, b) in zip(values, bounds, strict=True)]
+    refiner = Refiner(tree, RefinementSettings(intervals=None, escape=None))
+    asked = []
+
+    def others():
+        asked.append(1)
+        yield [values]
+        asked.append(2)
+        yield [far]
+
+    assert refiner.refine([view], [values], others=others()).E_total < 0.01
+    assert asked == []
+    alone, helped = refiner.refine([view], [far]), refiner.refine([view], [far], others=others())
+    assert alone.E_total > 0.1
+    assert helped.E_total < 0.01
+    assert asked == [1]
+
+
+def test_nothing_is_determined_where_the_body_does_not_fit(tree, search):
+    values = drawn_values(tree, np.random.default_rng(6))
+    view = view_of(tree, values)
+    assert any(joint.determined for joint in search.match([view]).pose_set.joints)
+    spoilt = view.mask.copy()
+    spoilt[5:60, 5:60] = True
+    joints = search.match([View(view.camera, spoilt)]).pose_set.joints
+    limits = np.concatenate([np.column_stack(tree.value_bounds(i)) for i in range(len(tree.nodes))])
+    assert not any(joint.determined for joint in joints)
+    np.testing.assert_allclose([(joint.low, joint.high) for joint in joints], limits)
+
+
 def test_bad_settings_are_refused(search):
     with pytest.raises(SettingsError, match="starts"):
         ContinuousSearchSettings(starts=0)
+    with pytest.raises(SettingsError, match="grid"):
+        ContinuousSearchSettings(grids=())
     with pytest.raises(SettingsError, match="enough"):
         RefinementSettings(enough=-1.0)
     with pytest.raises(SettingsError, match="view"):

@@ -34,6 +34,7 @@ from drake_pose.apps.settings import EstimateSettings
 from drake_pose.apps.summary import FrameRecord, check_same_job, describe_job, summarize
 from drake_pose.camera import Camera, ParallelCamera
 from drake_pose.errors import SettingsError
+from drake_pose.filtering import TrackingSettings
 from drake_pose.matching import MatchResult
 from drake_pose.matching.root_placement import scale_camera
 from drake_pose.matching.root_placement_search import PlacedMatch
@@ -120,7 +121,8 @@ def estimate_scene(
     job = describe_job(Path(scene), Path(model), settings)
     if recorded is not None and folder_path is not None:
         check_same_job(job, recorded, folder_path)
-    run = _Run(inputs, job, folder_path, recorded)
+    tracking = sequence_tracking(inputs.scene, inputs.search, settings.track)
+    run = _Run(inputs, job, folder_path, recorded, tracking)
     run.estimate(on_frame)
     if replay:
         run.write_replay()
@@ -136,8 +138,10 @@ class _Run:
         job: Mapping[str, Any],
         path: Path | None,
         recorded: Mapping[str, Any] | None,
+        tracking: TrackingSettings | None,
     ) -> None:
         self._inputs = inputs
+        self._tracking = tracking
         self._job = job
         self._with_base = _base_moves(inputs)
         self._folder = None
@@ -190,7 +194,7 @@ class _Run:
             inputs.cameras,
             frames,
             inputs.root_positions,
-            tracking=sequence_tracking(inputs.scene, inputs.search),
+            tracking=self._tracking,
         )
         period = _period(inputs.scene)
         simulator = Simulator(matching.diagram)

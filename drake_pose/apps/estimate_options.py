@@ -159,6 +159,15 @@ AnglesOption = Annotated[
         rich_help_panel=_SEARCH,
     ),
 ]
+TrackOption = Annotated[
+    bool,
+    typer.Option(
+        "--track/--no-track",
+        help="Whether the frames of a scene that is a sequence are tracked: matched first, and "
+        "after a loss. Otherwise every frame is matched on its own.",
+        rich_help_panel=_SEARCH,
+    ),
+]
 ResumeOption = Annotated[
     bool,
     typer.Option(

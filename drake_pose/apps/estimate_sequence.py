@@ -13,7 +13,9 @@ from drake_pose.systems.mask_player import DEFAULT_FRAME_RATE_HZ
 _USUAL_FRAME_RATE_HZ = 30.0
 
 
-def sequence_tracking(scene: Scene, search: PoseSearch) -> TrackingSettings | None:
+def sequence_tracking(
+    scene: Scene, search: PoseSearch, track: bool = True
+) -> TrackingSettings | None:
     """How the body of a scene is tracked; None where every frame is matched on its own.
 
     A sequence without a frame rate is taken as a video of 30 frames a second.
@@ -22,8 +24,9 @@ def sequence_tracking(scene: Scene, search: PoseSearch) -> TrackingSettings | No
         scene: the scene; one with ``sequence: true`` is tracked, unless its camera's scale is
             unknown: then the search finds it anew in every frame.
         search: what matches the first frame; where it finds the root's position, the track does.
+        track: whether frames that follow one another are tracked at all.
     """
-    if not scene.sequence or scene.scale_unknown:
+    if not track or not scene.sequence or scene.scale_unknown:
         return None
     tracking = TrackingSettings(root_moves=isinstance(search, RootPlacementSearch))
     if scene.frame_rate_hz is not None:

@@ -136,6 +136,10 @@ filter's own deviations are honest.
 
     drake-pose reproduce shimada --runs 20 --observed lines --out results/shimada
 
+[bold]Every truncation on the same sequences, side by side:[/bold]
+
+    drake-pose reproduce shimada --runs 20 --truncation all
+
 [bold]One view, stared at for 5,000 frames: the flaw that the authors state:[/bold]
 
     drake-pose reproduce shimada --runs 10 --static 5000
@@ -164,4 +168,19 @@ poses.csv, joint_centres.csv, TRC and MOT files, a summary that names bad camera
 [bold]Example:[/bold]
 
     drake-pose capture SCENE --out results/person
+""")
+
+WALK = _help("""
+Walk through a garden in the browser, as an avatar that moves like the captured person.
+
+The room of the capture is small, so where one stands in it is a command: facing right or left
+turns the view, standing ahead of or behind the first frame's place walks forward or backward.
+Plays a result of capture, a simulated person, or neither: then the arrow keys walk. The page can be
+opened on this machine alone.
+
+[bold]Example:[/bold]
+
+    drake-pose walk --simulate
+
+    drake-pose walk results/person
 """)

@@ -33,6 +33,7 @@ from drake_pose.apps.estimate_options import (
     RunLimitOption,
     SceneArgument,
     TimeLimitOption,
+    TrackOption,
     TruthOption,
 )
 from drake_pose.apps.kameda_command import kameda
@@ -51,6 +52,7 @@ from drake_pose.apps.terminal import (
     usage_errors,
     warn,
 )
+from drake_pose.apps.walk_command import walk
 from drake_pose.errors import ModelError
 
 app = typer.Typer(
@@ -109,6 +111,7 @@ def estimate(
     time_limit: TimeLimitOption = None,
     method: MethodOption = "wide",
     angles: AnglesOption = "continuous",
+    track: TrackOption = True,
     resume: ResumeOption = False,
     replay: ReplayOption = True,
     json: JsonOption = False,
@@ -131,6 +134,7 @@ def estimate(
             hold=parse_assignments(hold or (), "--hold"),
             method=method,
             angles=angles,
+            track=track,
         )
     interrupted = f"interrupted; the finished frames are in {out}; go on with --resume"
     with errors_as_messages(interrupted):
@@ -254,6 +258,7 @@ def undistort(
 
 
 app.command(name="capture", help=help_texts.CAPTURE)(capture)
+app.command(name="walk", help=help_texts.WALK)(walk)
 reproduce_app.command(name="kameda", help=help_texts.KAMEDA)(kameda)
 reproduce_app.command(name="shimada", help=help_texts.SHIMADA)(shimada)
 reproduce_app.command(name="date", help=help_texts.DATE)(date)

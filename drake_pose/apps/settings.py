@@ -43,6 +43,7 @@ class EstimateSettings:
         method: ``wide``: many hypotheses side by side; ``paper``: the search as it was published.
         angles: ``continuous``: refined between the samples; ``grid``: multiples of the interval
             alone, as always with the method ``paper``. Of the method ``wide`` alone.
+        track: whether frames of a sequence are tracked; else every one is matched on its own.
 
     Raises:
         SettingsError: if there is no such method, an option belongs to the other one, or a count
@@ -64,6 +65,7 @@ class EstimateSettings:
     hold: Mapping[str, float] = field(default_factory=dict)
     method: str = "wide"
     angles: str = "continuous"
+    track: bool = True
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -114,6 +114,31 @@ class ExperimentResult:
         return table
 
 
+@dataclass(frozen=True)
+class ComparedTruncations:
+    """The same sequences filtered with every truncation, by the names of ``TRUNCATIONS``."""
+
+    results: Mapping[str, ExperimentResult]
+
+    def as_json(self) -> dict[str, object]:
+        """What each result says, by truncation."""
+        return {name: result.as_json() for name, result in self.results.items()}
+
+    def table(self) -> Table:
+        """The figures of all truncations and both cases, side by side."""
+        observed = next(iter(self.results.values())).observed
+        table = Table(title=f"Shimada, synthetic hand: all truncations, {observed} observation")
+        table.add_column("figure (at t = 55 where nothing is said)")
+        columns = []
+        for name, result in self.results.items():
+            for key in CASES:
+                table.add_column(f"{name}\n{key}", justify="right")
+                columns.append(_figures(result.trials[key]))
+        for key, (label, form) in _LABELS.items():
+            table.add_row(escape(label), *(form.format(column[key]) for column in columns))
+        return table
+
+
 _LABELS = {
     "length_error_mean": ("length error, mean [pixel]", "{:.2f}"),
     "length_error_p95": ("  95th percentile", "{:.2f}"),
@@ -172,6 +197,35 @@ def run_experiment(
                 progress(place * runs + run + 1)
         trials[key] = tuple(case)
     return ExperimentResult(trials, seed, settings, observed)
+
+
+def compare_truncations(
+    runs: int = 50,
+    seed: int = 0,
+    observed: str = "full",
+    progress: Callable[[int], None] | None = None,
+) -> ComparedTruncations:
+    """Run the experiment with every truncation, on the same sequences.
+
+    Args:
+        runs: of each case and truncation; the others are those of ``run_experiment``.
+        seed: as there.
+        observed: as there.
+        progress: called with the number of sequences done after each, all truncations counted.
+
+    Raises:
+        SettingsError: if an argument is not one of these.
+    """
+    results: dict[str, ExperimentResult] = {}
+    for place, truncation in enumerate(TRUNCATIONS):
+        before = place * runs * len(CASES)
+
+        def advance(done: int, before: int = before) -> None:
+            if progress is not None:
+                progress(before + done)
+
+        results[truncation] = run_experiment(runs, seed, truncation, observed, advance)
+    return ComparedTruncations(results)
 
 
 def experiment_settings(truncation: str, iterations: int | None = None) -> FilterSettings:

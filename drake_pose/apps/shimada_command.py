@@ -10,6 +10,8 @@ import typer
 from drake_pose.apps.estimate_options import JsonOption
 from drake_pose.apps.terminal import errors_as_messages, print_json
 
+_ALL = "all"
+
 
 def shimada(
     runs: Annotated[
@@ -17,7 +19,10 @@ def shimada(
     ] = 50,
     seed: Annotated[int, typer.Option(min=0, help="Another seed draws other sequences.")] = 0,
     truncation: Annotated[
-        str, typer.Option(help="sequential (the paper's), joint, clip or none.")
+        str,
+        typer.Option(
+            help="sequential (the paper's), joint, clip, none; or all of them, side by side."
+        ),
     ] = "joint",
     observed: Annotated[
         str, typer.Option(help="full: all points and lines; lines: knuckles hidden.")
@@ -44,20 +49,32 @@ def shimada(
     """See help_texts.SHIMADA."""
     if static is not None and out is not None:
         raise typer.BadParameter("makes no plots; leave --out away", param_hint="--static")
+    if truncation == _ALL and (static is not None or out is not None):
+        raise typer.BadParameter("all goes without --static and --out", param_hint="--truncation")
     with errors_as_messages():
         from drake_pose.apps.report import count_progress, output_console
         from drake_pose.apps.result_folder import require_empty
-        from drake_pose.apps.shimada import CASES, ExperimentResult, run_experiment
+        from drake_pose.apps.shimada import (
+            CASES,
+            ComparedTruncations,
+            ExperimentResult,
+            compare_truncations,
+            run_experiment,
+        )
         from drake_pose.apps.shimada_pictures import save_pictures
         from drake_pose.apps.shimada_static import MARKS, StaticResult, run_static_experiment
+        from drake_pose.filtering.truncated_filter import TRUNCATIONS
 
-        result: ExperimentResult | StaticResult
+        result: ExperimentResult | ComparedTruncations | StaticResult
         if static is not None:
             marks = (*(mark for mark in MARKS if mark < static), static)
             with count_progress("views", runs) as advance:
                 result = run_static_experiment(
                     runs, seed, truncation, observed, start, marks, advance
                 )
+        elif truncation == _ALL:
+            with count_progress("sequences", runs * len(CASES) * len(TRUNCATIONS)) as advance:
+                result = compare_truncations(runs, seed, observed, advance)
         else:
             if out is not None:
                 require_empty(out)

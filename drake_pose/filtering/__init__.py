@@ -1,5 +1,6 @@
 """Belief within limits: a Kalman filter whose estimates respect linear inequalities."""
 
+from drake_pose.filtering.axis_observation import AxisObservation
 from drake_pose.filtering.contour_observation import (
     ContourMeasurement,
     ContourObservation,
@@ -42,6 +43,7 @@ from drake_pose.filtering.views import Stare, View
 __all__ = [
     "TRACKED",
     "Axis",
+    "AxisObservation",
     "AxisObserver",
     "AxisSettings",
     "Belief",

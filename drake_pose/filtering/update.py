@@ -64,6 +64,48 @@ class Updated:
     iterations: int
 
 
+@dataclass(frozen=True, eq=False)
+class _Weighed:
+    """An observation model with the noise of one measurement."""
+
+    model: ObservationModel
+    variances: Array
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.model.names
+
+    @property
+    def wraps(self) -> NDArray[np.bool_]:
+        return self.model.wraps
+
+    def predict(self, x: Array) -> tuple[Array, Array]:
+        return self.model.predict(x)
+
+    def mirrors(self, belief: Belief) -> list[Array]:
+        return self.model.mirrors(belief)
+
+
+def with_variances(model: ObservationModel, y: Array, variances: Array) -> ObservationModel:
+    """The same model for one measurement whose noise is its own.
+
+    Args:
+        model: what is measured.
+        y: (m,) the measurement, NaN where occluded.
+        variances: (m,) of its noise; those of what is occluded do not matter.
+
+    Raises:
+        SettingsError: wrong sizes, or a variance of something measured that is not positive.
+    """
+    check_measurement(y, model)
+    check_measurement(variances, model)
+    bad = np.isfinite(y) & ~(variances > 0)
+    if bad.any():
+        name = model.names[int(np.flatnonzero(bad)[0])]
+        raise SettingsError(f"the variance of measurement '{name}' must be positive")
+    return _Weighed(model, np.where(np.isfinite(variances), variances, model.variances))
+
+
 def check_measurement(y: Array, model: ObservationModel) -> Array:
     """(m,) a measurement, NaN where occluded.
 

@@ -79,8 +79,8 @@ class PoseSet:
     Args:
         families: best first; of equals the larger one first.
         joints: each value of the pose tree, node after node, over all families.
-        tolerance: what the search ranks poses by, J or a cost of the edges, may be so much above the
-            best pose's [pixel].
+        tolerance: what the search ranks poses by, J or a cost of the edges, may be so much above
+            the best pose's [pixel].
         complete: whether no pose within the tolerance was left out (on the grid, for a search on
             a grid).
         family_count: how many families there are; ``families`` may hold only the first of them.

@@ -1,9 +1,15 @@
 """The estimators as Drake systems, and ready diagrams of them."""
 
+from drake_pose.systems.axis_sensor import AxisSensor, BodyBelief, StateMatcher
 from drake_pose.systems.diagrams import (
     MatchingDiagram,
     build_recorded_matching,
     build_simulated_matching,
+)
+from drake_pose.systems.hand_tracking import (
+    HandTracking,
+    add_hand_tracking,
+    build_hand_tracking,
 )
 from drake_pose.systems.mask_player import MaskPlayer
 from drake_pose.systems.person_tracker import PersonTracker, build_person_capture
@@ -11,10 +17,14 @@ from drake_pose.systems.silhouette_matcher import STATISTICS, SilhouetteMatcher
 from drake_pose.systems.silhouette_tracker import TRACK, SilhouetteTracker
 from drake_pose.systems.skin import MeshcatSkin, SkinPoser, add_meshcat_skin, add_skin
 from drake_pose.systems.truncated_ekf import TruncatedEkf
+from drake_pose.systems.walk import Walker, WalkKeys, WalkView, build_walk
 
 __all__ = [
     "STATISTICS",
     "TRACK",
+    "AxisSensor",
+    "BodyBelief",
+    "HandTracking",
     "MaskPlayer",
     "MatchingDiagram",
     "MeshcatSkin",
@@ -22,10 +32,17 @@ __all__ = [
     "SilhouetteMatcher",
     "SilhouetteTracker",
     "SkinPoser",
+    "StateMatcher",
     "TruncatedEkf",
+    "WalkKeys",
+    "WalkView",
+    "Walker",
+    "add_hand_tracking",
     "add_meshcat_skin",
     "add_skin",
+    "build_hand_tracking",
     "build_person_capture",
     "build_recorded_matching",
     "build_simulated_matching",
+    "build_walk",
 ]

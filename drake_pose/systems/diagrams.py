@@ -20,7 +20,7 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
-from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
+from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, OutputPort
 from pydrake.systems.primitives import LogVectorOutput, TrajectorySource, VectorLogSink
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 from pydrake.systems.sensors import RgbdSensor
@@ -138,6 +138,40 @@ def build_simulated_matching(
     builder = DiagramBuilder()
     model = search.tree.model
     scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
+    matcher = builder.AddNamedSystem(
+        "silhouette_matcher", _make_matcher(search, cameras, period, tracking)
+    )
+    truth, images = add_simulated_cameras(builder, scene_graph, model, cameras, true_positions)
+    for camera, image in zip(cameras, images, strict=True):
+        builder.Connect(image, matcher.GetInputPort(label_image_port(camera, cameras)))
+    if meshcat is not None:
+        add_posed_body(builder, scene_graph, model, matcher, "estimated", ESTIMATE_COLOUR)
+        MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
+        estimate = matcher.GetOutputPort("estimated_positions")
+        add_meshcat_skin(builder, meshcat, model, truth, "true")
+        add_meshcat_skin(builder, meshcat, model, estimate, "estimated", ESTIMATE_COLOUR)
+    return _finish(builder, matcher, period, None)
+
+
+def add_simulated_cameras(
+    builder: DiagramBuilder,
+    scene_graph: SceneGraph,
+    model: ArticulatedModel,
+    cameras: Sequence[Camera],
+    true_positions: Trajectory | np.ndarray,
+) -> tuple[OutputPort, list[OutputPort]]:
+    """Add a body that moves on a given trajectory, and RgbdSensors that see it.
+
+    Args:
+        builder: the diagram under construction.
+        scene_graph: where the body's geometry goes.
+        model: the body.
+        cameras: where the sensors are.
+        true_positions: the body's positions (nq,), constant or over time.
+
+    Returns:
+        The port of the positions, and that of each camera's label image.
+    """
     if isinstance(true_positions, np.ndarray):
         true_positions = PiecewisePolynomial(true_positions.reshape(-1, 1))
     truth = builder.AddNamedSystem("true_positions", TrajectorySource(true_positions))
@@ -148,9 +182,7 @@ def build_simulated_matching(
     _pose_plant(builder, scene_graph, plant, truth.get_output_port(), "true")
     labels = {name: label for label, name in enumerate(model.link_names)}
     add_skin(builder, scene_graph, model, truth.get_output_port(), "true", labels)
-    matcher = builder.AddNamedSystem(
-        "silhouette_matcher", _make_matcher(search, cameras, period, tracking)
-    )
+    images = []
     for camera in cameras:
         colour_camera, depth_camera, X_WC = _drake_camera(camera, model, true_positions)
         sensor = builder.AddNamedSystem(
@@ -158,17 +190,8 @@ def build_simulated_matching(
             RgbdSensor(scene_graph.world_frame_id(), X_WC, colour_camera, depth_camera),
         )
         builder.Connect(scene_graph.get_query_output_port(), sensor.query_object_input_port())
-        builder.Connect(
-            sensor.label_image_output_port(),
-            matcher.GetInputPort(label_image_port(camera, cameras)),
-        )
-    if meshcat is not None:
-        add_posed_body(builder, scene_graph, model, matcher, "estimated", ESTIMATE_COLOUR)
-        MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
-        estimate = matcher.GetOutputPort("estimated_positions")
-        add_meshcat_skin(builder, meshcat, model, truth.get_output_port(), "true")
-        add_meshcat_skin(builder, meshcat, model, estimate, "estimated", ESTIMATE_COLOUR)
-    return _finish(builder, matcher, period, None)
+        images.append(sensor.label_image_output_port())
+    return truth.get_output_port(), images
 
 
 def _make_matcher(
@@ -209,17 +232,17 @@ def add_posed_body(
     builder: DiagramBuilder,
     scene_graph: SceneGraph,
     model: ArticulatedModel,
-    matcher: SilhouetteMatcher,
+    estimator: LeafSystem,
     name: str,
     colour: Rgba | None = None,
 ) -> MultibodyPlant:
-    """Add a body that stands as the matcher estimates, for the eye only: no sensor sees it.
+    """Add a body that stands as is estimated, for the eye only: no sensor sees it.
 
     Args:
         builder: the diagram under construction.
         scene_graph: where the body's geometry goes.
         model: the body.
-        matcher: gives the positions.
+        estimator: its output ``estimated_positions`` poses the body.
         name: prefix of the body's name in the SceneGraph.
         colour: in place of the body's own colours.
 
@@ -229,7 +252,7 @@ def add_posed_body(
     plant = MultibodyPlant(0.0)
     plant.RegisterAsSourceForSceneGraph(scene_graph)
     model.add_to(plant, scene_graph, prefix=name)
-    _pose_plant(builder, scene_graph, plant, matcher.GetOutputPort("estimated_positions"), name)
+    _pose_plant(builder, scene_graph, plant, estimator.GetOutputPort("estimated_positions"), name)
     source = plant.get_source_id()
     inspector = scene_graph.model_inspector()
     for index in range(plant.num_bodies()):

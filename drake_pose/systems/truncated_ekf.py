@@ -9,6 +9,7 @@ from scipy.stats import chi2
 
 from drake_pose.errors import SettingsError
 from drake_pose.filtering import Belief, FilterState, ObservationModel, TruncatedFilter, make_belief
+from drake_pose.filtering.update import with_variances
 from drake_pose.systems.filter_packing import FilterPacking, require_time_forward
 
 Array = NDArray[np.float64]
@@ -27,7 +28,9 @@ class TruncatedEkf(LeafSystem):
         name: TruncatedEkf
         input_ports:
         - measurement (optional)
+        - measurement_variances (optional)
         - reset_state (optional)
+        - restart (optional)
         output_ports:
         - estimated_state
         - covariance
@@ -38,6 +41,8 @@ class TruncatedEkf(LeafSystem):
 
     A periodic update predicts and uses the measurement: NaN where something is occluded; all NaN,
     or an unconnected port, where a camera is late or missing, which leaves the prediction.
+    ``measurement_variances`` are those of this one's noise, finite where it is; the observation
+    model's own where the port is not connected.
 
     - ``estimated_state`` (n), ``covariance`` (n x n, row by row): of the heaviest hypothesis.
     - ``hypothesis_weights`` (cap), ``hypothesis_states`` (cap x n, row by row): the heaviest
@@ -46,9 +51,9 @@ class TruncatedEkf(LeafSystem):
     - ``statistics``: see ``STATISTICS``. ``lost`` is 1 while measurements have been as unlikely
       as one in a million for several steps.
 
-    At the first update, and while the track is lost, the filter starts again from ``reset_state``
-    (n), for example from a matcher, if all its elements are finite; with the covariance of the
-    belief given here.
+    At the first update, while the track is lost, and whenever ``restart`` (1) is not 0, the filter
+    starts again from ``reset_state`` (n), for example from a matcher, if all its elements are
+    finite; with the covariance of the belief given here.
 
     Args:
         belief_filter: says what is estimated, from what, and inside which limits.
@@ -83,6 +88,7 @@ class TruncatedEkf(LeafSystem):
         packed = self._packing.pack(belief_filter.start(self._start))
         self._declare_measurement()
         self._reset = self.DeclareVectorInputPort("reset_state", self._n)
+        self._restart = self.DeclareVectorInputPort("restart", 1)
         self._belief, self._stare, self._view = (self.DeclareDiscreteState(p) for p in packed)
         # The statistics, how many unlikely measurements there were in a row, the last time.
         self._record = self.DeclareDiscreteState(np.r_[0.0, 1.0, 0.0, 0.0, 0.0, 0.0, -math.inf])
@@ -93,14 +99,17 @@ class TruncatedEkf(LeafSystem):
     def _declare_measurement(self) -> None:
         size = len(self.filter.observation.names)
         self._measurement = self.DeclareVectorInputPort("measurement", size)
+        self._variances = self.DeclareVectorInputPort("measurement_variances", size)
 
-    def _measure(
-        self, context: Context, prediction: FilterState
-    ) -> tuple[Array, ObservationModel | None]:
+    def _measure(self, context: Context) -> tuple[Array, ObservationModel | None]:
         """What is measured now, and with what model if not the filter's own."""
-        if self._measurement.HasValue(context):
-            return np.array(self._measurement.Eval(context)), None
-        return np.full(len(self.filter.observation.names), np.nan), None
+        if not self._measurement.HasValue(context):
+            return np.full(len(self.filter.observation.names), np.nan), None
+        y = np.array(self._measurement.Eval(context))
+        if not self._variances.HasValue(context):
+            return y, None
+        variances = np.array(self._variances.Eval(context))
+        return y, with_variances(self.filter.observation, y, variances)
 
     def _declare_outputs(self) -> None:
         n = self._n
@@ -143,14 +152,17 @@ class TruncatedEkf(LeafSystem):
         require_time_forward(self, context, record[6])
         first, lost, unlikely = record[0] == 0, record[4] > 0, int(record[5])
         fresh = first
-        if (first or lost) and self._reset.HasValue(context):
+        wanted = first or lost
+        if self._restart.HasValue(context):
+            wanted = wanted or self._restart.Eval(context)[0] != 0
+        if wanted and self._reset.HasValue(context):
             mean = np.array(self._reset.Eval(context))
             if np.isfinite(mean).all():
                 state = self.filter.start(Belief(mean, self._start.covariance))
                 fresh, unlikely = True, 0
         if not fresh:
             state = self.filter.predict(state)
-        y, model = self._measure(context, state)
+        y, model = self._measure(context)
         state = self.filter.update(state, y, model)
         if state.count:
             limit = chi2.ppf(1 - _LOSS_PROBABILITY, state.count)

@@ -1,9 +1,12 @@
+import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from drake_pose.apps.estimate import estimate_scene
 from drake_pose.apps.estimate_sequence import sequence_tracking
+from drake_pose.apps.main import app
 from drake_pose.apps.settings import EstimateSettings
 from drake_pose.filtering import TRACKED
 from drake_pose.matching.root_placement_search import RootPlacementSearch
@@ -42,6 +45,42 @@ def test_stills_are_matched_one_by_one(tmp_path: Path) -> None:
     assert all(record.stopped_by != TRACKED for record in result.records.values())
 
 
+def test_a_sequence_need_not_be_tracked(tmp_path: Path) -> None:
+    """Unrelated stills whose scene.yaml says otherwise: as if it did not."""
+    said = write_sequence(tmp_path / "said", "sequence: true\nframe_rate_hz: 30\n")
+    stills = write_sequence(tmp_path / "stills", "sequence: false\n")
+    found = []
+    for scene, track in ((said, False), (stills, True)):
+        settings = EstimateSettings(
+            interval=20.0, method="paper", frames=("0000", "0001"), track=track
+        )
+        result = estimate_scene(scene.folder, scene.model, settings=settings, replay=False)
+        assert all(record.stopped_by != TRACKED for record in result.records.values())
+        assert result.summary["settings"]["track"] is track
+        found.append([row.q for row in result.rows])
+    np.testing.assert_array_equal(found[0], found[1])
+
+
+def test_the_command_has_the_option(tmp_path: Path) -> None:
+    scene = write_sequence(tmp_path / "scene", "sequence: true\nframe_rate_hz: 30\n")
+    made = {}
+    for option in ("--track", "--no-track"):
+        out = tmp_path / option
+        with pytest.raises(SystemExit) as ended:
+            app(
+                [
+                    *("estimate", str(scene.folder), "--model", str(scene.model)),
+                    *("--out", str(out), "--method", "paper", "--interval", "20"),
+                    *("--frame", "0000:0002", "--no-replay", option),
+                ]
+            )
+        assert ended.value.code == 0
+        frames = json.loads((out / "summary.json").read_text())["frames"]
+        made[option] = sum(frame["stopped_by"] == TRACKED for frame in frames.values())
+    assert made["--track"] >= 2
+    assert made["--no-track"] == 0
+
+
 def test_how_a_scene_is_tracked(tiny_scene: TinyScene) -> None:
     def scene_with(text: str) -> Scene:
         (tiny_scene.folder / "scene.yaml").write_text(text)
@@ -57,6 +96,7 @@ def test_how_a_scene_is_tracked(tiny_scene: TinyScene) -> None:
     assert slow is not None
     # The diagram plays a frame a second; the motion of a step must be the same.
     assert slow.angle_acceleration * 1.0**2 == known.angle_acceleration / 30**2
+    assert sequence_tracking(video, search, track=False) is None
     moved = sequence_tracking(video, RootPlacementSearch.__new__(RootPlacementSearch))
     assert moved is not None
     assert moved.root_moves

@@ -1,11 +1,20 @@
+import json
+
 import numpy as np
 import pytest
 
-from drake_pose.apps.shimada import CASES, experiment_filter, run_experiment
+from drake_pose.apps.main import app
+from drake_pose.apps.shimada import (
+    CASES,
+    compare_truncations,
+    experiment_filter,
+    run_experiment,
+)
 from drake_pose.apps.shimada_motion import FRAMES, OBSERVED, make_sequence, true_states
 from drake_pose.apps.shimada_pictures import save_pictures
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.hand_observation import HAND_STATE, LENGTHS, MEASURED, HandObservation
+from drake_pose.filtering.truncated_filter import TRUNCATIONS
 
 KEYS = {
     "length_error_mean",
@@ -152,3 +161,33 @@ def test_bad_arguments_are_named(bad, word):
     with pytest.raises(SettingsError, match=word):
         run_experiment(**bad)
     assert OBSERVED == ("full", "lines")
+
+
+def test_all_truncations_side_by_side(capsys):
+    with pytest.raises(SystemExit) as ended:
+        app(["reproduce", "shimada", "--runs", "2", "--truncation", "all", "--json"])
+    assert ended.value.code == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert list(figures) == list(TRUNCATIONS)
+    for truncation, result in figures.items():
+        assert result["truncation"] == truncation
+        assert all(set(result[key]) >= KEYS for key in CASES)
+    alone = run_experiment(runs=2, truncation="sequential").as_json()
+    for key in CASES:
+        assert figures["sequential"][key]["angle_rmse"] == pytest.approx(alone[key]["angle_rmse"])
+    assert len({result["r13_35"]["length_error_mean"] for result in figures.values()}) == 4
+
+
+def test_the_table_of_all_truncations_has_a_column_for_each():
+    done = []
+    table = compare_truncations(runs=1, observed="lines", progress=done.append).table()
+    assert done == list(range(1, 9))
+    assert len(table.columns) == 1 + len(TRUNCATIONS) * len(CASES)
+
+
+@pytest.mark.parametrize("other", [("--static", "5"), ("--out", "somewhere")])
+def test_all_truncations_make_no_pictures(other, capsys):
+    with pytest.raises(SystemExit) as ended:
+        app(["reproduce", "shimada", "--truncation", "all", *other])
+    assert ended.value.code == 2
+    assert "--truncation" in capsys.readouterr().err

@@ -137,6 +137,44 @@ def test_a_loss_is_said_and_a_reset_mends_it(sequence):
     np.testing.assert_allclose(estimate[:2], sequence.states[-1, :2], atol=3)
 
 
+def test_restart_starts_again_although_nothing_is_lost(sequence):
+    f, _ = experiment_filter()
+    ekf = TruncatedEkf(f, sequence.guess, PERIOD)
+    context = ekf.CreateDefaultContext()
+    wanted, moved = sequence.states[0][0], sequence.states[0].copy()
+
+    def step(t, restart):
+        context.SetTime(t)
+        ekf.GetInputPort("restart").FixValue(context, [restart])
+        ekf.GetInputPort("reset_state").FixValue(context, moved)
+        context.get_mutable_discrete_state().SetFrom(ekf.EvalUniquePeriodicDiscreteUpdate(context))
+        return ekf.GetOutputPort("estimated_state").Eval(context)[0]
+
+    assert step(0.0, 0.0) == pytest.approx(wanted)
+    # The hand moves on at its rate.
+    moved[0] += 100.0
+    assert step(1.0, 0.0) == pytest.approx(wanted, abs=10.0)
+    assert step(2.0, 1.0) == pytest.approx(wanted + 100.0)
+
+
+def test_a_frame_can_bring_its_own_noise(sequence):
+    """The same measurement, once as sure as the model says and once ten times less."""
+    f, observation = experiment_filter()
+    deviations = []
+    for factor in (None, 1.0, 100.0):
+        ekf = TruncatedEkf(f, sequence.guess, PERIOD)
+        context = ekf.CreateDefaultContext()
+        ekf.GetInputPort("measurement").FixValue(context, sequence.measurements[0])
+        if factor is not None:
+            port = ekf.GetInputPort("measurement_variances")
+            port.FixValue(context, factor * observation.variances)
+        context.get_mutable_discrete_state().SetFrom(ekf.EvalUniquePeriodicDiscreteUpdate(context))
+        covariance = ekf.GetOutputPort("covariance").Eval(context).reshape(len(HAND_STATE), -1)
+        deviations.append(np.sqrt(np.diag(covariance)))
+    np.testing.assert_array_equal(deviations[0], deviations[1])
+    assert (deviations[2][:2] > 2 * deviations[1][:2]).all()
+
+
 def test_bad_settings_are_refused(sequence):
     f, _ = experiment_filter()
     with pytest.raises(SettingsError, match="period"):

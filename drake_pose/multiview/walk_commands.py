@@ -1,0 +1,158 @@
+"""Walking through a place by gestures: commands from a stance, and the way walked (Date, table 1).
+
+The room where a person is captured is small, the place large. So where the person stands in the
+room is a command, not a place: facing right or left turns the view, standing ahead of or behind the
+rest place walks forward or backward.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.errors import SettingsError
+
+Array = NDArray[np.float64]
+
+NO_COMMAND = (0, 0)
+
+
+@dataclass(frozen=True)
+class WalkSettings:
+    """When a stance is a command, and how fast it is followed.
+
+    A command begins at one threshold and ends at a lower one, so that a person near it, or noise of
+    the capture, does not switch it on and off.
+
+    Args:
+        turn_begin, turn_end: how far the face is turned away from the rest direction [rad].
+        step_begin, step_end: how far the person stands from the rest place [m].
+        turn_rate: how fast the view turns [rad/s].
+        speed: how fast one walks [m/s].
+        body_radius: how near one comes to walls and objects [m].
+
+    Raises:
+        SettingsError: something is not positive, or a command ends beyond where it begins.
+    """
+
+    turn_begin: float = math.radians(25.0)
+    turn_end: float = math.radians(15.0)
+    step_begin: float = 0.18
+    step_end: float = 0.10
+    turn_rate: float = math.radians(40.0)
+    speed: float = 0.9
+    body_radius: float = 0.3
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        for name, value in vars(self).items():
+            if not (math.isfinite(value) and value > 0.0):
+                raise SettingsError(f"walking: {name} must be a positive number, not {value}")
+        for name in ("turn", "step"):
+            begin, end = getattr(self, f"{name}_begin"), getattr(self, f"{name}_end")
+            if end > begin:
+                raise SettingsError(f"walking: {name}_end {end} lies beyond {name}_begin {begin}")
+
+
+def stance_of(left_W: Array, head_W: Array, feet_W: Array) -> Array:
+    """How a person stands in the room.
+
+    Args:
+        left_W: (3,) the direction to the left of the face. The face's own direction would be
+            undefined where the person looks at the floor; this one stays level.
+        head_W: (3,) where the head is [m].
+        feet_W: (2, 3) where the feet are [m].
+
+    Returns:
+        (5,) the face's heading [rad] about the upward z axis, 0 along x; the head's x and y and the
+        x and y midway between the feet [m].
+    """
+    heading = math.atan2(-left_W[0], left_W[1])
+    return np.array([heading, *head_W[:2], *np.asarray(feet_W)[:, :2].mean(axis=0)])
+
+
+def offsets_from_rest(stance: Array, rest: Array) -> tuple[float, float]:
+    """How far a stance is from the one at rest.
+
+    Returns:
+        How far the face is turned to the left [rad], and how far ahead, in the rest's direction,
+        the person stands [m]: the lesser of the head's and the feet's way, 0 where they go
+        different ways. Leaning and reaching a foot out are thus no steps.
+    """
+    turned = stance[0] - rest[0]
+    turned = math.atan2(math.sin(turned), math.cos(turned))
+    forward = np.array([math.cos(rest[0]), math.sin(rest[0])])
+    head, feet = (stance[1:] - rest[1:]).reshape(2, 2) @ forward
+    ahead = math.copysign(min(abs(head), abs(feet)), head) if head * feet > 0.0 else 0.0
+    return turned, ahead
+
+
+def recognise_command(
+    stance: Array, rest: Array, last: tuple[int, int], settings: WalkSettings
+) -> tuple[int, int]:
+    """Table 1: the command that a stance gives.
+
+    Args:
+        stance, rest: (5,) from stance_of. A stance that is not finite, because the person was not
+            found, is no command: whoever is lost from sight stops.
+        last: the command before; see WalkSettings.
+        settings: the thresholds.
+
+    Returns:
+        Turning: 1 left, -1 right, 0 not; walking: 1 forward, -1 backward, 0 not.
+    """
+    if not np.isfinite(stance).all():
+        return NO_COMMAND
+    turned, ahead = offsets_from_rest(stance, rest)
+    return (
+        _switch(turned, last[0], settings.turn_begin, settings.turn_end),
+        _switch(ahead, last[1], settings.step_begin, settings.step_end),
+    )
+
+
+def follow_command(
+    pose: Array,
+    command: tuple[int, int],
+    seconds: float,
+    settings: WalkSettings,
+    half_size: float = math.inf,
+    obstacles: Array | None = None,
+) -> Array:
+    """The walker's pose in the place after a command was followed for a while.
+
+    Turning and walking at once is an exact arc of a circle. At a wall or an obstacle the walker
+    slides along.
+
+    Args:
+        pose: (3,) x, y [m] and heading [rad].
+        command: from recognise_command.
+        seconds: how long.
+        settings: how fast.
+        half_size: the place is a square about the origin; half its side [m].
+        obstacles: (n, 3) x, y and radius of round obstacles [m].
+
+    Returns:
+        (3,) the new pose, its heading in -pi..pi.
+    """
+    turn = command[0] * settings.turn_rate * seconds
+    middle = pose[2] + 0.5 * turn
+    chord = command[1] * settings.speed * seconds * float(np.sinc(0.5 * turn / math.pi))
+    place = pose[:2] + chord * np.array([math.cos(middle), math.sin(middle)])
+    for x, y, radius in np.empty((0, 3)) if obstacles is None else obstacles:
+        away = place - (x, y)
+        distance, allowed = float(np.linalg.norm(away)), radius + settings.body_radius
+        if 0.0 < distance < allowed:
+            place = place + away * (allowed / distance - 1.0)
+    limit = half_size - settings.body_radius
+    heading = math.atan2(math.sin(pose[2] + turn), math.cos(pose[2] + turn))
+    return np.array([*np.clip(place, -limit, limit), heading])
+
+
+def _switch(value: float, last: int, begin: float, end: float) -> int:
+    """1, -1 or 0: a value beyond a threshold, the lower one where it was so before."""
+    if last and value * last > end:
+        return last
+    return int(math.copysign(1, value)) if abs(value) >= begin else 0

@@ -1,0 +1,158 @@
+"""The place of the walk-through: a walled garden of simple shapes, drawn in Meshcat."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import Box, Cylinder, Ellipsoid, Meshcat, Rgba, Shape, Sphere
+from pydrake.math import RigidTransform, RollPitchYaw
+
+HALF_SIZE = 12.0
+"""Half the side of the garden [m]; the origin is its middle."""
+
+START = (-8.0, 0.0, 0.0)
+"""Where a walk begins: x, y [m] and heading [rad]."""
+
+_WALL_HEIGHT = 2.4
+_STONE = (0.76, 0.72, 0.65)
+_GATE = (0.85, 0.25, 0.10)
+_BARK = (0.36, 0.25, 0.16)
+_LEAVES = (0.18, 0.45, 0.20)
+_PATH = (0.82, 0.76, 0.62)
+_LAWN = (0.42, 0.60, 0.33)
+_WATER = (0.20, 0.45, 0.65)
+_LIGHTS = {
+    "AmbientLight": 1.6,
+    "FillLight": 1.6,
+    "PointLightNegativeX": 0.0,
+    "PointLightPositiveX": 0.0,
+}
+_GATES = (-4.0, -1.5, 4.0, 7.5)
+_TREES = ((3.5, 4.0), (6.5, -4.5), (-3.0, 5.5), (-6.5, -4.0), (-8.5, 7.5), (8.5, 8.0), (1.0, -7.0))
+_BALLS = ((2.5, -2.5, (0.95, 0.75, 0.10)), (-3.5, -1.5, (0.45, 0.20, 0.60)))
+
+
+@dataclass(frozen=True)
+class PlaceObject:
+    """An object of the place.
+
+    Args:
+        name: its path in Meshcat's tree.
+        shape: one of Drake's.
+        position: (x, y, z) of its middle [m].
+        colour: (r, g, b) in 0..1.
+        radius: one does not come nearer to its axis than this [m]; 0: one walks over or under it.
+    """
+
+    name: str
+    shape: Shape
+    position: tuple[float, float, float]
+    colour: tuple[float, float, float]
+    radius: float = 0.0
+
+
+def place_objects() -> tuple[PlaceObject, ...]:
+    """All objects: lawn, paths, walls, gates over the path, trees, balls, a fountain."""
+    return (*_ground(), *_walls(), *_gates(), *_trees(), *_things())
+
+
+def place_obstacles() -> NDArray[np.float64]:
+    """(n, 3) x, y and radius of what one cannot walk through [m]."""
+    return np.array([(*one.position[:2], one.radius) for one in place_objects() if one.radius])
+
+
+def draw_place(meshcat: Meshcat, path: str = "place") -> None:
+    """Draw the place, under a path of Meshcat's tree, below a sky."""
+    for one in place_objects():
+        here = f"{path}/{one.name}"
+        meshcat.SetObject(here, one.shape, Rgba(*one.colour))
+        meshcat.SetTransform(here, RigidTransform(one.position))
+    meshcat.SetProperty("/Grid", "visible", False)
+    meshcat.SetProperty("/Axes", "visible", False)
+    # Meshcat's point lights stand near the origin: daylight comes from far away.
+    for name, intensity in _LIGHTS.items():
+        meshcat.SetProperty(f"/Lights/{name}/<object>", "intensity", intensity)
+    meshcat.SetProperty("/Background", "top_color", [0.45, 0.65, 0.90])
+    meshcat.SetProperty("/Background", "bottom_color", [0.85, 0.92, 0.98])
+
+
+def look_over_shoulder(meshcat: Meshcat, pose: NDArray[np.float64]) -> None:
+    """Point the browser's view as the walker looks, from behind and above.
+
+    Args:
+        meshcat: whose view.
+        pose: (3,) x, y [m] and heading [rad] of the walker.
+    """
+    forward = np.array([math.cos(pose[2]), math.sin(pose[2]), 0.0])
+    ground = np.array([pose[0], pose[1], 0.0])
+    eye = np.clip(ground - 3.2 * forward, 0.3 - HALF_SIZE, HALF_SIZE - 0.3)
+    eye[2], target = 2.1, ground + 1.5 * forward + (0.0, 0.0, 1.1)
+    meshcat.SetCameraPose(eye, target)
+
+
+def walker_transform(pose: NDArray[np.float64], rest: NDArray[np.float64]) -> RigidTransform:
+    """X_PR: the room in the place, so that who stands at rest in it is where the walker is.
+
+    Args:
+        pose: (3,) x, y [m] and heading [rad] of the walker in the place.
+        rest: (5,) stance at rest in the room; the feet's place counts.
+    """
+    turn = RollPitchYaw(0.0, 0.0, pose[2] - rest[0])
+    X_PF = RigidTransform(turn, [pose[0], pose[1], 0.0])
+    return X_PF.multiply(RigidTransform([-rest[3], -rest[4], 0.0]))
+
+
+def _ground() -> list[PlaceObject]:
+    side = 2.0 * HALF_SIZE
+    return [
+        PlaceObject("lawn", Box(side, side, 0.1), (0.0, 0.0, -0.05), _LAWN),
+        PlaceObject("path_x", Box(side, 1.8, 0.02), (0.0, 0.0, 0.0), _PATH),
+        PlaceObject("path_y", Box(1.8, side, 0.02), (0.0, 0.0, 0.001), _PATH),
+    ]
+
+
+def _walls() -> list[PlaceObject]:
+    side, z = 2.0 * HALF_SIZE, 0.5 * _WALL_HEIGHT
+    long, deep = Box(side, 0.3, _WALL_HEIGHT), Box(0.3, side, _WALL_HEIGHT)
+    return [
+        PlaceObject("wall_left", long, (0.0, HALF_SIZE, z), _STONE),
+        PlaceObject("wall_right", long, (0.0, -HALF_SIZE, z), _STONE),
+        PlaceObject("wall_ahead", deep, (HALF_SIZE, 0.0, z), _STONE),
+        PlaceObject("wall_behind", deep, (-HALF_SIZE, 0.0, z), _STONE),
+    ]
+
+
+def _gates() -> list[PlaceObject]:
+    found = []
+    for index, x in enumerate(_GATES):
+        for side, y in (("left", 1.3), ("right", -1.3)):
+            name = f"gate_{index}_{side}"
+            found.append(PlaceObject(name, Cylinder(0.15, 2.8), (x, y, 1.4), _GATE, 0.15))
+        found.append(PlaceObject(f"gate_{index}_top", Box(0.3, 3.4, 0.25), (x, 0.0, 2.9), _GATE))
+    return found
+
+
+def _trees() -> list[PlaceObject]:
+    found = []
+    for index, (x, y) in enumerate(_TREES):
+        found.append(PlaceObject(f"trunk_{index}", Cylinder(0.18, 2.0), (x, y, 1.0), _BARK, 0.18))
+        crown = Ellipsoid(1.1, 1.1, 1.4)
+        found.append(PlaceObject(f"crown_{index}", crown, (x, y, 2.9), _LEAVES))
+    return found
+
+
+def _things() -> list[PlaceObject]:
+    balls = [
+        PlaceObject(f"ball_{index}", Sphere(0.5), (x, y, 0.5), colour, 0.5)
+        for index, (x, y, colour) in enumerate(_BALLS)
+    ]
+    x, y = -6.0, 3.0
+    fountain = [
+        PlaceObject("basin", Cylinder(1.3, 0.45), (x, y, 0.225), _STONE, 1.3),
+        PlaceObject("water", Cylinder(1.15, 0.02), (x, y, 0.46), _WATER),
+        PlaceObject("spout", Cylinder(0.12, 1.3), (x, y, 0.65), _STONE),
+    ]
+    return balls + fountain

@@ -29,6 +29,8 @@ from drake_pose.matching.wide_settings import Stage, WideSearchSettings
 
 # No other start is searched on where one has led to so many times what is enough.
 _FAIR = 4.0
+# Rounds agree where the worse one's J is no more than so many times the better one's.
+_AGREEING = 1.1
 
 
 def _grid(interval_deg: float, stage: Stage) -> WideSearchSettings:
@@ -166,7 +168,7 @@ class Refiner:
             escapes: how many of the refined poses are searched on by placing parts anew.
             deadline: what has begun then is ended by the shortest way (``time.perf_counter``).
             others: more poses to start from, taken one round after another while none has led to a
-                good pose.
+                good pose. Two rounds that end equally well end the search: the body fits no better.
 
         Raises:
             SettingsError: if there is no view or no start.
@@ -184,11 +186,13 @@ class Refiner:
             if more is None:
                 break
             poses = [self.body.parameters(start, root_position) for start in more]
-            if poses:
-                reached = min(
-                    (reached, self._descend_all(problem, poses, escapes, deadline)),
-                    key=lambda one: problem.J(one.parameters),
-                )
+            if not poses:
+                continue
+            again = self._descend_all(problem, poses, escapes, deadline)
+            least, most = sorted(problem.J(one.parameters) for one in (reached, again))
+            reached = min((reached, again), key=lambda one: problem.J(one.parameters))
+            if most <= _AGREEING * least:
+                break
         reached = self._descend_last(problem, reached, deadline)
         middle = time.perf_counter()
         intervals, settings = None, self.settings

@@ -87,7 +87,8 @@ def test_ctrl_c_keeps_finished_frames_and_the_job_can_be_resumed(tmp_path: Path)
     environment = {**os.environ, "COLUMNS": "200"}
     process = subprocess.Popen(
         command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env=environment,
+        # Whoever runs the tests in the background has the signal ignored, which children inherit.
+        env=environment, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     poses = out / "poses.csv"
     deadline = time.monotonic() + 120.0

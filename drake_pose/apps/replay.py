@@ -12,11 +12,11 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
-from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from drake_pose.body import ArticulatedModel
 from drake_pose.camera import Camera, PinholeCamera
 from drake_pose.systems import add_meshcat_skin
+from drake_pose.systems.posed_geometry import pose_plant
 
 _BODY_PATH = "visualizer"
 _CAMERA_COLOUR = Rgba(0.0, 0.45, 0.70, 1.0)
@@ -57,15 +57,8 @@ def make_replay(
     plant = MultibodyPlant(0.0)
     plant.RegisterAsSourceForSceneGraph(scene_graph)
     model.add_to(plant, scene_graph)
-    plant.Finalize()
     source = builder.AddNamedSystem("positions", ConstantVectorSource(positions[0]))
-    poser = builder.AddNamedSystem(
-        "geometry_pose", MultibodyPositionToGeometryPose(plant, input_multibody_state=False)
-    )
-    builder.Connect(source.get_output_port(), poser.get_input_port())
-    builder.Connect(
-        poser.get_output_port(), scene_graph.get_source_pose_port(plant.get_source_id())
-    )
+    pose_plant(builder, scene_graph, plant, source.get_output_port(), "geometry_pose")
     MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
     add_meshcat_skin(
         builder, meshcat, model, source.get_output_port(), "body", prefix=_BODY_PATH, recorded=True

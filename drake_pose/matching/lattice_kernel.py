@@ -10,19 +10,10 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from drake_pose.matching.wide_kernel import Reaches, count_bits, count_unreachable
+from drake_pose.matching.wide_kernel import Reaches, count_bits, count_unreachable, mix_bits
 
 _LOW_HALF = np.uint64(0xFFFFFFFF)
 _HALF = np.uint64(32)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _mix(number: np.uint64) -> np.uint64:
-    """A number scattered over all 64 bits (splitmix64)."""
-    number = number + np.uint64(0x9E3779B97F4A7C15)
-    number = (number ^ (number >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    number = (number ^ (number >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return number ^ (number >> np.uint64(31))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -74,16 +65,16 @@ def tell_apart(
                 if added != np.uint64(0):
                     code += (added & _LOW_HALF) * keys[2 * (begin + k)]
                     code += (added >> _HALF) * keys[2 * (begin + k) + 1]
-        likeness = _mix(code)
+        likeness = mix_bits(code)
         for j in range(open_nodes.shape[0]):
             k = open_nodes[j]
             p = c if k == node else poses[h, k]
-            likeness = _mix(likeness ^ np.uint64(p * poses.shape[1] + k))
+            likeness = mix_bits(likeness ^ np.uint64(p * poses.shape[1] + k))
         greatest, total = max(far[h, 0], pose_far[c]), far[h, 1] + pose_far[c]
         if total > 0:
-            likeness = _mix(likeness ^ np.uint64(greatest)) + _mix(np.uint64(total))
+            likeness = mix_bits(likeness ^ np.uint64(greatest)) + mix_bits(np.uint64(total))
         likeness |= np.uint64(1)
-        slot = np.int64(_mix(likeness) & np.uint64(size - 1))
+        slot = np.int64(mix_bits(likeness) & np.uint64(size - 1))
         while table[slot] != np.uint64(0) and table[slot] != likeness:
             slot = (slot + 1) & (size - 1)
         if table[slot] == np.uint64(0):

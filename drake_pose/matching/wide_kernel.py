@@ -112,7 +112,7 @@ def order_best(costs: np.ndarray, count: int) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _mix(number: np.uint64) -> np.uint64:
+def mix_bits(number: np.uint64) -> np.uint64:
     """A number scattered over all 64 bits (splitmix64)."""
     number = number + np.uint64(0x9E3779B97F4A7C15)
     number = (number ^ (number >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -127,7 +127,7 @@ def _find_likeness(
     """A number that tells by a code and by the poses of the nodes that have children to come."""
     for i in open_nodes:
         p = pose if i == node else poses[i]
-        code = _mix(code ^ np.uint64(p * poses.shape[0] + i))
+        code = mix_bits(code ^ np.uint64(p * poses.shape[0] + i))
     return code | np.uint64(1)
 
 
@@ -135,7 +135,7 @@ def _find_likeness(
 def _is_new(table: np.ndarray, likeness: np.uint64) -> bool:
     """Whether a number is not in a hash table yet (0: an empty slot); it is then."""
     last = table.shape[0] - 1
-    slot = np.int64(_mix(likeness) & np.uint64(last))
+    slot = np.int64(mix_bits(likeness) & np.uint64(last))
     while table[slot] != np.uint64(0):
         if table[slot] == likeness:
             return False

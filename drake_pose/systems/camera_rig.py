@@ -11,7 +11,6 @@ from pydrake.geometry import MakeRenderEngineVtk, RenderEngineVtkParams, SceneGr
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import PassThrough, TrajectorySource
-from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 from pydrake.systems.sensors import RgbdSensor
 from pydrake.trajectories import Trajectory
 
@@ -19,6 +18,7 @@ from drake_pose.body import ArticulatedModel
 from drake_pose.camera import PinholeCamera
 from drake_pose.errors import CameraError, UnknownNameError
 from drake_pose.silhouette import label_image_to_mask
+from drake_pose.systems.posed_geometry import pose_plant
 
 _RENDERER = "rig_renderer"
 # What 16 bits of millimetres can hold; nothing of a room is farther away [m].
@@ -31,8 +31,8 @@ class CameraRig:
 
     The diagram's input ``positions`` (nq) poses the body, or a trajectory does. Its outputs are
     ``color_image_<camera>``, ``label_image_<camera>`` and ``depth_image_<camera>``; an image is
-    rendered when it is asked for. Render in one thread only (drake-notes: an engine first used in
-    another thread gives wrong images).
+    rendered when it is asked for. Render in one thread only: an engine first used in
+    another thread gives wrong images.
 
     Args:
         diagram: the whole diagram.
@@ -100,20 +100,14 @@ def build_camera_rig(
     plant.RegisterAsSourceForSceneGraph(scene_graph)
     model.add_to(plant, scene_graph)
     sensors = add_cameras(builder, scene_graph, cameras, background)
-    plant.Finalize()
-    poser = builder.AddNamedSystem(
-        "geometry_pose", MultibodyPositionToGeometryPose(plant, input_multibody_state=False)
-    )
-    builder.Connect(
-        poser.get_output_port(), scene_graph.get_source_pose_port(plant.get_source_id())
-    )
     if true_positions is None:
-        entrance = builder.AddNamedSystem("positions", PassThrough(plant.num_positions()))
+        entrance = builder.AddNamedSystem("positions", PassThrough(model.plant.num_positions()))
         builder.ExportInput(entrance.get_input_port(), "positions")
-        builder.Connect(entrance.get_output_port(), poser.get_input_port())
+        positions = entrance.get_output_port()
     else:
         source = builder.AddNamedSystem("true_positions", TrajectorySource(true_positions))
-        builder.Connect(source.get_output_port(), poser.get_input_port())
+        positions = source.get_output_port()
+    pose_plant(builder, scene_graph, plant, positions, "geometry_pose")
     return CameraRig(builder.Build(), dict(cameras), sensors)
 
 

@@ -22,7 +22,6 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, OutputPort
 from pydrake.systems.primitives import LogVectorOutput, TrajectorySource, VectorLogSink
-from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 from pydrake.systems.sensors import RgbdSensor
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
@@ -32,6 +31,7 @@ from drake_pose.filtering.contour_tracking import TrackingSettings
 from drake_pose.matching import PoseSearch
 from drake_pose.silhouette import Scene
 from drake_pose.systems.mask_player import MaskPlayer
+from drake_pose.systems.posed_geometry import pose_plant
 from drake_pose.systems.silhouette_matcher import SilhouetteMatcher, label_image_port
 from drake_pose.systems.silhouette_tracker import SilhouetteTracker
 from drake_pose.systems.skin import add_meshcat_skin, add_skin
@@ -179,7 +179,7 @@ def add_simulated_cameras(
     plant.RegisterAsSourceForSceneGraph(scene_graph)
     model.add_to(plant, scene_graph, prefix="true")
     scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(RenderEngineVtkParams()))
-    _pose_plant(builder, scene_graph, plant, truth.get_output_port(), "true")
+    pose_plant(builder, scene_graph, plant, truth.get_output_port(), "true_geometry_pose")
     labels = {name: label for label, name in enumerate(model.link_names)}
     add_skin(builder, scene_graph, model, truth.get_output_port(), "true", labels)
     images = []
@@ -252,7 +252,8 @@ def add_posed_body(
     plant = MultibodyPlant(0.0)
     plant.RegisterAsSourceForSceneGraph(scene_graph)
     model.add_to(plant, scene_graph, prefix=name)
-    _pose_plant(builder, scene_graph, plant, estimator.GetOutputPort("estimated_positions"), name)
+    estimate = estimator.GetOutputPort("estimated_positions")
+    pose_plant(builder, scene_graph, plant, estimate, f"{name}_geometry_pose")
     source = plant.get_source_id()
     inspector = scene_graph.model_inspector()
     for index in range(plant.num_bodies()):
@@ -268,25 +269,6 @@ def add_posed_body(
                 properties.AddProperty("phong", "diffuse", colour)
                 scene_graph.AssignRole(source, geometry, properties, RoleAssign.kReplace)
     return plant
-
-
-def _pose_plant(
-    builder: DiagramBuilder,
-    scene_graph: SceneGraph,
-    plant: MultibodyPlant,
-    positions: OutputPort,
-    name: str,
-) -> None:
-    """Finalize a plant, and let positions in its own order pose its geometry."""
-    plant.Finalize()
-    poser = builder.AddNamedSystem(
-        f"{name}_geometry_pose",
-        MultibodyPositionToGeometryPose(plant, input_multibody_state=False),
-    )
-    builder.Connect(positions, poser.get_input_port())
-    builder.Connect(
-        poser.get_output_port(), scene_graph.get_source_pose_port(plant.get_source_id())
-    )
 
 
 def _finish(

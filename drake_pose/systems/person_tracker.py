@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, SceneGraph
-from pydrake.multibody.plant import MultibodyPlant
+from pydrake.geometry import Meshcat
 from pydrake.systems.framework import (
     BasicVector,
     Context,
@@ -17,7 +16,6 @@ from pydrake.systems.framework import (
     EventStatus,
     LeafSystem,
 )
-from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 from pydrake.systems.sensors import ImageLabel16I
 from pydrake.trajectories import Trajectory
 
@@ -28,6 +26,7 @@ from drake_pose.multiview.silhouette_fit import SilhouetteFit
 from drake_pose.multiview.silhouette_tracker import SilhouetteTracker, TrackState, see_silhouette
 from drake_pose.silhouette import label_image_to_mask
 from drake_pose.systems.camera_rig import build_camera_rig
+from drake_pose.systems.posed_geometry import add_avatar
 
 # A picture's height over the spacing of its region's edge points.
 _EDGE_POINTS = 80.0
@@ -156,29 +155,6 @@ def build_person_capture(
     for name in ("estimated_positions", "share"):
         builder.ExportOutput(system.GetOutputPort(name), name)
     if meshcat is not None:
-        _add_avatar(builder, model, system, meshcat, period)
+        positions = system.GetOutputPort("estimated_positions")
+        add_avatar(builder, model, positions, meshcat, "avatar", period)
     return builder.Build()
-
-
-def _add_avatar(
-    builder: DiagramBuilder,
-    model: ArticulatedModel,
-    system: PersonTracker,
-    meshcat: Meshcat,
-    period: float,
-) -> None:
-    """Show the person at the estimated positions."""
-    scene_graph = builder.AddNamedSystem("avatar_scene_graph", SceneGraph())
-    plant = MultibodyPlant(0.0)
-    plant.RegisterAsSourceForSceneGraph(scene_graph)
-    model.add_to(plant, scene_graph)
-    plant.Finalize()
-    poser = builder.AddNamedSystem(
-        "avatar_pose", MultibodyPositionToGeometryPose(plant, input_multibody_state=False)
-    )
-    builder.Connect(system.GetOutputPort("estimated_positions"), poser.get_input_port())
-    builder.Connect(
-        poser.get_output_port(), scene_graph.get_source_pose_port(plant.get_source_id())
-    )
-    parameters = MeshcatVisualizerParams(prefix="avatar", publish_period=period)
-    MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, parameters)

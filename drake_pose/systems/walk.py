@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, SceneGraph
-from pydrake.multibody.plant import MultibodyPlant
+from pydrake.geometry import Meshcat
 from pydrake.systems.framework import (
     BasicVector,
     Context,
@@ -16,7 +15,6 @@ from pydrake.systems.framework import (
     LeafSystem,
 )
 from pydrake.systems.primitives import TrajectorySource
-from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 from pydrake.trajectories import Trajectory
 
 from drake_pose.body import ArticulatedModel
@@ -28,6 +26,7 @@ from drake_pose.multiview.walk_commands import (
     recognise_command,
     stance_of,
 )
+from drake_pose.systems.posed_geometry import add_avatar
 from drake_pose.systems.walk_place import (
     HALF_SIZE,
     START,
@@ -270,31 +269,8 @@ def build_walk(
     view = builder.AddNamedSystem("view", WalkView(meshcat, period))
     for name in ("walker_pose", "rest"):
         builder.Connect(walker.GetOutputPort(name), view.GetInputPort(name))
-    _add_avatar(builder, model, walker, meshcat, period)
+    avatar = walker.GetOutputPort("avatar_positions")
+    add_avatar(builder, model, avatar, meshcat, f"{_WALKER}/avatar", period)
     for name in ("walker_pose", "command"):
         builder.ExportOutput(walker.GetOutputPort(name), name)
     return builder.Build()
-
-
-def _add_avatar(
-    builder: DiagramBuilder,
-    model: ArticulatedModel,
-    walker: Walker,
-    meshcat: Meshcat,
-    period: float,
-) -> None:
-    """Draw the person below the walker's path."""
-    scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
-    plant = MultibodyPlant(0.0)
-    plant.RegisterAsSourceForSceneGraph(scene_graph)
-    model.add_to(plant, scene_graph)
-    plant.Finalize()
-    poser = builder.AddNamedSystem(
-        "avatar_pose", MultibodyPositionToGeometryPose(plant, input_multibody_state=False)
-    )
-    builder.Connect(walker.GetOutputPort("avatar_positions"), poser.get_input_port())
-    builder.Connect(
-        poser.get_output_port(), scene_graph.get_source_pose_port(plant.get_source_id())
-    )
-    parameters = MeshcatVisualizerParams(prefix=f"{_WALKER}/avatar", publish_period=period)
-    MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, parameters)

@@ -22,6 +22,8 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
+from tests.urdf.surfaces import winding_numbers
+
 URDF = Path(__file__).resolve().parents[2] / "urdf"
 BODIES = ("woman", "man")
 PIXELS_PER_METRE = 226.0  # Kameda: 1 cm = 2.26 pixels
@@ -130,21 +132,6 @@ def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def mesh_of(name: str, link: str) -> trimesh.Trimesh:
     vertices, _, triangles = read_obj(URDF / name / "meshes" / f"{link}.obj")
     return trimesh.Trimesh(vertices, triangles, process=False)
-
-
-def winding_numbers(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
-    """Return how often the mesh winds round each point (n, 3): at least 1 inside some shell."""
-    corners = mesh.triangles[None] - points[:, None, None]
-    lengths = np.linalg.norm(corners, axis=-1)
-    a, b, c = corners[..., 0, :], corners[..., 1, :], corners[..., 2, :]
-    volume = np.einsum("nij,nij->ni", a, np.cross(b, c))
-    below = (
-        lengths.prod(axis=-1)
-        + np.einsum("nij,nij->ni", a, b) * lengths[..., 2]
-        + np.einsum("nij,nij->ni", b, c) * lengths[..., 0]
-        + np.einsum("nij,nij->ni", c, a) * lengths[..., 1]
-    )
-    return np.arctan2(volume, below).sum(axis=1) / (2.0 * np.pi)
 
 
 def silhouette_area_changed(mesh: trimesh.Trimesh, first: float, second: float) -> float:

@@ -1,0 +1,61 @@
+"""Bodies in a diagram's SceneGraph that stand as given positions say, with no dynamics."""
+
+from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, SceneGraph
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.framework import DiagramBuilder, OutputPort
+from pydrake.systems.rendering import MultibodyPositionToGeometryPose
+
+from drake_pose.body import ArticulatedModel
+
+
+def pose_plant(
+    builder: DiagramBuilder,
+    scene_graph: SceneGraph,
+    plant: MultibodyPlant,
+    positions: OutputPort,
+    name: str,
+) -> None:
+    """Finalize a plant, and let positions in its own order pose its geometry.
+
+    Args:
+        builder: the diagram under construction.
+        scene_graph: where the plant is registered as a source.
+        plant: the plant, not finalized yet.
+        positions: (nq,) its positions.
+        name: of the system in between.
+    """
+    plant.Finalize()
+    poser = builder.AddNamedSystem(
+        name, MultibodyPositionToGeometryPose(plant, input_multibody_state=False)
+    )
+    builder.Connect(positions, poser.get_input_port())
+    builder.Connect(
+        poser.get_output_port(), scene_graph.get_source_pose_port(plant.get_source_id())
+    )
+
+
+def add_avatar(
+    builder: DiagramBuilder,
+    model: ArticulatedModel,
+    positions: OutputPort,
+    meshcat: Meshcat,
+    prefix: str,
+    period: float,
+) -> None:
+    """Show a body in Meshcat, in a SceneGraph of its own that no sensor sees.
+
+    Args:
+        builder: the diagram under construction.
+        model: the body.
+        positions: (nq,) in its plant's order.
+        meshcat: where it is drawn.
+        prefix: the path below which it is drawn.
+        period: time between two drawings [s].
+    """
+    scene_graph = builder.AddNamedSystem("avatar_scene_graph", SceneGraph())
+    plant = MultibodyPlant(0.0)
+    plant.RegisterAsSourceForSceneGraph(scene_graph)
+    model.add_to(plant, scene_graph)
+    pose_plant(builder, scene_graph, plant, positions, "avatar_pose")
+    parameters = MeshcatVisualizerParams(prefix=prefix, publish_period=period)
+    MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, parameters)

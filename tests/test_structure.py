@@ -20,6 +20,9 @@ MAY_KNOW = {
 # Drake keeps two plain value types, ImageLabel16I and CameraInfo, in pydrake.systems.sensors.
 VALUE_TYPES = {"camera/models.py", "camera/drake.py", "silhouette/label_images.py"}
 
+# Beside the rooms, for all of them.
+FOR_ALL = {"errors", "yaml_files"}
+
 FILES = sorted(PACKAGE.rglob("*.py"))
 
 
@@ -46,7 +49,7 @@ def test_imports_point_left_only(path):
         return
     for module, names in imports_of(path):
         parts = module.split(".")
-        if parts[0] == "drake_pose" and len(parts) > 1 and parts[1] != "errors":
+        if parts[0] == "drake_pose" and len(parts) > 1 and parts[1] not in FOR_ALL:
             assert parts[1] in MAY_KNOW[room] | {room}, f"{relative} imports {module}"
         if module.startswith("pydrake.systems") and room not in ("systems", "apps"):
             allowed = set(names) <= {"ImageLabel16I", "CameraInfo"}

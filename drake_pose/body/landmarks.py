@@ -6,15 +6,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from drake_pose.body.link_graph import PlantKinematics, build_link_graph
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.pose_tree import PoseTree
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
-
-_LARGEST_FILE = 1 << 20
+from drake_pose.yaml_files import read_yaml
 
 
 class Landmark(NamedTuple):
@@ -50,19 +48,6 @@ class NodeLandmarks:
         return np.asarray(turned + X[..., :3, 3])
 
 
-class _UniqueKeyLoader(yaml.SafeLoader):
-    """A safe loader that refuses a key given twice (PyYAML silently keeps the last one)."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """The mapping, all of whose keys differ."""
-        mapping = super().construct_mapping(node, deep=deep)
-        if len(mapping) != len(node.value):
-            raise yaml.constructor.ConstructorError(
-                None, None, "a key is given twice", node.start_mark
-            )
-        return mapping
-
-
 def landmarks_file(model_path: Path | str) -> Path:
     """Where a model's landmarks are looked for: ``landmarks.yaml`` beside the model file."""
     return Path(model_path).with_name("landmarks.yaml")
@@ -83,7 +68,7 @@ def load_landmarks(model_path: Path | str) -> dict[str, Landmark]:
         ModelError: the file cannot be read; the message names it and the entry.
     """
     file = landmarks_file(model_path)
-    content = _read(file)
+    content = read_yaml(file, ModelError)
     entries = content.get("landmarks") if isinstance(content, dict) else None
     if not isinstance(entries, dict) or not entries or set(content) != {"landmarks"}:
         raise ModelError(f"{file}: one mapping 'landmarks' with at least one entry is expected")
@@ -161,24 +146,6 @@ def _body(model: ArticulatedModel, name: str, link: str) -> int:
         where = f"{landmarks_file(model.path)}: '{name}': {model.path.name}"
         raise UnknownNameError("link", link, model.link_names, where)
     return model.link_index(link)
-
-
-def _read(file: Path) -> Any:
-    """The file's content, plain values only."""
-    try:
-        with file.open("rb") as stream:
-            data = stream.read(_LARGEST_FILE + 1)
-    except OSError as error:
-        raise ModelError(f"{file}: cannot read the landmarks: {error.strerror}") from error
-    if len(data) > _LARGEST_FILE:
-        raise ModelError(f"{file}: larger than {_LARGEST_FILE} bytes, which is no landmarks file")
-    try:
-        # The loader derives from yaml.SafeLoader.
-        return yaml.load(data, Loader=_UniqueKeyLoader)
-    except (yaml.YAMLError, ValueError, TypeError) as error:
-        raise ModelError(f"{file}: not a YAML file: {' '.join(str(error).split())}") from error
-    except RecursionError:
-        raise ModelError(f"{file}: nested too deeply") from None
 
 
 def _landmark(entry: Any, where: str) -> Landmark:

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.camera.checks import check_number
-from drake_pose.camera.yaml_files import read_yaml
 from drake_pose.errors import CameraError
+from drake_pose.yaml_files import read_yaml
 
 Array = NDArray[np.float64]
 

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from drake_pose.camera.checks import check_number, check_side
 from drake_pose.camera.models import PinholeCamera
-from drake_pose.camera.yaml_files import read_yaml
 from drake_pose.errors import CameraError
+from drake_pose.yaml_files import read_yaml
 
 Array = NDArray[np.float64]
 

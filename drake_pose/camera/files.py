@@ -10,8 +10,8 @@ import yaml
 
 from drake_pose.camera.checks import check_number, check_pose, check_side
 from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
-from drake_pose.camera.yaml_files import read_yaml
 from drake_pose.errors import CameraError
+from drake_pose.yaml_files import read_yaml
 
 _COMMON = ("width", "height", "center_x", "center_y", "X_WC")
 _REQUIRED = {

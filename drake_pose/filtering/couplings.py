@@ -4,8 +4,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Optional
 
+import numpy as np
 import yaml
 from pydrake.common.yaml import yaml_load_typed
 
@@ -25,7 +25,6 @@ _LARGEST_FILE = 1 << 20
 _UNITS = {"": 1.0, "rad": 1.0, "m": 1.0, "deg": math.pi / 180.0, "mm": 1e-3}
 
 
-# yaml_load_typed reads Optional, but not the form with a bar.
 @dataclass
 class Difference:
     """lower <= first - second <= upper, or |first - second| <= within.
@@ -38,9 +37,9 @@ class Difference:
 
     first: str = ""
     second: str = ""
-    within: Optional[float] = None  # noqa: UP045
-    lower: Optional[float] = None  # noqa: UP045
-    upper: Optional[float] = None  # noqa: UP045
+    within: float = math.inf
+    lower: float = -math.inf
+    upper: float = math.inf
     unit: str = ""
 
 
@@ -57,8 +56,8 @@ class GeneralRow:
 
     name: str = ""
     terms: dict[str, float] = field(default_factory=dict)
-    lower: Optional[float] = None  # noqa: UP045
-    upper: Optional[float] = None  # noqa: UP045
+    lower: float = -math.inf
+    upper: float = math.inf
     unit: str = ""
 
 
@@ -98,8 +97,8 @@ def load_couplings(path: Path | str, columns: Sequence[str]) -> Inequalities:
         if difference.first == difference.second:
             raise ModelError(f"{where}: give two different joints as first and second")
         lower, upper = difference.lower, difference.upper
-        if difference.within is not None:
-            if lower is not None or upper is not None:
+        if math.isfinite(difference.within):
+            if math.isfinite(lower) or math.isfinite(upper):
                 raise ModelError(f"{where}: give either within, or lower and upper")
             lower, upper = -difference.within, difference.within
         terms = {difference.first: 1.0, difference.second: -1.0}
@@ -151,17 +150,16 @@ def _row(
     columns: Sequence[str],
     name: str,
     terms: dict[str, float],
-    bounds: tuple[float | None, float | None],
+    bounds: tuple[float, float],
     unit: str,
     where: str,
 ) -> Inequalities:
     if unit not in _UNITS:
         known = ", ".join(key for key in _UNITS if key)
         raise ModelError(f"{where}: unit '{unit}' is unknown; use one of {known}")
-    if bounds == (None, None):
+    if not np.isfinite(bounds).any():
         raise ModelError(f"{where}: nothing is bounded; give within, lower or upper")
-    lower = -math.inf if bounds[0] is None else bounds[0] * _UNITS[unit]
-    upper = math.inf if bounds[1] is None else bounds[1] * _UNITS[unit]
+    lower, upper = (bound * _UNITS[unit] for bound in bounds)
     row = row_from_terms(columns, terms, where)
     try:
         return two_sided(columns, name, row, lower, upper)

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from drake_pose.camera import Camera, ParallelCamera, load_cameras
-from drake_pose.camera.yaml_files import read_yaml
 from drake_pose.errors import SceneError, UnknownNameError
 from drake_pose.silhouette.masks import read_mask
+from drake_pose.yaml_files import read_yaml
 
 _FIELDS = ("sequence", "frame_rate_hz")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatVisualizer, SceneGraph
@@ -15,6 +16,7 @@ from pydrake.trajectories import Trajectory
 from drake_pose.camera import Camera
 from drake_pose.filtering import (
     AxisSettings,
+    Belief,
     ContourObservation,
     ContourTracker,
     FilterSettings,
@@ -78,32 +80,12 @@ def add_hand_tracking(
         SettingsError: a period that is not positive, no axes, or a tree without free values.
         UnknownNameError: there is no segment of such a name.
     """
-    tracking = tracking or TrackingSettings()
-    body = ContourObservation(search.tree, [camera])
-    start = ContourTracker(body, period, tracking).start(
-        body.state(search.tree.model.default_positions)
+    parts = _filter_parts(search, camera, axes, period, tracking or TrackingSettings(), settings)
+    observation = parts.observation
+    ekf = builder.AddNamedSystem("truncated_ekf", TruncatedEkf(parts.filter, parts.start, period))
+    sensor = builder.AddNamedSystem(
+        "axis_sensor", AxisSensor(observation, parts.transition, camera)
     )
-    middle = (0.5 * (camera.width - 1), 0.5 * (camera.height - 1))
-    observation = AxisObservation(body, camera, axes, middle, settings)
-    layout = body.layout
-    accelerations = {
-        name: period**2
-        * (tracking.angle_acceleration if body.is_angle(name) else tracking.length_acceleration)
-        for name in layout.moving
-    }
-    transition = layout.transition(math.exp(-period / tracking.memory))
-    belief_filter = TruncatedFilter(
-        layout,
-        observation,
-        model_inequalities(search.tree.model).only_of(layout.names),
-        layout.process_noise(accelerations),
-        FilterSettings(),
-        transition,
-    )
-    ekf = builder.AddNamedSystem(
-        "truncated_ekf", TruncatedEkf(belief_filter, start.state.best, period)
-    )
-    sensor = builder.AddNamedSystem("axis_sensor", AxisSensor(observation, transition, camera))
     matcher = builder.AddNamedSystem("matcher", StateMatcher(search, observation, camera))
     belief = builder.AddNamedSystem("belief", BodyBelief(observation))
     matched = matcher.GetOutputPort("matched_state")
@@ -129,6 +111,48 @@ def add_hand_tracking(
         statistics_log=log(ekf.GetOutputPort("statistics")),
         restart_log=log(sensor.GetOutputPort("restart")),
     )
+
+
+class _FilterParts(NamedTuple):
+    """A filter of a body's free positions that measures axes. start: its first belief."""
+
+    filter: TruncatedFilter
+    observation: AxisObservation
+    transition: np.ndarray
+    start: Belief
+
+
+def _filter_parts(
+    search: PoseSearch,
+    camera: Camera,
+    axes: Mapping[str, Ends],
+    period: float,
+    tracking: TrackingSettings,
+    settings: AxisSettings | None,
+) -> _FilterParts:
+    """What is needed to filter; the arguments are those of add_hand_tracking."""
+    body = ContourObservation(search.tree, [camera])
+    start = ContourTracker(body, period, tracking).start(
+        body.state(search.tree.model.default_positions)
+    )
+    middle = (0.5 * (camera.width - 1), 0.5 * (camera.height - 1))
+    observation = AxisObservation(body, camera, axes, middle, settings)
+    layout = body.layout
+    accelerations = {
+        name: period**2
+        * (tracking.angle_acceleration if body.is_angle(name) else tracking.length_acceleration)
+        for name in layout.moving
+    }
+    transition = layout.transition(math.exp(-period / tracking.memory))
+    belief_filter = TruncatedFilter(
+        layout,
+        observation,
+        model_inequalities(search.tree.model).only_of(layout.names),
+        layout.process_noise(accelerations),
+        FilterSettings(),
+        transition,
+    )
+    return _FilterParts(belief_filter, observation, transition, start.state.best)
 
 
 def build_hand_tracking(

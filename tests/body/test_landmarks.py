@@ -174,6 +174,6 @@ def test_bad_files_are_named(text: str, complaint: str, tmp_path: Path) -> None:
 
 
 def test_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match=r"landmarks.yaml: cannot read the landmarks: No such"):
+    with pytest.raises(ModelError, match=r"landmarks.yaml: cannot read it: No such"):
         load_landmarks(tmp_path / "thing.urdf")
     assert landmarks_file("a/thing.urdf") == Path("a/landmarks.yaml")

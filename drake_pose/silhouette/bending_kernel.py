@@ -9,8 +9,8 @@ from numba import njit
 
 from drake_pose.silhouette.kernel import (
     _FIRST_CAPACITY,
+    _add_areas,
     _fill_safely,
-    _find_spans,
     _make_work,
 )
 from drake_pose.silhouette.outline import PackedOutlines
@@ -94,11 +94,5 @@ def score_bent(
         for k in range(parts.shape[0]):
             bend(own, parts[k], bands[n])
         crossings = _fill_safely(own, X_CN[n], camera, crossings, work)
-        spans = work.spans
-        for row in range(work.reach[0], work.reach[1]):
-            for k in range(_find_spans(row, crossings, work.counts, work.changes, spans)):
-                a, b = spans[k, 0], spans[k, 1]
-                areas[n, 0] += b - a
-                for s in range(prefixes.shape[0]):
-                    areas[n, 1 + s] += prefixes[s, row, b] - prefixes[s, row, a]
+        _add_areas(work, crossings, prefixes, areas[n])
     return areas

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from drake_pose.silhouette.kernel import eye_in_node
 from drake_pose.silhouette.outline import PackedOutlines
 
 # Slits and overlaps narrower than this [pixel] are rounding where surfaces touch.
@@ -60,12 +61,7 @@ def _find_facings(
     facings: np.ndarray,
 ) -> None:
     """Writes which side of each triangle is seen: +1, 0 or -1; 0 after the last and too near."""
-    e0, e1, e2, share = X[2, 0], X[2, 1], X[2, 2], 0.0
-    if camera[0] == 0.0:
-        t0, t1, t2, share = X[0, 3], X[1, 3], X[2, 3], 1.0
-        e0 = -(X[0, 0] * t0 + X[1, 0] * t1 + X[2, 0] * t2)
-        e1 = -(X[0, 1] * t0 + X[1, 1] * t1 + X[2, 1] * t2)
-        e2 = -(X[0, 2] * t0 + X[1, 2] * t1 + X[2, 2] * t2)
+    e0, e1, e2, share = eye_in_node(X, camera)
     begin, end = packed.starts[node, 1], packed.starts[node + 1, 1]
     for i in range(end - begin):
         t = begin + i

@@ -137,19 +137,29 @@ def _project(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def eye_in_node(X: np.ndarray, camera: np.ndarray) -> tuple[float, float, float, float]:
+    """Returns where a camera stands, or the way it looks, in a node's frame; 1 or 0 says which.
+
+    The parallel camera looks along it, the pinhole stands there: opposite signs, which only turn
+    the winding number's sign.
+    """
+    if camera[0] != 0.0:
+        return X[2, 0], X[2, 1], X[2, 2], 0.0
+    t0, t1, t2 = X[0, 3], X[1, 3], X[2, 3]
+    return (
+        -(X[0, 0] * t0 + X[1, 0] * t1 + X[2, 0] * t2),
+        -(X[0, 1] * t0 + X[1, 1] * t1 + X[2, 1] * t2),
+        -(X[0, 2] * t0 + X[1, 2] * t1 + X[2, 2] * t2),
+        1.0,
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _find_facings(
     packed: PackedOutlines, node: int, X_CN: np.ndarray, camera: np.ndarray, work: _Work
 ) -> None:
     """Writes which side of each triangle the camera sees: +1, 0 or -1; 0 after the last."""
-    # The parallel camera looks along (e0, e1, e2), the pinhole stands there: opposite signs, which
-    # only turn the winding number's sign.
-    X = X_CN[node]
-    e0, e1, e2, share = X[2, 0], X[2, 1], X[2, 2], 0.0
-    if camera[0] == 0.0:
-        t0, t1, t2, share = X[0, 3], X[1, 3], X[2, 3], 1.0
-        e0 = -(X[0, 0] * t0 + X[1, 0] * t1 + X[2, 0] * t2)
-        e1 = -(X[0, 1] * t0 + X[1, 1] * t1 + X[2, 1] * t2)
-        e2 = -(X[0, 2] * t0 + X[1, 2] * t1 + X[2, 2] * t2)
+    e0, e1, e2, share = eye_in_node(X_CN[node], camera)
     begin, end = packed.starts[node, 1], packed.starts[node + 1, 1]
     n0, n1 = packed.planes[0, begin:end], packed.planes[1, begin:end]
     n2, offset = packed.planes[2, begin:end], packed.planes[3, begin:end]
@@ -350,6 +360,18 @@ def _find_many_spans(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _add_areas(work: _Work, crossings: np.ndarray, prefixes: np.ndarray, areas: np.ndarray) -> None:
+    """Adds the area of a filled body, and of its intersection with each set, to areas (1 + k,)."""
+    spans = work.spans
+    for row in range(work.reach[0], work.reach[1]):
+        for k in range(_find_spans(row, crossings, work.counts, work.changes, spans)):
+            a, b = spans[k, 0], spans[k, 1]
+            areas[0] += b - a
+            for s in range(prefixes.shape[0]):
+                areas[1 + s] += prefixes[s, row, b] - prefixes[s, row, a]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def score(
     packed: PackedOutlines, X_CN: np.ndarray, camera: np.ndarray, prefixes: np.ndarray
 ) -> np.ndarray:
@@ -369,13 +391,7 @@ def score(
     areas = np.zeros((X_CN.shape[0], 1 + prefixes.shape[0]), dtype=np.int64)
     for n in range(X_CN.shape[0]):
         crossings = _fill_safely(packed, X_CN[n], camera, crossings, work)
-        spans = work.spans
-        for row in range(work.reach[0], work.reach[1]):
-            for k in range(_find_spans(row, crossings, work.counts, work.changes, spans)):
-                a, b = spans[k, 0], spans[k, 1]
-                areas[n, 0] += b - a
-                for s in range(prefixes.shape[0]):
-                    areas[n, 1 + s] += prefixes[s, row, b] - prefixes[s, row, a]
+        _add_areas(work, crossings, prefixes, areas[n])
     return areas
 
 

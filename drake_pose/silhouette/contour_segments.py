@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from drake_pose.silhouette.kernel import eye_in_node
+from drake_pose.silhouette.eye import eye_in_node
 from drake_pose.silhouette.outline import PackedOutlines
 
 # Slits and overlaps narrower than this [pixel] are rounding where surfaces touch.

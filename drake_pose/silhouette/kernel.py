@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from drake_pose.silhouette.eye import eye_in_node
 from drake_pose.silhouette.outline import PackedOutlines
 
 # Crossings are kept as 8 * pixel + weight + 4; a weight is a whole number from -2 to 2.
@@ -134,24 +135,6 @@ def _project(
         inverse = 1.0 / (d0 * x[i] + d1 * y[i] + d2 * z[i] + d3)
         u[i] = (a0 * x[i] + a1 * y[i] + a2 * z[i] + a3) * inverse + cx
         v[i] = (b0 * x[i] + b1 * y[i] + b2 * z[i] + b3) * inverse + cy
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def eye_in_node(X: np.ndarray, camera: np.ndarray) -> tuple[float, float, float, float]:
-    """Returns where a camera stands, or the way it looks, in a node's frame; 1 or 0 says which.
-
-    The parallel camera looks along it, the pinhole stands there: opposite signs, which only turn
-    the winding number's sign.
-    """
-    if camera[0] != 0.0:
-        return X[2, 0], X[2, 1], X[2, 2], 0.0
-    t0, t1, t2 = X[0, 3], X[1, 3], X[2, 3]
-    return (
-        -(X[0, 0] * t0 + X[1, 0] * t1 + X[2, 0] * t2),
-        -(X[0, 1] * t0 + X[1, 1] * t1 + X[2, 1] * t2),
-        -(X[0, 2] * t0 + X[1, 2] * t1 + X[2, 2] * t2),
-        1.0,
-    )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

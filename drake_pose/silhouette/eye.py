@@ -1,0 +1,24 @@
+"""Where a camera stands in a node's frame."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def eye_in_node(X: np.ndarray, camera: np.ndarray) -> tuple[float, float, float, float]:
+    """Returns where a camera stands, or the way it looks, in a node's frame; 1 or 0 says which.
+
+    The parallel camera looks along it, the pinhole stands there: opposite signs, which only turn
+    the winding number's sign.
+    """
+    if camera[0] != 0.0:
+        return X[2, 0], X[2, 1], X[2, 2], 0.0
+    t0, t1, t2 = X[0, 3], X[1, 3], X[2, 3]
+    return (
+        -(X[0, 0] * t0 + X[1, 0] * t1 + X[2, 0] * t2),
+        -(X[0, 1] * t0 + X[1, 1] * t1 + X[2, 1] * t2),
+        -(X[0, 2] * t0 + X[1, 2] * t1 + X[2, 2] * t2),
+        1.0,
+    )

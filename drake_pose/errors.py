@@ -35,6 +35,10 @@ class OutputError(DrakePoseError):
     """A result cannot be written where it was asked for."""
 
 
+class ClusterError(DrakePoseError):
+    """Workers cannot be started or reached, or are not fit for the work."""
+
+
 class UnknownNameError(DrakePoseError):
     """A link, joint, camera or frame of that name does not exist.
 

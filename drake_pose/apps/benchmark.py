@@ -26,6 +26,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
+from drake_pose.apps.date_cost import cost_table
 from drake_pose.apps.kameda import experiment_camera, experiment_search, run_experiment
 from drake_pose.apps.kameda_table import experiment_table
 from drake_pose.body import TriangleMesh, bundled_model, load_model
@@ -165,7 +166,7 @@ def _fastest(function: Callable[[], object], repeats: int) -> float:
 
 
 def main() -> None:
-    """Print what the kernel, its agreement with Drake and experiment A come to on this machine."""
+    """Print what kernel, agreement with Drake, Date's capture and experiment A come to here."""
     console = Console()
     table = Table(title="One segment, 700 x 700 pixels, one core")
     for heading in ("triangles", "kernel, a candidate", "Drake label image", "ratio"):
@@ -180,6 +181,7 @@ def main() -> None:
         )
     console.print(table)
     console.print(_agreement_table())
+    console.print(cost_table())
     start = time.process_time()
     result = run_experiment(experiment_search())
     seconds = time.process_time() - start

@@ -17,7 +17,6 @@ from drake_pose.apps.date_studio import Studio
 from drake_pose.apps.date_tracks import PaperTrack, Sight, SilhouetteTrack, see
 from drake_pose.body.landmarks import landmarks_of_nodes
 from drake_pose.body.tree_kinematics import TreeKinematics
-from drake_pose.camera.rigs import FACE_CAMERA
 from drake_pose.errors import SettingsError
 
 Array = NDArray[np.float64]
@@ -83,7 +82,9 @@ class DateResult:
             "joint_error_p95_mm": float(np.percentile(errors[self.method], 95)),
             "ik_only_mm": _mean(errors["ik_only"]),
             "paper_mm": _mean(errors["paper"]),
-            "elbows_and_knees": {f"{way}_mm": self._middle(e) for way, e in errors.items()},
+            "elbows_and_knees": self._of_joints(errors, ("elbow", "knee")),
+            "elbows": self._of_joints(errors, ("elbow",)),
+            "knees": self._of_joints(errors, ("knee",)),
             "face_error_deg": _mean(self.face_errors[chosen]),
             "frames_to_recover": _slowest(anywhere or list(self.recoveries.values())),
             "frames_to_recover_registered": self.recoveries.get(REGISTERED),
@@ -104,10 +105,13 @@ class DateResult:
         figures = {f"{way}_mm": _mean(errors[chosen]) for way, errors in self.errors.items()}
         return {**figures, "face_error_deg": _mean(self.face_errors[chosen])}
 
-    def _middle(self, errors: Array) -> float:
-        """Mean error of elbows and knees, which the paper's search is for."""
-        middle = [i for i, n in enumerate(self.joint_names) if n.endswith(("elbow", "knee"))]
-        return _mean(errors[:, middle])
+    def _of_joints(self, errors: Mapping[str, Array], ends: tuple[str, ...]) -> Mapping[str, float]:
+        """Mean errors of the joints whose names end so, by way of capturing.
+
+        Elbows and knees are what the paper's search is for.
+        """
+        chosen = [i for i, name in enumerate(self.joint_names) if name.endswith(ends)]
+        return {f"{way}_mm": _mean(values[:, chosen]) for way, values in errors.items()}
 
     def table(self) -> Table:
         """The figures of each motion."""
@@ -186,7 +190,7 @@ class _Experiment:
         self.cameras, self.seed, self.method = cameras, seed, method
         self.studio = Studio.build(cameras, size, np.random.default_rng([seed, 1]))
         self.motion = make_motion(self.studio.skeleton, frames, seed)
-        self.setup = setup = self.studio.prepare(self.motion.q[0])
+        setup = self.studio.prepare(self.motion.q[0])
         model = self.studio.model
         tree = model.pose_tree()
         self.kinematics = TreeKinematics(tree)
@@ -194,8 +198,8 @@ class _Experiment:
         self.order = np.array([model.position_index(name) for name in self.kinematics.names])
         alone = replace(setup, settings=replace(setup.settings, search=False))
         self.tracks: dict[str, PaperTrack | SilhouetteTrack] = {
-            "ik_only": PaperTrack(alone),
-            "paper": PaperTrack(setup),
+            "ik_only": PaperTrack.build(alone),
+            "paper": PaperTrack.build(setup),
         }
         if method == "silhouette":
             self.tracks[method] = SilhouetteTrack.build(model, self.studio.cameras)
@@ -251,7 +255,7 @@ class _Experiment:
     def _see(self, q: Array) -> Sight:
         studio = self.studio
         wanted = self.method == "silhouette"
-        return see(studio.pictures(q), studio.backgrounds, self.setup, FACE_CAMERA, wanted)
+        return see(studio.pictures(q), studio.backgrounds, wanted)
 
     def _off(self, found: Array, q: Array) -> Array:
         """(k,) how far the joint centres at found positions (nq,) are off those at q (nq,) [mm]."""

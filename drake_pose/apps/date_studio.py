@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -13,26 +12,19 @@ from pydrake.systems.framework import Context
 
 from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.body.landmarks import Landmark, load_landmarks
-from drake_pose.camera import Camera, PinholeCamera
+from drake_pose.camera import PinholeCamera
 from drake_pose.camera.rigs import FACE_CAMERA, circle_of_cameras
-from drake_pose.multiview.capture import CaptureSettings, CaptureSetup, see_person
-from drake_pose.multiview.faces import FaceTemplates, cut_face, learn_faces
-from drake_pose.multiview.features import find_features
-from drake_pose.multiview.paper_pose import waist_of
-from drake_pose.multiview.recognition import register_pose
+from drake_pose.multiview.capture import CaptureSetup
 from drake_pose.multiview.regions import Background, learn_background
 from drake_pose.multiview.skeleton import Skeleton, load_skeleton
 from drake_pose.systems.camera_rig import CameraRig, build_camera_rig
+from drake_pose.systems.paper_preparation import prepare_paper_capture
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 _NOISE = 3.0
 _EMPTY_PICTURES = 5
-_TURNS_DEG = np.linspace(-80.0, 80.0, 20)
-_NODS_DEG = np.linspace(-35.0, 50.0, 15)
-_FACE_SIZE = (200, 200)
 _FAR_AWAY = -9.0
 
 
@@ -87,11 +79,6 @@ class Studio:
             generator,
         )
 
-    @property
-    def ring(self) -> dict[str, PinholeCamera]:
-        """The cameras on the circle."""
-        return {name: camera for name, camera in self.cameras.items() if name != FACE_CAMERA}
-
     def pictures(self, q: Array) -> dict[str, Picture]:
         """What all cameras see of a person at q (nq,), noise included."""
         self.rig.set_positions(self.context, q)
@@ -106,29 +93,9 @@ class Studio:
         Args:
             q: (nq,) the registered pose, which the person shows once for it.
         """
-
-        def draw(camera: Camera, positions: Array) -> Mask:
-            self.rig.set_positions(self.context, positions)
-            return self.rig.mask(self.context, camera.name)
-
-        ring = self.ring
-        pictures = self.pictures(q)
-        views = {
-            name: see_person(pictures[name], _SETTINGS, background=self.backgrounds[name])
-            for name in ring
-        }
-        seen = find_features(
-            list(ring.values()),
-            [view.blobs.centroids for view in views.values()],
-            [view.region for view in views.values()],
-            self.skeleton.features(q),
+        return prepare_paper_capture(
+            self.model, self.cameras, FACE_CAMERA, q, self.pictures(q), self.backgrounds
         )
-        places = np.where(seen.support[:, None] > 0, seen.places, np.nan)
-        skeleton = self.skeleton.with_features(q, places)
-        registered = register_pose(skeleton, q, list(ring.values()), draw)
-        faces = learn_rendered_faces(self.model, q, self.skeleton, _SETTINGS)
-        settings = replace(_SETTINGS, waist=waist_of(skeleton))
-        return CaptureSetup(skeleton, ring, self.cameras[FACE_CAMERA], faces, registered, settings)
 
     def side_by_side(self, q: Array, estimates: Sequence[Array], name: str) -> Picture:
         """The person as a camera sees it, and as estimated, side by side (H, n W, 3)."""
@@ -139,9 +106,6 @@ class Studio:
         return np.hstack(shown)
 
 
-_SETTINGS = CaptureSettings()
-
-
 def noisy(picture: Picture, generator: np.random.Generator) -> Picture:
     """A picture with a camera's noise: 3 grey levels."""
     # One byte a channel is enough for noise, and four times as fast as a double.
@@ -149,37 +113,3 @@ def noisy(picture: Picture, generator: np.random.Generator) -> Picture:
     cv2.setRNGSeed(int(generator.integers(1 << 31)))
     cv2.randn(noise, np.zeros(3), np.full(3, _NOISE))
     return np.clip(picture + noise, 0, 255).astype(np.uint8)
-
-
-def learn_rendered_faces(
-    model: ArticulatedModel, q: Array, skeleton: Skeleton, settings: CaptureSettings
-) -> FaceTemplates:
-    """Templates of a model's face: 300 rendered pictures, 20 turns times 15 nods.
-
-    Args:
-        model: the person.
-        q: (nq,) positions of the rest of the body.
-        skeleton: the person's.
-        settings: which colours are skin.
-    """
-    head = skeleton.features(q)[0]
-    camera = circle_of_cameras(
-        1, height=float(head[2]), target=head, field_of_view=math.radians(11.0), size=_FACE_SIZE
-    )["camera_0"]
-    azimuth = math.atan2(camera.X_WC[1, 3] - head[1], camera.X_WC[0, 3] - head[0])
-    rig = build_camera_rig(model, {"camera_0": camera})
-    context = rig.diagram.CreateDefaultContext()
-    faces, directions = [], []
-    for turn in np.radians(_TURNS_DEG):
-        for nod in np.radians(_NODS_DEG):
-            posed = np.array(q)
-            posed[skeleton.head_angles] = azimuth + turn, nod
-            posed[skeleton.head_positions] += head - skeleton.features(posed)[0]
-            rig.set_positions(context, posed)
-            picture = rig.picture(context, "camera_0")
-            view = see_person(picture, settings, rig.mask(context, "camera_0"))
-            face = cut_face(picture, view.blobs)
-            if face is not None:
-                faces.append(face)
-                directions.append((turn, nod))
-    return learn_faces(faces, np.array(directions))

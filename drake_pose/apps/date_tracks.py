@@ -8,18 +8,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.common.value import AbstractValue
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.sensors import ImageRgba8U
 
 from drake_pose.body import ArticulatedModel
 from drake_pose.camera import Camera
 from drake_pose.errors import SettingsError
-from drake_pose.multiview.capture import (
-    CaptureSetup,
-    CaptureState,
-    PersonView,
-    capture_frame,
-    see_person,
-    start_state,
-)
+from drake_pose.multiview.capture import CaptureSetup
 from drake_pose.multiview.regions import Background, person_region
 from drake_pose.multiview.silhouette_fit import SilhouetteFit
 from drake_pose.multiview.silhouette_tracker import (
@@ -28,11 +24,14 @@ from drake_pose.multiview.silhouette_tracker import (
     TrackState,
     see_silhouette,
 )
+from drake_pose.systems.colour_images import picture_to_colour_image
+from drake_pose.systems.paper_capture import PaperCapture, build_paper_capture
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 _EDGE_SPACING = 8.0
+_PERIOD = 1.0 / 30.0
 
 
 class Clock:
@@ -51,58 +50,48 @@ class Clock:
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What the stages before the pose found in a frame.
+    """What all ways of capturing are given of a frame.
 
     Args:
-        paper: by camera on the circle, as the paper needs it.
-        face: the face camera's picture and what is in it.
+        images: by camera, as a Drake sensor would give them.
         silhouettes: of all cameras; empty where only the paper's method runs.
-        paper_ms, silhouette_ms: processor time of each stage, all cameras together.
+        silhouette_ms: processor time of each stage of these, all cameras together.
     """
 
-    paper: Mapping[str, PersonView]
-    face: tuple[Picture, PersonView]
+    images: Mapping[str, ImageRgba8U]
     silhouettes: Mapping[str, SilhouetteView]
-    paper_ms: Mapping[str, float]
     silhouette_ms: Mapping[str, float]
 
 
 def see(
-    pictures: Mapping[str, Picture],
-    backgrounds: Mapping[str, Background],
-    setup: CaptureSetup,
-    face_camera: str,
-    silhouettes: bool,
+    pictures: Mapping[str, Picture], backgrounds: Mapping[str, Background], silhouettes: bool
 ) -> Sight:
-    """Processes a frame's pictures (H, W, 3), camera by camera."""
+    """Takes a frame's pictures (H, W, 3), and finds the silhouettes in them where wanted."""
+    images = {name: picture_to_colour_image(shot) for name, shot in pictures.items()}
+    if not silhouettes:
+        return Sight(images, {}, {})
     clock = Clock()
     regions = {name: person_region(shot, backgrounds[name]) for name, shot in pictures.items()}
     clock.lap("region")
-    seen = {}
-    if silhouettes:
-        seen = {name: see_silhouette(region, _EDGE_SPACING) for name, region in regions.items()}
+    seen = {name: see_silhouette(region, _EDGE_SPACING) for name, region in regions.items()}
     clock.lap("edge")
-    paper = {
-        name: see_person(shot, setup.settings, regions[name]) for name, shot in pictures.items()
-    }
-    clock.lap("skin")
-    laps = clock.laps
-    return Sight(
-        paper,
-        (pictures[face_camera], paper.pop(face_camera)),
-        seen,
-        {"region": laps["region"], "skin": laps["skin"]},
-        {"region": laps["region"], "edge": laps["edge"]},
-    )
+    return Sight(images, seen, clock.laps)
 
 
 @dataclass(eq=False)
 class PaperTrack:
-    """The paper's way, with its search for elbows and knees or without."""
+    """The paper's way, with its search for elbows and knees or without: its ready diagram."""
 
-    setup: CaptureSetup
-    state: CaptureState | None = None
+    capture: PaperCapture
+    simulator: Simulator
     milliseconds: list[Mapping[str, float]] = field(default_factory=list)
+    frames: int = 0
+
+    @staticmethod
+    def build(setup: CaptureSetup) -> PaperTrack:
+        """A track that knows nothing yet."""
+        capture = build_paper_capture(setup, period=_PERIOD)
+        return PaperTrack(capture, Simulator(capture.diagram))
 
     def step(self, sight: Sight) -> Array:
         """The positions (nq,) of one more frame.
@@ -110,24 +99,40 @@ class PaperTrack:
         Raises:
             SettingsError: the registered pose was not recognised in the first frame.
         """
-        frame = capture_frame(self.setup, self.state, sight.paper, sight.face)
-        if frame is None:
+        diagram, context = self.capture.diagram, self.simulator.get_mutable_context()
+        if self.frames:
+            # Stops just before this frame's update, which so sees the images that follow.
+            self.simulator.AdvanceTo(_PERIOD * self.frames)
+        self.frames += 1
+        for name, image in sight.images.items():
+            diagram.GetInputPort(f"color_image_{name}").FixValue(context, AbstractValue.Make(image))
+        clock = Clock()
+        for stage in self.capture.stages:
+            self.capture.evaluate(context, stage)
+            clock.lap(stage)
+        self.simulator.AdvancePendingEvents()
+        clock.lap("pose")
+        q = np.array(diagram.GetOutputPort("estimated_positions").Eval(context))
+        if not np.isfinite(q).all():
             raise SettingsError(
                 "the registered pose was not recognised in the first frame: take more cameras, or "
                 "larger pictures"
             )
-        self.state = frame.state
-        if frame.pose is not None:
-            self.milliseconds.append({**sight.paper_ms, **frame.milliseconds})
-        return frame.state.q
+        if not diagram.GetOutputPort("similarity").Eval(context)[0]:
+            self.milliseconds.append(clock.laps)
+        return q
 
     def destroyed(self, q: Array, _generator: np.random.Generator) -> PaperTrack:
         """A track that is turned around, its left and right exchanged; q (nq,) is where it was."""
-        skeleton = self.setup.skeleton
+        setup = self.capture.estimator.setup
         wrong = np.array(q)
-        wrong[skeleton.head_angles[0]] += np.pi
-        state = start_state(skeleton, skeleton.clip(wrong))
-        return PaperTrack(self.setup, CaptureState(state.q, state.features[[3, 4, 0, 2, 1]]))
+        wrong[setup.skeleton.head_angles[0]] += np.pi
+        wrong = setup.skeleton.clip(wrong)
+        track = PaperTrack(self.capture, Simulator(self.capture.diagram))
+        estimator = track.capture.estimator
+        context = estimator.GetMyMutableContextFromRoot(track.simulator.get_mutable_context())
+        estimator.set_person(context, wrong, setup.skeleton.features(wrong)[[3, 4, 0, 2, 1]])
+        return track
 
 
 @dataclass(eq=False)

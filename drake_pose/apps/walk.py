@@ -171,7 +171,7 @@ def walk(
         seconds = min(seconds or times[-1], times[-1])
     stride = stride_positions(player.model)
     diagram = build_walk(player.model, meshcat, positions, stride, period)
-    log = _CommandLog(on_command)
+    log = CommandLog(on_command)
     simulator = Simulator(diagram)
     simulator.set_target_realtime_rate(speed)
     command, pose = (diagram.GetOutputPort(name) for name in ("command", "walker_pose"))
@@ -211,7 +211,7 @@ def show(page: Meshcat, patience: float = 10.0) -> bool:
     return page.GetNumActiveConnections() > 0
 
 
-class _CommandLog:
+class CommandLog:
     """Which commands were followed for how long."""
 
     def __init__(self, on_command: Callable[[str], None] | None) -> None:

@@ -23,7 +23,12 @@ _LIMBS = {
     "right_leg": ("right_hip", "right_knee", "right_ankle"),
 }
 _TRUNK = ("neck", "left_hip", "right_hip")
+PERSON_LANDMARKS = frozenset({*_TRUNK, *(name for limb in _LIMBS.values() for name in limb)})
+"""The anatomical joint centres that a model of a person has in its landmarks.yaml."""
+
 _POSES = 2048
+# One in so many of them is stretched.
+_STRETCHED = 8
 # Points of a limb that are nearer to each other fill the same space [m].
 _APART = 0.08
 # Where points are put on a limb: so far from root to middle joint, and on to the end; a hand's or
@@ -40,6 +45,7 @@ class PlannedLimb:
         values: (k,) which of the tree's values move it alone.
         joints: (3,) its root, middle joint and end among the landmarks.
         poses: (n, k) values all over its limits; the first is at rest.
+        stretched: (s,) in which of them the limb is stretched out.
         samples_T: (n, m, 3) points along it in the trunk's frame at these [m].
         weights: (n, m) their shares: less where others are beside them, as on a folded limb.
         length: from its root to its end, stretched out [m].
@@ -49,6 +55,7 @@ class PlannedLimb:
     values: NDArray[np.intp]
     joints: NDArray[np.intp]
     poses: Array
+    stretched: NDArray[np.intp]
     samples_T: Array
     weights: Array
     length: float
@@ -74,8 +81,7 @@ class BodyPlan:
         self.kinematics = kinematics
         tree = kinematics.tree
         known = load_landmarks(tree.model.path)
-        needed = {*_TRUNK, *(name for limb in _LIMBS.values() for name in limb)}
-        missing = sorted(needed - set(known))
+        missing = sorted(PERSON_LANDMARKS - set(known))
         if missing:
             raise ModelError(
                 f"{tree.model.path}: landmarks.yaml lacks {', '.join(missing)}, which the capture "
@@ -113,6 +119,10 @@ class BodyPlan:
         lower, upper = kinematics.lower[values], kinematics.upper[values]
         poses = np.clip(rest[values], lower, upper) * np.ones((_POSES, 1))
         poses[1:] = lower + share[1:] * (upper - lower)
+        # People stretch their limbs more often than chance would.
+        stretched = np.flatnonzero(kinematics.value_nodes[values] == self._node(end))
+        chosen = np.arange(_POSES // _STRETCHED)
+        poses[np.ix_(chosen, stretched)] = poses[0, stretched]
         joints = np.array([self.landmarks.names.index(name) for name in (root, middle, end)])
         X_WN = np.empty((_POSES, len(moves), 4, 4))
         for k, pose in enumerate(poses):
@@ -124,7 +134,9 @@ class BodyPlan:
         samples_T = np.einsum("nji,nmj->nmi", R_WT, samples_W - p_WT[:, None])
         a, b, c = self.landmarks.positions(X_WN[0])[joints]
         length = float(np.linalg.norm(b - a) + np.linalg.norm(c - b))
-        return PlannedLimb(nodes, values, joints, poses, samples_T, crowding(samples_T), length)
+        return PlannedLimb(
+            nodes, values, joints, poses, chosen, samples_T, crowding(samples_T), length
+        )
 
     def samples(self, limb: PlannedLimb, X_WN: Array) -> Array:
         """(m, 3) points along a limb in the world [m] where the nodes are at X_WN."""

@@ -156,3 +156,20 @@ def face_direction(face: Picture, templates: FaceTemplates) -> FaceDirection:
         float(distances[nearest] / scale),
         float(np.sqrt(left) / scale),
     )
+
+
+def find_face(picture: Picture, blobs: Blobs, templates: FaceTemplates, farthest: float) -> Array:
+    """The direction (2,) of the face in a picture [rad]; nan where no face is seen.
+
+    Args:
+        picture: (H, W, 3) red, green, blue.
+        blobs: its skin.
+        templates: what faces look like.
+        farthest: how far from the eigenspace a face may be [grey levels].
+    """
+    face = cut_face(picture, blobs)
+    if face is not None:
+        found = face_direction(face, templates)
+        if found.outside <= farthest:
+            return found.direction
+    return np.full(2, np.nan)

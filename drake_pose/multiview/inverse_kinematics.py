@@ -196,11 +196,7 @@ def reach(
         distance = math.sqrt(distance)
         if distance < _CLOSE_ENOUGH or step == steps:
             break
-        for k in range(n):
-            for r in range(3):
-                u, v = (r + 1) % 3, (r + 2) % 3
-                arm_u, arm_v = tip[u] - places[k, u], tip[v] - places[k, v]
-                J[k, r] = turning[k, u] * arm_v - turning[k, v] * arm_u if free[k] else 0.0
+        _fill_jacobian(turning, places, tip, free, J)
         _solve_damped(J, gap, pull)
         largest = 0.0
         for k in range(n):
@@ -247,6 +243,18 @@ def _walk_chain(
             R[r, j] = cosine * old_j - sine * old_i
     for r in range(3):
         tip[r] += R[r, 0] * end[0] + R[r, 1] * end[1] + R[r, 2] * end[2]
+
+
+@njit(cache=True, nogil=True)
+def _fill_jacobian(
+    turning: Array, places: Array, tip: Array, free: NDArray[np.bool_], J: Array
+) -> None:
+    """Fills in J (n, 3): how the end (3,) moves with each free joint; 0 for the others."""
+    for k in range(len(turning)):
+        for r in range(3):
+            u, v = (r + 1) % 3, (r + 2) % 3
+            arm_u, arm_v = tip[u] - places[k, u], tip[v] - places[k, v]
+            J[k, r] = turning[k, u] * arm_v - turning[k, v] * arm_u if free[k] else 0.0
 
 
 @njit(cache=True, nogil=True)

@@ -100,14 +100,7 @@ def estimate_pose(
             inverse kinematics puts them.
         waist: the constants of the waist formula; the paper's where not given.
     """
-    q = np.array(last, dtype=np.float64)
-    if head_angles is not None:
-        index = skeleton.head_angles
-        q[index] = np.clip(head_angles, skeleton.lower[index], skeleton.upper[index])
-    q[skeleton.head_positions] = features[0] - skeleton.head_rotation(q) @ skeleton.face_H
-    q = upper_body(skeleton, q, features, face_known=head_angles is not None)
-    # Where the head's angles moved, its middle must still be where it was measured.
-    q[skeleton.head_positions] = features[0] - skeleton.head_rotation(q) @ skeleton.face_H
+    q = _head_and_arms(skeleton, last, features, head_angles)
     R_WT, neck = skeleton.trunk_pose(q)
     place = (waist or Waist()).place(features, float(q[skeleton.head_angles[0]]))
     # The model's trunk is one piece: it cannot hold shoulders and waist found apart. For its
@@ -137,6 +130,21 @@ def estimate_pose(
         aimed[limb.positions] = move_limb(limb, R_aimed, own_root, angles, end)
         limbs[name] = found
     return PaperPose(skeleton.clip(aimed), limbs, neck, place, scores)
+
+
+def _head_and_arms(
+    skeleton: Skeleton, last: Array, features: Array, head_angles: Array | None
+) -> Array:
+    """Positions (nq,) with head and hands where they were measured; legs as in the last frame."""
+    q = np.array(last, dtype=np.float64)
+    if head_angles is not None:
+        index = skeleton.head_angles
+        q[index] = np.clip(head_angles, skeleton.lower[index], skeleton.upper[index])
+    q[skeleton.head_positions] = features[0] - skeleton.head_rotation(q) @ skeleton.face_H
+    q = upper_body(skeleton, q, features, face_known=head_angles is not None)
+    # Where the head's angles moved, its middle must still be where it was measured.
+    q[skeleton.head_positions] = features[0] - skeleton.head_rotation(q) @ skeleton.face_H
+    return q
 
 
 def _middle(limb: Limb, R_WT: Array, root: Array, angles: Array) -> Array:

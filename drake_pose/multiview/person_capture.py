@@ -7,7 +7,7 @@ lengths and girths, and everything is followed once more with these.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from drake_pose.body import PoseTree
 from drake_pose.camera import Camera
 from drake_pose.errors import SettingsError
+from drake_pose.multiview.person_search import SearchSettings
 from drake_pose.multiview.person_shape import PersonShape, fit_shape, shape_noise, shape_values
 from drake_pose.multiview.silhouette_edges import EdgePoints
 from drake_pose.multiview.silhouette_fit import Round, SilhouetteFit
@@ -31,6 +32,7 @@ from drake_pose.silhouette import Outline
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 ReadFrame = Callable[[int], Mapping[str, Mask]]
+_Seen = tuple[list[Camera], list[SilhouetteView]]
 
 # A picture's height over the spacing of its region's edge points.
 _EDGE_POINTS = 120.0
@@ -43,7 +45,7 @@ def _lenient() -> TrackerSettings:
     ends = (Round(0.07, 0.05), Round(0.05, 0.05), Round(0.04, 0.04))
     return TrackerSettings(
         rounds=(Round(0.10, 0.06), *ends),
-        restart_rounds=(Round(0.20, 0.06), Round(0.15, 0.06), Round(0.10, 0.06), *ends),
+        search=SearchSettings((Round(0.20, 0.06), Round(0.15, 0.06), Round(0.10, 0.06), *ends)),
     )
 
 
@@ -81,6 +83,8 @@ class PersonCapture:
         shape: the person's; None where the model has no shape joints.
         outlines: the simplified surfaces of the tree's nodes, as wide as the person.
         tree: the pose tree.
+        deviations: (frames, nq) standard deviations of the positions [rad or m], as far as the
+            pictures and the limits tell; nan where nobody was seen in time.
     """
 
     q: Array
@@ -88,6 +92,7 @@ class PersonCapture:
     shape: PersonShape | None
     outlines: tuple[Outline, ...]
     tree: PoseTree
+    deviations: Array
 
 
 def capture_person(
@@ -97,6 +102,7 @@ def capture_person(
     count: int,
     settings: PersonCaptureSettings | None = None,
     on_frame: Callable[[int], None] | None = None,
+    pauses: Collection[int] = (),
 ) -> PersonCapture:
     """Captures a recording.
 
@@ -108,6 +114,7 @@ def capture_person(
         count: how many frames there are.
         settings: how.
         on_frame: called with each frame that is finished.
+        pauses: the frames before which the person was out of sight, and may have gone anywhere.
 
     Raises:
         ModelError: the model has no landmarks of trunk, arms and legs.
@@ -116,23 +123,19 @@ def capture_person(
     if count < 1:
         raise SettingsError("a recording needs one frame or more")
     settings = settings or PersonCaptureSettings()
-    recording = _Recording(cameras, read)
-    fit = SilhouetteFit(tree, noise=shape_noise())
-    is_shape = shape_values(tree)
-    tracker = SilhouetteTracker(fit, settings.tracker, is_shape)
-    states = {}
-    shape = None
-    if is_shape.any():
-        span = min(count, settings.shape_span)
-        rough = _follow_all(tracker, recording, range(span), settings, None)
-        wanted = np.unique(np.linspace(0, span - 1, settings.shape_frames).astype(int))
-        poses = {int(k): one.values for k in wanted if (one := rough[int(k)]) is not None}
-        used = list(poses)
-        shape = fit_shape(fit, [recording.edges(k) for k in used], np.array(list(poses.values())))
-        worn = SilhouetteFit(tree, shape.outlines, shape_noise())
-        tracker = SilhouetteTracker(worn, settings.tracker, is_shape, shape.values)
-        states = {k: tracker.start(pose) for k, pose in zip(used, shape.poses, strict=True)}
-    followed = _follow_all(tracker, recording, range(count), settings, states, on_frame)
+    recording = _Recording(cameras, read, frozenset(pauses))
+    tracker, shape, states = _measured(tree, recording, count, settings)
+    deviations = np.full((count, len(tree.model.position_names)), np.nan)
+
+    def finish(frame: int, state: TrackState | None, seen: _Seen) -> None:
+        if state is not None:
+            lengths = None if shape is None else shape.covariance
+            sure = tracker.uncertainty(state.values, *seen, lengths)
+            deviations[frame] = tracker.deviations(sure.covariance)
+        if on_frame is not None:
+            on_frame(frame)
+
+    followed = _follow_all(tracker, recording, range(count), settings, states, finish)
     empty = np.full(len(tree.model.position_names), np.nan)
     found = [followed.get(k) for k in range(count)]
     return PersonCapture(
@@ -141,16 +144,19 @@ def capture_person(
         shape,
         tracker.fit.outlines,
         tree,
+        deviations,
     )
 
 
 class _Recording:
     """A recording's frames as the tracker needs them."""
 
-    def __init__(self, cameras: Mapping[str, Camera], read: ReadFrame) -> None:
-        self._cameras, self._read = cameras, read
+    def __init__(
+        self, cameras: Mapping[str, Camera], read: ReadFrame, pauses: frozenset[int]
+    ) -> None:
+        self._cameras, self._read, self.pauses = cameras, read, pauses
 
-    def see(self, frame: int) -> tuple[list[Camera], list[SilhouetteView]]:
+    def see(self, frame: int) -> _Seen:
         """The cameras that have a picture, and what each says."""
         masks = self._read(frame)
         cameras = [self._cameras[name] for name in masks]
@@ -166,22 +172,46 @@ class _Recording:
         return cameras, [view.edge for view in views]
 
 
+def _measured(
+    tree: PoseTree, recording: _Recording, count: int, settings: PersonCaptureSettings
+) -> tuple[SilhouetteTracker, PersonShape | None, dict[int, TrackState]]:
+    """What follows a person of the shape that the first frames give, the shape, and poses there."""
+    fit = SilhouetteFit(tree, noise=shape_noise())
+    is_shape = shape_values(tree)
+    tracker = SilhouetteTracker(fit, settings.tracker, is_shape)
+    if not is_shape.any():
+        return tracker, None, {}
+    span = min(count, settings.shape_span)
+    rough = _follow_all(tracker, recording, range(span), settings, None)
+    wanted = np.unique(np.linspace(0, span - 1, settings.shape_frames).astype(int))
+    poses = {int(k): one.values for k in wanted if (one := rough[int(k)]) is not None}
+    used = list(poses)
+    shape = fit_shape(fit, [recording.edges(k) for k in used], np.array(list(poses.values())))
+    worn = SilhouetteFit(tree, shape.outlines, shape_noise())
+    tracker = SilhouetteTracker(worn, settings.tracker, is_shape, shape.values)
+    states = {k: tracker.start(pose) for k, pose in zip(used, shape.poses, strict=True)}
+    return tracker, shape, states
+
+
 def _follow_all(
     tracker: SilhouetteTracker,
     recording: _Recording,
     frames: range,
     settings: PersonCaptureSettings,
     known: Mapping[int, TrackState] | None,
-    on_frame: Callable[[int], None] | None = None,
+    finish: Callable[[int, TrackState | None, _Seen], None] | None = None,
 ) -> dict[int, TrackState | None]:
     """The states of all frames, begun where the person is known or fits best."""
     found: dict[int, TrackState | None] = {}
 
-    def follow(state: TrackState | None, frame: int) -> TrackState | None:
-        cameras, views = recording.see(frame)
-        found[frame] = tracker.follow(state, cameras, views)
-        if on_frame is not None:
-            on_frame(frame)
+    def follow(state: TrackState | None, frame: int, is_pause: bool = False) -> TrackState | None:
+        seen = recording.see(frame)
+        found[frame] = tracker.follow(state, *seen)
+        if is_pause and state is not None:
+            anew = tracker.follow(None, *seen)
+            found[frame] = max(found[frame], anew, key=lambda one: one.share if one else 0.0)
+        if finish is not None:
+            finish(frame, found[frame], seen)
         return found[frame]
 
     if not settings.is_sequence:
@@ -196,9 +226,9 @@ def _follow_all(
     forwards: TrackState | None = state
     backwards: TrackState | None = state
     for frame in range(begin, frames.stop):
-        forwards = follow(forwards, frame)
+        forwards = follow(forwards, frame, frame > begin and frame in recording.pauses)
     for frame in range(begin - 1, frames.start - 1, -1):
-        backwards = follow(backwards, frame)
+        backwards = follow(backwards, frame, frame + 1 in recording.pauses)
     return found
 
 

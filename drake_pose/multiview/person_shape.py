@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from drake_pose.body import PoseTree, TriangleMesh
 from drake_pose.camera import Camera
 from drake_pose.errors import ModelError
+from drake_pose.multiview.pose_uncertainty import pose_uncertainty
 from drake_pose.multiview.silhouette_edges import EdgePoints
 from drake_pose.multiview.silhouette_fit import Noise, Round, SilhouetteFit
 from drake_pose.silhouette import Outline, outline_from_mesh
@@ -58,6 +59,7 @@ class PersonShape:
 
     Args:
         values: (m,) of the pose tree; the shape joints' are the person's, others 0.
+        covariance: (h, h) of the shape joints' [m].
         is_shape: (m,) which values are shape joints.
         girths: by part, sides alike: how wide, 1 as the model.
         poses: (frames, m) values in the frames that it was fitted to.
@@ -65,6 +67,7 @@ class PersonShape:
     """
 
     values: Array
+    covariance: Array
     is_shape: Mask
     girths: dict[str, float]
     poses: Array
@@ -106,7 +109,7 @@ def fit_shape(
     is_shape = shape_values(fit.tree)
     if not is_shape.any():
         raise ModelError(f"{fit.tree.model.path}: a person's shape needs a model with shape joints")
-    parts, groups = _groups(fit.tree)
+    parts, groups = shape_parts(fit.tree)
     girths = np.zeros(len(parts))
     shape = np.zeros(int(is_shape.sum()))
     prior = _shape_prior(fit, is_shape, len(parts), settings)
@@ -134,7 +137,31 @@ def fit_shape(
     values[is_shape] = shape
     poses[:, is_shape] = shape
     widths = {part: float(np.exp(girth)) for part, girth in zip(parts, girths, strict=True)}
-    return PersonShape(values, is_shape, widths, poses, worn.outlines)
+    information = prior[: len(shape), : len(shape)] + _told(worn, frames, poses, is_shape, settings)
+    covariance = np.asarray(np.linalg.inv(information))
+    return PersonShape(values, covariance, is_shape, widths, poses, worn.outlines)
+
+
+def _told(
+    fit: SilhouetteFit,
+    frames: Sequence[tuple[Sequence[Camera], Sequence[EdgePoints]]],
+    poses: Array,
+    is_shape: Mask,
+    settings: ShapeSettings,
+) -> Array:
+    """(h, h) information about the lengths, that of a frame, the mean.
+
+    Where a person's surface is not the model's it is so in all frames: more of them do not help.
+    """
+    own = np.flatnonzero(~is_shape)
+    apriori = np.eye(len(own)) / settings.pose_deviation**2
+    told = np.zeros((int(is_shape.sum()), int(is_shape.sum())))
+    for (cameras, edges), pose in zip(frames, poses, strict=True):
+        H = pose_uncertainty(fit, cameras, edges, pose, settings.rounds[-1]).information
+        cross = H[np.ix_(own, is_shape)]
+        follow = np.linalg.solve(H[np.ix_(own, own)] + apriori, cross)
+        told += (H[np.ix_(is_shape, is_shape)] - cross.T @ follow) / len(frames)
+    return told
 
 
 def widened(fit: SilhouetteFit, girths: Array) -> tuple[Outline, ...]:
@@ -146,7 +173,7 @@ def widened(fit: SilhouetteFit, girths: Array) -> tuple[Outline, ...]:
     return tuple(wider)
 
 
-def _groups(tree: PoseTree) -> tuple[list[str], list[int]]:
+def shape_parts(tree: PoseTree) -> tuple[list[str], list[int]]:
     """The parts that have a girth, and which of them each node belongs to."""
     names = [
         node.name.removeprefix("left_").removeprefix("right_").removesuffix("_end")

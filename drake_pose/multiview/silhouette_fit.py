@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from drake_pose.body import PoseTree
 from drake_pose.body.tree_kinematics import Motions, TreeKinematics
-from drake_pose.camera import Camera, ParallelCamera
+from drake_pose.camera import Camera
 from drake_pose.matching.robust_fit import few_triangles
 from drake_pose.multiview.silhouette_edges import EdgePoints
 from drake_pose.multiview.silhouette_kernel import collect, compare_contours
@@ -81,8 +81,9 @@ class PoseFit:
 
     Args:
         values: (m,) of the pose tree [rad or m].
-        agreement: (nodes + 1, 2) before the last step: the length of each node's contour, and of
-            all edges in the last row, and how much of it fits to within the last scale [m].
+        agreement: (nodes + 1, 3) before the last step: the length of each node's contour, and of
+            all edges in the last row, how much of it fits to within the last scale, and how well:
+            one minus the cost in scales, summed along it [m].
     """
 
     values: Array
@@ -91,8 +92,38 @@ class PoseFit:
     @property
     def share(self) -> float:
         """Of both contours' lengths, what fits, 0 to 1."""
-        compared, fitting = self.agreement.sum(axis=0)
+        compared, fitting, _ = self.agreement.sum(axis=0)
         return float(fitting / max(compared, 1e-9))
+
+    @property
+    def closeness(self) -> float:
+        """How well both contours fit, 0 to 1: what tells the better one of two fits."""
+        compared, _, close = self.agreement.sum(axis=0)
+        return float(close / max(compared, 1e-9))
+
+
+class _Sight(NamedTuple):
+    """What all cameras say, as the kernel takes it.
+
+    cameras: X_CW (c, 4, 4) and kernel parameters (c, 8); edges: uv, normals and lengths of all edge
+    points, camera after camera, and where each begins.
+    """
+
+    cameras: tuple[Array, Array]
+    edges: tuple[Array, Array, Array, Indices]
+
+
+class Comparison(NamedTuple):
+    """What each camera says of each node's affine motion x (12,): x^T A x - 2 b^T x.
+
+    A: (cameras, nodes, 12, 12), lower triangles; b: (cameras, nodes, 12); motions: of the nodes at
+    the values; agreement: as in PoseFit.
+    """
+
+    A: Array
+    b: Array
+    motions: Motions
+    agreement: Array
 
 
 class Equations(NamedTuple):
@@ -163,9 +194,13 @@ class SilhouetteFit:
         """
         index = np.flatnonzero(np.ones(len(values), bool) if held is None else ~held)
         current = np.clip(values, self.lower, self.upper)
-        agreement = np.zeros((len(self.outlines) + 1, 2))
+        agreement = np.zeros((len(self.outlines) + 1, 3))
+        sight = _pack(cameras, edges)
         for step in rounds:
-            H, g, agreement = self.equations(cameras, edges, current, step)
+            A, b, motions, agreement = self._compare(sight, current, step)
+            affine = affine_motions(motions.twists)
+            A, b = A.sum(axis=0), b.sum(axis=0)
+            H, g = collect(A, b, affine, self._starts, self._moving, self._moving, len(values))
             if prior is not None:
                 g = g + prior.information * (current - prior.mean)
                 H = H + np.diag(prior.information)
@@ -178,7 +213,7 @@ class SilhouetteFit:
         edges: Sequence[EdgePoints],
         values: Array,
         step: Round,
-        groups: Sequence[int] = (),
+        groups: Sequence[int],
     ) -> Equations:
         """The normal equations at values (m,); arguments as in fit.
 
@@ -186,13 +221,26 @@ class SilhouetteFit:
             cameras, edges, values: as in fit.
             step: how.
             groups: (nodes,) for each node which girth it shares with others, or -1; the equations
-                then have the logarithms of these girths after the values.
+                have the logarithms of these girths after the values.
         """
+        A, b, motions, agreement = self.compare(cameras, edges, values, step)
+        A, b = A.sum(axis=0), b.sum(axis=0)
+        owners, parameters, starts = self._with_girths(groups)
+        affine = np.vstack([affine_motions(motions.twists), [_widening(X) for X in motions.X_WN]])
+        size = len(values) + max(groups, default=-1) + 1
+        H, g = collect(A, b, affine, starts, owners, parameters, size)
+        return Equations(H, g, agreement)
+
+    def compare(
+        self, cameras: Sequence[Camera], edges: Sequence[EdgePoints], values: Array, step: Round
+    ) -> Comparison:
+        """The contours at values (m,) compared with all cameras' edges; arguments as in fit."""
+        return self._compare(_pack(cameras, edges), values, step)
+
+    def _compare(self, sight: _Sight, values: Array, step: Round) -> Comparison:
         motions = self.kinematics.motions(values)
-        count = len(self.outlines)
-        A, b = np.zeros((count, 12, 12)), np.zeros((count, 12))
-        pixels = np.array([pixels_per_metre(camera, motions) for camera in cameras])
-        noise = self.noise
+        pixels = _pixels_per_metre(sight.cameras, motions.X_WN[0, :3, 3])
+        nodes, noise = len(self.outlines), self.noise
         weights = np.column_stack(
             [
                 1.0 / pixels,
@@ -202,35 +250,20 @@ class SilhouetteFit:
                 0.5 / (pixels * noise.correlation * (pixels * noise.deviation) ** 2),
             ]
         )
-        agreement = np.zeros((count + 1, 2))
+        A, b = np.zeros((len(pixels), nodes, 12, 12)), np.zeros((len(pixels), nodes, 12))
+        agreement = np.zeros((nodes + 1, 3))
         compare_contours(
             self._packed,
             motions.X_WN,
-            (
-                np.array([camera.X_CW for camera in cameras]),
-                np.array([camera.kernel_parameters() for camera in cameras]),
-            ),
-            (
-                np.concatenate([edge.uv for edge in edges]),
-                np.concatenate([edge.normals for edge in edges]),
-                np.concatenate([edge.lengths for edge in edges]),
-                np.cumsum([0, *(len(edge.uv) for edge in edges)]),
-            ),
+            sight.cameras,
+            sight.edges,
             weights,
             _REACH,
             A,
             b,
             agreement,
         )
-        affine = affine_motions(motions.twists)
-        if not groups:
-            H, g = collect(A, b, affine, self._starts, self._moving, self._moving, len(values))
-            return Equations(H, g, agreement)
-        owners, parameters, starts = self._with_girths(groups)
-        widening = np.array([_widening(X) for X in motions.X_WN])
-        size = len(values) + max(groups) + 1
-        H, g = collect(A, b, np.vstack([affine, widening]), starts, owners, parameters, size)
-        return Equations(H, g, agreement)
+        return Comparison(A, b, motions, agreement)
 
     def _with_girths(self, groups: Sequence[int]) -> tuple[Indices, Indices, Indices]:
         """The owners, parameters and starts of `collect` with a widening after each node's own."""
@@ -259,12 +292,27 @@ class SilhouetteFit:
         return stepped
 
 
-def pixels_per_metre(camera: Camera, motions: Motions) -> float:
-    """How large a metre is in a camera's picture, about where the body's root is [pixel/m]."""
-    if isinstance(camera, ParallelCamera):
-        return camera.pixels_per_metre
-    depth = camera.X_CW[2, :3] @ motions.X_WN[0, :3, 3] + camera.X_CW[2, 3]
-    return float(camera.focal_x / max(depth, camera.near))
+def _pack(cameras: Sequence[Camera], edges: Sequence[EdgePoints]) -> _Sight:
+    return _Sight(
+        (
+            np.array([camera.X_CW for camera in cameras]),
+            np.array([camera.kernel_parameters() for camera in cameras]),
+        ),
+        (
+            np.concatenate([edge.uv for edge in edges]),
+            np.concatenate([edge.normals for edge in edges]),
+            np.concatenate([edge.lengths for edge in edges]),
+            np.cumsum([0, *(len(edge.uv) for edge in edges)]),
+        ),
+    )
+
+
+def _pixels_per_metre(cameras: tuple[Array, Array], place: Array) -> Array:
+    """(c,) how large a metre at a place (3,) is in each picture [pixel/m]."""
+    X_CW, parameters = cameras
+    kind, focal, near = parameters[:, 0], parameters[:, 1], parameters[:, 5]
+    depth = np.maximum(X_CW[:, 2, :3] @ place + X_CW[:, 2, 3], near)
+    return np.asarray(np.where(kind == 0.0, focal / depth, focal))
 
 
 def affine_motions(twists: Array) -> Array:

@@ -81,7 +81,7 @@ def compare_contours(
     b: Array,
     agreement: Array,
 ) -> None:
-    """Adds what all cameras say of the nodes' affine motions, in world lengths.
+    """Adds what each camera says of the nodes' affine motions, in world lengths.
 
     Args:
         packed: the nodes' surfaces.
@@ -92,10 +92,11 @@ def compare_contours(
         weights: (c, 4) of each camera: metres a pixel, the cost's scale and the spacing of the
             body's contour [pixel], weight of a pixel of contour.
         reach: farther points do not correspond [scales].
-        A, b: (nodes, 12, 12), lower triangles, and (nodes, 12) added to: the cost is
+        A, b: (c, nodes, 12, 12), lower triangles, and (c, nodes, 12) added to: the cost is
             x^T A x - 2 b^T x for x the rows of a node's affine motion (3, 4).
-        agreement: (nodes + 1, 2) added to: the length of each node's contour, and of all edges in
-            the last row, and how much of it fits to within the scale [m].
+        agreement: (nodes + 1, 3) added to: the length of each node's contour, and of all edges in
+            the last row, how much of it fits to within the scale, and how well: one minus the cost
+            in scales, summed along it [m].
     """
     uv, normals, lengths, starts = edges
     for c in range(len(weights)):
@@ -113,7 +114,7 @@ def compare_contours(
         contour = sample_contour(packed, segments, cameras[1][c], 0.0, weights[c, 2], True)
         edge = (uv[begin:end], normals[begin:end], lengths[begin:end])
         camera = (cameras[0][c], cameras[1][c])
-        _add_camera(contour, edge, X_WN, camera, weights[c], reach, A, b, agreement)
+        _add_camera(contour, edge, X_WN, camera, weights[c], reach, A[c], b[c], agreement)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -150,6 +151,7 @@ def _add_camera(
         t = (r / scale) ** 2
         if t < 1.0:
             agreement[counted, 1] += length * metres
+        agreement[counted, 2] += length * metres / (1.0 + t)
         node = nodes[i]
         for k in range(3):
             p[k] = X_WN[node, k, 3]

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from drake_pose.silhouette.scenes import Scene, load_scene
     from drake_pose.silhouette.scoring import (
         draw_mask,
+        draw_segments,
         prefix_sums,
         score_bodies,
         score_candidates,
@@ -34,6 +35,7 @@ _HOMES = {
     "Scene": "scenes",
     "TreeSurfaces": "bending",
     "draw_mask": "scoring",
+    "draw_segments": "scoring",
     "label_image_to_mask": "label_images",
     "load_scene": "scenes",
     "mask_to_label_image": "label_images",
@@ -57,6 +59,7 @@ __all__ = [
     "Scene",
     "TreeSurfaces",
     "draw_mask",
+    "draw_segments",
     "label_image_to_mask",
     "load_scene",
     "mask_to_label_image",

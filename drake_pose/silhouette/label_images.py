@@ -22,8 +22,18 @@ def mask_to_label_image(mask: np.ndarray) -> ImageLabel16I:
     """Returns a mask (H, W) as a label image: OBJECT on the object, EMPTY elsewhere."""
     height, width = mask.shape
     image = ImageLabel16I(width, height)
-    image.mutable_data[:, :, 0] = np.where(mask, OBJECT, EMPTY)
+    fill_label_image(image, mask)
     return image
+
+
+def fill_label_image(image: ImageLabel16I, mask: np.ndarray) -> None:
+    """Makes a label image that exists show a mask (H, W), of whatever size it was before."""
+    height, width = mask.shape
+    image.resize(width, height)
+    labels = image.mutable_data[:, :, 0]
+    # A tenth of the time of numpy.where.
+    np.multiply(mask, np.int16(OBJECT - EMPTY), out=labels, dtype=np.int16)
+    labels += np.int16(EMPTY)
 
 
 def label_image_to_mask(

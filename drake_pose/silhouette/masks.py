@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
-import struct
-import zlib
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from drake_pose.camera.checks import LARGEST_SIDE
+from drake_pose.camera.picture_files import check_png
 from drake_pose.errors import MaskError
 
-_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
-
-def read_mask(path: str | Path, width: int | None = None, height: int | None = None) -> np.ndarray:
+def read_mask(
+    path: str | Path,
+    width: int | None = None,
+    height: int | None = None,
+    *,
+    may_be_empty: bool = False,
+) -> np.ndarray:
     """Reads a mask: a PNG picture of black (0) and one other value or colour, the object.
 
     Args:
         path: the file.
         width, height: the size the mask must have [pixel], where known.
+        may_be_empty: whether a picture that shows nothing is as good as any.
 
     Returns:
         (H, W) bool, True on the object.
@@ -34,7 +38,7 @@ def read_mask(path: str | Path, width: int | None = None, height: int | None = N
         data = path.read_bytes()
     except OSError as error:
         raise MaskError(f"{path}: cannot read the mask: {error.strerror}") from error
-    found = _check_png(data, path)
+    found = check_png(data, path, MaskError)
     if max(found) > LARGEST_SIDE:
         raise MaskError(f"{path}: {found[0]} x {found[1]} pixels are too many")
     expected = (found[0] if width is None else width, found[1] if height is None else height)
@@ -46,7 +50,7 @@ def read_mask(path: str | Path, width: int | None = None, height: int | None = N
     picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if picture is None:
         raise MaskError(f"{path}: the PNG picture is damaged")
-    return _to_mask(picture, path)
+    return _to_mask(picture, path, may_be_empty)
 
 
 def write_mask(path: str | Path, mask: np.ndarray) -> None:
@@ -65,39 +69,17 @@ def write_mask(path: str | Path, mask: np.ndarray) -> None:
         raise MaskError(f"{path}: cannot write the mask: {error.strerror}") from error
 
 
-def _check_png(data: bytes, path: Path) -> tuple[int, int]:
-    """Returns a PNG picture's width and height; refuses one that is cut short or damaged.
-
-    OpenCV's decoders differ from version to version in what they make of half a picture.
-    """
-    if not data.startswith(_SIGNATURE):
-        raise MaskError(f"{path}: not a PNG picture")
-    position, kind = len(_SIGNATURE), b""
-    while kind != b"IEND":
-        header = data[position : position + 8]
-        if len(header) < 8:
-            raise MaskError(f"{path}: the PNG picture is cut short")
-        length, kind = struct.unpack(">I4s", header)
-        end = position + 8 + length
-        checksum = data[end : end + 4]
-        if len(checksum) < 4:
-            raise MaskError(f"{path}: the PNG picture is cut short")
-        if struct.unpack(">I", checksum)[0] != zlib.crc32(data[position + 4 : end]):
-            raise MaskError(f"{path}: the PNG picture is damaged")
-        if position == len(_SIGNATURE) and (kind != b"IHDR" or length != 13):
-            raise MaskError(f"{path}: the PNG picture is damaged")
-        position = end + 4
-    width, height = struct.unpack(">II", data[16:24])
-    return width, height
-
-
-def _to_mask(picture: np.ndarray, path: Path) -> np.ndarray:
+def _to_mask(picture: np.ndarray, path: Path, may_be_empty: bool) -> np.ndarray:
     """Returns the mask of a decoded picture (H, W) or (H, W, channels)."""
     layers = picture[:, :, None] if picture.ndim == 2 else picture
     if layers.shape[2] == 4 and (layers[:, :, 3] == layers[0, 0, 3]).all():
         layers = layers[:, :, :3]  # an alpha channel that says nothing
+    elif layers.shape[2] == 4 and (layers[:, :, :3] == layers[0, 0, :3]).all():
+        layers = layers[:, :, 3:]  # one that says all
     mask: np.ndarray = np.any(layers, axis=2)
     if not mask.any():
+        if may_be_empty:
+            return mask
         raise MaskError(f"{path}: the mask is empty (all black): no object to be seen")
     if mask.all():
         raise MaskError(f"{path}: the mask is full (no black pixel): no background to be seen")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from drake_pose.camera import Camera, ParallelCamera, load_cameras
 from drake_pose.errors import SceneError, UnknownNameError
 from drake_pose.silhouette.masks import read_mask
+from drake_pose.silhouette.scene_files import Leftovers, SceneFiles, find_masks
 from drake_pose.yaml_files import read_yaml
 
 _FIELDS = ("sequence", "frame_rate_hz")
@@ -21,6 +22,7 @@ _LOOKING_BACK = np.array(
     [[0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
 _ANY_SCALE = 1000.0
+_UNKNOWN = "camera"
 
 
 @dataclass(frozen=True)
@@ -30,12 +32,13 @@ class Scene:
     Args:
         path: the folder.
         cameras: the cameras by name, in the camera file's order.
-        frames: the frames' names, sorted; a frame may lack some cameras.
+        frames: the frames' names in natural order, 2 before 10; a frame may lack some cameras.
         masks: the mask file of (camera, frame).
         sequence: whether the frames follow each other in time.
         frame_rate_hz: frames a second, where the scene says.
         scale_unknown: whether nobody knows the cameras: each is a parallel camera that looks along
             the world's -x, and its pixels_per_metre and what it looks at are to be found.
+        leftovers: what lies in the folder and is not used.
     """
 
     path: Path
@@ -45,6 +48,7 @@ class Scene:
     sequence: bool = False
     frame_rate_hz: float | None = None
     scale_unknown: bool = False
+    leftovers: Leftovers = field(default_factory=Leftovers)
 
     def cameras_of(self, frame: str) -> tuple[str, ...]:
         """Returns the names of the cameras that have a mask of a frame.
@@ -69,8 +73,13 @@ class Scene:
             raise UnknownNameError("frame", frame, known, f"{self.path}: camera '{camera}'")
         return self.masks[camera, frame]
 
-    def read(self, camera: str, frame: str) -> np.ndarray:
+    def read(self, camera: str, frame: str, *, may_be_empty: bool = False) -> np.ndarray:
         """Returns the mask (H, W) bool of a camera's frame.
+
+        Args:
+            camera: the camera's name.
+            frame: the frame's name.
+            may_be_empty: whether a picture that shows nobody is as good as any.
 
         Raises:
             UnknownNameError: when there is no such camera, or it has no such frame.
@@ -78,7 +87,7 @@ class Scene:
         """
         path = self.mask_path(camera, frame)
         size = self.cameras[camera]
-        return read_mask(path, size.width, size.height)
+        return read_mask(path, size.width, size.height, may_be_empty=may_be_empty)
 
 
 def load_scene(path: str | Path, cameras: Mapping[str, Camera] | None = None) -> Scene:
@@ -87,7 +96,8 @@ def load_scene(path: str | Path, cameras: Mapping[str, Camera] | None = None) ->
     The folder has `cameras.yaml`, `masks/<camera>/<frame>.png` and perhaps `scene.yaml`
     (`sequence: true|false`, `frame_rate_hz`). With a single camera the masks may lie in
     `masks/<frame>.png`. Such masks need no camera file: without one they were taken by a camera
-    that nobody knows, or by several where the pictures' sizes differ.
+    that nobody knows, or by several where the pictures' sizes differ. Masks of cameras that are not
+    in the camera file are left over, see `Scene.leftovers`.
 
     Args:
         path: the folder.
@@ -103,56 +113,33 @@ def load_scene(path: str | Path, cameras: Mapping[str, Camera] | None = None) ->
     sequence, frame_rate_hz = _read_settings(folder / "scene.yaml")
     if cameras is None:
         if not (folder / "cameras.yaml").is_file():
-            cameras, masks = _unknown_cameras(folder)
-            frames = tuple(sorted({frame for _, frame in masks}))
-            return Scene(folder, cameras, frames, masks, sequence, frame_rate_hz, True)
+            cameras, files = _unknown_cameras(folder)
+            return Scene(folder, cameras, files.frames, files.masks, sequence, frame_rate_hz, True)
         cameras = load_cameras(folder / "cameras.yaml")
-    masks = _find_masks(folder, cameras)
-    frames = tuple(sorted({frame for _, frame in masks}))
-    return Scene(folder, dict(cameras), frames, masks, sequence, frame_rate_hz)
+    files = find_masks(folder, cameras)
+    return Scene(
+        folder,
+        dict(cameras),
+        files.frames,
+        files.masks,
+        sequence,
+        frame_rate_hz,
+        leftovers=files.leftovers,
+    )
 
 
-def _find_masks(folder: Path, cameras: Mapping[str, Camera]) -> dict[tuple[str, str], Path]:
-    """Returns the mask files of (camera, frame)."""
-    root = folder / "masks"
-    if not root.is_dir():
-        raise SceneError(f"{folder}: has no folder masks/<camera>/<frame>.png")
-    flat = sorted(root.glob("*.png"))
-    if flat:
-        if len(cameras) != 1:
-            raise SceneError(
-                f"{root}: masks that lie in no camera's folder need exactly one camera, but there "
-                f"are {len(cameras)}: {', '.join(cameras)}"
-            )
-        (name,) = cameras
-        return {(name, file.stem): file for file in flat}
-    strangers = sorted(p.name for p in root.iterdir() if p.is_dir() and p.name not in cameras)
-    if strangers:
-        raise SceneError(
-            f"{root}: folder {', '.join(strangers)} belongs to no camera; there are: "
-            f"{', '.join(cameras)}"
-        )
-    masks = {
-        (name, file.stem): file for name in cameras for file in sorted((root / name).glob("*.png"))
-    }
-    if not masks:
-        raise SceneError(f"{root}: holds no mask <camera>/<frame>.png of: {', '.join(cameras)}")
-    return masks
-
-
-def _unknown_cameras(
-    folder: Path,
-) -> tuple[dict[str, Camera], dict[tuple[str, str], Path]]:
-    """Returns a camera for every size of picture, and the mask files of (camera, frame)."""
-    files = sorted((folder / "masks").glob("*.png"))
-    if not files:
+def _unknown_cameras(folder: Path) -> tuple[dict[str, Camera], SceneFiles]:
+    """Returns a camera for every size of picture, and the masks."""
+    if not (folder / "masks").is_dir() or not any((folder / "masks").glob("*.png")):
         raise SceneError(
             f"{folder}: has no cameras.yaml, so its cameras must be given; only masks that lie in "
             "masks/<frame>.png need none"
         )
-    sizes = [read_mask(file).shape[::-1] for file in files]
+    found = find_masks(folder, [_UNKNOWN])
+    sizes = {frame: read_mask(file).shape[::-1] for (_, frame), file in found.masks.items()}
+    several = len(set(sizes.values())) > 1
     names = {
-        size: "camera" if len(set(sizes)) == 1 else f"camera_{size[0]}x{size[1]}" for size in sizes
+        size: f"{_UNKNOWN}_{size[0]}x{size[1]}" if several else _UNKNOWN for size in sizes.values()
     }
     cameras: dict[str, Camera] = {
         name: ParallelCamera(
@@ -160,8 +147,8 @@ def _unknown_cameras(
         )
         for (width, height), name in names.items()
     }
-    masks = {(names[size], file.stem): file for size, file in zip(sizes, files, strict=True)}
-    return cameras, masks
+    masks = {(names[sizes[frame]], frame): file for (_, frame), file in found.masks.items()}
+    return cameras, SceneFiles(masks, found.frames)
 
 
 def _read_settings(path: Path) -> tuple[bool, float | None]:

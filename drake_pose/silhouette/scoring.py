@@ -66,6 +66,27 @@ def draw_mask(outlines: Sequence[Outline], X_CN: np.ndarray, camera: Camera) -> 
     return mask.view(np.bool_)
 
 
+def draw_segments(outlines: Sequence[Outline], X_CN: np.ndarray, camera: Camera) -> np.ndarray:
+    """Returns (H, W) uint8 which node of a body is seen in each pixel, counted from 1; 0: none.
+
+    Parts are painted one over the other, the one whose middle is farthest first, so their edges are
+    good to look at, not to measure by.
+
+    Args:
+        outlines: the surfaces of at most 255 nodes.
+        X_CN: (nodes, 4, 4) their poses in the camera.
+        camera: the camera.
+    """
+    shown = [k for k, outline in enumerate(outlines) if len(outline.vertices)]
+    middles = [X_CN[k, 2, :3] @ outlines[k].vertices.mean(axis=0) + X_CN[k, 2, 3] for k in shown]
+    segments = np.zeros((camera.height, camera.width), dtype=np.uint8)
+    for place in np.argsort(middles)[::-1]:
+        node = shown[place]
+        packed, poses = check_body([outlines[node]], np.asarray(X_CN)[None, [node]])
+        paint(packed, poses[0], camera.kernel_parameters(), segments, node + 1)
+    return segments
+
+
 def subtract_body(
     mask: np.ndarray,
     prefix: np.ndarray,

@@ -18,6 +18,7 @@ from drake_pose.body import ArticulatedModel
 from drake_pose.camera import PinholeCamera
 from drake_pose.errors import CameraError, UnknownNameError
 from drake_pose.silhouette import label_image_to_mask
+from drake_pose.systems.colour_images import colour_image_to_picture
 from drake_pose.systems.posed_geometry import pose_plant
 
 _RENDERER = "rig_renderer"
@@ -59,8 +60,7 @@ class CameraRig:
         Raises:
             UnknownNameError: there is no such camera.
         """
-        image = self._port("color_image", camera).Eval(context)
-        return np.array(image.data[:, :, :3])
+        return colour_image_to_picture(self._port("color_image", camera).Eval(context))
 
     def mask(self, context: Context, camera: str) -> NDArray[np.bool_]:
         """Where a camera sees the body: (H, W).

@@ -1,11 +1,47 @@
 """Bodies in a diagram's SceneGraph that stand as given positions say, with no dynamics."""
 
+import numpy as np
+from numpy.typing import NDArray
 from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.framework import DiagramBuilder, OutputPort
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiagramBuilder,
+    LeafSystem,
+    OutputPort,
+)
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from drake_pose.body import ArticulatedModel
+
+
+class KnownPositions(LeafSystem):
+    """Passes positions on, and others instead while they are not known.
+
+    .. pydrake_system::
+
+        name: KnownPositions
+        input_ports:
+        - positions
+        output_ports:
+        - known_positions
+
+    A plant refuses positions that are nan, which is what estimators say before they found a body.
+
+    Args:
+        otherwise: (nq,) the output while the input is not finite.
+    """
+
+    def __init__(self, otherwise: NDArray[np.float64]) -> None:
+        super().__init__()
+        self._otherwise = otherwise
+        self._input = self.DeclareVectorInputPort("positions", len(otherwise))
+        self.DeclareVectorOutputPort("known_positions", len(otherwise), self._calc)
+
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        q = self._input.Eval(context)
+        output.SetFromVector(q if np.isfinite(q).all() else self._otherwise)
 
 
 def pose_plant(
@@ -47,7 +83,7 @@ def add_avatar(
     Args:
         builder: the diagram under construction.
         model: the body.
-        positions: (nq,) in its plant's order.
+        positions: (nq,) in its plant's order; while they are nan it stands at its model's default.
         meshcat: where it is drawn.
         prefix: the path below which it is drawn.
         period: time between two drawings [s].
@@ -56,6 +92,8 @@ def add_avatar(
     plant = MultibodyPlant(0.0)
     plant.RegisterAsSourceForSceneGraph(scene_graph)
     model.add_to(plant, scene_graph)
-    pose_plant(builder, scene_graph, plant, positions, "avatar_pose")
+    known = builder.AddNamedSystem("avatar_positions", KnownPositions(model.default_positions))
+    builder.Connect(positions, known.get_input_port())
+    pose_plant(builder, scene_graph, plant, known.get_output_port(), "avatar_pose")
     parameters = MeshcatVisualizerParams(prefix=prefix, publish_period=period)
     MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, parameters)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import Meshcat
@@ -13,6 +16,7 @@ from pydrake.systems.framework import (
     DiscreteValues,
     EventStatus,
     LeafSystem,
+    OutputPort,
 )
 from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import Trajectory
@@ -43,6 +47,10 @@ KEYS = {"ahead": "ArrowUp", "behind": "ArrowDown", "left": "ArrowLeft", "right":
 
 _PARTS = ("head", "left_foot", "right_foot")
 _WALKER = "walker"
+# Who stands still moves head and feet by no more [m], and turns the face by no more [rad].
+_STILL, _FACING = 0.08, 0.25
+# Nobody turns the face by more from one frame to the next [rad].
+_AROUND = math.radians(100.0)
 # A key that is held down is pressed again and again, but first after half a second.
 _HELD = 0.55
 
@@ -62,8 +70,10 @@ class Walker(LeafSystem):
         - rest
         - avatar_positions
 
-    The first pose seen is the rest: where and which way the person stands without a command. Until
-    then, and while ``positions`` are not finite, nobody is there who could command. ``keys`` (turn,
+    The first pose in which the person stands still is the rest: where and which way the person
+    stands without a command. Until then, and while ``positions`` are not finite, nobody is there
+    who could command. Whoever turns around from one frame to the next was taken for facing the
+    wrong way, at rest too: the rest turns around with the person. ``keys`` (turn,
     walk) may stay unconnected; where not 0 it goes before the gestures. Outputs: the walker's x, y
     [m] and heading [rad] in the place; the command (turn, walk); the rest (5), nan until somebody
     was seen; and the last known positions (nq).
@@ -73,9 +83,10 @@ class Walker(LeafSystem):
         standing: (nq,) avatar_positions until somebody was seen [rad or m].
         period: time between two frames [s].
         settings: thresholds and speeds.
+        settle: how long the person must stand still at first [s]; 0: the first pose is the rest.
 
     Raises:
-        SettingsError: the period is not positive.
+        SettingsError: the period is not positive, or the time to settle negative.
         UnknownNameError: a link is missing.
     """
 
@@ -85,10 +96,13 @@ class Walker(LeafSystem):
         standing: Array,
         period: float,
         settings: WalkSettings | None = None,
+        settle: float = 0.0,
     ) -> None:
         super().__init__()
         if not period > 0:
             raise SettingsError(f"the walker's period must be positive, not {period}")
+        if not settle >= 0:
+            raise SettingsError(f"the time to settle must be 0 s or more, not {settle}")
         for part in _PARTS:
             if part not in model.link_names:
                 raise UnknownNameError("link", part, model.link_names, str(model.path))
@@ -104,6 +118,10 @@ class Walker(LeafSystem):
             "rest": np.full(5, np.nan),
             "avatar_positions": standing,
         }
+        self._settle = settle
+        # The stance that the person may be settling in, and since when [s].
+        self._settling = self.DeclareDiscreteState(np.append(np.full(5, np.nan), 0.0))
+        self._heading = self.DeclareDiscreteState(np.full(1, np.nan))
         self._states = {name: self.DeclareDiscreteState(start) for name, start in starts.items()}
         for name, state in self._states.items():
             self.DeclareStateOutputPort(name, state)
@@ -115,14 +133,24 @@ class Walker(LeafSystem):
         }
         turn, walk = NO_COMMAND
         q = self._positions.Eval(context)
+        heading = np.nan
         if np.isfinite(q).all():
             discrete_state.set_value(self._states["avatar_positions"], q)
             stance, rest = self._stance(q), states["rest"]
-            if not np.isfinite(rest).all():
+            heading = stance[0]
+            turned = math.remainder(
+                heading - context.get_discrete_state(self._heading).value()[0], 2.0 * math.pi
+            )
+            if abs(turned) > _AROUND:
+                rest = rest + np.array([turned, 0.0, 0.0, 0.0, 0.0])
+                discrete_state.set_value(self._states["rest"], rest)
+            if not np.isfinite(rest).all() and self._is_settled(stance, context, discrete_state):
                 rest = stance
                 discrete_state.set_value(self._states["rest"], rest)
-            last = states["command"].astype(int)
-            turn, walk = recognise_command(stance, rest, (last[0], last[1]), self._settings)
+            if np.isfinite(rest).all():
+                last = states["command"].astype(int)
+                turn, walk = recognise_command(stance, rest, (last[0], last[1]), self._settings)
+        discrete_state.set_value(self._heading, np.array([heading]))
         if self._keys.HasValue(context):
             pressed = self._keys.Eval(context).astype(int)
             turn, walk = int(pressed[0]) or turn, int(pressed[1]) or walk
@@ -137,6 +165,16 @@ class Walker(LeafSystem):
         discrete_state.set_value(self._states["command"], np.array([turn, walk], dtype=float))
         discrete_state.set_value(self._states["walker_pose"], pose)
         return EventStatus.Succeeded()
+
+    def _is_settled(self, stance: Array, context: Context, discrete_state: DiscreteValues) -> bool:
+        """Whether the person has stood still for long enough."""
+        settling = context.get_discrete_state(self._settling).value()
+        moved = np.abs(stance - settling[:5])
+        still = bool((moved[1:] <= _STILL).all() and moved[0] <= _FACING)
+        if not still:
+            settling = np.append(stance, context.get_time())
+            discrete_state.set_value(self._settling, settling)
+        return bool(context.get_time() - settling[5] >= self._settle)
 
     def _stance(self, q: Array) -> Array:
         self._plant.SetPositions(self._plant_context, q)
@@ -235,13 +273,18 @@ class WalkView(LeafSystem):
         return EventStatus.Succeeded()
 
 
+AddPositions = Callable[[DiagramBuilder], OutputPort]
+"""Adds systems to a diagram under construction; the port is that of the person's positions (nq)."""
+
+
 def build_walk(
     model: ArticulatedModel,
     meshcat: Meshcat,
-    positions: Trajectory | None,
+    positions: Trajectory | AddPositions | None,
     stride: Array,
     period: float = 1.0 / 30.0,
     settings: WalkSettings | None = None,
+    settle: float = 0.0,
 ) -> Diagram:
     """A place in Meshcat and a person who walks through it by gestures or keys.
 
@@ -251,17 +294,20 @@ def build_walk(
         model: the person.
         meshcat: where all is drawn.
         positions: the person's positions (nq,) over time, in a room with z upward, nan where not
-            found; None: the keys alone.
+            found; or what adds the systems that give them; None: the keys alone.
         stride: (n, nq) one stride on the spot that ends standing, for the keys.
         period: time between two frames [s].
         settings: thresholds and speeds.
+        settle: how long the person must stand still at first [s]; 0: the first pose is the rest.
     """
     draw_place(meshcat)
     builder = DiagramBuilder()
     keys = builder.AddNamedSystem("keys", WalkKeys(meshcat, stride, period))
-    walker = builder.AddNamedSystem("walker", Walker(model, stride[-1], period, settings))
+    walker = builder.AddNamedSystem("walker", Walker(model, stride[-1], period, settings, settle))
     if positions is None:
         source = keys.GetOutputPort("positions")
+    elif callable(positions):
+        source = positions(builder)
     else:
         source = builder.AddNamedSystem("positions", TrajectorySource(positions)).get_output_port()
     builder.Connect(source, walker.GetInputPort("positions"))

@@ -4,6 +4,7 @@ import pytest
 from typer.testing import CliRunner
 
 from drake_pose.apps.date import METHODS, run_experiment
+from drake_pose.apps.date_cost import measure_cost
 from drake_pose.apps.date_motion import MOTIONS, REGISTERED, make_motion
 from drake_pose.apps.date_pictures import save_pictures
 from drake_pose.apps.main import app
@@ -31,6 +32,13 @@ def skeleton():
 @pytest.fixture(scope="module")
 def result():
     return run_experiment(cameras=4, frames=60, seed=1)
+
+
+class TestCost:
+    def test_cost_grows_no_faster_than_the_number_of_cameras(self):
+        few, many = (measure_cost(count, size=(320, 240)).sum() / count for count in (4, 12))
+        # Timings on a busy machine are rough.
+        assert many < 1.6 * few
 
 
 class TestMotion:
@@ -63,6 +71,9 @@ class TestExperiment:
         assert figures["joint_error_mm"] < 40.0
         assert figures["face_error_deg"] < 6.0
         assert figures["paper_mm"] < figures["ik_only_mm"]
+        # The search moves elbows and knees alone; the paper's waist holds the knees back.
+        assert figures["elbows"]["paper_mm"] < 0.7 * figures["elbows"]["ik_only_mm"]
+        assert set(figures["knees"]) == {"ik_only_mm", "paper_mm", "silhouette_mm"}
         assert figures["frames_to_recover"] is not None
         assert figures["frames_to_recover"] <= 15
         assert figures["fps"] == pytest.approx(1e3 / figures["ms_per_frame"]["all"])

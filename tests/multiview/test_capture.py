@@ -1,108 +1,46 @@
-"""Contours, recognition, faces and the whole capture, on pictures that Drake renders."""
+"""Contours, recognition, faces and one camera's share, on pictures that Drake renders."""
 
 import cv2
 import numpy as np
 import pytest
 
-from drake_pose.body import bundled_model, load_model
-from drake_pose.camera.rigs import FACE_CAMERA, circle_of_cameras
-from drake_pose.errors import SettingsError, UnknownNameError
-from drake_pose.multiview.capture import (
-    CaptureSettings,
-    CaptureSetup,
-    capture_frame,
-    see_person,
-    start_state,
-)
+from drake_pose.camera.rigs import FACE_CAMERA
+from drake_pose.errors import SettingsError
+from drake_pose.multiview.capture import CaptureSetup, see_person
 from drake_pose.multiview.contours import measure_contour, similarity
-from drake_pose.multiview.faces import cut_face, face_direction, head_angles, learn_faces
+from drake_pose.multiview.faces import (
+    cut_face,
+    face_direction,
+    find_face,
+    head_angles,
+    learn_faces,
+)
 from drake_pose.multiview.features import find_features
-from drake_pose.multiview.recognition import recognise, register_pose, registered_positions
-from drake_pose.multiview.regions import learn_background
-from drake_pose.multiview.skeleton import FEATURES, LIMBS, load_skeleton, rotation
+from drake_pose.multiview.recognition import recognise
+from drake_pose.multiview.regions import learn_background, person_region
+from drake_pose.multiview.skeleton import FEATURES, rotation
 from drake_pose.multiview.skin_blobs import SkinColour, skin_blobs
-from drake_pose.systems.camera_rig import build_camera_rig
-
-SETTINGS = CaptureSettings()
-
-
-class Studio:
-    """A simulated person before nine cameras."""
-
-    def __init__(self):
-        self.model = load_model(bundled_model("person"), check=False)
-        self.skeleton = load_skeleton(self.model)
-        self.cameras = circle_of_cameras(8, size=(320, 240))
-        self.ring = {n: c for n, c in self.cameras.items() if n != FACE_CAMERA}
-        self.rig = build_camera_rig(self.model, self.cameras)
-        self.context = self.rig.diagram.CreateDefaultContext()
-
-    def posed(self, **degrees):
-        q = np.array(self.model.default_positions)
-        q[self.skeleton.head_positions[2]] = 1.55
-        for name, value in degrees.items():
-            q[self.model.position_index(name)] = np.radians(value)
-        return q
-
-    def picture(self, q, name):
-        self.rig.set_positions(self.context, q)
-        return self.rig.picture(self.context, name)
-
-    def mask(self, q, name):
-        self.rig.set_positions(self.context, q)
-        return self.rig.mask(self.context, name)
-
-    def view(self, q, name):
-        return see_person(self.picture(q, name), SETTINGS, self.mask(q, name))
-
-    def views(self, q):
-        return {name: self.view(q, name) for name in self.ring}
-
-    def face(self, q):
-        picture = self.picture(q, FACE_CAMERA)
-        return picture, see_person(picture, SETTINGS, self.mask(q, FACE_CAMERA))
+from tests.multiview.studio import shared_studio
 
 
 @pytest.fixture(scope="module")
 def studio():
-    return Studio()
+    return shared_studio()
 
 
 @pytest.fixture(scope="module")
 def registered(studio):
-    q = registered_positions(studio.skeleton)
-    q[2] = 1.55
-    cameras = list(studio.ring.values())
-    return register_pose(
-        studio.skeleton, q, cameras, lambda camera, q: studio.mask(q, camera.name), 36
-    )
+    return studio.registered
 
 
 @pytest.fixture(scope="module")
-def calibrated(studio, registered):
-    """The skeleton whose features are where the cameras see them."""
-    views = studio.views(registered.q)
-    found = find_features(
-        list(studio.ring.values()),
-        [view.blobs.centroids for view in views.values()],
-        [view.region for view in views.values()],
-        studio.skeleton.features(registered.q),
-    )
-    assert (found.support > 10).all()
-    return studio.skeleton.with_features(registered.q, found.places)
+def calibrated(studio):
+    return studio.calibrated
 
 
 @pytest.fixture(scope="module")
 def templates(studio):
-    turns, nods = np.radians(np.linspace(-60, 60, 9)), np.radians(np.linspace(-25, 35, 6))
-    directions = np.array([(turn, nod) for turn in turns for nod in nods])
-    faces = []
-    for turn, nod in directions:
-        q = studio.posed()
-        q[studio.skeleton.head_angles] = turn, nod
-        picture, view = studio.face(q)
-        faces.append(cut_face(picture, view.blobs))
-    return learn_faces(faces, directions)
+    return studio.templates
 
 
 class TestContours:
@@ -195,7 +133,15 @@ class TestFaces:
         assert found.template == 20
         assert found.distance < 1.0
         noise = np.random.default_rng(2).integers(0, 255, face.shape).astype(np.uint8)
-        assert face_direction(noise, templates).outside > 3 * found.outside + 30
+        outside = face_direction(noise, templates).outside
+        assert outside > 3 * found.outside + 30
+        np.testing.assert_array_equal(
+            find_face(picture, view.blobs, templates, 30.0), templates.directions[20]
+        )
+        patches = np.zeros((240, 320, 3), np.uint8)
+        patches[50:180:20, 60:140] = patches[40:180, 60:140:20] = (217, 166, 135)
+        blobs = skin_blobs(patches, np.ones((240, 320), bool), SkinColour())
+        assert np.isnan(find_face(patches, blobs, templates, 30.0)).all()
 
     def test_eigenspace_is_that_of_a_singular_value_decomposition(self):
         generator = np.random.default_rng(3)
@@ -230,16 +176,6 @@ class TestFaces:
 
 
 class TestCapture:
-    def setup_of(self, studio, calibrated, templates=None, registered=None, **settings):
-        return CaptureSetup(
-            calibrated,
-            studio.ring,
-            studio.cameras[FACE_CAMERA] if templates else None,
-            templates,
-            registered,
-            CaptureSettings(**settings),
-        )
-
     def test_features_are_measured_where_they_are(self, studio, calibrated):
         q = studio.posed(left_upper_arm_x=-60, left_upper_arm_z=20, right_upper_arm_z=-40)
         views = studio.views(q)
@@ -254,62 +190,6 @@ class TestCapture:
         assert (found.support > 0).all()
         assert errors.max() < 0.03, dict(zip(FEATURES, errors, strict=True))
 
-    def test_movement_is_followed(self, studio, calibrated, templates):
-        setup = self.setup_of(studio, calibrated, templates)
-        start = studio.posed(left_upper_arm_z=10, right_upper_arm_z=-10, left_forearm_x=-10)
-        goal = studio.posed(
-            left_upper_arm_x=-50, left_upper_arm_z=10, left_forearm_x=-50, right_upper_arm_z=-50,
-            left_thigh_x=-25, left_shin_x=30, head_y=12,
-        )  # fmt: skip
-        state = start_state(calibrated, start)
-        for share in np.linspace(0, 1, 8)[1:]:
-            q = start + share * (goal - start)
-            frame = capture_frame(setup, state, studio.views(q), studio.face(q))
-            state = frame.state
-            assert set(frame.milliseconds) == {"features", "face", "pose"}
-        for name in LIMBS:
-            errors = np.linalg.norm(
-                frame.pose.limbs[name] - calibrated.limb_points(q, name), axis=1
-            )
-            assert errors[0] < 0.06
-            assert errors[1] < 0.10
-            assert errors[2] < 0.04
-            ends = calibrated.limb_points(state.q, name)[2]
-            assert np.linalg.norm(ends - calibrated.limb_points(q, name)[2]) < 0.05
-
-    def test_lost_track_is_mended_by_the_registered_pose(self, studio, calibrated, registered):
-        setup = self.setup_of(studio, calibrated, None, registered)
-        wrong = start_state(calibrated, studio.posed(head_y=150, left_thigh_x=-90))
-        moving = studio.views(studio.posed(left_upper_arm_z=45, right_upper_arm_x=-40))
-        lost = capture_frame(setup, wrong, moving)
-        assert lost.recognition is None
-        q = np.array(registered.q)
-        q[:2] = 0.15, -0.1
-        mended = capture_frame(setup, lost.state, studio.views(q))
-        assert mended.recognition is not None
-        errors = [
-            calibrated.limb_points(mended.state.q, n) - calibrated.limb_points(q, n) for n in LIMBS
-        ]
-        assert np.linalg.norm(errors, axis=-1).max() < 0.12
-
-    def test_nobody_known_yet(self, studio, calibrated, registered):
-        setup = self.setup_of(studio, calibrated, None, registered)
-        assert capture_frame(setup, None, studio.views(studio.posed())) is None
-        assert capture_frame(setup, None, studio.views(registered.q)) is not None
-
-    def test_cameras_may_stop(self, studio, calibrated):
-        setup = self.setup_of(studio, calibrated)
-        q = studio.posed(left_upper_arm_z=30, right_upper_arm_z=-30)
-        state = start_state(calibrated, q)
-        views = studio.views(q)
-        some = {name: view for name, view in views.items() if name in ("camera_1", "camera_6")}
-        for seen in (some, dict(list(views.items())[:1]), {}):
-            frame = capture_frame(setup, state, seen)
-            assert np.isfinite(frame.state.q).all()
-        assert not frame.features.support.any()
-        with pytest.raises(UnknownNameError, match="camera_9"):
-            capture_frame(setup, state, {"camera_9": views["camera_0"]})
-
     def test_background_instead_of_a_mask(self, studio):
         generator = np.random.default_rng(5)
         away = studio.posed()
@@ -321,15 +201,17 @@ class TestCapture:
         ]
         q = studio.posed(left_upper_arm_z=60)
         background = learn_background(shots)
-        found = see_person(studio.picture(q, "camera_0"), SETTINGS, background=background)
+        found = person_region(studio.picture(q, "camera_0"), background)
         true = studio.mask(q, "camera_0")
-        assert (found.region & true).sum() / (found.region | true).sum() > 0.93
-        with pytest.raises(SettingsError, match="background"):
-            see_person(shots[0], SETTINGS)
+        assert (found & true).sum() / (found | true).sum() > 0.93
+        with pytest.raises(SettingsError, match="region"):
+            see_person(shots[0], true[:-1], SkinColour())
 
     def test_too_few_cameras(self, studio, calibrated):
         with pytest.raises(SettingsError, match="two cameras"):
             CaptureSetup(calibrated, dict(list(studio.ring.items())[:1]))
+        with pytest.raises(SettingsError, match="face camera 'camera_3'"):
+            CaptureSetup(calibrated, studio.ring, studio.ring["camera_3"])
 
     def test_features_of_a_known_pose_change_the_skeleton_a_little_only(self, studio):
         skeleton = studio.skeleton

@@ -77,6 +77,9 @@ class TestShape:
         off = np.array([found[name] - stretch for name, stretch in LENGTHS.items()])
         assert np.abs(off).mean() < 0.5 * np.mean(np.abs(list(LENGTHS.values())))
         assert all(0.93 < girth < 1.07 for girth in shape.girths.values())
+        names = [n for n, is_length in zip(found, shape.is_shape, strict=True) if is_length]
+        off = np.array([found[name] - LENGTHS.get(name, 0.0) for name in names])
+        assert 0.05 < off @ np.linalg.solve(shape.covariance, off) / len(off) < 2.0
 
     def test_girths_are_found(self, person, cameras):
         fit = SilhouetteFit(person.pose_tree(), noise=shape_noise())
@@ -145,6 +148,10 @@ class TestCapture:
                 if joint != "head_top":
                     errors.append(1e3 * np.linalg.norm(found[joint] - place))
         assert np.mean(errors) < 60.0
+        assert captured.deviations.shape == captured.q.shape
+        angles = [k for k, kind in enumerate(person.position_kinds) if kind == "angle"]
+        assert (captured.deviations[:, angles] > 0.003).all()
+        assert np.median(captured.deviations[:, angles]) < 0.15
         assert (captured.q >= person.lower - 1e-9).all()
         assert (captured.q <= person.upper + 1e-9).all()
         ious = []

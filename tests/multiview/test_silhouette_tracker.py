@@ -7,6 +7,7 @@ from drake_pose.body import bundled_model, load_model
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.errors import ModelError, SettingsError
 from drake_pose.multiview.body_plan import crowding
+from drake_pose.multiview.person_search import SearchSettings, Sight
 from drake_pose.multiview.silhouette_fit import SilhouetteFit
 from drake_pose.multiview.silhouette_tracker import (
     SilhouetteTracker,
@@ -100,6 +101,12 @@ class TestTracker:
         assert min(errors) < 25.0
         assert errors[-1] < 25.0
 
+    def test_stretched_arms_are_not_bent_the_wrong_way(self, world):
+        # Slightly bent backwards and twisted about itself, a stretched arm looks almost the same.
+        q = world.pose(left_upper_arm_z=80.0, right_upper_arm_z=-80.0)
+        state = world.tracker.follow(None, world.cameras, world.views(q))
+        assert world.off(state.values, q) < 25.0
+
     def test_lost_arm_is_searched_again(self, world):
         q = world.pose(**WALKING)
         lifted = world.pose(**{**WALKING, "left_upper_arm_z": 110.0, "left_forearm_x": -20.0})
@@ -116,11 +123,33 @@ class TestTracker:
         assert state.share == 0.0
         np.testing.assert_allclose(state.values, values, atol=1e-6)
 
+    def test_all_headings_are_tried_the_first_ones_all_around(self):
+        settings = SearchSettings(headings=12, headings_a_frame=3)
+        tried = [settings.turns(k) for k in range(4)]
+        assert sorted(turn for turns in tried for turn in turns) == list(range(12))
+        assert tried[0] == [0, 4, 8]
+        assert tried[1] == [2, 6, 10]
+        assert settings.turns(4) == tried[0]
+
+    def test_small_pictures_show_the_same_places(self, world):
+        views = world.views(world.pose(**WALKING))
+        sight = Sight(world.cameras, [v.region for v in views], [v.edge for v in views])
+        points = np.array([[0.1, 0.2, 1.0], [-0.1, 0.0, 0.4]])
+        for k, small, region in zip(sight.judges, *sight.small, strict=True):
+            assert region.shape == (small.height, small.width)
+            stride = world.cameras[k].height / small.height
+            uv, _ = world.cameras[k].project(points)
+            np.testing.assert_allclose(small.project(points)[0], uv / stride, atol=1e-9)
+
     def test_settings_are_checked(self):
         with pytest.raises(SettingsError, match="round"):
             TrackerSettings(rounds=())
-        with pytest.raises(SettingsError, match="direction"):
-            TrackerSettings(headings=0)
+        with pytest.raises(SettingsError, match="headings must be 1"):
+            SearchSettings(headings=0)
+        with pytest.raises(SettingsError, match="round"):
+            SearchSettings(rounds=())
+        with pytest.raises(SettingsError, match="share"):
+            SearchSettings(fitted=0.0)
 
 
 class TestPlan:
@@ -134,6 +163,11 @@ class TestPlan:
                 n.startswith(tuple(f"{side}_{p}" for p in parts)) for n in names[limb.values]
             )
             assert len(limb.values) == 4
+            middle = [
+                n for n, v in enumerate(limb.values) if "forearm" in names[v] or "shin" in names[v]
+            ]
+            assert (limb.poses[limb.stretched][:, middle] == 0.0).all()
+            assert 0 < len(limb.stretched) < len(limb.poses)
             assert (limb.poses >= plan.kinematics.lower[limb.values]).all()
             assert (limb.poses <= plan.kinematics.upper[limb.values]).all()
 

@@ -40,6 +40,9 @@ def test_deep_colour_and_transparent_masks(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_mask(save(tmp_path, colour)), MASK)
     opaque = np.dstack([colour, np.full(MASK.shape, 255, dtype=np.uint8)])
     np.testing.assert_array_equal(read_mask(save(tmp_path, opaque)), MASK)
+    white = np.full((*MASK.shape, 4), 255, dtype=np.uint8)
+    white[:, :, 3] *= MASK
+    np.testing.assert_array_equal(read_mask(save(tmp_path, white)), MASK)
 
 
 def test_recorded_masks(shared_data: Path) -> None:

@@ -8,8 +8,10 @@ from drake_pose.body import bundled_model, load_model
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.errors import SettingsError
 from drake_pose.multiview.silhouette_fit import SilhouetteFit
-from drake_pose.multiview.silhouette_tracker import SilhouetteTracker
+from drake_pose.multiview.silhouette_tracker import SilhouetteTracker, see_silhouette
+from drake_pose.silhouette import LabelRenderer
 from drake_pose.systems.person_tracker import PersonTracker, build_person_capture
+from drake_pose.systems.silhouette_eye import edge_spacing
 
 
 @pytest.fixture(scope="module")
@@ -46,15 +48,59 @@ def test_moving_person_is_followed_and_shown(person, cameras):
     assert meshcat.HasPath("/drake/avatar") or meshcat.HasPath("avatar")
 
 
-def test_without_pictures_the_default_stays(person, cameras):
+def test_without_pictures_nobody_is_found(person, cameras):
     tracker = SilhouetteTracker(SilhouetteFit(person.pose_tree()))
     system = PersonTracker(tracker, list(cameras.values()), 0.1)
     simulator = Simulator(system)
     simulator.AdvanceTo(0.25)
     context = simulator.get_context()
     found = system.GetOutputPort("estimated_positions").Eval(context)
-    np.testing.assert_allclose(found, person.default_positions, atol=1e-12)
+    assert len(found) == len(person.default_positions)
+    assert np.isnan(found).all()
     assert system.GetOutputPort("share").Eval(context)[0] == 0.0
+    assert not system.GetOutputPort("seen").Eval(context).any()
+
+
+def test_person_is_lost_kept_in_mind_and_found_again(person, cameras):
+    tracker = SilhouetteTracker(SilhouetteFit(person.pose_tree()))
+    system = PersonTracker(tracker, list(cameras.values()), 0.1)
+    simulator = Simulator(system)
+    context = simulator.get_context()
+    q = np.zeros(len(person.position_names))
+    q[person.position_index("position_z")] = 1.55
+
+    def show(x, time, blind=()):
+        q[person.position_index("position_x")] = x
+        for name, camera in cameras.items():
+            view = None
+            if name not in blind:
+                mask = LabelRenderer(person, camera).mask(q)
+                view = see_silhouette(mask, edge_spacing(camera))
+            system.GetInputPort(f"silhouette_{name}").FixValue(context, view)
+        system.GetInputPort("time").FixValue(context, [time])
+        simulator.AdvanceTo(context.get_time() + 0.1)
+        names = ("estimated_positions", "last_positions", "share", "seen")
+        return [system.GetOutputPort(name).Eval(context).copy() for name in names]
+
+    none = tuple(cameras)
+    show(0.0, np.nan)
+    assert np.isnan(system.GetOutputPort("time").Eval(context)[0])
+    found, last, share, seen = show(0.0, 1.0)
+    assert found[0] == pytest.approx(0.0, abs=0.02)
+    assert share[0] > 0.8
+    assert seen.tolist() == [1, 1, 1, 1]
+    # The same time stamp: nothing new, whatever the pictures show.
+    again, _, _, _ = show(0.0, 1.0, none)
+    np.testing.assert_array_equal(again, found)
+    lost, kept, share, seen = show(0.0, 1.1, none)
+    assert np.isnan(lost).all()
+    np.testing.assert_array_equal(kept, last)
+    assert share[0] == 0.0
+    assert not seen.any()
+    # Back, a step away, and one camera is blind.
+    found, _, _, seen = show(0.15, 1.4, none[:1])
+    assert found[0] == pytest.approx(0.15, abs=0.03)
+    assert seen.tolist() == [0, 1, 1, 1]
 
 
 def test_arguments_are_checked(person, cameras):

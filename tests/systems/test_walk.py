@@ -77,6 +77,30 @@ def test_gestures_walk_and_turn(person, page):
     assert page.HasPath("/drake/place/lawn")
 
 
+def test_who_was_taken_for_facing_the_wrong_way_turns_the_rest_around(person, page):
+    """The tracker mends itself: no command to turn, and ahead is where the person faces."""
+    stances = [standing(person, 0.0, 179.0), standing(person), standing(person, 0.4)]
+    found = run(person, page, stances)
+    assert [tuple(command) for _, command in found] == [(0, 0), (0, 0), (0, 1)]
+
+
+def test_rest_is_where_the_person_stands_still(person, page):
+    ways = [standing(person, x) for x in np.linspace(-0.5, 0.0, 30)]
+    times = PERIOD * np.arange(30 + 40 + 30)
+    q = np.array([*ways, *[standing(person)] * 40, *[standing(person, 0.4)] * 30])
+    path = PiecewisePolynomial.ZeroOrderHold(times, q.T)
+    stride = np.array([standing(person)])
+    diagram = build_walk(person, page, path, stride, PERIOD, SETTINGS, settle=1.0)
+    simulator = Simulator(diagram)
+    rest = diagram.GetSubsystemByName("walker").GetOutputPort("rest")
+    own = diagram.GetSubsystemByName("walker").GetMyContextFromRoot(simulator.get_context())
+    simulator.AdvanceTo(1.5)
+    assert np.isnan(rest.Eval(own)).all()
+    simulator.AdvanceTo(3.2)
+    assert rest.Eval(own)[3] == pytest.approx(0.0, abs=0.09)
+    assert tuple(diagram.GetOutputPort("command").Eval(simulator.get_context())) == (0, 1)
+
+
 def press(page, button):
     """What the browser sends for a button: a map of two texts as MessagePack."""
     texts = ["type", "button", "name", button]
@@ -124,6 +148,8 @@ def test_wrong_period_and_body_are_refused(person):
     q = standing(person)
     with pytest.raises(SettingsError, match="period"):
         Walker(person, q, 0.0)
+    with pytest.raises(SettingsError, match="settle"):
+        Walker(person, q, PERIOD, settle=-1.0)
     arm = load_model(bundled_model("hand"), check=False)
     with pytest.raises(UnknownNameError, match="head"):
         Walker(arm, arm.default_positions, PERIOD)

@@ -1,0 +1,131 @@
+"""Pictures and masks in files: whole ones only, in one form."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.camera.checks import LARGEST_SIDE
+from drake_pose.errors import DrakePoseError
+
+Picture = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+
+SUFFIXES = (".png", ".jpg", ".jpeg")
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+_JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+# A lossy picture of a mask is white from here on.
+_HALF = 128
+
+
+def read_picture(path: Path, error_type: type[DrakePoseError]) -> Picture:
+    """Reads a PNG or JPEG picture.
+
+    Returns:
+        (H, W, 3) red, green, blue.
+
+    Raises:
+        error_type: names the file; when it is no whole picture.
+    """
+    picture = _decode(_read(path, error_type), cv2.IMREAD_COLOR, path, error_type)
+    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def read_person_mask(path: Path, error_type: type[DrakePoseError]) -> Mask:
+    """Reads a PNG or JPEG picture of a mask; it may be empty, where nobody is seen.
+
+    A PNG is black and one other colour; a JPEG, whose values its compression blurs, dark and light.
+
+    Returns:
+        (H, W), True on the person.
+
+    Raises:
+        error_type: names the file; when it is no whole picture, or no mask.
+    """
+    data = _read(path, error_type)
+    picture = _decode(data, cv2.IMREAD_UNCHANGED, path, error_type)
+    if picture.ndim == 3 and picture.shape[2] == 4 and np.ptp(picture[:, :, 3]) == 0:
+        picture = np.ascontiguousarray(picture[:, :, :3])  # An alpha channel that says nothing.
+    if data.startswith(_JPEG):
+        mask = mask_of_picture(picture)
+    else:
+        black = cv2.inRange(picture, (0, 0, 0, 0), (0, 0, 0, 0)) > 0
+        mask = ~black
+        first = picture.reshape(len(black.ravel()), -1)[mask.argmax()]
+        colour = tuple(float(value) for value in first)
+        same = cv2.countNonZero(cv2.inRange(picture, colour, colour))
+        if mask.any() and same != np.count_nonzero(mask):
+            raise error_type(
+                f"{path}: has more than two values, but a mask is black, and one other colour on "
+                "the person; threshold it, or give a background instead of masks"
+            )
+    if mask.all():
+        raise error_type(f"{path}: the mask is full (no black pixel): no background to be seen")
+    return np.asarray(mask, dtype=np.bool_)
+
+
+def mask_of_picture(picture: Picture) -> Mask:
+    """The mask (H, W) of a picture (H, W) or (H, W, 3) that compression blurred: what is light."""
+    grey = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+    return np.asarray(grey >= _HALF, dtype=np.bool_)
+
+
+def check_png(data: bytes, path: Path, error_type: type[DrakePoseError]) -> tuple[int, int]:
+    """A PNG picture's width and height; one that is cut short or damaged is refused.
+
+    OpenCV's decoders differ from version to version in what they make of half a picture.
+
+    Raises:
+        error_type: names the file.
+    """
+    if not data.startswith(_PNG):
+        raise error_type(f"{path}: not a PNG picture")
+    position, kind = len(_PNG), b""
+    while kind != b"IEND":
+        header = data[position : position + 8]
+        if len(header) < 8:
+            raise error_type(f"{path}: the PNG picture is cut short")
+        length, kind = struct.unpack(">I4s", header)
+        end = position + 8 + length
+        checksum = data[end : end + 4]
+        if len(checksum) < 4:
+            raise error_type(f"{path}: the PNG picture is cut short")
+        if struct.unpack(">I", checksum)[0] != zlib.crc32(data[position + 4 : end]):
+            raise error_type(f"{path}: the PNG picture is damaged")
+        if position == len(_PNG) and (kind != b"IHDR" or length != 13):
+            raise error_type(f"{path}: the PNG picture is damaged")
+        position = end + 4
+    width, height = struct.unpack(">II", data[16:24])
+    return width, height
+
+
+def _read(path: Path, error_type: type[DrakePoseError]) -> bytes:
+    """A file's content, a whole PNG or JPEG picture as far as its frame tells."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise error_type(f"{path}: cannot read the picture: {error.strerror}") from error
+    if data.startswith(_JPEG):
+        if not data.rstrip(b"\0").endswith(_JPEG_END):
+            raise error_type(f"{path}: the JPEG picture is cut short")
+        return data
+    if max(check_png(data, path, error_type)) > LARGEST_SIDE:
+        raise error_type(f"{path}: has more than {LARGEST_SIDE} pixels a side")
+    return data
+
+
+def _decode(data: bytes, how: int, path: Path, error_type: type[DrakePoseError]) -> Picture:
+    """A picture as OpenCV gives it."""
+    try:
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), how)
+    except cv2.error:
+        picture = None
+    if picture is None or max(picture.shape[:2]) > LARGEST_SIDE:
+        raise error_type(f"{path}: not a whole PNG or JPEG picture")
+    return np.asarray(picture)

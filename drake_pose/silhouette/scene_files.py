@@ -1,0 +1,154 @@
+"""Which files of a scene's folder are masks, of which camera and frame, and which are left over."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from pathlib import Path
+
+from drake_pose.errors import SceneError
+
+_SUFFIX = ".png"
+
+
+@dataclass(frozen=True)
+class Leftovers:
+    """What lies in a scene's folder and is not used.
+
+    Args:
+        uncalibrated: folders of masks that belong to no camera, with how many masks each has.
+        doubled: masks of (camera, frame) beside the one that is used: the same number again.
+        foreign: by camera, files that are no masks; "" for those that lie in no camera's folder.
+    """
+
+    uncalibrated: Mapping[str, int] = field(default_factory=dict)
+    doubled: Mapping[tuple[str, str], tuple[Path, ...]] = field(default_factory=dict)
+    foreign: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class SceneFiles:
+    """A scene's masks.
+
+    Args:
+        masks: the mask file of (camera, frame).
+        frames: the frames' names in their natural order: 2 before 10.
+        leftovers: what is not used.
+    """
+
+    masks: Mapping[tuple[str, str], Path]
+    frames: tuple[str, ...]
+    leftovers: Leftovers = field(default_factory=Leftovers)
+
+
+def natural_key(name: str) -> tuple[tuple[str, int], ...]:
+    """What names are sorted by: texts and the numbers in them in turn, so that 2 precedes 10."""
+    texts = re.split(r"(?<=[0-9])(?![0-9])", name)
+    pairs = [re.fullmatch(r"(.*?)([0-9]*)", text, re.DOTALL) for text in texts]
+    return tuple((p[1], int(p[2] or -1)) for p in pairs if p is not None)
+
+
+def close_names(name: str, known: Iterable[str]) -> list[str]:
+    """Those known names that a misspelt one may stand for."""
+    lower = {one.lower(): one for one in known}
+    return [lower[one] for one in get_close_matches(name.lower(), lower, n=2)]
+
+
+def find_masks(folder: Path, cameras: Iterable[str]) -> SceneFiles:
+    """Finds masks/<camera>/<frame>.png, or masks/<frame>.png of a single camera.
+
+    Hidden files are passed over. Folders that belong to no camera, and files that are no PNG
+    pictures, are left over. Cameras that number their frames with and without leading zeros mean
+    the same frames.
+
+    Raises:
+        SceneError: names the folder; no masks, masks that lie in no camera's folder, or a folder
+            that cannot be read.
+    """
+    names = list(cameras)
+    root = folder / "masks"
+    if not root.is_dir():
+        raise SceneError(f"{folder}: has no folder masks/<camera>/<frame>.png")
+    flat, foreign = _list_pictures(root)
+    folders = [path for path in _visible(root) if path.is_dir()]
+    found = {path.name: _list_pictures(path) for path in folders}
+    known = {name: found[name][0] for name in names if name in found}
+    strangers = {name: len(files) for name, (files, _) in found.items() if name not in names}
+    if flat and not any(known.values()):
+        if len(names) != 1:
+            raise SceneError(
+                f"{root}: masks that lie in no camera's folder need exactly one camera, but there "
+                f"are {len(names)}: {', '.join(names)}"
+            )
+        known, flat = {names[0]: flat}, []
+    if not any(known.values()):
+        raise SceneError(_no_masks(root, names, strangers, found))
+    masks, frames, doubled = _join_frames(known)
+    beside = [name for name in foreign if not name.endswith("/")]
+    others = {"": (*beside, *(path.name for path in flat))}
+    others |= {name: found[name][1] for name in names if name in found}
+    kept = {name: files for name, files in others.items() if files}
+    return SceneFiles(masks, frames, Leftovers(strangers, doubled, kept))
+
+
+def _no_masks(
+    root: Path,
+    names: list[str],
+    strangers: Mapping[str, int],
+    found: Mapping[str, tuple[list[Path], tuple[str, ...]]],
+) -> str:
+    """What to say where no camera has a mask."""
+    text = f"{root}: holds no mask <camera>/<frame>.png of: {', '.join(names)}"
+    if strangers:
+        text += f"; folder {', '.join(strangers)} belongs to no camera of the camera file"
+    others = [f"{name}/{file}" for name in names if name in found for file in found[name][1]]
+    if others:
+        text += f"; {others[0]} is {'a folder' if others[0].endswith('/') else 'no PNG picture'}"
+    return text
+
+
+def _visible(folder: Path) -> list[Path]:
+    """A folder's entries by name, but for hidden ones, such as those that macOS leaves behind."""
+    try:
+        entries = sorted(folder.iterdir())
+    except OSError as error:
+        raise SceneError(f"{folder}: cannot be read: {error.strerror}") from error
+    return [path for path in entries if not path.name.startswith(".")]
+
+
+def _list_pictures(folder: Path) -> tuple[list[Path], tuple[str, ...]]:
+    """The PNG files of a folder, and the names of its other files."""
+    entries = _visible(folder)
+    pictures = [p for p in entries if p.suffix.lower() == _SUFFIX and not p.is_dir()]
+    others = [path for path in entries if path not in pictures]
+    return pictures, tuple(f"{path.name}/" if path.is_dir() else path.name for path in others)
+
+
+def _join_frames(
+    files: Mapping[str, list[Path]],
+) -> tuple[dict[tuple[str, str], Path], tuple[str, ...], dict[tuple[str, str], tuple[Path, ...]]]:
+    """Masks by camera and frame, the frames, and what is there twice.
+
+    A single camera's frames are told apart by their whole names: they may be unrelated stills.
+    """
+    spelt = sorted({f.stem for own in files.values() for f in own}, key=lambda s: (-len(s), s))
+    name_of = {stem: stem for stem in spelt}
+    if sum(bool(own) for own in files.values()) > 1:
+        first: dict[tuple[tuple[str, int], ...], str] = {}
+        name_of = {stem: first.setdefault(natural_key(stem), stem) for stem in spelt}
+    masks: dict[tuple[str, str], Path] = {}
+    doubled: dict[tuple[str, str], tuple[Path, ...]] = {}
+    for camera, own in files.items():
+        for file in sorted(own, key=lambda f: (-len(f.stem), f.name)):
+            key = camera, name_of[file.stem]
+            if key in masks:
+                doubled[key] = (*doubled.get(key, ()), file)
+            else:
+                masks[key] = file
+    frames = sorted({frame for _, frame in masks}, key=lambda name: (natural_key(name), name))
+    order = {frame: k for k, frame in enumerate(frames)}
+    cameras = {camera: k for k, camera in enumerate(files)}
+    listed = sorted(masks, key=lambda key: (cameras[key[0]], order[key[1]]))
+    return {key: masks[key] for key in listed}, tuple(frames), doubled

@@ -20,6 +20,7 @@ test: $(VENV)/ready
 
 bench: $(VENV)/ready
 	$(PYTHON) -m drake_pose.apps.benchmark
+	$(PYTHON) -m drake_pose.apps.cluster_benchmark
 
 clean:
 	rm -rf $(VENV) results

@@ -1,4 +1,4 @@
-"""The command `drake-pose capture`."""
+"""The command `drake-pose capture`: estimate with the bundled person, who is followed."""
 
 from __future__ import annotations
 
@@ -7,44 +7,85 @@ from typing import Annotated
 
 import typer
 
-from drake_pose.apps.estimate_options import JsonOption, ReplayOption, SceneArgument
-from drake_pose.apps.terminal import FAILED, errors_as_messages, print_json, say, warn
+from drake_pose.apps.cluster_options import SchedulerOption, WatchersOption, workers_of
+from drake_pose.apps.estimate_command import run_estimate
+from drake_pose.apps.estimate_options import (
+    CameraOption,
+    FrameOption,
+    JsonOption,
+    OutOption,
+    OverlayOption,
+    ReplayOption,
+    ResumeOption,
+    SceneArgument,
+    TrackOption,
+    TruthOption,
+)
+from drake_pose.apps.live_command import (
+    FitShapeOption,
+    SecondsOption,
+    ShapeOption,
+    ToleranceOption,
+    run_live_capture,
+)
+from drake_pose.apps.settings import EstimateSettings
+from drake_pose.apps.terminal import errors_as_messages
 
 
 def capture(
     scene: SceneArgument,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the result.")],
+    out: OutOption,
     model: Annotated[
         Path | None,
         typer.Option(help="A person with landmarks.yaml beside it; the bundled one if not given."),
     ] = None,
+    camera: CameraOption = None,
+    frame: FrameOption = None,
+    truth: TruthOption = None,
+    track: TrackOption = True,
+    resume: ResumeOption = False,
+    overlay: OverlayOption = True,
     replay: ReplayOption = True,
+    seconds: SecondsOption = None,
+    shape: ShapeOption = None,
+    fit_shape: FitShapeOption = True,
+    tolerance: ToleranceOption = None,
+    workers: WatchersOption = 0,
+    scheduler: SchedulerOption = None,
     json: JsonOption = False,
 ) -> None:
     """See help_texts.CAPTURE."""
-    with errors_as_messages():
-        from drake_pose.apps.capture import capture_scene
-        from drake_pose.apps.report import count_progress, percent
-        from drake_pose.silhouette import load_scene
-
-        done = 0
-        with count_progress("frames", len(load_scene(scene).frames)) as advance:
-
-            def count(frames: int) -> None:
-                nonlocal done
-                done += frames
-                advance(done)
-
-            result = capture_scene(scene, out, model, replay, count)
-        for text in result.warnings:
-            warn(text)
-        summary = result.summary
-        if json:
-            print_json(summary)
-        else:
-            say(
-                f"drake-pose: {summary['found_count']} of {summary['frame_count']} frames, mean "
-                f"intersection over union {percent(summary['mean_iou'])}; result in {out}"
+    if workers and scheduler is not None:
+        raise typer.BadParameter("give --workers or --scheduler, not both")
+    # The name of SOURCES; its module would make every command's start slow.
+    if (scene / "sources.yaml").is_file():
+        if camera or frame or truth or resume or not track:
+            raise typer.BadParameter(
+                "--camera, --frame, --truth, --no-track and --resume are for a folder of masks; "
+                f"{scene} has a sources.yaml"
             )
-        if not summary["found_count"]:
-            raise typer.Exit(FAILED)
+        with errors_as_messages(), workers_of(workers, scheduler) as client:
+            open_eyes = None
+            if client is not None:
+                from drake_pose.apps.cluster_eyes import opener
+
+                # Workers may have another working folder.
+                scene, open_eyes = scene.absolute(), opener(client, tolerance)
+            run_live_capture(
+                scene, out, model, seconds=seconds, shape=shape, fit_shape=fit_shape,
+                tolerance=tolerance, replay=replay, json=json, open_eyes=open_eyes,
+            )  # fmt: skip
+        return
+    if seconds or shape or not fit_shape or tolerance or workers or scheduler:
+        raise typer.BadParameter(f"{scene} has no sources.yaml, which that option is for")
+    with errors_as_messages():
+        from drake_pose.apps.capture import bundled_person
+
+        model = model or bundled_person()
+    settings = EstimateSettings(
+        cameras=tuple(camera or ()), frames=tuple(frame or ()), method="person", track=track
+    )
+    run_estimate(
+        scene, model, out, settings, truth=truth, resume=resume, overlay=overlay, replay=replay,
+        json=json,
+    )  # fmt: skip

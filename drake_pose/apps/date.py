@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from drake_pose.apps.date_motion import MOTIONS, REGISTERED, Motion, make_motion
+from drake_pose.apps.date_motion import REGISTERED, Motion, make_motion
 from drake_pose.apps.date_studio import Studio
-from drake_pose.apps.date_tracks import PaperTrack, Sight, SilhouetteTrack, see
+from drake_pose.apps.date_tracks import PaperTrack, SilhouetteTrack, see
 from drake_pose.body.landmarks import landmarks_of_nodes
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.errors import SettingsError
@@ -30,6 +30,7 @@ FRAMES = 240
 _RIGHT_AGAIN, _RIGHT_MM = 2.0, 25.0
 # How long a destroyed track is watched [frames].
 _WATCHED = 30
+_FEWEST_WATCHED = 10
 
 
 TITLES = {
@@ -71,6 +72,11 @@ class DateResult:
     seed: int
     pictures: Mapping[str, NDArray[np.uint8]]
 
+    @property
+    def motions(self) -> tuple[str, ...]:
+        """Those that were shown."""
+        return tuple(name for name in dict.fromkeys(self.names) if name != REGISTERED)
+
     def as_json(self) -> dict[str, object]:
         """The figures; the registered pose's frames do not count."""
         chosen = np.array([name != REGISTERED for name in self.names])
@@ -92,7 +98,7 @@ class DateResult:
             "ms_per_frame": {**self.milliseconds, "all": whole},
             "fps": 1e3 / whole,
             "camera_frames_per_second": 1e3 * self.cameras / whole,
-            "motions": {motion: self._of_motion(motion) for motion in MOTIONS},
+            "motions": {motion: self._of_motion(motion) for motion in self.motions},
             "frames": len(self.names),
             "cameras": self.cameras,
             "seed": self.seed,
@@ -123,7 +129,7 @@ class DateResult:
             title=f"Date: {self.cameras} cameras, {len(self.names)} frames",
         )
         moving = np.array([name != REGISTERED for name in self.names])
-        rows = {motion: np.array(self.names) == motion for motion in MOTIONS} | {"all": moving}
+        rows = {name: np.array(self.names) == name for name in self.motions} | {"all": moving}
         for motion, chosen in rows.items():
             table.add_row(
                 motion,
@@ -202,7 +208,9 @@ class _Experiment:
             "paper": PaperTrack.build(setup),
         }
         if method == "silhouette":
-            self.tracks[method] = SilhouetteTrack.build(model, self.studio.cameras)
+            self.tracks[method] = SilhouetteTrack.build(
+                model, self.studio.cameras, self.studio.backgrounds
+            )
         self.generator = np.random.default_rng([seed, 2])
 
     def run(self, progress: Callable[[int], None] | None) -> DateResult:
@@ -211,17 +219,17 @@ class _Experiment:
         estimates: dict[str, list[Array]] = {way: [] for way in self.tracks}
         watched: list[_Watched] = []
         pictures = {}
-        destroyed_at = _destruction(motion)
+        destroyed_at = frames_of_destruction(motion)
         for k, q in enumerate(motion.q):
-            sight = self._see(q)
+            images = see(studio.pictures(q))
             if k in destroyed_at:
                 track = self.tracks[self.method].destroyed(motion.q[k - 1], self.generator)
                 watched.append(_Watched(destroyed_at[k], track, []))
             for way, track in self.tracks.items():
-                estimates[way].append(track.step(sight))
+                estimates[way].append(track.step(images))
             for one in watched:
                 if len(one.errors) < _WATCHED:
-                    one.errors.append(float(np.mean(self._off(one.track.step(sight), q))))
+                    one.errors.append(float(np.mean(self._off(one.track.step(images), q))))
             if _is_middle(motion, k):
                 shown = [estimates[way][-1] for way in self.tracks]
                 pictures[motion.names[k]] = studio.side_by_side(q, shown, SHOWN_CAMERA)
@@ -251,11 +259,6 @@ class _Experiment:
             seed=self.seed,
             pictures=pictures,
         )
-
-    def _see(self, q: Array) -> Sight:
-        studio = self.studio
-        wanted = self.method == "silhouette"
-        return see(studio.pictures(q), studio.backgrounds, wanted)
 
     def _off(self, found: Array, q: Array) -> Array:
         """(k,) how far the joint centres at found positions (nq,) are off those at q (nq,) [mm]."""
@@ -289,12 +292,15 @@ class _Watched(NamedTuple):
         return good[0] + 1 if good else None
 
 
-def _destruction(motion: Motion) -> dict[int, str]:
-    """Where tracks are destroyed: amid each motion, and when the registered pose is shown again."""
-    last = motion.names.index(MOTIONS[-1])
-    again = next(k for k, n in enumerate(motion.names) if n == REGISTERED and k > last)
-    found = {k: motion.names[k] for k in range(len(motion.q)) if _is_middle(motion, k)}
-    return {**found, again: REGISTERED}
+def frames_of_destruction(motion: Motion) -> dict[int, str]:
+    """Where tracks are destroyed: amid each motion, and when the registered pose is shown again.
+
+    Not in the last frames of a motion cut short, where recovery could not be seen.
+    """
+    count = len(motion.names)
+    found = {k: motion.names[k] for k in range(count - _FEWEST_WATCHED) if _is_middle(motion, k)}
+    again = 1 + max(k for k, name in enumerate(motion.names) if name != REGISTERED)
+    return found if again == count else {**found, again: REGISTERED}
 
 
 def _is_middle(motion: Motion, k: int) -> bool:

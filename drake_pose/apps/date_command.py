@@ -15,7 +15,9 @@ def date(
     cameras: Annotated[
         int, typer.Option(min=3, help="How many, the face camera among them; the paper's is 9.")
     ] = 9,
-    frames: Annotated[int, typer.Option(min=40, help="How many frames.")] = 240,
+    frames: Annotated[
+        int, typer.Option(min=40, help="How many frames; fewer than 120 do not show all motions.")
+    ] = 240,
     seed: Annotated[int, typer.Option(min=0, help="Another seed draws other motions.")] = 0,
     method: Annotated[
         str, typer.Option(help="silhouette: all silhouettes at once; paper: the paper's way alone.")

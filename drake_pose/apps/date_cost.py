@@ -32,13 +32,13 @@ def measure_cost(cameras: int, size: tuple[int, int] = (640, 480), seed: int = 0
     studio = Studio.build(cameras, size, np.random.default_rng([seed, 1]))
     motion = make_motion(studio.skeleton, 4 * FEWEST_FRAMES, seed)
     begin = motion.names.index(MOTIONS[0])
-    track = SilhouetteTrack.build(studio.model, studio.cameras)
-    track.state = track.tracker.start(track.tracker.values(motion.q[begin]))
+    track = SilhouetteTrack.build(studio.model, studio.cameras, studio.backgrounds)
+    track.place(motion.q[begin])
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
         for q in motion.q[begin : begin + _FRAMES]:
-            track.step(see(studio.pictures(q), studio.backgrounds, True))
+            track.step(see(studio.pictures(q)))
     finally:
         cv2.setNumThreads(threads)
     laps = [(lap["region"] + lap["edge"], lap["pose"]) for lap in track.milliseconds]

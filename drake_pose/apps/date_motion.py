@@ -22,6 +22,9 @@ MOTIONS = ("walk", "reach", "lean", "crouch", "turn", "cross")
 REGISTERED = "registered"
 FEWEST_FRAMES = 40
 
+# In fewer frames the motions would be faster than people are; so they are not all shown.
+_WHOLE = 120
+
 _RELAXED: KeyPose = {
     "left_upper_arm_z": 8.0,
     "right_upper_arm_z": -8.0,
@@ -98,6 +101,8 @@ class Motion:
 def make_motion(skeleton: Skeleton, frames: int, seed: int) -> Motion:
     """A person who shows the registered pose, goes through all motions, and shows it again.
 
+    All of it takes 120 frames or more; of fewer the first ones are given.
+
     The lower foot always stands on the floor. Every run draws how far each motion goes (85 to 115
     per cent) and where on the floor the person stands.
 
@@ -114,10 +119,11 @@ def make_motion(skeleton: Skeleton, frames: int, seed: int) -> Motion:
     generator = np.random.default_rng(seed)
     registered = registered_positions(skeleton)
     relaxed = _positions(skeleton, {}, 1.0)
-    still = max(4, frames // 20)
+    whole = max(frames, _WHOLE)
+    still = whole // 20
     # From key pose to key pose it always takes about as long.
     steps = np.cumsum([0, *(len(_KEY_POSES[motion]) + 1 for motion in MOTIONS)])
-    lengths = np.diff(np.rint((frames - 2 * still) * steps / steps[-1]).astype(int))
+    lengths = np.diff(np.rint((whole - 2 * still) * steps / steps[-1]).astype(int))
     rows, names = [registered] * still, [REGISTERED] * still
     before = registered
     for motion, length in zip(MOTIONS, lengths, strict=True):
@@ -130,10 +136,10 @@ def make_motion(skeleton: Skeleton, frames: int, seed: int) -> Motion:
     rows += [registered] * still
     names += [REGISTERED] * still
     q = np.array(rows)
-    q[:, skeleton.head_positions[:2]] = _path(frames, generator)
+    q[:, skeleton.head_positions[:2]] = _path(whole, generator)
     for row in q:
         _stand_on_floor(skeleton, row)
-    return Motion(q, tuple(names))
+    return Motion(q[:frames], tuple(names[:frames]))
 
 
 def _positions(skeleton: Skeleton, key: KeyPose, size: float) -> Array:

@@ -6,15 +6,7 @@ import json
 from pathlib import Path
 
 from drake_pose.apps.estimate import OnFrame, SceneEstimate, estimate_scene
-from drake_pose.apps.result_folder import (
-    FAMILIES,
-    JOINTS,
-    OVERLAY,
-    POSES,
-    REPLAY,
-    SUMMARY,
-    require_empty,
-)
+from drake_pose.apps.result_folder import OVERLAY, RESULT_FILES, SUMMARY, require_empty
 from drake_pose.apps.settings import EstimateSettings
 from drake_pose.body import bundled_model
 from drake_pose.errors import OutputError, SceneError
@@ -22,9 +14,6 @@ from drake_pose.errors import OutputError, SceneError
 MODEL = "man"
 ROOT = "right_foot"
 ANKLE = "right_ankle"
-
-
-_FILES = (POSES, JOINTS, FAMILIES, REPLAY, SUMMARY)
 
 
 def demo_scene() -> Path:
@@ -78,11 +67,11 @@ def _clear_earlier_demo(out: Path, scene: Path) -> None:
         is_demo = Path(summary["scene"]).resolve() == scene.resolve()
     except (OSError, ValueError, TypeError, KeyError):
         is_demo = False
-    if not is_demo or {file.name for file in out.iterdir()} - {*_FILES, OVERLAY}:
+    if not is_demo or {file.name for file in out.iterdir()} - {*RESULT_FILES, OVERLAY}:
         require_empty(out)
         return
     try:
-        for file in (*(out / name for name in _FILES), *(out / OVERLAY).glob("*/*.png")):
+        for file in (*(out / name for name in RESULT_FILES), *(out / OVERLAY).glob("*/*.png")):
             file.unlink(missing_ok=True)
         for folder in (*(out / OVERLAY).glob("*"), out / OVERLAY):
             if folder.is_dir():

@@ -12,6 +12,14 @@ from pydrake.multibody.tree import BodyIndex
 
 from drake_pose.apps.measurements import TrueAngles, read_joint_centres, read_true_angles
 from drake_pose.apps.options import select_frames
+from drake_pose.apps.person_choice import follows_person
+from drake_pose.apps.scene_checks import (
+    CheckedScene,
+    check_scene,
+    check_upright,
+    leave_out_unreadable,
+    texts_of,
+)
 from drake_pose.apps.settings import EstimateSettings, RootTurns
 from drake_pose.body import ArticulatedModel, PoseTree, RootRotation, load_model
 from drake_pose.camera import Camera
@@ -42,18 +50,21 @@ class Inputs:
         model: the body.
         cameras: the cameras that are matched together.
         frames: the frames' names.
-        search: the search, made for the body's pose tree.
+        search: the search, made for the body's pose tree; None where a person is followed by all
+            silhouettes at once.
         root_positions: the root's position (3,) by frame [m], where it differs.
         truth: measured joint positions, where there are some.
+        warnings: what the user should know of the input.
     """
 
     scene: Scene
     model: ArticulatedModel
     cameras: tuple[Camera, ...]
     frames: tuple[str, ...]
-    search: PoseSearch
+    search: PoseSearch | None
     root_positions: Mapping[str, np.ndarray] | None
     truth: TrueAngles | None
+    warnings: tuple[str, ...] = ()
 
 
 def read_inputs(
@@ -71,11 +82,15 @@ def read_inputs(
     Raises:
         DrakePoseError: names the file, camera, frame, link or joint at fault.
     """
-    scene = load_scene(scene_path)
-    cameras = _select_cameras(scene, settings.cameras)
-    frames = _select_frames(scene, cameras, settings.frames)
+    checked = check_scene(load_scene(scene_path))
+    scene = checked.scene
+    cameras = select_cameras(scene, settings.cameras)
+    frames = select_seen_frames(scene, cameras, settings.frames)
     model = load_model(model_path)
     truth = _read_truth(scene_path, truth_path, model)
+    if follows_person(scene, cameras, model, settings):
+        texts = texts_of(*checked.warnings, *check_upright(cameras))
+        return Inputs(scene, model, cameras, frames, None, None, truth, texts)
     root_positions = None
     position: np.ndarray | None = None
     anywhere = settings.root_position == "unknown" or (
@@ -92,22 +107,34 @@ def read_inputs(
         search = _make_placement_search(model, settings, position, scene.scale_unknown)
     else:
         search = _make_search(_make_tree(model, settings, position), settings, model)
-    _check_pictures(scene, cameras, frames, search)
-    return Inputs(scene, model, cameras, frames, search, root_positions, truth)
+    read = _check_pictures(scene, cameras, frames, search)
+    texts = texts_of(*checked.warnings, *read.warnings)
+    return Inputs(read.scene, model, cameras, frames, search, root_positions, truth, texts)
 
 
-def _select_cameras(scene: Scene, wanted: Sequence[str]) -> tuple[Camera, ...]:
+def select_cameras(scene: Scene, wanted: Sequence[str]) -> tuple[Camera, ...]:
+    """The wanted cameras in the scene's order; all that have masks where none is named.
+
+    Raises:
+        UnknownNameError: if there is no such camera.
+    """
     for name in wanted:
         if name not in scene.cameras:
             raise UnknownNameError("camera", name, scene.cameras, str(scene.path))
-    names = [name for name in scene.cameras if name in wanted or not wanted]
+    used = set(wanted) or {name for name, _ in scene.masks}
+    names = [name for name in scene.cameras if name in used]
     return tuple(scene.cameras[name] for name in names)
 
 
-def _select_frames(
+def select_seen_frames(
     scene: Scene, cameras: Sequence[Camera], wanted: Sequence[str]
 ) -> tuple[str, ...]:
-    """The wanted frames that at least one of the cameras has seen."""
+    """The wanted frames that at least one of the cameras has seen.
+
+    Raises:
+        SceneError: if there is none.
+        UnknownNameError: if there is no such frame.
+    """
     names = [camera.name for camera in cameras]
     frames = [
         frame
@@ -186,7 +213,7 @@ def _in_plant_units(model: ArticulatedModel, values: Mapping[str, float]) -> dic
 def _make_search(tree: PoseTree, settings: EstimateSettings, model: ArticulatedModel) -> PoseSearch:
     interval = math.radians(settings.interval)
     intervals = _in_plant_units(model, settings.joint_intervals)
-    if settings.method == "wide":
+    if settings.method != "paper":
         wide = WideSearchSettings(
             interval=interval,
             length_interval=settings.length_interval,
@@ -247,17 +274,15 @@ def _make_placement_search(
 
 def _check_pictures(
     scene: Scene, cameras: Sequence[Camera], frames: Sequence[str], search: PoseSearch
-) -> None:
+) -> CheckedScene:
     """Reads every mask once, and looks whether every camera can see the body in a first pose.
 
-    A bad mask is better met now than after an hour of searching.
+    A bad mask is better met now than after an hour of searching; another camera makes up for it.
     """
-    for camera in cameras:
-        for frame in frames:
-            if (camera.name, frame) in scene.masks:
-                scene.read(camera.name, frame)
+    readable = leave_out_unreadable(scene, [camera.name for camera in cameras], frames)
     if isinstance(search, RootPlacementSearch):
-        return
+        return readable
     X_WN = search.tree.node_poses(search.tree.default_values())
     for camera in cameras:
         require_visible(search.sampled.outlines, camera.X_CW @ X_WN, camera)
+    return readable

@@ -146,7 +146,9 @@ MethodOption = Annotated[
     str,
     typer.Option(
         metavar="NAME",
-        help="wide: many hypotheses side by side; paper: as published.",
+        help="wide: many hypotheses side by side; paper: as published; person: one person followed "
+        "by several cameras at once; auto: person where model, cameras and options allow it, else "
+        "wide.",
         rich_help_panel=_SEARCH,
     ),
 ]
@@ -178,6 +180,14 @@ ReplayOption = Annotated[
     bool,
     typer.Option(
         "--replay/--no-replay", help="Whether to write replay.html.", rich_help_panel=RESULT_PANEL
+    ),
+]
+OverlayOption = Annotated[
+    bool,
+    typer.Option(
+        "--overlay/--no-overlay",
+        help="Whether to write overlay/<camera>/<frame>.png.",
+        rich_help_panel=RESULT_PANEL,
     ),
 ]
 JsonOption = Annotated[

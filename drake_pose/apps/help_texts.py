@@ -35,11 +35,16 @@ paper is the search of Kameda, Minoh and Ikeda as they published it.
 Where scene.yaml says [bold]sequence: true[/bold], the body is searched in the first frame and
 tracked by its contour from there, inside its limits; it is searched again when the track is lost.
 
-DIR gets poses.csv (a row a frame: every joint's position in rad or m, E_total, seconds), joints.csv
-(which joints the silhouettes determine, and in what interval), families.csv (poses that look the
-same), summary.json, overlay/<camera>/<frame>.png to judge by, and replay.html. E_total is the area
-where body and silhouette differ over the silhouette's area. Ctrl-C keeps the finished frames;
---resume goes on.
+A person before two calibrated cameras or more is followed by all silhouettes at once, lengths and
+girths being fitted where the model has them, if the model has a person's landmarks and a root on
+joints, as urdf/person/person_shape.urdf does, and no option concerns a search (--method person).
+
+DIR gets report.html, which shows it all; poses.csv (a row a frame: every joint's position in rad or
+m, E_total, seconds); joints.csv (which joints the silhouettes determine, and in what interval);
+families.csv (poses that look the same); joint_centres.csv where landmarks.yaml lies beside the
+model; of a sequence joint_centres.trc, positions.mot and motion.bvh; summary.json;
+overlay/<camera>/<frame>.png to judge by; and replay.html. E_total is the area where body and
+silhouette differ over the silhouette's area. Ctrl-C keeps the finished frames; --resume goes on.
 
 [bold]A robot arm bolted to the world's origin, seen by two cameras:[/bold]
 
@@ -162,12 +167,39 @@ core's; rendering does not count.
 CAPTURE = _help("""
 Capture one moving person in a scene with several calibrated cameras, from masks alone.
 
-Nothing need be known of the person: lengths and girths are fitted to the first frames. Writes
-poses.csv, joint_centres.csv, TRC and MOT files, a summary that names bad cameras, and replay.html.
+Nothing need be known of the person: lengths and girths are fitted to the first frames. This is
+[bold]estimate[/bold] with the bundled person, and writes the same: report.html, which names bad
+cameras, poses.csv, joint_centres.csv, TRC, MOT and BVH files, overlays, and replay.html. A
+recording is captured as a whole: after Ctrl-C, --resume begins it again.
 
 [bold]Example:[/bold]
 
     drake-pose capture SCENE --out results/person
+
+A folder with [bold]sources.yaml[/bold] beside cameras.yaml is captured frame by frame as its
+pictures come: live cameras as fast as they are, videos and folders as fast as can be. A camera that
+stops is left out and taken back when it returns. Ctrl-C ends it and keeps everything.
+
+    front:
+      kind: device             # or folder, video
+      location: 0              # a device's number or address; a path
+      background: empty/front  # pictures of the empty room; or masks: true
+    side: {kind: video, location: side.mp4, background: empty/side}
+
+[bold]Example:[/bold]
+
+    drake-pose capture STUDIO --out results/person --seconds 60
+""")
+
+EMPTY_ROOM = _help("""
+Take pictures of the empty room with the cameras of a sources.yaml, into their background folders.
+
+What differs from them is the person, so leave the room first, and take them anew when the light
+changes or a camera moves.
+
+[bold]Example:[/bold]
+
+    drake-pose empty-room STUDIO
 """)
 
 WALK = _help("""
@@ -175,12 +207,42 @@ Walk through a garden in the browser, as an avatar that moves like the captured 
 
 The room of the capture is small, so where one stands in it is a command: facing right or left
 turns the view, standing ahead of or behind the first frame's place walks forward or backward.
-Plays a result of capture, a simulated person, or neither: then the arrow keys walk. The page can be
-opened on this machine alone.
+Plays a result of capture, a simulated person, the person before live cameras (who commands after
+standing still for a second), or none of these: then the arrow keys walk. The page can be opened on
+this machine alone.
 
 [bold]Example:[/bold]
 
     drake-pose walk --simulate
 
     drake-pose walk results/person
+
+    drake-pose walk --live STUDIO
+""")
+
+BATCH = _help("""
+Estimate many scenes, long ones in chunks of frames, by as many workers as there are.
+
+The result is that of [bold]estimate[/bold], scene by scene, and the same however many work: chunks
+are cut by the job. In a sequence the first frame of each chunk is matched and the others are
+tracked; the recording of a person who is followed is not cut. A finished chunk is on the disk at
+once; a worker that dies costs the chunk it had, which another one does. A scene that fails is named
+and does not stop the others. Ctrl-C keeps the finished chunks; --resume computes what is missing.
+
+The job file, whose paths are relative to it; settings are those of estimate by their names in
+Python (EstimateSettings), and in defaults for all scenes; without a model it is the bundled person:
+
+    chunk: 100
+    defaults: {replay: false}
+    scenes:
+      monday: {scene: recordings/monday, model: arm.urdf, interval: 15}
+      tuesday: {scene: recordings/tuesday, model: arm.urdf, frames: "0:99"}
+      walker: {scene: recordings/walker}
+
+Workers on this machine talk over its loopback address alone. Those of a Dask scheduler must have
+the same drake_pose, and find scenes, models and DIR under the same paths as this machine does.
+
+[bold]Example:[/bold]
+
+    drake-pose batch jobs.yaml --out results/all --workers 2
 """)

@@ -7,13 +7,19 @@ import io
 import math
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from drake_pose.apps.summary import FrameRecord, JointRecord
+from drake_pose.body import ArticulatedModel
 from drake_pose.matching import JointEstimate, PoseSet
 
 JOINT_COLUMNS = ("frame", "joint", "determined", "low", "high", "families")
 """A row for each frame and joint, over all families [deg or m]."""
 FAMILY_COLUMNS = ("frame", "family", "joint", "value", "determined", "low", "high")
 """A row for each frame, family and joint; family 1 holds the answer [deg or m]."""
+
+# Of a normal distribution, 95 % lie within so many standard deviations.
+_NORMAL_95 = 1.96
 
 
 def record_pose_set(
@@ -32,6 +38,32 @@ def record_pose_set(
         values = [float(value) for node in family.node_values for value in node]
         families.append(_record(family.joints, kinds, values))
     return _record(pose_set.joints, kinds, None), tuple(families)
+
+
+def record_deviations(
+    model: ArticulatedModel, q: np.ndarray, deviations: np.ndarray
+) -> dict[str, JointRecord]:
+    """What standard deviations say of each position: 95 % within its limits.
+
+    A position is determined where that is less than half its range.
+
+    Args:
+        model: the model.
+        q: (nq,) positions [rad or m]; nothing is known where they are nan.
+        deviations: (nq,) their standard deviations [rad or m]; nan where nobody knows.
+    """
+    if not np.isfinite(q).all():
+        return {}
+    half = _NORMAL_95 * np.where(np.isfinite(deviations), deviations, np.inf)
+    low, high = np.maximum(q - half, model.lower), np.minimum(q + half, model.upper)
+    determined = 2.0 * half < 0.5 * (model.upper - model.lower)
+    records = {}
+    for k in np.flatnonzero(np.isfinite(low) & np.isfinite(high)):
+        unit = math.degrees(1.0) if model.position_kinds[k] == "angle" else 1.0
+        records[model.position_names[k]] = JointRecord(
+            bool(determined[k]), float(unit * low[k]), float(unit * high[k])
+        )
+    return records
 
 
 def _record(

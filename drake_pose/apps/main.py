@@ -9,8 +9,10 @@ import typer
 
 from drake_pose import __version__
 from drake_pose.apps import help_texts
+from drake_pose.apps.batch_command import batch
 from drake_pose.apps.capture_command import capture
 from drake_pose.apps.date_command import date
+from drake_pose.apps.estimate_command import run_estimate
 from drake_pose.apps.estimate_options import (
     AnglesOption,
     CameraOption,
@@ -25,6 +27,7 @@ from drake_pose.apps.estimate_options import (
     ModelOption,
     OutOption,
     OutsideLimitOption,
+    OverlayOption,
     ReplayOption,
     ResumeOption,
     RootOption,
@@ -37,6 +40,7 @@ from drake_pose.apps.estimate_options import (
     TruthOption,
 )
 from drake_pose.apps.kameda_command import kameda
+from drake_pose.apps.live_command import empty_room
 from drake_pose.apps.options import (
     parse_assignments,
     parse_root_position,
@@ -109,10 +113,11 @@ def estimate(
     candidates: CandidatesOption = 5,
     run_limit: RunLimitOption = 10_000,
     time_limit: TimeLimitOption = None,
-    method: MethodOption = "wide",
+    method: MethodOption = "auto",
     angles: AnglesOption = "continuous",
     track: TrackOption = True,
     resume: ResumeOption = False,
+    overlay: OverlayOption = True,
     replay: ReplayOption = True,
     json: JsonOption = False,
 ) -> None:
@@ -136,23 +141,10 @@ def estimate(
             angles=angles,
             track=track,
         )
-    interrupted = f"interrupted; the finished frames are in {out}; go on with --resume"
-    with errors_as_messages(interrupted):
-        from drake_pose.apps.estimate import estimate_scene
-        from drake_pose.apps.report import FrameProgress, print_estimate
-
-        with FrameProgress() as progress:
-            result = estimate_scene(
-                scene, model, out, settings, truth=truth, resume=resume, replay=replay,
-                on_frame=progress,
-            )  # fmt: skip
-        if json:
-            print_json(result.summary)
-        else:
-            print_estimate(result)
-        if result.found_count == 0:
-            say("drake-pose: error: no pose was found in any frame")
-            raise typer.Exit(FAILED)
+    run_estimate(
+        scene, model, out, settings, truth=truth, resume=resume, overlay=overlay, replay=replay,
+        json=json,
+    )  # fmt: skip
 
 
 @app.command(help=help_texts.DEMO)
@@ -257,7 +249,9 @@ def undistort(
         say(f"drake-pose: {len(written)} pictures written to {out}")
 
 
+app.command(name="batch", help=help_texts.BATCH)(batch)
 app.command(name="capture", help=help_texts.CAPTURE)(capture)
+app.command(name="empty-room", help=help_texts.EMPTY_ROOM)(empty_room)
 app.command(name="walk", help=help_texts.WALK)(walk)
 reproduce_app.command(name="kameda", help=help_texts.KAMEDA)(kameda)
 reproduce_app.command(name="shimada", help=help_texts.SHIMADA)(shimada)

@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from drake_pose.apps.result_folder import OVERLAY, POSES, REPLAY
+from drake_pose.apps.result_folder import OVERLAY, POSES, REPLAY, REPORT
 from drake_pose.apps.summary import FrameRecord
 from drake_pose.apps.terminal import warn
 
@@ -30,7 +30,7 @@ def output_console() -> Console:
     return console if console.is_terminal else Console(highlight=False, width=160)
 
 
-def _progress() -> Progress:
+def progress_bar() -> Progress:
     """A bar on stderr; nothing where stderr is no terminal."""
     console = Console(stderr=True)
     return Progress(
@@ -46,7 +46,7 @@ def _progress() -> Progress:
 @contextmanager
 def count_progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
     """A progress bar; the value is a function to call with how many are done."""
-    with _progress() as progress:
+    with progress_bar() as progress:
         task = progress.add_task(what, total=total)
         yield lambda done: progress.update(task, completed=done)
 
@@ -55,8 +55,9 @@ class FrameProgress:
     """A progress bar over frames that also says where no pose was found."""
 
     def __init__(self) -> None:
-        self._progress = _progress()
-        self._task = self._progress.add_task("reading", total=None)
+        self._progress = progress_bar()
+        self._stage = "reading"
+        self._task = self._progress.add_task(self._stage, total=None)
 
     def __enter__(self) -> FrameProgress:
         """Show the bar."""
@@ -67,9 +68,17 @@ class FrameProgress:
         """Take the bar away."""
         self._progress.stop()
 
+    def show_stage(self, stage: str, done: int, total: int | None) -> None:
+        """Show what is done before the first frame is finished, each stage by a bar of its own."""
+        if stage != self._stage:
+            self._progress.remove_task(self._task)
+            self._task = self._progress.add_task(stage, total=total)
+            self._stage = stage
+        self._progress.update(self._task, completed=done, total=total)
+
     def __call__(self, finished: int, total: int, frame: str, record: FrameRecord | None) -> None:
         """Show that a frame is finished."""
-        self._progress.update(self._task, description="frames", completed=finished, total=total)
+        self.show_stage("frames", finished, total)
         if record is None:
             return
         if not record.found:
@@ -86,8 +95,27 @@ class FrameProgress:
 def print_estimate(result: SceneEstimate) -> None:
     """Prints a row a frame, the joint errors where the truth is known, and where the result is."""
     console = output_console()
-    table = Table("frame", "E_total", "before", "runs", "seconds", title="Estimate")
     with_truth = any(record.joint_errors for record in result.records.values())
+    if result.summary["method"] == "person":
+        console.print("One person was followed by all silhouettes at once (--method person).")
+        console.print(_camera_table(result))
+    else:
+        console.print(_frame_table(result, with_truth))
+    if with_truth:
+        console.print(_error_table(result))
+    _print_totals(console, result)
+
+
+def _camera_table(result: SceneEstimate) -> Table:
+    """A row a camera: how many frames it had a say in, and how well it agrees."""
+    table = Table("camera", "frames", "mean IoU")
+    for camera, one in result.summary["cameras"].items():
+        table.add_row(escape(camera), str(one["frames"]), percent(one["mean_iou"]))
+    return table
+
+
+def _frame_table(result: SceneEstimate, with_truth: bool) -> Table:
+    table = Table("frame", "E_total", "before", "runs", "seconds", title="Estimate")
     if with_truth:
         table.add_column("mean joint error")
     for frame, record in result.records.items():
@@ -101,10 +129,7 @@ def print_estimate(result: SceneEstimate) -> None:
         if with_truth:
             cells.append(_mean_angle_error(result, record))
         table.add_row(*cells)
-    console.print(table)
-    if with_truth:
-        console.print(_error_table(result))
-    _print_totals(console, result)
+    return table
 
 
 def print_demo(result: SceneEstimate) -> None:
@@ -144,10 +169,13 @@ def _print_totals(console: Console, result: SceneEstimate) -> None:
     console.print(f"found          {result.found_count} of {len(result.records)} frames")
     console.print(f"E_total        {percent(summary['mean_E_total'])} in the mean")
     console.print(f"seconds        {summary['median_seconds']:.2f} a frame in the median")
-    if result.folder is not None:
-        console.print(f"poses          {escape(str(result.folder / POSES))}", soft_wrap=True)
-        if (result.folder / REPLAY).is_file():
-            console.print(f"replay         {escape(str(result.folder / REPLAY))}", soft_wrap=True)
+    if summary["mean_iou"] is not None:
+        console.print(f"IoU            {percent(summary['mean_iou'])} in the mean")
+    if result.folder is None:
+        return
+    for label, file in (("poses", POSES), ("report", REPORT), ("replay", REPLAY)):
+        if (result.folder / file).is_file():
+            console.print(f"{label:<14} {escape(str(result.folder / file))}", soft_wrap=True)
 
 
 def _angle_errors(result: SceneEstimate, record: FrameRecord) -> list[float]:

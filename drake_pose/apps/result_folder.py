@@ -1,4 +1,4 @@
-"""The result folder: poses.csv, joints.csv, families.csv, summary.json, overlays and replay.html.
+"""The result folder: tables of poses and joints, files of motion, pages, overlays, a summary.
 
 Every finished frame is on the disk before the next one begins, and every other file is written
 beside its place and then moved there, so that an interruption never leaves half a file.
@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any, TextIO
 
 import numpy as np
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_pose.errors import OutputError
 
@@ -23,8 +25,15 @@ POSES = "poses.csv"
 JOINTS = "joints.csv"
 FAMILIES = "families.csv"
 SUMMARY = "summary.json"
-REPLAY = "replay.html"
+REPLAY, REPORT = "replay.html", "report.html"
+JOINT_CENTRES = "joint_centres.csv"
+TRC, MOT, BVH = "joint_centres.trc", "positions.mot", "motion.bvh"
 OVERLAY = "overlay"
+
+RESULT_FILES = (
+    POSES, JOINTS, FAMILIES, SUMMARY, REPLAY, REPORT, JOINT_CENTRES, TRC, MOT, BVH
+)  # fmt: skip
+"""Every file that a result may have beside its overlays."""
 
 BASE_COLUMNS = ("base_x", "base_y", "base_z", "base_qw", "base_qx", "base_qy", "base_qz")
 """Columns of the plant's world in the scene's world: position [m] and unit quaternion."""
@@ -54,6 +63,21 @@ class PoseRow:
         return bool(np.isfinite(self.error))
 
 
+def base_cells(X_WB: np.ndarray) -> np.ndarray:
+    """BASE_COLUMNS (7,) of a pose (4, 4): position [m] and unit quaternion."""
+    rotation = RotationMatrix.ProjectToRotationMatrix(X_WB[:3, :3])
+    return np.concatenate([X_WB[:3, 3], rotation.ToQuaternion().wxyz()])
+
+
+def base_pose(base: np.ndarray | None) -> np.ndarray:
+    """The pose (4, 4) that BASE_COLUMNS (7,) describe; the identity where there are none."""
+    if base is None:
+        return np.eye(4)
+    # The quaternion was rounded when it was written.
+    rotation = RotationMatrix(Quaternion(base[3:] / np.linalg.norm(base[3:])))
+    return np.asarray(RigidTransform(rotation, base[:3]).GetAsMatrix4())
+
+
 class ResultFolder:
     """Writes a result, frame by frame.
 
@@ -76,9 +100,9 @@ class ResultFolder:
         self.with_base = with_base
         self.rows: list[PoseRow] = []
         self._file: TextIO | None = None
-        if path.exists() and not path.is_dir():
-            raise OutputError(f"{path}: is a file, but the result is a folder; name another one")
-        if not resume:
+        if resume:
+            _require_no_file(path)
+        else:
             require_empty(path)
         if resume and (path / POSES).is_file():
             self.rows = self._read_rows()
@@ -135,6 +159,10 @@ class ResultFolder:
         except OSError as error:
             raise _cannot_write(self.path / POSES, error) from error
         self.rows.append(row)
+
+    def clear(self) -> None:
+        """Forget the rows that were read for a resumption."""
+        self.rows = []
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
         """Write summary.json; numbers that are not finite become null.
@@ -208,16 +236,27 @@ class ResultFolder:
 
 
 def require_empty(path: Path) -> None:
-    """Refuses a folder that exists and holds something.
+    """Refuses a folder that exists and holds something, and a place where none can be.
 
     Raises:
-        OutputError: names the folder.
+        OutputError: names the folder, or the file that lies in its place.
     """
+    _require_no_file(path)
     if path.is_dir() and any(path.iterdir()):
         raise OutputError(
             f"{path}: the output folder exists and is not empty; name another one with --out, or "
             "go on with an interrupted result in it with --resume"
         )
+
+
+def _require_no_file(path: Path) -> None:
+    """Refuses a folder that cannot be, since it or what it would lie in is a file."""
+    try:
+        existing = next((place for place in (path, *path.parents) if place.exists()), None)
+    except OSError as error:
+        raise _cannot_write(path, error) from error
+    if existing is not None and not existing.is_dir():
+        raise OutputError(f"{existing}: is a file, but the result is a folder; name another one")
 
 
 def read_summary(path: Path) -> dict[str, Any]:

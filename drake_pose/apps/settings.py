@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
 from drake_pose.apps.options import Axis
 from drake_pose.errors import SettingsError
 
-METHODS = ("wide", "paper")
+METHODS = ("auto", "wide", "paper", "person")
 ANGLES = ("continuous", "grid")
+# What a search for the pose heeds, and one who is followed by all silhouettes at once does not.
+_OF_THE_SEARCH = (
+    "root", "root_position", "root_rotation", "interval", "length_interval", "joint_intervals",
+    "outside_limit", "candidates", "run_limit", "time_limit", "hold", "angles",
+)  # fmt: skip
 RootTurns = Literal["fixed", "free"] | Mapping[Axis, tuple[float, float]]
 
 
@@ -40,7 +45,10 @@ class EstimateSettings:
         time_limit: after so many seconds the search of a frame answers with what it has; None: no
             limit. Of the method ``wide`` alone.
         hold: positions that are known, by name [deg or m].
-        method: ``wide``: many hypotheses side by side; ``paper``: the search as it was published.
+        method: ``wide``: many hypotheses side by side; ``paper``: the search as it was published;
+            ``person``: one person is followed by the silhouettes of several cameras at once;
+            ``auto``: ``person`` where model and scene allow it and no setting concerns a search,
+            else ``wide``.
         angles: ``continuous``: refined between the samples; ``grid``: multiples of the interval
             alone, as always with the method ``paper``. Of the method ``wide`` alone.
         track: whether frames of a sequence are tracked; else every one is matched on its own.
@@ -63,7 +71,7 @@ class EstimateSettings:
     run_limit: int = 10_000
     time_limit: float | None = None
     hold: Mapping[str, float] = field(default_factory=dict)
-    method: str = "wide"
+    method: str = "auto"
     angles: str = "continuous"
     track: bool = True
 
@@ -77,10 +85,25 @@ class EstimateSettings:
         for name in ("candidates", "run_limit"):
             if getattr(self, name) < 1:
                 raise SettingsError(f"{name} must be 1 or more, not {getattr(self, name)}")
-        if self.method == "wide" and self.outside_limit is not None:
+        if self.method in ("auto", "wide") and self.outside_limit is not None:
             raise SettingsError("the wide search has no outside limit r; leave it out")
+        if self.method == "person" and self.search_settings:
+            raise SettingsError(
+                f"the method person follows a person and searches no pose; leave "
+                f"{self.search_settings[0]} out"
+            )
         if self.method == "paper" and self.time_limit is not None:
             raise SettingsError("the paper's search has no time limit; give a run limit instead")
+
+    @property
+    def search_settings(self) -> tuple[str, ...]:
+        """The names of those that only a search heeds and that are not at their defaults."""
+        return tuple(
+            one.name
+            for one in fields(self)
+            if one.name in _OF_THE_SEARCH
+            and getattr(self, one.name) != ({} if one.default is MISSING else one.default)
+        )
 
     def as_json(self) -> dict[str, Any]:
         """Returns the settings as plain JSON values."""

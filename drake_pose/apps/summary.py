@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -16,6 +16,8 @@ from drake_pose import __version__
 from drake_pose.apps.settings import EstimateSettings
 from drake_pose.errors import OutputError
 
+# A camera is suspicious where its pictures agree so much less than the others'.
+_SUSPICIOUS = 0.15
 _PACKAGES = ("drake", "numpy", "numba", "opencv-python-headless")
 
 
@@ -46,7 +48,7 @@ class FrameRecord:
         first_E_total: before the re-estimation.
         runs: how often step 3 was run.
         stopped_by: why the search ended: "end", "exact", "run_limit" or "time_limit";
-            "tracked" where the pose was tracked.
+            "tracked" where the pose was tracked, "followed" by the method person.
         outside_limit: r in each view [pixel].
         joint_errors: estimate minus truth by position [deg or m], where the truth is known.
         camera_scale: pixels a metre of a parallel camera whose scale was found.
@@ -54,6 +56,8 @@ class FrameRecord:
         joints: what is known of each value of the pose tree, by name.
         families: by name too, in each family of poses that look the same; the first of them.
         family_count: how many families there are; None where the search does not say.
+        ious: by camera that was used, intersection over union of silhouette and body.
+        share: of the contours' lengths, what fits; by the method person alone.
     """
 
     found: bool
@@ -69,6 +73,8 @@ class FrameRecord:
     joints: Mapping[str, JointRecord] = field(default_factory=dict)
     families: tuple[Mapping[str, JointRecord], ...] = ()
     family_count: int | None = None
+    ious: Mapping[str, float] = field(default_factory=dict)
+    share: float | None = None
 
     @staticmethod
     def from_json(values: Mapping[str, Any]) -> FrameRecord:
@@ -131,9 +137,20 @@ def check_same_job(job: Mapping[str, Any], recorded: Mapping[str, Any], folder: 
 
 
 def summarize(
-    job: Mapping[str, Any], records: Mapping[str, FrameRecord], complete: bool
+    job: Mapping[str, Any],
+    records: Mapping[str, FrameRecord],
+    complete: bool,
+    more: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Returns the content of summary.json."""
+    """Returns the content of summary.json.
+
+    Args:
+        job: from describe_job.
+        records: of the finished frames.
+        complete: whether all is done, all files written.
+        more: what the method and the checks have to say.
+    """
+    ious = [iou for record in records.values() for iou in record.ious.values()]
     errors = [record.E_total for record in records.values() if record.E_total is not None]
     seconds = [record.seconds for record in records.values()]
     return {
@@ -141,12 +158,48 @@ def summarize(
         "frame_count": len(records),
         "found_count": sum(record.found for record in records.values()),
         "mean_E_total": float(np.mean(errors)) if errors else None,
+        "mean_iou": float(np.mean(ious)) if ious else None,
         "median_seconds": float(np.median(seconds)) if seconds else None,
         "joint_errors": _joint_errors(records),
+        "cameras": describe_cameras(records),
+        **(more or {}),
         **job,
         "versions": _versions(),
         "frames": {name: record.as_json() for name, record in records.items()},
     }
+
+
+def describe_cameras(records: Mapping[str, FrameRecord]) -> dict[str, dict[str, float]]:
+    """By camera: in how many frames it was compared, and its mean intersection over union."""
+    found: dict[str, list[float]] = {}
+    for record in records.values():
+        for camera, iou in record.ious.items():
+            found.setdefault(camera, []).append(iou)
+    return {
+        camera: {"frames": len(ious), "mean_iou": float(np.mean(ious))}
+        for camera, ious in found.items()
+    }
+
+
+def camera_warnings(
+    records: Mapping[str, FrameRecord], known: Sequence[str] = ()
+) -> tuple[str, ...]:
+    """Which cameras agree much less than the others, where there are three or more.
+
+    Args:
+        records: of the frames.
+        known: warnings that were given before; a camera that they name is not named again.
+    """
+    means = {name: float(one["mean_iou"]) for name, one in describe_cameras(records).items()}
+    if len(means) < 3:
+        return ()
+    usual = float(np.median(list(means.values())))
+    return tuple(
+        f"camera '{name}' agrees badly (IoU {mean:.2f}, the median is {usual:.2f}): has it moved "
+        "since it was calibrated, or are its masks poor?"
+        for name, mean in means.items()
+        if mean < usual - _SUSPICIOUS and not any(f"'{name}'" in text for text in known)
+    )
 
 
 def _joint_errors(records: Mapping[str, FrameRecord]) -> dict[str, dict[str, float]]:

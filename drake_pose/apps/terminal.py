@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from pathlib import Path
+from typing import Any, NoReturn
 
 import typer
 
@@ -15,18 +16,22 @@ FAILED = 1
 
 
 @contextmanager
-def errors_as_messages(interrupted: str = "interrupted") -> Iterator[None]:
+def errors_as_messages(folder: Path | None = None) -> Iterator[None]:
     """Turns what may go wrong inside a command into a message and exit status 1.
 
     Args:
-        interrupted: the message after Ctrl-C.
+        folder: where --resume goes on after Ctrl-C; None: there is nothing to go on with.
     """
     try:
         yield
     except DrakePoseError as error:
         _fail(str(error))
     except KeyboardInterrupt:
-        _fail(interrupted)
+        if folder is None:
+            _fail("interrupted")
+        if not folder.is_dir():
+            _fail("interrupted before anything was written")
+        _fail(f"interrupted; what is finished is in {folder}; go on with --resume")
     except SystemExit as error:
         # Drake raises SystemExit where one of its C++ demands fails, and exits without a word.
         _fail(f"Drake stopped with a failed demand: {error}")
@@ -58,6 +63,6 @@ def print_json(value: Mapping[str, Any]) -> None:
     typer.echo(json.dumps(without_nan(value), indent=2, ensure_ascii=False, allow_nan=False))
 
 
-def _fail(message: str) -> None:
+def _fail(message: str) -> NoReturn:
     say(f"drake-pose: error: {message}")
     raise typer.Exit(FAILED)

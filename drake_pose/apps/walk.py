@@ -52,19 +52,21 @@ class Player:
     rate_hz: float = RATE_HZ
 
 
-def recorded_player(result: Path, model_path: Path | None, rate_hz: float) -> Player:
+def recorded_player(result: Path, model_path: Path | None, rate_hz: float | None) -> Player:
     """Plays the poses of a result folder, as `drake-pose capture` writes it.
 
     Args:
         result: the folder.
         model_path: the model it was captured with; the bundled one that its summary names where
             not given.
-        rate_hz: its frames a second.
+        rate_hz: its frames a second; those in its summary where not given.
 
     Raises:
         OutputError: there is no such result, or it is one of another model.
         SettingsError: the rate is not positive.
     """
+    if rate_hz is None:
+        rate_hz = float(read_summary(result).get("frame_rate_hz") or RATE_HZ)
     if not (math.isfinite(rate_hz) and rate_hz > 0):
         raise SettingsError(f"frames a second must be a positive number, not {rate_hz}")
     if model_path is None:

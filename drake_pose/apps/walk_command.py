@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from drake_pose.apps.cluster_options import SchedulerOption, WatchersOption, workers_of
 from drake_pose.apps.estimate_options import JsonOption
+from drake_pose.apps.live_command import ShapeOption
 from drake_pose.apps.terminal import errors_as_messages, print_json, say, warn
+
+if TYPE_CHECKING:
+    from distributed import Client
+    from pydrake.geometry import Meshcat
+
+    from drake_pose.apps.live_scene import LiveScene
+    from drake_pose.systems.live_capture import LiveEyes
 
 
 def walk(
@@ -18,10 +28,20 @@ def walk(
     simulate: Annotated[
         bool, typer.Option("--simulate", help="Play a simulated person's motion.")
     ] = False,
+    live: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Be captured: a folder with sources.yaml."),
+    ] = None,
+    shape: ShapeOption = None,
+    workers: WatchersOption = 0,
+    scheduler: SchedulerOption = None,
     model: Annotated[
         Path | None, typer.Option(help="The model of the result, where it is not a bundled one.")
     ] = None,
-    rate: Annotated[float, typer.Option(help="The result's frames a second.")] = 30.0,
+    rate: Annotated[
+        float | None,
+        typer.Option(help="The result's frames a second; what its summary says if not given."),
+    ] = None,
     seconds: Annotated[
         float | None, typer.Option(help="End after so many seconds of the walk.")
     ] = None,
@@ -29,7 +49,8 @@ def walk(
         float, typer.Option(help="Seconds walked a second; 0: as fast as can be.")
     ] = 1.0,
     port: Annotated[
-        int | None, typer.Option(help="Where the page listens; a free port if not given.")
+        int | None,
+        typer.Option(min=1024, max=65535, help="Where the page listens; a free port if not given."),
     ] = None,
     browser: Annotated[
         bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")
@@ -37,25 +58,90 @@ def walk(
     json: JsonOption = False,
 ) -> None:
     """See help_texts.WALK."""
-    if simulate and result is not None:
-        raise typer.BadParameter("give a result or --simulate, not both")
+    if sum([simulate, result is not None, live is not None]) > 1:
+        raise typer.BadParameter("give a result, --simulate or --live, not two of them")
+    if workers and scheduler is not None:
+        raise typer.BadParameter("give --workers or --scheduler, not both")
+    if live is None and (workers or scheduler is not None or shape is not None):
+        raise typer.BadParameter("--shape, --workers and --scheduler are for --live")
+    if result is None and rate is not None:
+        raise typer.BadParameter("--rate is for a result")
+    if result is None and live is None and model is not None:
+        raise typer.BadParameter("--model is for a result or --live")
     with errors_as_messages():
         from drake_pose.apps import walk as walking
 
+        if live is not None:
+            with workers_of(workers, scheduler) as client:
+                walked = _walk_live(live, model, shape, seconds, port, browser, client)
+            _print(walked, json)
+            return
         if result is not None:
             player = walking.recorded_player(result, model, rate)
         elif simulate:
             player = walking.simulated_player()
         else:
             player = walking.key_player()
-        page = walking.open_page(port)
-        say(f"drake-pose: {page.web_url()} - arrow keys walk and turn, Ctrl-C ends")
-        if browser and not walking.show(page):
-            warn("no browser has opened the page yet")
-        walked = walking.walk(
-            player, page, seconds, speed, lambda words: say(f"drake-pose: {words or 'stand'}")
-        )
-        if json:
-            print_json(walked)
-        else:
-            say(f"drake-pose: {walking.summary_line(walked)}")
+        page = _open_page(port, browser)
+        _print(walking.walk(player, page, seconds, speed, _say_command), json)
+
+
+def _walk_live(
+    folder: Path,
+    model: Path | None,
+    shape: Path | None,
+    seconds: float | None,
+    port: int | None,
+    browser: bool,
+    client: Client | None,
+) -> dict[str, Any]:
+    """Walks with the cameras of a folder; what it is to walk with is read before the page opens."""
+    from drake_pose.apps.live_scene import hush_opencv, load_live_scene
+    from drake_pose.apps.live_walk import walk_live
+
+    hush_opencv()
+    # Workers may have another working folder.
+    scene = load_live_scene(folder if client is None else folder.absolute())
+    page = _open_page(port, browser)
+
+    def report(text: str) -> None:
+        say(f"drake-pose: {text}")
+
+    open_eyes = None if client is None else _opener(client, scene)
+    walked = walk_live(scene, page, model, shape, seconds, open_eyes, _say_command, report)
+    for text in walked["warnings"]:
+        warn(text)
+    return walked
+
+
+def _opener(client: Client, scene: LiveScene) -> Callable[[], LiveEyes]:
+    """What opens the eyes on the workers."""
+    from drake_pose.apps.cluster_eyes import opener
+
+    # A recording cannot be skipped from afar as fast as its moments pass, so that it is waited for.
+    return lambda: opener(client)(scene)
+
+
+def _open_page(port: int | None, browser: bool) -> Meshcat:
+    """The page, shown in the browser where there is one."""
+    from drake_pose.apps import walk as walking
+
+    page = walking.open_page(port)
+    say(f"drake-pose: {page.web_url()} - arrow keys walk and turn, Ctrl-C ends")
+    if browser and not walking.show(page):
+        warn("no browser has opened the page yet")
+    return page
+
+
+def _say_command(words: str) -> None:
+    say(f"drake-pose: {words or 'stand'}")
+
+
+def _print(walked: dict[str, Any], json: bool) -> None:
+    """A walk's result."""
+    from drake_pose.apps.walk import summary_line
+
+    if json:
+        print_json(walked)
+    else:
+        say(f"drake-pose: {summary_line(walked)}")

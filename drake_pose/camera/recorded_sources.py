@@ -152,7 +152,10 @@ class VideoSource(FrameSource):
         self._time = 0.0
         self._advance()
         if self._ahead is None:
-            raise SceneError(f"{self._path}: not a video that OpenCV can read")
+            raise SceneError(
+                f"{self._path}: not a video that OpenCV can read, though the source of camera "
+                f"'{specification.camera}'"
+            )
         if wrong := self.wrong_size(self._ahead):
             self.close()
             raise SceneError(f"{self._path}: camera '{specification.camera}' {wrong}")

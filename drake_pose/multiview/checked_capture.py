@@ -26,6 +26,7 @@ from drake_pose.multiview.camera_faults import (
     share_of,
 )
 from drake_pose.multiview.person_capture import (
+    EDGE_POINTS,
     PersonCapture,
     PersonCaptureSettings,
     ReadFrame,
@@ -45,8 +46,6 @@ Mask = NDArray[np.bool_]
 _COMPARED = 10
 # And carved out of their silhouettes in so many.
 _CARVED = 3
-# A picture's height over the spacing of its region's edge points.
-_EDGE_POINTS = 120.0
 # Pictures of which less fits than this share of the others' do not agree.
 _AGREES = 0.7
 # Nobody is seen as small or as tall [m], not even in part; else lengths are in another unit.
@@ -267,7 +266,7 @@ class _Judge:
         return FrameView(edges, self._values[frame])
 
     def _edge(self, name: str, mask: Mask) -> EdgePoints:
-        spacing = max(2.0, self._cameras[name].height / _EDGE_POINTS)
+        spacing = max(2.0, self._cameras[name].height / EDGE_POINTS)
         return find_edge_points(mask, spacing)
 
 

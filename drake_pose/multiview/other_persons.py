@@ -231,12 +231,26 @@ def _is_strangers(
     return figure.area > _LARGE * own[person.figures[k]].area
 
 
+class KeptViews(NamedTuple):
+    """What cameras say of one person only.
+
+    Attributes:
+        views: what each of them says.
+        cut: the names of cameras whose views had others in them, who were cut out.
+        merged: the names of those in which the person and another are one figure, left whole.
+    """
+
+    views: list[SilhouetteView]
+    cut: tuple[str, ...]
+    merged: tuple[str, ...]
+
+
 def keep_views(
     cameras: Sequence[Camera],
     views: Sequence[SilhouetteView],
     spacing: Callable[[Camera], float],
     place: Array | None = None,
-) -> list[SilhouetteView]:
+) -> KeptViews:
     """What cameras say of one person only, for a tracker that sees frame after frame.
 
     Args:
@@ -250,9 +264,10 @@ def keep_views(
         {camera.name: view.region for camera, view in zip(cameras, views, strict=True)},
         place,
     )
-    return [
+    alone = [
         see_silhouette(kept.masks[camera.name], spacing(camera))
         if camera.name in kept.cut
         else view
         for camera, view in zip(cameras, views, strict=True)
     ]
+    return KeptViews(alone, kept.cut, kept.merged)

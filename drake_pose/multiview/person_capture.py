@@ -34,8 +34,9 @@ Mask = NDArray[np.bool_]
 ReadFrame = Callable[[int], Mapping[str, Mask]]
 _Seen = tuple[list[Camera], list[SilhouetteView]]
 
-# A picture's height over the spacing of its region's edge points.
-_EDGE_POINTS = 120.0
+EDGE_POINTS = 120.0
+"""A picture's height over the usual spacing of its region's edge points."""
+
 # A fresh start of which more fits needs no other to be compared with.
 _SURE = 0.97
 
@@ -161,7 +162,7 @@ class _Recording:
         masks = self._read(frame)
         cameras = [self._cameras[name] for name in masks]
         views = [
-            see_silhouette(mask, max(2.0, camera.height / _EDGE_POINTS))
+            see_silhouette(mask, max(2.0, camera.height / EDGE_POINTS))
             for camera, mask in zip(cameras, masks.values(), strict=True)
         ]
         return cameras, views

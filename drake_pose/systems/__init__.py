@@ -21,6 +21,7 @@ from drake_pose.systems.paper_pose_estimator import PaperPoseEstimator
 from drake_pose.systems.person_tracker import PersonTracker, build_person_capture
 from drake_pose.systems.picture_capture import PictureCapture
 from drake_pose.systems.pose_recogniser import PoseRecogniser
+from drake_pose.systems.silhouette_capture import SilhouetteCapture, build_silhouette_capture
 from drake_pose.systems.silhouette_eye import SilhouetteEye
 from drake_pose.systems.silhouette_matcher import STATISTICS, SilhouetteMatcher
 from drake_pose.systems.silhouette_tracker import TRACK, SilhouetteTracker
@@ -48,6 +49,7 @@ __all__ = [
     "PersonTracker",
     "PictureCapture",
     "PoseRecogniser",
+    "SilhouetteCapture",
     "SilhouetteEye",
     "SilhouetteMatcher",
     "SilhouetteTracker",
@@ -65,6 +67,7 @@ __all__ = [
     "build_paper_capture",
     "build_person_capture",
     "build_recorded_matching",
+    "build_silhouette_capture",
     "build_simulated_matching",
     "build_walk",
 ]

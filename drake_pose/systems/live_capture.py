@@ -9,12 +9,13 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
 
 from drake_pose.camera import Camera
+from drake_pose.multiview.person_capture import EDGE_POINTS
 from drake_pose.multiview.regions import Background
 from drake_pose.multiview.silhouette_tracker import SilhouetteTracker
 from drake_pose.systems.person_tracker import PersonTracker
 from drake_pose.systems.picture_capture import CameraCount, PictureCapture
 from drake_pose.systems.posed_geometry import add_avatar
-from drake_pose.systems.silhouette_eye import EDGE_POINTS, SilhouetteEye
+from drake_pose.systems.silhouette_eye import SilhouetteEye
 
 
 class EyePorts(NamedTuple):
@@ -94,7 +95,7 @@ class LocalEyes:
             builder.AddNamedSystem(f"eye_{name}", eye)
             port = f"{'label' if background is None else 'color'}_image_{name}"
             builder.Connect(self.capture.GetOutputPort(port), eye.get_input_port())
-            silhouettes[name] = eye.get_output_port()
+            silhouettes[name] = eye.GetOutputPort("silhouette")
         return EyePorts(silhouettes, self.capture.GetOutputPort("time"))
 
     def take_reports(self) -> list[str]:
@@ -116,6 +117,7 @@ def add_person_tracker(
     cameras: Mapping[str, Camera],
     eyes: EyePorts,
     period: float,
+    with_deviations: bool = False,
 ) -> PersonTracker:
     """Add what follows a person with eyes.
 
@@ -125,11 +127,12 @@ def add_person_tracker(
         cameras: two calibrated cameras or more.
         eyes: what LiveEyes.add gave.
         period: time between two looks at the eyes [s].
+        with_deviations: whether the positions' standard deviations are an output.
 
     Raises:
         SettingsError: fewer than two cameras, or a period that is not positive.
     """
-    system = PersonTracker(tracker, list(cameras.values()), period)
+    system = PersonTracker(tracker, list(cameras.values()), period, with_deviations)
     builder.AddNamedSystem("person_tracker", system)
     for name, port in eyes.silhouettes.items():
         builder.Connect(port, system.GetInputPort(f"silhouette_{name}"))
@@ -142,24 +145,27 @@ def build_live_capture(
     cameras: Mapping[str, Camera],
     eyes: LiveEyes,
     meshcat: Meshcat | None = None,
+    with_deviations: bool = False,
 ) -> Diagram:
     """Cameras' pictures, or what workers elsewhere make of them, to a person's poses.
 
     The diagram's outputs are those of PersonTracker: ``estimated_positions``, ``last_positions``,
-    ``share``, ``time`` and ``seen``; and ``silhouette_<camera>``, its inputs.
+    ``share``, ``time``, ``seen``, ``others``, and where wanted ``deviations``; and
+    ``silhouette_<camera>``, its inputs.
 
     Args:
         tracker: made for the person's pose tree.
         cameras: two calibrated cameras or more.
         eyes: those of the cameras, here or elsewhere.
         meshcat: where the avatar is shown; None: nowhere.
+        with_deviations: whether the positions' standard deviations are an output.
 
     Raises:
         SettingsError: fewer than two cameras, or a period that is not positive.
     """
     builder = DiagramBuilder()
     ports = eyes.add(builder)
-    system = add_person_tracker(builder, tracker, cameras, ports, eyes.period)
+    system = add_person_tracker(builder, tracker, cameras, ports, eyes.period, with_deviations)
     for name, port in ports.silhouettes.items():
         builder.ExportOutput(port, f"silhouette_{name}")
     for index in range(system.num_output_ports()):

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import (
-    Context,
-    Diagram,
     DiagramBuilder,
     InputPortIndex,
     LeafSystem,
@@ -25,32 +22,18 @@ from drake_pose.systems.horizontal_image import HorizontalImage
 from drake_pose.systems.paper_pose_estimator import PaperPoseEstimator
 from drake_pose.systems.pose_recogniser import PoseRecogniser
 from drake_pose.systems.posed_geometry import add_avatar
+from drake_pose.systems.staged_diagram import StagedDiagram
 
 
 @dataclass(frozen=True, eq=False)
-class PaperCapture:
-    """A diagram of the paper's capture, and the parts of it that one asks afterwards.
+class PaperCapture(StagedDiagram):
+    """A diagram of the paper's capture, and the part of it that one asks afterwards.
 
     Args:
-        diagram: the whole diagram.
         estimator: keeps what one frame hands to the next.
-        stages: the output ports of each stage before the pose, in their order: whoever evaluates
-            one after the other sees what each costs.
     """
 
-    diagram: Diagram
     estimator: PaperPoseEstimator
-    stages: Mapping[str, tuple[OutputPort, ...]]
-
-    def evaluate(self, context: Context, stage: str) -> None:
-        """Have a stage compute what it has not computed yet.
-
-        Args:
-            context: the diagram's.
-            stage: one of stages.
-        """
-        for port in self.stages[stage]:
-            port.Eval(port.get_system().GetMyContextFromRoot(context))
 
 
 def build_paper_capture(
@@ -93,7 +76,7 @@ def build_paper_capture(
         positions = estimator.GetOutputPort("estimated_positions")
         model = setup.skeleton.model
         add_avatar(wiring.builder, model, positions, meshcat, "avatar", period)
-    return PaperCapture(wiring.builder.Build(), estimator, wiring.stages)
+    return PaperCapture(wiring.builder.Build(), wiring.stages, estimator)
 
 
 class _Wiring:

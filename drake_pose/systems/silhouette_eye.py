@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, LeafSystem
 from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 
 from drake_pose.camera import Camera
+from drake_pose.multiview.person_capture import EDGE_POINTS
 from drake_pose.multiview.regions import Background, person_region
 from drake_pose.multiview.silhouette_tracker import SilhouetteView, see_silhouette
 from drake_pose.silhouette import label_image_to_mask
 from drake_pose.systems.colour_images import colour_image_to_picture
-
-EDGE_POINTS = 80.0
-"""A picture's height over the usual spacing of its region's edge points."""
 
 # The edge of a person's region is longer than this share of the picture's height.
 _LEAST_EDGE = 0.15
@@ -40,11 +40,12 @@ class SilhouetteEye(LeafSystem):
         input_ports:
         - label_image
         output_ports:
+        - region
         - silhouette
 
-    With a background the input port is ``color_image`` instead. The output is abstract: a
-    SilhouetteView, or None where the port is not connected or the image has no pixels: then the
-    camera gave no picture at that moment.
+    With a background the input port is ``color_image`` instead. The outputs are abstract: the
+    person's region (H, W), and a SilhouetteView of it; None where the port is not connected or the
+    image has no pixels: then the camera gave no picture at that moment.
 
     Args:
         camera: the camera.
@@ -66,21 +67,30 @@ class SilhouetteEye(LeafSystem):
         else:
             name, image = "color_image", ImageRgba8U(camera.width, camera.height)
         self._image = self.DeclareAbstractInputPort(name, AbstractValue.Make(image))
+        self._region = self.DeclareAbstractOutputPort(
+            "region", _allocate, self._calc_region, {self._image.ticket()}
+        )
         self.DeclareAbstractOutputPort(
-            "silhouette", lambda: AbstractValue.Make(None), self._see, {self._image.ticket()}
+            "silhouette", _allocate, self._calc_silhouette, {self._image.ticket()}
         )
 
-    def _see(self, context: Context, output: AbstractValue) -> None:
-        output.set_value(self._silhouette(context))
+    def _calc_region(self, context: Context, output: AbstractValue) -> None:
+        output.set_value(self._person(context))
 
-    def _silhouette(self, context: Context) -> SilhouetteView | None:
+    def _calc_silhouette(self, context: Context, output: AbstractValue) -> None:
+        region = self._region.Eval(context)
+        output.set_value(None if region is None else see_silhouette(region, self._spacing))
+
+    def _person(self, context: Context) -> NDArray[np.bool_] | None:
         if not self._image.HasValue(context):
             return None
         image = self._image.Eval(context)
         if image.size() == 0:
             return None
         if self._background is None:
-            region = label_image_to_mask(image)
-        else:
-            region = person_region(colour_image_to_picture(image), self._background)
-        return see_silhouette(region, self._spacing)
+            return label_image_to_mask(image)
+        return person_region(colour_image_to_picture(image), self._background)
+
+
+def _allocate() -> AbstractValue:
+    return AbstractValue.Make(None)

@@ -252,7 +252,7 @@ def test_output_in_the_place_of_a_file(own_scene: TinyScene, runner: CliRunner) 
 def test_output_below_a_file(own_scene: TinyScene, runner: CliRunner) -> None:
     file = own_scene.folder.parent / "file"
     file.write_text("mine")
-    assert_refused(run(runner, own_scene, "--out", str(file / "out")), "cannot be written")
+    assert_refused(run(runner, own_scene, "--out", str(file / "out")), "is a file")
 
 
 def test_resuming_another_job(own_scene: TinyScene, runner: CliRunner, tmp_path: Path) -> None:
@@ -280,7 +280,9 @@ def test_ctrl_c_says_how_to_go_on(
         raise KeyboardInterrupt
 
     monkeypatch.setattr("drake_pose.apps.estimate.read_inputs", interrupt)
-    assert_refused(run(runner, own_scene), "interrupted", "--resume")
+    assert_refused(run(runner, own_scene), "interrupted before anything was written")
+    (own_scene.folder.parent / "out").mkdir()
+    assert_refused(run(runner, own_scene), "interrupted", "out", "--resume")
 
 
 def test_any_other_error_is_a_bug_and_stays_visible(

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from drake_pose.apps.date import METHODS, run_experiment
+from drake_pose.apps.date import METHODS, frames_of_destruction, run_experiment
 from drake_pose.apps.date_cost import measure_cost
 from drake_pose.apps.date_motion import MOTIONS, REGISTERED, make_motion
 from drake_pose.apps.date_pictures import save_pictures
@@ -31,7 +31,7 @@ def skeleton():
 
 @pytest.fixture(scope="module")
 def result():
-    return run_experiment(cameras=4, frames=60, seed=1)
+    return run_experiment(cameras=4, frames=120, seed=1, size=(480, 360))
 
 
 class TestCost:
@@ -57,6 +57,14 @@ class TestMotion:
         first, again, other = (make_motion(skeleton, 60, seed).q for seed in (1, 1, 2))
         np.testing.assert_array_equal(first, again)
         assert np.abs(first - other).max() > 0.01
+
+    def test_fewer_frames_are_not_faster(self, skeleton):
+        short, whole = (make_motion(skeleton, frames, 3) for frames in (50, 120))
+        np.testing.assert_array_equal(short.q, whole.q[:50])
+        assert short.names == whole.names[:50]
+        assert REGISTERED not in frames_of_destruction(short).values()
+        assert max(frames_of_destruction(short)) < 40
+        assert list(frames_of_destruction(whole).values()) == [*MOTIONS, REGISTERED]
 
     def test_too_few_frames(self, skeleton):
         with pytest.raises(SettingsError, match="40 frames"):

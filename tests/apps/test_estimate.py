@@ -32,7 +32,8 @@ def test_result_folder(tiny_scene: TinyScene, runner: CliRunner, tmp_path: Path)
     result = runner.invoke(app, arguments(tiny_scene, out))
     assert result.exit_code == 0, result.output
     assert sorted(path.name for path in out.iterdir()) == [
-        "families.csv", "joints.csv", "overlay", "poses.csv", "replay.html", "summary.json"
+        "families.csv", "joints.csv", "overlay", "poses.csv", "replay.html", "report.html",
+        "summary.json",
     ]  # fmt: skip
     rows = read_rows(out / "poses.csv")
     assert list(rows[0]) == ["frame", *NAMES, "error", "seconds"]

@@ -63,6 +63,9 @@ def test_a_sequence_need_not_be_tracked(tmp_path: Path) -> None:
 
 def test_the_command_has_the_option(tmp_path: Path) -> None:
     scene = write_sequence(tmp_path / "scene", "sequence: true\nframe_rate_hz: 30\n")
+    (scene.model.parent / "landmarks.yaml").write_text(
+        "landmarks:\n  hook: {link: jib, point: [0, 0, 0.4]}\n"
+    )
     made = {}
     for option in ("--track", "--no-track"):
         out = tmp_path / option
@@ -75,6 +78,10 @@ def test_the_command_has_the_option(tmp_path: Path) -> None:
                 ]
             )
         assert ended.value.code == 0
+        files = {path.name for path in out.iterdir()}
+        assert files > {
+            "joint_centres.csv", "joint_centres.trc", "positions.mot", "motion.bvh", "report.html"
+        }  # fmt: skip
         frames = json.loads((out / "summary.json").read_text())["frames"]
         made[option] = sum(frame["stopped_by"] == TRACKED for frame in frames.values())
     assert made["--track"] >= 2

@@ -9,9 +9,14 @@ from drake_pose.apps.motion_files import (
     centres_as_trc,
     joint_centres,
     positions_as_mot,
+    write_motion,
 )
+from drake_pose.apps.result_folder import BASE_COLUMNS, PoseRow, ResultFolder
 from drake_pose.body import bundled_model, load_model
 from drake_pose.body.landmarks import load_landmarks
+from drake_pose.silhouette import load_scene
+from tests.apps.bvh_reader import read_bvh
+from tests.apps.scenes import write_scene
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +63,39 @@ def test_trc_is_in_millimetres_with_y_up(person, q):
     assert float(lines[7].split("\t")[1]) == pytest.approx(1 / 60.0, abs=1e-6)
     assert all(cell == "" for cell in lines[8].split("\t")[2:])
     assert {len(line.split("\t")) for line in lines[6:9]} == {2 + 3 * len(landmarks)}
+
+
+def test_a_results_files_honour_the_base_and_leave_out_what_is_not_known(tmp_path):
+    scene = write_scene(tmp_path / "scene", [(20, -40)] * 4)
+    (scene.folder / "scene.yaml").write_text("sequence: true\nframe_rate_hz: 25\n")
+    (scene.model.parent / "landmarks.yaml").write_text(
+        "landmarks:\n  hook: {link: jib, point: [0, 0, 0.4]}\n"
+    )
+    model = load_model(scene.model, check=False)
+    base = np.array([1.0, 2.0, 3.0, np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])  # 90 degrees about z.
+    q = np.array([0.5, -1.0])
+    lost = PoseRow("0002", np.full(2, np.nan), None, np.nan, 0.1)
+    rows = [PoseRow("0001", q, base, 0.1, 0.1), lost, PoseRow("0003", q, base, 0.1, 0.1)]
+    folder = ResultFolder(tmp_path / "out", model.position_names, with_base=True)
+    warnings = write_motion(folder, model, load_scene(scene.folder), rows, 25.0)
+    context = model.plant.CreateDefaultContext()
+    model.plant.SetPositions(context, q)
+    jib = model.plant.GetBodyByName("jib").EvalPoseInWorld(context)
+    x, y, z = jib.multiply(np.array([0.0, 0.0, 0.4]))
+    written = list(csv.DictReader((tmp_path / "out" / "joint_centres.csv").open()))
+    assert [row["frame"] for row in written] == ["0001", "0003"]
+    found = [float(written[0][axis]) for axis in "xyz"]
+    np.testing.assert_allclose(found, [1.0 - y, 2.0 + x, 3.0 + z], atol=1e-4)
+    motion = read_bvh((tmp_path / "out" / "motion.bvh").read_text())
+    assert motion.frame_time == pytest.approx(0.04)
+    p_WJ = jib.translation()
+    place = [100 * (1.0 - p_WJ[1]), 100 * (3.0 + p_WJ[2]), -100 * (2.0 + p_WJ[0])]
+    np.testing.assert_allclose(motion.places()["jib"], [place] * 3, atol=0.01)
+    assert "1 of 3 frames" in warnings[0]
+    mot = (tmp_path / "out" / "positions.mot").read_text().splitlines()
+    header = mot[mot.index("endheader") + 1].split("\t")
+    assert header[-7:] == list(BASE_COLUMNS)
+    assert [float(cell) for cell in mot[-1].split("\t")[-7:]] == pytest.approx(base, abs=1e-5)
 
 
 def test_mot_is_in_degrees(person, q):

@@ -76,8 +76,14 @@ def test_a_folder_that_holds_something_is_refused(tmp_path: Path) -> None:
 
 def test_a_file_in_the_folders_place_is_refused(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("mine")
-    with pytest.raises(OutputError, match="is a file"):
-        ResultFolder(tmp_path / "out", NAMES, with_base=False)
+    for place in (tmp_path / "out", tmp_path / "out" / "deeper"):
+        with pytest.raises(OutputError, match="out: is a file"):
+            ResultFolder(place, NAMES, with_base=False)
+
+
+def test_a_name_that_no_folder_can_have_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="aaa: cannot be written: File name too long"):
+        ResultFolder(tmp_path / ("a" * 300), NAMES, with_base=False)
 
 
 @pytest.mark.parametrize(

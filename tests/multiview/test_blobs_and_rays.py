@@ -15,7 +15,7 @@ from drake_pose.multiview.features import (
     inside_silhouettes,
 )
 from drake_pose.multiview.rays import meeting_points, nearest_points, viewing_rays
-from drake_pose.multiview.regions import learn_background, person_region
+from drake_pose.multiview.regions import Background, learn_background, person_region
 from drake_pose.multiview.skin_blobs import SkinColour, learn_skin_colour, skin_blobs
 
 SKIN = (217, 166, 135)
@@ -58,6 +58,32 @@ class TestRegion:
         region = person_region(picture, learn_background(empty))
         assert region[20, 20]
         assert not region[101, 6]
+
+    @pytest.mark.parametrize("seed", range(40))
+    def test_region_is_what_its_definition_says(self, seed):
+        # Small pictures: patches meet the border, each other, and are missing altogether.
+        generator = np.random.default_rng(seed)
+        shape = tuple(generator.integers(3, 45, 2))
+        mean = generator.integers(0, 256, (*shape, 3)).astype(np.uint8)
+        deviation = generator.uniform(3.0, 70.0, shape).astype(np.float32)
+        noise = generator.normal(0.0, 1.5 * deviation[:, :, None], mean.shape)
+        picture = np.clip(mean + noise, 0, 255).astype(np.uint8)
+        for _ in range(seed % 7):
+            top, left = (int(generator.integers(0, n)) for n in shape)
+            patch = slice(top, top + 9), slice(left, left + 6)
+            picture[patch] = np.where(mean[patch] < 128, 255, 0)
+            deviation[patch] = 3.0
+        off = np.abs(picture.astype(int) - mean) > np.floor(5.0 * deviation)[:, :, None]
+        square = np.ones((3, 3), np.uint8)
+        expected = off.any(axis=2).astype(np.uint8)
+        for step in (cv2.MORPH_OPEN, cv2.MORPH_CLOSE):
+            expected = cv2.morphologyEx(expected, step, square)
+        _, labels = cv2.connectedComponents(expected, connectivity=8)
+        areas = np.bincount(labels.ravel())[1:]
+        kept = 1 + np.flatnonzero(areas >= 0.1 * areas.max(initial=0))
+        region = person_region(picture, Background(mean, deviation))
+        np.testing.assert_array_equal(region, np.isin(labels, kept))
+        assert region.any() == bool(expected.any())
 
     def test_sizes_must_agree(self):
         with pytest.raises(SettingsError):

@@ -213,7 +213,9 @@ class TestOthers:
         cameras = list(nine.cameras.values())
         views = [see_silhouette(mask | other[name], 2.0) for name, mask in alone.items()]
         place = np.array([-0.2, 0.1, 0.9])
-        for name, view in zip(alone, keep_views(cameras, views, lambda _: 2.0, place), strict=True):
+        found = keep_views(cameras, views, lambda _: 2.0, place)
+        assert (found.cut, found.merged) == (kept.cut, kept.merged)
+        for name, view in zip(alone, found.views, strict=True):
             np.testing.assert_array_equal(view.region, kept.masks[name])
             if name in kept.cut:
                 np.testing.assert_array_equal(view.edge.uv, find_edge_points(alone[name], 2.0).uv)

@@ -12,6 +12,10 @@ from drake_pose.multiview.silhouette_tracker import SilhouetteTracker, see_silho
 from drake_pose.silhouette import LabelRenderer
 from drake_pose.systems.person_tracker import PersonTracker, build_person_capture
 from drake_pose.systems.silhouette_eye import edge_spacing
+from tests.multiview.persons_in_view import see, stepping
+
+# Who is followed walks; in this frame another one comes into view, and stays.
+OTHER_COMES = 5
 
 
 @pytest.fixture(scope="module")
@@ -97,10 +101,83 @@ def test_person_is_lost_kept_in_mind_and_found_again(person, cameras):
     np.testing.assert_array_equal(kept, last)
     assert share[0] == 0.0
     assert not seen.any()
-    # Back, a step away, and one camera is blind.
-    found, _, _, seen = show(0.15, 1.4, none[:1])
+    # Back, a step away, and one camera is blind: the search goes on for some frames.
+    for time in (1.4, 1.5, 1.6, 1.7):
+        found, _, _, seen = show(0.15, time, none[:1])
     assert found[0] == pytest.approx(0.15, abs=0.03)
     assert seen.tolist() == [0, 1, 1, 1]
+
+
+@pytest.fixture(scope="module")
+def poses(person):
+    return np.array([stepping(person, 0.25 * k, 0.02 * k - 0.2, 0.1) for k in range(12)])
+
+
+@pytest.fixture(scope="module")
+def alone(person, cameras, poses):
+    return see(person, cameras, poses)
+
+
+@pytest.fixture(scope="module")
+def both(person, cameras, alone):
+    other = np.array([stepping(person, 0.2 * k, 0.7, 1.4 - 0.02 * k) for k in range(12)])
+    frames = see(person, cameras, other)
+    for frame in frames[:OTHER_COMES]:
+        for mask in frame.values():
+            mask[:] = False
+    return [
+        {name: mask | own[name] for name, mask in frame.items()}
+        for own, frame in zip(alone, frames, strict=True)
+    ]
+
+
+@pytest.fixture(scope="module")
+def watch(person, cameras):
+    """What comes out for masks (T,), by port: (T, n)."""
+    tracker = SilhouetteTracker(SilhouetteFit(person.pose_tree()))
+    names = ("estimated_positions", "others", "deviations", "seen")
+
+    def watch(frames):
+        system = PersonTracker(tracker, list(cameras.values()), 0.1, with_deviations=True)
+        simulator = Simulator(system)
+        context = simulator.get_context()
+        found = []
+        for k, masks in enumerate(frames):
+            for name, camera in cameras.items():
+                view = see_silhouette(masks[name], edge_spacing(camera))
+                system.GetInputPort(f"silhouette_{name}").FixValue(context, view)
+            system.GetInputPort("time").FixValue(context, [0.1 * k])
+            simulator.AdvanceTo(0.1 * k + 0.05)
+            found.append([system.GetOutputPort(name).Eval(context).copy() for name in names])
+        return dict(zip(names, map(np.array, zip(*found, strict=True)), strict=True))
+
+    return watch
+
+
+def test_the_one_is_followed_as_if_alone(watch, poses, alone, both):
+    single, double = watch(alone), watch(both)
+    assert not single["others"].any()
+    assert double["others"][:, 0].tolist() == [0.0] * OTHER_COMES + [1.0] * 7
+    np.testing.assert_array_equal(double["seen"], 1.0)
+    off, off_alone = (
+        np.degrees(np.abs(one["estimated_positions"] - poses)[:, 3:]) for one in (double, single)
+    )
+    assert np.median(off, axis=1).max() < np.median(off_alone, axis=1).max() + 2.0
+    places = np.linalg.norm((double["estimated_positions"] - poses)[:, :3], axis=1)
+    assert places.max() < 0.02
+
+
+def test_deviations_tell_how_sure_each_position_is(watch, poses, alone):
+    nobody = {name: np.zeros_like(mask) for name, mask in alone[0].items()}
+    found = watch([nobody, *alone[:5], nobody])
+    deviations = found["deviations"]
+    assert np.isnan(deviations[[0, -1]]).all()
+    off = np.abs(found["estimated_positions"] - np.vstack([poses[:1], poses[:6]]))[1:-1]
+    known = deviations[1:-1]
+    assert (known > 0.0).all()
+    # Of normal errors 95 % are less than 1.96 deviations.
+    assert np.mean(off < 1.96 * known) > 0.8
+    assert np.median(off / known) > 0.02
 
 
 def test_arguments_are_checked(person, cameras):

@@ -210,7 +210,7 @@ class TestEye:
         image = rig.diagram.GetOutputPort(f"{kind}_image_camera_0").Eval(context)
         own = eye.CreateDefaultContext()
         eye.get_input_port().FixValue(own, image)
-        found = eye.get_output_port().Eval(own)
+        found = eye.GetOutputPort("silhouette").Eval(own)
         if kind == "label":
             region = rig.mask(context, "camera_0")
         else:
@@ -227,9 +227,9 @@ class TestEye:
             (SilhouetteEye(camera, background), ImageRgba8U()),
         ):
             context = eye.CreateDefaultContext()
-            assert eye.get_output_port().Eval(context) is None
+            assert eye.GetOutputPort("silhouette").Eval(context) is None
             eye.get_input_port().FixValue(context, image)
-            assert eye.get_output_port().Eval(context) is None
+            assert eye.GetOutputPort("silhouette").Eval(context) is None
 
     def test_nobody_shown_is_an_empty_region(self, rig):
         _, camera, _, _ = rig
@@ -237,7 +237,7 @@ class TestEye:
         context = eye.CreateDefaultContext()
         empty = np.zeros((camera.height, camera.width), dtype=bool)
         eye.get_input_port().FixValue(context, mask_to_label_image(empty))
-        found = eye.get_output_port().Eval(context)
+        found = eye.GetOutputPort("silhouette").Eval(context)
         assert not found.region.any()
         assert len(found.edge.uv) == 0
         assert not shows_somebody(found)
@@ -258,6 +258,6 @@ def test_rgba_alpha_is_ignored():
     image.mutable_data[:, :, 3] = 7
     context = eye.CreateDefaultContext()
     eye.get_input_port().FixValue(context, image)
-    region = eye.get_output_port().Eval(context).region
+    region = eye.GetOutputPort("silhouette").Eval(context).region
     assert region[12:18, 12:18].all()
     assert not region[:8].any()

@@ -38,7 +38,10 @@ def test_python_examples_run(
 
 def test_there_are_examples() -> None:
     assert len(blocks("python")) == 2
-    commands = {"calibrate", "capture", "check", "estimate", "reproduce", "undistort", "walk"}
+    commands = {
+        "batch", "calibrate", "capture", "check", "empty-room", "estimate", "reproduce",
+        "undistort", "walk",
+    }  # fmt: skip
     assert {words[0] for words in DRAKE_POSE_LINES} == commands
 
 

@@ -1,0 +1,32 @@
+"""A diagram whose stages can be evaluated, and so timed, one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from pydrake.systems.framework import Context, Diagram, OutputPort
+
+
+@dataclass(frozen=True, eq=False)
+class StagedDiagram:
+    """A diagram, and what is computed in it before its state is updated.
+
+    Args:
+        diagram: the whole diagram.
+        stages: the output ports of each stage, in their order: whoever evaluates one after the
+            other sees what each costs.
+    """
+
+    diagram: Diagram
+    stages: Mapping[str, tuple[OutputPort, ...]]
+
+    def evaluate(self, context: Context, stage: str) -> None:
+        """Have a stage compute what it has not computed yet.
+
+        Args:
+            context: the diagram's.
+            stage: one of stages.
+        """
+        for port in self.stages[stage]:
+            port.Eval(port.get_system().GetMyContextFromRoot(context))

@@ -178,7 +178,8 @@ recording is captured as a whole: after Ctrl-C, --resume begins it again.
 
 A folder with [bold]sources.yaml[/bold] beside cameras.yaml is captured frame by frame as its
 pictures come: live cameras as fast as they are, videos and folders as fast as can be. A camera that
-stops is left out and taken back when it returns. Ctrl-C ends it and keeps everything.
+stops is left out and taken back when it returns. Ctrl-C ends it and keeps everything but the
+pictures, so there are no overlays.
 
     front:
       kind: device             # or folder, video

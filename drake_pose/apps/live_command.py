@@ -21,7 +21,7 @@ _PANEL = "Live cameras, videos and folders of pictures, by sources.yaml"
 
 SecondsOption = Annotated[
     float | None,
-    typer.Option(help="End after so many seconds.", rich_help_panel=_PANEL),
+    typer.Option(min=0.01, help="End after so many seconds.", rich_help_panel=_PANEL),
 ]
 ShapeOption = Annotated[
     Path | None,

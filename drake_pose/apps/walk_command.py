@@ -43,10 +43,10 @@ def walk(
         typer.Option(help="The result's frames a second; what its summary says if not given."),
     ] = None,
     seconds: Annotated[
-        float | None, typer.Option(help="End after so many seconds of the walk.")
+        float | None, typer.Option(min=0.01, help="End after so many seconds of the walk.")
     ] = None,
     speed: Annotated[
-        float, typer.Option(help="Seconds walked a second; 0: as fast as can be.")
+        float, typer.Option(min=0.0, help="Seconds walked a second; 0: as fast as can be.")
     ] = 1.0,
     port: Annotated[
         int | None,

@@ -76,18 +76,16 @@ def walk_live(
         stride = stride_positions(model)
         diagram = build_walk(model, meshcat, add, stride, opened.period, settle=SETTLE)
         command, pose = (diagram.GetOutputPort(name) for name in ("command", "walker_pose"))
-        positions = diagram.GetSubsystemByName("person_tracker").GetOutputPort(
-            "estimated_positions"
-        )
+        person = diagram.GetSubsystemByName("person_tracker")
+        positions = person.GetOutputPort("estimated_positions")
         log = CommandLog(on_command)
         presence = _Presence(on_report)
-        tracker_system = diagram.GetSubsystemByName("person_tracker")
         last = [0.0, *pose.Eval(diagram.CreateDefaultContext())]
 
         def watch(context: Context) -> None:
             log.add(context.get_time(), command.Eval(context))
-            own = tracker_system.GetMyContextFromRoot(context)
-            presence.add(math.isfinite(positions.Eval(own)[0]))
+            found = positions.Eval(person.GetMyContextFromRoot(context))
+            presence.add(math.isfinite(found[0]))
             last[:] = [context.get_time(), *pose.Eval(context)]
 
         run_live(diagram, opened, seconds, on_report, monitor=watch, is_shown=True)

@@ -55,12 +55,8 @@ def read_person_mask(path: Path, error_type: type[DrakePoseError]) -> Mask:
     if data.startswith(_JPEG):
         mask = mask_of_picture(picture)
     else:
-        black = cv2.inRange(picture, (0, 0, 0, 0), (0, 0, 0, 0)) > 0
-        mask = ~black
-        first = picture.reshape(len(black.ravel()), -1)[mask.argmax()]
-        colour = tuple(float(value) for value in first)
-        same = cv2.countNonZero(cv2.inRange(picture, colour, colour))
-        if mask.any() and same != np.count_nonzero(mask):
+        mask, is_one_colour = split_colours(picture)
+        if not is_one_colour:
             raise error_type(
                 f"{path}: has more than two values, but a mask is black, and one other colour on "
                 "the person; threshold it, or give a background instead of masks"
@@ -68,6 +64,15 @@ def read_person_mask(path: Path, error_type: type[DrakePoseError]) -> Mask:
     if mask.all():
         raise error_type(f"{path}: the mask is full (no black pixel): no background to be seen")
     return np.asarray(mask, dtype=np.bool_)
+
+
+def split_colours(picture: NDArray[np.integer]) -> tuple[Mask, bool]:
+    """Where a picture (H, W) or (H, W, channels) is not black, and if that is all of one colour."""
+    mask = cv2.inRange(picture, (0, 0, 0, 0), (0, 0, 0, 0)) == 0
+    first = np.atleast_1d(picture[np.unravel_index(mask.argmax(), mask.shape)])
+    colour = tuple(float(value) for value in first)
+    same = cv2.countNonZero(cv2.inRange(picture, colour, colour))
+    return mask, not mask.any() or same == np.count_nonzero(mask)
 
 
 def mask_of_picture(picture: Picture) -> Mask:

@@ -150,26 +150,16 @@ class Sight:
 
 def _coarser(camera: Camera, stride: int) -> Camera:
     """The camera of every so manieth pixel of every so manieth row."""
-    width, height = -(-camera.width // stride), -(-camera.height // stride)
-    middle = camera.center_x / stride, camera.center_y / stride
-    if isinstance(camera, ParallelCamera):
-        return replace(
-            camera,
-            width=width,
-            height=height,
-            center_x=middle[0],
-            center_y=middle[1],
-            pixels_per_metre=camera.pixels_per_metre / stride,
-        )
-    return replace(
+    smaller = replace(
         camera,
-        width=width,
-        height=height,
-        center_x=middle[0],
-        center_y=middle[1],
-        focal_x=camera.focal_x / stride,
-        focal_y=camera.focal_y / stride,
+        width=-(-camera.width // stride),
+        height=-(-camera.height // stride),
+        center_x=camera.center_x / stride,
+        center_y=camera.center_y / stride,
     )
+    if isinstance(smaller, ParallelCamera):
+        return replace(smaller, pixels_per_metre=smaller.pixels_per_metre / stride)
+    return replace(smaller, focal_x=smaller.focal_x / stride, focal_y=smaller.focal_y / stride)
 
 
 class PersonSearch:

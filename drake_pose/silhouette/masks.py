@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from drake_pose.camera.checks import LARGEST_SIDE
-from drake_pose.camera.picture_files import check_png
+from drake_pose.camera.picture_files import check_png, split_colours
 from drake_pose.errors import MaskError
 
 
@@ -76,15 +76,14 @@ def _to_mask(picture: np.ndarray, path: Path, may_be_empty: bool) -> np.ndarray:
         layers = layers[:, :, :3]  # an alpha channel that says nothing
     elif layers.shape[2] == 4 and (layers[:, :, :3] == layers[0, 0, :3]).all():
         layers = layers[:, :, 3:]  # one that says all
-    mask: np.ndarray = np.any(layers, axis=2)
+    mask, is_one_colour = split_colours(np.ascontiguousarray(layers))
     if not mask.any():
         if may_be_empty:
             return mask
         raise MaskError(f"{path}: the mask is empty (all black): no object to be seen")
     if mask.all():
         raise MaskError(f"{path}: the mask is full (no black pixel): no background to be seen")
-    first = layers[np.unravel_index(mask.argmax(), mask.shape)]
-    if (layers[mask] != first).any():
+    if not is_one_colour:
         values = len(np.unique(layers.reshape(-1, layers.shape[2]), axis=0))
         raise MaskError(
             f"{path}: the mask has {values} values, but must have two: black, and one other on the "

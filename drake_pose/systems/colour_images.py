@@ -20,10 +20,15 @@ def picture_to_colour_image(picture: Picture | None) -> ImageRgba8U:
     """
     if picture is None:
         return ImageRgba8U()
-    height, width = picture.shape[:2]
-    image = ImageRgba8U(width, height)
-    cv2.cvtColor(picture, cv2.COLOR_RGB2RGBA, dst=image.mutable_data)
+    image = ImageRgba8U()
+    fill_colour_image(image, picture)
     return image
+
+
+def fill_colour_image(image: ImageRgba8U, picture: Picture) -> None:
+    """Makes a colour image that of a picture (H, W, 3) in red, green, blue, in its size."""
+    image.resize(picture.shape[1], picture.shape[0])
+    cv2.cvtColor(picture, cv2.COLOR_RGB2RGBA, dst=image.mutable_data)
 
 
 def colour_image_to_picture(image: ImageRgba8U) -> Picture:

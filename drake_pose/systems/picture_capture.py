@@ -6,11 +6,18 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
-import cv2
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DependencyTicket,
+    EventStatus,
+    LeafSystem,
+    State,
+)
 from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 
 from drake_pose.camera import Camera
@@ -18,6 +25,7 @@ from drake_pose.camera.frame_sources import Clock, FrameSource, TimedPicture
 from drake_pose.camera.synchroniser import CameraChange, Moment, Synchroniser
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.silhouette.label_images import fill_label_image
+from drake_pose.systems.colour_images import fill_colour_image
 
 USUAL_RATE_HZ = 30.0
 """Pictures a second where no source says."""
@@ -128,22 +136,29 @@ class PictureCapture(LeafSystem):
         self._reports: list[str] = []
         self.skipped = 0
         self._state = self.DeclareDiscreteState(np.array([0.0, math.nan, 0.0]))
-        self._declare_outputs(cameras)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(self.period, 0.0, self._look)
-
-    def _declare_outputs(self, cameras: Mapping[str, Camera]) -> None:
         ticket = {self.discrete_state_ticket(self._state)}
-        for name, source in self._sources.items():
-            size = cameras[name].width, cameras[name].height
-            if source.specification.gives_masks:
-                port, image, calc = "label_image", ImageLabel16I(*size), self._calc_label(name)
-            else:
-                port, image, calc = "color_image", ImageRgba8U(*size), self._calc_color(name)
-            self.DeclareAbstractOutputPort(
-                f"{port}_{name}", lambda image=image: AbstractValue.Make(image), calc, ticket
-            )
+        self._declare_outputs(cameras, ticket)
         self.DeclareVectorOutputPort("time", 1, self._calc_time, ticket)
         self.DeclareVectorOutputPort("fresh", 1, self._calc_fresh, ticket)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(self.period, 0.0, self._look)
+
+    def _declare_outputs(
+        self, cameras: Mapping[str, Camera], ticket: set[DependencyTicket]
+    ) -> None:
+        """One output a camera."""
+        for name, source in self._sources.items():
+            size = cameras[name].width, cameras[name].height
+            fill: Callable[[Any, np.ndarray], None]
+            if source.specification.gives_masks:
+                port, image, fill = "label_image", ImageLabel16I(*size), fill_label_image
+            else:
+                port, image, fill = "color_image", ImageRgba8U(*size), fill_colour_image
+            self.DeclareAbstractOutputPort(
+                f"{port}_{name}",
+                lambda image=image: AbstractValue.Make(image),
+                self._calc_image(name, fill),
+                ticket,
+            )
 
     @property
     def moment(self) -> Moment[TimedPicture] | None:
@@ -232,12 +247,18 @@ class PictureCapture(LeafSystem):
             elif source.ended:
                 self._synchroniser.finish(name)
             return
+        self._feed_due(name, source, now)
+
+    def _feed_due(self, name: str, source: FrameSource, now: float) -> None:
+        """Hands on what a source has given up to now; the first later one is kept for its time."""
         while self.live or self._synchroniser.waiting(name) < _AHEAD:
             one = self._pending[name]
             if one is None:
                 one = self._pending[name] = source.read()
             if one is None:
-                self._synchroniser.finish(name)
+                # Live, one that is silent is waited for; a recording has waited itself.
+                if source.ended or not self.live:
+                    self._synchroniser.finish(name)
                 return
             if one.time - self._origins[name] > now:
                 return
@@ -269,24 +290,15 @@ class PictureCapture(LeafSystem):
         one = None if self._moment is None else self._moment.items.get(name)
         return None if one is None else one.picture
 
-    def _calc_label(self, name: str) -> Callable[[Context, AbstractValue], None]:
-        def calc(context: Context, output: AbstractValue) -> None:
-            image, mask = output.get_mutable_value(), self._picture(name)
-            if mask is None:
-                image.resize(0, 0)
-                return
-            fill_label_image(image, mask)
-
-        return calc
-
-    def _calc_color(self, name: str) -> Callable[[Context, AbstractValue], None]:
+    def _calc_image(
+        self, name: str, fill: Callable[[Any, np.ndarray], None]
+    ) -> Callable[[Context, AbstractValue], None]:
         def calc(context: Context, output: AbstractValue) -> None:
             image, picture = output.get_mutable_value(), self._picture(name)
             if picture is None:
                 image.resize(0, 0)
                 return
-            image.resize(picture.shape[1], picture.shape[0])
-            cv2.cvtColor(picture, cv2.COLOR_RGB2RGBA, dst=image.mutable_data)
+            fill(image, picture)
 
         return calc
 

@@ -6,15 +6,12 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import Context
+from pydrake.systems.framework import Context, DependencyTicket
 
 from drake_pose.camera import Camera
 from drake_pose.camera.frame_sources import FrameSource
 from drake_pose.multiview.view_packing import unpack_view
 from drake_pose.systems.picture_capture import PictureCapture
-
-# A recorded camera's views are read so many ahead of its slowest neighbour's.
-_AHEAD = 8
 
 
 class RemoteEyes(PictureCapture):
@@ -33,8 +30,9 @@ class RemoteEyes(PictureCapture):
     camera gave no picture at that moment.
     """
 
-    def _declare_outputs(self, cameras: Mapping[str, Camera]) -> None:
-        ticket = {self.discrete_state_ticket(self._state)}
+    def _declare_outputs(
+        self, cameras: Mapping[str, Camera], ticket: set[DependencyTicket]
+    ) -> None:
         for name in self._sources:
             self.DeclareAbstractOutputPort(
                 f"silhouette_{name}",
@@ -42,8 +40,6 @@ class RemoteEyes(PictureCapture):
                 self._calc_silhouette(name),
                 ticket,
             )
-        self.DeclareVectorOutputPort("time", 1, self._calc_time, ticket)
-        self.DeclareVectorOutputPort("fresh", 1, self._calc_fresh, ticket)
 
     def overdue(self, camera: str) -> float:
         """The time stamp up to which a camera's pictures come too late [s]."""
@@ -51,19 +47,7 @@ class RemoteEyes(PictureCapture):
 
     def _feed(self, name: str, source: FrameSource, now: float) -> None:
         """Hands on the views of a camera that are due; one that is silent is waited for."""
-        while self.live or self._synchroniser.waiting(name) < _AHEAD:
-            one = self._pending[name]
-            if one is None:
-                one = self._pending[name] = source.read()
-            if one is None:
-                # A recording has waited long enough itself.
-                if source.ended or not self.live:
-                    self._synchroniser.finish(name)
-                return
-            if one.time - self._origins[name] > now:
-                return
-            self._synchroniser.add(name, one.time - self._origins[name], one)
-            self._pending[name] = None
+        self._feed_due(name, source, now)
 
     def _calc_silhouette(self, name: str) -> Callable[[Context, AbstractValue], None]:
         def calc(context: Context, output: AbstractValue) -> None:

@@ -108,12 +108,13 @@ def _searchable_limits(
             raise ModelError(f"{name}: lower limit {low:g} is above upper limit {high:g}")
         if np.isfinite(low) and np.isfinite(high):
             continue
-        if kind != "angle" or np.isfinite(low) or np.isfinite(high):
+        if kind == "length":
+            continue  # It may say where the object stands: see unlimited_slides.
+        if np.isfinite(low) or np.isfinite(high):
             raise ModelError(
-                f"{name} has no limits: lower {low:g}, upper {high:g} "
-                f"[{'rad' if kind == 'angle' else 'm'}]; give it a lower and an upper limit in "
-                f"the model file, or give load_model limits={{'{names[index]}': (low, high)}}, so "
-                "that its values can be searched"
+                f"{name} has no limits: lower {low:g}, upper {high:g} [rad]; give it a lower and "
+                f"an upper limit in the model file, or give load_model "
+                f"limits={{'{names[index]}': (low, high)}}, so that its values can be searched"
             )
         lower[index], upper[index] = -np.pi, np.pi
     return lower, upper

@@ -38,7 +38,7 @@ class ArticulatedModel:
             ``joint_suffix`` for joints of several positions.
         position_kinds: "angle" [rad], "length" [m] or "quaternion" for each position.
         lower, upper: (nq,) limits [rad or m], read-only; -pi, pi for a joint that turns freely;
-            infinite for the pose of a floating body.
+            infinite for the pose of a floating body, and for slides without limits.
         default_positions: (nq,) Drake's default positions moved inside the limits, read-only.
         link_meshes: the visual geometry of each link that has some, in the link's frame.
         skin: the bands of surface that bend with the joints, from the file beside the model's

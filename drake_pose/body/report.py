@@ -118,6 +118,12 @@ def _warnings(model: ArticulatedModel, tree: PoseTree) -> list[str]:
             "these joints move nothing that is seen and keep their default values: "
             + ", ".join(tree.unobserved_positions)
         )
+    if tree.held:
+        warnings.append(
+            "these joints have no limits: they say where the object stands and keep their default "
+            "values, and a root position moves it: "
+            + ", ".join(model.position_names[position] for position in tree.held)
+        )
     warnings += [
         f"link '{node.name}' is not watertight: its silhouette may have gaps"
         for node in tree.nodes

@@ -13,6 +13,7 @@ from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.pose_tree import NodePlacement, PoseTree, PoseTreeNode
 from drake_pose.body.root import RootRotation
 from drake_pose.body.skin_bands import find_skin, require_placed
+from drake_pose.body.unlimited_slides import placing_slides, refuse_unlimited_slides
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
 
 Chain = tuple[JointEdge, ...]
@@ -208,6 +209,9 @@ def _plant_rooted(
 ) -> PoseTree:
     """The tree that hangs on the plant's world as the file says."""
     branches = _branches(graph, 0)
+    objects = [branches[index] for index in _outermost(branches)]
+    chains = [[i for edge in branch.chain for i in edge.positions] for branch in objects]
+    held = {**placing_slides(model, chains, held), **held}
     X_WB = np.eye(4)
     if position is not None:
         tops = [branch for branch in branches if branch.parent < 0]
@@ -227,6 +231,13 @@ def _plant_rooted(
     }
     name = graph.groups[0].name
     return _assemble(model, graph, branches, roots, BasePose("constant", X_WB), held, name)
+
+
+def _outermost(branches: list[Branch]) -> list[int]:
+    """The branches that hang on the world, whether it is seen, and so a branch itself, or not."""
+    if branches and branches[0].group == 0:
+        return [index for index, branch in enumerate(branches) if branch.parent == 0]
+    return [index for index, branch in enumerate(branches) if branch.parent < 0]
 
 
 def _leading_translations(model: ArticulatedModel, chain: Chain) -> tuple[int, ...]:
@@ -358,6 +369,7 @@ def _assemble(
                 skin=None if inner is None else find_skin(model, graph, inner, branch.group, steps),
             )
         )
+    refuse_unlimited_slides(model, [i for node in nodes for i in node.positions], held)
     require_placed(
         model, graph, {(branches[b.parent].group, b.group) for b in branches if b.parent >= 0}
     )

@@ -151,6 +151,47 @@ def test_limits_that_drake_does_not_read_are_kept(all_joints):
     np.testing.assert_allclose(all_joints.upper[index], [1, 1, np.pi, 3, 2, np.pi])
 
 
+def planar_robot(more: str = "") -> str:
+    """A body that slides and turns in a plane, and an arm."""
+    return urdf(
+        *(link(name, "") for name in ("bx", "bz")),
+        link("body"),
+        link("arm"),
+        joint("x", "prismatic", "world", "bx", axis="1 0 0", limits=None),
+        joint("z", "prismatic", "bx", "bz", axis="0 0 1", limits=None, origin=""),
+        joint("turn", "continuous", "bz", "body", axis="0 1 0", limits=None, origin=""),
+        joint("shoulder", "revolute", "body", "arm"),
+        more,
+    )
+
+
+def test_slides_without_limits_say_where_the_only_object_stands(tmp_path):
+    model = load_model(write(tmp_path, planar_robot()), check=False)
+    tree = model.pose_tree()
+    slides = [model.position_index("x"), model.position_index("z")]
+    assert dict(tree.held) == dict.fromkeys(slides, 0.0)
+    assert largest_difference_from_drake(model, tree) < 1e-9
+    moved = model.pose_tree(root_position=(1.0, -2.0, 3.0))
+    assert largest_difference_from_drake(model, moved) < 1e-9
+    X_WN = moved.node_poses(moved.default_values())
+    np.testing.assert_allclose(X_WN[0, :3, 3], (1.0, -2.0, 3.0), atol=1e-12)
+    assert dict(moved.held) == dict(tree.held)
+    turned = model.pose_tree("arm", root_position=(0.0, 0.0, 0.0))
+    assert largest_difference_from_drake(model, turned) < 1e-9
+
+
+def test_slides_without_limits_are_refused_where_they_must_be_searched(tmp_path):
+    ball = link("ball") + joint("y", "prismatic", "world", "ball", limits=None)
+    model = load_model(write(tmp_path, planar_robot(ball)), check=False)
+    with pytest.raises(ModelError, match=r"'x', 'z', 'y' have no limits.*of 2 objects"):
+        model.pose_tree()
+    model.pose_tree(held={"x": 0.0, "z": 0.1, "y": 0.2})
+    hand = link("hand") + joint("grip", "prismatic", "arm", "hand", limits=None)
+    model = load_model(write(tmp_path, planar_robot(hand)), check=False)
+    with pytest.raises(ModelError, match="joint 'grip' has no limits"):
+        model.pose_tree()
+
+
 def test_planar_joint_agrees_with_drake_and_needs_limits(tmp_path):
     planar = """<sdf version="1.9" xmlns:drake="http://drake.mit.edu"><model name="m">
     <link name="a"><visual name="v"><geometry><sphere><radius>0.1</radius></sphere></geometry>
@@ -159,8 +200,8 @@ def test_planar_joint_agrees_with_drake_and_needs_limits(tmp_path):
     <drake:joint name="p" type="planar"><drake:parent>a</drake:parent>
     <drake:child>b</drake:child><drake:damping>0 0 0</drake:damping></drake:joint></model></sdf>"""
     path = write(tmp_path, planar, "planar.sdf")
-    with pytest.raises(ModelError, match=r"joint 'p' \(its x\) has no limits"):
-        load_model(path, check=False)
+    with pytest.raises(ModelError, match=r"joints 'p_x', 'p_y' have no limits"):
+        load_model(path, check=False).pose_tree()
     limits = {"p_x": (-1.0, 1.0), "p_y": (0.0, 2.0)}
     model = load_model(path, limits=limits, check=False)
     assert model.upper[model.position_index("p_y")] == 2.0

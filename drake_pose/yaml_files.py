@@ -8,6 +8,7 @@ from typing import Any
 import yaml
 
 from drake_pose.errors import DrakePoseError
+from drake_pose.regular_files import read_regular
 
 _LARGEST_FILE = 1 << 20
 
@@ -34,8 +35,7 @@ def read_yaml(path: Path, error_type: type[DrakePoseError]) -> Any:
         error_type: names the file; when it cannot be read, is too large, or is no YAML file.
     """
     try:
-        with path.open("rb") as file:
-            data = file.read(_LARGEST_FILE + 1)
+        data = read_regular(path, _LARGEST_FILE + 1)
     except OSError as error:
         raise error_type(f"{path}: cannot read it: {error.strerror}") from error
     if len(data) > _LARGEST_FILE:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -152,7 +153,7 @@ def _read_truth(
     if truth_path is not None:
         return read_true_angles(truth_path, model.position_names)
     path = scene_path / TRUTH_FILE
-    if not path.is_file():
+    if not os.path.lexists(path):
         return None
     try:
         return read_true_angles(path, model.position_names)

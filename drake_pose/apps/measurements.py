@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ import numpy as np
 
 from drake_pose.apps.options import frame_number
 from drake_pose.errors import SceneError, UnknownNameError
+from drake_pose.regular_files import read_regular
 
 _CENTRE_COLUMNS = ("frame", "joint", "x", "y", "z")
 
@@ -110,9 +112,9 @@ def angle_difference(a: float, b: float) -> float:
 def _read_csv(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """Returns the first line's columns, and each other line with its number."""
     try:
-        with path.open(newline="", encoding="utf-8") as file:
-            reader = csv.reader(file)
-            lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader if row]
+        text = read_regular(path).decode("utf-8-sig")
+        reader = csv.reader(io.StringIO(text, newline=""))
+        lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader if row]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         reason = error.strerror if isinstance(error, OSError) else "not a CSV file"
         raise SceneError(f"{path}: cannot read it: {reason}") from error

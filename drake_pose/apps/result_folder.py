@@ -134,7 +134,8 @@ class ResultFolder:
             OutputError: if it cannot be written.
         """
         self.close()
-        in_order = sorted(self.rows, key=lambda row: frames.index(row.frame))
+        place = {frame: index for index, frame in enumerate(frames)}
+        in_order = sorted(self.rows, key=lambda row: place[row.frame])
         if in_order != self.rows:
             self.rows = in_order
             self._write_rows()

@@ -9,6 +9,7 @@ import numpy as np
 
 from drake_pose.camera import Camera
 from drake_pose.errors import MaskError, SceneError
+from drake_pose.regular_files import require_regular
 from drake_pose.silhouette import Scene
 from drake_pose.silhouette.scene_files import close_names, natural_key
 
@@ -175,7 +176,9 @@ def _alike(scene: Scene, name: str, last: str, frame: str) -> bool:
     """Whether two mask files are alike byte for byte; what cannot be read is not."""
     one, other = scene.masks[name, last], scene.masks[name, frame]
     try:
-        return one.stat().st_size == other.stat().st_size and one.read_bytes() == other.read_bytes()
+        if require_regular(one) != require_regular(other):
+            return False
+        return one.read_bytes() == other.read_bytes()
     except OSError:
         return False
 

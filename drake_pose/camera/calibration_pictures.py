@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from drake_pose.camera.calibration_board import Board, Sighting
 from drake_pose.camera.checks import LARGEST_SIDE
 from drake_pose.errors import CameraError
+from drake_pose.regular_files import read_regular
 
 _SUFFIXES = (".png", ".jpg", ".jpeg")
 
@@ -129,7 +130,7 @@ def read_picture(path: Path, *, grey: bool = False) -> NDArray[np.uint8]:
         CameraError: names the file; when it cannot be read or is no picture.
     """
     try:
-        data = np.frombuffer(path.read_bytes(), np.uint8)
+        data = np.frombuffer(read_regular(path), np.uint8)
     except OSError as error:
         raise CameraError(f"{path}: cannot read the picture: {error.strerror}") from error
     how = cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR

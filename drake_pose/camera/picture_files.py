@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from drake_pose.camera.checks import LARGEST_SIDE
 from drake_pose.errors import DrakePoseError
+from drake_pose.regular_files import read_regular
 
 Picture = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
@@ -113,7 +114,7 @@ def check_png(data: bytes, path: Path, error_type: type[DrakePoseError]) -> tupl
 def _read(path: Path, error_type: type[DrakePoseError]) -> bytes:
     """A file's content, a whole PNG or JPEG picture as far as its frame tells."""
     try:
-        data = path.read_bytes()
+        data = read_regular(path)
     except OSError as error:
         raise error_type(f"{path}: cannot read the picture: {error.strerror}") from error
     if data.startswith(_JPEG):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 import re
 from pathlib import Path
@@ -24,6 +25,7 @@ from drake_pose.camera.picture_files import (
     read_picture,
 )
 from drake_pose.errors import SceneError
+from drake_pose.regular_files import read_regular
 
 TIME_STAMPS = "timestamps.csv"
 
@@ -230,11 +232,11 @@ def read_time_stamps(path: Path) -> list[tuple[str, float]]:
         SceneError: names the file and the line.
     """
     try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            reader = csv.DictReader(stream)
-            if not {"frame", "time"} <= set(reader.fieldnames or ()):
-                raise SceneError(f"{path}: needs the columns frame and time [s] in its first line")
-            rows = [(reader.line_num, row["frame"], row["time"]) for row in reader]
+        text = read_regular(path).decode("utf-8-sig")
+        reader = csv.DictReader(io.StringIO(text, newline=""))
+        if not {"frame", "time"} <= set(reader.fieldnames or ()):
+            raise SceneError(f"{path}: needs the columns frame and time [s] in its first line")
+        rows = [(reader.line_num, row["frame"], row["time"]) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise SceneError(f"{path}: cannot be read: {error}") from error
     found: dict[str, float] = {}

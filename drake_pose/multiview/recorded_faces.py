@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from drake_pose.errors import SceneError
 from drake_pose.multiview.faces import FaceTemplates, cut_face, learn_faces
 from drake_pose.multiview.regions import Background, learn_background, person_region
 from drake_pose.multiview.skin_blobs import SkinColour, skin_blobs
+from drake_pose.regular_files import read_regular
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -52,8 +54,8 @@ def learn_recorded_faces(folder: Path, skin: SkinColour | None = None) -> FaceTe
 def _read_directions(path: Path) -> list[tuple[str, float, float]]:
     """Picture, turn and nod [deg] of each line."""
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = list(csv.reader(file))
+        text = read_regular(path).decode("utf-8-sig")
+        rows = list(csv.reader(io.StringIO(text, newline="")))
     except OSError as error:
         raise SceneError(f"{path}: cannot read the directions: {error.strerror}") from error
     except (UnicodeDecodeError, csv.Error) as error:

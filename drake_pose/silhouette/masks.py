@@ -10,6 +10,7 @@ import numpy as np
 from drake_pose.camera.checks import LARGEST_SIDE
 from drake_pose.camera.picture_files import check_png, split_colours
 from drake_pose.errors import MaskError
+from drake_pose.regular_files import read_regular
 
 
 def read_mask(
@@ -35,7 +36,7 @@ def read_mask(
     """
     path = Path(path)
     try:
-        data = path.read_bytes()
+        data = read_regular(path)
     except OSError as error:
         raise MaskError(f"{path}: cannot read the mask: {error.strerror}") from error
     found = check_png(data, path, MaskError)

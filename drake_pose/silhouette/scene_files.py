@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -11,6 +12,7 @@ from pathlib import Path
 from drake_pose.errors import SceneError
 
 _SUFFIX = ".png"
+_NUMBER = re.compile("([0-9]+)")
 
 
 @dataclass(frozen=True)
@@ -45,9 +47,8 @@ class SceneFiles:
 
 def natural_key(name: str) -> tuple[tuple[str, int], ...]:
     """What names are sorted by: texts and the numbers in them in turn, so that 2 precedes 10."""
-    texts = re.split(r"(?<=[0-9])(?![0-9])", name)
-    pairs = [re.fullmatch(r"(.*?)([0-9]*)", text, re.DOTALL) for text in texts]
-    return tuple((p[1], int(p[2] or -1)) for p in pairs if p is not None)
+    texts = _NUMBER.split(name)
+    return tuple(zip(texts[::2], [*map(int, texts[1::2]), -1], strict=True))
 
 
 def close_names(name: str, known: Iterable[str]) -> list[str]:
@@ -72,8 +73,8 @@ def find_masks(folder: Path, cameras: Iterable[str]) -> SceneFiles:
     if not root.is_dir():
         raise SceneError(f"{folder}: has no folder masks/<camera>/<frame>.png")
     flat, foreign = _list_pictures(root)
-    folders = [path for path in _visible(root) if path.is_dir()]
-    found = {path.name: _list_pictures(path) for path in folders}
+    folders = [entry.name for entry in _visible(root) if entry.is_dir()]
+    found = {name: _list_pictures(root / name) for name in folders}
     known = {name: found[name][0] for name in names if name in found}
     strangers = {name: len(files) for name, (files, _) in found.items() if name not in names}
     if flat and not any(known.values()):
@@ -109,21 +110,27 @@ def _no_masks(
     return text
 
 
-def _visible(folder: Path) -> list[Path]:
+def _visible(folder: Path) -> list[os.DirEntry[str]]:
     """A folder's entries by name, but for hidden ones, such as those that macOS leaves behind."""
     try:
-        entries = sorted(folder.iterdir())
+        with os.scandir(folder) as entries:
+            seen = [entry for entry in entries if not entry.name.startswith(".")]
     except OSError as error:
         raise SceneError(f"{folder}: cannot be read: {error.strerror}") from error
-    return [path for path in entries if not path.name.startswith(".")]
+    return sorted(seen, key=lambda entry: entry.name)
 
 
 def _list_pictures(folder: Path) -> tuple[list[Path], tuple[str, ...]]:
     """The PNG files of a folder, and the names of its other files."""
-    entries = _visible(folder)
-    pictures = [p for p in entries if p.suffix.lower() == _SUFFIX and not p.is_dir()]
-    others = [path for path in entries if path not in pictures]
-    return pictures, tuple(f"{path.name}/" if path.is_dir() else path.name for path in others)
+    pictures, others = [], []
+    for entry in _visible(folder):
+        if entry.is_dir():
+            others.append(f"{entry.name}/")
+        elif entry.name.lower().endswith(_SUFFIX):
+            pictures.append(folder / entry.name)
+        else:
+            others.append(entry.name)
+    return pictures, tuple(others)
 
 
 def _join_frames(
@@ -133,21 +140,23 @@ def _join_frames(
 
     A single camera's frames are told apart by their whole names: they may be unrelated stills.
     """
-    spelt = sorted({f.stem for own in files.values() for f in own}, key=lambda s: (-len(s), s))
+    stems = {file: file.stem for own in files.values() for file in own}
+    spelt = sorted(set(stems.values()), key=lambda stem: (-len(stem), stem))
+    keys = {stem: natural_key(stem) for stem in spelt}
     name_of = {stem: stem for stem in spelt}
     if sum(bool(own) for own in files.values()) > 1:
         first: dict[tuple[tuple[str, int], ...], str] = {}
-        name_of = {stem: first.setdefault(natural_key(stem), stem) for stem in spelt}
+        name_of = {stem: first.setdefault(keys[stem], stem) for stem in spelt}
     masks: dict[tuple[str, str], Path] = {}
     doubled: dict[tuple[str, str], tuple[Path, ...]] = {}
     for camera, own in files.items():
-        for file in sorted(own, key=lambda f: (-len(f.stem), f.name)):
-            key = camera, name_of[file.stem]
+        for file in sorted(own, key=lambda file: (-len(stems[file]), file.name)):
+            key = camera, name_of[stems[file]]
             if key in masks:
                 doubled[key] = (*doubled.get(key, ()), file)
             else:
                 masks[key] = file
-    frames = sorted({frame for _, frame in masks}, key=lambda name: (natural_key(name), name))
+    frames = sorted({frame for _, frame in masks}, key=lambda name: (keys[name], name))
     order = {frame: k for k, frame in enumerate(frames)}
     cameras = {camera: k for k, camera in enumerate(files)}
     listed = sorted(masks, key=lambda key: (cameras[key[0]], order[key[1]]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -56,9 +57,10 @@ class Scene:
         Raises:
             UnknownNameError: when there is no such frame.
         """
-        if frame not in self.frames:
+        names = tuple(camera for camera in self.cameras if (camera, frame) in self.masks)
+        if not names and frame not in self.frames:
             raise UnknownNameError("frame", frame, self.frames, str(self.path))
-        return tuple(camera for camera in self.cameras if (camera, frame) in self.masks)
+        return names
 
     def mask_path(self, camera: str, frame: str) -> Path:
         """Returns the mask file of a camera's frame.
@@ -112,7 +114,7 @@ def load_scene(path: str | Path, cameras: Mapping[str, Camera] | None = None) ->
         raise SceneError(f"{folder}: no such folder; a scene has cameras.yaml and masks")
     sequence, frame_rate_hz = _read_settings(folder / "scene.yaml")
     if cameras is None:
-        if not (folder / "cameras.yaml").is_file():
+        if not os.path.lexists(folder / "cameras.yaml"):
             cameras, files = _unknown_cameras(folder)
             return Scene(folder, cameras, files.frames, files.masks, sequence, frame_rate_hz, True)
         cameras = load_cameras(folder / "cameras.yaml")

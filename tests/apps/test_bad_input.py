@@ -1,7 +1,9 @@
 """Bad input on the command line: a message that names the culprit, exit status, no traceback."""
 
 import json
+import os
 import shutil
+import socket
 from collections.abc import Callable
 from pathlib import Path
 
@@ -123,6 +125,58 @@ def test_scene(name: str, own_scene: TinyScene, runner: CliRunner) -> None:
     spoil(own_scene)
     assert_refused(run(runner, own_scene), *parts)
     assert not (own_scene.folder.parent / "out").exists()
+
+
+def replace_by_pipe(path: Path) -> None:
+    path.unlink(missing_ok=True)
+    os.mkfifo(path)
+
+
+def replace_by_device(path: Path) -> None:
+    path.unlink(missing_ok=True)
+    path.symlink_to("/dev/zero")  # Reading it never ends.
+
+
+def replace_by_socket(path: Path) -> None:
+    path.unlink(missing_ok=True)
+    with socket.socket(socket.AF_UNIX) as listener:
+        here = os.open(path.parent, os.O_RDONLY)
+        try:  # A socket's path must be short.
+            listener.bind(f"/proc/self/fd/{here}/{path.name}")
+        finally:
+            os.close(here)
+
+
+def replace_by_folder(path: Path) -> None:
+    path.unlink(missing_ok=True)
+    path.mkdir()
+
+
+NO_FILES = {
+    "named pipe": replace_by_pipe,
+    "device": replace_by_device,
+    "socket": replace_by_socket,
+    "folder": replace_by_folder,
+}
+
+
+@pytest.mark.parametrize("place", ["masks/front/0000.png", "cameras.yaml", "joint_angles.csv"])
+@pytest.mark.parametrize("kind", NO_FILES)
+def test_what_is_no_file_is_never_opened(
+    kind: str, place: str, own_scene: TinyScene, runner: CliRunner
+) -> None:
+    for mask in own_scene.folder.glob("masks/*/*.png"):
+        if mask.name != "0000.png":
+            mask.unlink()
+    NO_FILES[kind](own_scene.folder / place)
+    assert_refused(run(runner, own_scene), Path(place).name, kind)
+
+
+def test_a_model_that_is_no_file_is_never_opened(
+    own_scene: TinyScene, runner: CliRunner, tmp_path: Path
+) -> None:
+    os.mkfifo(tmp_path / "pipe.urdf")
+    assert_refused(run(runner, own_scene, model=tmp_path / "pipe.urdf"), "pipe.urdf", "not a file")
 
 
 SPOILT_MODELS: dict[str, tuple[str, tuple[str, ...]]] = {

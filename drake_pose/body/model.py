@@ -15,7 +15,7 @@ from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex
 from drake_pose.body.geometry import body_mesh, make_drawable
 from drake_pose.body.limits import PositionKind, describe_positions
 from drake_pose.body.mesh import TriangleMesh
-from drake_pose.body.parsing import ModelSource, unread_limits
+from drake_pose.body.parsing import ModelSource
 from drake_pose.body.safety import check_in_child
 from drake_pose.body.skin import SkinBand, load_skin
 from drake_pose.errors import ModelError, UnknownNameError
@@ -43,7 +43,7 @@ class ArticulatedModel:
         link_meshes: the visual geometry of each link that has some, in the link's frame.
         skin: the bands of surface that bend with the joints, from the file beside the model's
             (``load_skin``); usually none.
-        warnings: what Drake remarked while reading the file.
+        warnings: what is not read of the file or not enforced, and what Drake remarked.
     """
 
     path: Path
@@ -152,7 +152,8 @@ def load_model(
 
     Args:
         path: a URDF, SDFormat, MJCF (.xml) or model directives (.dmd.yaml) file.
-        package_paths: folders for ``package://name/...``; ``drake_pose`` is known already.
+        package_paths: folders for ``package://name/...``, by name. Others are looked for on the way
+            up from the file and in ROS_PACKAGE_PATH; ``drake_pose`` is known already.
         limits: limits (lower, upper) [rad or m] by position name, instead of the file's: the only
             way to limit planar joints, whose limits Drake's parser does not read.
         check: first read the file in a child process, so that a file that crashes Drake, hangs it
@@ -185,12 +186,13 @@ def read_model(
     try:
         make_drawable(plant, scene_graph, instances)
         plant.Finalize()
-        positions = describe_positions(plant, {**unread_limits(path), **limits}, str(path))
+        positions = describe_positions(plant, {**source.limits, **limits}, str(path))
         meshes = {
             name: body_mesh(plant, scene_graph, plant.get_body(BodyIndex(index)))
             for index, name in enumerate(link_names(plant))
         }
-    except (ModelError, RuntimeError) as error:
+    # Drake ends the process, which Python sees as SystemExit, at some values.
+    except (ModelError, RuntimeError, SystemExit) as error:
         raise ModelError(f"{path}: {error}") from error
     meshes = {name: mesh for name, mesh in meshes.items() if not mesh.is_empty}
     if not meshes:

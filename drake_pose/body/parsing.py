@@ -1,11 +1,9 @@
 """One model file into one Drake plant, with every failure turned into a ModelError."""
 
 import logging
-import math
-import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,44 +12,50 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
-from drake_pose.body.mjcf import cure_mjcf, is_mjcf
-from drake_pose.body.packages import package_map
+from drake_pose.body.curing import Curing
+from drake_pose.body.xml_checks import read_limits
 from drake_pose.errors import ModelError
 
-_EXTENSIONS = (".urdf", ".sdf", ".xml", ".mjcf", ".yaml", ".yml")
+# Inertias play no role in what is seen.
+_ABOUT_INERTIA = ("invalid inertia", "parsing inertia matrix", "as central inertia")
+# Some of Drake's messages hold whole files.
+_LONGEST_REASON = 1000
 
 
 @dataclass(frozen=True)
 class ModelSource:
-    """A model file and, for MJCF, the cured text that is parsed in its place."""
+    """A model file and the cured text that is parsed in its place.
+
+    Attributes:
+        path: the file.
+        text: what Drake parses.
+        kind: what Drake's parser calls that kind of text.
+        warnings: what of the file is not read, or not enforced.
+        limits: limits (lower, upper) [rad] by position name that Drake's parser passes over.
+    """
 
     path: Path
-    package_paths: Mapping[str, str]
-    cured_text: str | None
+    text: str
+    kind: str
+    warnings: tuple[str, ...]
+    limits: Mapping[str, tuple[float, float]]
+    _curing: Curing
 
     @staticmethod
     def open(path: Path, package_paths: Mapping[str, str]) -> "ModelSource":
         """Look at a file before Drake does.
 
         Raises:
-            ModelError: missing, unreadable, of an unknown kind, or MJCF that cannot be cured.
+            ModelError: missing, unreadable, of an unknown kind, or it cannot be cured; the message
+                names link, joint or mesh.
         """
         if not path.exists():
             raise ModelError(f"model file {path} does not exist")
         if not path.is_file():
             raise ModelError(f"model file {path} is not a file")
-        if path.suffix.lower() not in _EXTENSIONS:
-            raise ModelError(
-                f"model file {path}: '{path.suffix}' is not a kind of file that Drake's Parser "
-                "reads; use .urdf, .sdf, .xml (MJCF) or .dmd.yaml"
-            )
-        try:
-            with path.open("rb") as file:
-                file.read(1)
-        except OSError as error:
-            raise ModelError(f"model file {path} cannot be read: {error.strerror}") from error
-        cured_text = cure_mjcf(path) if is_mjcf(path) else None
-        return ModelSource(path, package_paths, cured_text)
+        curing = Curing(package_paths)
+        text, kind = curing.cure(path)
+        return ModelSource(path, text, kind, tuple(curing.warnings), curing.limits, curing)
 
     def parse(
         self, plant: MultibodyPlant, scene_graph: SceneGraph | None, prefix: str = ""
@@ -65,7 +69,8 @@ class ModelSource:
             prefix: put before the model's name.
 
         Returns:
-            The new model instances, and Drake's warnings.
+            The new model instances, and what is worth knowing of the file, Drake's warnings among
+            it.
 
         Raises:
             ModelError: Drake cannot read the model.
@@ -74,31 +79,31 @@ class ModelSource:
             Parser(plant, prefix) if scene_graph is None else Parser(plant, scene_graph, prefix)
         )
         parser.SetAutoRenaming(True)
-        parser.package_map().AddMap(package_map(self.package_paths))
         with captured_warnings() as warnings:
             try:
-                if self.cured_text is None:
-                    instances = parser.AddModels(self.path)
-                else:
-                    instances = parser.AddModelsFromString(self.cured_text, "xml")
-            # Drake ends the process, which Python sees as SystemExit, on crossed limits.
+                instances = parser.AddModelsFromString(self.text, self.kind)
+            # Drake ends the process, which Python sees as SystemExit, at some values.
             except (RuntimeError, ValueError, SystemExit) as error:
-                raise ModelError(self._explain(str(error))) from error
+                raise ModelError(self._explain(str(error), warnings)) from error
         where = str(self.path)
-        return list(instances), [_name_file(warning, where) for warning in warnings]
+        remarks = [
+            self._curing.name_originals(warning, where)
+            for warning in warnings
+            if not any(mark in warning for mark in _ABOUT_INERTIA)
+        ]
+        return list(instances), [*self.warnings, *remarks]
 
-    def _explain(self, reason: str) -> str:
+    def _explain(self, reason: str, warnings: list[str]) -> str:
         """Why the file cannot be used, with the joint whose limits are at fault, if one is."""
-        joint = find_bad_limits(self.path)
-        if joint is not None:
-            return f"{self.path}: {joint}"
-        text = _name_file(reason, self.path.name)
+        if self.kind == "xml":
+            joint = find_bad_limits(self.text)
+            if joint is not None:
+                return f"{self.path}: {joint}"
+        # SDFormat's reader says where in its error, and what in a warning before it.
+        remarks = [text.split("Msg: ")[-1] for text in warnings if "Error" in text]
+        text = "; ".join([*remarks, reason.strip()])[:_LONGEST_REASON]
+        text = self._curing.name_originals(text, self.path.name)
         return f"{self.path}: {text or 'Drake refuses this model without saying why'}"
-
-
-def _name_file(text: str, where: str) -> str:
-    """Name the file instead of the text in memory, whose lines are those of the cured file."""
-    return re.sub(r"<literal-string>\.\w+(:\d+)?", where, text)
 
 
 @contextmanager
@@ -121,71 +126,18 @@ def captured_warnings() -> Iterator[list[str]]:
         logger.handlers, logger.propagate = handlers, propagate
 
 
-def find_bad_limits(path: Path) -> str | None:
-    """The first joint of a URDF, SDFormat or MJCF file whose limits are not a number or crossed.
+def find_bad_limits(text: str) -> str | None:
+    """The first joint of an MJCF file's text whose limits are not numbers or crossed.
 
     Returns:
         A sentence that names the joint, or None.
     """
-    try:
-        root = ElementTree.parse(path).getroot()
-    except (ElementTree.ParseError, OSError):
-        return None
-    for joint in root.iter("joint"):
-        for lower_text, upper_text in _limit_texts(joint):
-            name = joint.get("name", "(unnamed)")
-            try:
-                lower, upper = float(lower_text), float(upper_text)
-            except ValueError:
-                return f"joint '{name}': limits '{lower_text}', '{upper_text}' are not numbers"
-            if math.isnan(lower) or math.isnan(upper):
-                return f"joint '{name}': a limit is NaN; give numbers, lower first"
-            if lower > upper:
-                return (
-                    f"joint '{name}': lower limit {lower:g} is above upper limit {upper:g}; "
-                    "exchange them"
-                )
+    for joint in ElementTree.fromstring(text).iter("joint"):
+        values = joint.get("range", "").split()
+        if len(values) != 2:
+            continue
+        try:
+            read_limits(values[0], values[1], joint.get("name", "(unnamed)"))
+        except ModelError as error:
+            return str(error)
     return None
-
-
-def _limit_texts(joint: ElementTree.Element) -> Iterator[tuple[str, str]]:
-    """The (lower, upper) pairs written for a joint in URDF, SDFormat or MJCF."""
-    for limit in joint.iter("limit"):
-        lower = limit.get("lower") or limit.findtext("lower")
-        upper = limit.get("upper") or limit.findtext("upper")
-        if lower is not None and upper is not None:
-            yield lower, upper
-    values = joint.get("range", "").split()
-    if len(values) == 2:
-        yield values[0], values[1]
-
-
-def unread_limits(path: Path) -> dict[str, tuple[float, float]]:
-    """Limits of universal and screw joints of an SDFormat file, which Drake's parser passes over.
-
-    Returns:
-        (lower, upper) [rad] by position name.
-    """
-    if path.suffix.lower() != ".sdf":
-        return {}
-    try:
-        root = ElementTree.parse(path).getroot()
-    except (ElementTree.ParseError, OSError):
-        return {}
-    limits = {}
-    suffixes = {"universal": (("axis", "_qx"), ("axis2", "_qy")), "screw": (("axis", ""),)}
-    for joint in root.iter("joint"):
-        for axis, suffix in suffixes.get(joint.get("type", ""), ()):
-            lower, upper = (joint.findtext(f"{axis}/limit/{side}") for side in ("lower", "upper"))
-            with suppress(ValueError, TypeError):
-                limits[f"{joint.get('name')}{suffix}"] = (float(lower or ""), float(upper or ""))
-    return limits
-
-
-def count_mimic_joints(path: Path) -> int:
-    """How many joints of a URDF or SDFormat file are written to follow another joint."""
-    try:
-        root = ElementTree.parse(path).getroot()
-    except (ElementTree.ParseError, OSError):
-        return 0
-    return sum(1 for joint in root.iter("joint") for _ in joint.iter("mimic"))

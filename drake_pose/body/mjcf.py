@@ -166,6 +166,8 @@ def _write_out_joints(root: ElementTree.Element, compiler: dict[str, str]) -> No
     """Say of each joint whether it is limited, and leave only actuators that Drake can have."""
     movable = set()
     for joint in root.iter("joint"):
+        if not joint.get("name", "unsaid"):
+            del joint.attrib["name"]
         name = joint.get("name", "(unnamed)")
         if joint.get("type", "hinge") not in ("hinge", "slide"):
             continue

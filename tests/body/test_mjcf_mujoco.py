@@ -107,6 +107,16 @@ def test_a_model_without_a_name_takes_its_files(tmp_path):
     assert load_model(file_of(tmp_path, attributes=""), check=False).name == "m"
 
 
+def test_bodies_and_joints_need_no_names(tmp_path):
+    body = """<body name="body1"><geom size="0.1"/><body pos="0 0 1"><joint name="" range="-9 9"/>
+    <joint name="q" axis="1 0 0" range="-90 90"/><geom size="0.1"/><body name="" pos="0 0 1">
+    <geom size="0.1"/></body></body></body>"""
+    model = load_model(file_of(tmp_path, body), check=False)
+    places = body_places(model, {"q": np.pi / 2})
+    assert set(model.link_meshes) == {"body1", "body2", "body3"}
+    np.testing.assert_allclose(places["body3"][0], (0.0, -1.0, 1.0), atol=1e-12)
+
+
 @pytest.mark.parametrize("root", ["robot", "sdf", "something"])
 def test_another_kind_of_file_is_named(tmp_path, root):
     path = write(tmp_path, f'<{root} name="r"><link name="a"/></{root}>', "m.xml")

@@ -22,6 +22,7 @@ from drake_pose.filtering import (
     stack,
     two_sided,
 )
+from tests.written_files import assert_same_files
 
 HAND = bundled_model("two_finger_hand")
 FREE_AND_LIMITED = """<robot name="r">
@@ -229,5 +230,8 @@ def test_bad_arrays_are_refused():
 def test_the_hand_is_what_its_script_writes(tmp_path):
     script = HAND.parent / "make_two_finger_hand.py"
     subprocess.run([sys.executable, str(script), "--out", str(tmp_path)], check=True)
-    for name in ("two_finger_hand.urdf", "two_finger_hand.couplings.yaml"):
-        assert (tmp_path / name).read_bytes() == (HAND.parent / name).read_bytes()
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "two_finger_hand.urdf",
+        "two_finger_hand.couplings.yaml",
+    }
+    assert_same_files(tmp_path, HAND.parent)

@@ -23,6 +23,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
 from tests.urdf.surfaces import winding_numbers
+from tests.written_files import assert_same_files
 
 URDF = Path(__file__).resolve().parents[2] / "urdf"
 BODIES = ("woman", "man")
@@ -156,8 +157,7 @@ def test_script_writes_the_committed_files(name: str, tmp_path: Path) -> None:
     committed = {p.relative_to(URDF / name) for p in (URDF / name).glob(f"{name}.*")}
     committed |= {p.relative_to(URDF / name) for p in (URDF / name / "meshes").iterdir()}
     assert written == committed
-    for path in sorted(written):
-        assert (tmp_path / path).read_bytes() == (URDF / name / path).read_bytes(), path
+    assert_same_files(tmp_path, URDF / name)
 
 
 def test_stature_scales_the_body(tmp_path: Path) -> None:

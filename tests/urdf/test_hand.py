@@ -19,6 +19,7 @@ from tests.urdf.surfaces import (
     winding_numbers,
     written_again,
 )
+from tests.written_files import assert_same_files
 
 FINGERS = ("index", "middle", "ring", "little")
 HANDS = ("hand", "right_hand")
@@ -90,8 +91,7 @@ def tip(model: ArticulatedModel, finger: str, q: np.ndarray) -> np.ndarray:
 def test_script_writes_the_committed_files(tmp_path: Path) -> None:
     written = written_again("hand", tmp_path)
     assert written == committed("hand")
-    for path in written:
-        assert (tmp_path / path).read_bytes() == (URDF / "hand" / path).read_bytes(), path
+    assert_same_files(tmp_path, URDF / "hand")
 
 
 def test_hand_length_scales_everything(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-.PHONY: demo test bench clean
+.PHONY: demo test robots bench clean
 
 VENV := .venv
 PYTHON := $(VENV)/bin/python
@@ -17,6 +17,10 @@ test: $(VENV)/ready
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/mypy
 	$(PYTHON) -m pytest -n auto --maxprocesses 4 --dist loadfile
+
+# Other people's robots for `make test`, which skips their tests without: 1.3 GB.
+robots: $(VENV)/ready
+	$(PYTHON) -m pip install --quiet --disable-pip-version-check --editable ".[robots]"
 
 bench: $(VENV)/ready
 	$(PYTHON) -m drake_pose.apps.benchmark

@@ -7,6 +7,7 @@ import io
 import re
 import struct
 import tempfile
+import xml.etree.ElementTree as ElementTree
 from operator import methodcaller
 from pathlib import Path
 from typing import Any, TextIO
@@ -18,6 +19,8 @@ from pydrake.geometry import ReadObjToTriangleSurfaceMesh
 from drake_pose.body.mesh import TriangleMesh, join_meshes, merge_duplicate_vertices
 from drake_pose.errors import ModelError
 
+# What a COLLADA file says of colours and textures.
+_DAE_LOOKS = ("library_images", "library_effects", "library_materials", "bind_material")
 READABLE_EXTENSIONS = (".obj", ".gltf", ".glb", ".stl", ".dae", ".msh")
 _STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 # glTF's vertical axis is y, Drake's is z: (x, y, z) becomes (x, -z, y).
@@ -153,7 +156,7 @@ def _read_dae(path: Path) -> TriangleMesh:
         raise ModelError(f"mesh file {path}: install 'pycollada' to read DAE files") from error
     parts = []
     try:
-        document = collada.Collada(str(path))
+        document = collada.Collada(io.BytesIO(_shapes_of_dae(path)))
         if document.scene is None:
             raise ModelError(f"mesh file {path} has no scene: nothing would be drawn")
         for geometry in document.scene.objects("geometry"):
@@ -167,6 +170,17 @@ def _read_dae(path: Path) -> TriangleMesh:
     mesh = join_meshes(parts)
     unit = document.assetInfo.unitmeter
     return TriangleMesh(mesh.vertices * (1.0 if unit is None else unit), mesh.triangles)
+
+
+def _shapes_of_dae(path: Path) -> bytes:
+    """The text of a COLLADA file without colours and textures.
+
+    A material that names a missing texture would take its triangles with it.
+    """
+    root = ElementTree.parse(path).getroot()
+    for parent in list(root.iter()):
+        parent[:] = [child for child in parent if child.tag.rpartition("}")[2] not in _DAE_LOOKS]
+    return ElementTree.tostring(root)
 
 
 def _read_with_trimesh(path: Path, source: Path | io.BytesIO, extension: str) -> TriangleMesh:

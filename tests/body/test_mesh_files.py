@@ -100,6 +100,8 @@ def test_a_dae_file_needs_no_texture_and_is_in_metres(tmp_path):
     unit = '<unit name="inch" meter="0.0254"/><up_axis>'
     path = write(tmp_path, text.replace("<up_axis>", unit), "t.dae")
     assert_tetrahedron(read_mesh_file(path), 0.0254)
+    broken = write(tmp_path, text.replace("<source>s<", "<source>gone<"), "broken.dae")
+    assert_tetrahedron(read_mesh_file(broken))
 
 
 def test_mujocos_own_mesh_files_are_read(tmp_path):

@@ -27,6 +27,7 @@ _IGNORED_BY_DRAKE = ("composite", "flexcomp", "attach", "replicate")
 _WITHOUT_EFFECT = frozenset(
     ("camera", "light", "site", "texture", "contact", "sensor", "keyframe", "visual", "statistic")
 )
+_ALMOST_MASSLESS = {"pos": "0 0 0", "mass": "1e-6", "diaginertia": "1e-9 1e-9 1e-9"}
 _MAXIMUM_INCLUDE_DEPTH = 20
 
 
@@ -65,6 +66,7 @@ def cure_mjcf(path: Path) -> str:
         # With this setting Drake and MuJoCo refuse a body that states no inertia.
         needs_inertia = compiler.get("inertiafromgeom") == "false"
         _write_out_joints(root, compiler)
+        _give_masses(root)
         for body in list(root.iter("body")):
             _nest_joints(body, needs_inertia=needs_inertia)
     except ModelError as error:
@@ -190,6 +192,14 @@ def _write_out_joints(root: ElementTree.Element, compiler: dict[str, str]) -> No
                 actuator.remove(element)
 
 
+def _give_masses(root: ElementTree.Element) -> None:
+    """Give a mass to bodies that state none: Drake refuses those, and MuJoCo takes fixed ones."""
+    for inertial in root.iter("inertial"):
+        if not numbers(inertial, "mass", 1, "0")[0] > 0.0:
+            inertial.attrib.pop("fullinertia", None)
+            inertial.attrib.update(_ALMOST_MASSLESS)
+
+
 def _nest_joints(body: ElementTree.Element, *, needs_inertia: bool) -> None:
     """Turn a body with joints j1 .. jn into n nested bodies with one joint each, in that order."""
     joints = body.findall("joint")
@@ -209,6 +219,5 @@ def _nest_joints(body: ElementTree.Element, *, needs_inertia: bool) -> None:
             current = ElementTree.SubElement(current, "body", {"name": inner_name})
         current.append(joint)
         if number < len(joints) - 1 and needs_inertia:
-            inertia = {"pos": "0 0 0", "mass": "1e-6", "diaginertia": "1e-9 1e-9 1e-9"}
-            ElementTree.SubElement(current, "inertial", inertia)
+            ElementTree.SubElement(current, "inertial", _ALMOST_MASSLESS)
     current.extend(content)

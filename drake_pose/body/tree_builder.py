@@ -299,7 +299,7 @@ def _turned_over(
     else:
         chain = _chain_from_world(graph, set(groups))
         base = base_of_chain(model, graph, chain, groups.index(chain[-1].outer))
-        if any(edge.joint_map is None for edge in chain) and _seen(graph, 0):
+        if any(edge.joint_map is None for edge in chain):
             branches, roots = _with_world(model, graph, branches, roots)
     taken = [model.position_names[index] for index in base.positions if index in held]
     if taken:
@@ -326,7 +326,7 @@ def _with_world(
     branches: list[Branch],
     roots: dict[int, NodePlacement],
 ) -> tuple[list[Branch], dict[int, NodePlacement]]:
-    """Add what stands in the world beside a floating object, as further roots."""
+    """Add what is seen in the world beside a floating object, as further roots."""
     offset = len(branches)
     joined, placements = list(branches), dict(roots)
     X_WA = PlantKinematics(model).pose(graph.groups[0].body)

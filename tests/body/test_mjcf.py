@@ -127,3 +127,11 @@ def test_a_file_that_includes_itself_is_refused(tmp_path):
 def test_broken_xml_names_the_file(tmp_path):
     with pytest.raises(ModelError, match=r"m\.xml"):
         load_model(write(tmp_path, "<mujoco><worldbody>", "m.xml"), check=False)
+
+
+def test_a_body_without_mass_is_read(tmp_path):
+    inertial = '<inertial pos="0 0 0" mass="0" diaginertia="0 0 0"/>'
+    body = f'<body name="b">{inertial}<joint name="j" range="-1 1"/><geom size="0.1"/></body>'
+    text = f'<mujoco model="m"><worldbody>{body}</worldbody></mujoco>'
+    model = load_model(write(tmp_path, text, "m.xml"), check=False)
+    assert set(model.link_meshes) == {"b"}

@@ -11,6 +11,7 @@ from .models import (
     FLOATING_URDF,
     JOINTED_BASE_URDF,
     JOINTS_SDF,
+    SPHERE,
     WELDED_URDF,
     joint,
     link,
@@ -178,6 +179,15 @@ def test_slides_without_limits_say_where_the_only_object_stands(tmp_path):
     assert dict(moved.held) == dict(tree.held)
     turned = model.pose_tree("arm", root_position=(0.0, 0.0, 0.0))
     assert largest_difference_from_drake(model, turned) < 1e-9
+
+
+def test_what_hangs_on_an_unseen_world_is_in_the_tree_of_a_floating_object(tmp_path):
+    arm = joint("a1", "revolute", "world", "upper") + joint("a2", "revolute", "upper", "lower")
+    text = urdf(link("ball", SPHERE), link("upper"), link("lower"), arm)
+    model = load_model(write(tmp_path, text), check=False)
+    tree = model.pose_tree()
+    assert [node.name for node in tree.nodes] == ["ball", "upper", "lower"]
+    assert largest_difference_from_drake(model, tree) < 1e-9
 
 
 def test_slides_without_limits_are_refused_where_they_must_be_searched(tmp_path):

@@ -209,8 +209,12 @@ Walk through a garden in the browser, as an avatar that moves like the captured 
 The room of the capture is small, so where one stands in it is a command: facing right or left
 turns the view, standing ahead of or behind the first frame's place walks forward or backward.
 Plays a result of capture, a simulated person, the person before live cameras (who commands after
-standing still for a second), or none of these: then the arrow keys walk. The page can be opened on
-this machine alone.
+standing still for a second), or none of these: then the arrow keys walk. A recording is played once
+a browser shows the page, and again at the press of its button.
+
+The page can be opened on this machine alone, by all its users, and only under its own address:
+other web pages that ask for it (a foreign Origin or Host) are refused. Through ssh, forward the
+same port: ssh -L 7000:localhost:7000, with --no-browser --wait.
 
 [bold]Example:[/bold]
 

@@ -9,7 +9,7 @@ import typer
 
 from drake_pose.apps.estimate_options import JsonOption
 from drake_pose.apps.settings import EstimateSettings
-from drake_pose.apps.terminal import errors_as_messages, print_json, say, usage_errors
+from drake_pose.apps.terminal import errors_as_messages, finite, print_json, say, usage_errors
 
 
 def kameda(
@@ -20,7 +20,10 @@ def kameda(
         str, typer.Option(help="lattice: multiples of 20 degrees, as in the paper; continuous.")
     ] = "lattice",
     outside_limit: Annotated[
-        float, typer.Option(min=0.0, help=r"r \[pixel]; the paper's is 200.", metavar="R")
+        float,
+        typer.Option(
+            min=0.0, callback=finite, help=r"r \[pixel]; the paper's is 200.", metavar="R"
+        ),
     ] = 200.0,
     candidates: Annotated[
         int,
@@ -29,7 +32,13 @@ def kameda(
         ),
     ] = 5,
     interval: Annotated[
-        float, typer.Option(min=1.0, max=90.0, help=r"Sampling interval \[deg]; the paper's is 20.")
+        float,
+        typer.Option(
+            min=1.0,
+            max=90.0,
+            callback=finite,
+            help=r"Sampling interval \[deg]; the paper's is 20.",
+        ),
     ] = 20.0,
     views: Annotated[
         int | None,

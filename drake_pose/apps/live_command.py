@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from drake_pose.apps.terminal import FAILED, errors_as_messages, print_json, say, warn
+from drake_pose.apps.terminal import FAILED, errors_as_messages, finite, print_json, say, warn
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -21,7 +21,9 @@ _PANEL = "Live cameras, videos and folders of pictures, by sources.yaml"
 
 SecondsOption = Annotated[
     float | None,
-    typer.Option(min=0.01, help="End after so many seconds.", rich_help_panel=_PANEL),
+    typer.Option(
+        min=0.01, callback=finite, help="End after so many seconds.", rich_help_panel=_PANEL
+    ),
 ]
 ShapeOption = Annotated[
     Path | None,
@@ -43,6 +45,7 @@ ToleranceOption = Annotated[
     float | None,
     typer.Option(
         metavar="SECONDS",
+        callback=finite,
         help="How far apart pictures of one moment may be; half the time between two pictures if "
         "not given, 0.9 of it for live cameras.",
         rich_help_panel=_PANEL,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -44,6 +45,13 @@ def usage_errors() -> Iterator[None]:
         yield
     except DrakePoseError as error:
         raise typer.BadParameter(str(error)) from None
+
+
+def finite(number: float | None) -> float | None:
+    """Refuses nan and inf, which an option's range lets pass; its callback."""
+    if number is not None and not math.isfinite(number):
+        raise typer.BadParameter(f"{number} is not a finite number")
+    return number
 
 
 def say(message: str) -> None:

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import csv
+import ipaddress
 import logging
 import math
+import secrets
 import time
+import weakref
 import webbrowser
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,25 +20,32 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Diagram
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_pose.apps.date_motion import make_motion
+from drake_pose.apps.local_proxy import PORTS, listen, serve
 from drake_pose.apps.result_folder import POSES, read_summary
 from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.errors import OutputError, SettingsError
 from drake_pose.multiview.skeleton import load_skeleton
-from drake_pose.systems.walk import build_walk
+from drake_pose.systems.walk import KEYS, build_walk
 
 Array = NDArray[np.float64]
 
 RATE_HZ = 30.0
 """Frames a second where a recording does not say."""
 
+REPLAY, _REPLAY_KEY = "play again", "Space"
+"""The page's button at the end of a recording, and the key that presses it."""
+
 COMMANDS = ("turn left", "turn right", "walk ahead", "walk behind")
 
 _SIMULATED_FRAMES = 1200
 # How often it is looked whether the walk has ended [s].
 _LOOK = 0.5
+# Between two looks at browser and button [s].
+_NAP = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,20 +131,44 @@ def stride_positions(model: ArticulatedModel) -> Array:
 
 
 def open_page(port: int | None = None) -> Meshcat:
-    """A Meshcat page that only this machine can open, without Drake's own message.
+    """A Meshcat page for this machine's browsers, without Drake's own message.
+
+    Meshcat itself would send what it shows to any web page that asks for it, so that a proxy stands
+    before it, at the page's address. Meshcat listens at one of 2^24 loopback addresses, which no
+    web page can find by trying; where the system has but one of them (macOS), at a port that one
+    could find among 2^16.
 
     Args:
         port: where it listens; a free one where not given.
+
+    Raises:
+        SettingsError: no page can be opened at the port.
     """
     logger = logging.getLogger("drake")
     level = logger.level
     logger.setLevel(logging.WARNING)
     try:
-        return Meshcat(MeshcatParams(host="localhost", port=port, show_stats_plot=False))
-    except RuntimeError as error:
-        raise SettingsError(f"no page can be opened at port {port}: {error}") from error
+        listening = listen(port)
+        url = f"http://localhost:{listening.getsockname()[1]}"
+        page, host = _hidden_meshcat(url)
+    except (OSError, RuntimeError) as error:
+        where = f"port {port}" if port is not None else f"ports {PORTS[0]} to {PORTS[-1]}"
+        raise SettingsError(f"no page can be opened at {where}: {error}") from error
     finally:
         logger.setLevel(level)
+    weakref.finalize(page, serve(listening, (host, page.port())))
+    return page
+
+
+def _hidden_meshcat(url: str) -> tuple[Meshcat, str]:
+    """A Meshcat that says it is at a URL, and the loopback address at which it is."""
+    # Neither the network's own address, nor its last one, which is for broadcasts.
+    hidden = ipaddress.ip_address((127 << 24) + 1 + secrets.randbelow((1 << 24) - 2))
+    for host in (str(hidden), "127.0.0.1"):
+        with suppress(RuntimeError):
+            params = MeshcatParams(host=host, port=0, show_stats_plot=False, web_url_pattern=url)
+            return Meshcat(params), host
+    raise RuntimeError("Meshcat cannot listen at any loopback address")
 
 
 def walk(
@@ -142,6 +177,7 @@ def walk(
     seconds: float | None = None,
     speed: float = 1.0,
     on_command: Callable[[str], None] | None = None,
+    again: Callable[[], bool] | None = None,
 ) -> dict[str, Any]:
     """Lets the avatar walk until its recording, the given time, or the user (Ctrl-C) ends it.
 
@@ -151,10 +187,12 @@ def walk(
         seconds: how long; the recording's length where not given, without end for keys alone.
         speed: seconds walked a second; 0: as fast as the machine can.
         on_command: called when the command changes, with its words, "" for none.
+        again: asked at the end whether to walk once more from the start; not at all where not
+            given.
 
     Returns:
-        seconds walked; x, y [m] and heading_deg where the walk ended; and by command how many
-        seconds it was followed.
+        Of the last walk: seconds walked; x, y [m] and heading_deg where it ended; and by command
+        how many seconds it was followed.
 
     Raises:
         SettingsError: a time or a speed that cannot be.
@@ -173,27 +211,41 @@ def walk(
         seconds = min(seconds or times[-1], times[-1])
     stride = stride_positions(player.model)
     diagram = build_walk(player.model, meshcat, positions, stride, period)
-    log = CommandLog(on_command)
+    end = math.inf if seconds is None else seconds
+    while True:
+        walked, reached = _walk_once(diagram, end, speed, CommandLog(on_command))
+        if not reached or again is None or not again():
+            return walked
+        # What was pressed before does not move the next walker.
+        for name, key in KEYS.items():
+            meshcat.AddButton(name, key)
+
+
+def _walk_once(
+    diagram: Diagram, end: float, speed: float, log: CommandLog
+) -> tuple[dict[str, Any], bool]:
+    """Walks up to a time [s] or Ctrl-C; what ``walk`` returns, and whether it came to the time."""
     simulator = Simulator(diagram)
     simulator.set_target_realtime_rate(speed)
     command, pose = (diagram.GetOutputPort(name) for name in ("command", "walker_pose"))
     simulator.set_monitor(lambda context: log.add(context.get_time(), command.Eval(context)))
     context = simulator.get_context()
-    end = math.inf if seconds is None else seconds
+    reached = True
     try:
         simulator.Initialize()
         while context.get_time() < end:
             simulator.AdvanceTo(min(context.get_time() + _LOOK, end))
     except KeyboardInterrupt:
-        pass
+        reached = False
     x, y, heading = pose.Eval(context)
-    return {
+    walked = {
         "seconds": context.get_time(),
         "x": float(x),
         "y": float(y),
         "heading_deg": math.degrees(heading),
         "commands": log.seconds,
     }
+    return walked, reached
 
 
 def show(page: Meshcat, patience: float = 10.0) -> bool:
@@ -206,11 +258,29 @@ def show(page: Meshcat, patience: float = 10.0) -> bool:
     Returns:
         Whether a browser shows it.
     """
-    end = time.monotonic() + patience
     if webbrowser.open(page.web_url()):
-        while page.GetNumActiveConnections() == 0 and time.monotonic() < end:
-            time.sleep(0.05)
+        wait_for_browser(page, patience)
     return page.GetNumActiveConnections() > 0
+
+
+def wait_for_browser(page: Meshcat, patience: float = math.inf) -> None:
+    """Waits until a browser shows a page, for so long at most [s]."""
+    end = time.monotonic() + patience
+    while page.GetNumActiveConnections() == 0 and time.monotonic() < end:
+        time.sleep(_NAP)
+
+
+def wait_for_replay(page: Meshcat) -> bool:
+    """Waits until the page's button to play again is pressed; False: Ctrl-C was, instead."""
+    page.AddButton(REPLAY, _REPLAY_KEY)
+    try:
+        while page.GetButtonClicks(REPLAY) == 0:
+            time.sleep(_NAP)
+    except KeyboardInterrupt:
+        return False
+    finally:
+        page.DeleteButton(REPLAY)
+    return True
 
 
 class CommandLog:

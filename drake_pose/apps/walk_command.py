@@ -11,7 +11,7 @@ import typer
 from drake_pose.apps.cluster_options import SchedulerOption, WatchersOption, workers_of
 from drake_pose.apps.estimate_options import JsonOption
 from drake_pose.apps.live_command import ShapeOption
-from drake_pose.apps.terminal import errors_as_messages, print_json, say, warn
+from drake_pose.apps.terminal import errors_as_messages, finite, print_json, say, warn
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -40,13 +40,20 @@ def walk(
     ] = None,
     rate: Annotated[
         float | None,
-        typer.Option(help="The result's frames a second; what its summary says if not given."),
+        typer.Option(
+            callback=finite,
+            help="The result's frames a second; what its summary says if not given.",
+        ),
     ] = None,
     seconds: Annotated[
-        float | None, typer.Option(min=0.01, help="End after so many seconds of the walk.")
+        float | None,
+        typer.Option(min=0.01, callback=finite, help="End after so many seconds of the walk."),
     ] = None,
     speed: Annotated[
-        float, typer.Option(min=0.0, help="Seconds walked a second; 0: as fast as can be.")
+        float,
+        typer.Option(
+            min=0.0, callback=finite, help="Seconds walked a second; 0: as fast as can be."
+        ),
     ] = 1.0,
     port: Annotated[
         int | None,
@@ -55,6 +62,15 @@ def walk(
     browser: Annotated[
         bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")
     ] = True,
+    wait: Annotated[
+        bool | None,
+        typer.Option(
+            "--wait/--no-wait",
+            help="Play a result or --simulate once a browser shows the page, and again when the "
+            "page asks for it, until Ctrl-C or --seconds; --no-wait: at once, and once. "
+            "Default: as --browser.",
+        ),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """See help_texts.WALK."""
@@ -68,6 +84,8 @@ def walk(
         raise typer.BadParameter("--rate is for a result")
     if result is None and live is None and model is not None:
         raise typer.BadParameter("--model is for a result or --live")
+    if rate is not None and rate <= 0.0:
+        raise typer.BadParameter("must be above 0", param_hint="--rate")
     with errors_as_messages():
         from drake_pose.apps import walk as walking
 
@@ -82,8 +100,21 @@ def walk(
             player = walking.simulated_player()
         else:
             player = walking.key_player()
-        page = _open_page(port, browser)
-        _print(walking.walk(player, page, seconds, speed, _say_command), json)
+        waits = player.q is not None and (browser if wait is None else wait)
+        page = _open_page(port, browser, waits)
+        again = _asker(page) if waits and seconds is None else None
+        _print(walking.walk(player, page, seconds, speed, _say_command, again), json)
+
+
+def _asker(page: Meshcat) -> Callable[[], bool]:
+    """What waits at the end of a recording until it is to be played again."""
+    from drake_pose.apps.walk import wait_for_replay
+
+    def ask() -> bool:
+        say("drake-pose: the end; space or the page's button plays it again, Ctrl-C ends")
+        return wait_for_replay(page)
+
+    return ask
 
 
 def _walk_live(
@@ -122,13 +153,17 @@ def _opener(client: Client, scene: LiveScene) -> Callable[[], LiveEyes]:
     return lambda: opener(client)(scene)
 
 
-def _open_page(port: int | None, browser: bool) -> Meshcat:
-    """The page, shown in the browser where there is one."""
+def _open_page(port: int | None, browser: bool, waits: bool = False) -> Meshcat:
+    """The page, shown in the browser where there is one; waits until it is, or says it is not."""
     from drake_pose.apps import walk as walking
 
     page = walking.open_page(port)
     say(f"drake-pose: {page.web_url()} - arrow keys walk and turn, Ctrl-C ends")
-    if browser and not walking.show(page):
+    shown = browser and walking.show(page)
+    if waits and not shown:
+        say("drake-pose: waiting until a browser shows the page")
+        walking.wait_for_browser(page)
+    elif browser and not shown:
         warn("no browser has opened the page yet")
     return page
 

@@ -1,7 +1,11 @@
+import contextlib
 import json
 import math
 import shutil
+import socket
 import subprocess
+import threading
+import time
 
 import cv2
 import numpy as np
@@ -11,13 +15,16 @@ from typer.testing import CliRunner
 from drake_pose.apps.main import app
 from drake_pose.apps.result_folder import PoseRow, ResultFolder
 from drake_pose.apps.walk import (
+    REPLAY,
     Player,
+    _walk_once,
     key_player,
     open_page,
     recorded_player,
     show,
     simulated_player,
     stride_positions,
+    wait_for_replay,
     walk,
 )
 from drake_pose.body import bundled_model, load_model
@@ -115,7 +122,8 @@ def test_simulated_person_turns_both_ways():
 def test_wrong_usage_is_refused(tmp_path):
     both = CliRunner().invoke(app, ["walk", str(tmp_path), "--simulate", "--no-browser"])
     assert both.exit_code == 2
-    for words in (["--seconds", "0"], ["--seconds", "1", "--speed", "-1"]):
+    numbers = (["--seconds", "0"], ["--seconds", "1", "--speed", "-1"])
+    for words in (*numbers, ["--seconds", "inf"], ["--seconds", "1", "--speed", "nan"]):
         done = CliRunner().invoke(app, ["walk", "--no-browser", *words])
         assert done.exit_code == 2
         assert words[-2] in done.stderr
@@ -123,8 +131,9 @@ def test_wrong_usage_is_refused(tmp_path):
 
 def test_port_that_is_taken_is_named():
     page = open_page()
-    with pytest.raises(SettingsError, match=str(page.port())):
-        open_page(page.port())
+    port = int(page.web_url().rpartition(":")[2])
+    with pytest.raises(SettingsError, match=f"port {port}"):
+        open_page(port)
 
 
 def test_browser_that_does_not_open_is_not_waited_for_for_ever(monkeypatch):
@@ -133,6 +142,89 @@ def test_browser_that_does_not_open_is_not_waited_for_for_ever(monkeypatch):
     page = open_page()
     assert not show(page, patience=0.1)
     assert opened == [page.web_url()]
+
+
+@contextlib.contextmanager
+def shown(url):
+    """A page that a browser shows, as far as its server can tell."""
+    place = url.removeprefix("http://")
+    with socket.create_connection(("127.0.0.1", int(place.rpartition(":")[2]))) as opened:
+        opened.sendall(
+            f"GET / HTTP/1.1\r\nHost: {place}\r\nOrigin: {url}\r\nConnection: Upgrade\r\n"
+            "Upgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
+            "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n".encode()
+        )
+        yield
+
+
+def test_recording_waits_for_a_browser_and_is_played_again(tmp_path, monkeypatch):
+    record(tmp_path, [0.0] * 5)
+    pages, browsers = [], contextlib.ExitStack()
+    monkeypatch.setattr(
+        "drake_pose.apps.walk.open_page", lambda _: pages.append(open_page()) or pages[0]
+    )
+    urls, begun, presses = [], [], []
+
+    def open_later():
+        time.sleep(0.5)
+        assert not begun, "played before a browser was there"
+        browsers.enter_context(shown(*urls))
+
+    def press(page):
+        """Play again once; then Ctrl-C."""
+        presses.append(page)
+        return len(presses) == 1
+
+    def walk_once(*arguments):
+        begun.append(pages[0].GetNumActiveConnections())
+        return _walk_once(*arguments)
+
+    opening = threading.Thread(target=open_later)
+    monkeypatch.setattr("webbrowser.open", lambda url: urls.append(url) or opening.start())
+    monkeypatch.setattr("drake_pose.apps.walk.wait_for_replay", press)
+    monkeypatch.setattr("drake_pose.apps.walk._walk_once", walk_once)
+    with browsers:
+        done = CliRunner().invoke(app, ["walk", str(tmp_path), "--speed", "0", "--json"])
+        opening.join()
+    assert done.exit_code == 0, done.output
+    assert begun == [1, 1]
+    assert len(presses) == 2
+    assert json.loads(done.stdout)["seconds"] == pytest.approx(0.5)
+    assert "waiting until a browser" in done.stderr
+
+
+def test_button_and_control_c_end_the_wait_for_another_play(monkeypatch):
+    page = open_page()
+    # What the browser sends for a button: a map of two texts as MessagePack.
+    texts = ["type", "button", "name", REPLAY]
+    packed = b"\x82" + b"".join(bytes([0xA0 + len(text)]) + text.encode() for text in texts)
+    monkeypatch.setattr("time.sleep", lambda _: page._InjectWebsocketMessage(message=packed))
+    assert wait_for_replay(page)
+    assert REPLAY not in page.GetButtonNames()
+
+    def interrupt(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("time.sleep", interrupt)
+    assert not wait_for_replay(page)
+    assert REPLAY not in page.GetButtonNames()
+
+
+def test_a_walk_once_more_begins_at_the_start():
+    player, asked = key_player(), []
+    q = np.tile(stride_positions(player.model)[-1], (5, 1))
+    q[1:, player.model.position_index("position_x")] = 0.4
+    page = open_page()
+    once = walk(Player(player.model, q), page, speed=0.0)
+    assert once["x"] > START[0]
+    again = walk(
+        Player(player.model, q),
+        page,
+        speed=0.0,
+        again=lambda: not asked.append(1) and len(asked) < 3,
+    )
+    assert len(asked) == 3
+    assert again == once
 
 
 def test_keys_alone_leave_the_walker_where_he_is():

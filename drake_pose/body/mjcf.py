@@ -25,8 +25,32 @@ from drake_pose.errors import ModelError
 _IGNORED_BY_DRAKE = ("composite", "flexcomp", "attach", "replicate")
 # What neither moves a body nor is a part of one; Drake refuses or remarks on some of it.
 _WITHOUT_EFFECT = frozenset(
-    ("camera", "light", "site", "texture", "contact", "sensor", "keyframe", "visual", "statistic")
+    (
+        "camera",
+        "light",
+        "site",
+        "texture",
+        "contact",
+        "sensor",
+        "keyframe",
+        "visual",
+        "statistic",
+        "option",
+    )
 )
+# Attributes about contact and forces: Drake remarks on each of them that it does not use it.
+_FORCES = {
+    "joint": (
+        "actuatorfrclimited", "actuatorfrcrange", "actuatorgravcomp", "frictionloss", "group",
+        "margin", "solimpfriction", "solimplimit", "solreffriction", "solreflimit", "springdamper",
+        "springref", "stiffness", "user",
+    ),
+    "geom": (
+        "condim", "fluidcoef", "fluidshape", "friction", "gap", "margin", "priority", "solimp",
+        "solmix", "solref", "user",
+    ),
+    "body": ("gravcomp", "mocap", "sleep", "user"),
+}  # fmt: skip
 _ALMOST_MASSLESS = {"pos": "0 0 0", "mass": "1e-6", "diaginertia": "1e-9 1e-9 1e-9"}
 _MAXIMUM_INCLUDE_DEPTH = 20
 
@@ -67,6 +91,7 @@ def cure_mjcf(path: Path) -> str:
         needs_inertia = compiler.get("inertiafromgeom") == "false"
         _write_out_joints(root, compiler)
         _give_masses(root)
+        _remove_forces(root)
         for body in list(root.iter("body")):
             _nest_joints(body, needs_inertia=needs_inertia)
     except ModelError as error:
@@ -198,6 +223,14 @@ def _give_masses(root: ElementTree.Element) -> None:
         if not numbers(inertial, "mass", 1, "0")[0] > 0.0:
             inertial.attrib.pop("fullinertia", None)
             inertial.attrib.update(_ALMOST_MASSLESS)
+
+
+def _remove_forces(root: ElementTree.Element) -> None:
+    """Remove what neither places nor shows anything."""
+    for tag, names in _FORCES.items():
+        for element in root.iter(tag):
+            for name in names:
+                element.attrib.pop(name, None)
 
 
 def _nest_joints(body: ElementTree.Element, *, needs_inertia: bool) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -194,10 +195,11 @@ class ResultWriter:
         errors = {}
         for name, true_value in zip(truth.names, true_values, strict=True):
             index = model.position_index(name)
-            if model.position_kinds[index] == "angle":
-                errors[name] = float(np.degrees(angle_difference(q[index], true_value)))
-            else:
-                errors[name] = float(q[index] - true_value)
+            error = float(q[index] - true_value)
+            if model.periodic[index]:
+                error = angle_difference(q[index], true_value)
+            is_angle = model.position_kinds[index] == "angle"
+            errors[name] = math.degrees(error) if is_angle else error
         return errors
 
     def finish(self, replay: bool) -> None:

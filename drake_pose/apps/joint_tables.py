@@ -55,7 +55,10 @@ def record_deviations(
     if not np.isfinite(q).all():
         return {}
     half = _NORMAL_95 * np.where(np.isfinite(deviations), deviations, np.inf)
-    low, high = np.maximum(q - half, model.lower), np.minimum(q + half, model.upper)
+    # An interval about half a turn goes on beyond it.
+    lower = np.where(model.turns_freely, q - math.pi, model.lower)
+    upper = np.where(model.turns_freely, q + math.pi, model.upper)
+    low, high = np.maximum(q - half, lower), np.minimum(q + half, upper)
     determined = 2.0 * half < 0.5 * (model.upper - model.lower)
     records = {}
     for k in np.flatnonzero(np.isfinite(low) & np.isfinite(high)):

@@ -10,6 +10,7 @@ from pydrake.multibody.tree import Frame, JointIndex
 from scipy.optimize import least_squares
 
 from drake_pose.body.joint_map import JointMap, inverse_transforms
+from drake_pose.body.limits import nearest_turn, one_turn
 from drake_pose.body.link_graph import JointEdge, LinkGraph, PlantKinematics
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.errors import ModelError
@@ -89,7 +90,9 @@ class BasePose:
     ) -> NDArray[np.float64]:
         """Base positions (n,) that put the anchor at X_WA, inside their limits if possible."""
         index = list(self.positions)
+        periodic = model.periodic[index]
         lower, upper = model.lower[index], model.upper[index]
+        middle = np.mean(one_turn(lower, upper, model.default_positions[index]), axis=0)
         turns = np.array([model.position_kinds[i] == "angle" for i in index])
 
         def residual(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -110,7 +113,7 @@ class BasePose:
             )
             if np.abs(found.fun).max() > _EXACT:
                 continue
-            wrapped = np.where(turns, (found.x + np.pi) % (2.0 * np.pi) - np.pi, found.x)
+            wrapped = nearest_turn(found.x, middle, periodic)
             if np.all((wrapped >= lower - 1e-9) & (wrapped <= upper + 1e-9)):
                 return wrapped
             outside = wrapped if outside is None else outside

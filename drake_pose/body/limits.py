@@ -34,16 +34,61 @@ _KINDS: dict[str, tuple[PositionKind, ...]] = {
 }
 FLOATING_TYPES = ("rpy_floating", "quaternion_floating")
 
+_FULL_TURN = 2.0 * np.pi
+# Limits further apart than this are written for none [rad, rad, m]. An angle turns freely then, but
+# what a screw or a slide does looks different everywhere.
+_WIDEST_ANGLE, _WIDEST_SCREW, _WIDEST_LENGTH = 4.0 * _FULL_TURN, 100.0 * _FULL_TURN, 1e3
+# Limits written with ten digits are a full turn.
+_ROUNDING = 1e-9
+
 
 @dataclass(frozen=True)
 class Positions:
-    """What a plant's q means; all in the plant's order, arrays (nq,) and read-only."""
+    """What a plant's q means; all in the plant's order, arrays (nq,) and read-only.
+
+    Attributes:
+        names, kinds: of each position.
+        lower, upper: the limits; one turn about the default position for an angle without.
+        defaults: Drake's default positions, moved inside the limits.
+        periodic: angles that look the same after a full turn: all but those of screws.
+        turns_freely: angles without limits, or with limits so wide that they mean none.
+        warnings: what was made of limits that could not be taken as they are written.
+    """
 
     names: tuple[str, ...]
     kinds: tuple[PositionKind, ...]
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
     defaults: NDArray[np.float64]
+    periodic: NDArray[np.bool_]
+    turns_freely: NDArray[np.bool_]
+    warnings: tuple[str, ...]
+
+
+def turns_around(
+    lower: NDArray[np.float64], upper: NDArray[np.float64], periodic: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Which values (k,) can take every direction inside their limits (k,)."""
+    return np.asarray(periodic & (upper - lower >= _FULL_TURN - _ROUNDING))
+
+
+def one_turn(
+    lower: NDArray[np.float64], upper: NDArray[np.float64], near: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Limits (k,), and of those wider than a turn the turn inside them nearest to values (k,)."""
+    low = np.clip(near - np.pi, lower, np.maximum(upper - _FULL_TURN, lower))
+    return low, np.minimum(low + _FULL_TURN, upper)
+
+
+def nearest_turn(
+    values: NDArray[np.float64], near: NDArray[np.float64], periodic: NDArray[np.bool_] | bool
+) -> NDArray[np.float64]:
+    """Values (k,), those that are periodic less the full turns that bring them nearest to others.
+
+    What is half a turn away on either side stays there.
+    """
+    turns = np.round((values - near) / _FULL_TURN)
+    return np.asarray(np.where(periodic, values - _FULL_TURN * turns, values))
 
 
 def describe_positions(
@@ -70,6 +115,9 @@ def describe_positions(
     count = plant.num_positions()
     kinds: list[PositionKind] = ["angle"] * count
     lower, upper = np.full(count, -np.inf), np.full(count, np.inf)
+    periodic, free = np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
+    defaults = np.array(plant.GetDefaultPositions(), dtype=np.float64)
+    warnings: list[str] = []
     for joint in (plant.get_joint(index) for index in plant.GetJointIndices()):
         if joint.type_name() not in _KINDS:
             raise ModelError(
@@ -78,43 +126,113 @@ def describe_positions(
             )
         span = slice(joint.position_start(), joint.position_start() + joint.num_positions())
         kinds[span] = _KINDS[joint.type_name()]
+        periodic[span] = [kind == "angle" for kind in kinds[span]]
+        periodic[span] &= joint.type_name() != "screw"
         if joint.type_name() not in FLOATING_TYPES:
-            lower[span], upper[span] = _searchable_limits(joint, names[span], given)
-    defaults = np.clip(plant.GetDefaultPositions(), lower, upper)
-    for array in (lower, upper, defaults):
+            lower[span], upper[span] = _written_limits(joint, names[span], given)
+            wide = _too_wide(joint, lower[span], upper[span])
+            turn = one_turn(lower[span], upper[span], defaults[span])
+            warnings += _remarks(joint, names[span], wide, (lower[span], upper[span]), turn)
+            free[span] = wide & periodic[span]
+            # Slides may say where the object stands: see unlimited_slides.
+            slides = np.array([kind == "length" for kind in kinds[span]], dtype=np.bool_)
+            lower[span] = np.where(wide, np.where(slides, -np.inf, turn[0]), lower[span])
+            upper[span] = np.where(wide, np.where(slides, np.inf, turn[1]), upper[span])
+    defaults = np.clip(defaults, lower, upper)
+    for array in (lower, upper, defaults, periodic, free):
         array.setflags(write=False)
-    return Positions(tuple(names), tuple(kinds), lower, upper, defaults)
+    return Positions(
+        tuple(names), tuple(kinds), lower, upper, defaults, periodic, free, tuple(warnings)
+    )
 
 
-def _searchable_limits(
+def _written_limits(
     joint: Joint, names: list[str], given: Mapping[str, tuple[float, float]]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Finite limits of one joint: those given, or a full turn for a joint that turns freely.
+    """The limits (k,) of one joint: those given, else the file's.
 
-    A screw without limits gets a full turn too: Drake's parser reads no limits for screws.
+    Raises:
+        ModelError: a limit is NaN, or they are crossed.
     """
     lower = np.array(joint.position_lower_limits(), dtype=np.float64)
     upper = np.array(joint.position_upper_limits(), dtype=np.float64)
-    for index, kind in enumerate(_KINDS[joint.type_name()]):
-        low, high = lower[index], upper[index] = given.get(
-            names[index], (lower[index], upper[index])
-        )
-        name = f"joint '{joint.name()}'"
-        if joint.num_positions() > 1:
-            name += f" (its {joint.position_suffix(index)})"
+    for index, name in enumerate(names):
+        low, high = lower[index], upper[index] = given.get(name, (lower[index], upper[index]))
         if np.isnan(low) or np.isnan(high):
-            raise ModelError(f"{name}: a limit is NaN; give numbers, lower first")
+            raise ModelError(f"{_title(joint, index)}: a limit is NaN; give numbers, lower first")
         if low > high:
-            raise ModelError(f"{name}: lower limit {low:g} is above upper limit {high:g}")
-        if np.isfinite(low) and np.isfinite(high):
-            continue
-        if kind == "length":
-            continue  # It may say where the object stands: see unlimited_slides.
-        if np.isfinite(low) or np.isfinite(high):
             raise ModelError(
-                f"{name} has no limits: lower {low:g}, upper {high:g} [rad]; give it a lower and "
-                f"an upper limit in the model file, or give load_model "
-                f"limits={{'{names[index]}': (low, high)}}, so that its values can be searched"
+                f"{_title(joint, index)}: lower limit {low:g} is above upper limit {high:g}"
             )
-        lower[index], upper[index] = -np.pi, np.pi
     return lower, upper
+
+
+def _title(joint: Joint, index: int) -> str:
+    """What messages call one position of a joint."""
+    suffix = f" (its {joint.position_suffix(index)})" if joint.num_positions() > 1 else ""
+    return f"joint '{joint.name()}'{suffix}"
+
+
+def _too_wide(
+    joint: Joint, lower: NDArray[np.float64], upper: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Which limits (k,) are too far apart to be limits."""
+    angle = _WIDEST_SCREW if joint.type_name() == "screw" else _WIDEST_ANGLE
+    kinds = _KINDS[joint.type_name()]
+    widest = np.array([angle if kind == "angle" else _WIDEST_LENGTH for kind in kinds])
+    return np.asarray(upper - lower > widest * (1.0 + _ROUNDING))
+
+
+def _remarks(
+    joint: Joint,
+    names: list[str],
+    wide: NDArray[np.bool_],
+    limits: tuple[NDArray[np.float64], NDArray[np.float64]],
+    turn: tuple[NDArray[np.float64], NDArray[np.float64]],
+) -> list[str]:
+    """What is said of limits that are too wide; nothing of a joint that has none at all.
+
+    Args:
+        joint: the joint.
+        names: (k,) of its positions.
+        wide: (k,) which limits are too wide.
+        limits: (k,) as they are written.
+        turn: (k,) what is searched of an angle.
+
+    Raises:
+        ModelError: an angle with one limit, of which nobody knows what the other is meant to be,
+            or a screw with limits that cannot be searched. A screw may have none: Drake's parser
+            reads none for screws.
+    """
+    remarks = []
+    for index in np.flatnonzero(wide):
+        low, high = float(limits[0][index]), float(limits[1][index])
+        title, is_screw = _title(joint, int(index)), joint.type_name() == "screw"
+        unlimited = bool(np.isinf(low) and np.isinf(high))
+        one_sided = bool(np.isinf(low) or np.isinf(high)) and not unlimited
+        advice = (
+            "give it a lower and an upper limit in the model file, or give load_model "
+            f"limits={{'{names[index]}': (low, high)}}"
+        )
+        answers = f"{np.degrees(turn[0][index]):.6g} to {np.degrees(turn[1][index]):.6g} degrees"
+        if _KINDS[joint.type_name()][index] == "length":
+            if not unlimited and not one_sided:
+                remarks.append(
+                    f"{title} has limits of {low:g} and {high:g} m, more than {_WIDEST_LENGTH:g} m "
+                    "apart: they are taken as none"
+                )
+        elif one_sided or (is_screw and not unlimited):
+            lacks = "limits" if one_sided else "limits that can be searched"
+            raise ModelError(
+                f"{title} has no {lacks}: lower {low:g}, upper {high:g} [rad]; {advice}, so that "
+                "its values can be searched"
+            )
+        elif is_screw:
+            remarks.append(f"{title} is a screw without limits: searched from {answers}; {advice}")
+        elif not unlimited:
+            remarks.append(
+                f"{title} has limits of {low:g} and {high:g} rad, more than "
+                f"{_WIDEST_ANGLE / _FULL_TURN:g} turns apart: it is taken to turn freely, and "
+                f"answers are given from {answers}"
+            )
+    return remarks

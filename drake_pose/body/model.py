@@ -37,13 +37,18 @@ class ArticulatedModel:
         position_names: one unique name a position, in the plant's order: the joint's name, or
             ``joint_suffix`` for joints of several positions.
         position_kinds: "angle" [rad], "length" [m] or "quaternion" for each position.
-        lower, upper: (nq,) limits [rad or m], read-only; -pi, pi for a joint that turns freely;
-            infinite for the pose of a floating body, and for slides without limits.
+        lower, upper: (nq,) limits [rad or m], read-only; half a turn either side of the default
+            position for a joint that turns freely; infinite for the pose of a floating body, and
+            for slides without limits.
         default_positions: (nq,) Drake's default positions moved inside the limits, read-only.
+        periodic: (nq,) bool, read-only: angles that look the same after a full turn.
+        turns_freely: (nq,) bool, read-only: angles without limits, or with limits more than four
+            turns apart, which mean none.
         link_meshes: the visual geometry of each link that has some, in the link's frame.
         skin: the bands of surface that bend with the joints, from the file beside the model's
             (``load_skin``); usually none.
-        warnings: what is not read of the file or not enforced, and what Drake remarked.
+        warnings: what is not read of the file or not enforced, which limits were not taken as they
+            are written, and what Drake remarked.
     """
 
     path: Path
@@ -55,6 +60,8 @@ class ArticulatedModel:
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
     default_positions: NDArray[np.float64]
+    periodic: NDArray[np.bool_]
+    turns_freely: NDArray[np.bool_]
     link_meshes: Mapping[str, TriangleMesh]
     skin: tuple[SkinBand, ...]
     warnings: tuple[str, ...]
@@ -210,9 +217,11 @@ def read_model(
         lower=positions.lower,
         upper=positions.upper,
         default_positions=positions.defaults,
+        periodic=positions.periodic,
+        turns_freely=positions.turns_freely,
         link_meshes=MappingProxyType(meshes),
         skin=load_skin(path, link_names(plant)),
-        warnings=tuple(warnings),
+        warnings=(*warnings, *positions.warnings),
         _source=source,
     )
 

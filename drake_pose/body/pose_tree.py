@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from drake_pose.body.base_pose import BasePose
 from drake_pose.body.joint_map import ChainStep, chain_transforms
+from drake_pose.body.limits import one_turn, turns_around
 from drake_pose.body.link_graph import PlantKinematics
 from drake_pose.body.mesh import TriangleMesh
 from drake_pose.body.model import ArticulatedModel
@@ -159,23 +160,52 @@ class PoseTree:
         if rotation is not None and rotation.kind == "free":
             return even_rotations(rotation.interval or interval)
         lower, upper = self.value_bounds(node)
+        periodic = self._periodic(node)
         axes = []
         for index, name in enumerate(self.nodes[node].value_names):
             if rotation is not None:
-                is_angle, spacing = True, rotation.interval or interval
+                spacing = rotation.interval or interval
             else:
                 kind = self.model.position_kinds[self.nodes[node].positions[index]]
-                is_angle = kind == "angle"
-                spacing = interval if is_angle else length_interval
+                spacing = interval if kind == "angle" else length_interval
             if lower[index] == upper[index]:
                 axes.append([float(lower[index])])
                 continue
             spacing = intervals.get(name, spacing)
+            is_angle = bool(periodic[index])
             axes.append(axis_samples(lower[index], upper[index], spacing, is_angle=is_angle))
         return product_grid(axes, self.nodes[node].name)
 
     def value_bounds(self, node: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lower and upper limits (k,) of a node's values [rad or m]; equal where held."""
+        """Between which values (k,) a node is searched [rad or m]; equal where held.
+
+        The limits, or of wider ones the one turn that is nearest to the default position.
+        """
+        lower, upper = self._limits(node)
+        around = self.turns_around(node)
+        low, high = one_turn(lower, upper, self._default_values(node))
+        return np.where(around, low, lower), np.where(around, high, upper)
+
+    def value_limits(self, node: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Limits (k,) of a node's values [rad or m]; equal where held, infinite where it is free.
+
+        Free are joints that turn freely.
+        """
+        lower, upper = self._limits(node)
+        if self.nodes[node].positions:
+            free = self.model.turns_freely[list(self.nodes[node].positions)] & (lower < upper)
+            lower[free], upper[free] = -np.inf, np.inf
+        return lower, upper
+
+    def turns_around(self, node: int) -> NDArray[np.bool_]:
+        """Which of a node's values (k,) are angles that can take every direction.
+
+        No limit stands in their way, and they are the same after a full turn.
+        """
+        return turns_around(*self._limits(node), self._periodic(node))
+
+    def _limits(self, node: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """As value_limits, but one turn of what turns freely."""
         rotation = self._placements[node].rotation
         if rotation is not None:
             return np.array(rotation.lower), np.array(rotation.upper)
@@ -185,6 +215,13 @@ class PoseTree:
             if position in self.held:
                 lower[index] = upper[index] = self.held[position]
         return lower, upper
+
+    def _periodic(self, node: int) -> NDArray[np.bool_]:
+        """Which of a node's values (k,) are angles that look the same after a full turn."""
+        rotation = self._placements[node].rotation
+        if rotation is not None:
+            return np.full(len(rotation.lower), rotation.kind == "limited")
+        return self.model.periodic[list(self.nodes[node].positions)]
 
     def relative_transforms(self, node: int, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """X_PN (n, 4, 4) of a node in its parent (the world W for a root) at values (n, k).
@@ -227,15 +264,14 @@ class PoseTree:
 
     def default_values(self) -> list[NDArray[np.float64]]:
         """Each node's values (k_i,) at the model's default positions and the root as given."""
-        values = []
-        for node, placement in zip(self.nodes, self._placements, strict=True):
-            if placement.rotation is not None:
-                middle = 0.5 * (placement.rotation.lower + placement.rotation.upper)
-                values.append(np.array(middle))
-                continue
-            q = self.model.default_positions
-            values.append(np.array([self.held.get(index, q[index]) for index in node.positions]))
-        return values
+        return [self._default_values(node) for node in range(len(self.nodes))]
+
+    def _default_values(self, node: int) -> NDArray[np.float64]:
+        rotation = self._placements[node].rotation
+        if rotation is not None:
+            return np.array(0.5 * (rotation.lower + rotation.upper))
+        q = self.model.default_positions
+        return np.array([self.held.get(index, q[index]) for index in self.nodes[node].positions])
 
     def positions_from(
         self, values: Sequence[NDArray[np.float64]]

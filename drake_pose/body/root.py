@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from drake_pose.body.limits import nearest_turn
 from drake_pose.errors import SettingsError
 
 Axis = Literal["x", "y", "z"]
@@ -111,7 +112,10 @@ class RootRotation:
         return self.R_W0 @ Rotation.from_euler("".join(self.axes).upper(), values).as_matrix()
 
     def values_from(self, R_WR: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The values (k,) [rad] of a rotation (3, 3), the nearest there are where it is limited."""
+        """The values (k,) [rad] of a rotation (3, 3), the nearest there are where it is limited.
+
+        Those of axes are in the turn nearest to the middle of their limits.
+        """
         rotation = Rotation.from_matrix(self.R_W0.T @ R_WR)
         if self.kind == "fixed":
             return np.zeros(0)
@@ -119,7 +123,9 @@ class RootRotation:
             return np.asarray(rotation.as_rotvec())
         sequence = "".join(self.axes).upper()
         completed = sequence + "".join(axis for axis in "XYZ" if axis not in sequence)
-        return np.asarray(rotation.as_euler(completed))[: len(sequence)]
+        angles = np.asarray(rotation.as_euler(completed))[: len(sequence)]
+        middle = 0.5 * (self.lower + self.upper)
+        return nearest_turn(angles, middle, True)
 
 
 def even_rotations(interval: float) -> NDArray[np.float64]:

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from drake_pose.body.limits import nearest_turn
 from drake_pose.body.pose_tree import PoseTree
 from drake_pose.errors import SettingsError
 
@@ -67,8 +68,10 @@ class TreeKinematics:
         tree: the pose tree.
         names: the names of the m values, node after node.
         value_nodes: (m,) the node of each value.
-        lower, upper: (m,) limits [rad or m]; equal where a value is held.
+        lower, upper: (m,) limits [rad or m]; equal where a value is held, infinite where it is an
+            angle that can take every direction.
         is_angle: (m,) whether a value is an angle [rad], else a length [m].
+        turns_around: (m,) whether it is an angle that can take every direction.
         packed: the tree as ``find_motions`` takes it.
 
     Args:
@@ -81,8 +84,11 @@ class TreeKinematics:
         counts = [len(node.value_names) for node in tree.nodes]
         self.value_nodes = np.repeat(np.arange(len(counts)), counts)
         bounds = [tree.value_bounds(i) for i in range(len(counts))]
-        self.lower = np.concatenate([lower for lower, _ in bounds])
-        self.upper = np.concatenate([upper for _, upper in bounds])
+        lower, upper = np.hstack([np.zeros((2, 0)), *bounds])
+        self._middle = 0.5 * (lower + upper)
+        self.turns_around = np.concatenate([tree.turns_around(i) for i in range(len(counts))])
+        self.lower = np.where(self.turns_around, -np.inf, lower)
+        self.upper = np.where(self.turns_around, np.inf, upper)
         kinds = [
             [tree.model.position_kinds[position] != "length" for position in node.positions]
             if node.positions
@@ -119,6 +125,35 @@ class TreeKinematics:
     def split(self, values: np.ndarray) -> tuple[np.ndarray, ...]:
         """Each node's values (k_i,) of all values (m,)."""
         return tuple(np.split(np.asarray(values), self.packed.value_starts[1:-1]))
+
+    def nearest_turns(self, values: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
+        """The same pose's values (m,), angles that turn around in the turn nearest to others.
+
+        Args:
+            values: all values [rad or m].
+            near: (m,); None: where answers are given, about the default positions.
+        """
+        return nearest_turn(values, self._middle if near is None else near, self.turns_around)
+
+    def within_limits(self, values: np.ndarray) -> np.ndarray:
+        """The same pose's values (m,), angles that turn around less the turns beyond their limits.
+
+        One that turns freely stays what it is.
+        """
+        limits = [self.tree.value_limits(i) for i in range(len(self.tree.nodes))]
+        lower, upper = np.hstack([np.zeros((2, 0)), *limits])
+        full = 2.0 * math.pi
+        above = np.maximum(np.ceil((values - upper) / full), 0.0)
+        below = np.maximum(np.ceil((lower - values) / full), 0.0)
+        return np.where(self.turns_around, values - full * (above - below), values)
+
+    def reach(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper ends (m,) of what values may be about those of a pose (m,).
+
+        The limits, or half a turn either side of an angle that turns around.
+        """
+        lower = np.where(self.turns_around, values - math.pi, self.lower)
+        return lower, np.where(self.turns_around, values + math.pi, self.upper)
 
     def poses(self, values: np.ndarray) -> np.ndarray:
         """X_WN (nodes, 4, 4) at values (m,)."""

@@ -63,7 +63,7 @@ def _faults(model: ArticulatedModel, positions: Sequence[int]) -> str:
     many = len(names) > 1
     return (
         f"{model.path}: joint{'s' if many else ''} {', '.join(repr(name) for name in names)} "
-        f"ha{'ve' if many else 's'} no limits; give a lower and an upper limit [m] in the model "
-        f"file, or give load_model limits={{'{names[0]}': (low, high)}}, so that values can be "
-        "searched"
+        f"ha{'ve' if many else 's'} no limits, or limits too wide to be searched; give a lower and "
+        f"an upper limit [m] in the model file, or give load_model limits={{'{names[0]}': (low, "
+        "high)}, so that values can be searched"
     )

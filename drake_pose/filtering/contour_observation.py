@@ -160,7 +160,7 @@ class ContourObservation:
         return bool(self._kinematics.is_angle[self._kinematics.names.index(name)])
 
     def inequalities(self) -> Inequalities:
-        """The limits of all values; angles that turn freely have none."""
+        """The limits of all values; angles that can take every direction have none."""
         lower = np.r_[self._kinematics.lower, np.full(3, -np.inf)]
         upper = np.r_[self._kinematics.upper, np.full(3, np.inf)]
         turns = np.r_[self._kinematics.is_angle, np.zeros(3, dtype=bool)]
@@ -182,8 +182,11 @@ class ContourObservation:
         return self._kinematics.poses(values)[0, :3, 3]
 
     def node_values(self, x: Array) -> tuple[Array, ...]:
-        """Each node's values (k_i,) of a state (n,)."""
-        return self._kinematics.split(self._split(x)[0])
+        """Each node's values (k_i,) of a state (n,), inside the limits.
+
+        The state itself goes on where an angle that can take every direction passes its limits.
+        """
+        return self._kinematics.split(self._kinematics.within_limits(self._split(x)[0]))
 
     def _split(self, x: Array) -> tuple[Array, Array]:
         """The tree's values (m,) and the root's shift (3,) of a state (n,)."""
@@ -202,7 +205,7 @@ class ContourObservation:
         tree = self.tree
         if np.any(shift):
             tree = tree.with_root_position(self._root(values) + shift)
-        return tree.positions_from(self._kinematics.split(values))
+        return tree.positions_from(self.node_values(x))
 
     def state(self, q: Array, X_WB: Array | None = None) -> Array:
         """(n,) a state at rest at the plant's positions q (nq,)."""
@@ -216,6 +219,14 @@ class ContourObservation:
         x = np.zeros(len(self.layout))
         x[self._state_index] = np.r_[values, shift][self._parameter_index]
         return x
+
+    def continued(self, x: Array, last: Array) -> Array:
+        """The same pose (n,), angles that turn around in the turns nearest to the last state's."""
+        values = self._split(x)[0]
+        turns = self._kinematics.nearest_turns(values, self._split(last)[0]) - values
+        turned = x.copy()
+        turned[self._state_index] += np.r_[turns, np.zeros(3)][self._parameter_index]
+        return turned
 
     def draw(self, x: Array, camera: Camera) -> Mask:
         """(H, W) what a camera would see of the body at a state (n,)."""

@@ -179,14 +179,11 @@ def from_bounds(
 def from_model(model: ArticulatedModel) -> Inequalities:
     """Every finite position limit of a model [rad or m]: (14), and with shape joints (16).
 
-    A joint that turns freely (limits of a full turn, -pi to pi) has no limit to give. A model
-    without any limit gives an empty set.
+    A joint that turns freely has no limit to give, nor one whose limits meet after a full turn. A
+    model without any limit gives an empty set.
     """
-    full_turn = (
-        (np.array(model.position_kinds) == "angle")
-        & (model.lower == -np.pi)
-        & (model.upper == np.pi)
-    )
+    meet = np.abs(model.upper - model.lower - 2.0 * np.pi) < 1e-9
+    full_turn = model.turns_freely | (model.periodic & meet)
     lower = np.where(full_turn, -np.inf, model.lower)
     upper = np.where(full_turn, np.inf, model.upper)
     return from_bounds(model.position_names, lower, upper)

@@ -86,7 +86,12 @@ class MatchAndTrack:
         found = [] if tracked is None else [tracked]
         if matched.found:
             observation = self._observation(root_position)
-            start = self.tracker.start(observation.state(matched.q, matched.X_WB))
+            x = observation.state(matched.q, matched.X_WB)
+            if last.track is not None:
+                # A search does not know how often an angle has turned round.
+                x = observation.continued(x, last.track.state.best.mean)
+                matched = self._turned(matched, observation.node_values(x))
+            start = self.tracker.start(x)
             followed = self.tracker.follow(start, self._masks(views), True, root_position)
             found += [
                 (followed, self._result(followed, views, root_position, begin)),
@@ -96,6 +101,14 @@ class MatchAndTrack:
             return Followed(None, 0.0, last.matches + 1), matched
         track, result = min(found, key=lambda pair: pair[1].E_total)
         return Followed(track, result.E_total, last.matches + 1), result
+
+    def _turned(self, matched: MatchResult, node_values: Sequence[Array]) -> MatchResult:
+        """A pose in the turns of a track that goes on."""
+        turns = [
+            2.0 * np.pi * np.round((now - then) / (2.0 * np.pi))
+            for now, then in zip(node_values, matched.node_values, strict=True)
+        ]
+        return matched.turned(self._search.tree, turns)
 
     def _masks(self, views: Sequence[View]) -> list[NDArray[np.bool_] | None]:
         seen = {view.camera.name: view.mask for view in views}

@@ -5,6 +5,7 @@ hand may be anywhere behind the trunk. A family is what can be told apart by loo
 differ by small steps, those of two families do not.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,8 +21,10 @@ class JointEstimate:
         node: the node that the value belongs to.
         determined: True: it lies between low and high; False: it is free, and low and high are
             the ends of what was seen.
-        low, high: the interval or the range [rad or m].
+        low, high: the interval or the range [rad or m]; of an angle that turns around it may go
+            beyond its limits, as the same directions a full turn before or after.
         values: (n,) the different values seen, smallest first [rad or m].
+        turns_around: whether it is an angle that can take every direction.
     """
 
     name: str
@@ -30,9 +33,12 @@ class JointEstimate:
     low: float
     high: float
     values: np.ndarray
+    turns_around: bool = False
 
     def holds(self, value: float, margin: float = 1e-9) -> bool:
-        """Whether a value lies in the interval or range."""
+        """Whether a value lies in the interval or range; full turns make no difference."""
+        if self.turns_around:
+            value -= 2.0 * math.pi * round((value - 0.5 * (self.low + self.high)) / (2.0 * math.pi))
         return self.low - margin <= value <= self.high + margin
 
 

@@ -167,7 +167,9 @@ def _describe(
         described.append(_describe_family(sampled, own, family, samples, complete))
     return GridPoseSet(
         families=tuple(described),
-        joints=estimate_joints(sampled, lattice.samples_seen(), complete=complete),
+        joints=estimate_joints(
+            sampled, lattice.samples_seen(), described[0].node_values, complete=complete
+        ),
         tolerance=tolerance,
         complete=complete,
         family_count=len(families),
@@ -191,7 +193,7 @@ def _describe_family(
         X_WB=X_WB,
         node_values=tuple(values),
         J=family.J,
-        joints=estimate_joints(sampled, lattice.samples_seen(), complete=complete),
+        joints=estimate_joints(sampled, lattice.samples_seen(), values, complete=complete),
         size=family.size,
     )
 

@@ -46,7 +46,10 @@ def cluster_samples(sampled: SampledTree, node: int, samples: np.ndarray) -> np.
         return labels
     steps = grid_steps(grid)
     scaled = np.where(np.isfinite(steps), grid[samples] / steps, 0.0)
-    turns = np.where(_turns_around(sampled, node), 2.0 * np.pi / steps, 0.0)
+    rotation = sampled.tree.placements[node].rotation
+    # A rotation vector of half a turn is the same as its opposite, or nearly so.
+    around = sampled.tree.turns_around(node) | (rotation is not None and rotation.kind == "free")
+    turns = np.where(around, 2.0 * np.pi / steps, 0.0)
     scaled = np.where(turns > 0.0, np.mod(scaled, np.where(turns > 0.0, turns, 1.0)), scaled)
     tree = cKDTree(scaled - np.where(turns > 0.0, 0.0, scaled.min(axis=0)), boxsize=turns)
     near = tree.query_pairs(_NEIGHBOUR, p=np.inf, output_type="ndarray")
@@ -58,17 +61,6 @@ def cluster_samples(sampled: SampledTree, node: int, samples: np.ndarray) -> np.
     graph = coo_array((ones, (links[:, 0], links[:, 1])), shape=(len(samples), len(samples)))
     labels[samples] = connected_components(graph, directed=False)[1]
     return labels
-
-
-def _turns_around(sampled: SampledTree, node: int) -> np.ndarray:
-    """Which values (k,) bool of a node are angles that may turn all the way around."""
-    tree = sampled.tree
-    lower, upper = tree.value_bounds(node)
-    positions = tree.nodes[node].positions
-    angles = [tree.model.position_kinds[position] == "angle" for position in positions]
-    if len(angles) != len(lower):
-        angles = [True] * len(lower)
-    return np.asarray(angles) & (upper - lower >= 2.0 * np.pi - 1e-9)
 
 
 def split_lattice(lattice: PoseLattice, labels: list[np.ndarray]) -> list[LatticeFamily]:

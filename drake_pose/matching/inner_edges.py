@@ -186,7 +186,9 @@ def choose_by_edges(
     samples, found = samples[order], found[order]
     left = int((found >= found[0] - alike).sum())
     seen = [np.unique(column) for column in samples[:left].T]
-    joints = estimate_joints(answer.sampled, seen, complete=answer.complete and exhaustive)
+    best = [grid[t] for grid, t in zip(answer.sampled.values, samples[0], strict=True)]
+    complete = answer.complete and exhaustive
+    joints = estimate_joints(answer.sampled, seen, best, complete=complete)
     return EdgeChoice(samples, found, left, joints, exhaustive)
 
 

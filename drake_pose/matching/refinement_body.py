@@ -51,7 +51,7 @@ class RefinementBody:
         skins: the nodes' bands of skin, by node, in the order of the surfaces.
         surfaces: what their poses are made of.
         weights: (v,) how far each vertex goes with its own node's values; 1 but in bands.
-        lower, upper: (m + 4,) limits of the parameters.
+        lower, upper: (m + 4,) limits of the parameters; infinite where an angle turns around.
 
     Args:
         tree: the pose tree.
@@ -109,6 +109,15 @@ class RefinementBody:
     def node_values(self, parameters: np.ndarray) -> tuple[np.ndarray, ...]:
         """Each node's values."""
         return self.kinematics.split(parameters[:-_EXTRA])
+
+    def nearest_turns(self, parameters: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
+        """The same pose's parameters, angles in the turn nearest to others (m + 4,).
+
+        Without others, where answers are given: see ``TreeKinematics.nearest_turns``.
+        """
+        values = None if near is None else near[:-_EXTRA]
+        turned = self.kinematics.nearest_turns(parameters[:-_EXTRA], values)
+        return np.concatenate([turned, parameters[-_EXTRA:]])
 
     def columns(self, node: int) -> np.ndarray:
         """The indices of a node's values among the parameters."""

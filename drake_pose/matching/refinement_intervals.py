@@ -133,14 +133,18 @@ def find_intervals(
     tolerance = settings.tolerance * problem.border_length
     poses = [parameters]
     for other in _find_alternatives(problem, search, parameters, tolerance, settings):
+        # The same pose is not another one for a full turn.
+        other = problem.body.nearest_turns(other, parameters)
         # What differs less is the same optimum, not quite reached.
         if np.abs(other - parameters).max() > settings.same:
             poses.append(other)
     fits = problem.J(parameters) <= settings.misfit * problem.border_length
-    families = [
-        RefinedFamily(tuple(members), _estimates(problem, members, margins, fits, settings))
-        for members in _group(poses, margins, settings)
-    ]
+    families = []
+    for members in _group(poses, margins, settings):
+        first = problem.body.nearest_turns(members[0])
+        members = [problem.body.nearest_turns(member, first) for member in members]
+        joints = _estimates(problem, members, margins, fits, settings)
+        families.append(RefinedFamily(tuple(members), joints))
     joints = _estimates(problem, poses, margins, fits, settings)
     return Intervals(joints, covariance, tuple(families), tolerance)
 
@@ -172,23 +176,34 @@ def _estimates(
 
     Args:
         problem: gives the body.
-        poses: their parameters.
+        poses: their parameters, the best first.
         margins: (m,) how far the truth may be from a pose.
         fits: whether the best pose may be the true one; else nothing is known.
         settings: the parameters.
     """
     kinematics = problem.body.kinematics
+    ends = kinematics.reach(poses[0][: len(kinematics.names)])
     estimates = []
     for j, name in enumerate(kinematics.names):
         node = int(kinematics.value_nodes[j])
         seen = np.array(sorted({float(pose[j]) for pose in poses}))
-        lower, upper = float(kinematics.lower[j]), float(kinematics.upper[j])
+        lower, upper = float(ends[0][j]), float(ends[1][j])
         low, high = max(seen[0] - margins[j], lower), min(seen[-1] + margins[j], upper)
         widest = settings.widest_angle if kinematics.is_angle[j] else settings.widest_length
         determined = bool(high - low <= 2.0 * widest and fits)
         if not fits:
             low, high = lower, upper
-        estimates.append(JointEstimate(name, node, determined, float(low), float(high), seen))
+        estimates.append(
+            JointEstimate(
+                name,
+                node,
+                determined,
+                float(low),
+                float(high),
+                seen,
+                bool(kinematics.turns_around[j]),
+            )
+        )
     return tuple(estimates)
 
 

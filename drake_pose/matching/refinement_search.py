@@ -194,6 +194,7 @@ class Refiner:
             if most <= _AGREEING * least:
                 break
         reached = self._descend_last(problem, reached, deadline)
+        reached = reached._replace(parameters=self.body.nearest_turns(reached.parameters))
         middle = time.perf_counter()
         intervals, settings = None, self.settings
         if settings.intervals is not None:

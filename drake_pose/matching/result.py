@@ -1,13 +1,14 @@
 """What a search is given and what it answers."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from drake_pose.body import PoseTree
 from drake_pose.camera import Camera
 from drake_pose.errors import MaskError
-from drake_pose.matching.families import PoseSet
+from drake_pose.matching.families import JointEstimate, PoseSet
 
 UNEXPLAINED = 0.5
 """From this E_total on, the pose is no explanation of the silhouettes."""
@@ -101,7 +102,55 @@ class MatchResult:
     lower_bound: float = 0.0
     pose_set: PoseSet | None = None
 
+    def turned(self, tree: PoseTree, turns: Sequence[np.ndarray]) -> "MatchResult":
+        """The same pose with angles in other turns.
+
+        Args:
+            tree: the pose tree that was searched.
+            turns: (k_i,) for each node what is added to its values, full turns [rad].
+        """
+        pose_set = self.pose_set
+        if pose_set is not None:
+            joint_turns = np.concatenate(turns)
+            families = [
+                replace(
+                    family,
+                    q=_turned_positions(family.q, tree, turns),
+                    node_values=_add(family.node_values, turns),
+                    joints=_turned_joints(family.joints, joint_turns),
+                )
+                for family in pose_set.families
+            ]
+            joints = _turned_joints(pose_set.joints, joint_turns)
+            pose_set = replace(pose_set, families=tuple(families), joints=joints)
+        return replace(
+            self,
+            q=_turned_positions(self.q, tree, turns),
+            node_values=_add(self.node_values, turns),
+            pose_set=pose_set,
+        )
+
     @property
     def explained(self) -> bool:
         """Whether the pose explains the silhouettes at least in the rough (UNEXPLAINED)."""
         return bool(self.found and self.E_total < UNEXPLAINED)
+
+
+def _turned_positions(q: np.ndarray, tree: PoseTree, turns: Sequence[np.ndarray]) -> np.ndarray:
+    turned = np.array(q)
+    for node, added in zip(tree.nodes, turns, strict=True):
+        # The values of a root that is turned by a RootRotation are no positions.
+        if node.positions:
+            turned[list(node.positions)] += added
+    return turned
+
+
+def _turned_joints(joints: Sequence[JointEstimate], turns: np.ndarray) -> tuple[JointEstimate, ...]:
+    return tuple(
+        replace(joint, low=joint.low + turn, high=joint.high + turn, values=joint.values + turn)
+        for joint, turn in zip(joints, turns.tolist(), strict=True)
+    )
+
+
+def _add(node_values: Sequence[np.ndarray], turns: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
+    return tuple(values + added for values, added in zip(node_values, turns, strict=True))

@@ -77,6 +77,7 @@ class _Family:
     size: int = 1
 
     def holds(self, values: np.ndarray) -> bool:
+        """Whether values (m,), of angles in the turn nearest to the family's, are in it."""
         inside = (values >= self.low - _ROUNDING) & (values <= self.high + _ROUNDING)
         return bool(inside.all())
 
@@ -131,7 +132,7 @@ class RobustFamilies:
     def _is_in(self, families: list[_Family], values: np.ndarray) -> bool:
         """Whether some family holds a pose; it is counted there."""
         for i, family in enumerate(families):
-            if family.holds(values):
+            if family.holds(self._kinematics.nearest_turns(values, family.values)):
                 families[i] = _Family(family.values, family.low, family.high, family.size + 1)
                 return True
         return False
@@ -143,12 +144,13 @@ class RobustFamilies:
                 return
             look = self._fit.refine(flip.values, _LOOK)
             if look.cost <= self._limit and not self._is_in(families, look.values):
-                families.append(self._flipped(family, flip, look.values))
+                values = self._kinematics.nearest_turns(look.values)
+                families.append(self._flipped(family, flip, values))
 
     def _flipped(self, family: _Family, flip: Flip, values: np.ndarray) -> _Family:
         """A family after a flip, about a pose (m,): an interval flips as its middle does."""
-        lower, upper = self._kinematics.lower, self._kinematics.upper
         below, above = family.values - family.low, family.high - family.values
+        lower, upper = self._kinematics.reach(family.values)
         # Where a limit ended the interval, the flipped one may go further.
         below = np.where(flip.changed & (family.low <= lower + _ROUNDING), math.inf, below)
         above = np.where(flip.changed & (family.high >= upper - _ROUNDING), math.inf, above)
@@ -156,11 +158,12 @@ class RobustFamilies:
             np.where(flip.mirrored, above, below),
             np.where(flip.mirrored, below, above),
         )
+        lower, upper = self._kinematics.reach(values)
         return _Family(values, np.maximum(values - below, lower), np.minimum(values + above, upper))
 
     def _spread(self, values: np.ndarray) -> _Family:
         """What the values (m,) may be about a pose."""
-        lower, upper = self._kinematics.lower, self._kinematics.upper
+        lower, upper = self._kinematics.reach(values)
         cost = self._cost(values)
         room = max(self._limit - cost, _LEAST_ROOM * self._tolerance)
         H = self._fit.curvature(values, _LOOK.scales[0], _LOOK.spacing)
@@ -183,7 +186,9 @@ class RobustFamilies:
     def _move(self, values: np.ndarray, index: int, along: np.ndarray, cost: float) -> float:
         """How far a value can go, the others following along (m,), from a pose of some cost."""
         kind = 0 if self._kinematics.is_angle[index] else 1
-        lower, upper = self._kinematics.lower, self._kinematics.upper
+        lower, upper = self._kinematics.lower.copy(), self._kinematics.upper.copy()
+        # Beyond half a turn the values come back from the other side.
+        lower[index], upper[index] = (ends[index] for ends in self._kinematics.reach(values))
         step, best = _FIRST_STEPS[kind], cost
         while self._proceed():
             before, before_cost = values[index], cost
@@ -220,9 +225,14 @@ class RobustFamilies:
     def _joints(self, families: Sequence[_Family]) -> tuple[JointEstimate, ...]:
         """Each value over some families."""
         kinematics, settings = self._kinematics, self._settings
-        low = np.min([family.low for family in families], axis=0)
-        high = np.max([family.high for family in families], axis=0)
-        seen = np.array([family.values for family in families])
+        # All in the turns nearest to the first one.
+        seen = np.array(
+            [kinematics.nearest_turns(family.values, families[0].values) for family in families]
+        )
+        turns = seen - [family.values for family in families]
+        lower, upper = kinematics.reach(families[0].values)
+        low = np.maximum(np.min([one.low for one in families] + turns, axis=0), lower)
+        high = np.minimum(np.max([one.high for one in families] + turns, axis=0), upper)
         estimates = []
         for i, name in enumerate(kinematics.names):
             widest = settings.widest_angle if kinematics.is_angle[i] else settings.widest_length
@@ -235,6 +245,7 @@ class RobustFamilies:
                     float(low[i]),
                     float(high[i]),
                     np.unique(np.round(seen[:, i], 12)),
+                    bool(kinematics.turns_around[i]),
                 )
             )
         return tuple(estimates)

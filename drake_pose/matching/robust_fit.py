@@ -16,6 +16,7 @@ import fast_simplification
 import numpy as np
 
 from drake_pose.body import TriangleMesh
+from drake_pose.body.limits import nearest_turn
 from drake_pose.body.tree_kinematics import TreeKinematics
 from drake_pose.camera import Camera
 from drake_pose.errors import SettingsError
@@ -220,22 +221,31 @@ def refine_best(
             if refined and not proceed():
                 break
             refined.append(fit.refine(start, part))
-        kept = unlike(refined, count)
+        kept = unlike(refined, count, fit.kinematics.turns_around)
         values = [pose.values for pose in kept]
     return kept
 
 
-def unlike(poses: Sequence[RobustPose], count: int, apart: float = 0.05) -> list[RobustPose]:
+def unlike(
+    poses: Sequence[RobustPose],
+    count: int,
+    turns_around: np.ndarray | bool = False,
+    apart: float = 0.05,
+) -> list[RobustPose]:
     """The best poses some value of which differs by more than so much [rad or m] from better ones.
 
     Args:
         poses: in any order.
         count: at most so many.
+        turns_around: (m,) the values that are the same after a full turn.
         apart: the difference.
     """
     chosen: list[RobustPose] = []
     for pose in sorted(poses, key=lambda one: one.cost):
-        if all(np.abs(pose.values - other.values).max(initial=0.0) > apart for other in chosen):
+        gaps = (
+            nearest_turn(pose.values, other.values, turns_around) - other.values for other in chosen
+        )
+        if all(np.abs(gap).max(initial=0.0) > apart for gap in gaps):
             chosen.append(pose)
         if len(chosen) >= count:
             break

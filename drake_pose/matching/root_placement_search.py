@@ -297,7 +297,8 @@ class RootPlacementSearch:
         p_WR = self._root_of(best)
         tree = self.tree.with_root_position(p_WR)
         node_values = []
-        for i, values in enumerate(self._refined.node_values(best.parameters)):
+        parameters = self._refined.nearest_turns(best.parameters)
+        for i, values in enumerate(self._refined.node_values(parameters)):
             # The plant's own joints hold the root where it is now.
             lower, upper = tree.value_bounds(i)
             node_values.append(np.where(lower == upper, lower, values))

@@ -133,8 +133,14 @@ def _remainder(angles: np.ndarray) -> np.ndarray:
 def _inside(
     kinematics: TreeKinematics, values: np.ndarray, changed: Iterable[int]
 ) -> np.ndarray | None:
-    """The values, turned by full turns into their limits; None where that cannot be."""
+    """The values, turned by full turns into their limits; None where that cannot be.
+
+    Angles that turn around are brought to where answers are given.
+    """
+    values = kinematics.nearest_turns(values)
     for index in changed:
+        if kinematics.turns_around[index]:
+            continue
         lower, upper = kinematics.lower[index], kinematics.upper[index]
         full = 2.0 * math.pi
         values[index] -= full * math.floor((values[index] - lower) / full)

@@ -161,13 +161,17 @@ class _WholeRun:
                     continue
                 done.append(pose.values)
                 found += self._others(rough, pose.values, settings)
-            pool = unlike([*pool, *found], settings.survivors)
-        self.poses = refine_best(
+            pool = unlike([*pool, *found], settings.survivors, self.kinematics.turns_around)
+        refined = refine_best(
             self.fit,
             [pose.values for pose in pool[: settings.answers]],
             [(IN_THE_END, settings.answers)],
             self._proceed,
         )
+        turned = [self.kinematics.nearest_turns(pose.values) for pose in refined]
+        self.poses = [
+            replace(pose, values=values) for pose, values in zip(refined, turned, strict=True)
+        ]
         if settings.families is not None:
             self._families = RobustFamilies(self.fit, settings.families, self._proceed)
 
@@ -193,7 +197,7 @@ class _WholeRun:
         best_looks = []
         for group, count in ((flipped, settings.flipped), (tried, settings.tried)):
             looks = [RobustPose(one, self.fit.cost(one, scale, spacing)) for one in group]
-            best_looks += unlike(looks, count, apart=0.5 * interval)
+            best_looks += unlike(looks, count, kinematics.turns_around, 0.5 * interval)
         return [self.fit.refine(look.values, HALFWAY) for look in best_looks if self._proceed()]
 
     def _limbs(self) -> list[list[int]]:

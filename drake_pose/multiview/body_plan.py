@@ -89,8 +89,7 @@ class BodyPlan:
             )
         self.landmarks = landmarks_of_nodes(tree, known)
         self.trunk = int(self._node("neck"))
-        turns = kinematics.upper - kinematics.lower >= 2.0 * np.pi - 1e-9
-        free = np.flatnonzero(kinematics.is_angle & turns)
+        free = np.flatnonzero(kinematics.turns_around)
         self.heading = int(free[0]) if len(free) else None
 
     def trunk_middle(self, X_WN: Array) -> Array:
@@ -116,7 +115,7 @@ class BodyPlan:
         values = np.flatnonzero(own & free)
         nodes = np.flatnonzero((moves & own).any(axis=1))
         share = qmc.Halton(len(values), scramble=False).random(_POSES)
-        lower, upper = kinematics.lower[values], kinematics.upper[values]
+        lower, upper = (ends[values] for ends in kinematics.reach(rest))
         poses = np.clip(rest[values], lower, upper) * np.ones((_POSES, 1))
         poses[1:] = lower + share[1:] * (upper - lower)
         # People stretch their limbs more often than chance would.

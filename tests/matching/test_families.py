@@ -176,7 +176,7 @@ def test_two_neighbouring_values_are_still_determined(tmp_path: Path) -> None:
     sampled = ProblemMaker(swinging_chain(tmp_path, 2).pose_tree(), 0.5).body.sampled
     grid = sampled.values[0][:, 0]
     pair, three = [np.flatnonzero((grid > -0.1) & (grid < limit)) for limit in (0.6, 1.1)]
-    one, other = estimate_joints(sampled, [pair, three])
+    one, other = estimate_joints(sampled, [pair, three], [np.zeros(1)] * 2)
     assert one.determined
     assert (one.low, one.high) == pytest.approx((-0.25, 0.75))
     assert not other.determined or len(three) <= 2

@@ -1,0 +1,206 @@
+"""Which values joints may have, and which of them are searched and answered with."""
+
+import math
+
+import numpy as np
+import pytest
+from pydrake.math import RotationMatrix
+from pydrake.multibody.tree import BodyIndex
+
+from drake_pose.body import RootRotation, load_model
+from drake_pose.body.limits import nearest_turn, one_turn, turns_around
+from drake_pose.body.tree_kinematics import TreeKinematics
+from drake_pose.errors import ModelError
+from tests.body.models import JOINTS_SDF, joint, link, urdf, write
+
+FULL = 2.0 * math.pi
+
+
+def one_joint(tmp_path, limits, kind="revolute", given=None, mount="fixed"):
+    """Two links, and between them a joint with limits as they are written in a URDF."""
+    text = urdf(
+        link("a"),
+        link("b"),
+        joint("mount", mount, "world", "a"),
+        joint("j", kind, "a", "b", limits=limits),
+    )
+    return load_model(write(tmp_path, text), limits=given, check=False)
+
+
+def node_of_joint(tree):
+    return tree.node_index("b")
+
+
+@pytest.mark.parametrize(
+    ("limits", "kind"),
+    [
+        (None, "continuous"),
+        (None, "revolute"),
+        ('lower="-1e16" upper="1e16"', "revolute"),
+        ('lower="-10000" upper="10000"', "revolute"),
+        ('lower="-12.6" upper="12.6"', "revolute"),
+    ],
+)
+def test_limits_beyond_a_few_turns_are_none(tmp_path, limits, kind):
+    model = one_joint(tmp_path, limits, kind)
+    np.testing.assert_allclose([model.lower[0], model.upper[0]], [-math.pi, math.pi])
+    assert model.turns_freely[0]
+    said = [warning for warning in model.warnings if "joint 'j'" in warning]
+    assert len(said) == (limits is not None)
+    if limits is not None:
+        assert "turn freely" in said[0]
+        assert f"{float(limits.split(chr(34))[3]):g} rad" in said[0]
+    tree = model.pose_tree()
+    node = node_of_joint(tree)
+    grid = np.degrees(tree.grid(node, math.radians(20.0))[:, 0])
+    assert len(grid) == 18
+    assert np.abs(grid).max() <= 180.0 + 1e-9
+    assert np.isinf(tree.value_limits(node)).all()
+
+
+@pytest.mark.parametrize("turns", [1.0, 2.0, 4.0])
+def test_some_turns_are_limits_of_which_one_turn_is_searched(tmp_path, turns):
+    high = 0.5 * turns * FULL
+    model = one_joint(tmp_path, f'lower="{-high}" upper="{high}"')
+    assert not model.turns_freely[0]
+    assert not model.warnings
+    np.testing.assert_allclose([model.lower[0], model.upper[0]], [-high, high])
+    tree = model.pose_tree()
+    node = node_of_joint(tree)
+    np.testing.assert_allclose(np.ravel(tree.value_bounds(node)), [-math.pi, math.pi])
+    np.testing.assert_allclose(np.ravel(tree.value_limits(node)), [-high, high])
+    assert tree.turns_around(node).all()
+
+
+def test_less_than_a_turn_is_as_it_was(tmp_path):
+    tree = one_joint(tmp_path, 'lower="-3.1" upper="3.1"').pose_tree()
+    node = node_of_joint(tree)
+    assert not tree.turns_around(node).any()
+    np.testing.assert_allclose(np.ravel(tree.value_bounds(node)), [-3.1, 3.1])
+    kinematics = TreeKinematics(tree)
+    np.testing.assert_allclose([kinematics.lower[0], kinematics.upper[0]], [-3.1, 3.1])
+    np.testing.assert_allclose(kinematics.nearest_turns(np.array([9.0])), [9.0])
+    held = tree.model.pose_tree(held={"j": 0.3})
+    assert not held.turns_around(node).any()
+
+
+def test_the_turn_that_is_searched_lies_about_the_default_inside_the_limits(tmp_path):
+    text = """<sdf version="1.9"><model name="m"><link name="a"><visual name="v"><geometry><box>
+    <size>1 1 1</size></box></geometry></visual></link><joint name="j" type="revolute"><parent>world
+    </parent><child>a</child><axis><xyz>0 0 1</xyz>
+    <limit><lower>{}</lower><upper>{}</upper></limit></axis></joint></model></sdf>"""
+    # Without a default of its own a joint's is 0, moved inside the limits.
+    for limits, turn in (
+        ((-math.pi, 3 * math.pi), (-math.pi, math.pi)),
+        ((-1.0, 9.0), (-1.0, FULL - 1.0)),
+        ((-9.0, 0.5), (0.5 - FULL, 0.5)),
+        ((2.0, 2.0 + 1.5 * FULL), (2.0, 2.0 + FULL)),
+        ((2.0, 1e16), (2.0, 2.0 + FULL)),
+    ):
+        file = write(tmp_path, text.format(*limits), "m.sdf")
+        tree = load_model(file, check=False).pose_tree()
+        np.testing.assert_allclose(np.ravel(tree.value_bounds(0)), turn, atol=1e-9)
+        grid = tree.grid(0, math.radians(20.0))[:, 0]
+        assert turn[0] - 1e-9 <= grid.min() <= grid.max() <= turn[1] + 1e-9
+        assert len(np.unique(np.round(np.degrees(grid) % 360.0, 6) % 360.0)) == len(grid) == 18
+
+
+def test_limits_given_by_hand_are_taken_likewise(tmp_path):
+    model = one_joint(tmp_path, None, "continuous", {"j": (-500.0, 500.0)})
+    assert model.turns_freely[0]
+    assert "joint 'j'" in model.warnings[0]
+    model = one_joint(tmp_path, 'lower="-1e16" upper="1e16"', given={"j": (-0.5, 0.25)})
+    assert not model.warnings
+    np.testing.assert_allclose([model.lower[0], model.upper[0]], [-0.5, 0.25])
+
+
+@pytest.mark.parametrize(
+    ("limits", "kind", "message"),
+    [
+        ('lower="-1e16" upper="1e16"', "prismatic", r"joint 'j' has no limits, or limits too wide"),
+        ('lower="0" upper="5000"', "prismatic", r"'j' .*limits={'j': \(low, high\)}"),
+        ('upper="1"', "prismatic", r"joint 'j' has no limits"),
+        ('lower="-1"', "revolute", r"joint 'j' has no limits: .*upper inf \[rad\]"),
+    ],
+)
+def test_what_cannot_be_searched_is_refused_by_name(tmp_path, limits, kind, message):
+    with pytest.raises(ModelError, match=message):
+        one_joint(tmp_path, limits, kind, mount="revolute").pose_tree()
+    model = one_joint(tmp_path, limits, kind, {"j": (-0.5, 0.5)}, mount="revolute")
+    assert model.pose_tree().model.upper[model.position_index("j")] == 0.5
+
+
+def test_slides_of_absurd_length_are_without_limits_and_it_is_said(tmp_path):
+    model = one_joint(tmp_path, 'lower="-1e16" upper="1e16"', "prismatic")
+    assert np.isinf([model.lower[0], model.upper[0]]).all()
+    assert "joint 'j' has limits of -1e+16 and 1e+16 m" in model.warnings[0]
+
+
+def test_a_screw_looks_different_after_a_turn(tmp_path):
+    three_turns = JOINTS_SDF.replace(
+        "<lower>-3</lower><upper>3</upper>", "<lower>-9</lower><upper>9</upper>"
+    )
+    model = load_model(write(tmp_path, three_turns, "m.sdf"), check=False)
+    index = model.position_index("screw")
+    assert not model.periodic[index]
+    assert model.periodic[model.position_index("turn")]
+    tree = model.pose_tree()
+    node = next(i for i, one in enumerate(tree.nodes) if "screw" in one.value_names)
+    column = tree.nodes[node].value_names.index("screw")
+    assert not tree.turns_around(node)[column]
+    grid = tree.grid(
+        node, 1.0, {name: 10.0 for name in tree.nodes[node].value_names if name != "screw"}
+    )
+    np.testing.assert_allclose(np.unique(grid[:, column]), np.arange(-9.0, 10.0))
+    without = JOINTS_SDF.replace(
+        "<limit><lower>-3</lower><upper>3</upper><effort>0</effort></limit>", ""
+    )
+    model = load_model(write(tmp_path, without, "m.sdf"), check=False)
+    assert any("'screw' is a screw without limits" in warning for warning in model.warnings)
+
+
+def test_turned_values_are_the_same_pose_for_drake(tmp_path):
+    """Plain forward kinematics at values before and after they are brought into another turn."""
+    model = one_joint(tmp_path, 'lower="-6.2831853" upper="6.2831853"')
+    tree = model.pose_tree()
+    kinematics = TreeKinematics(tree)
+    context = model.plant.CreateDefaultContext()
+    body = model.plant.get_body(BodyIndex(model.link_index("b")))
+
+    def pose(q):
+        model.plant.SetPositions(context, q)
+        return model.plant.EvalBodyPoseInWorld(context, body).GetAsMatrix4()
+
+    random = np.random.default_rng(3)
+    for values in random.uniform(-FULL, FULL, (40, 1)):
+        turned = kinematics.nearest_turns(values)
+        assert abs(turned[0]) <= math.pi
+        np.testing.assert_allclose(pose(turned), pose(values), atol=1e-12)
+        near = random.uniform(-20.0, 20.0, 1)
+        followed = kinematics.nearest_turns(values, near)
+        assert abs(followed[0] - near[0]) <= math.pi + 1e-12
+        np.testing.assert_allclose(pose(followed), pose(values), atol=1e-12)
+        inside = kinematics.within_limits(followed)
+        assert abs(inside[0]) <= FULL
+        if abs(followed[0]) <= FULL - 1e-6:
+            assert inside[0] == followed[0]
+        np.testing.assert_allclose(pose(inside), pose(values), atol=1e-12)
+    assert kinematics.within_limits(np.array([400.0]))[0] == pytest.approx(400.0 - 63 * FULL)
+
+
+def test_half_a_turn_either_side_stays():
+    values = np.array([math.pi, -math.pi, math.pi + 1e-6, 7.0])
+    turned = nearest_turn(values, np.zeros(4), True)
+    np.testing.assert_allclose(turned, [math.pi, -math.pi, 1e-6 - math.pi, 7.0 - FULL])
+    low, high = one_turn(np.array([-1.0]), np.array([1.0]), np.array([0.5]))
+    assert (low[0], high[0]) == (-1.0, 1.0)
+    assert turns_around(np.array([0.0]), np.array([FULL]), np.array([True])).all()
+
+
+def test_a_root_that_is_turned_about_axes_is_answered_within_its_limits():
+    """Euler angles come from -180 to 180 degrees, whatever the limits are."""
+    rotation = RootRotation.limited([("y", 90.0, 270.0)])
+    for angle in (100.0, 190.0, 265.0):
+        R = RotationMatrix.MakeYRotation(math.radians(angle)).matrix()
+        values = rotation.values_from(R)
+        np.testing.assert_allclose(np.degrees(values), [angle], atol=1e-9)

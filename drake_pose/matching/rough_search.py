@@ -32,6 +32,8 @@ _WORDS = 4
 _LEVELS = 10
 # So many cells of a cover are as wide as the root of the silhouettes' area.
 _CELLS = 40.0
+# A cover has so many rows and columns at most: 80 MB.
+_MOST_CELLS = 500
 _LEAST_HYPOTHESES = 64
 # So many times the hypotheses kept are looked at for some that do not stand alike.
 _SPARE = 8
@@ -272,13 +274,17 @@ def _mean_size(views: Sequence[View]) -> float:
 def _look_at(body: WideBody, views: Sequence[View], settings: RoughSettings) -> list[RoughView]:
     """The silhouettes as the rough search sees them."""
     size = _mean_size(views)
-    slack, cell = settings.slack * size, max(1.0, size / _CELLS)
+    slack, least_cell = settings.slack * size, max(1.0, size / _CELLS)
     largest = max(max((float(r.max(initial=0.0)) for r in body.ball_radii), default=0.0), 1e-6)
     seen = []
     for view in views:
         points = _spread_points(view.mask)
-        radii = np.linspace(0.15, 1.0, _LEVELS) * (largest * _largest_scale(body, view) + slack)
-        origin, end = points.min(axis=0) - radii[-1], points.max(axis=0) + radii[-1]
+        # No ball counts whose middle is outside the picture, and one as large as it covers all.
+        reach = min(largest * _largest_scale(body, view), math.hypot(*view.mask.shape)) + slack
+        radii = np.linspace(0.15, 1.0, _LEVELS) * reach
+        origin = np.maximum(points.min(axis=0) - reach, -1.0)
+        end = np.minimum(points.max(axis=0) + reach, np.add(view.mask.shape, 1.0))
+        cell = max(least_cell, float((end - origin).max()) / _MOST_CELLS)
         rows, columns = np.ceil((end - origin) / cell).astype(int)
         cover = np.zeros((_LEVELS, rows, columns, _WORDS), dtype=np.uint64)
         fill_cover(cover, points, origin, cell, radii)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,6 +11,9 @@ from drake_pose.camera import Camera, PinholeCamera
 from drake_pose.errors import CameraError
 from drake_pose.silhouette.outline import Outline
 from drake_pose.silhouette.scoring import draw_mask
+
+# A body that is as large as so many pictures is not what they show.
+_LARGER = 10.0
 
 
 def require_visible(outlines: Sequence[Outline], X_CN: np.ndarray, camera: Camera) -> None:
@@ -22,7 +26,8 @@ def require_visible(outlines: Sequence[Outline], X_CN: np.ndarray, camera: Camer
 
     Raises:
         CameraError: names the camera; when the body is wholly behind it, when the camera is inside
-            one of the surfaces, or when the body lies wholly outside the picture.
+            one of the surfaces, when the body is far larger than the picture, or lies wholly
+            outside of it.
     """
     solid = [
         (outline, np.asarray(X))
@@ -39,12 +44,28 @@ def require_visible(outlines: Sequence[Outline], X_CN: np.ndarray, camera: Camer
             )
         if any(_winding_at_origin(p_C[outline.triangles]) > 0.5 for outline, p_C in placed):
             raise CameraError(f"{where} is inside the body; check X_WC and the body's position")
+    size, picture = _least_size(placed, camera), math.hypot(camera.width, camera.height)
+    if size > _LARGER * picture:
+        raise CameraError(
+            f"{where}: the body is larger than the picture, at least {size:.3g} pixels across, "
+            f"the picture {picture:.0f}; check the focal length [pixel], X_WC and the model's "
+            "scale [m]"
+        )
     mask = draw_mask([outline for outline, _ in solid], np.array([X for _, X in solid]), camera)
     if not mask.any():
         raise CameraError(
             f"{where} shows nothing of the body: it lies outside the picture of "
             f"{camera.width} x {camera.height} pixels; check X_WC and the body's position"
         )
+
+
+def _least_size(placed: Sequence[tuple[Outline, np.ndarray]], camera: Camera) -> float:
+    """The diagonal of a body's box as it would look at its farthest point [pixel]."""
+    corners = np.vstack([p_C for _, p_C in placed])
+    scale = float(camera.kernel_parameters()[1])
+    if isinstance(camera, PinholeCamera):
+        scale /= float(corners[:, 2].max())
+    return scale * float(np.linalg.norm(np.ptp(corners, axis=0)))
 
 
 def _in_camera(outline: Outline, X_CN: np.ndarray) -> np.ndarray:

@@ -100,6 +100,14 @@ SPOILT_SCENES: dict[str, tuple[Spoil, tuple[str, ...]]] = {
         lambda s: edit_camera(s, X_WC=pose(0, 0, 0)),
         ("camera 'front'", "inside the body"),
     ),
+    "far too long a lens": (
+        lambda s: edit_camera(s, focal_x=1e5, focal_y=1e5),
+        ("camera 'front'", "larger than the picture", "focal length"),
+    ),
+    "no lens at all": (
+        lambda s: edit_camera(s, focal_x=1e12, focal_y=1e12),
+        ("camera 'front'", "larger than the picture"),
+    ),
     "no masks": (lambda s: shutil.rmtree(s.folder / "masks"), ("masks",)),
     "mask is no picture": (
         lambda s: mask_path(s).write_text("PNG"),

@@ -1,10 +1,13 @@
 """The rough search: what is right in the rough is among the few that are refined."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from drake_pose.body import PoseTree
 from drake_pose.errors import SettingsError
+from drake_pose.matching import View
 from drake_pose.matching.rough_kernel import fill_cover
 from drake_pose.matching.rough_search import RoughSearch, RoughSettings
 from drake_pose.matching.wide_body import WideBody
@@ -62,6 +65,18 @@ def test_a_limb_searched_again_leaves_the_rest(tree: PoseTree, body: WideBody) -
     assert (poses.samples[:, :hand] == -1).all()
     best = body.sampled.values[hand][poses.samples[0, hand], 0]
     assert abs(best - values[-1]) <= SETTINGS.interval
+
+
+@pytest.mark.parametrize("longer", [1e3, 1e9])
+def test_a_lens_that_is_far_too_long_does_not_fill_the_memory(
+    tree: PoseTree, body: WideBody, longer: float
+) -> None:
+    view = draw_view(tree, draw_pose(tree, np.random.default_rng(3)), arm_cameras()[0])
+    focal = longer * arm_cameras()[0].focal_x
+    wrong = View(replace(arm_cameras()[0], focal_x=focal, focal_y=focal), view.mask)
+    search = RoughSearch(body, [wrong], SETTINGS)
+    assert sum(view.cover.nbytes for view in search._views) < 1e8
+    assert len(search.find()) >= 1
 
 
 def test_cover_holds_the_points_within_the_radius() -> None:

@@ -31,7 +31,8 @@ from drake_pose.apps.result_folder import (
     read_summary,
     without_nan,
 )
-from drake_pose.apps.summary import FrameRecord, describe_job, summarize
+from drake_pose.apps.scene_checks import frame_ranges
+from drake_pose.apps.summary import FrameRecord, describe_job, mask_digests, summarize
 from drake_pose.body import load_model
 from drake_pose.body.landmarks import landmarks_file
 from drake_pose.errors import DrakePoseError, OutputError
@@ -143,6 +144,7 @@ def perform(task: Task) -> Outcome:
     begin = time.perf_counter()
     try:
         if task.place.is_dir():
+            _require_same_masks(task)
             return Outcome(None, 0.0, _totals(task))
         _note_attempt(task)
         _make(task)
@@ -172,6 +174,27 @@ def remove_parts(out: Path) -> None:
     """Removes what interrupted tasks have left."""
     for folder in (out / WORK).glob(f"*/*{_PART}*"):
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def _require_same_masks(task: Task) -> None:
+    """Refuses a finished scene whose masks were replaced; a chunk's are seen to when it is joined.
+
+    Raises:
+        OutputError: names the frames.
+    """
+    if task.index is not None:
+        return
+    scene = load_scene(task.job.scene)
+    gone = []
+    for frame, record in read_summary(task.place)["frames"].items():
+        known = record.get("masks", {})
+        if frame in task.frames and mask_digests(scene, known, frame) != known:
+            gone.append(frame)
+    if gone:
+        raise OutputError(
+            f"{task.place}: the masks of frame {frame_ranges(gone, scene.frames)} were replaced "
+            "since; remove that folder to have it estimated again"
+        )
 
 
 def _note_attempt(task: Task) -> None:

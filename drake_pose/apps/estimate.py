@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from drake_pose.apps.estimate_inputs import Inputs, read_inputs
 from drake_pose.apps.estimate_person import follow_person
 from drake_pose.apps.estimate_result import OnFrame, OnStage, ResultWriter, SceneEstimate
 from drake_pose.apps.estimate_sequence import sequence_tracking
+from drake_pose.apps.fit_checks import find_contradiction
 from drake_pose.apps.joint_tables import record_pose_set
 from drake_pose.apps.mask_agreement import compare_masks
 from drake_pose.apps.result_folder import PoseRow, base_cells, read_summary, require_empty
@@ -20,7 +22,7 @@ from drake_pose.apps.settings import EstimateSettings
 from drake_pose.apps.summary import FrameRecord, check_same_job, describe_job
 from drake_pose.camera import Camera, ParallelCamera
 from drake_pose.errors import SettingsError
-from drake_pose.matching import MatchResult, PoseSearch
+from drake_pose.matching import MatchResult, PoseSearch, View
 from drake_pose.matching.root_placement import scale_camera
 from drake_pose.matching.root_placement_search import PlacedMatch
 from drake_pose.silhouette import LabelRenderer
@@ -79,7 +81,9 @@ def estimate_scene(
     result.open()
     try:
         if search is not None:
-            _Matching(inputs, search, result, settings.track, overlay).run(on_frame)
+            matching = _Matching(inputs, search, result, settings.track, overlay)
+            matching.run(on_frame)
+            matching.compare_cameras(on_stage)
         elif result.missing:
             follow_person(result, settings.track, overlay, on_frame, on_stage)
         result.finish(replay)
@@ -136,6 +140,22 @@ class _Matching:
             self._finish_frame(frame, matching.matcher.last_result)
             if on_frame is not None:
                 on_frame(finished + index + 1, total, frame, self._result.records[frame])
+
+    def compare_cameras(self, on_stage: OnStage | None) -> None:
+        """Warn of cameras that contradict each other; few frames are matched again for it."""
+        scene, root_positions = self._inputs.scene, self._inputs.root_positions or {}
+
+        def match(frame: str, views: Sequence[View]) -> float:
+            if on_stage is not None:
+                on_stage("comparing the cameras", 0, None)
+            found = self._search.match(views, root_positions.get(frame))
+            return found.E_total if found.found else math.inf
+
+        contradiction = find_contradiction(
+            match, self._inputs.cameras, scene.read, scene.masks, self._result.records
+        )
+        if contradiction is not None:
+            self._result.warn([contradiction.text])
 
     def _finish_frame(self, frame: str, match: MatchResult | None) -> None:
         if match is None:

@@ -13,6 +13,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from drake_pose.apps.estimate_inputs import Inputs
+from drake_pose.apps.fit_checks import poor_fit_warnings
 from drake_pose.apps.joint_tables import family_table, joint_table
 from drake_pose.apps.measurements import angle_difference
 from drake_pose.apps.motion_files import write_motion
@@ -30,7 +31,9 @@ from drake_pose.apps.result_folder import (
     base_pose,
     without_nan,
 )
-from drake_pose.apps.summary import FrameRecord, camera_warnings, summarize
+from drake_pose.apps.scene_checks import frame_ranges
+from drake_pose.apps.summary import FrameRecord, camera_warnings, mask_digests, summarize
+from drake_pose.errors import OutputError
 
 # Whatever ends the job writes the summary; this is for a job that is killed [s]. It takes a while
 # where the recording is long: so many times as long is spent on frames.
@@ -127,11 +130,40 @@ class ResultWriter:
             error = row.error if row.found else None
             plain = {"found": row.found, "E_total": error, "seconds": row.seconds}
             self.records[frame] = FrameRecord.from_json(known.get(frame, plain))
+        self._drop_replaced()
 
     @property
     def missing(self) -> list[str]:
         """The frames that are not finished."""
         return [frame for frame in self.inputs.frames if frame not in self.rows]
+
+    def _drop_replaced(self) -> None:
+        """Forget finished frames whose masks are not those any more that they were made from.
+
+        A frame whose masks nobody recorded, as the job was killed, is one of them.
+
+        Raises:
+            OutputError: such a frame is not among those that are to be estimated.
+        """
+        gone = [f for f, record in self.records.items() if self._digests(f) != record.masks]
+        if not gone:
+            return
+        known = self.inputs.scene.frames
+        if others := set(gone).difference(self.inputs.frames):
+            raise OutputError(
+                f"frame {frame_ranges(others, known)}: the masks were replaced since it was "
+                "finished; have it estimated again, too, or name another folder"
+            )
+        for frame in gone:
+            del self.rows[frame], self.records[frame]
+        if self._folder is not None:
+            self._folder.forget(gone)
+        listed = frame_ranges(gone, known)
+        self.warn([f"frame {listed}: estimated again, as the masks were replaced or not recorded"])
+
+    def _digests(self, frame: str) -> dict[str, str]:
+        names = [camera.name for camera in self.inputs.cameras]
+        return mask_digests(self.inputs.scene, names, frame)
 
     def inputs_of_all(self) -> Inputs:
         """The inputs, the frames that are finished already among them."""
@@ -161,6 +193,7 @@ class ResultWriter:
         """Write a frame. Finished is what has its row in poses.csv; all else comes before."""
         if self._folder is not None:
             self._folder.add(row)
+        record = replace(record, masks=self._digests(row.frame))
         self.rows[row.frame], self.records[row.frame] = row, record
         if time.monotonic() > self._next_summary:
             self.write_summary()
@@ -206,6 +239,8 @@ class ResultWriter:
         """Write what is made of all frames; then the result is complete."""
         rows = self.ordered_rows()
         self.warn(camera_warnings(self.records, self._warnings))
+        held = self._job.get("settings", {}).get("hold", {})
+        self.warn(poor_fit_warnings(rows, self._ordered_records(), self.inputs.model, held))
         if self._folder is not None:
             self._folder.sort(self.inputs.scene.frames)
             self.warn(

@@ -10,7 +10,7 @@ import csv
 import io
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
@@ -164,6 +164,10 @@ class ResultFolder:
     def clear(self) -> None:
         """Forget the rows that were read for a resumption."""
         self.rows = []
+
+    def forget(self, frames: Collection[str]) -> None:
+        """Forget some of the rows that were read for a resumption."""
+        self.rows = [row for row in self.rows if row.frame not in frames]
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
         """Write summary.json; numbers that are not finite become null.

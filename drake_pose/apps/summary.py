@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -15,9 +16,13 @@ import numpy as np
 from drake_pose import __version__
 from drake_pose.apps.settings import EstimateSettings
 from drake_pose.errors import OutputError
+from drake_pose.regular_files import digest, read_regular
+from drake_pose.silhouette import Scene
 
 # A camera is suspicious where its pictures agree so much less than the others'.
 _SUSPICIOUS = 0.15
+# Of a mask's digest so many digits are kept.
+_DIGITS = 16
 _PACKAGES = ("drake", "numpy", "numba", "opencv-python-headless")
 
 
@@ -57,6 +62,7 @@ class FrameRecord:
         families: by name too, in each family of poses that look the same; the first of them.
         family_count: how many families there are; None where the search does not say.
         ious: by camera that was used, intersection over union of silhouette and body.
+        masks: by camera, what tells the mask's file from another (``mask_digests``).
         share: of the contours' lengths, what fits; by the method person alone.
     """
 
@@ -75,6 +81,7 @@ class FrameRecord:
     family_count: int | None = None
     ious: Mapping[str, float] = field(default_factory=dict)
     share: float | None = None
+    masks: Mapping[str, str] = field(default_factory=dict)
 
     @staticmethod
     def from_json(values: Mapping[str, Any]) -> FrameRecord:
@@ -113,6 +120,17 @@ def describe_job(scene: Path, model: Path, settings: EstimateSettings) -> dict[s
             "cameras": _digest(scene / "cameras.yaml"),
         },
     }
+
+
+def mask_digests(scene: Scene, cameras: Iterable[str], frame: str) -> dict[str, str]:
+    """What tells the mask files of a frame from others, by camera; none where it cannot be read."""
+    found = {}
+    for camera in cameras:
+        path = scene.masks.get((camera, frame))
+        if path is not None:
+            with suppress(OSError):
+                found[camera] = digest(path)[:_DIGITS]
+    return found
 
 
 def check_same_job(job: Mapping[str, Any], recorded: Mapping[str, Any], folder: Path) -> None:
@@ -226,6 +244,6 @@ def _versions() -> dict[str, str]:
 
 def _digest(path: Path) -> str | None:
     try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
+        return hashlib.sha256(read_regular(path)).hexdigest()
     except OSError:
         return None

@@ -162,6 +162,13 @@ def _path(value: Any, where: str, base: Path) -> Path:
     return base / _text(value, where, base)
 
 
+def _packages(value: Any, where: str, base: Path) -> dict[str, Path]:
+    return {
+        str(name): _path(folder, f"{where}: {name}", base)
+        for name, folder in _mapping(value, where).items()
+    }
+
+
 def _root_position(value: Any, where: str, base: Path) -> Any:
     if isinstance(value, list) and len(value) == 3:
         return tuple(_number(one, where, base) for one in value)
@@ -199,5 +206,6 @@ SETTINGS: dict[str, Callable[[Any, str, Path], Any]] = {
     "method": _text,
     "angles": _text,
     "track": _yes_or_no,
+    "packages": _packages,
 }
 """How each setting of an estimate is read."""

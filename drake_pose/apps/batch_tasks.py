@@ -123,8 +123,10 @@ def plan_scene(job: SceneJob, out: Path) -> tuple[Task, ...]:
     frames = select_seen_frames(scene, cameras, job.settings.frames)
     # A model is read only where it may be a person's: that takes seconds.
     maybe = landmarks_file(job.model).is_file() or job.settings.method == "person"
-    if maybe and follows_person(scene, cameras, load_model(job.model), job.settings):
-        return (Task(job, out, None, frames),)
+    if maybe:
+        model = load_model(job.model, package_paths=job.settings.packages)
+        if follows_person(scene, cameras, model, job.settings):
+            return (Task(job, out, None, frames),)
     cuts = range(0, len(frames), job.chunk)
     return tuple(
         Task(job, out, index, frames[cut : cut + job.chunk]) for index, cut in enumerate(cuts)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from drake_pose.apps.estimate import estimate_scene
@@ -24,6 +25,7 @@ def capture_scene(
     *,
     replay: bool = True,
     overlay: bool = True,
+    packages: Mapping[str, Path] | None = None,
 ) -> SceneEstimate:
     """Captures the person in a scene with two calibrated cameras or more.
 
@@ -34,6 +36,7 @@ def capture_scene(
             not given.
         replay: whether replay.html is written.
         overlay: whether overlays are written.
+        packages: folders of packages that the model's ``package://`` names mean, by name.
 
     Returns:
         The estimate, as `estimate_scene` gives it.
@@ -43,7 +46,7 @@ def capture_scene(
         ModelError: the model is no person with landmarks.
         OutputError: the result cannot be written.
     """
-    settings = EstimateSettings(method="person")
+    settings = EstimateSettings(method="person", packages=packages or {})
     return estimate_scene(
         scene, model or bundled_person(), out, settings, replay=replay, overlay=overlay
     )

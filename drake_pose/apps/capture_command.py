@@ -15,6 +15,7 @@ from drake_pose.apps.estimate_options import (
     JsonOption,
     OutOption,
     OverlayOption,
+    PackageOption,
     ReplayOption,
     ResumeOption,
     SceneArgument,
@@ -28,8 +29,9 @@ from drake_pose.apps.live_command import (
     ToleranceOption,
     run_live_capture,
 )
+from drake_pose.apps.options import parse_packages
 from drake_pose.apps.settings import EstimateSettings
-from drake_pose.apps.terminal import errors_as_messages
+from drake_pose.apps.terminal import errors_as_messages, usage_errors
 
 
 def capture(
@@ -39,6 +41,7 @@ def capture(
         Path | None,
         typer.Option(help="A person with landmarks.yaml beside it; the bundled one if not given."),
     ] = None,
+    package: PackageOption = None,
     camera: CameraOption = None,
     frame: FrameOption = None,
     truth: TruthOption = None,
@@ -55,6 +58,8 @@ def capture(
     json: JsonOption = False,
 ) -> None:
     """See help_texts.CAPTURE."""
+    with usage_errors():
+        packages = parse_packages(package or ())
     if workers and scheduler is not None:
         raise typer.BadParameter("give --workers or --scheduler, not both")
     # The name of SOURCES; its module would make every command's start slow.
@@ -74,6 +79,7 @@ def capture(
             run_live_capture(
                 scene, out, model, seconds=seconds, shape=shape, fit_shape=fit_shape,
                 tolerance=tolerance, replay=replay, json=json, open_eyes=open_eyes,
+                packages=packages,
             )  # fmt: skip
         return
     if seconds or shape or not fit_shape or tolerance or workers or scheduler:
@@ -83,7 +89,11 @@ def capture(
 
         model = model or bundled_person()
     settings = EstimateSettings(
-        cameras=tuple(camera or ()), frames=tuple(frame or ()), method="person", track=track
+        cameras=tuple(camera or ()),
+        frames=tuple(frame or ()),
+        method="person",
+        track=track,
+        packages=packages,
     )
     run_estimate(
         scene, model, out, settings, truth=truth, resume=resume, overlay=overlay, replay=replay,

@@ -87,10 +87,10 @@ def read_inputs(
     scene = checked.scene
     cameras = select_cameras(scene, settings.cameras)
     frames = select_seen_frames(scene, cameras, settings.frames)
-    model = load_model(model_path)
+    model = load_model(model_path, package_paths=settings.packages)
     truth = _read_truth(scene_path, truth_path, model)
     if follows_person(scene, cameras, model, settings):
-        texts = texts_of(*checked.warnings, *check_upright(cameras))
+        texts = (*texts_of(*checked.warnings, *check_upright(cameras)), *model.warnings)
         return Inputs(scene, model, cameras, frames, None, None, truth, texts)
     root_positions = None
     position: np.ndarray | None = None
@@ -109,7 +109,7 @@ def read_inputs(
     else:
         search = _make_search(_make_tree(model, settings, position), settings, model)
     read = _check_pictures(scene, cameras, frames, search)
-    texts = texts_of(*checked.warnings, *read.warnings)
+    texts = (*texts_of(*checked.warnings, *read.warnings), *model.warnings)
     return Inputs(read.scene, model, cameras, frames, search, root_positions, truth, texts)
 
 

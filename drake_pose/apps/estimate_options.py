@@ -25,6 +25,14 @@ ModelOption = Annotated[
         "--model", "-m", metavar="FILE", help="The body: URDF, SDFormat, MJCF or .dmd.yaml."
     ),
 ]
+PackageOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME=FOLDER",
+        help="Where the package of the model's package://NAME/... files lies; repeat for several. "
+        "Others are looked for on the way up from the model's file and in ROS_PACKAGE_PATH.",
+    ),
+]
 OutOption = Annotated[
     Path,
     typer.Option("--out", "-o", metavar="DIR", help="Folder for the result; new or empty."),

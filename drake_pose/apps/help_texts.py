@@ -78,9 +78,14 @@ A fit model has visual geometry to be seen, and limits on every joint that could
 ever. Shown are the segments of the pose tree: the link each one is, what it hangs on, its joints in
 the order of rotation with their limits, and its triangles. Exit status 1: not fit.
 
-[bold]Example:[/bold]
+Collision geometry, transmissions and plugins are not read. Joints that are written to follow others
+are named: they are searched by themselves. A file that still holds xacro macros is to be expanded
+first. Packages are looked for on the way up from the file and in ROS_PACKAGE_PATH.
+
+[bold]Examples:[/bold]
 
     drake-pose check urdf/woman/woman.urdf
+    drake-pose check arm.urdf --package arm_description=ros/arm_description
 """)
 
 CALIBRATE = _help("""

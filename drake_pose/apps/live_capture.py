@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,7 @@ class LiveSettings:
         shape: a result of capture with the same person, whose lengths and girths are taken.
         fit_shape: whether otherwise the first frames give them; else they are the model's.
         replay: whether replay.html is written.
+        packages: folders of packages that the model's ``package://`` names mean, by name.
 
     Raises:
         SettingsError: a time that cannot be.
@@ -55,6 +56,7 @@ class LiveSettings:
     shape: Path | None = None
     fit_shape: bool = True
     replay: bool = True
+    packages: Mapping[str, Path] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.seconds is not None and not 0.0 < self.seconds < np.inf:
@@ -106,7 +108,7 @@ def capture_live(
     """
     settings = settings or LiveSettings()
     opener: OpenEyes = open_eyes or (lambda: scene.open_eyes())
-    model = load_model(model_path or bundled_person())
+    model = load_model(model_path or bundled_person(), package_paths=settings.packages)
     # A folder that cannot be written is refused before a camera is opened.
     require_empty(out)
     shape = _shape(scene, model, settings, opener, on_report)
@@ -115,7 +117,7 @@ def capture_live(
     eyes = opener()
     try:
         diagram = build_live_capture(tracker, scene.cameras, eyes, with_deviations=True)
-        result = _Result(scene, model, tracker, out, eyes.period)
+        result = _Result(scene, model, tracker, out, eyes.period, settings.packages)
         result.writer.more["method"] = "person"
         if shape is not None:
             result.writer.more |= {"lengths_m": shape.lengths, "girths": shape.girths}
@@ -174,6 +176,7 @@ class _Result:
         tracker: SilhouetteTracker,
         out: Path,
         period: float,
+        packages: Mapping[str, Path],
     ) -> None:
         self._scene, self._model, self._tracker = scene, model, tracker
         self._period = period
@@ -182,7 +185,8 @@ class _Result:
         self._last = -1
         recorded = Scene(scene.path, scene.cameras, (), {}, True, 1.0 / period)
         inputs = Inputs(recorded, model, tuple(scene.cameras.values()), (), None, None, None)
-        job = describe_job(scene.path, model.path, EstimateSettings(method="person"))
+        settings = EstimateSettings(method="person", packages=packages)
+        job = describe_job(scene.path, model.path, settings)
         self.writer = ResultWriter(inputs, job, out, None, with_base=False)
 
     @property

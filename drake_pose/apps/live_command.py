@@ -65,6 +65,7 @@ def run_live_capture(
     replay: bool = True,
     json: bool = False,
     open_eyes: Callable[[LiveScene], LiveEyes] | None = None,
+    packages: Mapping[str, Path] | None = None,
 ) -> None:
     """Captures as the pictures come, tells what happens, and prints what came out."""
     with errors_as_messages():
@@ -73,7 +74,7 @@ def run_live_capture(
         from drake_pose.apps.report import FrameProgress
 
         hush_opencv()
-        settings = LiveSettings(seconds, shape, fit_shape, replay)
+        settings = LiveSettings(seconds, shape, fit_shape, replay, packages or {})
         scene = load_live_scene(folder)
 
         def eyes() -> LiveEyes:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,7 @@ def walk_live(
     open_eyes: Callable[[], LiveEyes] | None = None,
     on_command: Callable[[str], None] = lambda _: None,
     on_report: Callable[[str], None] = lambda _: None,
+    packages: Mapping[str, Path] | None = None,
 ) -> dict[str, Any]:
     """Lets the avatar walk as the person before the cameras commands, until Ctrl-C.
 
@@ -51,6 +52,7 @@ def walk_live(
         on_command: called when the command changes, with its words, "" for none.
         on_report: hears at once of cameras that stop and return, of bad pictures, and of a person
             who is found or lost.
+        packages: folders of packages that the model's ``package://`` names mean, by name.
 
     Returns:
         As walk in drake_pose.apps.walk; found_share of the periods in which the person was known;
@@ -62,7 +64,7 @@ def walk_live(
     """
     if seconds is not None and not 0.0 < seconds < math.inf:
         raise SettingsError(f"the walk's length must be a positive number, not {seconds} s")
-    model = load_model(model_path or bundled_person())
+    model = load_model(model_path or bundled_person(), package_paths=packages)
     known = None if shape is None else shape_of_result(shape)
     tracker = tracker_of_person(model.pose_tree(), known)
     opened: LiveEyes = scene.open_eyes(live=True) if open_eyes is None else open_eyes()

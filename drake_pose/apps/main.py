@@ -28,6 +28,7 @@ from drake_pose.apps.estimate_options import (
     OutOption,
     OutsideLimitOption,
     OverlayOption,
+    PackageOption,
     ReplayOption,
     ResumeOption,
     RootOption,
@@ -43,6 +44,7 @@ from drake_pose.apps.kameda_command import kameda
 from drake_pose.apps.live_command import empty_room
 from drake_pose.apps.options import (
     parse_assignments,
+    parse_packages,
     parse_root_position,
     parse_root_rotation,
 )
@@ -99,6 +101,7 @@ def estimate(
     scene: SceneArgument,
     model: ModelOption,
     out: OutOption,
+    package: PackageOption = None,
     camera: CameraOption = None,
     frame: FrameOption = None,
     hold: HoldOption = None,
@@ -140,6 +143,7 @@ def estimate(
             method=method,
             angles=angles,
             track=track,
+            packages=parse_packages(package or ()),
         )
     run_estimate(
         scene, model, out, settings, truth=truth, resume=resume, overlay=overlay, replay=replay,
@@ -172,15 +176,18 @@ def demo(
 @app.command(help=help_texts.CHECK)
 def check(
     file: Annotated[Path, typer.Argument(help="The model: URDF, SDFormat, MJCF or .dmd.yaml.")],
+    package: PackageOption = None,
     json: JsonOption = False,
 ) -> None:
     """See help_texts.CHECK."""
+    with usage_errors():
+        packages = parse_packages(package or ())
     with errors_as_messages():
         from drake_pose.apps.check import report_as_json, report_as_table
         from drake_pose.apps.report import output_console
         from drake_pose.body import describe_model
 
-        report = describe_model(file)
+        report = describe_model(file, package_paths=packages)
         if json:
             print_json(report_as_json(report))
         elif report.usable:

@@ -46,6 +46,25 @@ def parse_assignments(texts: Iterable[str], option: str) -> dict[str, float]:
     return values
 
 
+def parse_packages(texts: Iterable[str]) -> dict[str, Path]:
+    """Returns the absolute folders of ``NAME=FOLDER`` texts by package.
+
+    Raises:
+        SettingsError: if a text has another form, a name is given twice, or there is no folder.
+    """
+    folders: dict[str, Path] = {}
+    for text in texts:
+        name, equals, folder = text.partition("=")
+        if not (name and equals and folder):
+            raise SettingsError(f"--package: '{text}' must have the form NAME=FOLDER")
+        if name in folders:
+            raise SettingsError(f"--package: '{name}' is given twice")
+        if not Path(folder).is_dir():
+            raise SettingsError(f"--package {name}: there is no folder {folder}")
+        folders[name] = Path(folder).absolute()
+    return folders
+
+
 def parse_root_position(
     text: str,
 ) -> tuple[float, float, float] | tuple[Path, str] | Literal["unknown"]:

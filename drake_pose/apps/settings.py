@@ -52,6 +52,7 @@ class EstimateSettings:
         angles: ``continuous``: refined between the samples; ``grid``: multiples of the interval
             alone, as always with the method ``paper``. Of the method ``wide`` alone.
         track: whether frames of a sequence are tracked; else every one is matched on its own.
+        packages: folders of packages that the model's ``package://`` names mean, by name.
 
     Raises:
         SettingsError: if there is no such method, an option belongs to the other one, or a count
@@ -74,6 +75,7 @@ class EstimateSettings:
     method: str = "auto"
     angles: str = "continuous"
     track: bool = True
+    packages: Mapping[str, Path] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -116,4 +118,5 @@ class EstimateSettings:
             values["root_rotation"] = [
                 [axis, lower, upper] for axis, (lower, upper) in self.root_rotation.items()
             ]
+        values["packages"] = {name: str(folder) for name, folder in self.packages.items()}
         return values | {"cameras": list(self.cameras), "frames": list(self.frames)}

@@ -63,7 +63,12 @@ class Player:
     rate_hz: float = RATE_HZ
 
 
-def recorded_player(result: Path, model_path: Path | None, rate_hz: float | None) -> Player:
+def recorded_player(
+    result: Path,
+    model_path: Path | None,
+    rate_hz: float | None,
+    packages: Mapping[str, Path] | None = None,
+) -> Player:
     """Plays the poses of a result folder, as `drake-pose capture` writes it.
 
     Args:
@@ -71,6 +76,7 @@ def recorded_player(result: Path, model_path: Path | None, rate_hz: float | None
         model_path: the model it was captured with; the bundled one that its summary names where
             not given.
         rate_hz: its frames a second; those in its summary where not given.
+        packages: folders of packages that the model's ``package://`` names mean, by name.
 
     Raises:
         OutputError: there is no such result, or it is one of another model.
@@ -85,7 +91,7 @@ def recorded_player(result: Path, model_path: Path | None, rate_hz: float | None
         model_path = bundled_model("person").with_name(Path(name).name)
         if not model_path.is_file():
             raise OutputError(f"{result}: its model '{name}' is not a bundled one; give --model")
-    model = load_model(model_path)
+    model = load_model(model_path, package_paths=packages)
     path, columns = result / POSES, list(model.position_names)
     try:
         with path.open(newline="", encoding="utf-8") as stream:

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from drake_pose.apps.cluster_options import SchedulerOption, WatchersOption, workers_of
-from drake_pose.apps.estimate_options import JsonOption
+from drake_pose.apps.estimate_options import JsonOption, PackageOption
 from drake_pose.apps.live_command import ShapeOption
-from drake_pose.apps.terminal import errors_as_messages, finite, print_json, say, warn
+from drake_pose.apps.options import parse_packages
+from drake_pose.apps.terminal import (
+    errors_as_messages,
+    finite,
+    print_json,
+    say,
+    usage_errors,
+    warn,
+)
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -38,6 +46,7 @@ def walk(
     model: Annotated[
         Path | None, typer.Option(help="The model of the result, where it is not a bundled one.")
     ] = None,
+    package: PackageOption = None,
     rate: Annotated[
         float | None,
         typer.Option(
@@ -86,16 +95,20 @@ def walk(
         raise typer.BadParameter("--model is for a result or --live")
     if rate is not None and rate <= 0.0:
         raise typer.BadParameter("must be above 0", param_hint="--rate")
+    if package and model is None:
+        raise typer.BadParameter("--package is for --model")
+    with usage_errors():
+        packages = parse_packages(package or ())
     with errors_as_messages():
         from drake_pose.apps import walk as walking
 
         if live is not None:
             with workers_of(workers, scheduler) as client:
-                walked = _walk_live(live, model, shape, seconds, port, browser, client)
+                walked = _walk_live(live, model, shape, seconds, port, browser, client, packages)
             _print(walked, json)
             return
         if result is not None:
-            player = walking.recorded_player(result, model, rate)
+            player = walking.recorded_player(result, model, rate, packages)
         elif simulate:
             player = walking.simulated_player()
         else:
@@ -125,6 +138,7 @@ def _walk_live(
     port: int | None,
     browser: bool,
     client: Client | None,
+    packages: Mapping[str, Path],
 ) -> dict[str, Any]:
     """Walks with the cameras of a folder; what it is to walk with is read before the page opens."""
     from drake_pose.apps.live_scene import hush_opencv, load_live_scene
@@ -139,7 +153,9 @@ def _walk_live(
         say(f"drake-pose: {text}")
 
     open_eyes = None if client is None else _opener(client, scene)
-    walked = walk_live(scene, page, model, shape, seconds, open_eyes, _say_command, report)
+    walked = walk_live(
+        scene, page, model, shape, seconds, open_eyes, _say_command, report, packages
+    )
     for text in walked["warnings"]:
         warn(text)
     return walked

@@ -1,8 +1,9 @@
 """One model file into one Drake plant, with every failure turned into a ModelError."""
 
 import logging
+import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,9 @@ from drake_pose.body.curing import Curing
 from drake_pose.body.xml_checks import read_limits
 from drake_pose.errors import ModelError
 
+_MOST_ALIKE = 10
+# Names in quotes, and numbers.
+_VARIABLE = re.compile(r"'[^']*'|-?\d[\d.e+-]*")
 # Inertias play no role in what is seen.
 _ABOUT_INERTIA = ("invalid inertia", "parsing inertia matrix", "as central inertia")
 # Some of Drake's messages hold whole files.
@@ -91,7 +95,7 @@ class ModelSource:
             for warning in warnings
             if not any(mark in warning for mark in _ABOUT_INERTIA)
         ]
-        return list(instances), [*self.warnings, *remarks]
+        return list(instances), limit_kinds([*self.warnings, *remarks])
 
     def _explain(self, reason: str, warnings: list[str]) -> str:
         """Why the file cannot be used, with the joint whose limits are at fault, if one is."""
@@ -104,6 +108,22 @@ class ModelSource:
         text = "; ".join([*remarks, reason.strip()])[:_LONGEST_REASON]
         text = self._curing.name_originals(text, self.path.name)
         return f"{self.path}: {text or 'Drake refuses this model without saying why'}"
+
+
+def limit_kinds(warnings: Sequence[str]) -> list[str]:
+    """Warnings of which those that differ in names and numbers alone are at most ten.
+
+    The last of ten is followed by how many more there are.
+    """
+    by_kind: dict[str, list[str]] = {}
+    for warning in warnings:
+        by_kind.setdefault(_VARIABLE.sub("", warning), []).append(warning)
+    shown = []
+    for alike in by_kind.values():
+        shown += alike[:_MOST_ALIKE]
+        if len(alike) > _MOST_ALIKE:
+            shown.append(f"... and {len(alike) - _MOST_ALIKE} more like: {alike[0]}")
+    return shown
 
 
 @contextmanager

@@ -1,8 +1,7 @@
 """Is this model fit for use, and if not, why: the facts behind ``drake-pose check FILE``."""
 
 import math
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,12 +12,10 @@ from scipy.spatial.transform import Rotation
 from drake_pose.body.link_graph import build_link_graph
 from drake_pose.body.mesh import TriangleMesh, is_watertight
 from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body.parsing import limit_kinds
 from drake_pose.body.pose_tree import PoseTree, PoseTreeNode
 from drake_pose.errors import DrakePoseError
 
-_MOST_ALIKE = 10
-# Names in quotes, and numbers.
-_VARIABLE = re.compile(r"'[^']*'|-?\d[\d.e+-]*")
 _SYMMETRY_TOLERANCE = 0.03
 _LEVELS = 12
 # Seven, so that a square or hexagonal cross-section does not pass for round.
@@ -133,22 +130,6 @@ def _warnings(model: ArticulatedModel, tree: PoseTree) -> list[str]:
         if not node.mesh.is_empty and not is_watertight(node.mesh)
     ]
     return limit_kinds(warnings + _symmetry_warnings(model))
-
-
-def limit_kinds(warnings: Sequence[str]) -> list[str]:
-    """Warnings of which those that differ in names and numbers alone are at most ten.
-
-    The last of ten is followed by how many more there are.
-    """
-    by_kind: dict[str, list[str]] = {}
-    for warning in warnings:
-        by_kind.setdefault(_VARIABLE.sub("", warning), []).append(warning)
-    shown = []
-    for alike in by_kind.values():
-        shown += alike[:_MOST_ALIKE]
-        if len(alike) > _MOST_ALIKE:
-            shown.append(f"... and {len(alike) - _MOST_ALIKE} more like: {alike[0]}")
-    return shown
 
 
 def _symmetry_warnings(model: ArticulatedModel) -> list[str]:

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 _TIMEOUT = 5.0
 """How long a scheduler and its workers may take to answer [s]."""
 
+# More than that, for the connection to say by itself what is wrong [s].
+_GRACE = 0.5
+
 TRIES = 3
 """A task that has killed its process or its worker so often is given up."""
 
@@ -124,21 +127,33 @@ def _connected(address: str) -> Iterator[Client]:
     from distributed.comm import get_address_host_port
 
     try:
-        # A client of such an address would be left half made, and complain when it is destroyed.
         get_address_host_port(address, strict=True)
     except ValueError as error:
         raise ClusterError(
             f"'{address}' is no scheduler's address; give one like tcp://10.0.0.7:8786"
         ) from error
     try:
+        # A client that finds nobody would be left half made, and complain when it is destroyed.
+        asyncio.run(_shake_hands(address))
         client = Client(address, timeout=_TIMEOUT, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
+    except (OSError, ValueError, TypeError, EOFError, MemoryError, asyncio.TimeoutError) as error:
+        # Whoever listens there may say anything: a web server's words are taken for a size of
+        # exabytes.
         raise ClusterError(
             f"no scheduler answers at {address} within {_TIMEOUT:g} s; start one with "
             "'dask scheduler --host 127.0.0.1' and workers with 'dask worker ADDRESS --nthreads 1'"
         ) from error
     with client:
         yield client
+
+
+async def _shake_hands(address: str) -> None:
+    """Connects to a scheduler once; raises what the connection raises, in time."""
+    from distributed.comm import connect
+
+    # Its own timeout does not hold where somebody listens and says nothing.
+    comm = await asyncio.wait_for(connect(address, timeout=_TIMEOUT), _TIMEOUT + _GRACE)
+    await comm.close()
 
 
 def require_fit_workers(client: Client, out: Path | None = None) -> None:

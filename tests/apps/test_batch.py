@@ -2,11 +2,14 @@
 
 import csv
 import dataclasses
+import gc
 import json
 import os
 import shutil
 import signal
+import socket
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -238,6 +241,34 @@ def test_unreachable_scheduler_is_refused(jobs, scenes, tmp_path, monkeypatch):
     assert result.exit_code == 1
     assert "no scheduler answers at tcp://127.0.0.1:9" in result.stderr
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("words", [b"", b"HTTP/1.0 400 Bad request\r\n\r\n" * 8])
+def test_who_listens_but_is_no_scheduler_is_named_in_time(words, monkeypatch, caplog, capfd):
+    monkeypatch.setattr("drake_pose.apps.cluster._TIMEOUT", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def talk():
+            while True:
+                try:
+                    talked.append(listening.accept()[0])
+                    talked[-1].sendall(words)
+                except OSError:
+                    return
+
+        talked = []
+        threading.Thread(target=talk, daemon=True).start()
+        address = f"tcp://127.0.0.1:{listening.getsockname()[1]}"
+        begin = time.monotonic()
+        with pytest.raises(ClusterError, match=address), open_cluster(scheduler=address):
+            pass
+        assert time.monotonic() - begin < 5.0
+        listening.shutdown(socket.SHUT_RDWR)
+    assert talked
+    for connection in talked:
+        connection.close()
+    gc.collect()
+    assert caplog.text == capfd.readouterr().err == ""
 
 
 @pytest.mark.parametrize("address", ["foo", "10.0.0.7:8786", "tcp://foo", "htp://x:1"])

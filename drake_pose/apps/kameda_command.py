@@ -11,13 +11,21 @@ from drake_pose.apps.estimate_options import JsonOption
 from drake_pose.apps.settings import EstimateSettings
 from drake_pose.apps.terminal import errors_as_messages, finite, print_json, say, usage_errors
 
+# What is about the grid of angles, which continuous ones have none of.
+_OF_GRID = ("method", "outside_limit", "candidates", "interval", "edges", "out")
+
 
 def kameda(
+    context: typer.Context,
     images: Annotated[int, typer.Option(min=1, help="How many silhouettes are drawn.")] = 219,
     seed: Annotated[int, typer.Option(min=0, help="Another seed draws other poses.")] = 0,
     method: Annotated[str, typer.Option(help="How to search: paper or wide.")] = "paper",
     angles: Annotated[
-        str, typer.Option(help="lattice: multiples of 20 degrees, as in the paper; continuous.")
+        str,
+        typer.Option(
+            help="lattice: multiples of 20 degrees, drawn and searched for as in the paper; "
+            "continuous: drawn anywhere, and refined between the samples."
+        ),
     ] = "lattice",
     outside_limit: Annotated[
         float,
@@ -41,16 +49,14 @@ def kameda(
         ),
     ] = 20.0,
     views: Annotated[
-        int | None,
-        typer.Option(
-            min=1, help="With continuous angles, refined between the samples: so many cameras."
-        ),
-    ] = None,
+        int, typer.Option(min=1, help="With --angles continuous: so many cameras.")
+    ] = 1,
     mismatch: Annotated[
         bool,
         typer.Option(
             "--mismatch",
-            help="With --views: beside it a body whose widths and joints are not the model's.",
+            help="With --angles continuous: beside it a body of other widths and joints than the "
+            "model's.",
         ),
     ] = False,
     edges: Annotated[
@@ -71,19 +77,20 @@ def kameda(
         EstimateSettings(method=method)
     if angles not in ("lattice", "continuous"):
         raise typer.BadParameter("must be lattice or continuous", param_hint="--angles")
-    if views is None and mismatch:
-        raise typer.BadParameter("needs --views", param_hint="--mismatch")
-    if edges and (method != "wide" or views is not None):
-        raise typer.BadParameter("needs --method wide, without --views", param_hint="--edges")
-    if views is None:
+    if edges and method != "wide":
+        raise typer.BadParameter("needs --method wide", param_hint="--edges")
+    others = _OF_GRID if angles == "continuous" else ("views", "mismatch")
+    for name in others:
+        if str(getattr(context.get_parameter_source(name), "name", "")) == "COMMANDLINE":
+            needed = "lattice" if angles == "continuous" else "continuous"
+            raise typer.BadParameter(
+                f"needs --angles {needed}", param_hint=f"--{name.replace('_', '-')}"
+            )
+    if angles == "lattice":
         with errors_as_messages():
             paper = (outside_limit, candidates)
-            _run_on_grid(images, seed, method, angles, interval, paper, edges, out, json)
+            _run_on_grid(images, seed, method, interval, paper, edges, out, json)
         return
-    if angles != "continuous" or out is not None:
-        raise typer.BadParameter(
-            "needs --angles continuous, and makes no pictures", param_hint="--views"
-        )
     with errors_as_messages():
         from drake_pose.apps.kameda_continuous import print_continuous, run_beside
 
@@ -94,7 +101,6 @@ def _run_on_grid(
     images: int,
     seed: int,
     method: str,
-    angles: str,
     interval: float,
     paper: tuple[float, int],
     edges: bool,
@@ -119,13 +125,13 @@ def _run_on_grid(
     paper_images = images if method == "paper" else min(images, PAPER_IMAGES)
     with count_progress("silhouettes, the paper's method", paper_images) as advance:
         search = experiment_search(*paper, interval)
-        results = [run_experiment(search, paper_images, seed, angles, advance)]
+        results = [run_experiment(search, paper_images, seed, advance)]
     beside: dict[str, object] = {}
     if method == "wide":
         beside["paper_method"] = results[0].as_json()
         with count_progress("silhouettes, wide search", images) as advance:
             wide = wide_experiment_search(interval)
-            results.append(run_experiment(wide, images, seed, angles, advance))
+            results.append(run_experiment(wide, images, seed, advance))
     settled: dict[str, int] = {}
     if edges:
         with count_progress("silhouettes, edges", images) as advance:

@@ -21,6 +21,7 @@ _ROWS = {
     "leaving_the_picture": ("bodies that leave the picture", "{}"),
     "exact_inside": ("matched exactly, of those that do not", "{}"),
     "proved": ("proved the best of the grid", "{}"),
+    "budget_spent": ("proof or set ended by its time or memory", "{}"),
     "truth_in_set": ("true pose in the set of poses as good", "{}"),
     "complete_sets": ("sets that are complete", "{}"),
     "several_families": ("silhouettes with several families of poses", "{}"),

@@ -13,6 +13,7 @@ import numpy as np
 
 from drake_pose.errors import SettingsError
 from drake_pose.matching.family_search import FamilySettings, find_families, samples_at
+from drake_pose.matching.lattice_poses import LatticeLimits
 from drake_pose.matching.proof import prove_optimal
 from drake_pose.matching.result import MatchResult, View
 from drake_pose.matching.wide_body import WideBody
@@ -27,6 +28,7 @@ class ExaminationSettings:
             is not tried. An answer with J = 0 needs none.
         family_time_limit: the same of the search for all poses as good; it then answers with those
             it has, and no joint is called determined.
+        memory: of each of the two, for what it keeps; it ends as if its time were over [byte].
         families: so many families are described at most.
         tolerance: as in ``FamilySettings``.
 
@@ -36,6 +38,7 @@ class ExaminationSettings:
 
     proof_time_limit: float | None = 1.0
     family_time_limit: float | None = 2.0
+    memory: int = LatticeLimits.memory
     families: int = 32
     tolerance: float | None = None
 
@@ -49,7 +52,10 @@ class ExaminationSettings:
     def family_settings(self) -> FamilySettings:
         """Those of the search for families."""
         return FamilySettings(
-            tolerance=self.tolerance, families=self.families, time_limit=self.family_time_limit
+            tolerance=self.tolerance,
+            families=self.families,
+            time_limit=self.family_time_limit,
+            memory=self.memory,
         )
 
 
@@ -70,8 +76,8 @@ def examine(
         root_position: (3,) as the search was given it [m].
 
     Returns:
-        The result with ``proved_optimal``, ``lower_bound`` and ``pose_set``; a better pose in place
-        of the one found if the proof met one. Nothing found stays as it is.
+        The result with ``proved_optimal``, ``lower_bound``, ``budget_spent`` and ``pose_set``; a
+        better pose in place of the one found if the proof met one. Nothing found stays as it is.
 
     Raises:
         SettingsError: if the result is not of the body's grid.
@@ -83,10 +89,12 @@ def examine(
     samples = samples_at(body.sampled, result.node_values)
     if samples is None:
         raise SettingsError("the pose to be examined is not on the body's sampling grid")
-    J, lower_bound = result.J, 0.0
+    J, lower_bound, spent = result.J, 0.0, result.J > 0.0
     if J > 0.0 and settings.proof_time_limit != 0.0:
-        proof = prove_optimal(body, views, samples, J, settings.proof_time_limit)
+        limit = settings.proof_time_limit
+        proof = prove_optimal(body, views, samples, J, limit, memory=settings.memory)
         samples, J, lower_bound = proof.samples, proof.J, proof.lower_bound
+        spent = proof.budget_spent
     answer = find_families(body, views, samples, J, settings.family_settings())
     best = answer.families[0]
     J = min(J, best.J)
@@ -96,6 +104,11 @@ def examine(
         result = replace(result, q=q, X_WB=X_WB, node_values=values, J=J, E_total=J / area)
     # A complete set has all that is as good or better.
     lower_bound = J if answer.complete else min(lower_bound, J)
+    proved = lower_bound >= J
     return replace(
-        result, proved_optimal=lower_bound >= J, lower_bound=lower_bound, pose_set=answer
+        result,
+        proved_optimal=proved,
+        lower_bound=lower_bound,
+        budget_spent=answer.budget_spent or (spent and not proved),
+        pose_set=answer,
     )

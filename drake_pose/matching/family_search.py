@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,6 +32,7 @@ class FamilySettings:
         pairs: so many pairs of a partial pose and a pose of the next node are looked at.
         poses: after so many poses of nodes are drawn it answers with what it has.
         time_limit: it answers with what it has after so many seconds; None: no limit.
+        memory: as in LatticeLimits [byte].
 
     Raises:
         SettingsError: if a value is out of its range.
@@ -44,6 +45,7 @@ class FamilySettings:
     pairs: int = 1_000_000
     poses: int = 100_000
     time_limit: float | None = None
+    memory: int = LatticeLimits.memory
 
     def __post_init__(self) -> None:
         if self.tolerance is not None and not self.tolerance >= 0.0:
@@ -52,7 +54,7 @@ class FamilySettings:
             raise SettingsError(f"contour_share must be from 0 to 1, not {self.contour_share}")
         if self.time_limit is not None and not self.time_limit >= 0.0:
             raise SettingsError(f"time_limit must be 0 s or more, not {self.time_limit}")
-        for name in ("families", "states", "pairs", "poses"):
+        for name in ("families", "states", "pairs", "poses", "memory"):
             if getattr(self, name) < 1:
                 raise SettingsError(f"{name} must be 1 or more, not {getattr(self, name)}")
 
@@ -64,10 +66,12 @@ class GridPoseSet(PoseSet):
     Args:
         lattice: the poses.
         sampled: the sampled tree.
+        budget_spent: whether a limit on time or room left poses out.
     """
 
     lattice: PoseLattice
     sampled: SampledTree
+    budget_spent: bool
 
     @property
     def size(self) -> float:
@@ -112,7 +116,9 @@ def find_families(
     deadline = np.inf
     if settings.time_limit is not None:
         deadline = time.perf_counter() + settings.time_limit
-    limits = LatticeLimits(settings.states, settings.pairs, settings.poses, deadline)
+    limits = LatticeLimits(
+        settings.states, settings.pairs, settings.poses, settings.memory, deadline
+    )
     found = search_lattice(body, views, J + tolerance, limits, samples)
     lattice = found.lattice
     if lattice.best_J < J:
@@ -120,7 +126,8 @@ def find_families(
     complete = found.complete
     if lattice.size == 0.0:
         lattice, complete = single_pose(samples, J), False
-    return _describe(body.sampled, lattice, samples, tolerance, complete, settings.families)
+    described = _describe(body.sampled, lattice, samples, tolerance, complete, settings.families)
+    return replace(described, budget_spent=found.limited)
 
 
 def samples_at(sampled: SampledTree, node_values: Sequence[np.ndarray]) -> np.ndarray | None:
@@ -175,6 +182,7 @@ def _describe(
         family_count=len(families),
         lattice=lattice,
         sampled=sampled,
+        budget_spent=False,
     )
 
 

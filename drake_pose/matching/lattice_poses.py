@@ -15,8 +15,10 @@ from drake_pose.silhouette.contour_cells import CelledOutline
 # Masks of more words than these get narrower bands, but none narrower than so many pixels.
 _WORDS = 2000
 _LEAST_BAND = 8
-# For so many poses of the parent a node is drawn before the limits are looked at again.
-_DRAWN_TOGETHER = 256
+# So many poses of a node are tried before the limits are looked at again.
+_TRIED_TOGETHER = 100_000
+# The same of the discs that hold what can be reached.
+_REACHES_TOGETHER = 20_000
 
 
 @dataclass(frozen=True)
@@ -27,12 +29,16 @@ class LatticeLimits:
         states: so many partial poses are kept after each node.
         pairs: so many pairs of a partial pose and a pose of the next node are looked at.
         poses: after so many poses of nodes are drawn it stops.
+        memory: it stops before drawn poses and what they reach take more than this, and keeps fewer
+            partial poses where all would take more than a quarter of it [byte]. What it needs for a
+            moment comes on top, about as much again.
         deadline: the value of time.perf_counter() at which it stops [s].
     """
 
     states: int = 20_000
     pairs: int = 1_000_000
     poses: int = 1_000_000
+    memory: int = 400_000_000
     deadline: float = np.inf
 
 
@@ -60,21 +66,43 @@ class BoundedPoses(PoseStore):
         super().__init__(body, pictures, np.inf)
         self._outside_limit = outside_limit
         self._limits = limits
+        self._reserved = 0
 
     def _limit(self, node: int) -> float:
         return self._outside_limit
+
+    def reserve(self, size: int = 0) -> None:
+        """Notes memory that what belongs to the poses takes [byte].
+
+        Raises:
+            LimitReached: with it, there is too much, or the time is over.
+        """
+        self._reserved += size
+        used = self._reserved + self.reach_runs.nbytes + self.reach_words.nbytes
+        used += sum(stored.nbytes for stored in self.nodes)
+        if used > self._limits.memory or time.perf_counter() >= self._limits.deadline:
+            raise LimitReached
 
     def groups(self, node: int, parents: np.ndarray, hidden: np.ndarray) -> np.ndarray:
         """As PoseStore.groups; raises LimitReached where a limit is reached."""
         # The largest first: the tables grow once.
         different = np.unique(parents)[::-1]
-        for begin in range(0, len(different), _DRAWN_TOGETHER):
-            drawn = sum(len(stored.samples) for stored in self.nodes)
-            if drawn > self._limits.poses or time.perf_counter() >= self._limits.deadline:
+        together = max(1, _TRIED_TOGETHER // len(self.body.sampled.X_PN[node]))
+        for begin in range(0, len(different), together):
+            if sum(len(stored.samples) for stored in self.nodes) > self._limits.poses:
                 raise LimitReached
-            some = different[begin : begin + _DRAWN_TOGETHER]
+            self.reserve()
+            some = different[begin : begin + together]
             super().groups(node, some, np.zeros(len(some), dtype=np.bool_))
         return super().groups(node, parents, hidden)
+
+    def reach_rows(self, node: int, parents: np.ndarray) -> np.ndarray:
+        """As PoseStore.reach_rows; raises LimitReached where a limit is reached."""
+        different = np.unique(parents)[::-1]
+        for begin in range(0, len(different), _REACHES_TOGETHER):
+            self.reserve()
+            super().reach_rows(node, different[begin : begin + _REACHES_TOGETHER])
+        return super().reach_rows(node, parents)
 
 
 def make_pictures(body: WideBody, views: Sequence[View], J_limit: float) -> Pictures:

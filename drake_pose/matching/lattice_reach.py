@@ -3,7 +3,7 @@
 import numpy as np
 
 from drake_pose.matching.lattice_kernel import unite_groups
-from drake_pose.matching.wide_poses import PoseStore
+from drake_pose.matching.lattice_poses import BoundedPoses
 
 
 class SubtreeReaches:
@@ -13,12 +13,12 @@ class SubtreeReaches:
         table: (r, w) uint64 unions; the rows beyond those in use are zero.
 
     Args:
-        store: the poses; what is missing is drawn.
+        store: the poses; what is missing is drawn within its limits, in which the table counts.
         tries: so many poses of a node are tried at a time; where there are more, a disc that holds
             all that they can cover will do.
     """
 
-    def __init__(self, store: PoseStore, tries: int) -> None:
+    def __init__(self, store: BoundedPoses, tries: int) -> None:
         self.store = store
         self._tries = tries
         self._nodes = store.body.sampled.tree.nodes
@@ -87,6 +87,8 @@ class SubtreeReaches:
         rows = np.arange(self._used, self._used + count)
         self._used += count
         if self._used > len(self.table):
-            more = np.zeros((self._used, self.table.shape[1]), dtype=np.uint64)
+            shape = self._used, self.table.shape[1]
+            self.store.reserve(8 * shape[0] * shape[1])
+            more = np.zeros(shape, dtype=np.uint64)
             self.table = np.concatenate([self.table, more])
         return rows

@@ -47,12 +47,14 @@ class FoundLattice:
     Attributes:
         lattice: the poses; every one is within the limit.
         complete: whether it holds all poses within the limit.
+        limited: whether a limit of the search left some out.
         lower_bound: no pose of the grid that is not in the lattice has a smaller objective [pixel].
         states: how many partial poses were looked at.
     """
 
     lattice: PoseLattice
     complete: bool
+    limited: bool
     lower_bound: float
     states: int
 
@@ -133,6 +135,7 @@ class _LatticeSearch:
         self._keys = generator.integers(0, 2**64, 2 * words, dtype=np.uint64) | np.uint64(1)
         self._layers: list[Layer] = []
         self._complete = True
+        self._limited = False
         self._lower_bound = np.inf
         self._visited = 0
         # The state that the pose to be kept is in; -1: none.
@@ -153,10 +156,11 @@ class _LatticeSearch:
         )
         while len(self._layers) < len(self.nodes):
             try:
+                self.store.reserve()
                 states, node, pairs = self._choose(states)
+                states = self._place(states, node, pairs)
             except LimitReached:
                 return self._stop(states)
-            states = self._place(states, node, pairs)
         return self._finish(states)
 
     def _stop(self, states: _States) -> FoundLattice:
@@ -164,7 +168,7 @@ class _LatticeSearch:
         bound = min(self._lower_bound, float(states.lows.min()) if len(states) else np.inf)
         nothing = np.zeros(0, dtype=np.int64)
         layers = [Layer(i, nothing, nothing, nothing) for i in range(len(self.nodes))]
-        return FoundLattice(PoseLattice(layers, np.zeros(0)), False, bound, self._visited)
+        return FoundLattice(PoseLattice(layers, np.zeros(0)), False, True, bound, self._visited)
 
     def _finish(self, states: _States) -> FoundLattice:
         """The answer when all nodes are placed: lows are then the objectives.
@@ -177,7 +181,7 @@ class _LatticeSearch:
         if not sure:
             self._drop(states.lows[highs > self.J_limit])
         bound = min(self._lower_bound, float(np.floor(self.J_limit)) + 1.0)
-        return FoundLattice(lattice, self._complete, bound, self._visited)
+        return FoundLattice(lattice, self._complete, self._limited, bound, self._visited)
 
     def _drop(self, lows: np.ndarray) -> None:
         """Note that states with these bounds were dropped though they might lead to poses."""
@@ -360,6 +364,7 @@ class _LatticeSearch:
         kept = np.zeros(len(states), dtype=np.bool_)
         kept[order[:count]] = True
         self._drop(states.lows[~kept])
+        self._limited = True
         places = np.cumsum(kept) - 1
         if self._layers:
             last = self._layers[-1].chosen(kept[self._layers[-1].ends])
@@ -370,13 +375,16 @@ class _LatticeSearch:
 
     def _fit_states(self, made: _States, alive: np.ndarray) -> np.ndarray:
         """Which (B,) bool of the states that are alive may be kept."""
-        if alive.sum() <= self.limits.states:
+        words = int(self.pictures.part_starts[-1])
+        room = max(1, min(self.limits.states, self.limits.memory // (4 * 8 * words)))
+        if alive.sum() <= room:
             return alive
         costs = np.where(alive, made.costs, np.iinfo(np.int64).max)
         order = self._ranked(replace(made, costs=costs))
         kept = np.zeros(len(alive), dtype=np.bool_)
-        kept[order[: self.limits.states]] = True
+        kept[order[:room]] = True
         self._drop(made.lows[alive & ~kept])
+        self._limited = True
         return kept
 
     def _ranked(self, states: _States) -> np.ndarray:

@@ -26,6 +26,7 @@ class Proof:
 
     Attributes:
         proved: whether no pose of the grid has a smaller objective than J.
+        budget_spent: whether a limit on time or room ended the proof before that was settled.
         J: the smallest objective known [pixel].
         samples: (nodes,) the samples of a pose that has it.
         lower_bound: no pose of the grid has a smaller objective than this [pixel].
@@ -33,6 +34,7 @@ class Proof:
     """
 
     proved: bool
+    budget_spent: bool
     J: float
     samples: np.ndarray
     lower_bound: float
@@ -47,6 +49,7 @@ def prove_optimal(
     time_limit: float | None = None,
     states: int = 20_000,
     pairs: int = 1_000_000,
+    memory: int = LatticeLimits.memory,
 ) -> Proof:
     """Prove a pose the best of the grid, or find the best.
 
@@ -58,10 +61,11 @@ def prove_optimal(
         time_limit: it answers with what it has after so many seconds; None: no limit.
         states: so many partial poses are kept after each node; more end the proof.
         pairs: the same of pairs of a partial pose and a pose of the next node.
+        memory: as in LatticeLimits [byte].
     """
     deadline = np.inf if time_limit is None else time.perf_counter() + time_limit
-    limits = LatticeLimits(states=states, pairs=pairs, deadline=deadline)
-    best, bound, visited, J_limit = samples, 0.0, 0, 0.0
+    limits = LatticeLimits(states=states, pairs=pairs, memory=memory, deadline=deadline)
+    best, bound, visited, J_limit, spent = samples, 0.0, 0, 0.0, False
     while bound < J:
         J_limit = min(J_limit, J - 1.0)
         found = search_lattice(body, views, J_limit, limits)
@@ -70,6 +74,8 @@ def prove_optimal(
             J, best = found.lattice.best_J, found.lattice.central()
         bound = max(bound, min(J, found.lower_bound))
         if not found.complete:
+            spent = found.limited
             break
         J_limit = max(_FIRST_LIMIT, 2.0 * J_limit)
-    return Proof(bound >= J, J, best, bound, visited)
+    proved = bound >= J
+    return Proof(proved, spent and not proved, J, best, bound, visited)

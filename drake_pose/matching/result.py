@@ -82,6 +82,8 @@ class MatchResult:
         seconds: wall time of the search [s].
         proved_optimal: whether it is proved that no pose of the search's grid has a smaller J.
         lower_bound: no pose of the grid has a smaller J than this [pixel]; 0 says nothing.
+        budget_spent: whether time or memory ended the proof, or the search for poses as good,
+            before all was settled.
         pose_set: all poses found that are as good, and what is known of each joint; None if the
             search did not ask.
     """
@@ -100,6 +102,7 @@ class MatchResult:
     seconds: float
     proved_optimal: bool = False
     lower_bound: float = 0.0
+    budget_spent: bool = False
     pose_set: PoseSet | None = None
 
     def turned(self, tree: PoseTree, turns: Sequence[np.ndarray]) -> "MatchResult":

@@ -103,6 +103,12 @@ class _Poses:
     runs: np.ndarray
     words: np.ndarray
 
+    @property
+    def nbytes(self) -> int:
+        """The memory that they take [byte]."""
+        arrays = (self.samples, self.parents, self.X_WN, self.areas, self.runs, self.words)
+        return sum(array.nbytes for array in arrays)
+
 
 class PoseStore:
     """All poses of all nodes that stay inside a limit, by the pose of their parent.

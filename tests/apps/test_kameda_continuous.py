@@ -80,6 +80,22 @@ def test_another_body_has_other_measures(search):
             np.testing.assert_allclose(after, share * before, atol=1e-12)
 
 
+def test_continuous_angles_mean_the_same_with_and_without_a_number_of_cameras(monkeypatch):
+    asked = []
+
+    def run(*arguments):
+        asked.append(arguments)
+        return {}
+
+    monkeypatch.setattr("drake_pose.apps.kameda_continuous.run_beside", run)
+    monkeypatch.setattr("drake_pose.apps.kameda_continuous.print_continuous", lambda *_: None)
+    for words in ([], ["--views", "1"]):
+        arguments = ["reproduce", "kameda", "--angles", "continuous", "--images", "3", *words]
+        done = CliRunner().invoke(app, arguments)
+        assert done.exit_code == 0, done.output
+    assert asked == [(3, 0, 1, False)] * 2
+
+
 def test_the_command_prints_both_bodies():
     arguments = ["reproduce", "kameda", "--angles", "continuous", "--views", "2", "--mismatch"]
     done = CliRunner().invoke(app, [*arguments, "--images", "1", "--json"])
@@ -93,9 +109,12 @@ def test_the_command_prints_both_bodies():
 @pytest.mark.parametrize(
     ("arguments", "word"),
     [
-        (["--mismatch"], "--views"),
+        (["--mismatch"], "continuous"),
         (["--views", "2"], "continuous"),
+        (["--views", "1"], "continuous"),
         (["--views", "0", "--angles", "continuous"], "views"),
+        (["--angles", "continuous", "--method", "paper"], "lattice"),
+        (["--angles", "continuous", "--outside-limit", "200"], "lattice"),
     ],
 )
 def test_wrong_options_are_refused(arguments, word):

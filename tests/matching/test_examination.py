@@ -34,6 +34,7 @@ def test_what_is_proved_is_the_best_of_the_grid(maker: ProblemMaker) -> None:
         best = problem.best[1]
         assert result.proved_optimal
         assert result.J == result.lower_bound == best
+        assert not result.budget_spent
         samples = samples_at(maker.body.sampled, result.node_values)
         assert samples is not None
         assert tuple(samples.tolist()) in problem.within(best)
@@ -78,6 +79,7 @@ def test_without_time_nothing_is_proved_but_what_is_exact(maker: ProblemMaker) -
         result = hasty.match(problem.views)
         assert result.lower_bound <= problem.best[1] <= result.J
         assert result.proved_optimal == (result.J == 0)
+        assert result.budget_spent
         assert result.pose_set is not None
         assert not result.pose_set.complete
         assert not any(joint.determined for joint in result.pose_set.joints)

@@ -37,7 +37,9 @@ def test_proves_what_brute_force_finds(
         assert tuple(proof.samples.tolist()) in problem.within(best)
 
 
-@pytest.mark.parametrize("limit", [{"states": 2}, {"pairs": 8}, {"time_limit": 0}])
+@pytest.mark.parametrize(
+    "limit", [{"states": 2}, {"pairs": 8}, {"time_limit": 0}, {"memory": 20_000}]
+)
 def test_a_limit_leaves_a_true_bound_and_no_false_proof(
     makers: list[ProblemMaker], limit: dict[str, int]
 ) -> None:
@@ -52,6 +54,7 @@ def test_a_limit_leaves_a_true_bound_and_no_false_proof(
         best = float(problem.Js.min())
         assert proof.lower_bound <= best <= proof.J <= problem.Js[start]
         assert tuple(proof.samples.tolist()) in problem.within(proof.J)
+        assert proof.budget_spent != proof.proved
         if proof.proved:
             proved += 1
             assert proof.J == best

@@ -21,7 +21,7 @@ MAY_KNOW = {
 VALUE_TYPES = {"camera/models.py", "camera/drake.py", "silhouette/label_images.py"}
 
 # Beside the rooms, for all of them.
-FOR_ALL = {"errors", "regular_files", "yaml_files"}
+FOR_ALL = {"compiled", "errors", "regular_files", "yaml_files"}
 
 FILES = sorted(PACKAGE.rglob("*.py"))
 

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from drake_pose.body.joint_map import ChainStep
+from drake_pose.compiled import compiled, copy_into
 
 
 class PackedBand(NamedTuple):
@@ -58,7 +58,7 @@ def pack_band(
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _apply_joint(
     band: PackedBand, step: int, basis: np.ndarray, X: np.ndarray, scratch: np.ndarray
 ) -> None:
@@ -87,10 +87,10 @@ def _apply_joint(
                     for m in range(3):
                         total -= X[i, k] * joint[m, k] * joint[m, 3]
             product[i, j] = total
-    X[:] = product
+    copy_into(X, product)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _find_transform(
     band: PackedBand, values: np.ndarray, share: float, X: np.ndarray, scratch: np.ndarray
 ) -> None:
@@ -108,7 +108,7 @@ def _find_transform(
         first += band.sizes[step]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def place_band(band: PackedBand, values: np.ndarray, placed: np.ndarray) -> None:
     """Writes the vertices (n, v, 3) in the node's frame at values (n, k), both real or complex."""
     scratch = np.empty((3, 3, 4), dtype=values.dtype)

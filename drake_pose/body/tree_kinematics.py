@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from drake_pose.body.limits import nearest_turn
 from drake_pose.body.pose_tree import PoseTree
+from drake_pose.compiled import compiled
 from drake_pose.errors import SettingsError
 
 _BY_JOINTS, _FREE, _LIMITED = 0, 1, 2
@@ -220,7 +220,7 @@ def _pack_tree(tree: PoseTree) -> PackedTree:
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _joint_transform(
     packed: PackedTree, step: int, values: np.ndarray, first: int, changed: int
 ) -> np.ndarray:
@@ -255,7 +255,7 @@ def _joint_transform(
     return X
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _multiply(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     """The product of two (4, 4)."""
     C = np.zeros((4, 4))
@@ -266,7 +266,7 @@ def _multiply(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     return C
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _inverse(X: np.ndarray) -> np.ndarray:
     """The inverse of a rigid transform (4, 4)."""
     Y = np.zeros((4, 4))
@@ -278,7 +278,7 @@ def _inverse(X: np.ndarray) -> np.ndarray:
     return Y
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _write_twist(X_WA: np.ndarray, M: np.ndarray, twist: np.ndarray) -> None:
     """Writes the world's twist (6,) of a twist matrix M (4, 4) in frame A."""
     w0, w1, w2 = M[2, 1], M[0, 2], M[1, 0]
@@ -291,7 +291,7 @@ def _write_twist(X_WA: np.ndarray, M: np.ndarray, twist: np.ndarray) -> None:
     twist[5] += p0 * twist[1] - p1 * twist[0]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _cross_matrix(x: float, y: float, z: float) -> np.ndarray:
     """The twist matrix (4, 4) of a turn about the origin."""
     M = np.zeros((4, 4))
@@ -300,7 +300,7 @@ def _cross_matrix(x: float, y: float, z: float) -> np.ndarray:
     return M
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _turn_freely(X_WA: np.ndarray, r: np.ndarray, twists: np.ndarray) -> np.ndarray:
     """X_WA times the rotation of a vector (3,), and the twists (3, 6) of its components.
 
@@ -327,7 +327,7 @@ def _turn_freely(X_WA: np.ndarray, r: np.ndarray, twists: np.ndarray) -> np.ndar
     return _multiply(X_WA, X)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _turn_about_axis(X_WA: np.ndarray, axis: int, angle: float, twist: np.ndarray) -> np.ndarray:
     """X_WA times the rotation about one of its axes, and its twist (6,)."""
     e = np.zeros(3)
@@ -341,7 +341,7 @@ def _turn_about_axis(X_WA: np.ndarray, axis: int, angle: float, twist: np.ndarra
     return _multiply(X_WA, X)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def find_motions(packed: PackedTree, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns X_WN (n, 4, 4) and the twists (m, 6) of all values."""
     count = packed.parents.shape[0]

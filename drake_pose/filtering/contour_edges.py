@@ -3,15 +3,16 @@
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from drake_pose.compiled import compiled
 
 Array = NDArray[np.float64]
 
 _STEP = 0.5
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _is_inside(mask: NDArray[np.bool_], u: float, v: float) -> int:
     """1 inside of the mask, 0 outside of it, -1 beyond the picture; nearest pixel."""
     row, column = math.floor(v + 0.5), math.floor(u + 0.5)
@@ -20,7 +21,7 @@ def _is_inside(mask: NDArray[np.bool_], u: float, v: float) -> int:
     return 1 if mask[row, column] else 0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def find_edges(mask: NDArray[np.bool_], uv: Array, normals: Array, reach: float) -> Array:
     """How far the mask's edge is from points of a contour, along their normals.
 

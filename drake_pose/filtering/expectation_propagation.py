@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from drake_pose.compiled import compiled, copy_into
 from drake_pose.filtering.factors import apply_site
 from drake_pose.filtering.normal_moments import FAR, interval_moments
 
@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 _SMALLEST_REST = 1e-3
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _moments_along(mean: Array, factor: Array, direction: Array) -> tuple[float, float]:
     n, k = factor.shape
     projected = np.zeros(k)
@@ -28,7 +28,7 @@ def _moments_along(mean: Array, factor: Array, direction: Array) -> tuple[float,
     return value, (projected * projected).sum()
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def apply_sites(
     mean: Array, factor: Array, directions: Array, sites: Array, left_out: int, sign: float
 ) -> float:
@@ -44,7 +44,7 @@ def apply_sites(
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _cavity(
     base_mean: Array,
     base_factor: Array,
@@ -65,7 +65,7 @@ def _cavity(
     return _moments_along(other_mean, other_factor, directions[i])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def propagate(
     base_mean: Array,
     base_factor: Array,
@@ -135,9 +135,9 @@ def propagate(
             break
         if largest > 1e-3:
             # Rounding must not add up over steps that change much.
-            mean[:] = base_mean
-            factor[:] = base_factor
+            copy_into(mean, base_mean)
+            copy_into(factor, base_factor)
             apply_sites(mean, factor, directions, sites, -1, 1.0)
-    mean[:] = base_mean
-    factor[:] = base_factor
+    copy_into(mean, base_mean)
+    copy_into(factor, base_factor)
     return apply_sites(mean, factor, directions, sites, -1, 1.0) + corrections.sum(), sweep

@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from drake_pose.compiled import compiled
 from drake_pose.errors import SettingsError
 
 Array = NDArray[np.float64]
@@ -33,7 +33,7 @@ def check_moments(mean: ArrayLike, covariance: ArrayLike) -> tuple[Array, Array]
     return q, Q
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _symmetrise(q: Array, Q: Array) -> int:
     """Make Q (n, n) exactly symmetric, in place; says what is wrong with it, or 0."""
     for i in range(len(q)):
@@ -91,7 +91,7 @@ def is_definite(covariance: Array) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def margins_in_deviations(mean: Array, Q: Array, phi: Array, b: Array) -> tuple[Array, int]:
     """(K,) (b - phi mean) / sqrt(phi^T Q phi), infinite without variance; and what clashes.
 
@@ -119,7 +119,7 @@ def margins_in_deviations(mean: Array, Q: Array, phi: Array, b: Array) -> tuple[
     return c, beyond
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def is_inside(mean: Array, phi: Array, b: Array) -> bool:
     """Whether phi mean <= b, but for rounding."""
     for k in range(len(b)):
@@ -133,7 +133,7 @@ def is_inside(mean: Array, phi: Array, b: Array) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def outer_product(A: Array) -> Array:
     """A A^T (n, n), exactly symmetric."""
     n, m = A.shape
@@ -148,7 +148,7 @@ def outer_product(A: Array) -> Array:
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def lower_or_root(P: Array) -> Array:
     """(n, n) a root of a semidefinite P: Cholesky's with zeros where nothing is left."""
     n = P.shape[0]
@@ -184,7 +184,7 @@ def covariance_from(factor: Array, definite: bool = True) -> Array:
     return product
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def apply_site(mean: Array, factor: Array, direction: Array, tau: float, nu: float) -> float:
     """Multiply a belief by exp(-tau s^2 / 2 + nu s), s = direction^T x, in place.
 

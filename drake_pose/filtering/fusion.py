@@ -3,15 +3,15 @@
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from drake_pose.compiled import compiled
 from drake_pose.filtering.factors import lower_or_root, outer_product
 
 Array = NDArray[np.float64]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def lower_factor(S: Array) -> tuple[Array, bool]:
     """Cholesky's L (m, m) of S = L L^T, and whether S is positive definite."""
     m = S.shape[0]
@@ -30,7 +30,7 @@ def lower_factor(S: Array) -> tuple[Array, bool]:
     return L, True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def fuse(P: Array, H: Array, noise: Array, innovation: Array) -> tuple[Array, float, float, bool]:
     """A linear measurement of a normal distribution.
 
@@ -69,7 +69,7 @@ def fuse(P: Array, H: Array, noise: Array, innovation: Array) -> tuple[Array, fl
     return dual, distance, log_determinant, True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def joseph(P: Array, H: Array, noise: Array) -> tuple[Array, bool]:
     """(n, n) (I - K H) P (I - K H)^T + K R K^T: positive also where rounding is not kind."""
     n, m = P.shape[0], H.shape[0]

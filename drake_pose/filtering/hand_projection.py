@@ -3,8 +3,9 @@
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from drake_pose.compiled import compiled, copy_into
 
 Array = NDArray[np.float64]
 
@@ -18,7 +19,7 @@ POINTS, FINGER_LINES, PALM_LINES, SCALE = 2, 18, 30, 36
 MEASUREMENTS = 37
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def scaled_rotation(q: Array) -> tuple[Array, Array]:
     """The matrix |q|^2 R(q) (3, 3) of any quaternion (w, x, y, z), and its derivatives (4, 3, 3).
 
@@ -37,7 +38,7 @@ def scaled_rotation(q: Array) -> tuple[Array, Array]:
     return M, D
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _place(
     x: Array, M: Array, D: Array, p: Array, dp: Array, scale: float, out: Array, jacobian: Array
 ) -> None:
@@ -54,7 +55,7 @@ def _place(
                 jacobian[a, QUATERNION + k] += scale * D[k, a, c] * p[c]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _line(
     start: Array, end: Array, d_start: Array, d_end: Array, shortest: float, h: Array, H: Array
 ) -> None:
@@ -77,7 +78,7 @@ def _line(
         H[1, e] = cosine * d_start[1, e] - sine * d_start[0, e] - along * turn
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _finger(
     x: Array, i: int, M: Array, D: Array, scale: float, points: Array, jacobians: Array
 ) -> None:
@@ -117,7 +118,7 @@ def _finger(
         _place(x, M, D, p, dp, scale, points[4 * i + j], jacobians[4 * i + j])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _palm(x: Array, M: Array, D: Array, scale: float, points: Array, jacobians: Array) -> None:
     """Ends of the three outer edges of the palm's box: its two sides and its top."""
     width, height, thickness = x[PALM], x[PALM + 1], x[PALM + 2]
@@ -148,7 +149,7 @@ def _palm(x: Array, M: Array, D: Array, scale: float, points: Array, jacobians: 
         _place(x, M, D, p, dp, scale, points[8 + k], jacobians[8 + k])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def project_hand(x: Array, scale: float, shortest: float) -> tuple[Array, Array, Array]:
     """All features of the hand.
 
@@ -172,8 +173,8 @@ def project_hand(x: Array, scale: float, shortest: float) -> tuple[Array, Array,
         H[a, WRIST + a] = 1.0
     for k in range(8):
         row = POINTS + 2 * k
-        h[row : row + 2] = points[k]
-        H[row : row + 2] = jacobians[k]
+        copy_into(h[row : row + 2], points[k])
+        copy_into(H[row : row + 2], jacobians[k])
     for i in range(2):
         for j in range(3):
             k = 3 * i + j
@@ -206,7 +207,7 @@ def project_hand(x: Array, scale: float, shortest: float) -> tuple[Array, Array,
     return h, H, points
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def mirror_changes(x: Array, reach: Array, slope: float) -> Array:
     """What to add to each flexion so that its segment looks the same, mirrored in depth.
 

@@ -3,7 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
+
+from drake_pose.compiled import compiled
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
 # The density is followed down to exp(-40) of its largest value: 4e-18.
@@ -13,7 +14,7 @@ FAR = 9.0
 _HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def interval_moments(lower: float, upper: float) -> tuple[float, float, float]:
     """Moments of a standard normal variable, given that it lies between two bounds.
 

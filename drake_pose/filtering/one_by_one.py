@@ -3,15 +3,15 @@
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from drake_pose.compiled import compiled
 from drake_pose.filtering.normal_moments import interval_moments
 
 Array = NDArray[np.float64]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def cut_one_by_one(
     mean: Array, factor: Array, phi: Array, b: Array, skip_above: float, c: Array
 ) -> float:

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from drake_pose.compiled import compiled
 from drake_pose.errors import SettingsError
 from drake_pose.matching.scoring import Scoring
 from drake_pose.matching.wide_drawing import draw_node
@@ -146,7 +146,7 @@ class _Looks:
         return _Looks(self.masks[kept], self.areas[kept], self.hidden[kept])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _find_hidden(masks: np.ndarray, far: np.ndarray) -> np.ndarray:
     """Which nodes (n, nodes) bool add nothing to what the others of their pose cover.
 
@@ -167,7 +167,7 @@ def _find_hidden(masks: np.ndarray, far: np.ndarray) -> np.ndarray:
     return hidden
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _find_different(
     masks: np.ndarray, areas: np.ndarray, hidden: np.ndarray, known: int, count: int, alike: float
 ) -> np.ndarray:
@@ -176,7 +176,8 @@ def _find_different(
     The first ``known`` are known to be different.
     """
     chosen = np.empty(count, dtype=np.int64)
-    chosen[:known] = np.arange(known)
+    for i in range(known):
+        chosen[i] = i
     found = known
     for i in range(known, masks.shape[0]):
         if found == count:

@@ -8,15 +8,15 @@ state, known by a hash of 64 bits.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from drake_pose.compiled import compiled
 from drake_pose.matching.wide_kernel import Reaches, count_bits, count_unreachable, mix_bits
 
 _LOW_HALF = np.uint64(0xFFFFFFFF)
 _HALF = np.uint64(32)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def tell_apart(
     masks: np.ndarray,
     poses: np.ndarray,
@@ -85,7 +85,7 @@ def tell_apart(
     return numbers, firsts[:count].copy(), codes[:count].copy()
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _write_union(
     mask: np.ndarray, runs: np.ndarray, words: np.ndarray, pose: int, union: np.ndarray
 ) -> None:
@@ -98,7 +98,7 @@ def _write_union(
             union[begin + k] |= words[place + k]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def bound_pairs(
     masks: np.ndarray,
     poses: np.ndarray,
@@ -141,7 +141,7 @@ def bound_pairs(
     return areas
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def unite_pairs(
     masks: np.ndarray, pairs: np.ndarray, runs: np.ndarray, words: np.ndarray
 ) -> np.ndarray:
@@ -152,7 +152,7 @@ def unite_pairs(
     return united
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def unite_groups(
     groups: np.ndarray,
     runs: np.ndarray,
@@ -183,7 +183,7 @@ def unite_groups(
                     union[k] |= below[k]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def sift_pairs(
     rests: np.ndarray,
     room: np.ndarray,
@@ -237,7 +237,7 @@ def sift_pairs(
     return good
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def find_rests(
     masks: np.ndarray, everything: np.ndarray, rows: np.ndarray, table: np.ndarray
 ) -> np.ndarray:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from drake_pose.body.tree_kinematics import Motions
 from drake_pose.camera import Camera
+from drake_pose.compiled import compiled
 from drake_pose.silhouette.contour_points import ContourPoints
 
 
@@ -66,7 +66,7 @@ def normal_jacobian(points: ContourPoints, motions: Motions, camera: Camera) -> 
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def picture_rows(p_W: np.ndarray, X_CW: np.ndarray, camera: np.ndarray, rows: np.ndarray) -> None:
     """Writes du/dp_W and dv/dp_W (2, 3) of a point."""
     x, y, z = X_CW[0, 3], X_CW[1, 3], X_CW[2, 3]
@@ -83,7 +83,7 @@ def picture_rows(p_W: np.ndarray, X_CW: np.ndarray, camera: np.ndarray, rows: np
             rows[1, k] = camera[2] * (X_CW[1, k] - X_CW[2, k] * y / z) / z
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def speed_along(row: np.ndarray, p: np.ndarray, twist: np.ndarray) -> float:
     """The speed of a point (3,) along a row (3,)."""
     s = twist[6]
@@ -94,7 +94,7 @@ def speed_along(row: np.ndarray, p: np.ndarray, twist: np.ndarray) -> float:
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _image_jacobian(
     p_W: np.ndarray,
     nodes: np.ndarray,
@@ -115,7 +115,7 @@ def _image_jacobian(
     return J
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _normal_jacobian(
     p_W: np.ndarray,
     nodes: np.ndarray,

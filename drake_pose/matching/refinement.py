@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from drake_pose.compiled import compiled
 from drake_pose.errors import SettingsError
 from drake_pose.matching.refinement_body import Freedom
 from drake_pose.matching.refinement_lines import Border
@@ -116,7 +116,7 @@ def descend(
     return parameters, least, steps
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def limited_step(
     H: np.ndarray,
     g: np.ndarray,
@@ -150,7 +150,7 @@ def limited_step(
     return step
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _solve(H: np.ndarray, g: np.ndarray, active: np.ndarray, damping: float) -> np.ndarray:
     """Solves the damped equations of some parameters (n,) by Cholesky's decomposition."""
     count = len(active)

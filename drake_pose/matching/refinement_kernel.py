@@ -10,8 +10,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from drake_pose.compiled import compiled
 from drake_pose.matching.pose_jacobian import picture_rows, speed_along
 from drake_pose.matching.refinement_lines import Border, compare_line, pixels_apart
 from drake_pose.silhouette.contour_body import ContourBody, find_body_segments
@@ -36,7 +36,7 @@ class Movements(NamedTuple):
     moved: np.ndarray
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def write_row(
     body: ContourBody,
     segments: Segments,
@@ -82,7 +82,7 @@ def write_row(
         row[k - begin] = follows * speed if movements.own[k] else speed
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def unite_spans(
     segments: Segments,
     across: int,
@@ -132,7 +132,7 @@ def unite_spans(
     return count
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _place_in_camera(X_CW: np.ndarray, X_WS: np.ndarray) -> np.ndarray:
     """X_CS (surfaces, 4, 4)."""
     X_CS = np.zeros_like(X_WS)
@@ -144,7 +144,7 @@ def _place_in_camera(X_CW: np.ndarray, X_WS: np.ndarray) -> np.ndarray:
     return X_CS
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def add_normal_equations(
     body: ContourBody,
     still: Border,
@@ -241,7 +241,7 @@ def add_normal_equations(
     return stride * apart, total, squares
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def find_contour_border(
     body: ContourBody,
     X_CW: np.ndarray,
@@ -286,7 +286,7 @@ def find_contour_border(
     return Border(row_starts, row_places, borders[1][0], borders[1][1], row_apart)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def count_apart(
     body: ContourBody, X_CW: np.ndarray, X_WS: np.ndarray, camera: np.ndarray, border: Border
 ) -> int:

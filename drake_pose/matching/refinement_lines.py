@@ -13,7 +13,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from drake_pose.compiled import compiled
 
 _FAR = 1e9
 
@@ -41,7 +42,7 @@ def find_border(mask: np.ndarray) -> Border:
     return Border(rows, row_places, columns, column_places, np.zeros(len(mask)))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _find_changes(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where the lines of pixels (n, m) change between 0 and 1: Border's starts and places."""
     starts = np.zeros(pixels.shape[0] + 1, dtype=np.int64)
@@ -61,7 +62,7 @@ def _find_changes(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return starts, places[:count].copy()
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _nearest(place: float, places: np.ndarray, first: int, end: int) -> float:
     """The signed distance from the nearest of every second place; _FAR where there is none."""
     best = _FAR
@@ -72,7 +73,7 @@ def _nearest(place: float, places: np.ndarray, first: int, end: int) -> float:
     return best
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def pixels_apart(
     places: np.ndarray, count: int, border: np.ndarray, first: int, end: int, width: int
 ) -> float:
@@ -101,7 +102,7 @@ def pixels_apart(
     return length
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def compare_line(
     places: np.ndarray,
     slopes: np.ndarray,
@@ -146,7 +147,7 @@ def compare_line(
             residuals[nearest] += weight * residual
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def clear_spans(border: Border, stride: int, free: np.ndarray) -> None:
     """Clears what a body covers from a picture of every so many rows and columns (h, w) bool.
 
@@ -164,7 +165,7 @@ def clear_spans(border: Border, stride: int, free: np.ndarray) -> None:
                 free[row, column] = False
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def add_apart_near(
     body: Border, border: Border, discs: np.ndarray, stride: int, areas: np.ndarray
 ) -> None:

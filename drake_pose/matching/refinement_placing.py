@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from drake_pose.body.skin_kernel import PackedBand, place_band
 from drake_pose.body.skin_motion import NodeSkin
 from drake_pose.body.tree_kinematics import PackedTree, find_motions
+from drake_pose.compiled import compiled, copy_into
 from drake_pose.silhouette.contour_body import move_surface
 
 
@@ -85,7 +85,7 @@ def pack_bands(skins: Mapping[int, NodeSkin], columns: Sequence[np.ndarray]) -> 
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def place_nodes(surfaces: Surfaces, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Poses X_WN (nodes, 4, 4), scaled where the body has grown, and twists (m + 4, 7).
 
@@ -96,7 +96,7 @@ def place_nodes(surfaces: Surfaces, parameters: np.ndarray) -> tuple[np.ndarray,
     count = parameters.shape[0] - 4
     X_WN, turns = find_motions(surfaces.tree, parameters[:count])
     twists = np.zeros((count + 4, 7))
-    twists[:count, :6] = turns
+    copy_into(twists, turns)
     size = np.exp(parameters[count + 3])
     p_WR = X_WN[0, :3, 3].copy()
     shift = parameters[count : count + 3]
@@ -120,7 +120,7 @@ def place_nodes(surfaces: Surfaces, parameters: np.ndarray) -> tuple[np.ndarray,
     return X_WN, twists
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def place_surfaces(
     surfaces: Surfaces,
     parameters: np.ndarray,

@@ -10,7 +10,8 @@ r^2 / (r^2 + c^2), with c the scale.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from drake_pose.compiled import compiled
 
 # Contours correspond only where their normals point alike: at least this cosine.
 _ALIKE = 0.2
@@ -18,7 +19,7 @@ _ALIKE = 0.2
 _NEAR = 2.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def add_body_contour(
     distances: np.ndarray,
     uv: np.ndarray,
@@ -70,7 +71,7 @@ def add_body_contour(
     return cost
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def add_silhouette_edge(
     edge: np.ndarray,
     edge_normals: np.ndarray,
@@ -117,7 +118,7 @@ def add_silhouette_edge(
     return cost
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@compiled(inline="always")
 def _add(H: np.ndarray, g: np.ndarray, row: np.ndarray, weight: float, r: float) -> None:
     """Adds one weighted residual and its derivatives."""
     for m in range(row.shape[0]):

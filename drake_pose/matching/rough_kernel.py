@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from drake_pose.compiled import compiled
 from drake_pose.matching.wide_kernel import count_bits
 
 
@@ -49,7 +49,7 @@ class Balls(NamedTuple):
     areas: np.ndarray
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def fill_cover(
     cover: np.ndarray, points: np.ndarray, origin: np.ndarray, cell: float, radii: np.ndarray
 ) -> None:
@@ -65,7 +65,7 @@ def fill_cover(
                         cover[level, i, j, p // 64] |= np.uint64(1) << np.uint64(p % 64)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _look_at_ball(
     view: RoughView, X_CP: np.ndarray, balls: Balls, sample: int, ball: int, covered: np.ndarray
 ) -> float:
@@ -97,7 +97,7 @@ def _look_at_ball(
     return cost
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def score_samples(
     view: RoughView,
     X_CP: np.ndarray,
@@ -129,7 +129,7 @@ def score_samples(
             scores[h, sample] += outside_weight * cost - gain * view.point_area
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def unite_pairs(
     view: RoughView, X_CP: np.ndarray, balls: Balls, masks: np.ndarray, pairs: np.ndarray
 ) -> np.ndarray:

@@ -1,8 +1,8 @@
 """Nodes drawn as bits at poses of one's own choice, whole rows of a mask at once."""
 
 import numpy as np
-from numba import njit
 
+from drake_pose.compiled import compiled
 from drake_pose.matching.wide_kernel import unite_masks
 from drake_pose.matching.wide_poses import Pictures
 from drake_pose.silhouette.bit_kernel import draw_bits
@@ -37,7 +37,7 @@ def draw_node(
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _spread_runs(masks: np.ndarray, runs: np.ndarray, words: np.ndarray) -> None:
     """Write each row's runs (n, K, 3) into masks (n, W)."""
     for i in range(masks.shape[0]):

@@ -10,8 +10,10 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
+
+from drake_pose.compiled import compiled
 
 _LOW_HALF = np.uint64(0xFFFFFFFF)
 _HALF = np.uint64(32)
@@ -29,7 +31,7 @@ def _count_bits(typing_context: Any, word: types.Type) -> Any:
 count_bits: Any = intrinsic(_count_bits)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def score_pairs(
     masks: np.ndarray,
     first: np.ndarray,
@@ -83,35 +85,40 @@ def score_pairs(
     return pairs[:count], gains[:count], losses[:count]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
 def order_best(costs: np.ndarray, count: int) -> np.ndarray:
     """The indices of the smallest costs (n,) int64, smallest first, equals in their order.
 
     All of them if there are ``count`` or fewer, else the best ``count``.
     """
-    lowest, highest = costs.min(), costs.max()
+    lowest, highest = int(costs.min()), int(costs.max())
     if costs.shape[0] > count and highest - lowest < 1 << 22:
-        numbers = np.zeros(highest - lowest + 2, dtype=np.int64)
-        for cost in costs:
-            numbers[cost - lowest + 1] += 1
-        total, limit = 0, highest
-        for step in range(1, numbers.shape[0]):
-            total += numbers[step]
-            numbers[step] += numbers[step - 1]
-            if total >= count:
-                limit = lowest + step - 1
-                break
-        chosen = np.empty(total, dtype=np.int64)
-        for i in range(costs.shape[0]):
-            if costs[i] <= limit:
-                step = costs[i] - lowest
-                chosen[numbers[step]] = i
-                numbers[step] += 1
-        return chosen[:count]
-    return np.argsort(costs, kind="mergesort")[:count]
+        return _order_by_counting(costs, lowest, highest, count)
+    return np.argsort(costs, kind="stable")[:count]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
+def _order_by_counting(costs: np.ndarray, lowest: int, highest: int, count: int) -> np.ndarray:
+    """As order_best, where the costs lie so close that each may have a counter."""
+    numbers = np.zeros(highest - lowest + 2, dtype=np.int64)
+    for cost in costs:
+        numbers[cost - lowest + 1] += 1
+    total, limit = 0, highest
+    for step in range(1, numbers.shape[0]):
+        total += numbers[step]
+        numbers[step] += numbers[step - 1]
+        if total >= count:
+            limit = lowest + step - 1
+            break
+    chosen = np.empty(total, dtype=np.int64)
+    for i in range(costs.shape[0]):
+        if costs[i] <= limit:
+            step = costs[i] - lowest
+            chosen[numbers[step]] = i
+            numbers[step] += 1
+    return chosen[:count]
+
+
+@compiled
 def mix_bits(number: np.uint64) -> np.uint64:
     """A number scattered over all 64 bits (splitmix64)."""
     number = number + np.uint64(0x9E3779B97F4A7C15)
@@ -120,7 +127,7 @@ def mix_bits(number: np.uint64) -> np.uint64:
     return number ^ (number >> np.uint64(31))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _find_likeness(
     poses: np.ndarray, code: np.uint64, node: int, pose: int, open_nodes: np.ndarray
 ) -> np.uint64:
@@ -131,7 +138,7 @@ def _find_likeness(
     return code | np.uint64(1)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _is_new(table: np.ndarray, likeness: np.uint64) -> bool:
     """Whether a number is not in a hash table yet (0: an empty slot); it is then."""
     last = table.shape[0] - 1
@@ -144,7 +151,7 @@ def _is_new(table: np.ndarray, likeness: np.uint64) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _add_hash(mask: np.ndarray, runs: np.ndarray, words: np.ndarray, keys: np.ndarray) -> np.uint64:
     """What the pixels of a pose (runs (K, 3)) that are not in a mask (W,) add to its hash."""
     code = np.uint64(0)
@@ -157,7 +164,7 @@ def _add_hash(mask: np.ndarray, runs: np.ndarray, words: np.ndarray, keys: np.nd
     return code
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _is_part(mask: np.ndarray, other: np.ndarray) -> bool:
     """Whether one mask (W,) is a part of another."""
     k = 0
@@ -180,7 +187,7 @@ class Reaches(NamedTuple):
     rows: np.ndarray
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def count_unreachable(
     mask: np.ndarray, poses: np.ndarray, everything: np.ndarray, reaches: Reaches, rest: np.ndarray
 ) -> np.int64:
@@ -207,7 +214,7 @@ def count_unreachable(
     return np.int64(count)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def grow_hypotheses(
     masks: np.ndarray,
     poses: np.ndarray,
@@ -293,7 +300,7 @@ def grow_hypotheses(
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def find_hidden(
     masks: np.ndarray, rows: np.ndarray, runs: np.ndarray, words: np.ndarray
 ) -> np.ndarray:
@@ -311,7 +318,7 @@ def find_hidden(
     return hidden
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def unite_masks(base: np.ndarray, pose_runs: np.ndarray, words: np.ndarray) -> None:
     """Add the pixels of poses, given by their runs (n, K, 3), to a mask (W,), in place."""
     for c in range(pose_runs.shape[0]):
@@ -321,7 +328,7 @@ def unite_masks(base: np.ndarray, pose_runs: np.ndarray, words: np.ndarray) -> N
                 base[begin + k] |= words[place + k]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def hash_mask(mask: np.ndarray, keys: np.ndarray) -> np.uint64:
     """The hash of a mask (W,)."""
     code = np.uint64(0)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from drake_pose.compiled import compiled
 from drake_pose.multiview.skeleton import Limb, Skeleton
 
 Array = NDArray[np.float64]
@@ -148,7 +148,7 @@ def unlocked(limb: Limb, angles: Array) -> Array:
     return np.array([*angles[:3], bend])
 
 
-@njit(cache=True, nogil=True)
+@compiled(error_model="python")
 def reach(
     R_start: Array,
     p_start: Array,
@@ -213,7 +213,7 @@ def reach(
     return angles, distance
 
 
-@njit(cache=True, nogil=True)
+@compiled(error_model="python")
 def _walk_chain(
     R_start: Array,
     p_start: Array,
@@ -245,7 +245,7 @@ def _walk_chain(
         tip[r] += R[r, 0] * end[0] + R[r, 1] * end[1] + R[r, 2] * end[2]
 
 
-@njit(cache=True, nogil=True)
+@compiled(error_model="python")
 def _fill_jacobian(
     turning: Array, places: Array, tip: Array, free: NDArray[np.bool_], J: Array
 ) -> None:
@@ -257,7 +257,7 @@ def _fill_jacobian(
             J[k, r] = turning[k, u] * arm_v - turning[k, v] * arm_u if free[k] else 0.0
 
 
-@njit(cache=True, nogil=True)
+@compiled(error_model="python")
 def _solve_damped(J: Array, gap: Array, pull: Array) -> None:
     """Fills in pull (3,) = (J^T J + damping)^-1 gap, J (n, 3), by Cramer's rule."""
     A = np.zeros((3, 3))

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from drake_pose.camera import Camera
+from drake_pose.compiled import compiled
 from drake_pose.silhouette import Outline, draw_mask
 
 Array = NDArray[np.float64]
@@ -64,7 +64,7 @@ def score_places(
     return total / len(cameras)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _score(samples: Array, weights: Array, camera: Array, X_CW: Array, worth: Worth) -> Array:
     """score_places for one camera."""
     height, width = worth.shape

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from drake_pose.camera import Camera
+from drake_pose.compiled import compiled
 from drake_pose.multiview.skeleton import Limb, rotation
 
 Array = NDArray[np.float64]
@@ -162,7 +162,7 @@ def correlation(samples: Array, cameras: Sequence[Camera], regions: Sequence[Mas
     return total / max(1, seers)
 
 
-@njit(cache=True, nogil=True)
+@compiled(error_model="python")
 def _inside_share(samples: Array, camera: Array, X_CW: Array, region: Mask) -> Array:
     """(n,) share of points (n, m, 3) in the picture that lie inside the region (H, W)."""
     shares = np.zeros(samples.shape[0])

@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from drake_pose.compiled import compiled
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -56,7 +57,7 @@ def find_edge_points(region: Mask, spacing: float) -> EdgePoints:
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _sample(
     pixels: NDArray[np.int32], starts: NDArray[np.int64], spacing: float, width: int, height: int
 ) -> tuple[Array, Array, Array]:

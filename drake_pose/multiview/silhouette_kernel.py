@@ -14,9 +14,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from drake_pose.compiled import compiled
 from drake_pose.matching.pose_jacobian import picture_rows
 from drake_pose.silhouette.contour_points import sample_contour
 from drake_pose.silhouette.contour_segments import find_segments
@@ -30,7 +30,7 @@ Mask = NDArray[np.bool_]
 _ALIKE = 0.3
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def nearest_alike(
     uv: Array, normals: Array, edge_uv: Array, edge_normals: Array, reach: float
 ) -> tuple[Indices, Indices]:
@@ -69,7 +69,7 @@ def nearest_alike(
     return of_point, of_edge
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def compare_contours(
     packed: PackedOutlines,
     X_WN: Array,
@@ -117,7 +117,7 @@ def compare_contours(
         _add_camera(contour, edge, X_WN, camera, weights[c], reach, A[c], b[c], agreement)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _add_camera(
     contour: tuple[Array, Array, Array, Indices, Array, Mask],
     edge: tuple[Array, Array, Array],
@@ -170,7 +170,7 @@ def _add_camera(
                 A[node, k, c] += share * w[c]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def collect(
     A: Array, b: Array, motions: Array, starts: Indices, owners: Indices, parameters: Indices,
     size: int,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from drake_pose.compiled import compiled
 from drake_pose.silhouette.kernel import (
     _FIRST_CAPACITY,
     _add_areas,
@@ -16,7 +16,7 @@ from drake_pose.silhouette.kernel import (
 from drake_pose.silhouette.outline import PackedOutlines
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def own_copy(packed: PackedOutlines) -> PackedOutlines:
     """Returns surfaces whose points, planes and balls may be changed."""
     return PackedOutlines(
@@ -31,7 +31,7 @@ def own_copy(packed: PackedOutlines) -> PackedOutlines:
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def bend(own: PackedOutlines, part: np.ndarray, band: np.ndarray) -> None:
     """Puts the vertices of one surface's band at other places.
 
@@ -65,7 +65,7 @@ def bend(own: PackedOutlines, part: np.ndarray, band: np.ndarray) -> None:
         planes[3, t] = nx * x + ny * y + nz * z
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def score_bent(
     packed: PackedOutlines,
     parts: np.ndarray,

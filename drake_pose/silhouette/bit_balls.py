@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from drake_pose.compiled import compiled
 from drake_pose.silhouette.bit_kernel import multiply, write_runs
 from drake_pose.silhouette.bit_view import WORD, BitView
 
 _WIDTH_LIMIT = 32768
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def sift_by_balls(
     view: BitView,
     X_WP: np.ndarray,
@@ -71,7 +71,7 @@ def sift_by_balls(
     return left
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _disc_leaves(
     nearest: np.ndarray, window: np.ndarray, u: float, v: float, radius: float
 ) -> bool:
@@ -85,7 +85,7 @@ def _disc_leaves(
     return (u - column) ** 2 + (v - row) ** 2 < radius * radius and radius > 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _square_outside(
     sums: np.ndarray, window: np.ndarray, camera: np.ndarray, u: float, v: float, half: float
 ) -> int:
@@ -102,7 +102,7 @@ def _square_outside(
     return area - (sums[d, b] - sums[c, b] - sums[d, a] + sums[c, a])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def draw_discs(
     view: BitView, X_WP: np.ndarray, p_PB: np.ndarray, radius: float
 ) -> tuple[np.ndarray, np.ndarray]:

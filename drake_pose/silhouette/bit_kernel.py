@@ -10,8 +10,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from drake_pose.compiled import compiled, with_room
 from drake_pose.silhouette.bending_kernel import bend, own_copy
 from drake_pose.silhouette.bit_view import WORD, BitView
 from drake_pose.silhouette.contour_cells import CelledOutline, find_cell
@@ -47,7 +47,7 @@ class _Scratch(NamedTuple):
     lasts: np.ndarray
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _make_scratch(edges: int) -> _Scratch:
     """Returns room for a surface of so many edges."""
     return _Scratch(
@@ -59,7 +59,7 @@ def _make_scratch(edges: int) -> _Scratch:
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def multiply(X_AB: np.ndarray, X_BC: np.ndarray, X_AC: np.ndarray) -> None:
     """Writes the upper three rows of X_AB X_BC."""
     for i in range(3):
@@ -70,7 +70,7 @@ def multiply(X_AB: np.ndarray, X_BC: np.ndarray, X_AC: np.ndarray) -> None:
             X_AC[i, j] = total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def draw_bits(
     celled: CelledOutline,
     view: BitView,
@@ -131,9 +131,7 @@ def draw_bits(
         if count < 0:
             continue
         if words.shape[0] < used + inside_size + band_size:
-            wider = np.empty(2 * words.shape[0] + inside_size + band_size, dtype=np.uint64)
-            wider[:used] = words[:used]
-            words = wider
+            words = with_room(words, used, 2 * words.shape[0] + inside_size + band_size)
         used = write_runs(view.inside, view.window, spans, count, words, used, runs[found, 0])
         if band_size:
             used = write_runs(view.band, view.window, spans, count, words, used, runs[found, 1])
@@ -144,7 +142,7 @@ def draw_bits(
     return kept, areas[:found].copy(), runs[:found].copy(), words[:used].copy()
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _fill_celled(
     celled: CelledOutline,
     X_CN: np.ndarray,
@@ -185,7 +183,7 @@ def _fill_celled(
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _add_band(
     band: PackedOutlines, X_CN: np.ndarray, camera: np.ndarray, crossings: np.ndarray, work: _Work
 ) -> bool:
@@ -206,7 +204,7 @@ def _add_band(
     return possible
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _picture_rows(X: np.ndarray, camera: np.ndarray) -> np.ndarray:
     """Returns (3, 4): a point's u and v [pixel], before the division by the third of a pinhole."""
     rows = np.empty((3, 4))
@@ -218,7 +216,7 @@ def _picture_rows(X: np.ndarray, camera: np.ndarray) -> np.ndarray:
     return rows
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _walk_cell(
     celled: CelledOutline,
     begin: int,
@@ -294,7 +292,7 @@ def _walk_cell(
     reach[0], reach[1] = lowest, highest
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _gather_spans(
     view: BitView,
     crossings: np.ndarray,
@@ -317,9 +315,7 @@ def _gather_spans(
     for row in range(work.reach[0], work.reach[1]):
         number = _find_spans(row, crossings, work.counts, work.changes, work.spans)
         if count + number > spans.shape[0]:
-            wider = np.empty((2 * spans.shape[0] + number, 3), dtype=np.int32)
-            wider[:count] = spans[:count]
-            spans = wider
+            spans = with_room(spans, count, 2 * spans.shape[0] + number)
         for k in range(number):
             a, b = work.spans[k, 0], work.spans[k, 1]
             total += b - a
@@ -341,7 +337,7 @@ def _gather_spans(
     return count, spans
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def write_runs(
     numbers: np.ndarray,
     window: np.ndarray,

@@ -10,7 +10,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from drake_pose.compiled import compiled
 
 WORD = 64
 _FAR = 1 << 14
@@ -71,7 +72,7 @@ def make_bit_view(
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _number_pixels(mask: np.ndarray) -> np.ndarray:
     """Returns (h, w + 1) int32: how many pixels of a mask (h, w) uint8 come before each."""
     numbers = np.empty((mask.shape[0], mask.shape[1] + 1), dtype=np.int32)
@@ -84,7 +85,7 @@ def _number_pixels(mask: np.ndarray) -> np.ndarray:
     return numbers
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _sum_corners(mask: np.ndarray) -> np.ndarray:
     """Returns (h + 1, w + 1) int32: the pixels of a mask (h, w) above and left of each corner."""
     sums = np.zeros((mask.shape[0] + 1, mask.shape[1] + 1), dtype=np.int32)
@@ -96,7 +97,7 @@ def _sum_corners(mask: np.ndarray) -> np.ndarray:
     return sums
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _widen(mask: np.ndarray, distance: int) -> np.ndarray:
     """Returns the pixels (h, w) uint8 within a distance of a mask, along rows and columns."""
     height, width = mask.shape
@@ -128,7 +129,7 @@ def _widen(mask: np.ndarray, distance: int) -> np.ndarray:
     return result
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _find_nearest(mask: np.ndarray, top: int, left: int) -> np.ndarray:
     """Returns BitView.nearest of a mask (h, w) uint8: first along columns, then along rows.
 

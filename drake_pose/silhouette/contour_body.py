@@ -7,9 +7,9 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from drake_pose.camera import Camera, ParallelCamera
+from drake_pose.compiled import compiled, copy_into, with_room
 from drake_pose.silhouette.contour_cells import CelledOutline, divide_outline, find_cell
 from drake_pose.silhouette.contour_segments import Segments
 from drake_pose.silhouette.outline import Outline
@@ -118,7 +118,7 @@ def _stack(parts: Sequence[np.ndarray], columns: int, dtype: type) -> np.ndarray
     return np.ascontiguousarray(np.vstack([np.empty((0, columns), dtype), *parts]), dtype=dtype)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def move_surface(
     points: np.ndarray, planes: np.ndarray, triangles: np.ndarray, vertices: np.ndarray
 ) -> None:
@@ -129,7 +129,7 @@ def move_surface(
         triangles: (t, 3) the surface's.
         vertices: (v, 3) [m], in the surface's frame.
     """
-    points[: vertices.shape[0]] = vertices
+    copy_into(points, vertices)
     for t in range(triangles.shape[0]):
         a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
         planes[t, 3] = 0.0
@@ -140,7 +140,7 @@ def move_surface(
             planes[t, 3] += planes[t, i] * vertices[a, i]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@compiled(inline="always")
 def _facing(
     planes: np.ndarray, t: int, eye_x: float, eye_y: float, eye_z: float, near: float
 ) -> int:
@@ -150,7 +150,7 @@ def _facing(
     return int(side > 0.0) - int(side < 0.0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _find_eye(X: np.ndarray, camera: np.ndarray, eye: np.ndarray) -> None:
     """Writes where the camera is in a surface's frame, as _facing takes it."""
     if camera[0] == 1.0:
@@ -162,7 +162,7 @@ def _find_eye(X: np.ndarray, camera: np.ndarray, eye: np.ndarray) -> None:
     eye[3] = 1.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def find_body_segments(
     body: ContourBody, X_CN: np.ndarray, camera: np.ndarray, wanted: np.ndarray
 ) -> Segments:
@@ -217,7 +217,8 @@ def find_body_segments(
                 continue
             if count == capacity:
                 capacity *= 2
-                ends, depths, labels = _more(ends), _more(depths), _more(labels)
+                ends, depths = with_room(ends, count, capacity), with_room(depths, count, capacity)
+                labels = with_room(labels, count, capacity)
             ends[count, 0], ends[count, 1] = uvz[0, 0], uvz[0, 1]
             ends[count, 2], ends[count, 3] = uvz[1, 0], uvz[1, 1]
             depths[count, 0], depths[count, 1] = uvz[0, 2], uvz[1, 2]
@@ -227,11 +228,3 @@ def find_body_segments(
     return Segments(
         ends[:count], depths[:count], labels[:count, 0], labels[:count, 1], labels[:count, 2:]
     )
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _more(array: np.ndarray) -> np.ndarray:
-    """The rows of an array (n, k), and as much room again."""
-    wider = np.empty((2 * array.shape[0], array.shape[1]), dtype=array.dtype)
-    wider[: array.shape[0]] = array
-    return wider

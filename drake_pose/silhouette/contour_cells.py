@@ -13,9 +13,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from drake_pose.body import TriangleMesh
+from drake_pose.compiled import compiled, with_room
 from drake_pose.silhouette.bending import BendingOutline
 from drake_pose.silhouette.outline import Outline, PackedOutlines, outline_from_mesh, pack
 
@@ -88,7 +88,7 @@ def divide_outline(
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def find_cell(x: float, y: float, z: float) -> int:
     """Returns the cell of a direction (of any length but 0)."""
     ax, ay, az = abs(x), abs(y), abs(z)
@@ -104,7 +104,7 @@ def find_cell(x: float, y: float, z: float) -> int:
     return (face * _CELLS_A_SIDE + row) * _CELLS_A_SIDE + column
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _cell_direction(face: int, s: float, t: float) -> np.ndarray:
     """Returns the unit direction (3,) of a point (s, t) of a face."""
     direction = np.ones(3)
@@ -113,7 +113,7 @@ def _cell_direction(face: int, s: float, t: float) -> np.ndarray:
     return direction / np.sqrt((direction**2).sum())
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _find_cell_edges(
     packed: PackedOutlines, side: int, spread: float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -140,9 +140,7 @@ def _find_cell_edges(
             sure = abs(height) > limit * lengths[i]
             facings[i] = 0 if not sure else (1 if height > 0.0 else -1)
         if count + edges.shape[1] > found.shape[0]:
-            wider = np.empty(2 * found.shape[0], dtype=np.int32)
-            wider[:count] = found[:count]
-            found = wider
+            found = with_room(found, count, 2 * found.shape[0])
         for e in range(edges.shape[1]):
             one, other = facings[edges[2, e]], facings[edges[3, e]]
             # An edge of one triangle, or of two that run the same way, is always a contour.

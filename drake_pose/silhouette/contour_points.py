@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from drake_pose.camera import Camera
+from drake_pose.compiled import compiled
 from drake_pose.errors import SettingsError
 from drake_pose.silhouette.contour_segments import (
     Segments,
@@ -74,7 +74,7 @@ def find_contour_points(
     return ContourPoints(*sample_contour(packed, segments, parameters, 0.0, spacing, True))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def sample_contour(
     packed: PackedOutlines,
     segments: Segments,

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from drake_pose.compiled import compiled, with_room
 from drake_pose.silhouette.eye import eye_in_node
 from drake_pose.silhouette.outline import PackedOutlines
 
@@ -29,7 +29,7 @@ class Segments(NamedTuple):
     vertices: np.ndarray
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _project_node(
     packed: PackedOutlines, node: int, X: np.ndarray, camera: np.ndarray, uvz: np.ndarray
 ) -> None:
@@ -51,7 +51,7 @@ def _project_node(
         uvz[2, i] = depth
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _find_facings(
     packed: PackedOutlines,
     node: int,
@@ -75,7 +75,7 @@ def _find_facings(
     facings[end - begin] = 0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def find_segments(packed: PackedOutlines, X_CN: np.ndarray, camera: np.ndarray) -> Segments:
     """Returns the projected contour edges of all surfaces at poses X_CN (nodes, 4, 4)."""
     most_points, most_triangles = 0, 0
@@ -98,10 +98,8 @@ def find_segments(packed: PackedOutlines, X_CN: np.ndarray, camera: np.ndarray) 
                 continue
             if count == capacity:
                 capacity *= 2
-                ends, depths = _longer(ends), _longer(depths)
-                wider = np.empty((capacity, 4), dtype=np.int64)
-                wider[:count] = labels
-                labels = wider
+                ends, depths = with_room(ends, count, capacity), with_room(depths, count, capacity)
+                labels = with_room(labels, count, capacity)
             a, b = np.int64(edges[0, e]), np.int64(edges[1, e])
             ends[count, 0], ends[count, 1] = uvz[0, a], uvz[1, a]
             ends[count, 2], ends[count, 3] = uvz[0, b], uvz[1, b]
@@ -114,15 +112,7 @@ def find_segments(packed: PackedOutlines, X_CN: np.ndarray, camera: np.ndarray) 
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _longer(array: np.ndarray) -> np.ndarray:
-    """The rows of an array (n, k), and as much room again."""
-    wider = np.empty((2 * array.shape[0], array.shape[1]))
-    wider[: array.shape[0]] = array
-    return wider
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def find_crossings(
     segments: Segments, across: int, first: float, spacing: float, lines: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -153,7 +143,9 @@ def find_crossings(
             after[s] = np.int64(np.ceil(min(high, float(lines))))
         for line in range(begin[s], after[s]):
             counts[line + 1] += 1
-    starts = np.cumsum(counts)
+    for line in range(lines):
+        counts[line + 1] += counts[line]
+    starts = counts
     places = np.empty(starts[lines])
     owners = np.empty(starts[lines], dtype=np.int64)
     used = starts[:-1].copy()
@@ -171,7 +163,7 @@ def find_crossings(
     return starts, places, owners
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def find_line_spans(
     segments: Segments,
     across: int,

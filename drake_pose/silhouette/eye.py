@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from drake_pose.compiled import compiled
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def eye_in_node(X: np.ndarray, camera: np.ndarray) -> tuple[float, float, float, float]:
     """Returns where a camera stands, or the way it looks, in a node's frame; 1 or 0 says which.
 

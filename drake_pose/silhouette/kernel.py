@@ -20,8 +20,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from drake_pose.compiled import compiled
 from drake_pose.silhouette.eye import eye_in_node
 from drake_pose.silhouette.outline import PackedOutlines
 
@@ -51,7 +51,7 @@ class _Work(NamedTuple):
     spans: np.ndarray
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _make_work(packed: PackedOutlines, camera: np.ndarray) -> _Work:
     """Returns room for the greatest of some surfaces."""
     width, height = int(camera[6]), int(camera[7])
@@ -70,7 +70,7 @@ def _make_work(packed: PackedOutlines, camera: np.ndarray) -> _Work:
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _walk_edge(
     ua: float,
     va: float,
@@ -111,7 +111,7 @@ def _walk_edge(
         counts[row] = count + 1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _project(
     packed: PackedOutlines, node: int, X_CN: np.ndarray, camera: np.ndarray, work: _Work
 ) -> None:
@@ -137,7 +137,7 @@ def _project(
         v[i] = (b0 * x[i] + b1 * y[i] + b2 * z[i] + b3) * inverse + cy
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _find_facings(
     packed: PackedOutlines, node: int, X_CN: np.ndarray, camera: np.ndarray, work: _Work
 ) -> None:
@@ -153,7 +153,7 @@ def _find_facings(
     facings[n0.shape[0]] = 0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _walk_clipped(
     corners: np.ndarray, weight: int, camera: np.ndarray, crossings: np.ndarray, work: _Work
 ) -> None:
@@ -182,7 +182,7 @@ def _walk_clipped(
         _walk_edge(pu[a], pv[a], pu[b], pv[b], weight, width, height, crossings, counts, reach)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _clip_near(
     packed: PackedOutlines,
     node: int,
@@ -217,7 +217,7 @@ def _clip_near(
         _walk_clipped(corners, facing, camera, crossings, work)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _walk_contour(
     packed: PackedOutlines, node: int, camera: np.ndarray, crossings: np.ndarray, work: _Work
 ) -> None:
@@ -238,7 +238,7 @@ def _walk_contour(
             _walk_edge(u[a], v[a], u[b], v[b], weight, width, height, crossings, counts, reach)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _fill_rows(
     packed: PackedOutlines, X_CN: np.ndarray, camera: np.ndarray, crossings: np.ndarray, work: _Work
 ) -> None:
@@ -262,7 +262,7 @@ def _fill_rows(
         _walk_contour(packed, node, camera, crossings, work)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _fill_safely(
     packed: PackedOutlines, X_CN: np.ndarray, camera: np.ndarray, crossings: np.ndarray, work: _Work
 ) -> np.ndarray:
@@ -278,7 +278,7 @@ def _fill_safely(
     return crossings
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@compiled(inline="always")
 def _find_spans(
     row: int, crossings: np.ndarray, counts: np.ndarray, changes: np.ndarray, spans: np.ndarray
 ) -> int:
@@ -295,7 +295,7 @@ def _find_spans(
     return _find_some_spans(row, count, crossings, spans)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _find_some_spans(row: int, count: int, crossings: np.ndarray, spans: np.ndarray) -> int:
     """As _find_spans by sorting the row's crossings."""
     for i in range(1, count):
@@ -317,7 +317,7 @@ def _find_some_spans(row: int, count: int, crossings: np.ndarray, spans: np.ndar
     return found
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _find_many_spans(
     row: int, count: int, crossings: np.ndarray, changes: np.ndarray, spans: np.ndarray
 ) -> int:
@@ -342,7 +342,7 @@ def _find_many_spans(
     return found
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _add_areas(work: _Work, crossings: np.ndarray, prefixes: np.ndarray, areas: np.ndarray) -> None:
     """Adds the area of a filled body, and of its intersection with each set, to areas (1 + k,)."""
     spans = work.spans
@@ -354,7 +354,7 @@ def _add_areas(work: _Work, crossings: np.ndarray, prefixes: np.ndarray, areas: 
                 areas[1 + s] += prefixes[s, row, b] - prefixes[s, row, a]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def score(
     packed: PackedOutlines, X_CN: np.ndarray, camera: np.ndarray, prefixes: np.ndarray
 ) -> np.ndarray:
@@ -378,7 +378,7 @@ def score(
     return areas
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def paint(
     packed: PackedOutlines, X_CN: np.ndarray, camera: np.ndarray, mask: np.ndarray, value: int
 ) -> np.ndarray:

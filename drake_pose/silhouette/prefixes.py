@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from drake_pose.compiled import compiled
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def sum_rows(mask: np.ndarray, prefix: np.ndarray, first: int, end: int) -> None:
     """Writes the prefix sums of rows first to end of mask (H, W) uint8 to prefix (H, W + 1)."""
     for row in range(first, end):

@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from drake_pose.camera import Camera
+from drake_pose.compiled import compiled
 from drake_pose.errors import SettingsError
 from drake_pose.silhouette.contour_points import ContourPoints, sample_contour
 from drake_pose.silhouette.contour_segments import (
@@ -80,7 +80,7 @@ def sub_pixel_difference(
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def _area_apart(segments: Segments, prefixes: np.ndarray, lines: int) -> float:
     """The area that body or mask covers, but not both [pixel].
 

@@ -1,0 +1,97 @@
+"""Kernels are compiled once for all processes, again when what they call changes, anywhere."""
+
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PROGRAM = """
+    import logging, sys
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    from kernels import caller
+    print(caller.kernel(3), sum(caller.kernel.stats.cache_misses.values()))
+"""
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Path:
+    """A package of two modules: kernel() in one calls constant() in the other."""
+    folder = tmp_path / "with spaces ä" / "kernels"
+    folder.mkdir(parents=True)
+    (folder / "__init__.py").touch()
+    write_callee(folder, 10, 1)
+    (folder / "caller.py").write_text(
+        "from drake_pose.compiled import compiled\n"
+        "from kernels.callee import OFFSET, constant\n"
+        "@compiled\ndef kernel(n):\n    return n + constant() + OFFSET\n"
+    )
+    return folder
+
+
+def write_callee(folder: Path, constant: int, offset: int) -> None:
+    text = f"@compiled\ndef constant():\n    return {constant}\nOFFSET = {offset}\n"
+    (folder / "callee.py").write_text(f"from drake_pose.compiled import compiled\n{text}")
+
+
+def start(package: Path, **variables: str) -> subprocess.Popen[str]:
+    search_path = os.pathsep.join([str(ROOT), str(package.parent)])
+    environment = {**os.environ, "PYTHONPATH": search_path, **variables}
+    environment.pop("NUMBA_CACHE_DIR", None)
+    command = [sys.executable, "-B", "-c", textwrap.dedent(PROGRAM)]
+    return subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def run(package: Path, **variables: str) -> tuple[list[int], str]:
+    """What kernel(3) says and how often it was compiled, and what was logged."""
+    process = start(package, **variables)
+    out, log = process.communicate(timeout=100)
+    assert process.returncode == 0, log
+    return [int(word) for word in out.split()], log
+
+
+def test_compiled_once_and_again_when_what_it_calls_changes(package: Path) -> None:
+    values, log = run(package)
+    assert values == [14, 1]
+    assert log.count("compiling kernels: up to two minutes, once") == 1
+    assert run(package) == ([14, 0], "")
+    write_callee(package, 20, 1)
+    assert run(package)[0] == [24, 1]
+    write_callee(package, 20, 5)
+    assert run(package)[0] == [28, 1]
+    assert run(package) == ([28, 0], "")
+
+
+def test_processes_side_by_side_compile_once(package: Path) -> None:
+    processes = [start(package) for _ in range(3)]
+    said = [process.communicate(timeout=100)[0].split() for process in processes]
+    assert sorted(said) == [["14", "0"], ["14", "0"], ["14", "1"]]
+
+
+def close_folder(folder: Path) -> None:
+    """Put a file where the cache folder would be: as root, no folder is read-only."""
+    (folder / "__pycache__").write_text("")
+
+
+def test_installation_that_cannot_be_written(package: Path, tmp_path: Path) -> None:
+    close_folder(package)
+    home = tmp_path / "home"
+    places = {"HOME": str(home), "XDG_CACHE_HOME": str(home / ".cache")}
+    values, log = run(package, **places)
+    assert values == [14, 1]
+    assert log.count(f"compiling kernels into {home / '.cache'}") == 1
+    assert run(package, **places) == ([14, 0], "")
+
+
+def test_nothing_can_be_written(package: Path, tmp_path: Path) -> None:
+    close_folder(package)
+    home = tmp_path / "home"
+    home.write_text("")
+    values, log = run(package, HOME=str(home), XDG_CACHE_HOME=str(home / ".cache"))
+    assert values == [14, 1]
+    assert log.count("name a folder that can be written in NUMBA_CACHE_DIR") == 1

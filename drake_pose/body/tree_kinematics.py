@@ -15,7 +15,7 @@ import numpy as np
 
 from drake_pose.body.limits import nearest_turn
 from drake_pose.body.pose_tree import PoseTree
-from drake_pose.compiled import compiled
+from drake_pose.compiled import compiled, copy_into
 from drake_pose.errors import SettingsError
 
 _BY_JOINTS, _FREE, _LIMITED = 0, 1, 2
@@ -369,5 +369,5 @@ def find_motions(packed: PackedTree, values: np.ndarray) -> tuple[np.ndarray, np
                 _write_twist(X, M, twists[value + k])
             X = _multiply(X, inverse if packed.inverted[step] else T)
             value += packed.sizes[step]
-        X_WN[node] = X
+        copy_into(X_WN[node], X)
     return X_WN, twists

@@ -26,15 +26,18 @@ def scaled_rotation(q: Array) -> tuple[Array, Array]:
     A polynomial of second degree: the quaternion's squared norm is the scale.
     """
     w, x, y, z = q
-    M = np.empty((3, 3))
-    M[0] = np.array([w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)])
-    M[1] = np.array([2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)])
-    M[2] = np.array([2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z])
+    M = np.array(
+        [
+            [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
+        ]
+    )
     D = np.empty((4, 3, 3))
-    D[0] = 2 * np.array([[w, -z, y], [z, w, -x], [-y, x, w]])
-    D[1] = 2 * np.array([[x, y, z], [y, -x, -w], [z, w, -x]])
-    D[2] = 2 * np.array([[-y, x, w], [x, y, z], [-w, z, -y]])
-    D[3] = 2 * np.array([[-z, -w, x], [w, -z, y], [x, y, z]])
+    copy_into(D[0], 2 * np.array([[w, -z, y], [z, w, -x], [-y, x, w]]))
+    copy_into(D[1], 2 * np.array([[x, y, z], [y, -x, -w], [z, w, -x]]))
+    copy_into(D[2], 2 * np.array([[-y, x, w], [x, y, z], [-w, z, -y]]))
+    copy_into(D[3], 2 * np.array([[-z, -w, x], [w, -z, y], [x, y, z]]))
     return M, D
 
 

@@ -162,5 +162,5 @@ def place_surfaces(
     X_WN, twists = place_nodes(surfaces, parameters)
     X_WS = np.empty((surfaces.nodes.shape[0], 4, 4))
     for s in range(X_WS.shape[0]):
-        X_WS[s] = X_WN[surfaces.nodes[s]]
+        copy_into(X_WS[s], X_WN[surfaces.nodes[s]])
     return X_WS, twists

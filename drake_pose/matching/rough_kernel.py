@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_pose.compiled import compiled
+from drake_pose.compiled import compiled, copy_into
 from drake_pose.matching.wide_kernel import count_bits
 
 
@@ -136,7 +136,7 @@ def unite_pairs(
     """The points (m, words) that pairs (m, 2) of a hypothesis and a sample cover in one view."""
     united = np.empty((pairs.shape[0], masks.shape[1]), dtype=np.uint64)
     for k in range(pairs.shape[0]):
-        united[k] = masks[pairs[k, 0]]
+        copy_into(united[k], masks[pairs[k, 0]])
         for ball in range(balls.radii.shape[0]):
             _look_at_ball(view, X_CP[pairs[k, 0]], balls, pairs[k, 1], ball, united[k])
     return united

@@ -13,7 +13,7 @@ import numpy as np
 from numba import types
 from numba.extending import intrinsic
 
-from drake_pose.compiled import compiled
+from drake_pose.compiled import compiled, copy_into
 
 _LOW_HALF = np.uint64(0xFFFFFFFF)
 _HALF = np.uint64(32)
@@ -271,9 +271,9 @@ def grow_hypotheses(
         code = hashes[h] + _add_hash(masks[h], runs[c], words, keys)
         if not _is_new(table, _find_likeness(poses[h], code, node, c, open_nodes)):
             continue
-        new_masks[count] = masks[h]
+        copy_into(new_masks[count], masks[h])
         unite_masks(new_masks[count], runs[c : c + 1], words)
-        new_poses[count] = poses[h]
+        copy_into(new_poses[count], poses[h])
         new_poses[count, node] = c
         lost = count_unreachable(new_masks[count], new_poses[count], everything, reaches, rest)
         if exact:

@@ -1,7 +1,8 @@
-.PHONY: demo test robots bench clean
+.PHONY: demo test test-slow robots bench clean
 
 VENV := .venv
 PYTHON := $(VENV)/bin/python
+PYTEST := $(PYTHON) -m pytest -n auto --maxprocesses 4 --dist loadfile
 
 # One stamp per environment: pip runs again only when pyproject.toml changed.
 $(VENV)/ready: pyproject.toml
@@ -12,13 +13,17 @@ $(VENV)/ready: pyproject.toml
 demo: $(VENV)/ready
 	$(VENV)/bin/drake-pose demo
 
+# Without the tests that are marked slow, which `make test-slow` runs: together they are all tests.
 test: $(VENV)/ready
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/mypy
-	$(PYTHON) -m pytest -n auto --maxprocesses 4 --dist loadfile
+	$(PYTEST) -m "not slow"
 
-# Other people's robots for `make test`, which skips their tests without: 1.3 GB.
+test-slow: $(VENV)/ready
+	$(PYTEST) -m slow
+
+# Other people's robots for the tests, which are skipped without: 1.3 GB.
 robots: $(VENV)/ready
 	$(PYTHON) -m pip install --quiet --disable-pip-version-check --editable ".[robots]"
 

@@ -194,6 +194,7 @@ def slow(task: Task) -> Outcome:
     return perform(task)
 
 
+@pytest.mark.slow
 def test_killed_worker_loses_and_repeats_nothing(jobs, alone, cluster, tmp_path):
     out = tmp_path / "out"
     victims = list(cluster.run(os.getpid).values())[:1]

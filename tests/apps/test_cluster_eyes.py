@@ -87,6 +87,7 @@ def here(scene, person):
     return Capture(scene, person, scene.open_eyes())
 
 
+@pytest.mark.slow
 def test_workers_see_what_this_process_sees(scene, person, cluster, here):
     eyes = ClusterEyes(cluster, scene)
     groups = eyes.watchers.groups
@@ -107,6 +108,7 @@ def test_workers_see_what_this_process_sees(scene, person, cluster, here):
     assert sum(group.view_bytes for group in groups) / views < 240 * 180 * 3 / 10
 
 
+@pytest.mark.slow
 def test_recording_loses_nothing_with_its_worker(scene, person, cluster, here):
     eyes = ClusterEyes(cluster, scene)
     victim = cluster.run(os.getpid)[eyes.watchers.groups[0].address]
@@ -122,6 +124,7 @@ def test_recording_loses_nothing_with_its_worker(scene, person, cluster, here):
     cluster.wait_for_workers(2, timeout=60)
 
 
+@pytest.mark.slow
 def test_live_capture_goes_on_without_a_worker_that_stops(scene, person, cluster, monkeypatch):
     monkeypatch.setattr("drake_pose.apps.cluster_groups._SILENCE", 0.3)
     ticks = itertools.count()
@@ -175,6 +178,7 @@ def test_a_camera_is_looked_through_where_it_hangs():
         place_cameras(cameras, {})
 
 
+@pytest.mark.slow
 def test_command(scene, cluster, tmp_path, monkeypatch):
     monkeypatch.setattr("drake_pose.apps.cluster.open_cluster", lambda *_: nullcontext(cluster))
     arguments = ["capture", str(scene.path), "--out", str(tmp_path / "out"), "--no-fit-shape",

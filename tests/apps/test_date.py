@@ -34,6 +34,7 @@ def result():
     return run_experiment(cameras=4, frames=120, seed=1, size=(480, 360))
 
 
+@pytest.mark.slow
 class TestCost:
     def test_cost_grows_no_faster_than_the_number_of_cameras(self):
         few, many = (measure_cost(count, size=(320, 240)).sum() / count for count in (4, 12))
@@ -71,6 +72,7 @@ class TestMotion:
             make_motion(skeleton, 39, 0)
 
 
+@pytest.mark.slow
 class TestExperiment:
     @pytest.mark.slow
     def test_figures(self, result):

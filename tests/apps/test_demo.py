@@ -12,7 +12,6 @@ from drake_pose.silhouette import LabelRenderer, load_scene
 from tests.apps.scenes import read_rows
 
 
-@pytest.mark.slow
 def test_demo(runner: CliRunner, tmp_path: Path) -> None:
     out = tmp_path / "demo"
     result = runner.invoke(app, ["demo", "--out", str(out)])

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from drake_pose.apps.family_pictures import save_families
 from drake_pose.apps.kameda import draw_values, experiment_camera, wide_experiment_search
@@ -11,6 +12,7 @@ from drake_pose.matching.family_search import find_families, samples_at
 from tests.matching.grid_problems import show_pose
 
 
+@pytest.mark.slow
 def test_a_column_for_each_family(tmp_path: Path) -> None:
     search, camera = wide_experiment_search(), experiment_camera()
     generator = np.random.default_rng(77)

@@ -39,6 +39,7 @@ def test_cameras_are_spread_over_half_a_turn():
         experiment_cameras(0)
 
 
+@pytest.mark.slow
 def test_figures_come_from_the_trials(result):
     figures = result.as_json()
     assert figures["images"] == 2
@@ -96,6 +97,7 @@ def test_continuous_angles_mean_the_same_with_and_without_a_number_of_cameras(mo
     assert asked == [(3, 0, 1, False)] * 2
 
 
+@pytest.mark.slow
 def test_the_command_prints_both_bodies():
     arguments = ["reproduce", "kameda", "--angles", "continuous", "--views", "2", "--mismatch"]
     done = CliRunner().invoke(app, [*arguments, "--images", "1", "--json"])

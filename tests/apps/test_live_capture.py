@@ -124,6 +124,7 @@ def test_ctrl_c_keeps_everything(studio, person, tmp_path):
     assert (out / "joint_centres.trc").is_file()
 
 
+@pytest.mark.slow
 def test_command_captures_and_refuses(studio, person, tmp_path):
     words = ["capture", str(studio), "--model", str(person.path), "--no-replay", "--json"]
     done = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "a"), "--seconds", "0.3"])

@@ -34,6 +34,7 @@ def studio(tmp_path_factory, person):
     return folder
 
 
+@pytest.mark.slow
 def test_person_before_the_cameras_walks_is_lost_and_found_again(studio, person):
     scene = load_live_scene(studio)
     commands, reports = [], []

@@ -9,6 +9,7 @@ from drake_pose.errors import SettingsError
 from drake_pose.filtering import FilterSettings, TruncatedFilter
 
 
+@pytest.mark.slow
 def test_staring_does_not_make_sure_and_new_views_still_correct():
     result = run_static_experiment(runs=4, seed=1, marks=(55, 400))
     assert (result.nees.mean(axis=0) < 1.7).all()
@@ -19,6 +20,7 @@ def test_staring_does_not_make_sure_and_new_views_still_correct():
     assert result.table().row_count == 2
 
 
+@pytest.mark.slow
 def test_what_was_learned_is_not_unlearned():
     result = run_static_experiment(runs=4, seed=2, marks=(400,), start="learned")
     assert result.nees.mean() < 2.0

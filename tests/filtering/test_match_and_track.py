@@ -89,6 +89,7 @@ def test_no_pose_found_is_said_and_asked_again(body):
     assert followed.matches == search.calls == 2
 
 
+@pytest.mark.slow
 def test_the_man_is_followed_through_two_cameras():
     """A body with skin: errors against the truth, and honest deviations."""
     model = load_model(bundled_model("man"), check=False)

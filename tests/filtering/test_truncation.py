@@ -282,21 +282,25 @@ def test_an_element_without_variance_stays_where_it_is(method):
         METHODS[method](np.array([0.0, 3.0]), covariance, rows)
 
 
+@pytest.mark.parametrize("method", METHODS.values())
+def test_indefinite_beliefs_are_refused(method):
+    # Not by clipping, which needs no factor.
+    with pytest.raises(SettingsError, match="indefinite"):
+        method([0, 0], [[1, 2], [2, 1]], from_bounds(["a", "b"], [-1, -1], [1, 1]))
+
+
 @pytest.mark.parametrize("method", [*METHODS.values(), clip])
 @pytest.mark.parametrize(
     ("mean", "covariance", "word"),
     [
         ([np.nan, 0], np.eye(2), "NaN"),
         ([0, 0], [[1, np.inf], [np.inf, 1]], "NaN or infinity"),
-        ([0, 0], [[1, 2], [2, 1]], "indefinite"),
         ([0, 0], [[1, 0.5], [0, 1]], "symmetric"),
         ([0, 0], np.eye(3), "fit"),
         ([0, 0, 0], np.eye(3), "for_columns"),
     ],
 )
 def test_bad_beliefs_are_refused(method, mean, covariance, word):
-    if method is clip and word == "indefinite":
-        pytest.skip("clipping uses no factor")
     with pytest.raises(SettingsError, match=word):
         method(mean, covariance, from_bounds(["a", "b"], [-1, -1], [1, 1]))
 

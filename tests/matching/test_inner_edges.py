@@ -107,6 +107,7 @@ def test_a_hand_before_the_trunk_is_found_by_its_edges(tmp_path: Path, most: int
     assert choice.joints[-1].determined == choice.exhaustive
 
 
+@pytest.mark.slow
 def test_experiment_a_edges_never_speak_against_the_truth() -> None:
     search, camera = wide_experiment_search(), experiment_camera()
     generator = np.random.default_rng(77)

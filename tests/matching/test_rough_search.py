@@ -34,6 +34,7 @@ def nearest(tree: PoseTree, X_WN: np.ndarray, values: np.ndarray) -> float:
     return float(np.linalg.norm(gaps, axis=2).max(axis=1).min())
 
 
+@pytest.mark.slow
 def test_the_pose_is_among_the_few(tree: PoseTree, body: WideBody) -> None:
     found = []
     for seed in range(10):

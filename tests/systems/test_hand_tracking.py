@@ -142,6 +142,7 @@ def compare(hand, estimated, deviations, truth):
     return np.degrees(np.abs(errors)), np.abs(errors) < 2 * deviations[:, index]
 
 
+@pytest.mark.slow
 def test_a_moving_hand_is_matched_once_and_tracked(hand, camera, search):
     """Plant and Drake's camera, end to end."""
     truth = positions(search, true_angles())
@@ -168,6 +169,7 @@ def test_a_moving_hand_is_matched_once_and_tracked(hand, camera, search):
     assert np.isnan(deviations[:, held]).all()
 
 
+@pytest.mark.slow
 def test_after_blank_images_it_finds_the_hand_again(hand, camera, renderer, search):
     """Nothing is seen for ten frames; then the hand is bent otherwise."""
     truth = positions(search, np.vstack([true_angles(12), true_angles(28, phase=2.2)]))
@@ -199,6 +201,7 @@ def bent(generator):
     return np.radians(angles)
 
 
+@pytest.mark.slow
 def test_a_loss_is_said_and_the_matcher_asked(hand, camera, renderer, search):
     """The hand is bent otherwise from one frame to the next."""
     cut, generator = 15, np.random.default_rng(0)

@@ -65,6 +65,7 @@ def test_without_pictures_nobody_is_found(person, cameras):
     assert not system.GetOutputPort("seen").Eval(context).any()
 
 
+@pytest.mark.slow
 def test_person_is_lost_kept_in_mind_and_found_again(person, cameras):
     tracker = SilhouetteTracker(SilhouetteFit(person.pose_tree()))
     system = PersonTracker(tracker, list(cameras.values()), 0.1)
@@ -154,6 +155,7 @@ def watch(person, cameras):
     return watch
 
 
+@pytest.mark.slow
 def test_the_one_is_followed_as_if_alone(watch, poses, alone, both):
     single, double = watch(alone), watch(both)
     assert not single["others"].any()

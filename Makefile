@@ -4,30 +4,37 @@ VENV := .venv
 PYTHON := $(VENV)/bin/python
 PYTEST := $(PYTHON) -m pytest -n auto --maxprocesses 4 --dist loadfile
 
-# One stamp per environment: pip runs again only when pyproject.toml changed.
+PIP := $(PYTHON) -m pip install --quiet --disable-pip-version-check --no-compile --editable
+# pip would compile every module of every package; Python does it for those that are imported.
+unexport PYTHONDONTWRITEBYTECODE
+
+# One stamp per set of packages: pip runs again only when pyproject.toml changed.
 $(VENV)/ready: pyproject.toml
 	test -x $(PYTHON) || python3 -m venv $(VENV)
-	$(PYTHON) -m pip install --quiet --disable-pip-version-check --editable ".[test]"
+	$(PIP) .
+	touch $@
+
+$(VENV)/ready-%: $(VENV)/ready
+	$(PIP) ".[$*]"
 	touch $@
 
 demo: $(VENV)/ready
 	$(VENV)/bin/drake-pose demo
 
 # Without the tests that are marked slow, which `make test-slow` runs: together they are all tests.
-test: $(VENV)/ready
+test: $(VENV)/ready-test
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/mypy
 	$(PYTEST) -m "not slow"
 
-test-slow: $(VENV)/ready
+test-slow: $(VENV)/ready-test
 	$(PYTEST) -m slow
 
 # Other people's robots for the tests, which are skipped without: 1.3 GB.
-robots: $(VENV)/ready
-	$(PYTHON) -m pip install --quiet --disable-pip-version-check --editable ".[robots]"
+robots: $(VENV)/ready-robots
 
-bench: $(VENV)/ready
+bench: $(VENV)/ready-cluster
 	$(PYTHON) -m drake_pose.apps.benchmark
 	$(PYTHON) -m drake_pose.apps.cluster_benchmark
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.markup import escape
 from rich.table import Table
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from drake_pose.apps.shimada_motion import (
     ACCELERATIONS,
@@ -325,7 +325,7 @@ def _bound(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> float:
 def _figures(trials: tuple[Trial, ...]) -> dict[str, float | int]:
     errors = np.array([trial.length_error for trial in trials])
     angles = np.array([trial.angle_errors for trial in trials])
-    low, high = chi2.ppf([0.025, 0.975], len(LENGTHS))
+    low, high = chdtri(len(LENGTHS), [0.975, 0.025])
     nees = np.array([trial.nees for trial in trials])
     return {
         "length_error_mean": float(errors.mean()),

@@ -22,7 +22,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from drake_pose.filtering.factors import lower_or_root
 from drake_pose.filtering.state import Belief
@@ -71,7 +71,7 @@ def next_view(view: View | None, y: Array, model: ObservationModel, chance: floa
 
 @lru_cache(maxsize=1024)
 def _largest_change(chance: float, count: int) -> float:
-    return float(chi2.isf(chance, count))
+    return float(chdtri(count, chance))
 
 
 def measure_curvature(model: ObservationModel, belief: Belief) -> Array:

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from drake_pose.body import PoseTree
 from drake_pose.errors import SettingsError
@@ -126,7 +126,7 @@ def find_intervals(
         extra: of the four parameters after the tree's values those that are unknown.
     """
     covariance = _covariance(problem, parameters, problem.body.freedom(None, extra), settings)
-    z = float(norm.ppf(0.5 + 0.5 * settings.confidence))
+    z = float(ndtri(0.5 + 0.5 * settings.confidence))
     # More wrong pixels than those of the masks' own noise: what is wrong elsewhere pulls here.
     wrong = problem.J(parameters) / (_PIXEL_SHARE * problem.border_length)
     margins = z * max(1.0, wrong) * np.sqrt(np.diag(covariance))

@@ -8,7 +8,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
 
 from drake_pose.body.landmarks import landmarks_of_nodes, load_landmarks
 from drake_pose.body.tree_kinematics import TreeKinematics
@@ -107,6 +106,8 @@ class BodyPlan:
         return int(self.landmarks.nodes[self.landmarks.names.index(landmark)])
 
     def _plan(self, root: str, middle: str, end: str) -> PlannedLimb:
+        from scipy.stats import qmc  # Slow to import, and needed for persons alone.
+
         kinematics = self.kinematics
         rest = kinematics.flatten(kinematics.tree.default_values())
         moves = kinematics.motions(rest).moves

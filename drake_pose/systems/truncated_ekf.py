@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, EventStatus, LeafSystem
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from drake_pose.errors import SettingsError
 from drake_pose.filtering import Belief, FilterState, ObservationModel, TruncatedFilter, make_belief
@@ -165,7 +165,7 @@ class TruncatedEkf(LeafSystem):
         y, model = self._measure(context)
         state = self.filter.update(state, y, model)
         if state.count:
-            limit = chi2.ppf(1 - _LOSS_PROBABILITY, state.count)
+            limit = chdtri(state.count, _LOSS_PROBABILITY)
             unlikely = unlikely + 1 if state.distance > limit else 0
         packed = self._packing.pack(state)
         for index, vector in zip((self._belief, self._stare, self._view), packed, strict=True):

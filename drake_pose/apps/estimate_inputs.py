@@ -22,7 +22,7 @@ from drake_pose.apps.scene_checks import (
     texts_of,
 )
 from drake_pose.apps.settings import EstimateSettings, RootTurns
-from drake_pose.body import ArticulatedModel, PoseTree, RootRotation, load_model
+from drake_pose.body import ArticulatedModel, PoseTree, RootRotation, load_model, model_warnings
 from drake_pose.camera import Camera
 from drake_pose.errors import SceneError, SettingsError, UnknownNameError
 from drake_pose.matching import (
@@ -109,7 +109,8 @@ def read_inputs(
     else:
         search = _make_search(_make_tree(model, settings, position), settings, model)
     read = _check_pictures(scene, cameras, frames, search)
-    texts = (*texts_of(*checked.warnings, *read.warnings), *model.warnings)
+    of_model = model_warnings(model, search.tree, settings.hold)
+    texts = (*texts_of(*checked.warnings, *read.warnings), *of_model)
     return Inputs(read.scene, model, cameras, frames, search, root_positions, truth, texts)
 
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
@@ -59,12 +62,13 @@ def check_scene(scene: Scene) -> CheckedScene:
     if scene.sequence:
         warnings += _check_gaps(scene)
         if len(scene.cameras) > 1:
-            frozen = find_frozen(scene)
+            repeats = find_repeats(scene)
+            frozen = _find_frozen(scene, repeats)
             warnings += _describe_frozen(scene, frozen)
             gone = {(name, frame) for name, frames in frozen.items() for frame in frames}
             masks = {key: path for key, path in scene.masks.items() if key not in gone}
             scene = replace(scene, masks=masks)
-            warnings += _check_repeated(scene)
+            warnings += _check_repeated(scene, repeats)
     return CheckedScene(scene, tuple(warnings))
 
 
@@ -156,31 +160,60 @@ def frame_ranges(frames: Iterable[str], known: Sequence[str]) -> str:
     return ", ".join(texts) + (f" and {rest} more" if rest else "")
 
 
-def find_frozen(scene: Scene) -> dict[str, tuple[str, ...]]:
-    """By camera, the frames in which its picture is the last one again while all others changed.
+class _MaskFile:
+    """A mask's file, read when it must be; nothing is said of one that cannot be."""
 
-    Pictures are read only where files are alike byte for byte.
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        with suppress(OSError):
+            self._size: int | None = require_regular(path)
+            return
+        self._size = None
+
+    @cached_property
+    def _content(self) -> bytes | None:
+        with suppress(OSError), self._path.open("rb", buffering=0) as file:
+            return file.read(self._size or 0)
+        return None
+
+    def is_like(self, other: _MaskFile) -> bool:
+        """Whether the two are alike byte for byte; what cannot be read is not."""
+        if self._size is None or self._size != other._size:
+            return False
+        return self._content is not None and self._content == other._content
+
+
+def find_repeats(scene: Scene) -> set[tuple[str, str]]:
+    """The masks, (camera, frame), whose file is that of the frame before again, byte for byte.
+
+    A recording has a hundred thousand of them: each is looked at once, and read only where it is as
+    large as a neighbour.
     """
+    found = set()
+    for name in scene.cameras:
+        last = None
+        for frame in scene.frames:
+            path = scene.masks.get((name, frame))
+            file = None if path is None else _MaskFile(path)
+            if file is not None and last is not None and file.is_like(last):
+                found.add((name, frame))
+            last = file
+    return found
+
+
+def _find_frozen(scene: Scene, repeats: set[tuple[str, str]]) -> dict[str, tuple[str, ...]]:
+    """By camera, the frames in which its picture is the last one again while all others changed."""
     found: dict[str, list[str]] = {}
     for last, frame in zip(scene.frames, scene.frames[1:], strict=False):
+        alike = [name for name in scene.cameras if (name, frame) in repeats]
+        if not alike:
+            continue
         both = [name for name in scene.cameras_of(frame) if (name, last) in scene.masks]
-        alike = {name for name in both if _alike(scene, name, last, frame)}
         others = [name for name in both if name not in alike]
-        if alike and len(others) > len(alike) and _has_changed(scene, others, last, frame):
+        if len(others) > len(alike) and _has_changed(scene, others, last, frame):
             for name in alike:
                 found.setdefault(name, []).append(frame)
     return {name: tuple(frames) for name, frames in found.items()}
-
-
-def _alike(scene: Scene, name: str, last: str, frame: str) -> bool:
-    """Whether two mask files are alike byte for byte; what cannot be read is not."""
-    one, other = scene.masks[name, last], scene.masks[name, frame]
-    try:
-        if require_regular(one) != require_regular(other):
-            return False
-        return one.read_bytes() == other.read_bytes()
-    except OSError:
-        return False
 
 
 def _has_changed(scene: Scene, names: Sequence[str], last: str, frame: str) -> bool:
@@ -210,12 +243,12 @@ def _describe_frozen(scene: Scene, frozen: Mapping[str, Sequence[str]]) -> list[
     ]
 
 
-def _check_repeated(scene: Scene) -> list[SceneWarning]:
+def _check_repeated(scene: Scene, repeats: set[tuple[str, str]]) -> list[SceneWarning]:
     """Frames that are the last one again in every camera."""
     repeated = []
     for last, frame in zip(scene.frames, scene.frames[1:], strict=False):
         both = [name for name in scene.cameras_of(frame) if (name, last) in scene.masks]
-        if len(both) > 1 and all(_alike(scene, name, last, frame) for name in both):
+        if len(both) > 1 and all((name, frame) in repeats for name in both):
             repeated.append(frame)
     if not repeated:
         return []

@@ -11,7 +11,13 @@ from drake_pose.body.mesh import TriangleMesh
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.body.packages import bundled_model, package_map
 from drake_pose.body.pose_tree import PoseTree, PoseTreeNode
-from drake_pose.body.report import JointReport, ModelReport, NodeReport, describe_model
+from drake_pose.body.report import (
+    JointReport,
+    ModelReport,
+    NodeReport,
+    describe_model,
+    model_warnings,
+)
 from drake_pose.body.root import RootRotation
 from drake_pose.body.skin import SkinBand
 from drake_pose.body.skin_bands import ModelSkin
@@ -37,5 +43,6 @@ __all__ = [
     "landmarks_of_nodes",
     "load_landmarks",
     "load_model",
+    "model_warnings",
     "package_map",
 ]

@@ -211,8 +211,8 @@ def _remarks(
         unlimited = bool(np.isinf(low) and np.isinf(high))
         one_sided = bool(np.isinf(low) or np.isinf(high)) and not unlimited
         advice = (
-            "give it a lower and an upper limit in the model file, or give load_model "
-            f"limits={{'{names[index]}': (low, high)}}"
+            "give it a lower and an upper limit in the model file (or to load_model: "
+            f"limits={{'{names[index]}': (low, high)}})"
         )
         answers = f"{np.degrees(turn[0][index]):.6g} to {np.degrees(turn[1][index]):.6g} degrees"
         if _KINDS[joint.type_name()][index] == "length":

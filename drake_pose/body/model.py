@@ -15,7 +15,7 @@ from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex
 from drake_pose.body.geometry import body_mesh, make_drawable
 from drake_pose.body.limits import PositionKind, describe_positions
 from drake_pose.body.mesh import TriangleMesh
-from drake_pose.body.parsing import ModelSource
+from drake_pose.body.parsing import ModelSource, limit_kinds
 from drake_pose.body.safety import check_in_child
 from drake_pose.body.skin import SkinBand, load_skin
 from drake_pose.errors import ModelError, UnknownNameError
@@ -221,7 +221,7 @@ def read_model(
         turns_freely=positions.turns_freely,
         link_meshes=MappingProxyType(meshes),
         skin=load_skin(path, link_names(plant)),
-        warnings=(*warnings, *positions.warnings),
+        warnings=tuple(limit_kinds([*warnings, *positions.warnings])),
         _source=source,
     )
 

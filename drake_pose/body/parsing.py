@@ -95,7 +95,7 @@ class ModelSource:
             for warning in warnings
             if not any(mark in warning for mark in _ABOUT_INERTIA)
         ]
-        return list(instances), limit_kinds([*self.warnings, *remarks])
+        return list(instances), [*self.warnings, *remarks]
 
     def _explain(self, reason: str, warnings: list[str]) -> str:
         """Why the file cannot be used, with the joint whose limits are at fault, if one is."""
@@ -113,7 +113,7 @@ class ModelSource:
 def limit_kinds(warnings: Sequence[str]) -> list[str]:
     """Warnings of which those that differ in names and numbers alone are at most ten.
 
-    The last of ten is followed by how many more there are.
+    The last of ten says how many more there are.
     """
     by_kind: dict[str, list[str]] = {}
     for warning in warnings:
@@ -122,7 +122,7 @@ def limit_kinds(warnings: Sequence[str]) -> list[str]:
     for alike in by_kind.values():
         shown += alike[:_MOST_ALIKE]
         if len(alike) > _MOST_ALIKE:
-            shown.append(f"... and {len(alike) - _MOST_ALIKE} more like: {alike[0]}")
+            shown[-1] += f" ... and {len(alike) - _MOST_ALIKE} more of this kind"
     return shown
 
 

@@ -1,7 +1,7 @@
 """Is this model fit for use, and if not, why: the facts behind ``drake-pose check FILE``."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -81,7 +81,7 @@ def describe_model(
         path=path,
         name=model.name,
         nodes=tuple(_node_report(tree, node) for node in tree.nodes),
-        warnings=tuple(_warnings(model, tree)),
+        warnings=model_warnings(model, tree),
         errors=(),
     )
 
@@ -104,8 +104,16 @@ def _node_report(tree: PoseTree, node: PoseTreeNode) -> NodeReport:
     )
 
 
-def _warnings(model: ArticulatedModel, tree: PoseTree) -> list[str]:
-    """Everything worth knowing before the model is used."""
+def model_warnings(
+    model: ArticulatedModel, tree: PoseTree, given: Iterable[str] = ()
+) -> tuple[str, ...]:
+    """Everything worth knowing before a model is used; at most ten warnings of a kind.
+
+    Args:
+        model: the model.
+        tree: its pose tree.
+        given: names of the positions that are held as the user wants.
+    """
     warnings = list(model.warnings)
     constraints = model.plant.num_constraints()
     if constraints:
@@ -118,18 +126,23 @@ def _warnings(model: ArticulatedModel, tree: PoseTree) -> list[str]:
             "these joints move nothing that is seen and keep their default values: "
             + ", ".join(tree.unobserved_positions)
         )
-    if tree.held:
+    slides = [
+        model.position_names[position]
+        for position, value in tree.held.items()
+        if np.isinf(model.upper[position] - model.lower[position])
+        and value == model.default_positions[position]
+    ]
+    if slides := [name for name in slides if name not in set(given)]:
         warnings.append(
             "these joints have no limits: they say where the object stands and keep their default "
-            "values, and a root position moves it: "
-            + ", ".join(model.position_names[position] for position in tree.held)
+            "values, and a root position moves it: " + ", ".join(slides)
         )
     warnings += [
         f"link '{node.name}' is not watertight: its silhouette may have gaps"
         for node in tree.nodes
         if not node.mesh.is_empty and not is_watertight(node.mesh)
     ]
-    return limit_kinds(warnings + _symmetry_warnings(model))
+    return tuple(limit_kinds(warnings + _symmetry_warnings(model)))
 
 
 def _symmetry_warnings(model: ArticulatedModel) -> list[str]:

@@ -64,6 +64,6 @@ def _faults(model: ArticulatedModel, positions: Sequence[int]) -> str:
     return (
         f"{model.path}: joint{'s' if many else ''} {', '.join(repr(name) for name in names)} "
         f"ha{'ve' if many else 's'} no limits, or limits too wide to be searched; give a lower and "
-        f"an upper limit [m] in the model file, or give load_model limits={{'{names[0]}': (low, "
-        "high)}, so that values can be searched"
+        f"an upper limit [m] in the model file (or to load_model: limits={{'{names[0]}': (low, "
+        f"high)}}), so that values can be searched, or hold it (--hold {names[0]}=VALUE)"
     )

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import socket
 from collections.abc import Callable
@@ -200,8 +201,8 @@ SPOILT_MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
     "NaN limit": (URDF.replace('lower="-1.6"', 'lower="nan"'), ("joint 'lift'",)),
     "crossed limits": (URDF.replace('lower="-1.6"', 'lower="1.7"'), ("joint 'lift'", "1.7")),
     "no limit": (
-        URDF.replace('<joint name="bolt" type="fixed">', '<joint name="bolt" type="prismatic">'),
-        ("joint 'bolt'", "no limits"),
+        re.sub(r'(?s)("luff" type=)"revolute"(.*?)<limit[^>]*>', r'\1"prismatic"\2', URDF),
+        ("joint 'luff'", "no limits", "--hold luff=VALUE"),
     ),
 }
 

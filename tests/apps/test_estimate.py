@@ -1,4 +1,5 @@
 import csv
+import html
 import json
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from drake_pose.apps.overlay import AGREEMENT_RGB, EXCESS_RGB, MISSING_RGB
 from drake_pose.apps.settings import EstimateSettings
 from drake_pose.body import load_model
 from drake_pose.silhouette import LabelRenderer, load_scene
-from tests.apps.scenes import NAMES, TinyScene, read_rows, write_scene, write_truth
+from tests.apps.scenes import NAMES, URDF, TinyScene, read_rows, write_scene, write_truth
 
 
 def arguments(scene: TinyScene, out: Path, *more: str) -> list[str]:
@@ -254,3 +255,27 @@ def test_what_is_known_of_each_joint(own_scene: TinyScene, runner: CliRunner) ->
             if (one["frame"], one["joint"], one["family"]) == (row["frame"], row["joint"], "1")
         ]
         assert answers == [pytest.approx(found, abs=1e-3)]
+
+
+def test_what_the_model_does_not_enforce_is_told(
+    tiny_scene: TinyScene, tmp_path: Path, runner: CliRunner
+) -> None:
+    text = URDF.replace('<joint name="bolt" type="fixed">', '<joint name="bolt" type="prismatic">')
+    joint = text.index('<joint name="luff"')
+    end = text.index("</joint>", joint)
+    model, out = tmp_path / "loose.urdf", tmp_path / "out"
+    model.write_text(f'{text[:end]}<mimic joint="lift"/>{text[end:]}')
+    arguments = ["--interval", "20", "--method", "paper", "--frame", "0", "--no-replay"]
+    place = ["--model", str(model), "--out", str(out)]
+    result = runner.invoke(app, ["estimate", str(tiny_scene.folder), *place, *arguments])
+    assert result.exit_code == 0, result.output
+    checked = runner.invoke(app, ["check", str(model), "--json"])
+    warnings = json.loads(checked.stdout)["warnings"]
+    assert len(warnings) == 2
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["warnings"] == warnings
+    page = html.unescape((out / "report.html").read_text())
+    for named, warning in zip(("<mimic>", "where the object stands"), warnings, strict=True):
+        assert named in warning
+        assert warning in result.stderr
+        assert warning in page

@@ -36,6 +36,7 @@ robots: $(VENV)/ready-robots
 
 bench: $(VENV)/ready-cluster
 	$(PYTHON) -m drake_pose.apps.benchmark
+	$(PYTHON) -m drake_pose.apps.memory_benchmark
 	$(PYTHON) -m drake_pose.apps.cluster_benchmark
 
 clean:

@@ -28,6 +28,10 @@ class ExaminationSettings:
             is not tried. An answer with J = 0 needs none.
         family_time_limit: the same of the search for all poses as good; it then answers with those
             it has, and no joint is called determined.
+        proof_poses: each step of the proof ends after so many poses of nodes are drawn, which takes
+            nearly all its time: about a second by default. Unlike a limit on time, the answer is
+            that of any machine.
+        family_poses: the same of the search for all poses as good: about two seconds.
         memory: of each of the two, for what it keeps; it ends as if its time were over [byte].
         families: so many families are described at most.
         tolerance: as in ``FamilySettings``.
@@ -36,8 +40,10 @@ class ExaminationSettings:
         SettingsError: if a value is out of its range.
     """
 
-    proof_time_limit: float | None = 1.0
-    family_time_limit: float | None = 2.0
+    proof_time_limit: float | None = None
+    family_time_limit: float | None = None
+    proof_poses: int = 25_000
+    family_poses: int = 50_000
     memory: int = LatticeLimits.memory
     families: int = 32
     tolerance: float | None = None
@@ -47,6 +53,8 @@ class ExaminationSettings:
             limit = getattr(self, name)
             if limit is not None and not (math.isfinite(limit) and limit >= 0.0):
                 raise SettingsError(f"{name} must be 0 s or more, not {limit}")
+        if self.proof_poses < 1:
+            raise SettingsError(f"proof_poses must be 1 or more, not {self.proof_poses}")
         self.family_settings()
 
     def family_settings(self) -> FamilySettings:
@@ -54,6 +62,7 @@ class ExaminationSettings:
         return FamilySettings(
             tolerance=self.tolerance,
             families=self.families,
+            poses=self.family_poses,
             time_limit=self.family_time_limit,
             memory=self.memory,
         )
@@ -91,8 +100,15 @@ def examine(
         raise SettingsError("the pose to be examined is not on the body's sampling grid")
     J, lower_bound, spent = result.J, 0.0, result.J > 0.0
     if J > 0.0 and settings.proof_time_limit != 0.0:
-        limit = settings.proof_time_limit
-        proof = prove_optimal(body, views, samples, J, limit, memory=settings.memory)
+        proof = prove_optimal(
+            body,
+            views,
+            samples,
+            J,
+            settings.proof_time_limit,
+            poses=settings.proof_poses,
+            memory=settings.memory,
+        )
         samples, J, lower_bound = proof.samples, proof.J, proof.lower_bound
         spent = proof.budget_spent
     answer = find_families(body, views, samples, J, settings.family_settings())

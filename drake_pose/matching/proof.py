@@ -49,6 +49,7 @@ def prove_optimal(
     time_limit: float | None = None,
     states: int = 20_000,
     pairs: int = 1_000_000,
+    poses: int = LatticeLimits.poses,
     memory: int = LatticeLimits.memory,
 ) -> Proof:
     """Prove a pose the best of the grid, or find the best.
@@ -61,10 +62,10 @@ def prove_optimal(
         time_limit: it answers with what it has after so many seconds; None: no limit.
         states: so many partial poses are kept after each node; more end the proof.
         pairs: the same of pairs of a partial pose and a pose of the next node.
-        memory: as in LatticeLimits [byte].
+        poses, memory: as in LatticeLimits, the latter in bytes.
     """
     deadline = np.inf if time_limit is None else time.perf_counter() + time_limit
-    limits = LatticeLimits(states=states, pairs=pairs, memory=memory, deadline=deadline)
+    limits = LatticeLimits(states, pairs, poses, memory, deadline)
     best, bound, visited, J_limit, spent = samples, 0.0, 0, 0.0, False
     while bound < J:
         J_limit = min(J_limit, J - 1.0)

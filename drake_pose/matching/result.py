@@ -82,8 +82,8 @@ class MatchResult:
         seconds: wall time of the search [s].
         proved_optimal: whether it is proved that no pose of the search's grid has a smaller J.
         lower_bound: no pose of the grid has a smaller J than this [pixel]; 0 says nothing.
-        budget_spent: whether time or memory ended the proof, or the search for poses as good,
-            before all was settled.
+        budget_spent: whether a limit on poses, time or memory ended the proof, or the search for
+            poses as good, before all was settled.
         pose_set: all poses found that are as good, and what is known of each joint; None if the
             search did not ask.
     """

@@ -38,7 +38,7 @@ def test_proves_what_brute_force_finds(
 
 
 @pytest.mark.parametrize(
-    "limit", [{"states": 2}, {"pairs": 8}, {"time_limit": 0}, {"memory": 20_000}]
+    "limit", [{"states": 2}, {"pairs": 8}, {"poses": 1}, {"time_limit": 0}, {"memory": 20_000}]
 )
 def test_a_limit_leaves_a_true_bound_and_no_false_proof(
     makers: list[ProblemMaker], limit: dict[str, int]

@@ -198,3 +198,11 @@ def with_room(array: np.ndarray, used: int, rows: int) -> np.ndarray:
     wider = np.empty((rows, *array.shape[1:]), dtype=array.dtype)
     copy_into(wider, array[:used])
     return wider
+
+
+def is_stored(kernel: Callable[..., Any]) -> bool:
+    """Whether a kernel was compiled before, for whatever arguments, and is stored."""
+    cache = getattr(kernel, "_cache", None)
+    if not isinstance(cache, _SharedCache):
+        return False
+    return (Path(cache.cache_path) / f"{cache._impl.filename_base}.nbi").is_file()

@@ -24,10 +24,11 @@ def run_estimate(
 ) -> None:
     """Estimates a scene with a progress bar, and prints what came out."""
     with errors_as_messages(out):
+        from drake_pose.apps.compile_ahead import compiling_ahead
         from drake_pose.apps.estimate import estimate_scene
         from drake_pose.apps.report import FrameProgress, print_estimate
 
-        with FrameProgress() as progress:
+        with compiling_ahead(), FrameProgress() as progress:
             result = estimate_scene(
                 scene, model, out, settings, truth=truth, resume=resume, replay=replay,
                 overlay=overlay, on_frame=progress, on_stage=progress.show_stage,

@@ -160,10 +160,11 @@ def demo(
 ) -> None:
     """See help_texts.DEMO."""
     with errors_as_messages():
+        from drake_pose.apps.compile_ahead import compiling_ahead
         from drake_pose.apps.demo import run_demo
         from drake_pose.apps.report import FrameProgress, print_demo
 
-        with FrameProgress() as progress:
+        with compiling_ahead(), FrameProgress() as progress:
             result = run_demo(out, on_frame=progress)
         if json:
             print_json(result.summary)

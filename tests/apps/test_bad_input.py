@@ -360,6 +360,7 @@ def test_any_other_error_is_a_bug_and_stays_visible(
     assert not isinstance(result.exception, DrakePoseError)
 
 
+@pytest.mark.slow
 def test_a_mask_that_no_pose_explains(own_scene: TinyScene, runner: CliRunner) -> None:
     picture = np.zeros((160, 200), np.uint8)
     picture[:6] = 255

@@ -87,6 +87,7 @@ class OneAtATime(ClusterCrew):
     size = 1
 
 
+@pytest.mark.slow
 def test_results_do_not_depend_on_who_works(jobs, alone, cluster, scenes, tmp_path):
     for name, crew in (("one", OneAtATime(cluster)), ("two", ClusterCrew(cluster))):
         result = run_batch(jobs, tmp_path / name, crew)
@@ -118,6 +119,7 @@ def test_one_chunk_of_a_sequence_is_an_estimate(scenes, jobs, tmp_path):
     assert rows(tmp_path / "batch" / "motion") == rows(tmp_path / "plain")
 
 
+@pytest.mark.slow
 def test_failing_scene_is_named_and_resume_computes_only_what_is_missing(
     scenes, jobs, alone, tmp_path
 ):

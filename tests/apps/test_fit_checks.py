@@ -64,6 +64,7 @@ def test_a_camera_that_moved(scene: TinyScene) -> None:
     assert re.match(r"camera(s 'front' and)? 'side' contradicts? ", first)
 
 
+@pytest.mark.slow
 def test_of_three_cameras_the_one_that_moved(scene: TinyScene) -> None:
     """The third sees as much as the second, from the other side."""
     model = load_model(scene.model)

@@ -59,6 +59,7 @@ def test_figures_come_from_the_trials(result):
     assert continuous_table({"one": result, "other": result}).row_count == 11
 
 
+@pytest.mark.slow
 def test_the_same_every_time(search, result):
     again = run_continuous_experiment(search, images=1, seed=7, views=2)
     np.testing.assert_array_equal(again.trials[0].result.q, result.trials[0].result.q)

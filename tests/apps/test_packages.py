@@ -81,6 +81,7 @@ def test_estimate_and_its_resumption(
     assert json.loads((out / "summary.json").read_text())["found_count"] == 2
 
 
+@pytest.mark.slow
 def test_batch(tmp_path: Path, tiny_scene: TinyScene, far: tuple[Path, Path]) -> None:
     model, folder = far
     scene = {"scene": str(tiny_scene.folder), "model": str(model), "frames": "0", "interval": 20}

@@ -87,6 +87,7 @@ MOVES = {
 
 class TestMovedCamera:
     @pytest.mark.parametrize("stage", ["four", "nine"])
+    @pytest.mark.slow
     def test_sound_rig_has_no_fault(self, stage: str, request: pytest.FixtureRequest) -> None:
         found = request.getfixturevalue(stage)
         assert found.find(found.masks) is None

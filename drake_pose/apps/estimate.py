@@ -22,7 +22,7 @@ from drake_pose.apps.settings import EstimateSettings
 from drake_pose.apps.summary import FrameRecord, check_same_job, describe_job
 from drake_pose.camera import Camera, ParallelCamera
 from drake_pose.errors import SettingsError
-from drake_pose.matching import MatchResult, PoseSearch, View
+from drake_pose.matching import MatchResult, PoseSearch, View, WholeSearch
 from drake_pose.matching.root_placement import scale_camera
 from drake_pose.matching.root_placement_search import PlacedMatch
 from drake_pose.silhouette import LabelRenderer
@@ -144,11 +144,14 @@ class _Matching:
     def compare_cameras(self, on_stage: OnStage | None) -> None:
         """Warn of cameras that contradict each other; few frames are matched again for it."""
         scene, root_positions = self._inputs.scene, self._inputs.root_positions or {}
+        search = self._search
+        if isinstance(search, WholeSearch):
+            search = search.without_alternatives()
 
         def match(frame: str, views: Sequence[View]) -> float:
             if on_stage is not None:
                 on_stage("comparing the cameras", 0, None)
-            found = self._search.match(views, root_positions.get(frame))
+            found = search.match(views, root_positions.get(frame))
             return found.E_total if found.found else math.inf
 
         contradiction = find_contradiction(

@@ -72,6 +72,11 @@ class WholeSearch:
             self._outlines = few_triangles(self.sampled.surfaces)
             self._kinematics = TreeKinematics(tree)
 
+    def without_alternatives(self) -> WholeSearch:
+        """The same search where only E_total is wanted: one round, and no set of poses."""
+        settings = replace(self.settings, rounds=0, families=None, examination=None)
+        return WholeSearch(self.tree, settings)
+
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> MatchResult:
         """Estimate the pose that the views show.
 

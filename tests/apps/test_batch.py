@@ -119,6 +119,20 @@ def test_one_chunk_of_a_sequence_is_an_estimate(scenes, jobs, tmp_path):
     assert rows(tmp_path / "batch" / "motion") == rows(tmp_path / "plain")
 
 
+def test_replaced_masks_are_named_when_a_batch_is_resumed(scenes, jobs, tmp_path):
+    shutil.copytree(scenes / "motion", tmp_path / "motion")
+    job = dataclasses.replace(jobs[1], scene=tmp_path / "motion", chunk=100)
+    run_batch([job], tmp_path / "batch")
+    before = rows(tmp_path / "batch" / "motion")
+    assert not run_batch([job], tmp_path / "batch", resume=True).failed
+    masks = tmp_path / "motion" / "masks" / "front"
+    shutil.copyfile(masks / "0002.png", masks / "0001.png")
+    again = run_batch([job], tmp_path / "batch", resume=True)
+    assert again.failed
+    assert "the masks of frame 0001 were replaced" in str(again.scenes["motion"].errors)
+    assert rows(tmp_path / "batch" / "motion") == before
+
+
 @pytest.mark.slow
 def test_failing_scene_is_named_and_resume_computes_only_what_is_missing(
     scenes, jobs, alone, tmp_path

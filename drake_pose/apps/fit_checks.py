@@ -94,7 +94,9 @@ def poor_fit_warnings(
         model: the body.
         held: names of positions that were not searched.
     """
-    errors = {frame: one.E_total for frame, one in records.items() if one.E_total is not None}
+    # A followed person is judged by the contours (describe_fit): others in view are in the masks.
+    judged = {frame: one for frame, one in records.items() if one.share is None}
+    errors = {frame: one.E_total for frame, one in judged.items() if one.E_total is not None}
     bad = [frame for frame, error in errors.items() if error >= BADLY_EXPLAINED]
     if not bad:
         return ()

@@ -318,6 +318,7 @@ def test_output_below_a_file(own_scene: TinyScene, runner: CliRunner) -> None:
     assert_refused(run(runner, own_scene, "--out", str(file / "out")), "is a file")
 
 
+@pytest.mark.slow
 def test_resuming_another_job(own_scene: TinyScene, runner: CliRunner, tmp_path: Path) -> None:
     assert run(runner, own_scene).exit_code == 0
     assert_refused(run(runner, own_scene, "--resume", "--candidates", "4"), "candidates", "5")

@@ -112,6 +112,7 @@ def test_results_do_not_depend_on_who_works(jobs, alone, cluster, scenes, tmp_pa
     assert len(list((alone / "motion" / "overlay" / "front").iterdir())) == 3
 
 
+@pytest.mark.slow
 def test_one_chunk_of_a_sequence_is_an_estimate(scenes, jobs, tmp_path):
     whole = dataclasses.replace(jobs[1], chunk=100)
     run_batch([whole], tmp_path / "batch")
@@ -177,6 +178,7 @@ def die_on_second_chunk(task: Task) -> Outcome:
     return perform(task)
 
 
+@pytest.mark.slow
 def test_poisoned_chunk_is_given_up_and_the_rest_is_kept(
     jobs, alone, cluster, tmp_path, monkeypatch
 ):

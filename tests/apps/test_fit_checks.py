@@ -99,6 +99,7 @@ def test_a_limit_that_keeps_the_truth_out(scene: TinyScene, tmp_path: Path) -> N
     assert "its limits (lift" in text
 
 
+@pytest.mark.slow
 def test_a_model_of_another_scale(scene: TinyScene, tmp_path: Path, runner: CliRunner) -> None:
     """Millimetres are seldom mistaken for metres: this one is but half as large again."""
 

@@ -12,6 +12,7 @@ _ONE, _OTHER = 200, 500
 MIB = 2**20
 
 
+@pytest.mark.slow
 def test_memory_is_that_of_the_process():
     # Filled, because pages that nobody wrote take none.
     def took(size):

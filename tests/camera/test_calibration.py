@@ -56,6 +56,7 @@ def shared_frame(seen, camera, seers):
     raise AssertionError(f"{camera} has no frame that {seers} cameras saw")
 
 
+@pytest.mark.slow
 class TestKnownCameras:
     @pytest.mark.parametrize("count", [1, 4, 8])
     def test_without_noise_everything_is_found_exactly(self, count):
@@ -111,6 +112,7 @@ class TestKnownCameras:
             )
 
 
+@pytest.mark.slow
 class TestSpoiltPictures:
     def test_picture_that_contradicts_its_own_lens_is_named(self):
         _, _, seen = rig()

@@ -176,6 +176,7 @@ def test_joint_agrees_with_exact_probability_and_gibbs_in_two_dimensions(seed):
 
 
 @pytest.mark.parametrize("seed", range(3))
+@pytest.mark.slow
 def test_joint_agrees_with_gibbs_on_table_1(seed):
     mean, covariance, rows = table_1_problem(seed)
     # Coupled angles mix slowly: with 100 sweeps the sampler itself is 0.1 deviations off.

@@ -241,6 +241,7 @@ def test_no_view_is_refused(tmp_path: Path) -> None:
         search(forked_body(tmp_path).pose_tree()).match([])
 
 
+@pytest.mark.slow
 def test_experiment_a_is_matched_exactly() -> None:
     paper, camera = experiment_search(), experiment_camera()
     matcher = WideSearch(paper.tree)

@@ -93,6 +93,7 @@ class TestMovedCamera:
         assert found.find(found.masks) is None
 
     @pytest.mark.parametrize("name", ["3 degrees", "5 cm"])
+    @pytest.mark.slow
     def test_moved_camera_is_found_among_nine(self, name: str, nine: Stage) -> None:
         fault = nine.find(nine.seen_by_moved("camera_2", *MOVES[name]))
         assert fault is not None

@@ -165,6 +165,7 @@ class TestSpoiltPictures:
             assert not calibrate(seen).left_out
 
 
+@pytest.mark.slow
 class TestCamerasThatDoNotFit:
     def test_camera_that_shares_no_picture_is_named(self):
         _, _, seen = rig()

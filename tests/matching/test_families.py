@@ -204,6 +204,7 @@ def test_a_pose_off_the_grid_has_no_samples(tmp_path: Path) -> None:
     assert samples_at(sampled, [np.array([0.5]), np.array([-0.9])]) is None
 
 
+@pytest.mark.slow
 def test_experiment_a_the_truth_is_in_the_set_and_all_members_look_alike() -> None:
     search, camera = wide_experiment_search(), experiment_camera()
     generator = np.random.default_rng(26)

@@ -156,6 +156,7 @@ def mirrored(masks: Masks, names: tuple[str, ...]) -> Masks:
     return [{n: m[:, ::-1] if n in names else m for n, m in own.items()} for own in masks]
 
 
+@pytest.mark.slow
 class TestRig:
     def test_sound_rig_has_no_fault(self, four: Stage, nine: Stage) -> None:
         assert find_rig_fault(four.cameras, four.masks[:2]) is None

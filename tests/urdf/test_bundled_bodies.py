@@ -160,6 +160,7 @@ def test_script_writes_the_committed_files(name: str, tmp_path: Path) -> None:
     assert_same_files(tmp_path, URDF / name)
 
 
+@pytest.mark.slow
 def test_stature_scales_the_body(tmp_path: Path) -> None:
     script = URDF / "woman" / "make_woman.py"
     command = [sys.executable, "-B", str(script), "--out", str(tmp_path), "--stature", "1.8"]

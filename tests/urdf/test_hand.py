@@ -94,6 +94,7 @@ def test_script_writes_the_committed_files(tmp_path: Path) -> None:
     assert_same_files(tmp_path, URDF / "hand")
 
 
+@pytest.mark.slow
 def test_hand_length_scales_everything(tmp_path: Path) -> None:
     written_again("hand", tmp_path, "--handlength", "0.21")
     large = read_obj(tmp_path / "meshes" / "left_palm.obj").vertices

@@ -98,7 +98,7 @@ def test_the_answer_does_not_depend_on_what_the_machine_is_set_to(
     finally:
         for child in children:
             child.kill()
-    # A sum's last bit may depend on where its array lies in memory, and a fit that stands still
-    # then ends a step earlier: 0.04 degrees were seen, once in many runs.
+    # Once in about ten runs, with nothing compiled, one joint differed by 0.04 degrees: why is not
+    # known; a sum's last bit that depends on where its array lies in memory would do it.
     for name, tolerance in (("poses.csv", 2e-3), ("joints.csv", 0.2), ("families.csv", 0.2)):
         assert_same(outs[0] / name, outs[1] / name, tolerance)

@@ -35,9 +35,9 @@ test-slow: $(VENV)/ready-test
 robots: $(VENV)/ready-robots
 
 bench: $(VENV)/ready-cluster
-	$(PYTHON) -m drake_pose.apps.benchmark
-	$(PYTHON) -m drake_pose.apps.memory_benchmark
-	$(PYTHON) -m drake_pose.apps.cluster_benchmark
+	$(PYTHON) -m drake_pose.apps.benchmarks.speed
+	$(PYTHON) -m drake_pose.apps.benchmarks.memory
+	$(PYTHON) -m drake_pose.apps.benchmarks.cluster
 
 clean:
 	rm -rf $(VENV) results

@@ -11,7 +11,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from drake_pose.apps.estimate import SceneEstimate, estimate_scene
+    from drake_pose.apps.estimate.scene import SceneEstimate, estimate_scene
     from drake_pose.apps.settings import EstimateSettings
     from drake_pose.body import bundled_model, load_model
     from drake_pose.camera import load_cameras
@@ -21,9 +21,9 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "EstimateSettings": "apps.settings",
-    "SceneEstimate": "apps.estimate",
+    "SceneEstimate": "apps.estimate.scene",
     "bundled_model": "body",
-    "estimate_scene": "apps.estimate",
+    "estimate_scene": "apps.estimate.scene",
     "load_cameras": "camera",
     "load_model": "body",
     "load_scene": "silhouette",

@@ -18,7 +18,7 @@ MAY_KNOW = {
     "apps": {"systems", "multiview", "filtering", "matching", "silhouette", "body", "camera"},
 }
 # Drake keeps two plain value types, ImageLabel16I and CameraInfo, in pydrake.systems.sensors.
-VALUE_TYPES = {"camera/models.py", "camera/drake.py", "silhouette/label_images.py"}
+VALUE_TYPES = {"camera/models.py", "camera/drake.py", "silhouette/pictures/label_images.py"}
 
 # Beside the rooms, for all of them.
 FOR_ALL = {"compiled", "errors", "regular_files", "yaml_files"}

@@ -13,10 +13,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from drake_pose.camera import save_cameras
-from drake_pose.camera.calibration import Calibration, CalibrationSettings, calibrate
-from drake_pose.camera.calibration_board import load_board
-from drake_pose.camera.calibration_lens import COEFFICIENTS, Lens, save_lenses
-from drake_pose.camera.calibration_pictures import (
+from drake_pose.camera.calibration.board import load_board
+from drake_pose.camera.calibration.calibrate import Calibration, CalibrationSettings, calibrate
+from drake_pose.camera.calibration.lens import COEFFICIENTS, Lens, save_lenses
+from drake_pose.camera.calibration.pictures import (
     BoardSightings,
     Picture,
     find_boards,

@@ -8,7 +8,7 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-from drake_pose.apps.result_folder import without_nan
+from drake_pose.apps.results.folder import without_nan
 from drake_pose.body import JointReport, ModelReport
 
 _UNITS = {"angle": " deg", "length": " m"}

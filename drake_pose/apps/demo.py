@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from drake_pose.apps.estimate import OnFrame, SceneEstimate, estimate_scene
-from drake_pose.apps.result_folder import OVERLAY, RESULT_FILES, SUMMARY, require_empty
+from drake_pose.apps.estimate.scene import OnFrame, SceneEstimate, estimate_scene
+from drake_pose.apps.results.folder import OVERLAY, RESULT_FILES, SUMMARY, require_empty
 from drake_pose.apps.settings import EstimateSettings
 from drake_pose.body import bundled_model
 from drake_pose.errors import OutputError, SceneError

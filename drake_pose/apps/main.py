@@ -8,12 +8,12 @@ from typing import Annotated
 import typer
 
 from drake_pose import __version__
-from drake_pose.apps import help_texts
-from drake_pose.apps.batch_command import batch
-from drake_pose.apps.capture_command import capture
-from drake_pose.apps.date_command import date
-from drake_pose.apps.estimate_command import run_estimate
-from drake_pose.apps.estimate_options import (
+from drake_pose.apps.commands import help_texts
+from drake_pose.apps.commands.batch import batch
+from drake_pose.apps.commands.capture import capture
+from drake_pose.apps.commands.date import date
+from drake_pose.apps.commands.estimate import run_estimate
+from drake_pose.apps.commands.estimate_options import (
     AnglesOption,
     CameraOption,
     CandidatesOption,
@@ -40,17 +40,10 @@ from drake_pose.apps.estimate_options import (
     TrackOption,
     TruthOption,
 )
-from drake_pose.apps.kameda_command import kameda
-from drake_pose.apps.live_command import empty_room
-from drake_pose.apps.options import (
-    parse_assignments,
-    parse_packages,
-    parse_root_position,
-    parse_root_rotation,
-)
-from drake_pose.apps.settings import EstimateSettings
-from drake_pose.apps.shimada_command import shimada
-from drake_pose.apps.terminal import (
+from drake_pose.apps.commands.kameda import kameda
+from drake_pose.apps.commands.live import empty_room
+from drake_pose.apps.commands.shimada import shimada
+from drake_pose.apps.commands.terminal import (
     FAILED,
     errors_as_messages,
     print_json,
@@ -58,7 +51,14 @@ from drake_pose.apps.terminal import (
     usage_errors,
     warn,
 )
-from drake_pose.apps.walk_command import walk
+from drake_pose.apps.commands.walk import walk
+from drake_pose.apps.options import (
+    parse_assignments,
+    parse_packages,
+    parse_root_position,
+    parse_root_rotation,
+)
+from drake_pose.apps.settings import EstimateSettings
 from drake_pose.errors import ModelError
 
 app = typer.Typer(
@@ -160,9 +160,9 @@ def demo(
 ) -> None:
     """See help_texts.DEMO."""
     with errors_as_messages():
-        from drake_pose.apps.compile_ahead import compiling_ahead
+        from drake_pose.apps.commands.report import FrameProgress, print_demo
         from drake_pose.apps.demo import run_demo
-        from drake_pose.apps.report import FrameProgress, print_demo
+        from drake_pose.apps.estimate.compile_ahead import compiling_ahead
 
         with compiling_ahead(), FrameProgress() as progress:
             result = run_demo(out, on_frame=progress)
@@ -185,7 +185,7 @@ def check(
         packages = parse_packages(package or ())
     with errors_as_messages():
         from drake_pose.apps.check import report_as_json, report_as_table
-        from drake_pose.apps.report import output_console
+        from drake_pose.apps.commands.report import output_console
         from drake_pose.body import describe_model
 
         report = describe_model(file, package_paths=packages)
@@ -226,8 +226,8 @@ def calibrate(
     """See help_texts.CALIBRATE."""
     with errors_as_messages():
         from drake_pose.apps.calibrate import calibrate_folder
-        from drake_pose.apps.report import output_console
-        from drake_pose.camera.calibration import CalibrationSettings
+        from drake_pose.apps.commands.report import output_console
+        from drake_pose.camera.calibration.calibrate import CalibrationSettings
 
         settings = CalibrationSettings(
             world=world, lens=lens, drop_spoilt=drop_spoilt, leave_out=tuple(leave_out or ())
@@ -251,7 +251,7 @@ def undistort(
     """See help_texts.UNDISTORT."""
     with errors_as_messages():
         from drake_pose.apps.calibrate import undistort_pictures
-        from drake_pose.camera.calibration_lens import load_lenses
+        from drake_pose.camera.calibration.lens import load_lenses
 
         written = undistort_pictures(folder, load_lenses(lenses), out)
         say(f"drake-pose: {len(written)} pictures written to {out}")

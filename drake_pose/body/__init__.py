@@ -1,5 +1,6 @@
 """What is looked at: links, joints, limits and surfaces of an articulated object."""
 
+from drake_pose.body.files.packages import bundled_model, package_map
 from drake_pose.body.landmarks import (
     Landmark,
     NodeLandmarks,
@@ -7,10 +8,7 @@ from drake_pose.body.landmarks import (
     landmarks_of_nodes,
     load_landmarks,
 )
-from drake_pose.body.mesh import TriangleMesh
 from drake_pose.body.model import ArticulatedModel, load_model
-from drake_pose.body.packages import bundled_model, package_map
-from drake_pose.body.pose_tree import PoseTree, PoseTreeNode
 from drake_pose.body.report import (
     JointReport,
     ModelReport,
@@ -18,10 +16,12 @@ from drake_pose.body.report import (
     describe_model,
     model_warnings,
 )
-from drake_pose.body.root import RootRotation
-from drake_pose.body.skin import SkinBand
-from drake_pose.body.skin_bands import ModelSkin
-from drake_pose.body.skin_motion import NodeSkin
+from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.body.surfaces.skin_file import SkinBand
+from drake_pose.body.tree.node_skin import ModelSkin
+from drake_pose.body.tree.pose_tree import PoseTree, PoseTreeNode
+from drake_pose.body.tree.root import RootRotation
+from drake_pose.body.tree.skin_motion import NodeSkin
 
 __all__ = [
     "ArticulatedModel",

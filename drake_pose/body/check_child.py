@@ -12,9 +12,9 @@ from pathlib import Path
 from pydrake.geometry import MakeRenderEngineVtk, RenderEngineVtkParams, SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 
+from drake_pose.body.files.parsing import captured_warnings
+from drake_pose.body.files.safety import MEMORY_LIMIT_BYTES
 from drake_pose.body.model import read_model
-from drake_pose.body.parsing import captured_warnings
-from drake_pose.body.safety import MEMORY_LIMIT_BYTES
 from drake_pose.errors import DrakePoseError
 
 

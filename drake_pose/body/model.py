@@ -12,17 +12,17 @@ from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex
 
-from drake_pose.body.geometry import body_mesh, make_drawable
+from drake_pose.body.files.parsing import ModelSource, limit_kinds
+from drake_pose.body.files.safety import check_in_child
 from drake_pose.body.limits import PositionKind, describe_positions
-from drake_pose.body.mesh import TriangleMesh
-from drake_pose.body.parsing import ModelSource, limit_kinds
-from drake_pose.body.safety import check_in_child
-from drake_pose.body.skin import SkinBand, load_skin
+from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.body.surfaces.skin_file import SkinBand, load_skin
+from drake_pose.body.surfaces.visual_geometry import body_mesh, make_drawable
 from drake_pose.errors import ModelError, UnknownNameError
 
 if TYPE_CHECKING:
-    from drake_pose.body.pose_tree import PoseTree
-    from drake_pose.body.root import RootRotation
+    from drake_pose.body.tree.pose_tree import PoseTree
+    from drake_pose.body.tree.root import RootRotation
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +129,7 @@ class ArticulatedModel:
         root_rotation: "RootRotation | None" = None,
         held: Mapping[str, float] | None = None,
     ) -> "PoseTree":
-        """The tree in which poses are searched; see ``drake_pose.body.pose_tree.PoseTree``.
+        """The tree in which poses are searched; see ``drake_pose.body.tree.pose_tree.PoseTree``.
 
         Args:
             root: the link to start from; None for the one nearest to the plant's world.
@@ -143,7 +143,7 @@ class ArticulatedModel:
             ModelError: the link has no geometry, or the file's joints allow no pose tree.
             SettingsError: a position or value that is not finite, or that is missing.
         """
-        from drake_pose.body.tree_builder import build_pose_tree  # It imports this module.
+        from drake_pose.body.tree.tree_builder import build_pose_tree  # It imports this module.
 
         return build_pose_tree(self, root, root_position, root_rotation, held or {})
 

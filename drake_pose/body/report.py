@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.link_graph import build_link_graph
-from drake_pose.body.mesh import TriangleMesh, is_watertight
+from drake_pose.body.files.parsing import limit_kinds
 from drake_pose.body.model import ArticulatedModel, load_model
-from drake_pose.body.parsing import limit_kinds
-from drake_pose.body.pose_tree import PoseTree, PoseTreeNode
+from drake_pose.body.surfaces.mesh import TriangleMesh, is_watertight
+from drake_pose.body.tree.link_graph import build_link_graph
+from drake_pose.body.tree.pose_tree import PoseTree, PoseTreeNode
 from drake_pose.errors import DrakePoseError
 
 _SYMMETRY_TOLERANCE = 0.03

@@ -1,19 +1,29 @@
 """Belief within limits: a Kalman filter whose estimates respect linear inequalities."""
 
-from drake_pose.filtering.axis_observation import AxisObservation
-from drake_pose.filtering.contour_observation import (
+from drake_pose.filtering.kalman.hypotheses import Hypothesis, Rejection
+from drake_pose.filtering.kalman.repeated_views import Stare, View
+from drake_pose.filtering.kalman.truncated_filter import (
+    FilterSettings,
+    FilterState,
+    TruncatedFilter,
+)
+from drake_pose.filtering.kalman.update import ObservationModel, Updated, update
+from drake_pose.filtering.measurements.axes import AxisObservation
+from drake_pose.filtering.measurements.contour import (
     ContourMeasurement,
     ContourObservation,
     ContourSettings,
 )
-from drake_pose.filtering.contour_tracking import ContourTracker, Track, TrackingSettings
-from drake_pose.filtering.couplings import (
+from drake_pose.filtering.measurements.segment_axes import Axis, AxisObserver, AxisSettings
+from drake_pose.filtering.state import Belief, StateLayout, make_belief
+from drake_pose.filtering.tracking.contour_tracker import ContourTracker, Track, TrackingSettings
+from drake_pose.filtering.tracking.match_and_track import TRACKED, Followed, MatchAndTrack
+from drake_pose.filtering.truncation.couplings import (
     couplings_file,
     load_couplings,
     model_inequalities,
 )
-from drake_pose.filtering.hypotheses import Hypothesis, Rejection
-from drake_pose.filtering.inequalities import (
+from drake_pose.filtering.truncation.inequalities import (
     Inequalities,
     from_bounds,
     from_model,
@@ -24,12 +34,8 @@ from drake_pose.filtering.inequalities import (
     stack,
     two_sided,
 )
-from drake_pose.filtering.match_and_track import TRACKED, Followed, MatchAndTrack
-from drake_pose.filtering.normal_moments import interval_moments
-from drake_pose.filtering.segment_axes import Axis, AxisObserver, AxisSettings
-from drake_pose.filtering.state import Belief, StateLayout, make_belief
-from drake_pose.filtering.truncated_filter import FilterSettings, FilterState, TruncatedFilter
-from drake_pose.filtering.truncation import (
+from drake_pose.filtering.truncation.normal_moments import interval_moments
+from drake_pose.filtering.truncation.truncated_normal import (
     JointRows,
     Truncated,
     clip,
@@ -37,8 +43,6 @@ from drake_pose.filtering.truncation import (
     truncate_joint,
     truncate_sequential,
 )
-from drake_pose.filtering.update import ObservationModel, Updated, update
-from drake_pose.filtering.views import Stare, View
 
 __all__ = [
     "TRACKED",

@@ -8,7 +8,7 @@ import numpy as np
 from drake_pose.body import PoseTree
 from drake_pose.camera import Camera
 from drake_pose.errors import MaskError
-from drake_pose.matching.families import JointEstimate, PoseSet
+from drake_pose.matching.pose_families import JointEstimate, PoseSet
 
 UNEXPLAINED = 0.5
 """From this E_total on, the pose is no explanation of the silhouettes."""

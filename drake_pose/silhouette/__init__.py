@@ -10,14 +10,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from drake_pose.silhouette.agreement import Agreement, measure_agreement
-    from drake_pose.silhouette.bending import BendingOutline, TreeSurfaces, score_bending
-    from drake_pose.silhouette.label_images import label_image_to_mask, mask_to_label_image
-    from drake_pose.silhouette.label_renderer import LabelRenderer
-    from drake_pose.silhouette.masks import read_mask, write_mask
-    from drake_pose.silhouette.outline import Outline, outline_from_mesh
-    from drake_pose.silhouette.scenes import Scene, load_scene
-    from drake_pose.silhouette.scoring import (
+    from drake_pose.silhouette.areas.agreement import Agreement, measure_agreement
+    from drake_pose.silhouette.areas.bending import BendingOutline, TreeSurfaces, score_bending
+    from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
+    from drake_pose.silhouette.areas.scoring import (
         draw_mask,
         draw_segments,
         prefix_sums,
@@ -25,30 +21,34 @@ if TYPE_CHECKING:
         score_candidates,
         subtract_body,
     )
-    from drake_pose.silhouette.visibility import require_visible
+    from drake_pose.silhouette.areas.visibility import require_visible
+    from drake_pose.silhouette.pictures.label_images import label_image_to_mask, mask_to_label_image
+    from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+    from drake_pose.silhouette.pictures.masks import read_mask, write_mask
+    from drake_pose.silhouette.pictures.scenes import Scene, load_scene
 
 _HOMES = {
-    "Agreement": "agreement",
-    "BendingOutline": "bending",
-    "LabelRenderer": "label_renderer",
-    "Outline": "outline",
-    "Scene": "scenes",
-    "TreeSurfaces": "bending",
-    "draw_mask": "scoring",
-    "draw_segments": "scoring",
-    "label_image_to_mask": "label_images",
-    "load_scene": "scenes",
-    "mask_to_label_image": "label_images",
-    "measure_agreement": "agreement",
-    "outline_from_mesh": "outline",
-    "prefix_sums": "scoring",
-    "read_mask": "masks",
-    "require_visible": "visibility",
-    "score_bending": "bending",
-    "score_bodies": "scoring",
-    "score_candidates": "scoring",
-    "subtract_body": "scoring",
-    "write_mask": "masks",
+    "Agreement": "areas.agreement",
+    "BendingOutline": "areas.bending",
+    "LabelRenderer": "pictures.label_renderer",
+    "Outline": "areas.outline",
+    "Scene": "pictures.scenes",
+    "TreeSurfaces": "areas.bending",
+    "draw_mask": "areas.scoring",
+    "draw_segments": "areas.scoring",
+    "label_image_to_mask": "pictures.label_images",
+    "load_scene": "pictures.scenes",
+    "mask_to_label_image": "pictures.label_images",
+    "measure_agreement": "areas.agreement",
+    "outline_from_mesh": "areas.outline",
+    "prefix_sums": "areas.scoring",
+    "read_mask": "pictures.masks",
+    "require_visible": "areas.visibility",
+    "score_bending": "areas.bending",
+    "score_bodies": "areas.scoring",
+    "score_candidates": "areas.scoring",
+    "subtract_body": "areas.scoring",
+    "write_mask": "pictures.masks",
 }
 
 __all__ = [

@@ -1,33 +1,33 @@
 """The estimators as Drake systems, and ready diagrams of them."""
 
-from drake_pose.systems.axis_sensor import AxisSensor, BodyBelief, StateMatcher
-from drake_pose.systems.diagrams import (
+from drake_pose.systems.bodies.skin import MeshcatSkin, SkinPoser, add_meshcat_skin, add_skin
+from drake_pose.systems.date.capture import PaperCapture, build_paper_capture
+from drake_pose.systems.date.face_direction_finder import FaceDirectionFinder
+from drake_pose.systems.date.feature_finder import FeatureFinder
+from drake_pose.systems.date.horizontal_image import HorizontalImage
+from drake_pose.systems.date.pose_estimator import PaperPoseEstimator
+from drake_pose.systems.date.pose_recogniser import PoseRecogniser
+from drake_pose.systems.estimators.axis_sensor import AxisSensor, BodyBelief, StateMatcher
+from drake_pose.systems.estimators.diagrams import (
     MatchingDiagram,
     build_recorded_matching,
     build_simulated_matching,
 )
-from drake_pose.systems.face_direction_finder import FaceDirectionFinder
-from drake_pose.systems.feature_finder import FeatureFinder
-from drake_pose.systems.hand_tracking import (
+from drake_pose.systems.estimators.hand_tracking import (
     HandTracking,
     add_hand_tracking,
     build_hand_tracking,
 )
-from drake_pose.systems.horizontal_image import HorizontalImage
-from drake_pose.systems.live_capture import EyePorts, LiveEyes, LocalEyes, build_live_capture
-from drake_pose.systems.mask_player import MaskPlayer
-from drake_pose.systems.paper_capture import PaperCapture, build_paper_capture
-from drake_pose.systems.paper_pose_estimator import PaperPoseEstimator
-from drake_pose.systems.person_tracker import PersonTracker, build_person_capture
-from drake_pose.systems.picture_capture import PictureCapture
-from drake_pose.systems.pose_recogniser import PoseRecogniser
-from drake_pose.systems.silhouette_capture import SilhouetteCapture, build_silhouette_capture
-from drake_pose.systems.silhouette_eye import SilhouetteEye
-from drake_pose.systems.silhouette_matcher import STATISTICS, SilhouetteMatcher
-from drake_pose.systems.silhouette_tracker import TRACK, SilhouetteTracker
-from drake_pose.systems.skin import MeshcatSkin, SkinPoser, add_meshcat_skin, add_skin
-from drake_pose.systems.truncated_ekf import TruncatedEkf
-from drake_pose.systems.walk import Walker, WalkKeys, WalkView, build_walk
+from drake_pose.systems.estimators.mask_player import MaskPlayer
+from drake_pose.systems.estimators.silhouette_matcher import STATISTICS, SilhouetteMatcher
+from drake_pose.systems.estimators.silhouette_tracker import TRACK, SilhouetteTracker
+from drake_pose.systems.estimators.truncated_ekf import TruncatedEkf
+from drake_pose.systems.person.live_capture import EyePorts, LiveEyes, LocalEyes, build_live_capture
+from drake_pose.systems.person.person_tracker import PersonTracker, build_person_capture
+from drake_pose.systems.person.silhouette_capture import SilhouetteCapture, build_silhouette_capture
+from drake_pose.systems.person.silhouette_sensor import SilhouetteEye
+from drake_pose.systems.pictures.picture_capture import PictureCapture
+from drake_pose.systems.walk.walk import Walker, WalkKeys, WalkView, build_walk
 
 __all__ = [
     "STATISTICS",

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_pose.apps.estimate_inputs import Inputs, read_inputs
+from drake_pose.apps.estimate.inputs import Inputs, read_inputs
 from drake_pose.apps.settings import EstimateSettings
 from drake_pose.matching import View
 from drake_pose.matching.scoring import Scoring

@@ -11,7 +11,7 @@ import yaml
 from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.camera import save_cameras
 from drake_pose.camera.rigs import circle_of_cameras
-from drake_pose.systems.camera_rig import build_camera_rig
+from drake_pose.systems.pictures.camera_rig import build_camera_rig
 
 SIZE = (240, 180)
 RATE_HZ = 15.0

@@ -8,8 +8,8 @@ import pytest
 
 from drake_pose.apps.calibrate import calibrate_folder, undistort_pictures
 from drake_pose.camera import load_cameras
-from drake_pose.camera.calibration import CalibrationSettings
-from drake_pose.camera.calibration_lens import load_lenses
+from drake_pose.camera.calibration.calibrate import CalibrationSettings
+from drake_pose.camera.calibration.lens import load_lenses
 from drake_pose.errors import CameraError, UnknownNameError
 from tests.camera.boards import CHECKERBOARD, facing, inside, photograph, poses_for_pairs, ring
 

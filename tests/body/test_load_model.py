@@ -7,7 +7,7 @@ from pydrake.geometry import MakeRenderEngineVtk, RenderEngineVtkParams, Role, S
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_pose.body import bundled_model, describe_model, load_model, package_map
-from drake_pose.body.mesh import TriangleMesh, is_watertight, merge_duplicate_vertices
+from drake_pose.body.surfaces.mesh import TriangleMesh, is_watertight, merge_duplicate_vertices
 from drake_pose.errors import ModelError, UnknownNameError
 
 from .models import FLOATING_URDF, WELDED_URDF, cube_obj, joint, link, urdf, write

@@ -9,10 +9,10 @@ import numpy as np
 from drake_pose.body import PoseTree
 from drake_pose.camera import ParallelCamera
 from drake_pose.matching import View
-from drake_pose.matching.family_search import samples_at
+from drake_pose.matching.grid.families.search import samples_at
+from drake_pose.matching.grid.sampled_body import WideBody
+from drake_pose.matching.grid.settings import WideSearchSettings
 from drake_pose.matching.scoring import SampledTree, Scoring
-from drake_pose.matching.wide_body import WideBody
-from drake_pose.matching.wide_settings import WideSearchSettings
 from drake_pose.silhouette import Outline, draw_mask, outline_from_mesh
 
 from .bodies import front_camera

@@ -6,14 +6,14 @@ import numpy as np
 
 from drake_pose.body import bundled_model, load_model
 from drake_pose.camera.rigs import FACE_CAMERA, circle_of_cameras
-from drake_pose.multiview.capture import see_person
-from drake_pose.multiview.faces import cut_face, learn_faces
-from drake_pose.multiview.features import find_features
-from drake_pose.multiview.recognition import register_pose, registered_positions
+from drake_pose.multiview.date.capture import see_person
+from drake_pose.multiview.date.faces import cut_face, learn_faces
+from drake_pose.multiview.date.features import find_features
+from drake_pose.multiview.date.recognition import register_pose, registered_positions
+from drake_pose.multiview.date.skeleton import load_skeleton
+from drake_pose.multiview.date.skin_blobs import SkinColour
 from drake_pose.multiview.regions import learn_background
-from drake_pose.multiview.skeleton import load_skeleton
-from drake_pose.multiview.skin_blobs import SkinColour
-from drake_pose.systems.camera_rig import build_camera_rig
+from drake_pose.systems.pictures.camera_rig import build_camera_rig
 
 HEAD_HEIGHT = 1.55
 

@@ -18,7 +18,7 @@ from pydrake.systems.sensors import CameraInfo
 
 from drake_pose.body import ArticulatedModel, load_model
 from drake_pose.body.landmarks import landmark_positions, load_landmarks
-from drake_pose.filtering.couplings import model_inequalities
+from drake_pose.filtering.truncation.couplings import model_inequalities
 from tests.urdf.surfaces import (
     URDF,
     Silhouettes,

@@ -13,7 +13,7 @@ from pydrake.geometry import LightParameter, MakeRenderEngineVtk, RenderEngineVt
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_pose.apps.demo import run_demo
-from drake_pose.apps.overlay import paint_agreement
+from drake_pose.apps.results.overlay import paint_agreement
 from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.camera import PinholeCamera
 from drake_pose.matching import PaperSearch, PaperSearchSettings, View

@@ -1,0 +1,1 @@
+"""Many scenes, in chunks, on any number of workers."""

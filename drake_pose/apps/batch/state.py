@@ -1,0 +1,138 @@
+"""How far a batch is: batch.json, and whether an interrupted one can go on."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from drake_pose import __version__
+from drake_pose.apps.batch.job import SceneJob
+from drake_pose.apps.batch.tasks import Task
+from drake_pose.apps.results.folder import without_nan
+from drake_pose.errors import OutputError
+
+BATCH = "batch.json"
+WAITING, FINISHED, FAILED = "waiting", "finished", "failed"
+
+
+@dataclass
+class SceneState:
+    """How far a scene is.
+
+    Args:
+        job: what is to be done.
+        described: the job and its files as they were at the start.
+        state: WAITING, FINISHED or FAILED.
+        tasks: its chunks, or the one task of a scene that is not cut.
+        done: the indices of the tasks that are finished.
+        errors: what went wrong, and in which frames ("": the whole scene).
+        totals: frame_count, found_count and mean_E_total of the result.
+        seconds: of the work on it in this run, over all workers [s].
+        attempts: how often a worker began one of its tasks.
+    """
+
+    job: SceneJob
+    described: Mapping[str, Any]
+    state: str = WAITING
+    tasks: tuple[Task, ...] = ()
+    done: set[int | None] = field(default_factory=set)
+    errors: dict[str, list[str]] = field(default_factory=dict)
+    totals: Mapping[str, Any] = field(default_factory=dict)
+    seconds: float = 0.0
+    attempts: int = 0
+
+    @property
+    def frame_count(self) -> int:
+        """All frames."""
+        return sum(len(task.frames) for task in self.tasks)
+
+    @property
+    def frames_done(self) -> int:
+        """The frames of finished tasks."""
+        return sum(len(task.frames) for task in self.tasks if task.index in self.done)
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain JSON values."""
+        return {
+            "state": self.state,
+            "errors": [{"error": text, "frames": frames} for text, frames in self.errors.items()],
+            "frame_count": self.frame_count,
+            "found_count": self.totals.get("found_count"),
+            "mean_E_total": self.totals.get("mean_E_total"),
+            "chunks": len(self.tasks),
+            "chunks_done": len(self.done),
+            "attempts": self.attempts,
+            "worker_seconds": self.seconds,
+            "job": self.described,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class BatchResult:
+    """What became of a batch. scenes: by name; seconds: of this run [s]; out: the folder."""
+
+    scenes: Mapping[str, SceneState]
+    seconds: float
+    out: Path
+
+    @property
+    def failed(self) -> tuple[str, ...]:
+        """The scenes that have no result."""
+        return tuple(name for name, one in self.scenes.items() if one.state == FAILED)
+
+    def as_json(self) -> dict[str, Any]:
+        """The content of batch.json."""
+        return {
+            "complete": all(one.state == FINISHED for one in self.scenes.values()),
+            "seconds": self.seconds,
+            "version": __version__,
+            "scenes": {name: one.as_json() for name, one in self.scenes.items()},
+        }
+
+
+def write_batch(result: BatchResult) -> None:
+    """Writes batch.json all at once.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    path = result.out / BATCH
+    part = path.with_name(path.name + ".part")
+    text = json.dumps(without_nan(result.as_json()), indent=2, ensure_ascii=False)
+    try:
+        result.out.mkdir(parents=True, exist_ok=True)
+        part.write_text(text + "\n", encoding="utf-8")
+        os.replace(part, path)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def check_same_batch(jobs: Sequence[SceneJob], out: Path) -> None:
+    """Refuses to resume a batch whose scenes were described otherwise; further scenes are allowed.
+
+    Raises:
+        OutputError: names the folder, the scene and what differs.
+    """
+    path = out / BATCH
+    try:
+        recorded = json.loads(path.read_text(encoding="utf-8"))["scenes"]
+        before = {name: scene["job"] for name, scene in recorded.items()}
+    except OSError as error:
+        raise OutputError(
+            f"{path}: cannot be read ({error.strerror}): no batch to resume"
+        ) from error
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise OutputError(f"{path}: is damaged, so it cannot be resumed") from error
+    for job in jobs:
+        described = json.loads(json.dumps(without_nan(job.describe())))
+        known = before.get(job.name, described)
+        for key, value in described.items():
+            if known.get(key) != value:
+                raise OutputError(
+                    f"{out}: scene '{job.name}' was begun with {key} = {known.get(key)}, not "
+                    f"{value}, so it cannot be resumed; name another folder"
+                )

@@ -1,0 +1,1 @@
+"""Benchmarks: ratios of time, memory, and workers (`make bench`)."""

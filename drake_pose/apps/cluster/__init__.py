@@ -1,0 +1,1 @@
+"""Workers on this machine or on others: scheduler, processes, and the cameras they watch."""

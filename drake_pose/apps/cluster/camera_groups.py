@@ -1,0 +1,339 @@
+"""Groups of cameras, each watched by a worker; a worker that dies is replaced."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+import uuid
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from concurrent import futures
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drake_pose.apps.cluster import camera_worker
+from drake_pose.apps.cluster.camera_assignment import CameraPlace, place_cameras
+from drake_pose.apps.cluster.camera_worker import WatchAnswer, WatchRequest
+from drake_pose.apps.cluster.worker import worker_resources
+from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecification, TimedPicture
+from drake_pose.errors import ClusterError, DrakePoseError
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+# So many pictures of each camera are asked for at once, and asked for again when fewer wait here.
+_COUNT = 4
+# So long a worker waits for a live camera's picture before it says that there is none [s].
+_LIVE_PATIENCE = 0.1
+# So long a recording waits for a worker, which may be started again meanwhile [s].
+_PATIENCE = 10.0
+# So long opening the sources may take, with all that a worker must import for it [s].
+_OPENING = 120.0
+# How often it is looked whether a worker that does not answer is still there [s].
+_ALIVE_PERIOD = 0.25
+# A worker that does not answer for so long is said to be silent [s].
+_SILENCE = 3.0
+_NAP = 0.0005
+
+
+class Watchers:
+    """Workers that watch cameras.
+
+    Attributes:
+        groups: of cameras, one for each worker.
+        reports: what the user should know and was not told yet.
+        overdue: says up to which time stamp a camera's pictures come too late [s].
+
+    Args:
+        client: of the cluster.
+        specifications: of the cameras' sources.
+        spacings: from edge point to edge point, by camera [pixel].
+        waits: whether a recording waits for a worker that does not answer; live, it goes on.
+
+    Raises:
+        ClusterError: there is no worker, or they do not get ready.
+        SceneError: a source cannot be opened.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        specifications: Sequence[SourceSpecification],
+        spacings: Mapping[str, float],
+        waits: bool,
+    ) -> None:
+        self._client, self.waits = client, waits
+        self.reports: list[str] = []
+        self.overdue: Callable[[str], float] = lambda _: -np.inf
+        self._addresses: tuple[str, ...] = ()
+        self._warm: dict[str, Future] = {}
+        self._looked = -np.inf
+        places = place_cameras(specifications, client.run(worker_resources))
+        self.groups = [WatchedGroup(self, place, spacings) for place in places]
+        try:
+            for group in self.groups:
+                group.prepare()
+            for group in self.groups:
+                group.require_ready()
+        except DrakePoseError:
+            self.close()
+            raise
+
+    @property
+    def client(self) -> Client:
+        """Of the cluster."""
+        return self._client
+
+    def addresses(self) -> tuple[str, ...]:
+        """The workers that are there, looked up a few times a second."""
+        if time.monotonic() - self._looked > _ALIVE_PERIOD:
+            self._addresses = tuple(sorted(self._client.nthreads()))
+            self._looked = time.monotonic()
+        return self._addresses
+
+    def free_address(self, group: WatchedGroup) -> str | None:
+        """The worker with the fewest groups; None where none can look through the cameras."""
+        loads = dict.fromkeys(filter(group.place.allows, self.addresses()), 0)
+        for other in self.groups:
+            if other is not group and other.address in loads:
+                loads[other.address] += 1
+        return min(loads, key=loads.__getitem__, default=None)
+
+    def is_warm(self, address: str) -> bool:
+        """Whether a worker has imported what it needs; it begins to where it has not."""
+        if address not in self._warm:
+            self._warm[address] = self._client.submit(
+                camera_worker.warm, workers=[address], pure=False
+            )
+        return bool(self._warm[address].done())
+
+    def pump(self) -> None:
+        """Takes what came, and asks for more."""
+        for group in self.groups:
+            group.pump()
+
+    def close(self) -> None:
+        """Lets go of the cameras."""
+        for group in self.groups:
+            group.close()
+
+
+class WatchedGroup:
+    """Cameras that one worker watches.
+
+    Attributes:
+        place: the cameras, and where they can be looked through.
+        address: of the worker.
+        specifications: by camera, of the cameras' sources.
+        queues: by camera, what came and was not read yet.
+        ended: the cameras that will give nothing any more.
+        rates: by camera, pictures a second, where known.
+        dropped: by camera, pictures that could not be used.
+        views, view_bytes, seconds: how many views came, of how many bytes, and the work for them.
+
+    Args:
+        watchers: all of them.
+        place: the cameras, and where they can be looked through.
+        spacings: from edge point to edge point, by camera [pixel].
+    """
+
+    def __init__(
+        self,
+        watchers: Watchers,
+        place: CameraPlace,
+        spacings: Mapping[str, float],
+    ) -> None:
+        self.place = place
+        self.specifications = {one.camera: one for one in place.specifications}
+        self.address = ""
+        self.queues: dict[str, deque[TimedPicture]] = {
+            name: deque() for name in self.specifications
+        }
+        self.ended: set[str] = set()
+        self.rates: dict[str, float | None] = dict.fromkeys(self.specifications)
+        self.dropped = dict.fromkeys(self.specifications, 0)
+        self.views, self.view_bytes, self.seconds = 0, 0, 0.0
+        self._watchers, self._spacings = watchers, spacings
+        self._key = uuid.uuid4().hex
+        self._after = dict.fromkeys(self.specifications, -np.inf)
+        self._future: Future | None = None
+        self._asked = 0.0
+        self._silent = self._given_up = False
+
+    @property
+    def names(self) -> str:
+        """The cameras, for messages."""
+        return ", ".join(f"'{name}'" for name in self.specifications)
+
+    def prepare(self) -> None:
+        """Begins to open the sources."""
+        self.address = self._watchers.free_address(self) or ""
+        self._ask(0)
+
+    def require_ready(self) -> None:
+        """Waits until the sources are open.
+
+        Raises:
+            SceneError: a source cannot be opened.
+            ClusterError: the worker does not get ready.
+        """
+        begin = time.monotonic()
+        while self._future is not None:
+            if time.monotonic() - begin > _OPENING:
+                raise ClusterError(f"the worker of camera {self.names} does not get ready")
+            time.sleep(_NAP)
+            if self._future.done():
+                future, self._future = self._future, None
+                self._take(future.result())
+
+    def pump(self) -> None:
+        """Takes what came, asks for more, and looks for another worker where this one died."""
+        if self._future is None:
+            self._settle()
+            waiting = [len(q) for name, q in self.queues.items() if name not in self.ended]
+            if self.address and min(waiting, default=_COUNT) < _COUNT:
+                self._ask(_COUNT)
+        elif self.address not in self._watchers.addresses():
+            self._future.cancel()
+            self._lose("was lost")
+        elif self._future.done():
+            self._note(self._future)
+        elif time.monotonic() - self._asked > _SILENCE:
+            self._report_silence("does not answer")
+
+    def await_camera(self, camera: str) -> None:
+        """Waits until there is something of a camera, or nothing is to be expected."""
+        begin = time.monotonic()
+        while not (self.queues[camera] or camera in self.ended or self._given_up):
+            self._watchers.pump()
+            # The next time nobody waits, until it answers.
+            self._given_up = time.monotonic() - begin > _PATIENCE
+            time.sleep(_NAP)
+
+    def close(self) -> None:
+        """Lets go of the sources."""
+        if self._future is not None:
+            self._future.cancel()
+            self._future = None
+        self.ended.update(self.specifications)
+        if self.address in self._watchers.addresses():
+            with suppress(asyncio.TimeoutError):
+                self._close_watch().exception(timeout=_PATIENCE)
+
+    @property
+    def _client(self) -> Client:
+        return self._watchers.client
+
+    def _ask(self, count: int) -> None:
+        request = WatchRequest(
+            self._key,
+            tuple(self.specifications.values()),
+            self._spacings,
+            {name: max(time, self._watchers.overdue(name)) for name, time in self._after.items()},
+            count,
+            _LIVE_PATIENCE,
+        )
+        self._asked = time.monotonic()
+        self._future = self._client.submit(
+            camera_worker.look, request, workers=[self.address], pure=False
+        )
+
+    def _note(self, future: Future) -> None:
+        """Takes an answer; it may have died with its worker."""
+        error = future.exception() if future.status == "error" else None
+        if future.status != "finished":
+            self._lose(f"failed ({error})" if isinstance(error, DrakePoseError) else "was lost")
+            return
+        with suppress(asyncio.TimeoutError, asyncio.CancelledError, futures.CancelledError):
+            answer = future.result(timeout=_ALIVE_PERIOD)
+            self._future = None
+            self._take(answer)
+
+    def _lose(self, how: str) -> None:
+        self._report_silence(how)
+        self._future, self.address = None, ""
+
+    def _report_silence(self, how: str) -> None:
+        if not self._silent:
+            self._watchers.reports.append(
+                f"the worker of camera {self.names} {how}; the others go on without"
+            )
+        self._silent = True
+
+    def _settle(self) -> None:
+        """Finds a worker where there is none; moves to a free one from one that has two groups."""
+        from distributed import fire_and_forget
+
+        free = self._watchers.free_address(self)
+        if free is None:
+            return
+        taken = {group.address for group in self._watchers.groups if group is not self}
+        if not self.address:
+            self.address = free
+        elif self.address in taken and free not in taken and self._watchers.is_warm(free):
+            fire_and_forget(self._close_watch())
+            self._watchers.reports.append(f"camera {self.names} moves to a worker of its own")
+            self.address = free
+
+    def _close_watch(self) -> Future:
+        return self._client.submit(
+            camera_worker.close, self._key, workers=[self.address], pure=False
+        )
+
+    def _take(self, answer: WatchAnswer) -> None:
+        if self._silent:
+            self._watchers.reports.append(f"a worker goes on with camera {self.names}")
+        self._silent = self._given_up = False
+        for name, views in answer.views.items():
+            for one in views:
+                packed = np.frombuffer(one.packed, dtype=np.uint8)
+                self.queues[name].append(TimedPicture(one.time, one.frame, packed))
+                self._after[name] = one.time
+                self.view_bytes += len(one.packed)
+            self.views += len(views)
+        self.ended.update(answer.ended)
+        self.rates.update(answer.rates)
+        self.dropped.update(answer.dropped)
+        self.seconds += answer.seconds
+        self._watchers.reports.extend(answer.problems)
+
+
+class WatchedSource(FrameSource):
+    """A camera whose pictures stay where they are: gives packed views in their place.
+
+    Args:
+        specification: where the pictures come from.
+        group: to which the camera belongs.
+        watchers: all of them.
+    """
+
+    def __init__(
+        self, specification: SourceSpecification, group: WatchedGroup, watchers: Watchers
+    ) -> None:
+        super().__init__(specification)
+        self._group, self._watchers = group, watchers
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing will come any more."""
+        name = self.specification.camera
+        return name in self._group.ended and not self._group.queues[name]
+
+    @property
+    def rate_hz(self) -> float | None:
+        """As the source says where it is open."""
+        return self._group.rates[self.specification.camera]
+
+    def close(self) -> None:
+        """Nothing is held open here."""
+
+    def _read(self) -> TimedPicture | None:
+        name = self.specification.camera
+        self._watchers.pump()
+        if self._watchers.waits:
+            self._group.await_camera(name)
+        self.dropped = self._group.dropped[name]
+        queue = self._group.queues[name]
+        return queue.popleft() if queue else None

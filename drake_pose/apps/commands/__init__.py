@@ -1,0 +1,1 @@
+"""The commands of `drake-pose`: their options, and what they print."""

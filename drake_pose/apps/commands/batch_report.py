@@ -1,0 +1,60 @@
+"""What `drake-pose batch` shows."""
+
+from __future__ import annotations
+
+from rich.markup import escape
+from rich.table import Table
+
+from drake_pose.apps.batch.state import FINISHED, BatchResult, SceneState
+from drake_pose.apps.commands.report import output_console, percent, progress_bar
+from drake_pose.apps.commands.terminal import warn
+
+
+class BatchProgress:
+    """A progress bar over the frames of all scenes that also says what went wrong."""
+
+    def __init__(self) -> None:
+        self._progress = progress_bar()
+        self._task = self._progress.add_task("reading", total=None)
+
+    def __enter__(self) -> BatchProgress:
+        """Show the bar."""
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Take the bar away."""
+        self._progress.stop()
+
+    def __call__(self, done: int, total: int, message: str) -> None:
+        """Show how far it is."""
+        self._progress.update(self._task, description="frames", completed=done, total=total)
+        if message:
+            warn(message)
+
+
+def print_batch(result: BatchResult) -> None:
+    """Prints a row a scene, and where the results are."""
+    table = Table("scene", "state", "found", "E_total", "chunks", "tries", "seconds", title="Batch")
+    for name, state in result.scenes.items():
+        table.add_row(escape(name), *_cells(state))
+    console = output_console()
+    console.print(table)
+    frames = sum(state.frames_done for state in result.scenes.values())
+    console.print(f"frames         {frames} in {result.seconds:.1f} s")
+    console.print(f"results        {escape(str(result.out))}", soft_wrap=True)
+
+
+def _cells(state: SceneState) -> list[str]:
+    """A row of the table; seconds are those of all workers."""
+    found = ""
+    if state.state == FINISHED:
+        found = f"{state.totals.get('found_count')} of {state.frame_count}"
+    return [
+        state.state,
+        found,
+        percent(state.totals.get("mean_E_total")),
+        f"{len(state.done)} of {len(state.tasks)}",
+        str(state.attempts),
+        f"{state.seconds:.1f}",
+    ]

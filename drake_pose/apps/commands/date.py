@@ -1,0 +1,46 @@
+"""The command `drake-pose reproduce date`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from drake_pose.apps.commands.estimate_options import JsonOption
+from drake_pose.apps.commands.terminal import errors_as_messages, print_json
+
+
+def date(
+    cameras: Annotated[
+        int, typer.Option(min=3, help="How many, the face camera among them; the paper's is 9.")
+    ] = 9,
+    frames: Annotated[
+        int, typer.Option(min=40, help="How many frames; fewer than 120 do not show all motions.")
+    ] = 240,
+    seed: Annotated[int, typer.Option(min=0, help="Another seed draws other motions.")] = 0,
+    method: Annotated[
+        str, typer.Option(help="silhouette: all silhouettes at once; paper: the paper's way alone.")
+    ] = "silhouette",
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for pictures; none without it.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """See help_texts.DATE."""
+    with errors_as_messages():
+        from drake_pose.apps.commands.report import count_progress, output_console
+        from drake_pose.apps.experiments.date.experiment import run_experiment
+        from drake_pose.apps.experiments.date.pictures import save_pictures
+        from drake_pose.apps.results.folder import require_empty
+
+        if out is not None:
+            require_empty(out)
+        with count_progress("frames", frames) as advance:
+            result = run_experiment(cameras, frames, seed, method, advance)
+        if out is not None:
+            save_pictures(result, out)
+        if json:
+            print_json(result.as_json())
+        else:
+            output_console().print(result.table(), result.costs())

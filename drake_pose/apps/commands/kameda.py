@@ -1,0 +1,152 @@
+"""The command `drake-pose reproduce kameda`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from drake_pose.apps.commands.estimate_options import JsonOption
+from drake_pose.apps.commands.terminal import (
+    errors_as_messages,
+    finite,
+    print_json,
+    say,
+    usage_errors,
+)
+from drake_pose.apps.settings import EstimateSettings
+
+# What is about the grid of angles, which continuous ones have none of.
+_OF_GRID = ("method", "outside_limit", "candidates", "interval", "edges", "out")
+
+
+def kameda(
+    context: typer.Context,
+    images: Annotated[int, typer.Option(min=1, help="How many silhouettes are drawn.")] = 219,
+    seed: Annotated[int, typer.Option(min=0, help="Another seed draws other poses.")] = 0,
+    method: Annotated[str, typer.Option(help="How to search: paper or wide.")] = "paper",
+    angles: Annotated[
+        str,
+        typer.Option(
+            help="lattice: multiples of 20 degrees, drawn and searched for as in the paper; "
+            "continuous: drawn anywhere, and refined between the samples."
+        ),
+    ] = "lattice",
+    outside_limit: Annotated[
+        float,
+        typer.Option(
+            min=0.0, callback=finite, help=r"r \[pixel]; the paper's is 200.", metavar="R"
+        ),
+    ] = 200.0,
+    candidates: Annotated[
+        int,
+        typer.Option(
+            min=1, help="How many candidates a node keeps; the paper's is 5.", metavar="K"
+        ),
+    ] = 5,
+    interval: Annotated[
+        float,
+        typer.Option(
+            min=1.0,
+            max=90.0,
+            callback=finite,
+            help=r"Sampling interval \[deg]; the paper's is 20.",
+        ),
+    ] = 20.0,
+    views: Annotated[
+        int, typer.Option(min=1, help="With --angles continuous: so many cameras.")
+    ] = 1,
+    mismatch: Annotated[
+        bool,
+        typer.Option(
+            "--mismatch",
+            help="With --angles continuous: beside it a body of other widths and joints than the "
+            "model's.",
+        ),
+    ] = False,
+    edges: Annotated[
+        bool,
+        typer.Option(
+            "--edges",
+            help="With --method wide: what edges inside the silhouettes settle of what they leave "
+            "open (some seconds for each of these).",
+        ),
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for pictures; none without it.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """See help_texts.KAMEDA."""
+    with usage_errors():
+        EstimateSettings(method=method)
+    if angles not in ("lattice", "continuous"):
+        raise typer.BadParameter("must be lattice or continuous", param_hint="--angles")
+    if edges and method != "wide":
+        raise typer.BadParameter("needs --method wide", param_hint="--edges")
+    others = _OF_GRID if angles == "continuous" else ("views", "mismatch")
+    for name in others:
+        if str(getattr(context.get_parameter_source(name), "name", "")) == "COMMANDLINE":
+            needed = "lattice" if angles == "continuous" else "continuous"
+            raise typer.BadParameter(
+                f"needs --angles {needed}", param_hint=f"--{name.replace('_', '-')}"
+            )
+    if angles == "lattice":
+        with errors_as_messages():
+            paper = (outside_limit, candidates)
+            _run_on_grid(images, seed, method, interval, paper, edges, out, json)
+        return
+    with errors_as_messages():
+        from drake_pose.apps.experiments.kameda.continuous import print_continuous, run_beside
+
+        print_continuous(run_beside(images, seed, views, mismatch), json)
+
+
+def _run_on_grid(
+    images: int,
+    seed: int,
+    method: str,
+    interval: float,
+    paper: tuple[float, int],
+    edges: bool,
+    out: Path | None,
+    json: bool,
+) -> None:
+    """Run the searches on a grid, the paper's with its r and K."""
+    from drake_pose.apps.commands.report import count_progress, output_console
+    from drake_pose.apps.experiments.kameda.experiment import (
+        PAPER_IMAGES,
+        experiment_search,
+        run_experiment,
+        wide_experiment_search,
+    )
+    from drake_pose.apps.experiments.kameda.inner_edges import edge_lines, settle_by_edges
+    from drake_pose.apps.experiments.kameda.pictures import save_pictures
+    from drake_pose.apps.experiments.kameda.table import experiment_table
+    from drake_pose.apps.results.folder import require_empty
+
+    if out is not None:
+        require_empty(out)
+    paper_images = images if method == "paper" else min(images, PAPER_IMAGES)
+    with count_progress("silhouettes, the paper's method", paper_images) as advance:
+        search = experiment_search(*paper, interval)
+        results = [run_experiment(search, paper_images, seed, advance)]
+    beside: dict[str, object] = {}
+    if method == "wide":
+        beside["paper_method"] = results[0].as_json()
+        with count_progress("silhouettes, wide search", images) as advance:
+            wide = wide_experiment_search(interval)
+            results.append(run_experiment(wide, images, seed, advance))
+    settled: dict[str, int] = {}
+    if edges:
+        with count_progress("silhouettes, edges", images) as advance:
+            settled = settle_by_edges(results[-1], advance)
+    if out is not None:
+        save_pictures(results[-1], out)
+    if json:
+        print_json({**results[-1].as_json(), **settled, **beside})
+        return
+    output_console().print(experiment_table(results))
+    if settled:
+        say(edge_lines(settled))

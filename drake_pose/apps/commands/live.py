@@ -1,0 +1,148 @@
+"""What `drake-pose capture` does with a folder that has a sources.yaml."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from drake_pose.apps.commands.terminal import (
+    FAILED,
+    errors_as_messages,
+    finite,
+    print_json,
+    say,
+    warn,
+)
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from drake_pose.apps.live.capture import LiveResult
+    from drake_pose.apps.live.scene import LiveScene
+    from drake_pose.systems.person.live_capture import LiveEyes
+
+_PANEL = "Live cameras, videos and folders of pictures, by sources.yaml"
+
+SecondsOption = Annotated[
+    float | None,
+    typer.Option(
+        min=0.01, callback=finite, help="End after so many seconds.", rich_help_panel=_PANEL
+    ),
+]
+ShapeOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="RESULT",
+        help="Take lengths and girths from an earlier capture of the same person.",
+        rich_help_panel=_PANEL,
+    ),
+]
+FitShapeOption = Annotated[
+    bool,
+    typer.Option(
+        "--fit-shape/--no-fit-shape",
+        help="Whether the first frames give lengths and girths; else they are the model's.",
+        rich_help_panel=_PANEL,
+    ),
+]
+ToleranceOption = Annotated[
+    float | None,
+    typer.Option(
+        metavar="SECONDS",
+        callback=finite,
+        help="How far apart pictures of one moment may be; half the time between two pictures if "
+        "not given, 0.9 of it for live cameras.",
+        rich_help_panel=_PANEL,
+    ),
+]
+
+
+def run_live_capture(
+    folder: Path,
+    out: Path,
+    model: Path | None,
+    *,
+    seconds: float | None = None,
+    shape: Path | None = None,
+    fit_shape: bool = True,
+    tolerance: float | None = None,
+    replay: bool = True,
+    json: bool = False,
+    open_eyes: Callable[[LiveScene], LiveEyes] | None = None,
+    packages: Mapping[str, Path] | None = None,
+) -> None:
+    """Captures as the pictures come, tells what happens, and prints what came out."""
+    with errors_as_messages():
+        from drake_pose.apps.commands.report import FrameProgress
+        from drake_pose.apps.live.capture import LiveSettings, capture_live
+        from drake_pose.apps.live.scene import hush_opencv, load_live_scene
+
+        hush_opencv()
+        settings = LiveSettings(seconds, shape, fit_shape, replay, packages or {})
+        scene = load_live_scene(folder)
+
+        def eyes() -> LiveEyes:
+            return scene.open_eyes(tolerance=tolerance) if open_eyes is None else open_eyes(scene)
+
+        with FrameProgress() as progress:
+
+            def show(count: int, found: bool) -> None:
+                progress.show_stage("frames", count, None)
+
+            result = capture_live(scene, out, model, settings, eyes, warn, show)
+        _print_result(result, json)
+
+
+def empty_room(
+    folder: Annotated[Path, typer.Argument(help="Holds cameras.yaml and sources.yaml.")],
+    pictures: Annotated[int, typer.Option(min=1, help="How many of each camera.")] = 30,
+) -> None:
+    """See help_texts.EMPTY_ROOM."""
+    with errors_as_messages():
+        from drake_pose.apps.live.empty_room import take_empty_room
+        from drake_pose.apps.live.scene import hush_opencv
+
+        hush_opencv()
+        for camera, place in take_empty_room(folder, pictures).items():
+            say(f"drake-pose: {camera}: {pictures} pictures of the empty room in {place}")
+
+
+def _print_result(result: LiveResult, json: bool) -> None:
+    """Says what came out, and fails where that is nothing."""
+    from drake_pose.apps.commands.report import output_console, print_estimate
+
+    estimate = result.estimate
+    for text in result.troubles:
+        warn(text)
+    if result.interrupted:
+        say("drake-pose: ended by Ctrl-C; all frames are kept")
+    if json:
+        print_json(estimate.summary)
+    elif estimate.rows:
+        print_estimate(estimate)
+        output_console().print(_source_table(estimate.summary["sources"]))
+    if not estimate.rows:
+        say("drake-pose: error: no camera gave a picture")
+        raise typer.Exit(FAILED)
+    if not estimate.found_count:
+        say("drake-pose: error: nobody was found in any frame")
+        raise typer.Exit(FAILED)
+
+
+def _source_table(sources: Mapping[str, Any]) -> Table:
+    """A row a camera: what became of its pictures, and when it stopped and returned."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table("camera", "pictures used", "unusable", "too late", "stopped and returned")
+    for name, source in sources.items():
+        changes = [
+            f"{one['what']} at {one['time']:.2f} s" if one["time"] is not None else "gave none"
+            for one in source["changes"]
+        ]
+        numbers = [str(source[what]) for what in ("used", "dropped", "late")]
+        table.add_row(escape(name), *numbers, ", ".join(changes))
+    return table

@@ -1,0 +1,198 @@
+"""The command `drake-pose walk`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from drake_pose.apps.commands.cluster_options import SchedulerOption, WatchersOption, workers_of
+from drake_pose.apps.commands.estimate_options import JsonOption, PackageOption
+from drake_pose.apps.commands.live import ShapeOption
+from drake_pose.apps.commands.terminal import (
+    errors_as_messages,
+    finite,
+    print_json,
+    say,
+    usage_errors,
+    warn,
+)
+from drake_pose.apps.options import parse_packages
+
+if TYPE_CHECKING:
+    from distributed import Client
+    from pydrake.geometry import Meshcat
+
+    from drake_pose.apps.live.scene import LiveScene
+    from drake_pose.systems.person.live_capture import LiveEyes
+
+
+def walk(
+    result: Annotated[
+        Path | None, typer.Argument(help="Result folder of capture, to be played; else the keys.")
+    ] = None,
+    simulate: Annotated[
+        bool, typer.Option("--simulate", help="Play a simulated person's motion.")
+    ] = False,
+    live: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Be captured: a folder with sources.yaml."),
+    ] = None,
+    shape: ShapeOption = None,
+    workers: WatchersOption = 0,
+    scheduler: SchedulerOption = None,
+    model: Annotated[
+        Path | None, typer.Option(help="The model of the result, where it is not a bundled one.")
+    ] = None,
+    package: PackageOption = None,
+    rate: Annotated[
+        float | None,
+        typer.Option(
+            callback=finite,
+            help="The result's frames a second; what its summary says if not given.",
+        ),
+    ] = None,
+    seconds: Annotated[
+        float | None,
+        typer.Option(min=0.01, callback=finite, help="End after so many seconds of the walk."),
+    ] = None,
+    speed: Annotated[
+        float,
+        typer.Option(
+            min=0.0, callback=finite, help="Seconds walked a second; 0: as fast as can be."
+        ),
+    ] = 1.0,
+    port: Annotated[
+        int | None,
+        typer.Option(min=1024, max=65535, help="Where the page listens; a free port if not given."),
+    ] = None,
+    browser: Annotated[
+        bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")
+    ] = True,
+    wait: Annotated[
+        bool | None,
+        typer.Option(
+            "--wait/--no-wait",
+            help="Play a result or --simulate once a browser shows the page, and again when the "
+            "page asks for it, until Ctrl-C or --seconds; --no-wait: at once, and once. "
+            "Default: as --browser.",
+        ),
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """See help_texts.WALK."""
+    if sum([simulate, result is not None, live is not None]) > 1:
+        raise typer.BadParameter("give a result, --simulate or --live, not two of them")
+    if workers and scheduler is not None:
+        raise typer.BadParameter("give --workers or --scheduler, not both")
+    if live is None and (workers or scheduler is not None or shape is not None):
+        raise typer.BadParameter("--shape, --workers and --scheduler are for --live")
+    if result is None and rate is not None:
+        raise typer.BadParameter("--rate is for a result")
+    if result is None and live is None and model is not None:
+        raise typer.BadParameter("--model is for a result or --live")
+    if rate is not None and rate <= 0.0:
+        raise typer.BadParameter("must be above 0", param_hint="--rate")
+    if package and model is None:
+        raise typer.BadParameter("--package is for --model")
+    with usage_errors():
+        packages = parse_packages(package or ())
+    with errors_as_messages():
+        from drake_pose.apps.live import walk as walking
+
+        if live is not None:
+            with workers_of(workers, scheduler) as client:
+                walked = _walk_live(live, model, shape, seconds, port, browser, client, packages)
+            _print(walked, json)
+            return
+        if result is not None:
+            player = walking.recorded_player(result, model, rate, packages)
+        elif simulate:
+            player = walking.simulated_player()
+        else:
+            player = walking.key_player()
+        waits = player.q is not None and (browser if wait is None else wait)
+        page = _open_page(port, browser, waits)
+        again = _asker(page) if waits and seconds is None else None
+        _print(walking.walk(player, page, seconds, speed, _say_command, again), json)
+
+
+def _asker(page: Meshcat) -> Callable[[], bool]:
+    """What waits at the end of a recording until it is to be played again."""
+    from drake_pose.apps.live.walk import wait_for_replay
+
+    def ask() -> bool:
+        say("drake-pose: the end; space or the page's button plays it again, Ctrl-C ends")
+        return wait_for_replay(page)
+
+    return ask
+
+
+def _walk_live(
+    folder: Path,
+    model: Path | None,
+    shape: Path | None,
+    seconds: float | None,
+    port: int | None,
+    browser: bool,
+    client: Client | None,
+    packages: Mapping[str, Path],
+) -> dict[str, Any]:
+    """Walks with the cameras of a folder; what it is to walk with is read before the page opens."""
+    from drake_pose.apps.live.live_walk import walk_live
+    from drake_pose.apps.live.scene import hush_opencv, load_live_scene
+
+    hush_opencv()
+    # Workers may have another working folder.
+    scene = load_live_scene(folder if client is None else folder.absolute())
+    page = _open_page(port, browser)
+
+    def report(text: str) -> None:
+        say(f"drake-pose: {text}")
+
+    open_eyes = None if client is None else _opener(client, scene)
+    walked = walk_live(
+        scene, page, model, shape, seconds, open_eyes, _say_command, report, packages
+    )
+    for text in walked["warnings"]:
+        warn(text)
+    return walked
+
+
+def _opener(client: Client, scene: LiveScene) -> Callable[[], LiveEyes]:
+    """What opens the eyes on the workers."""
+    from drake_pose.apps.cluster.remote_views import opener
+
+    # A recording cannot be skipped from afar as fast as its moments pass, so that it is waited for.
+    return lambda: opener(client)(scene)
+
+
+def _open_page(port: int | None, browser: bool, waits: bool = False) -> Meshcat:
+    """The page, shown in the browser where there is one; waits until it is, or says it is not."""
+    from drake_pose.apps.live import walk as walking
+
+    page = walking.open_page(port)
+    say(f"drake-pose: {page.web_url()} - arrow keys walk and turn, Ctrl-C ends")
+    shown = browser and walking.show(page)
+    if waits and not shown:
+        say("drake-pose: waiting until a browser shows the page")
+        walking.wait_for_browser(page)
+    elif browser and not shown:
+        warn("no browser has opened the page yet")
+    return page
+
+
+def _say_command(words: str) -> None:
+    say(f"drake-pose: {words or 'stand'}")
+
+
+def _print(walked: dict[str, Any], json: bool) -> None:
+    """A walk's result."""
+    from drake_pose.apps.live.walk import summary_line
+
+    if json:
+        print_json(walked)
+    else:
+        say(f"drake-pose: {summary_line(walked)}")

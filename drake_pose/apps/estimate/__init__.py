@@ -1,0 +1,1 @@
+"""A scene in, a pose a frame out."""

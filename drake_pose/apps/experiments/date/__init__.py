@@ -1,0 +1,1 @@
+"""Date's experiment: a simulated person before many cameras."""

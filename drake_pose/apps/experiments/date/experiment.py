@@ -1,0 +1,324 @@
+"""Date's experiment: a simulated person with known motion, captured by many cameras."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from rich.table import Table
+
+from drake_pose.apps.experiments.date.motion import REGISTERED, Motion, make_motion
+from drake_pose.apps.experiments.date.studio import Studio
+from drake_pose.apps.experiments.date.tracks import PaperTrack, SilhouetteTrack, see
+from drake_pose.body.landmarks import landmarks_of_nodes
+from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.errors import SettingsError
+
+Array = NDArray[np.float64]
+
+METHODS = ("silhouette", "paper")
+FEWEST_CAMERAS = 3
+SHOWN_CAMERA = "camera_0"
+FRAMES = 240
+
+# A track is right again within twice its usual error, or within this [mm].
+_RIGHT_AGAIN, _RIGHT_MM = 2.0, 25.0
+# How long a destroyed track is watched [frames].
+_WATCHED = 30
+_FEWEST_WATCHED = 10
+
+
+TITLES = {
+    "ik_only": "inverse kinematics alone",
+    "paper": "with the paper's search",
+    "silhouette": "all silhouettes",
+}
+"""What the ways of capturing are called."""
+
+
+@dataclass(frozen=True, eq=False)
+class DateResult:
+    """What the experiment measured.
+
+    Args:
+        method: of METHODS, whose figures lead.
+        names: (n,) motion of each frame.
+        joint_names: (k,) the joint centres.
+        errors: by way of capturing ("silhouette", "paper", "ik_only"): (n, k) [mm].
+        face_errors: (n,) angle between true and estimated direction of the head [deg].
+        recoveries: frames until a destroyed track was right again, by the motion during which it
+            was destroyed; REGISTERED: the registered pose was shown; None: not within _WATCHED.
+        search_ms: the longest that a frame's pose took on the way back [ms].
+        milliseconds: processor time by stage, a frame, all cameras together.
+        cameras: how many, the face camera included.
+        seed: what the motion was drawn with.
+        pictures: by motion: input and all estimates, side by side.
+    """
+
+    method: str
+    names: tuple[str, ...]
+    joint_names: tuple[str, ...]
+    errors: Mapping[str, Array]
+    face_errors: Array
+    recoveries: Mapping[str, int | None]
+    search_ms: float
+    milliseconds: Mapping[str, float]
+    cameras: int
+    seed: int
+    pictures: Mapping[str, NDArray[np.uint8]]
+
+    @property
+    def motions(self) -> tuple[str, ...]:
+        """Those that were shown."""
+        return tuple(name for name in dict.fromkeys(self.names) if name != REGISTERED)
+
+    def as_json(self) -> dict[str, object]:
+        """The figures; the registered pose's frames do not count."""
+        chosen = np.array([name != REGISTERED for name in self.names])
+        errors = {way: values[chosen] for way, values in self.errors.items()}
+        whole = sum(self.milliseconds.values())
+        anywhere = [n for motion, n in self.recoveries.items() if motion != REGISTERED]
+        return {
+            "joint_error_mm": _mean(errors[self.method]),
+            "joint_error_p95_mm": float(np.percentile(errors[self.method], 95)),
+            "ik_only_mm": _mean(errors["ik_only"]),
+            "paper_mm": _mean(errors["paper"]),
+            "elbows_and_knees": self._of_joints(errors, ("elbow", "knee")),
+            "elbows": self._of_joints(errors, ("elbow",)),
+            "knees": self._of_joints(errors, ("knee",)),
+            "face_error_deg": _mean(self.face_errors[chosen]),
+            "frames_to_recover": _slowest(anywhere or list(self.recoveries.values())),
+            "frames_to_recover_registered": self.recoveries.get(REGISTERED),
+            "ms_of_slowest_recovering_frame": self.search_ms,
+            "ms_per_frame": {**self.milliseconds, "all": whole},
+            "fps": 1e3 / whole,
+            "camera_frames_per_second": 1e3 * self.cameras / whole,
+            "motions": {motion: self._of_motion(motion) for motion in self.motions},
+            "frames": len(self.names),
+            "cameras": self.cameras,
+            "seed": self.seed,
+            "method": self.method,
+        }
+
+    def _of_motion(self, motion: str) -> dict[str, float]:
+        """The figures of one motion."""
+        chosen = np.array(self.names) == motion
+        figures = {f"{way}_mm": _mean(errors[chosen]) for way, errors in self.errors.items()}
+        return {**figures, "face_error_deg": _mean(self.face_errors[chosen])}
+
+    def _of_joints(self, errors: Mapping[str, Array], ends: tuple[str, ...]) -> Mapping[str, float]:
+        """Mean errors of the joints whose names end so, by way of capturing.
+
+        Elbows and knees are what the paper's search is for.
+        """
+        chosen = [i for i, name in enumerate(self.joint_names) if name.endswith(ends)]
+        return {f"{way}_mm": _mean(values[:, chosen]) for way, values in errors.items()}
+
+    def table(self) -> Table:
+        """The figures of each motion."""
+        ways = [way for way in TITLES if way in self.errors]
+        table = Table(
+            "motion",
+            *(f"{TITLES[way]} [mm]" for way in ways),
+            "face [deg]",
+            title=f"Date: {self.cameras} cameras, {len(self.names)} frames",
+        )
+        moving = np.array([name != REGISTERED for name in self.names])
+        rows = {name: np.array(self.names) == name for name in self.motions} | {"all": moving}
+        for motion, chosen in rows.items():
+            table.add_row(
+                motion,
+                *(f"{_mean(self.errors[way][chosen]):.1f}" for way in ways),
+                f"{_mean(self.face_errors[chosen]):.1f}",
+            )
+        return table
+
+    def costs(self) -> str:
+        """What a frame costs, and how soon a destroyed track is right again."""
+        whole = sum(self.milliseconds.values())
+        stages = ", ".join(f"{name} {spent:.1f}" for name, spent in self.milliseconds.items())
+        soon = ", ".join(
+            f"{motion} {'not' if n is None else n}" for motion, n in self.recoveries.items()
+        )
+        return (
+            f"One core, {TITLES[self.method]}: {whole:.1f} ms a frame ({stages}), "
+            f"{1e3 / whole:.0f} frames a second.\n"
+            f"Frames until a destroyed track was right again: {soon}; "
+            f"the slowest of them took {self.search_ms:.0f} ms."
+        )
+
+
+def run_experiment(
+    cameras: int = 9,
+    frames: int = FRAMES,
+    seed: int = 0,
+    method: str = "silhouette",
+    progress: Callable[[int], None] | None = None,
+    size: tuple[int, int] = (640, 480),
+) -> DateResult:
+    """Captures a simulated person.
+
+    Args:
+        cameras: how many, the face camera included.
+        frames: how many.
+        seed: another one draws other motions.
+        method: "silhouette" for all silhouettes at once, "paper" for the paper's way alone.
+        progress: called with the number of frames done after each.
+        size: width and height of the pictures [pixel].
+
+    Raises:
+        SettingsError: an argument is out of its range.
+    """
+    if method not in METHODS:
+        raise SettingsError(f"method must be one of {', '.join(METHODS)}, not '{method}'")
+    if cameras < FEWEST_CAMERAS:
+        raise SettingsError(f"cameras must be {FEWEST_CAMERAS} or more, not {cameras}")
+    # What is measured is one core's work.
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        return _Experiment(cameras, frames, seed, method, size).run(progress)
+    finally:
+        cv2.setNumThreads(threads)
+
+
+class _Experiment:
+    """One run; see run_experiment."""
+
+    def __init__(
+        self, cameras: int, frames: int, seed: int, method: str, size: tuple[int, int]
+    ) -> None:
+        self.cameras, self.seed, self.method = cameras, seed, method
+        self.studio = Studio.build(cameras, size, np.random.default_rng([seed, 1]))
+        self.motion = make_motion(self.studio.skeleton, frames, seed)
+        setup = self.studio.prepare(self.motion.q[0])
+        model = self.studio.model
+        tree = model.pose_tree()
+        self.kinematics = TreeKinematics(tree)
+        self.landmarks = landmarks_of_nodes(tree, self.studio.landmarks)
+        self.order = np.array([model.position_index(name) for name in self.kinematics.names])
+        alone = replace(setup, settings=replace(setup.settings, search=False))
+        self.tracks: dict[str, PaperTrack | SilhouetteTrack] = {
+            "ik_only": PaperTrack.build(alone),
+            "paper": PaperTrack.build(setup),
+        }
+        if method == "silhouette":
+            self.tracks[method] = SilhouetteTrack.build(
+                model, self.studio.cameras, self.studio.backgrounds
+            )
+        self.generator = np.random.default_rng([seed, 2])
+
+    def run(self, progress: Callable[[int], None] | None) -> DateResult:
+        """All frames."""
+        studio, motion = self.studio, self.motion
+        estimates: dict[str, list[Array]] = {way: [] for way in self.tracks}
+        watched: list[_Watched] = []
+        pictures = {}
+        destroyed_at = frames_of_destruction(motion)
+        for k, q in enumerate(motion.q):
+            images = see(studio.pictures(q))
+            if k in destroyed_at:
+                track = self.tracks[self.method].destroyed(motion.q[k - 1], self.generator)
+                watched.append(_Watched(destroyed_at[k], track, []))
+            for way, track in self.tracks.items():
+                estimates[way].append(track.step(images))
+            for one in watched:
+                if len(one.errors) < _WATCHED:
+                    one.errors.append(float(np.mean(self._off(one.track.step(images), q))))
+            if _is_middle(motion, k):
+                shown = [estimates[way][-1] for way in self.tracks]
+                pictures[motion.names[k]] = studio.side_by_side(q, shown, SHOWN_CAMERA)
+            if progress is not None:
+                progress(k + 1)
+        errors = {
+            way: np.array([self._off(found, q) for found, q in zip(path, motion.q, strict=True)])
+            for way, path in estimates.items()
+        }
+        right = max(_RIGHT_MM, _RIGHT_AGAIN * _mean(errors[self.method]))
+        rotation = studio.skeleton.head_rotation
+        return DateResult(
+            method=self.method,
+            names=motion.names,
+            joint_names=self.landmarks.names,
+            errors=errors,
+            face_errors=np.array(
+                [
+                    _angle_between(rotation(found), rotation(q))
+                    for found, q in zip(estimates[self.method], motion.q, strict=True)
+                ]
+            ),
+            recoveries={one.motion: one.frames_until(right) for one in watched},
+            search_ms=max(max(one.spent()) for one in watched),
+            milliseconds=self._medians(),
+            cameras=self.cameras,
+            seed=self.seed,
+            pictures=pictures,
+        )
+
+    def _off(self, found: Array, q: Array) -> Array:
+        """(k,) how far the joint centres at found positions (nq,) are off those at q (nq,) [mm]."""
+        places = [
+            self.landmarks.positions(self.kinematics.poses(positions[self.order]))
+            for positions in (found, q)
+        ]
+        return np.asarray(1e3 * np.linalg.norm(places[0] - places[1], axis=1))
+
+    def _medians(self) -> dict[str, float]:
+        """Milliseconds a frame, by stage."""
+        laps = self.tracks[self.method].milliseconds
+        names = dict.fromkeys(name for lap in laps for name in lap)
+        return {name: float(np.median([lap.get(name, 0.0) for lap in laps])) for name in names}
+
+
+class _Watched(NamedTuple):
+    """A destroyed track. errors: mean error of each frame since [mm]."""
+
+    motion: str
+    track: PaperTrack | SilhouetteTrack
+    errors: list[float]
+
+    def spent(self) -> list[float]:
+        """What the pose of each frame took [ms]."""
+        return [lap["pose"] for lap in self.track.milliseconds] or [0.0]
+
+    def frames_until(self, right: float) -> int | None:
+        """How many frames it took until the error was small enough; None: too many."""
+        good = [k for k, error in enumerate(self.errors) if error <= right]
+        return good[0] + 1 if good else None
+
+
+def frames_of_destruction(motion: Motion) -> dict[int, str]:
+    """Where tracks are destroyed: amid each motion, and when the registered pose is shown again.
+
+    Not in the last frames of a motion cut short, where recovery could not be seen.
+    """
+    count = len(motion.names)
+    found = {k: motion.names[k] for k in range(count - _FEWEST_WATCHED) if _is_middle(motion, k)}
+    again = 1 + max(k for k, name in enumerate(motion.names) if name != REGISTERED)
+    return found if again == count else {**found, again: REGISTERED}
+
+
+def _is_middle(motion: Motion, k: int) -> bool:
+    """Whether frame k is the middle one of its motion."""
+    same = [i for i, name in enumerate(motion.names) if name == motion.names[k]]
+    return motion.names[k] != REGISTERED and k == same[len(same) // 2]
+
+
+def _angle_between(R_a: Array, R_b: Array) -> float:
+    """Between the directions in which two heads look [deg]."""
+    return math.degrees(math.acos(min(1.0, max(-1.0, float(R_a[:, 2] @ R_b[:, 2])))))
+
+
+def _slowest(frames: Sequence[int | None]) -> int | None:
+    """The largest; None where one is."""
+    known = [n for n in frames if n is not None]
+    return max(known) if known and len(known) == len(frames) else None
+
+
+def _mean(values: Array) -> float:
+    return float(np.mean(values))

@@ -1,0 +1,1 @@
+"""Kameda's experiment A."""

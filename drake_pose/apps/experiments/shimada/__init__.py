@@ -1,0 +1,1 @@
+"""Shimada's synthetic experiment with the two-finger hand."""

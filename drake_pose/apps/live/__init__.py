@@ -1,0 +1,1 @@
+"""Capture of a person frame by frame, as pictures come, and the walk through the garden."""

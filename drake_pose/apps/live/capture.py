@@ -1,0 +1,299 @@
+"""Capture frame by frame, as the pictures come from live cameras, videos or folders."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drake_pose.apps.estimate.capture import bundled_person
+from drake_pose.apps.estimate.inputs import Inputs
+from drake_pose.apps.estimate.mask_agreement import compare_masks
+from drake_pose.apps.estimate.person import FOLLOWED
+from drake_pose.apps.estimate.result import ResultWriter, SceneEstimate
+from drake_pose.apps.live.run import FrameWatch, LiveFrame, Mask, run_live
+from drake_pose.apps.live.scene import LiveScene
+from drake_pose.apps.live.shape import fit_first_frames, shape_of_result
+from drake_pose.apps.results.folder import PoseRow, require_empty
+from drake_pose.apps.results.joint_tables import record_deviations
+from drake_pose.apps.results.summary import FrameRecord, describe_job
+from drake_pose.apps.settings import EstimateSettings
+from drake_pose.body import ArticulatedModel, load_model
+from drake_pose.camera.sources.recorded import TIME_STAMPS
+from drake_pose.errors import SettingsError
+from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker
+from drake_pose.multiview.recordings.known_shape import KnownShape, tracker_of_person
+from drake_pose.multiview.recordings.other_persons import keep_person
+from drake_pose.silhouette import Scene, draw_mask
+from drake_pose.systems.person.live_capture import LiveEyes, build_live_capture
+from drake_pose.systems.person.person_tracker import place_of_person
+from drake_pose.systems.pictures.picture_capture import CameraCount
+
+OpenEyes = Callable[[], LiveEyes]
+
+
+@dataclass(frozen=True)
+class LiveSettings:
+    """How a live capture is made.
+
+    Args:
+        seconds: how long; None: until the recordings end, or Ctrl-C.
+        shape: a result of capture with the same person, whose lengths and girths are taken.
+        fit_shape: whether otherwise the first frames give them; else they are the model's.
+        replay: whether replay.html is written.
+        packages: folders of packages that the model's ``package://`` names mean, by name.
+
+    Raises:
+        SettingsError: a time that cannot be.
+    """
+
+    seconds: float | None = None
+    shape: Path | None = None
+    fit_shape: bool = True
+    replay: bool = True
+    packages: Mapping[str, Path] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.seconds is not None and not 0.0 < self.seconds < np.inf:
+            raise SettingsError(f"the capture's length must be positive, not {self.seconds} s")
+
+
+@dataclass(frozen=True, eq=False)
+class LiveResult:
+    """What came out of a live capture.
+
+    Args:
+        estimate: the estimate, as that of a recorded scene.
+        interrupted: whether Ctrl-C ended it.
+        troubles: what the user should know and was not told while it ran.
+    """
+
+    estimate: SceneEstimate
+    interrupted: bool
+    troubles: tuple[str, ...]
+
+
+def capture_live(
+    scene: LiveScene,
+    out: Path,
+    model_path: Path | None = None,
+    settings: LiveSettings | None = None,
+    open_eyes: OpenEyes | None = None,
+    on_report: Callable[[str], None] = lambda _: None,
+    on_frame: Callable[[int, bool], None] = lambda _, __: None,
+) -> LiveResult:
+    """Captures a person as the pictures come, and writes the result's folder.
+
+    Ctrl-C ends the capture, and keeps everything.
+
+    Args:
+        scene: the cameras and where their pictures come from.
+        out: the result's folder, empty or not there.
+        model_path: a person with landmarks.yaml beside it; the bundled one with shape joints where
+            not given.
+        settings: how.
+        open_eyes: opens the eyes; those of the scene in this process where not given. Called once
+            more for the frames that give the person's shape.
+        on_report: hears at once of cameras that stop and return, and of bad pictures.
+        on_frame: hears of each frame: how many there are, and whether a person was found.
+
+    Raises:
+        SceneError, ModelError, SettingsError: what was given cannot be captured.
+        OutputError: the result cannot be written.
+    """
+    settings = settings or LiveSettings()
+    opener: OpenEyes = open_eyes or (lambda: scene.open_eyes())
+    model = load_model(model_path or bundled_person(), package_paths=settings.packages)
+    # A folder that cannot be written is refused before a camera is opened.
+    require_empty(out)
+    shape = _shape(scene, model, settings, opener, on_report)
+    tracker = tracker_of_person(model.pose_tree(), shape)
+    told: list[str] = []
+    eyes = opener()
+    try:
+        diagram = build_live_capture(tracker, scene.cameras, eyes, with_deviations=True)
+        result = _Result(scene, model, tracker, out, eyes.period, settings.packages)
+        result.writer.more["method"] = "person"
+        if shape is not None:
+            result.writer.more |= {"lengths_m": shape.lengths, "girths": shape.girths}
+        result.writer.open()
+        try:
+
+            def note(frame: LiveFrame) -> None:
+                found = result.add(frame)
+                on_frame(result.count, found)
+
+            def report(text: str) -> None:
+                told.append(text)
+                result.writer.warn([text])
+                on_report(text)
+
+            watch = FrameWatch(diagram, scene.cameras, note)
+            interrupted = run_live(diagram, eyes, settings.seconds, report, monitor=watch)
+            result.finish(eyes, settings.replay)
+        finally:
+            result.writer.close()
+    finally:
+        eyes.close()
+    estimate = result.writer.result()
+    troubles = tuple(text for text in estimate.warnings if text not in told)
+    return LiveResult(estimate, interrupted, troubles)
+
+
+def _shape(
+    scene: LiveScene,
+    model: ArticulatedModel,
+    settings: LiveSettings,
+    open_eyes: OpenEyes,
+    on_report: Callable[[str], None],
+) -> KnownShape | None:
+    """The person's lengths and girths; None: the model's."""
+    if settings.shape is not None:
+        return shape_of_result(settings.shape)
+    if not settings.fit_shape:
+        return None
+    eyes = open_eyes()
+    try:
+        # What is wrong with recorded pictures is said when they are captured.
+        report = on_report if eyes.live else lambda _: None
+        return fit_first_frames(scene, eyes, model.pose_tree(), report)
+    finally:
+        eyes.close()
+
+
+class _Result:
+    """The result of a capture under way."""
+
+    def __init__(
+        self,
+        scene: LiveScene,
+        model: ArticulatedModel,
+        tracker: SilhouetteTracker,
+        out: Path,
+        period: float,
+        packages: Mapping[str, Path],
+    ) -> None:
+        self._scene, self._model, self._tracker = scene, model, tracker
+        self._period = period
+        self._times: dict[str, float] = {}
+        self._seen: dict[tuple[str, str], Path] = {}
+        self._last = -1
+        recorded = Scene(scene.path, scene.cameras, (), {}, True, 1.0 / period)
+        inputs = Inputs(recorded, model, tuple(scene.cameras.values()), (), None, None, None)
+        settings = EstimateSettings(method="person", packages=packages)
+        job = describe_job(scene.path, model.path, settings)
+        self.writer = ResultWriter(inputs, job, out, None, with_base=False)
+
+    @property
+    def count(self) -> int:
+        """How many frames there are."""
+        return len(self._times)
+
+    def add(self, frame: LiveFrame) -> bool:
+        """Writes a frame, which is named after the periods since the first; whether found."""
+        self._last = max(self._last + 1, round(frame.time / self._period))
+        name = f"{self._last:06d}"
+        self._times[name] = frame.time
+        found = bool(np.isfinite(frame.q).all())
+        error, ious = self._agreement(frame) if found else (float("nan"), {})
+        for camera in frame.views:
+            self._seen[camera, name] = Path(self._scene.specifications[camera].location)
+        row = PoseRow(name, frame.q, None, error, frame.seconds)
+        record = FrameRecord(
+            found=row.found,
+            E_total=error if row.found else None,
+            seconds=frame.seconds,
+            stopped_by=FOLLOWED,
+            joints=record_deviations(self._model, frame.q, frame.deviations),
+            ious=ious,
+            share=frame.share,
+        )
+        self.writer.finish_frame(row, record)
+        return row.found
+
+    def finish(self, eyes: LiveEyes, replay: bool) -> None:
+        """Writes what is made of all frames."""
+        writer = self.writer
+        # A moment that no camera saw, or nobody had time for, is a frame without a pose.
+        frames = tuple(f"{k:06d}" for k in range(self._last + 1))
+        scene = replace(writer.inputs.scene, frames=frames, masks=self._seen)
+        writer.inputs = replace(writer.inputs, scene=scene, frames=tuple(self._times))
+        counts = eyes.counts()
+        writer.more["sources"] = {
+            name: _describe_camera(self._scene, name, count) for name, count in counts.items()
+        }
+        writer.more["skipped_moments"] = eyes.skipped
+        writer.warn(camera_troubles(counts, eyes.skipped))
+        if writer.rows:
+            writer.finish(replay)
+            _write_times(writer, self._times)
+
+    def _agreement(self, frame: LiveFrame) -> tuple[float, Mapping[str, float]]:
+        """E_total, and by camera the intersection over union of region and body."""
+        fit = self._tracker.fit
+        values = self._tracker.values(frame.q)
+        X_WN = fit.kinematics.poses(values)
+        masks: Mapping[str, Mask] = {name: view.region for name, view in frame.views.items()}
+        if frame.has_others:
+            place = place_of_person(self._tracker, values)
+            masks = keep_person(self._scene.cameras, masks, place).masks
+        bodies = {}
+        for name in masks:
+            camera = self._scene.cameras[name]
+            bodies[name] = draw_mask(fit.outlines, camera.X_CW @ X_WN, camera)
+        agreement = compare_masks(masks, bodies)
+        return agreement.E_total, agreement.ious
+
+
+def camera_troubles(counts: Mapping[str, CameraCount], skipped: int) -> list[str]:
+    """What the user should know at the end of a capture: pictures lost, by camera."""
+    troubles = []
+    for name, count in counts.items():
+        lost = [
+            f"{number} {what}"
+            for number, what in (
+                (count.dropped, "could not be used"),
+                (count.late, "came after their moment"),
+            )
+            if number
+        ]
+        if lost:
+            troubles.append(f"camera '{name}': of its pictures {' and '.join(lost)}")
+        stops = sum(change.stopped for change in count.changes)
+        if stops and count.changes[-1].stopped:
+            troubles.append(f"camera '{name}' had stopped by the end")
+    if skipped:
+        troubles.append(
+            f"{skipped} moments were skipped: this computer could not follow the cameras"
+        )
+    return troubles
+
+
+def _describe_camera(scene: LiveScene, name: str, count: CameraCount) -> dict[str, Any]:
+    """What summary.json says of a camera's source."""
+    given = scene.specifications[name]
+    return {
+        "kind": given.kind,
+        "location": given.location,
+        "used": count.used,
+        "dropped": count.dropped,
+        "late": count.late,
+        "changes": [
+            {"time": change.time, "what": "stopped" if change.stopped else "returned"}
+            for change in count.changes
+        ],
+    }
+
+
+def _write_times(writer: ResultWriter, times: Mapping[str, float]) -> None:
+    """Writes timestamps.csv: frame, time [s]."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(["frame", "time"])
+    table.writerows([frame, f"{time:.6f}"] for frame, time in times.items())
+    writer.write(TIME_STAMPS, text.getvalue().encode())

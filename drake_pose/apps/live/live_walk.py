@@ -1,0 +1,127 @@
+"""A walk through the garden with live cameras: the person before them is the avatar."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from pydrake.geometry import Meshcat
+from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
+
+from drake_pose.apps.estimate.capture import bundled_person
+from drake_pose.apps.live.capture import camera_troubles
+from drake_pose.apps.live.run import run_live
+from drake_pose.apps.live.scene import LiveScene
+from drake_pose.apps.live.shape import shape_of_result
+from drake_pose.apps.live.walk import CommandLog, stride_positions
+from drake_pose.body import load_model
+from drake_pose.errors import SettingsError
+from drake_pose.multiview.recordings.known_shape import tracker_of_person
+from drake_pose.systems.person.live_capture import LiveEyes, add_person_tracker
+from drake_pose.systems.walk.walk import build_walk
+
+SETTLE = 1.0
+"""Whoever comes before the cameras commands after standing still for so long [s]."""
+
+
+def walk_live(
+    scene: LiveScene,
+    meshcat: Meshcat,
+    model_path: Path | None = None,
+    shape: Path | None = None,
+    seconds: float | None = None,
+    open_eyes: Callable[[], LiveEyes] | None = None,
+    on_command: Callable[[str], None] = lambda _: None,
+    on_report: Callable[[str], None] = lambda _: None,
+    packages: Mapping[str, Path] | None = None,
+) -> dict[str, Any]:
+    """Lets the avatar walk as the person before the cameras commands, until Ctrl-C.
+
+    Recorded sources are played as if they were live.
+
+    Args:
+        scene: the cameras and where their pictures come from.
+        meshcat: the page.
+        model_path: a person with landmarks.yaml beside it; the bundled one where not given.
+        shape: a result of capture with the same person, whose lengths and girths are taken; the
+            model's where not given.
+        seconds: how long; without end, or until the recordings end, where not given.
+        open_eyes: opens the eyes; those of the scene in this process where not given.
+        on_command: called when the command changes, with its words, "" for none.
+        on_report: hears at once of cameras that stop and return, of bad pictures, and of a person
+            who is found or lost.
+        packages: folders of packages that the model's ``package://`` names mean, by name.
+
+    Returns:
+        As walk in drake_pose.apps.live.walk; found_share of the periods in which the person was
+        known; and warnings.
+
+    Raises:
+        SceneError, ModelError, SettingsError: what was given cannot be walked with.
+        OutputError: the shape's result is none.
+    """
+    if seconds is not None and not 0.0 < seconds < math.inf:
+        raise SettingsError(f"the walk's length must be a positive number, not {seconds} s")
+    model = load_model(model_path or bundled_person(), package_paths=packages)
+    known = None if shape is None else shape_of_result(shape)
+    tracker = tracker_of_person(model.pose_tree(), known)
+    opened: LiveEyes = scene.open_eyes(live=True) if open_eyes is None else open_eyes()
+    try:
+
+        def add(builder: DiagramBuilder) -> OutputPort:
+            ports = opened.add(builder)
+            system = add_person_tracker(builder, tracker, scene.cameras, ports, opened.period)
+            return system.GetOutputPort("estimated_positions")
+
+        stride = stride_positions(model)
+        diagram = build_walk(model, meshcat, add, stride, opened.period, settle=SETTLE)
+        command, pose = (diagram.GetOutputPort(name) for name in ("command", "walker_pose"))
+        person = diagram.GetSubsystemByName("person_tracker")
+        positions = person.GetOutputPort("estimated_positions")
+        log = CommandLog(on_command)
+        presence = _Presence(on_report)
+        last = [0.0, *pose.Eval(diagram.CreateDefaultContext())]
+
+        def watch(context: Context) -> None:
+            log.add(context.get_time(), command.Eval(context))
+            found = positions.Eval(person.GetMyContextFromRoot(context))
+            presence.add(math.isfinite(found[0]))
+            last[:] = [context.get_time(), *pose.Eval(context)]
+
+        run_live(diagram, opened, seconds, on_report, monitor=watch, is_shown=True)
+        warnings = camera_troubles(opened.counts(), 0)
+    finally:
+        opened.close()
+    time, x, y, heading = (float(value) for value in last)
+    return {
+        "seconds": time,
+        "x": x,
+        "y": y,
+        "heading_deg": math.degrees(heading),
+        "commands": log.seconds,
+        "found_share": presence.share,
+        "warnings": warnings,
+    }
+
+
+class _Presence:
+    """Whether a person is known, period by period."""
+
+    def __init__(self, on_report: Callable[[str], None]) -> None:
+        self._on_report = on_report
+        self._count, self._found, self._known = 0, 0, False
+
+    @property
+    def share(self) -> float:
+        """In which share of the periods the person was known."""
+        return self._found / max(self._count, 1)
+
+    def add(self, known: bool) -> None:
+        """Takes whether the person is known in a period."""
+        self._count += 1
+        self._found += known
+        if known != self._known:
+            self._on_report("the person is found" if known else "the person is lost")
+            self._known = known

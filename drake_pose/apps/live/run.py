@@ -1,0 +1,144 @@
+"""Runs the diagram of a live capture, period by period, and notes what comes out."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.systems.analysis import Simulator, SimulatorStatus
+from pydrake.systems.framework import Context, Diagram
+
+from drake_pose.multiview.person.silhouette_tracker import SilhouetteView
+from drake_pose.systems.person.live_capture import LiveEyes
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# A simulation that lags behind the clock by more [s] does not try to make up for it.
+_LARGEST_LAG = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class LiveFrame:
+    """What a moment's pictures say.
+
+    Args:
+        time: the pictures' time stamp, from the first ones on [s].
+        q: (nq,) estimated positions [rad or m]; nan where nobody was found.
+        share: of the contours, what fits.
+        views: by camera that gave a picture, what it says.
+        has_others: whether other persons are in the views, whom the tracker has cut out.
+        deviations: (nq,) standard deviations of q [rad or m]; nan where nobody was found, or where
+            the diagram does not give them.
+        seconds: the work since the frame before [s].
+    """
+
+    time: float
+    q: Array
+    share: float
+    views: Mapping[str, SilhouetteView]
+    has_others: bool
+    deviations: Array
+    seconds: float
+
+
+def run_live(
+    diagram: Diagram,
+    eyes: LiveEyes,
+    seconds: float | None,
+    on_report: Callable[[str], None],
+    until: Callable[[], bool] = lambda: False,
+    monitor: Callable[[Context], None] | None = None,
+    is_shown: bool = False,
+) -> bool:
+    """Runs a diagram until its recordings end, its time is up, or Ctrl-C.
+
+    Args:
+        diagram: with the eyes in it.
+        eyes: the eyes.
+        seconds: how long; None: without end.
+        on_report: hears what the user should know of cameras and pictures.
+        until: asked after every period whether it is enough.
+        monitor: called with the diagram's context after every period.
+        is_shown: whether somebody watches: then recordings, too, run no faster than the clock.
+
+    Returns:
+        Whether it was ended by Ctrl-C.
+    """
+    simulator = Simulator(diagram)
+    if monitor is not None:
+        simulator.set_monitor(monitor)
+    is_paced = eyes.live or is_shown
+    if is_paced:
+        simulator.set_target_realtime_rate(1.0)
+    context = simulator.get_context()
+    begin = start = time.monotonic()
+
+    def elapsed() -> float:
+        return time.monotonic() - start if eyes.live else context.get_time()
+
+    end = math.inf if seconds is None else seconds
+    reached = SimulatorStatus.ReturnReason.kReachedTerminationCondition
+    try:
+        simulator.Initialize()
+        begin = start = time.monotonic()
+        while elapsed() < end and not until():
+            status = simulator.AdvanceTo(context.get_time() + eyes.period)
+            for report in eyes.take_reports():
+                on_report(report)
+            if status.reason() == reached:
+                break
+            lag = time.monotonic() - begin - context.get_time()
+            if is_paced and lag > _LARGEST_LAG:
+                # What was missed is gone: nobody wants to see it in fast motion.
+                simulator.ResetStatistics()
+                begin += lag
+    except KeyboardInterrupt:
+        return True
+    return False
+
+
+class FrameWatch:
+    """Notes each new moment of a diagram from build_live_capture.
+
+    Args:
+        diagram: the diagram.
+        cameras: the names of its cameras.
+        on_frame: hears of each frame.
+    """
+
+    def __init__(
+        self, diagram: Diagram, cameras: Iterable[str], on_frame: Callable[[LiveFrame], None]
+    ) -> None:
+        names = ("time", "estimated_positions", "share", "others")
+        self._time, self._positions, self._share, self._others = (
+            diagram.GetOutputPort(name) for name in names
+        )
+        is_sure = diagram.HasOutputPort("deviations")
+        self._deviations = diagram.GetOutputPort("deviations") if is_sure else None
+        self._views = {name: diagram.GetOutputPort(f"silhouette_{name}") for name in cameras}
+        self._on_frame = on_frame
+        self._last = math.nan
+        self._begin = time.perf_counter()
+
+    def __call__(self, context: Context) -> None:
+        """Looks whether there is a new moment."""
+        moment = float(self._time.Eval(context)[0])
+        if math.isnan(moment) or moment == self._last:
+            return
+        self._last = moment
+        views = {name: port.Eval(context) for name, port in self._views.items()}
+        seen = {name: view for name, view in views.items() if view is not None}
+        share = float(self._share.Eval(context)[0])
+        q = np.array(self._positions.Eval(context))
+        has_others = bool(self._others.Eval(context)[0])
+        deviations = np.full(len(q), np.nan)
+        if self._deviations is not None:
+            deviations = np.array(self._deviations.Eval(context))
+        now = time.perf_counter()
+        self._on_frame(LiveFrame(moment, q, share, seen, has_others, deviations, now - self._begin))
+        self._begin = time.perf_counter()

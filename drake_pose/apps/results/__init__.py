@@ -1,0 +1,1 @@
+"""The result folder: tables, motion files, pages, overlays and the summary."""

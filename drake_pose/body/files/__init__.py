@@ -1,0 +1,1 @@
+"""Model files (URDF, SDFormat, MJCF, directives) made fit for Drake, and parsed."""

@@ -1,0 +1,177 @@
+"""Where the bundled models are, and how ``package://...`` and other file names are resolved."""
+
+import os
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from urllib.parse import unquote
+
+from pydrake.multibody.parsing import PackageMap
+
+from drake_pose.body.files.xml_files import read_xml
+from drake_pose.errors import ModelError, UnknownNameError
+
+_URI = re.compile(r"(?P<scheme>[A-Za-z][\w+.-]*)://(?P<rest>.*)", re.DOTALL)
+_PACKAGE_NAME = re.compile(r"\w[\w.-]*")
+# Folders of packages, and where in each of them packages lie.
+_SEARCH_PATHS = (
+    ("ROS_PACKAGE_PATH", "."),
+    ("AMENT_PREFIX_PATH", "share"),
+    ("GZ_SIM_RESOURCE_PATH", "."),
+    ("IGN_GAZEBO_RESOURCE_PATH", "."),
+    ("GAZEBO_MODEL_PATH", "."),
+    ("SDF_PATH", "."),
+)
+# A workspace's source folder has less; in others nobody keeps repositories.
+_MOST_REPOSITORIES = 1000
+
+
+def package_folder() -> Path:
+    """The folder of bundled models: inside the wheel, or beside ``drake_pose`` in a checkout.
+
+    Raises:
+        ModelError: the installation holds no models.
+    """
+    library = Path(__file__).resolve().parents[2]
+    for folder in (library / "urdf", library.parent / "urdf"):
+        if (folder / "package.xml").is_file():
+            return folder
+    raise ModelError(
+        f"the bundled models are missing: expected {library / 'urdf' / 'package.xml'}; "
+        "install drake_pose again"
+    )
+
+
+def package_map(package_paths: Mapping[str, Path | str] | None = None) -> PackageMap:
+    """Drake's PackageMap with the package ``drake_pose`` in it, and nothing to download.
+
+    Args:
+        package_paths: further packages, name to folder.
+
+    Raises:
+        ModelError: a folder does not exist, or the bundled models are missing.
+    """
+    packages = PackageMap()
+    # Drake would fetch its own models from the net, and wait for it.
+    packages.Remove("drake_models")
+    packages.AddPackageXml(package_folder() / "package.xml")
+    for name, folder in (package_paths or {}).items():
+        if not Path(folder).is_dir():
+            raise ModelError(f"package '{name}': folder {folder} does not exist")
+        if packages.Contains(name):
+            packages.Remove(name)
+        packages.Add(name, Path(folder).absolute())
+    return packages
+
+
+class FileFinder:
+    """The files that a model's ``package://``, ``model://``, ``file://`` and plain names mean.
+
+    A package is, in this order, one that is given, a bundled one, a folder on the way up from the
+    file that names it, or a folder of the environment's search paths.
+
+    Args:
+        package_paths: packages, name to folder.
+
+    Raises:
+        ModelError: a folder does not exist.
+    """
+
+    def __init__(self, package_paths: Mapping[str, Path | str] | None = None) -> None:
+        self._known = package_map(package_paths)
+
+    def resolve(self, name: str, file: Path, what: str) -> Path:
+        """The absolute path of a file or folder that exists.
+
+        Args:
+            name: as it is written.
+            file: the model file it is written in.
+            what: link and kind of thing, for messages.
+
+        Raises:
+            ModelError: the package is unknown, the file does not exist, or it is not a local one.
+        """
+        uri = _URI.fullmatch(name.strip())
+        if uri is None:
+            paths = [file.parent / name.strip()]
+        elif uri["scheme"] == "file":
+            paths = [Path(uri["rest"]), Path(unquote(uri["rest"]))]
+        elif uri["scheme"] in ("package", "model"):
+            package, _, inside = uri["rest"].lstrip("/").partition("/")
+            folders = self._package_folders(package, file)
+            paths = [folder / part for folder in folders for part in (inside, unquote(inside))]
+            if not paths:
+                raise ModelError(
+                    f"{what} '{name}': package '{package}' is not known: no package.xml or folder "
+                    f"of that name on the way up from {file.parent}, nor in ROS_PACKAGE_PATH; give "
+                    f"--package {package}=FOLDER (in Python package_paths)"
+                )
+        else:
+            raise ModelError(f"{what} '{name}' is not a file; fetch it and name it by its path")
+        for path in paths:
+            if path.exists():
+                return Path(os.path.abspath(path))
+        raise ModelError(f"{what} '{name}': {os.path.abspath(paths[0])} does not exist")
+
+    def _package_folders(self, name: str, file: Path) -> list[Path]:
+        """Where a package may lie, the likeliest place first; one alone where it is known."""
+        if self._known.Contains(name):
+            return [Path(self._known.GetPath(name))]
+        if not _PACKAGE_NAME.fullmatch(name):
+            return []
+        return [*_folders_above(name, file), *_folders_of_environment(name)]
+
+
+def _folders_above(name: str, file: Path) -> Iterator[Path]:
+    """Folders of a package on the way up from a file; only parents and their children are seen."""
+    for parent in file.absolute().parents:
+        if parent.name == name or _package_name(parent) == name:
+            yield parent
+        if (parent / name).is_dir():
+            yield parent / name
+
+
+def _folders_of_environment(name: str) -> Iterator[Path]:
+    """Folders of a package in ROS' and Gazebo's search paths, there or in a repository there."""
+    for variable, inside in _SEARCH_PATHS:
+        for text in filter(None, os.environ.get(variable, "").split(os.pathsep)):
+            folder = Path(text) / inside
+            if folder.name == name or _package_name(folder) == name:
+                yield folder
+            if (folder / name).is_dir():
+                yield folder / name
+                continue
+            yield from (one / name for one in _some_folders(folder) if (one / name).is_dir())
+
+
+def _some_folders(folder: Path) -> list[Path]:
+    """The folders in a folder; at most as many as a workspace has repositories."""
+    try:
+        with os.scandir(folder) as entries:
+            few = [entry for entry, _ in zip(entries, range(_MOST_REPOSITORIES), strict=False)]
+        return sorted(Path(entry.path) for entry in few if entry.is_dir())
+    except OSError:
+        return []
+
+
+def _package_name(folder: Path) -> str | None:
+    """The name in a folder's package.xml; None where it has none that can be read."""
+    path = folder / "package.xml"
+    try:
+        return (read_xml(path).findtext("name") or "").strip() if path.is_file() else None
+    except (ModelError, OSError):
+        return None
+
+
+def bundled_model(name: str) -> Path:
+    """The file of a model that drake_pose ships, for example ``bundled_model("woman")``.
+
+    Raises:
+        UnknownNameError: no such model; the message lists those that exist.
+    """
+    folder = package_folder()
+    known = {path.parent.name: path for path in sorted(folder.glob("*/*.urdf"))}
+    named = {key: folder / key / f"{key}.urdf" for key in known}
+    if name not in named:
+        raise UnknownNameError("bundled model", name, sorted(named), "drake_pose")
+    return named[name] if named[name].is_file() else known[name]

@@ -1,0 +1,1 @@
+"""Surfaces as triangles: meshes, mesh files, Drake's primitive shapes, the file of a skin."""

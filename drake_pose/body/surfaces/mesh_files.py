@@ -1,0 +1,284 @@
+"""Mesh files to triangles, and to files that Drake's renderer draws."""
+
+import atexit
+import functools
+import hashlib
+import io
+import re
+import struct
+import tempfile
+import xml.etree.ElementTree as ElementTree
+from operator import methodcaller
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import ReadObjToTriangleSurfaceMesh
+
+from drake_pose.body.surfaces.mesh import TriangleMesh, join_meshes, merge_duplicate_vertices
+from drake_pose.errors import ModelError
+
+# What a COLLADA file says of colours and textures.
+_DAE_LOOKS = ("library_images", "library_effects", "library_materials", "bind_material")
+READABLE_EXTENSIONS = (".obj", ".gltf", ".glb", ".stl", ".dae", ".msh")
+_STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+# glTF's vertical axis is y, Drake's is z: (x, y, z) becomes (x, -z, y).
+_R_DRAKE_GLTF = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+
+
+def read_mesh_file(path: Path, scale: NDArray[np.float64] | None = None) -> TriangleMesh:
+    """The triangles of an OBJ, glTF, GLB, STL, DAE or MuJoCo's MSH file.
+
+    Args:
+        path: the mesh file.
+        scale: (3,) factors along x, y and z; None for the file's own size.
+
+    Returns:
+        The mesh, duplicate vertices merged.
+
+    Raises:
+        ModelError: unknown extension, unreadable, no triangle, or a coordinate that is not finite.
+    """
+    mesh = _read_unscaled(path.resolve())
+    if scale is None:
+        return mesh
+    triangles = mesh.triangles if np.prod(scale) > 0 else mesh.triangles[:, ::-1]
+    return TriangleMesh(mesh.vertices * scale, triangles)
+
+
+@functools.lru_cache(maxsize=64)
+def _read_unscaled(path: Path) -> TriangleMesh:
+    """As read_mesh_file, at the file's own size."""
+    if not path.is_file():
+        raise ModelError(f"mesh file {path} does not exist")
+    extension = path.suffix.lower()
+    if extension not in READABLE_EXTENSIONS:
+        raise ModelError(
+            f"mesh file {path}: '{extension}' is not a format that can be read; "
+            f"use one of {', '.join(READABLE_EXTENSIONS)}"
+        )
+    if path in _written:
+        return _written[path]
+    try:
+        mesh = _READERS.get(extension, _read_gltf)(path)
+    except OSError as error:
+        raise ModelError(f"mesh file {path} cannot be read: {error.strerror or error}") from error
+    if mesh.triangles.size and not (
+        0 <= mesh.triangles.min() <= mesh.triangles.max() < len(mesh.vertices)
+    ):
+        raise ModelError(f"mesh file {path}: a face names a vertex that does not exist")
+    if not np.all(np.isfinite(mesh.vertices)):
+        raise ModelError(f"mesh file {path}: a vertex coordinate is not a finite number")
+    mesh = merge_duplicate_vertices(mesh)
+    if mesh.is_empty:
+        raise ModelError(f"mesh file {path} holds no triangle: nothing would be drawn")
+    return mesh
+
+
+def _read_obj(path: Path) -> TriangleMesh:
+    """An OBJ file as Drake itself reads it."""
+    # Drake takes a coordinate that is not a number for zero.
+    if re.search(rb"^v\s[^\n]*(nan|inf)", path.read_bytes(), re.MULTILINE | re.IGNORECASE):
+        raise ModelError(f"mesh file {path}: a vertex coordinate is not a finite number")
+    try:
+        surface = ReadObjToTriangleSurfaceMesh(path)
+    except RuntimeError as error:
+        raise ModelError(f"mesh file {path} cannot be read: {error}") from error
+    vertices = np.array(surface.vertices(), dtype=np.float64)
+    faces = surface.triangles()
+    corners = [
+        np.fromiter(map(methodcaller("vertex", corner), faces), np.int32, len(faces))
+        for corner in range(3)
+    ]
+    return TriangleMesh(vertices, np.stack(corners, axis=1))
+
+
+def _read_gltf(path: Path) -> TriangleMesh:
+    """A glTF or GLB file, all its parts at their places."""
+    mesh = _read_with_trimesh(path, path, path.suffix)
+    return TriangleMesh(mesh.vertices @ _R_DRAKE_GLTF.T, mesh.triangles)
+
+
+def _read_stl(path: Path) -> TriangleMesh:
+    """A binary STL file, whatever its header says, or one of text in any encoding."""
+    data = path.read_bytes()
+    count = int.from_bytes(data[80:84], "little")
+    if len(data) == 84 + 50 * count and count > 0:
+        corners = np.frombuffer(data, _STL_TRIANGLE, offset=84)["corners"]
+        order = np.arange(3 * count, dtype=np.int32)
+        return TriangleMesh(corners.reshape(-1, 3), order)
+    words = data.lower().split()
+    if not words or not words[0].startswith(b"solid") or b"facet" not in words[:100]:
+        raise ModelError(
+            f"mesh file {path} says that it holds {count} triangles, which take {84 + 50 * count} "
+            f"bytes, but it has {len(data)}: it is truncated or damaged"
+        )
+    text = data.decode("ascii", "replace").replace("\ufffd", "?").encode()
+    mesh = _read_with_trimesh(path, io.BytesIO(text), ".stl")
+    count = max(words.count(b"facet"), words.count(b"vertex") // 3)
+    if len(mesh.triangles) != count:
+        raise ModelError(
+            f"mesh file {path} begins {count} facets, and {len(mesh.triangles)} can be read: it is "
+            "truncated or damaged"
+        )
+    return mesh
+
+
+def _read_msh(path: Path) -> TriangleMesh:
+    """A file of MuJoCo's own binary format: four counts, float32 vertices, ..., int32 faces.
+
+    Source: MuJoCo's XML reference, section "mesh".
+    """
+    data = path.read_bytes()
+    counts = np.frombuffer(data[:16].ljust(16, b"\0"), "<i4").astype(np.int64)
+    vertices, normals, coordinates, faces = counts
+    floats = 3 * vertices + 3 * normals + 2 * coordinates
+    if counts.min() < 0 or len(data) != 16 + 4 * (floats + 3 * faces):
+        raise ModelError(
+            f"mesh file {path} is no MSH file of MuJoCo's, or truncated: its length does not match "
+            "the counts at its beginning"
+        )
+    points = np.frombuffer(data, "<f4", 3 * vertices, 16)
+    triangles = np.frombuffer(data, "<i4", 3 * faces, 16 + 4 * floats)
+    return TriangleMesh(points, triangles)
+
+
+def _read_dae(path: Path) -> TriangleMesh:
+    """A COLLADA file, all its parts at their places, in metres; textures are not looked at.
+
+    As in RViz and Gazebo, for which robots' files are written, <unit> is applied (pinocchio does
+    not), and <up_axis> is not: a mesh is placed by the file's own axes. Drake itself reads no DAE.
+    """
+    try:
+        import collada  # Slow to import, and needed for DAE files alone.
+    except ModuleNotFoundError as error:
+        raise ModelError(f"mesh file {path}: install 'pycollada' to read DAE files") from error
+    parts = []
+    try:
+        document = collada.Collada(io.BytesIO(_shapes_of_dae(path)))
+        if document.scene is None:
+            raise ModelError(f"mesh file {path} has no scene: nothing would be drawn")
+        for geometry in document.scene.objects("geometry"):
+            for primitive in geometry.primitives():
+                if hasattr(primitive, "triangleset"):
+                    primitive = primitive.triangleset()
+                if isinstance(primitive, collada.triangleset.BoundTriangleSet):
+                    parts.append(TriangleMesh(primitive.vertex, primitive.vertex_index))
+    except (*_READER_ERRORS, collada.common.DaeError) as error:
+        raise ModelError(f"mesh file {path} cannot be read: {error}") from error
+    mesh = join_meshes(parts)
+    unit = document.assetInfo.unitmeter
+    return TriangleMesh(mesh.vertices * (1.0 if unit is None else unit), mesh.triangles)
+
+
+def _shapes_of_dae(path: Path) -> bytes:
+    """The text of a COLLADA file without colours and textures.
+
+    A material that names a missing texture would take its triangles with it.
+    """
+    root = ElementTree.parse(path).getroot()
+    for parent in list(root.iter()):
+        parent[:] = [child for child in parent if child.tag.rpartition("}")[2] not in _DAE_LOOKS]
+    return ElementTree.tostring(root)
+
+
+def _read_with_trimesh(path: Path, source: Path | io.BytesIO, extension: str) -> TriangleMesh:
+    """What trimesh reads from a file, or from the content of one."""
+    import trimesh  # Slow to import, and needed for few models.
+
+    try:
+        surface = trimesh.load_mesh(source, file_type=extension[1:].lower(), process=False)
+    except _READER_ERRORS as error:
+        raise ModelError(f"mesh file {path} cannot be read: {error}") from error
+    return TriangleMesh(surface.vertices, surface.faces)
+
+
+# What trimesh, pycollada and their readers raise for broken files.
+_READER_ERRORS = (
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    OSError,
+    EOFError,
+    SyntaxError,
+    struct.error,
+)
+_READERS = {".obj": _read_obj, ".stl": _read_stl, ".msh": _read_msh, ".dae": _read_dae}
+
+
+def is_drawn_by_drake(path: Path) -> bool:
+    """True where Drake's VTK renderer draws this mesh file: glTF, and OBJ with normals."""
+    extension = path.suffix.lower()
+    if extension == ".gltf":
+        return True
+    if extension != ".obj":
+        return False
+    data = path.read_bytes()
+    return data.startswith(b"vn") or b"\nvn" in data
+
+
+@functools.cache
+def workspace() -> Path:
+    """This process's temporary folder for converted files; it is removed at exit."""
+    folder = tempfile.TemporaryDirectory(prefix="drake_pose_")
+    atexit.register(folder.cleanup)
+    return Path(folder.name)
+
+
+def drawable_file(path: Path) -> Path:
+    """An OBJ file with normals that shows what ``path`` shows, made on the first call.
+
+    Raises:
+        ModelError: as read_mesh_file.
+    """
+    path = path.resolve()
+    return _drawable_version(path, path.stat().st_mtime_ns if path.exists() else 0)
+
+
+@functools.cache
+def _drawable_version(path: Path, _: int) -> Path:
+    """As drawable_file, for the file as it was at some time."""
+    return write_obj(read_mesh_file(path), path.stem)
+
+
+# The meshes of the files that write_obj wrote: nobody needs to read those.
+_written: dict[Path, TriangleMesh] = {}
+
+
+def write_obj(mesh: TriangleMesh, name: str) -> Path:
+    """Write an OBJ file with normals into this process's temporary folder.
+
+    Args:
+        mesh: the surface.
+        name: what the file's name begins with.
+    """
+    triangles = mesh.triangles
+    digest = hashlib.sha256(mesh.vertices.tobytes() + triangles.tobytes()).hexdigest()[:16]
+    path = workspace() / f"{re.sub(r'[^A-Za-z0-9_-]', '_', name)}_{digest}.obj"
+    if path in _written:
+        return path
+    a, b, c = (mesh.vertices[triangles[:, corner]] for corner in range(3))
+    area_normals = np.cross(b - a, c - a)
+    normals = np.stack(
+        [
+            np.bincount(triangles.ravel(), np.repeat(area_normals[:, axis], 3), len(mesh.vertices))
+            for axis in range(3)
+        ],
+        axis=1,
+    )
+    normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    with path.open("w", encoding="ascii") as file:
+        _write_lines(file, "v %.15g %.15g %.15g\n", mesh.vertices)
+        _write_lines(file, "vn %.4g %.4g %.4g\n", normals)
+        _write_lines(file, "f %d//%d %d//%d %d//%d\n", np.repeat(triangles + 1, 2, axis=1))
+    _written[path] = mesh
+    return path
+
+
+def _write_lines(file: TextIO, line: str, rows: NDArray[Any]) -> None:
+    """Write one line a row, many rows at once: a million rows take seconds otherwise."""
+    for start in range(0, len(rows), 65536):
+        chunk = rows[start : start + 65536]
+        file.write((line * len(chunk)) % tuple(chunk.ravel().tolist()))

@@ -1,0 +1,153 @@
+"""What Drake draws: the visual geometry of a parsed model as triangle meshes.
+
+Everything is read back from Drake's SceneGraph (perception role, which is what cameras see), so
+that URDF, SDFormat, MJCF and model directives all work alike.
+"""
+
+import itertools
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydrake.geometry import (
+    Box,
+    Capsule,
+    Convex,
+    Cylinder,
+    Ellipsoid,
+    HalfSpace,
+    Mesh,
+    Role,
+    SceneGraph,
+    Shape,
+    Sphere,
+)
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
+
+from drake_pose.body.surfaces.mesh import TriangleMesh, join_meshes, merge_duplicate_vertices
+from drake_pose.body.surfaces.mesh_files import drawable_file, is_drawn_by_drake, read_mesh_file
+from drake_pose.body.surfaces.primitive_shapes import (
+    box_mesh,
+    capsule_mesh,
+    cylinder_mesh,
+    ellipsoid_mesh,
+    sphere_mesh,
+)
+from drake_pose.errors import ModelError
+
+
+def shape_mesh(shape: Shape) -> TriangleMesh:
+    """A Drake shape as triangles in the geometry's own frame.
+
+    Raises:
+        ModelError: a mesh file that cannot be drawn, or a shape that has no surface here.
+    """
+    if isinstance(shape, Box):
+        return box_mesh(shape.width(), shape.depth(), shape.height())
+    if isinstance(shape, Sphere):
+        return sphere_mesh(shape.radius())
+    if isinstance(shape, Cylinder):
+        return cylinder_mesh(shape.radius(), shape.length())
+    if isinstance(shape, Capsule):
+        return capsule_mesh(shape.radius(), shape.length())
+    if isinstance(shape, Ellipsoid):
+        return ellipsoid_mesh(shape.a(), shape.b(), shape.c())
+    if isinstance(shape, Mesh):
+        return read_mesh_file(Path(shape.source().path()), np.asarray(shape.scale3()))
+    if isinstance(shape, Convex):
+        return _convex_mesh(shape)
+    raise ModelError(f"a {type(shape).__name__} cannot be drawn as triangles")
+
+
+def _convex_mesh(shape: Convex) -> TriangleMesh:
+    """The convex hull of a mesh file, its polygons cut into fans."""
+    path = Path(shape.source().path())
+    read_mesh_file(path)
+    try:
+        hull = shape.GetConvexHull()
+    except RuntimeError as error:
+        raise ModelError(f"mesh file {path} has no convex hull: {error}") from error
+    triangles = []
+    for face in range(hull.num_elements()):
+        polygon = hull.element(face)
+        corners = [polygon.vertex(corner) for corner in range(polygon.num_vertices())]
+        triangles += [(corners[0], b, c) for b, c in itertools.pairwise(corners[1:])]
+    vertices = np.array([hull.vertex(index) for index in range(hull.num_vertices())])
+    return merge_duplicate_vertices(TriangleMesh(vertices, np.array(triangles, dtype=np.int32)))
+
+
+def body_mesh(plant: MultibodyPlant, scene_graph: SceneGraph, body: RigidBody) -> TriangleMesh:
+    """All visual geometry of one body, in the body's frame. Ground planes are left out.
+
+    Raises:
+        ModelError: geometry that cannot be drawn; the message names the link.
+    """
+    inspector = scene_graph.model_inspector()
+    meshes = []
+    for geometry in plant.GetVisualGeometriesForBody(body):
+        if inspector.GetPerceptionProperties(geometry) is None:
+            continue
+        shape = inspector.GetShape(geometry)
+        if isinstance(shape, HalfSpace):
+            continue
+        X_BG = np.array(inspector.GetPoseInFrame(geometry).GetAsMatrix4(), dtype=np.float64)
+        try:
+            meshes.append(shape_mesh(shape).transformed(X_BG))
+        except ModelError as error:
+            raise ModelError(f"link '{body.name()}': {error}") from error
+    return join_meshes(meshes)
+
+
+def make_drawable(
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph | None,
+    instances: Iterable[ModelInstanceIndex],
+) -> None:
+    """Replace mesh files that Drake's renderer would silently not draw, and hide ground planes.
+
+    STL, DAE, GLB and OBJ without normals become OBJ with normals in a temporary folder. A half
+    space loses its perception role: it is no part of the object and would fill the picture.
+
+    Args:
+        plant: a plant whose geometry is registered.
+        scene_graph: the SceneGraph the plant is registered with.
+        instances: the model instances to look at; the world's own geometry is looked at too.
+
+    Raises:
+        ModelError: a mesh file cannot be drawn, or one must be replaced and scene_graph is None.
+    """
+    bodies = [plant.get_body(index) for i in instances for index in plant.GetBodyIndices(i)]
+    source = plant.get_source_id()
+    if source is None:
+        return
+    for body in [plant.world_body(), *bodies]:
+        for geometry in plant.GetVisualGeometriesForBody(body):
+            if scene_graph is None:
+                raise ModelError(
+                    "add_to needs the scene_graph the plant is registered with, "
+                    "because mesh files may have to be converted"
+                )
+            inspector = scene_graph.model_inspector()
+            if inspector.GetPerceptionProperties(geometry) is None:
+                continue
+            shape = inspector.GetShape(geometry)
+            if isinstance(shape, HalfSpace):
+                scene_graph.RemoveRole(source, geometry, Role.kPerception)
+            elif isinstance(shape, (Mesh, Convex)) and shape.source().is_path():
+                try:
+                    replacement = _drawable_shape(shape)
+                except ModelError as error:
+                    raise ModelError(f"link '{body.name()}': {error}") from error
+                if replacement is not None:
+                    scene_graph.ChangeShape(source, geometry, replacement)
+
+
+def _drawable_shape(shape: Mesh | Convex) -> Mesh | Convex | None:
+    """What stands in for a mesh file that Drake's renderer does not draw; None: it draws it."""
+    path = Path(shape.source().path())
+    if path.is_file() and is_drawn_by_drake(path):
+        return None
+    scale: Any = shape.scale3()  # Drake's type stubs name no array type that numpy has.
+    return type(shape)(drawable_file(path), scale)

@@ -1,0 +1,183 @@
+"""Links and joints as a graph: welded links joined, joints measured, ready for any root."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.multibody.tree import BodyIndex, Joint, RigidBody
+
+from drake_pose.body.limits import FLOATING_TYPES
+from drake_pose.body.model import ArticulatedModel, link_names
+from drake_pose.body.surfaces.mesh import TriangleMesh, join_meshes
+from drake_pose.body.tree.joint_map import JointMap, inverse_transforms
+from drake_pose.errors import ModelError
+
+
+@dataclass(frozen=True)
+class LinkGroup:
+    """Links welded to each other.
+
+    Attributes:
+        name: the link whose frame is the group's frame.
+        links: names of all its links, the one nearest to the world first.
+        body: index of the plant's body whose frame is the group's frame.
+        mesh: the geometry of all its links in the group's frame.
+    """
+
+    name: str
+    links: tuple[str, ...]
+    body: int
+    mesh: TriangleMesh
+
+
+@dataclass(frozen=True)
+class JointEdge:
+    """A joint between two groups; the inner one is nearer to the world.
+
+    Attributes:
+        joint: index of the joint in the plant.
+        inner, outer: group indices.
+        positions: indices into q.
+        joint_map: X_inner_outer(values); None for a floating joint.
+    """
+
+    joint: int
+    inner: int
+    outer: int
+    positions: tuple[int, ...]
+    joint_map: JointMap | None
+
+
+@dataclass(frozen=True)
+class LinkGraph:
+    """All groups, group 0 holding the world, and all edges; a tree."""
+
+    groups: tuple[LinkGroup, ...]
+    edges: tuple[JointEdge, ...]
+
+    def group_of(self, link: str) -> int:
+        """The group that a link belongs to; the link must exist."""
+        return next(index for index, group in enumerate(self.groups) if link in group.links)
+
+    def edges_at(self, group: int) -> list[JointEdge]:
+        """The edges that end at a group."""
+        return [edge for edge in self.edges if group in (edge.inner, edge.outer)]
+
+
+class PlantKinematics:
+    """Poses of bodies in the plant's world, with a context of its own."""
+
+    def __init__(self, model: ArticulatedModel) -> None:
+        """Start at the model's default positions."""
+        self.plant = model.plant
+        self.context = model.plant.CreateDefaultContext()
+        self._defaults = model.default_positions
+
+    def pose(self, body: int, positions: Mapping[int, float] | None = None) -> NDArray[np.float64]:
+        """X_B_body (4, 4), B the plant's world, at defaults except for the given positions."""
+        q = np.array(self._defaults)
+        for index, value in (positions or {}).items():
+            q[index] = value
+        return self.pose_at(body, q)
+
+    def pose_at(self, body: int, q: NDArray[np.float64]) -> NDArray[np.float64]:
+        """X_B_body (4, 4) at q (nq,)."""
+        positions: Any = q  # Drake's type stubs name no array type that numpy has.
+        self.plant.SetPositions(self.context, positions)
+        X = self.plant.EvalBodyPoseInWorld(self.context, self.plant.get_body(BodyIndex(body)))
+        return np.asarray(X.GetAsMatrix4())
+
+
+def build_link_graph(model: ArticulatedModel, preferred_frame: str | None) -> LinkGraph:
+    """Walk the plant outwards from the world.
+
+    Args:
+        model: the model.
+        preferred_frame: a link whose frame its group shall have; None for the first with geometry.
+
+    Raises:
+        ModelError: the joints form a loop.
+    """
+    plant = model.plant
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+    touching: dict[int, list[tuple[Joint, RigidBody]]] = {}
+    for joint in joints:
+        parent, child = joint.parent_body(), joint.child_body()
+        touching.setdefault(int(parent.index()), []).append((joint, child))
+        touching.setdefault(int(child.index()), []).append((joint, parent))
+    group_of_body = {0: 0}
+    members: list[list[int]] = [[0]]
+    found: list[tuple[Joint, int, int]] = []
+    used: set[int] = set()
+    queue = [0]
+    for body in queue:
+        for joint, other in touching.get(body, []):
+            if int(joint.index()) in used:
+                continue
+            used.add(int(joint.index()))
+            far = int(other.index())
+            if far in group_of_body:
+                raise ModelError(f"{model.path}: joint '{joint.name()}' closes a loop of links")
+            if joint.num_positions() == 0:
+                group_of_body[far] = group_of_body[body]
+                members[group_of_body[body]].append(far)
+            else:
+                group_of_body[far] = len(members)
+                members.append([far])
+                found.append((joint, group_of_body[body], group_of_body[far]))
+            queue.append(far)
+    kinematics = PlantKinematics(model)
+    groups = tuple(_make_group(model, kinematics, group, preferred_frame) for group in members)
+    edges = tuple(
+        _make_edge(kinematics, groups, joint, inner, outer) for joint, inner, outer in found
+    )
+    return LinkGraph(groups, edges)
+
+
+def _make_group(
+    model: ArticulatedModel,
+    kinematics: PlantKinematics,
+    bodies: list[int],
+    preferred_frame: str | None,
+) -> LinkGroup:
+    """Join the meshes of welded bodies in one frame."""
+    names = link_names(model.plant)
+    links = tuple(names[body] for body in bodies)
+    seen = [name for name in links if name in model.link_meshes]
+    name = (seen or links)[0]
+    if preferred_frame is not None and preferred_frame in links:
+        name = preferred_frame
+    body = bodies[links.index(name)]
+    X_NB = inverse_transforms(kinematics.pose(body))
+    meshes = [
+        model.link_meshes[link]
+        if other == body
+        else model.link_meshes[link].transformed(X_NB @ kinematics.pose(other))
+        for link, other in zip(links, bodies, strict=True)
+        if link in model.link_meshes
+    ]
+    return LinkGroup(name, links, body, join_meshes(meshes))
+
+
+def _make_edge(
+    kinematics: PlantKinematics,
+    groups: tuple[LinkGroup, ...],
+    joint: Joint,
+    inner: int,
+    outer: int,
+) -> JointEdge:
+    """Measure one joint."""
+    start, count = joint.position_start(), joint.num_positions()
+    positions = tuple(range(start, start + count))
+    if joint.type_name() in FLOATING_TYPES:
+        return JointEdge(int(joint.index()), inner, outer, positions, None)
+
+    def pose(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        given = dict(zip(positions, values, strict=True))
+        X_BA = kinematics.pose(groups[inner].body, given)
+        return inverse_transforms(X_BA) @ kinematics.pose(groups[outer].body, given)
+
+    joint_map = JointMap.measure(pose, count, joint.name())
+    return JointEdge(int(joint.index()), inner, outer, positions, joint_map)

@@ -1,0 +1,343 @@
+"""The pose tree: the rigid parts of an object, each placed by its own few joint values.
+
+This is the tree of Kameda, Minoh, Ikeda (section 2): a node has a rigid surface, a band of skin
+that bends with its joint (where the model has one), a parent, and up to three rotations (here any
+number of positions of any joints) inside limits. The tree may start at
+any link; its nodes' transforms come from Drake's plant.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.body.limits import one_turn, turns_around
+from drake_pose.body.model import ArticulatedModel
+from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.body.tree.base_pose import BasePose
+from drake_pose.body.tree.joint_map import ChainStep, chain_transforms
+from drake_pose.body.tree.link_graph import PlantKinematics
+from drake_pose.body.tree.root import RootRotation, even_rotations
+from drake_pose.body.tree.sampling import axis_samples, product_grid
+from drake_pose.body.tree.skin_motion import NodeSkin, join_surfaces
+from drake_pose.errors import SettingsError, UnknownNameError
+
+DEFAULT_LENGTH_INTERVAL = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class PoseTreeNode:
+    """One part of the object: a rigid surface, and a band that bends with its values.
+
+    Attributes:
+        name: the link that carries the geometry; its frame is the node's frame N.
+        parent: index in ``PoseTree.nodes``; -1: the world.
+        depth: steps to the root; a root has 0.
+        children: indices in ``PoseTree.nodes``.
+        positions: indices into the plant's q, in order of rotation from the parent to the node; ()
+            for a fixed node and for a root that is turned by a RootRotation.
+        position_names: the names of these positions.
+        value_names: the names of the node's values: its position names, or those of the
+            RootRotation.
+        mesh: the rigid part in frame N, welded links included; empty where several parts hang on
+            a link that is not seen.
+        skin: the band of skin between the parent and the node, which bends with the node's values;
+            None where the model declares none.
+    """
+
+    name: str
+    parent: int
+    depth: int
+    children: tuple[int, ...]
+    positions: tuple[int, ...]
+    position_names: tuple[str, ...]
+    value_names: tuple[str, ...]
+    mesh: TriangleMesh
+    skin: NodeSkin | None = None
+
+    def surface(self, values: NDArray[np.float64]) -> TriangleMesh:
+        """The node's whole surface in frame N at its values (k,): the rigid part, then the band."""
+        return join_surfaces(self.mesh, self.skin, values)
+
+
+@dataclass(frozen=True, eq=False)
+class NodePlacement:
+    """How a node's values place it: X_PN = X_PA R(rotation values) step(values) step(values) ...
+
+    Attributes:
+        X_PA: (4, 4) constant part: the identity but for roots.
+        rotation: the RootRotation of a root that is turned by one, else None.
+        steps: the joints.
+    """
+
+    X_PA: NDArray[np.float64]
+    rotation: RootRotation | None
+    steps: tuple[ChainStep, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class PoseTree:
+    """All nodes of an object, parents before children. Never changes.
+
+    Attributes:
+        model: the model.
+        nodes: the nodes; the order depends on the model and the root alone.
+        leaves: indices of the nodes without children.
+        held: values of positions that are not searched, by index into q.
+        unobserved_positions: names of positions that move nothing that is seen, or that the root's
+            pose replaces; they keep their default values.
+        root: name of the root node; "world" where the plant's own roots are kept.
+    """
+
+    model: ArticulatedModel
+    nodes: tuple[PoseTreeNode, ...]
+    leaves: tuple[int, ...]
+    held: Mapping[int, float]
+    unobserved_positions: tuple[str, ...]
+    root: str
+    _placements: tuple[NodePlacement, ...] = field(repr=False)
+    _base: BasePose = field(repr=False)
+    _rebuild: "Callable[[NDArray[np.float64]], PoseTree] | None" = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        """Freeze the mapping."""
+        object.__setattr__(self, "held", MappingProxyType(dict(self.held)))
+
+    @property
+    def placements(self) -> tuple[NodePlacement, ...]:
+        """How the values of each node place it."""
+        return self._placements
+
+    def with_root_position(self, root_position: NDArray[np.float64]) -> "PoseTree":
+        """The same tree with the root's origin at another known position (3,) [m].
+
+        Raises:
+            SettingsError: not three finite numbers, or a tree without a single root.
+            ModelError: the base joints cannot hold the root there.
+        """
+        if self._rebuild is None:
+            raise SettingsError("only a tree made by ArticulatedModel.pose_tree can be moved")
+        return self._rebuild(root_position)
+
+    def node_index(self, name: str) -> int:
+        """The node of a link.
+
+        Raises:
+            UnknownNameError: no node has that name.
+        """
+        names = [node.name for node in self.nodes]
+        if name not in names:
+            raise UnknownNameError("node", name, names, str(self.model.path))
+        return names.index(name)
+
+    def grid(
+        self,
+        node: int,
+        interval: float,
+        intervals: Mapping[str, float] | None = None,
+        length_interval: float = DEFAULT_LENGTH_INTERVAL,
+    ) -> NDArray[np.float64]:
+        """The node's sampling grid (n, k): every combination of its positions' samples.
+
+        A position is sampled at the multiples of its interval inside its limits, by size, the
+        negative of two equals first; at the middle of the limits where no multiple lies inside;
+        at its one value where it is held. The last position changes fastest.
+
+        Args:
+            node: index of the node.
+            interval: for angles [rad].
+            intervals: intervals of single positions or root values, by name [rad or m].
+            length_interval: for lengths [m].
+
+        Raises:
+            SettingsError: an interval that is not positive, or a grid that is too large.
+            UnknownNameError: ``intervals`` names something that does not exist.
+        """
+        intervals = self._checked_intervals(intervals or {}, interval, length_interval)
+        rotation = self._placements[node].rotation
+        if rotation is not None and rotation.kind == "free":
+            return even_rotations(rotation.interval or interval)
+        lower, upper = self.value_bounds(node)
+        periodic = self._periodic(node)
+        axes = []
+        for index, name in enumerate(self.nodes[node].value_names):
+            if rotation is not None:
+                spacing = rotation.interval or interval
+            else:
+                kind = self.model.position_kinds[self.nodes[node].positions[index]]
+                spacing = interval if kind == "angle" else length_interval
+            if lower[index] == upper[index]:
+                axes.append([float(lower[index])])
+                continue
+            spacing = intervals.get(name, spacing)
+            is_angle = bool(periodic[index])
+            axes.append(axis_samples(lower[index], upper[index], spacing, is_angle=is_angle))
+        return product_grid(axes, self.nodes[node].name)
+
+    def value_bounds(self, node: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Between which values (k,) a node is searched [rad or m]; equal where held.
+
+        The limits, or of wider ones the one turn that is nearest to the default position.
+        """
+        lower, upper = self._limits(node)
+        around = self.turns_around(node)
+        low, high = one_turn(lower, upper, self._default_values(node))
+        return np.where(around, low, lower), np.where(around, high, upper)
+
+    def value_limits(self, node: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Limits (k,) of a node's values [rad or m]; equal where held, infinite where it is free.
+
+        Free are joints that turn freely.
+        """
+        lower, upper = self._limits(node)
+        if self.nodes[node].positions:
+            free = self.model.turns_freely[list(self.nodes[node].positions)] & (lower < upper)
+            lower[free], upper[free] = -np.inf, np.inf
+        return lower, upper
+
+    def turns_around(self, node: int) -> NDArray[np.bool_]:
+        """Which of a node's values (k,) are angles that can take every direction.
+
+        No limit stands in their way, and they are the same after a full turn.
+        """
+        return turns_around(*self._limits(node), self._periodic(node))
+
+    def _limits(self, node: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """As value_limits, but one turn of what turns freely."""
+        rotation = self._placements[node].rotation
+        if rotation is not None:
+            return np.array(rotation.lower), np.array(rotation.upper)
+        positions = list(self.nodes[node].positions)
+        lower, upper = self.model.lower[positions], self.model.upper[positions]
+        for index, position in enumerate(positions):
+            if position in self.held:
+                lower[index] = upper[index] = self.held[position]
+        return lower, upper
+
+    def _periodic(self, node: int) -> NDArray[np.bool_]:
+        """Which of a node's values (k,) are angles that look the same after a full turn."""
+        rotation = self._placements[node].rotation
+        if rotation is not None:
+            return np.full(len(rotation.lower), rotation.kind == "limited")
+        return self.model.periodic[list(self.nodes[node].positions)]
+
+    def relative_transforms(self, node: int, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """X_PN (n, 4, 4) of a node in its parent (the world W for a root) at values (n, k).
+
+        Raises:
+            SettingsError: values of the wrong width.
+        """
+        values = np.asarray(values, dtype=np.float64)
+        width = len(self.nodes[node].value_names)
+        if values.ndim != 2 or values.shape[1] != width:
+            raise SettingsError(
+                f"node '{self.nodes[node].name}': values of shape (n, {width}) expected for "
+                f"{self.nodes[node].value_names}, got {values.shape}"
+            )
+        placement = self._placements[node]
+        X = np.broadcast_to(placement.X_PA, (len(values), 4, 4)).copy()
+        if placement.rotation is not None:
+            X[:, :3, :3] = X[:, :3, :3] @ placement.rotation.rotations(values)
+        if placement.steps:
+            X = X @ chain_transforms(placement.steps, values)
+        return X
+
+    def node_poses(self, values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+        """X_WN (n_nodes, 4, 4), given each node's values (k_i,)."""
+        return self.node_poses_batch([np.asarray(v, dtype=np.float64)[None] for v in values])[0]
+
+    def node_poses_batch(self, values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+        """X_WN (n, n_nodes, 4, 4), given each node's values (n, k_i).
+
+        Raises:
+            SettingsError: not one array a node, or values of the wrong width.
+        """
+        if len(values) != len(self.nodes):
+            raise SettingsError(f"{len(self.nodes)} arrays of values expected, got {len(values)}")
+        X_WN = np.empty((len(values[0]), len(self.nodes), 4, 4))
+        for index, node in enumerate(self.nodes):
+            X_PN = self.relative_transforms(index, values[index])
+            X_WN[:, index] = X_PN if node.parent < 0 else X_WN[:, node.parent] @ X_PN
+        return X_WN
+
+    def default_values(self) -> list[NDArray[np.float64]]:
+        """Each node's values (k_i,) at the model's default positions and the root as given."""
+        return [self._default_values(node) for node in range(len(self.nodes))]
+
+    def _default_values(self, node: int) -> NDArray[np.float64]:
+        rotation = self._placements[node].rotation
+        if rotation is not None:
+            return np.array(0.5 * (rotation.lower + rotation.upper))
+        q = self.model.default_positions
+        return np.array([self.held.get(index, q[index]) for index in self.nodes[node].positions])
+
+    def positions_from(
+        self, values: Sequence[NDArray[np.float64]]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The plant's own positions that put every link where the tree does.
+
+        Args:
+            values: each node's values (k_i,).
+
+        Returns:
+            q (nq,) and X_WB (4, 4), the pose of the plant's world frame B in the world W; X_WB is
+            the identity where the plant's base joint can take up the root's pose.
+
+        Raises:
+            ModelError: the base joints cannot be solved for.
+        """
+        q = np.array(self.model.default_positions)
+        for index, value in self.held.items():
+            q[index] = value
+        for node, node_values in zip(self.nodes, values, strict=True):
+            if node.positions:
+                q[list(node.positions)] = node_values
+        return self._base.solve(self.model, q, self.node_poses(values))
+
+    def values_from_positions(
+        self, q: NDArray[np.float64], X_WB: NDArray[np.float64] | None = None
+    ) -> list[NDArray[np.float64]]:
+        """Each node's values (k_i,) at the plant's positions: the inverse of positions_from.
+
+        Args:
+            q: (nq,) the plant's positions.
+            X_WB: (4, 4) pose of the plant's world frame in the world; None for the identity. Only
+                the rotation of a root with a RootRotation depends on it.
+        """
+        q = np.asarray(q, dtype=np.float64)
+        values = []
+        for node, placement in zip(self.nodes, self._placements, strict=True):
+            if placement.rotation is None:
+                values.append(q[list(node.positions)])
+                continue
+            body = self.model.link_index(node.name)
+            R_BN = PlantKinematics(self.model).pose_at(body, q)[:3, :3]
+            R_WN = R_BN if X_WB is None else X_WB[:3, :3] @ R_BN
+            values.append(placement.rotation.values_from(R_WN))
+        return values
+
+    def base_within_limits(self, q: NDArray[np.float64]) -> bool:
+        """Whether the base positions that positions_from solved for lie inside their limits."""
+        index = list(self._base.positions)
+        margin = 1e-9
+        lower, upper = self.model.lower[index] - margin, self.model.upper[index] + margin
+        return bool(np.all((q[index] >= lower) & (q[index] <= upper)))
+
+    def _checked_intervals(
+        self, intervals: Mapping[str, float], interval: float, length_interval: float
+    ) -> Mapping[str, float]:
+        """The intervals, after checks."""
+        known = [name for node in self.nodes for name in node.value_names]
+        known += [name for name in self.model.position_names if name not in known]
+        for name in intervals:
+            if name not in known:
+                raise UnknownNameError("joint", name, known, str(self.model.path))
+        named = {"interval": interval, "length_interval": length_interval, **intervals}
+        for name, value in named.items():
+            if not (np.isfinite(value) and value > 0.0):
+                raise SettingsError(
+                    f"sampling interval '{name}' is {value}: give a positive number"
+                )
+        return intervals

@@ -1,0 +1,1 @@
+"""Where pictures come from: folders, videos and live cameras, synchronised by their time stamps."""

@@ -1,0 +1,188 @@
+"""Where a camera's pictures come from: a folder, a video file, or a live camera.
+
+A specification is plain and picklable, so that a source can be opened on another machine; what is
+opened gives pictures one after another, each with its time stamp. What is wrong with one picture
+costs only that picture, and is said in `problems`.
+"""
+
+from __future__ import annotations
+
+import abc
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.errors import SettingsError
+
+Picture = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+
+SourceKind = Literal["folder", "video", "device"]
+KINDS: tuple[SourceKind, ...] = ("folder", "video", "device")
+
+Clock = Callable[[], float]
+
+
+@dataclass(frozen=True)
+class SourceSpecification:
+    """Where a camera's pictures come from.
+
+    Args:
+        camera: the camera's name.
+        kind: folder: of pictures `<frame>.png` or `.jpg`, perhaps with a `timestamps.csv` (frame,
+            time [s]); video: a file that OpenCV reads; device: a live camera.
+        location: the folder's or file's path; a device's number or address.
+        width, height: of the pictures that the camera is calibrated for [pixel].
+        rate_hz: pictures a second. A folder without time stamps needs it; a video's own is used
+            where not given; a live camera's pictures bear the time at which they come.
+        background: a folder of pictures of the empty room; None: the source delivers masks.
+        offset: is added to time stamps [s], where cameras' clocks differ.
+        beside: other cameras' folders whose pictures of the same name were taken at the same time.
+
+    Raises:
+        SettingsError: an unknown kind, a size or a rate that cannot be.
+    """
+
+    camera: str
+    kind: SourceKind
+    location: str
+    width: int
+    height: int
+    rate_hz: float | None = None
+    background: str | None = None
+    offset: float = 0.0
+    beside: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        where = f"the source of camera '{self.camera}'"
+        if self.kind not in KINDS:
+            raise SettingsError(f"{where}: kind must be {', '.join(KINDS)}, not '{self.kind}'")
+        if self.width < 1 or self.height < 1:
+            raise SettingsError(f"{where}: pictures of {self.width} x {self.height} cannot be")
+        if self.rate_hz is not None and not (math.isfinite(self.rate_hz) and self.rate_hz > 0):
+            raise SettingsError(f"{where}: rate_hz must be a positive number, not {self.rate_hz}")
+
+    @property
+    def live(self) -> bool:
+        """Whether pictures come by themselves, and are gone where nobody takes them."""
+        return self.kind == "device"
+
+    @property
+    def gives_masks(self) -> bool:
+        """Whether the source delivers masks of the person instead of pictures."""
+        return self.background is None
+
+
+@dataclass(frozen=True, eq=False)
+class TimedPicture:
+    """A picture or a mask, and when it was taken.
+
+    Args:
+        time: its time stamp [s].
+        frame: its name.
+        picture: (H, W, 3) red, green, blue; or a mask (H, W), True on the person.
+    """
+
+    time: float
+    frame: str
+    picture: Picture | Mask
+
+
+class FrameSource(abc.ABC):
+    """One camera's pictures, in the order of their time stamps.
+
+    Attributes:
+        specification: where they come from.
+        problems: what was wrong so far, each with the camera's name; a reader may empty the list.
+        dropped: how many pictures were lost for that.
+
+    Args:
+        specification: where they come from.
+    """
+
+    def __init__(self, specification: SourceSpecification) -> None:
+        self.specification = specification
+        self.problems: list[str] = []
+        self.dropped = 0
+        self._last: TimedPicture | None = None
+
+    @property
+    @abc.abstractmethod
+    def ended(self) -> bool:
+        """Whether no picture will come any more."""
+
+    @property
+    def rate_hz(self) -> float | None:
+        """About how many pictures come a second; None where nobody knows."""
+        return self.specification.rate_hz
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """Lets go of the file or camera; may be called twice."""
+
+    @abc.abstractmethod
+    def _read(self) -> TimedPicture | None:
+        """The next picture, whatever its time stamp."""
+
+    def read(self) -> TimedPicture | None:
+        """The next picture; a live camera's newest.
+
+        A picture whose time stamp does not lie after the last one's is dropped.
+
+        Returns:
+            None where there is none now, or none any more (`ended`).
+        """
+        while (one := self._read()) is not None:
+            if self._last is None or one.time > self._last.time:
+                self._last = one
+                return one
+            same = one.time == self._last.time
+            what = "the same time stamp as" if same else "a time stamp before"
+            self.drop(f"frame {one.frame} has {what} frame {self._last.frame}: {one.time:g} s")
+        return None
+
+    def drop(self, reason: str) -> None:
+        """Notes that a picture was lost."""
+        self.dropped += 1
+        self.report(f"{reason}; it is left out")
+
+    def report(self, problem: str) -> None:
+        """Notes a problem."""
+        self.problems.append(f"camera '{self.specification.camera}': {problem}")
+
+    def wrong_size(self, picture: Picture | Mask) -> str:
+        """What is wrong with a picture's size; "" where it is the calibrated one."""
+        height, width = picture.shape[:2]
+        wanted = self.specification
+        if (width, height) == (wanted.width, wanted.height):
+            return ""
+        return (
+            f"has {width} x {height} pixels (width x height), but the camera is calibrated for "
+            f"{wanted.width} x {wanted.height}: give pictures of that size, or calibrate again"
+        )
+
+
+def open_source(specification: SourceSpecification, clock: Clock = time.monotonic) -> FrameSource:
+    """Opens a source.
+
+    Args:
+        specification: where the pictures come from.
+        clock: gives the time stamps of a live camera's pictures [s].
+
+    Raises:
+        SceneError: a folder or video that cannot be read, is empty, or whose pictures are not of
+            the calibrated size. A live camera that cannot be opened is tried again and again.
+    """
+    from drake_pose.camera.sources.live import DeviceSource
+    from drake_pose.camera.sources.recorded import FolderSource, VideoSource
+
+    if specification.kind == "folder":
+        return FolderSource(specification)
+    if specification.kind == "video":
+        return VideoSource(specification)
+    return DeviceSource(specification, clock)

@@ -1,0 +1,128 @@
+"""A live camera, read by a thread that always keeps the newest picture."""
+
+from __future__ import annotations
+
+import threading
+
+import cv2
+import numpy as np
+
+from drake_pose.camera.picture_files import mask_of_picture
+from drake_pose.camera.sources.frame_source import (
+    Clock,
+    FrameSource,
+    SourceSpecification,
+    TimedPicture,
+)
+
+FIRST_PAUSE = 0.5
+"""After a failure a camera is opened again after this time [s], then after twice as much, ..."""
+
+LONGEST_PAUSE = 10.0
+"""... but never later than this [s]."""
+
+# How long closing waits for the thread; OpenCV may hang on a network camera [s].
+_PATIENCE = 2.0
+
+
+class DeviceSource(FrameSource):
+    """A live camera: its newest picture, with the time at which it came.
+
+    A slow reader never sees old pictures: those that were not read in time are gone. A camera that
+    cannot be opened or fails is reported once and opened again, after growing pauses.
+
+    Args:
+        specification: of kind device; its location is a number or an address.
+        clock: gives the time stamps [s].
+    """
+
+    def __init__(self, specification: SourceSpecification, clock: Clock) -> None:
+        super().__init__(specification)
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._newest: TimedPicture | None = None
+        self._useless = False
+        self._failed = False
+        self._stop = threading.Event()
+        self._thread = threading.Thread(
+            target=self._run, name=f"camera {specification.camera}", daemon=True
+        )
+        self._thread.start()
+
+    @property
+    def ended(self) -> bool:
+        """Whether it was closed, or gives pictures of a wrong size."""
+        return self._stop.is_set() or self._useless
+
+    def close(self) -> None:
+        """Ends the thread, which lets go of the camera."""
+        self._stop.set()
+        self._thread.join(_PATIENCE)
+
+    def _read(self) -> TimedPicture | None:
+        with self._lock:
+            newest, self._newest = self._newest, None
+        return newest
+
+    def _run(self) -> None:
+        """Reads until closed; opens the camera again and again."""
+        pause, count = FIRST_PAUSE, 0
+        while not self.ended:
+            capture = self._open()
+            if capture is not None:
+                before = count
+                count = self._keep_newest(capture, count)
+                capture.release()
+                if count > before:
+                    pause = FIRST_PAUSE
+            if self.ended:
+                return
+            if not self._failed:
+                what = "stopped" if count else "cannot be opened"
+                self.report(
+                    f"'{self.specification.location}' {what}; it is tried again until it answers"
+                )
+                self._failed = True
+            self._stop.wait(pause)
+            pause = min(2.0 * pause, LONGEST_PAUSE)
+
+    def _open(self) -> cv2.VideoCapture | None:
+        """The camera, asked for pictures of the calibrated size."""
+        given = self.specification
+        place: int | str = int(given.location) if given.location.isdigit() else given.location
+        try:
+            capture = cv2.VideoCapture(place)
+            if not capture.isOpened():
+                return None
+            if isinstance(place, int):
+                capture.set(cv2.CAP_PROP_FRAME_WIDTH, given.width)
+                capture.set(cv2.CAP_PROP_FRAME_HEIGHT, given.height)
+                if given.rate_hz is not None:
+                    capture.set(cv2.CAP_PROP_FPS, given.rate_hz)
+        except cv2.error:
+            return None
+        return capture
+
+    def _keep_newest(self, capture: cv2.VideoCapture, count: int) -> int:
+        """Reads until the camera fails or is not wanted; the number of pictures in all."""
+        while not self.ended:
+            try:
+                found, picture = capture.read()
+            except cv2.error:
+                return count
+            if not found or picture is None:
+                return count
+            time = self._clock() + self.specification.offset
+            rgb = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+            if wrong := self.wrong_size(rgb):
+                self.report(f"'{self.specification.location}' {wrong}")
+                self._useless = True
+                return count
+            seen = mask_of_picture(rgb) if self.specification.gives_masks else rgb
+            if self._failed:
+                self.report(f"'{self.specification.location}' answers again")
+                self._failed = False
+            with self._lock:
+                self._newest = TimedPicture(time, f"{count:06d}", seen)
+            count += 1
+        return count

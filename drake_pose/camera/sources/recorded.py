@@ -1,0 +1,266 @@
+"""Recorded pictures: a folder of files, or a video file."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from drake_pose.camera.picture_files import (
+    SUFFIXES,
+    mask_of_picture,
+    read_person_mask,
+    read_picture,
+)
+from drake_pose.camera.sources.frame_source import (
+    FrameSource,
+    Mask,
+    Picture,
+    SourceSpecification,
+    TimedPicture,
+)
+from drake_pose.errors import SceneError
+from drake_pose.regular_files import read_regular
+
+TIME_STAMPS = "timestamps.csv"
+
+_NUMBER = re.compile(r"(\d+)$")
+
+
+class FolderSource(FrameSource):
+    """Pictures or masks `<frame>.png` or `.jpg` of a folder.
+
+    Their times are those of `timestamps.csv` (frame, time [s]) in that folder. Without it the
+    frames follow each other in the order of their names at the given rate, and frames of the same
+    name in the folders `beside` are of the same time; a number in a name means nothing.
+
+    Args:
+        specification: of kind folder.
+
+    Raises:
+        SceneError: names the folder; no picture, no times, or pictures of another size.
+    """
+
+    def __init__(self, specification: SourceSpecification) -> None:
+        super().__init__(specification)
+        self._folder = Path(specification.location)
+        files = find_picture_files(self._folder, specification.camera)
+        stamped = self._folder / TIME_STAMPS
+        times = read_time_stamps(stamped) if stamped.is_file() else self._counted(files)
+        missing = [frame for frame, _ in times if frame not in files]
+        if missing:
+            self.drop(f"{self._folder}: has no picture of {_listed(missing)}")
+            self.dropped += len(missing) - 1
+        strangers = sorted(set(files) - {frame for frame, _ in times})
+        if strangers:
+            self.drop(f"{stamped}: has no time of {_listed(strangers)}")
+            self.dropped += len(strangers) - 1
+        self._rows = [(files[frame], frame, time) for frame, time in times if frame in files]
+        if not self._rows:
+            raise SceneError(f"{stamped}: has no time of any picture in {self._folder}")
+        self._next = 0
+        self._check_first()
+
+    @property
+    def ended(self) -> bool:
+        """Whether all pictures were read."""
+        return self._next >= len(self._rows)
+
+    @property
+    def rate_hz(self) -> float | None:
+        """The given rate, or that of the time stamps."""
+        steps = np.diff([time for _, _, time in self._rows])
+        steps = steps[steps > 0]
+        return self.specification.rate_hz or (1.0 / float(np.median(steps)) if len(steps) else None)
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+    def _counted(self, files: dict[str, Path]) -> list[tuple[str, float]]:
+        """The frames' times by their rate."""
+        given = self.specification
+        if given.rate_hz is None:
+            raise SceneError(
+                f"{self._folder}: has no {TIME_STAMPS} (frame,time), so the source of camera "
+                f"'{given.camera}' needs rate_hz, its pictures a second"
+            )
+        names = set(files)
+        for folder in given.beside:
+            names |= set(find_picture_files(Path(folder), given.camera))
+        ordered = sorted(names)
+        if ordered != sorted(names, key=_by_number):
+            raise SceneError(
+                f"{self._folder}: the frames' names are numbers of different lengths, so their "
+                f"order is unclear; fill them with zeros (0009, 0010) or give a {TIME_STAMPS}"
+            )
+        return [(frame, k / given.rate_hz) for k, frame in enumerate(ordered)]
+
+    def _check_first(self) -> None:
+        """Refuses pictures of a wrong size before work begins."""
+        for path, _, _ in self._rows:
+            try:
+                picture = self._picture(path)
+            except SceneError:
+                continue  # It is named when its turn comes.
+            if wrong := self.wrong_size(picture):
+                raise SceneError(f"{path}: camera '{self.specification.camera}' {wrong}")
+            return
+        raise SceneError(f"{self._folder}: not one of its pictures can be read")
+
+    def _picture(self, path: Path) -> Picture | Mask:
+        if self.specification.gives_masks:
+            return read_person_mask(path, SceneError)
+        return read_picture(path, SceneError)
+
+    def _read(self) -> TimedPicture | None:
+        while self._next < len(self._rows):
+            path, frame, time = self._rows[self._next]
+            self._next += 1
+            try:
+                picture = self._picture(path)
+            except SceneError as error:
+                self.drop(str(error))
+                continue
+            if wrong := self.wrong_size(picture):
+                self.drop(f"{path}: {wrong}")
+                continue
+            return TimedPicture(time + self.specification.offset, frame, picture)
+        return None
+
+
+class VideoSource(FrameSource):
+    """The pictures of a video file; those of masks are white on the person.
+
+    Args:
+        specification: of kind video.
+
+    Raises:
+        SceneError: names the file; when it is no video, or of another size.
+    """
+
+    def __init__(self, specification: SourceSpecification) -> None:
+        super().__init__(specification)
+        self._path = Path(specification.location)
+        if not self._path.is_file():
+            raise SceneError(f"{self._path}: no such video file of camera '{specification.camera}'")
+        self._capture = cv2.VideoCapture(str(self._path))
+        self._count = 0
+        self._ahead: Picture | None = None
+        self._time = 0.0
+        self._advance()
+        if self._ahead is None:
+            raise SceneError(
+                f"{self._path}: not a video that OpenCV can read, though the source of camera "
+                f"'{specification.camera}'"
+            )
+        if wrong := self.wrong_size(self._ahead):
+            self.close()
+            raise SceneError(f"{self._path}: camera '{specification.camera}' {wrong}")
+
+    @property
+    def ended(self) -> bool:
+        """Whether all pictures were read."""
+        return self._ahead is None
+
+    @property
+    def rate_hz(self) -> float | None:
+        """The given rate, or the file's own."""
+        own = float(self._capture.get(cv2.CAP_PROP_FPS))
+        return self.specification.rate_hz or (own if own > 0 else None)
+
+    def close(self) -> None:
+        """Lets go of the file."""
+        self._capture.release()
+        self._ahead = None
+
+    def _read(self) -> TimedPicture | None:
+        if self._ahead is None:
+            return None
+        picture, time, frame = self._ahead, self._time, f"{self._count - 1:06d}"
+        self._advance()
+        seen = mask_of_picture(picture) if self.specification.gives_masks else picture
+        return TimedPicture(time + self.specification.offset, frame, seen)
+
+    def _advance(self) -> None:
+        """Reads one picture ahead, so that the end is known."""
+        self._ahead = None
+        found, picture = self._capture.read()
+        if not found or picture is None:
+            promised = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
+            if 0 < self._count < promised:
+                lost = promised - self._count
+                self.drop(f"{self._path}: ends after {self._count} of {promised} pictures")
+                self.dropped += lost - 1
+            return
+        rate = self.specification.rate_hz
+        if rate is None:
+            self._time = 1e-3 * self._capture.get(cv2.CAP_PROP_POS_MSEC)
+        else:
+            self._time = self._count / rate
+        self._count += 1
+        self._ahead = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def find_picture_files(folder: Path, camera: str) -> dict[str, Path]:
+    """The picture files of a folder, by frame, in the order of the names.
+
+    Raises:
+        SceneError: there is no such folder, no picture in it, or a frame twice.
+    """
+    if not folder.is_dir():
+        raise SceneError(f"{folder}: no such folder of camera '{camera}'s pictures")
+    files: dict[str, Path] = {}
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() in SUFFIXES:
+            if path.stem in files:
+                raise SceneError(f"{path}: the folder has frame {path.stem} twice; remove one")
+            files[path.stem] = path
+    if not files:
+        raise SceneError(f"{folder}: holds no picture <frame>.png or .jpg of camera '{camera}'")
+    return files
+
+
+def read_time_stamps(path: Path) -> list[tuple[str, float]]:
+    """The frames and times [s] of a `timestamps.csv`, in its order.
+
+    Raises:
+        SceneError: names the file and the line.
+    """
+    try:
+        text = read_regular(path).decode("utf-8-sig")
+        reader = csv.DictReader(io.StringIO(text, newline=""))
+        if not {"frame", "time"} <= set(reader.fieldnames or ()):
+            raise SceneError(f"{path}: needs the columns frame and time [s] in its first line")
+        rows = [(reader.line_num, row["frame"], row["time"]) for row in reader]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise SceneError(f"{path}: cannot be read: {error}") from error
+    found: dict[str, float] = {}
+    for line, frame, text in rows:
+        if frame in found:
+            raise SceneError(f"{path}: line {line}: has frame {frame} twice")
+        try:
+            time = float(text)
+        except (TypeError, ValueError):
+            time = math.nan
+        if not math.isfinite(time):
+            raise SceneError(f"{path}: line {line}: the time must be a number of seconds")
+        found[frame] = time
+    return list(found.items())
+
+
+def _by_number(name: str) -> tuple[str, int]:
+    """A key that puts 9 before 10."""
+    number = _NUMBER.search(name)
+    return (name[: number.start()], int(number[1])) if number else (name, -1)
+
+
+def _listed(frames: list[str]) -> str:
+    """A few frames' names."""
+    some = ", ".join(frames[:5])
+    more = f" and {len(frames) - 5} more" if len(frames) > 5 else ""
+    return f"frame{'s' if len(frames) > 1 else ''} {some}{more}"

@@ -1,0 +1,1 @@
+"""Shimada's two-finger hand: its projection, and its observation."""

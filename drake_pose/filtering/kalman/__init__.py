@@ -1,0 +1,1 @@
+"""The Kalman filter: update, hypotheses, and truncation after each step."""

@@ -1,0 +1,321 @@
+"""The filter: predict, linearise at every hypothesis, update, truncate, weigh."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.errors import SettingsError
+from drake_pose.filtering.factors import check_moments
+from drake_pose.filtering.kalman.hypotheses import (
+    Hypothesis,
+    Rejection,
+    merge_twins,
+    normalise,
+    prune,
+)
+from drake_pose.filtering.kalman.limited_update import LimitedUpdate, limited_update
+from drake_pose.filtering.kalman.repeated_views import (
+    AnchoredObservation,
+    View,
+    begin_stare,
+    next_view,
+)
+from drake_pose.filtering.kalman.update import ObservationModel, check_measurement, update
+from drake_pose.filtering.state import Belief, StateLayout, make_belief, name_flaws
+from drake_pose.filtering.truncation.inequalities import Inequalities, inner_point
+from drake_pose.filtering.truncation.truncated_normal import (
+    Truncated,
+    clip,
+    join_rows,
+    truncate_joint,
+    truncate_sequential,
+    unlimited,
+)
+
+Array = NDArray[np.float64]
+Truncation = Literal["joint", "sequential", "clip", "none"]
+Branch = tuple[Hypothesis, LimitedUpdate]
+_NO_SITES = np.zeros((0, 2))
+TRUNCATIONS: tuple[Truncation, ...] = ("joint", "sequential", "clip", "none")
+
+
+@dataclass(frozen=True)
+class FilterSettings:
+    """How a ``TruncatedFilter`` works.
+
+    Args:
+        truncation: "joint" (all rows at once), "sequential" (the paper's), "clip" (only the mean
+            is moved inside) or "none".
+        iterations: linearisations of an update at most; 1 for the paper's.
+        hypothesis_cap: how many hypotheses are kept at most; 1 for none but the best.
+        reject_below: a hypothesis beyond a row by more is given up: c_k (24) below this.
+        smallest_weight: lighter hypotheses are given up.
+        twin_distance: hypotheses closer than this in every element are one [deviations].
+        tolerance: of the joint truncation.
+        novelty: a measurement shows nothing new if noise alone would make it differ as much
+            from the one that began the view with more than this probability, see ``views``. 0:
+            every frame is new, as in the paper; so it is always with "sequential" and "clip".
+
+    Raises:
+        SettingsError: a value out of its range.
+    """
+
+    truncation: Truncation = "joint"
+    iterations: int = 20
+    hypothesis_cap: int = 4
+    reject_below: float = -4.0
+    smallest_weight: float = 1e-4
+    twin_distance: float = 0.3
+    tolerance: float = 1e-3
+    novelty: float = 1e-9
+
+    def __post_init__(self) -> None:
+        if self.truncation not in TRUNCATIONS:
+            raise SettingsError(
+                f"truncation must be one of {', '.join(TRUNCATIONS)}, not '{self.truncation}'"
+            )
+        if self.iterations < 1 or self.hypothesis_cap < 1:
+            raise SettingsError("iterations and hypothesis_cap must be 1 or more")
+        if not 0 <= self.novelty < 1:
+            raise SettingsError(f"novelty must be in [0, 1), not {self.novelty}")
+        if not (self.reject_below < 0 and 0 <= self.smallest_weight < 1 and self.tolerance > 0):
+            raise SettingsError(
+                "reject_below must be negative, smallest_weight in [0, 1), tolerance positive"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class FilterState:
+    """What a filter believes after a step.
+
+    Attributes:
+        step: how many measurements have been used.
+        hypotheses: the heaviest first, at least one.
+        rejections: what was given up in the last step.
+        distance, count: of the best hypothesis' last update; see ``Updated``.
+        view: what has been seen since the last new view.
+    """
+
+    step: int
+    hypotheses: tuple[Hypothesis, ...]
+    rejections: tuple[Rejection, ...] = ()
+    distance: float = 0.0
+    count: int = 0
+    view: View | None = None
+
+    @property
+    def best(self) -> Belief:
+        """The belief of the heaviest hypothesis."""
+        return self.hypotheses[0].belief
+
+
+class TruncatedFilter:
+    """An extended Kalman filter whose belief stays inside linear inequalities.
+
+    After Shimada, Shirai, Kuno and Miura, sections 4 and 5: prediction at constant velocity,
+    update linearised at the prediction and at its mirrored twins (30), truncation. Differences,
+    each of which can be set back: all rows are truncated at once; the update iterates, linearised
+    where the truncated belief lies; and with "joint" the truncated belief is given out and
+    linearised at, but the next step is predicted from the belief without its limits. Truncated
+    again in every step, a belief would be pushed away from its limits ever further, and would
+    become ever surer, though the limits say the same each time.
+
+    Args:
+        layout: what the state means.
+        observation: what is measured.
+        inequalities: the rows, over any elements of the state.
+        process_noise: (n, n) U of (6).
+        settings: how to work.
+        transition: (n, n) A of (6); constant velocity (8) if not given.
+
+    Attributes:
+        novelty: of the settings, or 0 where the truncation keeps no views.
+        site_count: how many sites a truncated hypothesis has.
+
+    Raises:
+        SettingsError: contradictory rows, named; or a process noise that is indefinite.
+        UnknownNameError: a row is about an element that the state lacks.
+    """
+
+    def __init__(
+        self,
+        layout: StateLayout,
+        observation: ObservationModel,
+        inequalities: Inequalities,
+        process_noise: Array,
+        settings: FilterSettings | None = None,
+        transition: Array | None = None,
+    ) -> None:
+        self.layout = layout
+        self.observation = observation
+        self.settings = settings or FilterSettings()
+        self.inequalities = inequalities.for_columns(layout.names)
+        inner_point(self.inequalities)
+        name_flaws(np.zeros(len(layout)), process_noise, layout, "the process noise")
+        _, self._U = check_moments(np.zeros(len(layout)), process_noise)
+        self._A = layout.transition() if transition is None else transition
+        self._rows = join_rows(self.inequalities)
+        self.site_count = len(self._rows.directions) if self.settings.truncation == "joint" else 0
+        # What is truncated and fed back has no offsets to keep.
+        feeds_back = self.settings.truncation in ("sequential", "clip")
+        self.novelty = 0.0 if feeds_back else self.settings.novelty
+
+    def start(self, belief: Belief) -> FilterState:
+        """The state before the first measurement, truncated (but for "none").
+
+        Raises:
+            SettingsError: a belief that does not fit, or is indefinite.
+        """
+        checked = make_belief(belief.mean, belief.covariance, self.layout)
+        truncated = self._truncate(checked, _NO_SITES)
+        return FilterState(0, (self._finish(Hypothesis(checked, checked), checked, truncated),))
+
+    def predict(self, state: FilterState) -> FilterState:
+        """One step at constant velocity: (6), for every hypothesis."""
+        moved = []
+        for h in state.hypotheses:
+            stare = h.stare.moved(self._A, self._U) if h.stare else None
+            free = stare.state() if stare else self._move(h.free)
+            moved.append(replace(h, belief=self._move(h.belief), free=free, stare=stare))
+        return replace(state, hypotheses=tuple(moved), rejections=())
+
+    def update(
+        self, state: FilterState, y: Array, observation: ObservationModel | None = None
+    ) -> FilterState:
+        """Use a measurement of the predicted moment: section 5, steps 2 to 6.
+
+        Args:
+            state: the prediction.
+            y: (m,) NaN where occluded.
+            observation: what is measured this time, if not what the filter was made with.
+
+        Raises:
+            SettingsError: the measurement does not fit.
+        """
+        step = state.step + 1
+        model = observation or self.observation
+        y = check_measurement(y, model)
+        view = next_view(state.view, y, model, self.novelty)
+        if view.count > 1:
+            branches = [self._repeat(h, y, model) for h in state.hypotheses]
+        else:
+            branches = [b for h in state.hypotheses for b in self._branches(h, y, model, step)]
+        alive, rejected = self._reject(branches, step)
+        finished = [self._weigh(h, result) for h, result in alive]
+        leader = max(range(len(finished)), key=lambda i: finished[i].log_weight)
+        merged, twins = merge_twins(normalise(finished), self.settings.twin_distance, step)
+        kept, pruned = prune(
+            merged, self.settings.hypothesis_cap, self.settings.smallest_weight, step
+        )
+        rejections = (*rejected, *twins, *pruned)
+        updated = alive[leader][1].updated
+        return FilterState(step, tuple(kept), rejections, updated.distance, updated.count, view)
+
+    def _move(self, belief: Belief) -> Belief:
+        P = self._A @ belief.covariance @ self._A.T + self._U
+        return Belief(self._A @ belief.mean, 0.5 * (P + P.T))
+
+    def _branches(
+        self, hypothesis: Hypothesis, y: Array, model: ObservationModel, step: int
+    ) -> list[Branch]:
+        """A hypothesis updated at its prediction, and at each mirrored one."""
+        hypothesis = replace(hypothesis, stare=None)
+        found = [(hypothesis, self._update(hypothesis, y, model, hypothesis.belief.mean))]
+        if self.settings.hypothesis_cap == 1:
+            return found
+        for start in model.mirrors(hypothesis.belief):
+            other = replace(hypothesis, born=step)
+            found.append((other, self._update(other, y, model, start, heated=False)))
+        return found
+
+    def _update(
+        self,
+        hypothesis: Hypothesis,
+        y: Array,
+        model: ObservationModel,
+        start: Array,
+        heated: bool = True,
+    ) -> LimitedUpdate:
+        iterations = self.settings.iterations
+        if self.settings.truncation == "none" or not self.inequalities:
+            updated = update(hypothesis.free, y, model, iterations, start, heated)
+            return LimitedUpdate(updated, unlimited(updated.belief))
+        return limited_update(
+            hypothesis.free, y, model, self._truncate, iterations, start, hypothesis.sites, heated
+        )
+
+    def _repeat(self, hypothesis: Hypothesis, y: Array, model: ObservationModel) -> Branch:
+        """A hypothesis updated by a further frame of the same view."""
+        stare = hypothesis.stare
+        if stare is None:
+            stare = begin_stare(model, hypothesis.free, hypothesis.belief, hypothesis.tangent)
+        updated = update(stare.belief, y, AnchoredObservation(model, stare.tangent))
+        stare = replace(stare, belief=updated.belief)
+        updated = replace(updated, belief=stare.state())
+        truncated = self._truncate(updated.belief, hypothesis.sites)
+        return replace(hypothesis, stare=stare), LimitedUpdate(updated, truncated)
+
+    def _reject(
+        self, branches: Sequence[Branch], step: int
+    ) -> tuple[list[Branch], list[Rejection]]:
+        """Section 5, step 5: give up what lies far beyond a row, but never all."""
+        if len(branches) == 1 or self.settings.truncation == "none" or not self.inequalities:
+            return list(branches), []
+        alive, rejected, worst_c = [], [], []
+        for hypothesis, result in branches:
+            c = result.truncated.c
+            k = int(np.argmin(c))
+            worst_c.append(c[k])
+            if c[k] < self.settings.reject_below:
+                name = self.inequalities.rows[k]
+                rejected.append(Rejection(step, hypothesis.born, "constraint", name, float(c[k])))
+            else:
+                alive.append((hypothesis, result))
+        if not alive:
+            keep = int(np.argmax(worst_c))
+            return [branches[keep]], rejected[:keep] + rejected[keep + 1 :]
+        return alive, rejected
+
+    def _weigh(self, hypothesis: Hypothesis, result: LimitedUpdate) -> Hypothesis:
+        """The hypothesis after its update, weighed by the measurement and by the limits."""
+        updated = result.updated
+        evidence = hypothesis.log_evidence + updated.log_likelihood
+        weighed = replace(hypothesis, log_evidence=evidence)
+        return self._finish(weighed, updated.belief, result.truncated)
+
+    def _finish(self, hypothesis: Hypothesis, free: Belief, result: Truncated) -> Hypothesis:
+        active = tuple(self.inequalities.rows[k] for k in np.flatnonzero(result.active))
+        belief = Belief(result.mean, result.covariance)
+        weight = hypothesis.log_evidence + result.log_probability
+        evidence = hypothesis.log_evidence
+        if self.settings.truncation != "joint":
+            # The paper's: the next step is predicted from the truncated belief.
+            free, evidence = belief, weight
+        return replace(
+            hypothesis,
+            belief=belief,
+            free=free,
+            log_weight=weight,
+            log_evidence=evidence,
+            active=active,
+            sites=result.sites,
+            tangent=hypothesis.tangent if hypothesis.stare else belief.mean,
+        )
+
+    def _truncate(self, belief: Belief, sites: Array) -> Truncated:
+        if self.settings.truncation == "none" or not self.inequalities:
+            return unlimited(belief)
+        if self.settings.truncation == "sequential":
+            return truncate_sequential(belief.mean, belief.covariance, self.inequalities)
+        if self.settings.truncation == "clip":
+            return clip(belief.mean, belief.covariance, self.inequalities)
+        return truncate_joint(
+            belief.mean,
+            belief.covariance,
+            self._rows,
+            tolerance=self.settings.tolerance,
+            start=sites if sites.size else None,
+        )

@@ -1,0 +1,1 @@
+"""What pictures measure of a pose: contours and axes of segments."""

@@ -1,0 +1,1 @@
+"""Following a body through a sequence of masks."""

@@ -1,0 +1,203 @@
+"""A filter that follows any body through masks, by its contour."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.errors import SettingsError
+from drake_pose.filtering.kalman.truncated_filter import (
+    FilterSettings,
+    FilterState,
+    TruncatedFilter,
+)
+from drake_pose.filtering.measurements.contour import (
+    ContourMeasurement,
+    ContourObservation,
+    Mask,
+)
+from drake_pose.filtering.state import Belief
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TrackingSettings:
+    """How a body may move, and how its contour is followed.
+
+    Args:
+        angle_acceleration: standard deviation of every joint's acceleration [rad/s^2].
+        length_acceleration: of the root's, and of joints that slide [m/s^2].
+        memory: time in which a rate that is not seen fades [s]: a hidden limb comes to rest.
+        start_angle: standard deviation of the angles at the start [rad].
+        start_length: of the root's position and other lengths at the start [m].
+        constant_length: of what never changes, such as lengths of segments, at the start [m].
+        rounds: how often the contour is compared anew in each frame.
+        lost_distance: the track is lost when the contour and the masks' edge are further apart
+            than this [pixel].
+        lost_share: and when a smaller share of the contour than this has an edge beside it.
+        lost_growth: and when E_total is so many times what it was after the last match ...
+        lost_margin: ... and larger than that by this.
+        root_moves: whether the root may be elsewhere than where the tree holds it.
+
+    Raises:
+        SettingsError: a number that is not positive.
+    """
+
+    angle_acceleration: float = 15.0
+    length_acceleration: float = 5.0
+    memory: float = 0.15
+    start_angle: float = 0.2
+    start_length: float = 0.03
+    constant_length: float = 0.03
+    rounds: int = 4
+    lost_distance: float = 12.0
+    lost_share: float = 0.6
+    lost_growth: float = 1.5
+    lost_margin: float = 0.1
+    root_moves: bool = False
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not isinstance(value, bool) and not 0 < value < math.inf:
+                raise SettingsError(f"{name} must be positive, not {value}")
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Where a tracker is after a frame.
+
+    Attributes:
+        state: the filter's.
+        measurement: of the contour at the end; None where no mask was given.
+        lost: whether the contour is far from the masks' edge.
+    """
+
+    state: FilterState
+    measurement: ContourMeasurement | None
+    lost: bool
+
+
+class ContourTracker:
+    """Follows a pose tree's values from mask to mask, inside the limits.
+
+    Args:
+        observation: the body and its cameras.
+        period: time between two frames [s].
+        settings: how it may move.
+
+    Attributes:
+        filter: the filter; its layout is the observation's.
+
+    Raises:
+        SettingsError: a period that is not positive.
+    """
+
+    def __init__(
+        self,
+        observation: ContourObservation,
+        period: float,
+        settings: TrackingSettings | None = None,
+    ) -> None:
+        if not 0 < period < math.inf:
+            raise SettingsError(f"the tracker's period must be positive, not {period}")
+        self.observation, self.settings = observation, settings or TrackingSettings()
+        layout = observation.layout
+        scale = {
+            name: period**2
+            * self._pick(name, self.settings.angle_acceleration, self.settings.length_acceleration)
+            for name in layout.moving
+        }
+        self.filter = TruncatedFilter(
+            layout,
+            _Nothing(len(layout)),
+            observation.inequalities(),
+            layout.process_noise(scale),
+            # A frame's numbers are not those of the frame before: there are no views to keep.
+            FilterSettings(hypothesis_cap=1, novelty=0.0),
+            layout.transition(math.exp(-period / self.settings.memory)),
+        )
+        self._period = period
+
+    def _pick(self, name: str, angle: float, length: float) -> float:
+        return angle if self.observation.is_angle(name) else length
+
+    def start(self, x: Array) -> Track:
+        """Begin at a state (n,), for example the matcher's, as sure of it as the settings say."""
+        layout, settings = self.observation.layout, self.settings
+        deviations = np.zeros(len(layout))
+        for name in layout.names:
+            index = layout.index(name)
+            if name in layout.constant:
+                deviations[index] = settings.constant_length
+            elif name in layout.moving:
+                deviations[index] = self._pick(name, settings.start_angle, settings.start_length)
+            else:
+                moving = name.removeprefix("rate_")
+                acceleration = self._pick(
+                    moving, settings.angle_acceleration, settings.length_acceleration
+                )
+                # What a limb picks up while its rate is remembered.
+                deviations[index] = acceleration * settings.memory * self._period
+        return Track(self.filter.start(Belief(x, np.diag(deviations**2))), None, False)
+
+    def follow(
+        self,
+        track: Track,
+        masks: Sequence[Mask | None],
+        first: bool = False,
+        root_position: Array | None = None,
+    ) -> Track:
+        """The next frame.
+
+        Args:
+            track: the last one.
+            masks: (H, W) of each camera; None where there is no picture.
+            first: the frame that the start was made for: nothing has moved since.
+            root_position: (3,) where the root is known to be now, if not where the tree holds it
+                [m].
+
+        Raises:
+            SettingsError: masks that do not fit the cameras.
+        """
+        observation = self.observation
+        if root_position is not None:
+            observation = observation.with_root_position(root_position)
+        prediction = track.state if first else self.filter.predict(track.state)
+        state, measurement = prediction, None
+        for _ in range(self.settings.rounds):
+            measurement = observation.measure(masks, state.best.mean)
+            if measurement is None:
+                break
+            state = self.filter.update(prediction, measurement.y, measurement)
+        if measurement is None:
+            return Track(state, None, track.lost or any(mask is not None for mask in masks))
+        last = observation.measure(masks, state.best.mean)
+        return Track(state, last, last is None or self._is_lost(last))
+
+    def _is_lost(self, measurement: ContourMeasurement) -> bool:
+        return (
+            measurement.distance > self.settings.lost_distance
+            or measurement.share < self.settings.lost_share
+        )
+
+
+class _Nothing:
+    """The measurement of a filter whose frames bring their own."""
+
+    names: tuple[str, ...] = ()
+    variances = np.zeros(0)
+    wraps = np.zeros(0, dtype=np.bool_)
+
+    def __init__(self, size: int) -> None:
+        self._size = size
+
+    def predict(self, x: Array) -> tuple[Array, Array]:
+        """Nothing."""
+        return np.zeros(0), np.zeros((0, self._size))
+
+    def mirrors(self, belief: Belief) -> list[Array]:
+        """None."""
+        return []

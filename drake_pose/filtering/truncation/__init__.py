@@ -1,0 +1,1 @@
+"""Linear inequalities, and the part of a normal distribution inside them."""

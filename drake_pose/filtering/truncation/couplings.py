@@ -1,0 +1,167 @@
+"""Couplings of joints, from a YAML file beside the model: (15) and (17) of Shimada et al."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import yaml
+from pydrake.common.yaml import yaml_load_typed
+
+from drake_pose.body import ArticulatedModel
+from drake_pose.errors import ModelError, SettingsError
+from drake_pose.filtering.truncation.inequalities import (
+    Inequalities,
+    from_model,
+    inner_point,
+    row_from_terms,
+    say_if_unlimited,
+    stack,
+    two_sided,
+)
+
+_LARGEST_FILE = 1 << 20
+_UNITS = {"": 1.0, "rad": 1.0, "m": 1.0, "deg": math.pi / 180.0, "mm": 1e-3}
+
+
+@dataclass
+class Difference:
+    """lower <= first - second <= upper, or |first - second| <= within.
+
+    Attributes:
+        first, second: the joints' names.
+        within, lower, upper: bounds in ``unit``; what is not given does not bound.
+        unit: "deg", "mm", "rad", "m", or nothing (the model's own, rad or m).
+    """
+
+    first: str = ""
+    second: str = ""
+    within: float = math.inf
+    lower: float = -math.inf
+    upper: float = math.inf
+    unit: str = ""
+
+
+@dataclass
+class GeneralRow:
+    """lower <= sum of factor x joint <= upper.
+
+    Attributes:
+        name: for messages and logs.
+        terms: a factor for each joint.
+        lower, upper: bounds in ``unit``; what is not given does not bound.
+        unit: as in ``Difference``.
+    """
+
+    name: str = ""
+    terms: dict[str, float] = field(default_factory=dict)
+    lower: float = -math.inf
+    upper: float = math.inf
+    unit: str = ""
+
+
+@dataclass
+class Couplings:
+    """The content of a couplings file."""
+
+    differences: list[Difference] = field(default_factory=list)
+    rows: list[GeneralRow] = field(default_factory=list)
+
+
+def load_couplings(path: Path | str, columns: Sequence[str]) -> Inequalities:
+    """Read the couplings of a YAML file.
+
+    The file has a list ``differences`` (fields of ``Difference``), a list ``rows`` (fields of
+    ``GeneralRow``), or both::
+
+        differences:
+          - {first: flexion_12, second: flexion_13, within: 10, unit: deg}
+        rows:
+          - {name: curl, terms: {flexion_11: 1, flexion_12: 1}, upper: 150, unit: deg}
+
+    Args:
+        path: the file.
+        columns: (n) the names of the elements of the state.
+
+    Raises:
+        ModelError: the file cannot be read; the message names it and what is wrong.
+        UnknownNameError: a row names a joint that does not exist.
+    """
+    file = Path(path)
+    content = _read(file)
+    parts = []
+    for difference in content.differences:
+        name = f"{difference.first} - {difference.second}"
+        where = f"{file}: '{name}'"
+        if difference.first == difference.second:
+            raise ModelError(f"{where}: give two different joints as first and second")
+        lower, upper = difference.lower, difference.upper
+        if math.isfinite(difference.within):
+            if math.isfinite(lower) or math.isfinite(upper):
+                raise ModelError(f"{where}: give either within, or lower and upper")
+            lower, upper = -difference.within, difference.within
+        terms = {difference.first: 1.0, difference.second: -1.0}
+        parts.append(_row(columns, name, terms, (lower, upper), difference.unit, where))
+    for row in content.rows:
+        where = f"{file}: row '{row.name}'"
+        parts.append(_row(columns, row.name, row.terms, (row.lower, row.upper), row.unit, where))
+    return stack(parts, columns)
+
+
+def couplings_file(model_file: Path) -> Path:
+    """Where a model's couplings are looked for: ``hand.couplings.yaml`` beside ``hand.urdf``."""
+    return model_file.with_name(f"{model_file.name.split('.')[0]}.couplings.yaml")
+
+
+def model_inequalities(model: ArticulatedModel) -> Inequalities:
+    """All that is known of a model's positions: its limits, and its couplings file if there is one.
+
+    Raises:
+        ModelError: the couplings file cannot be read.
+        UnknownNameError: it names a joint that does not exist.
+        SettingsError: the rows exclude each other; the message names them.
+    """
+    parts = [from_model(model)]
+    file = couplings_file(model.path)
+    if file.is_file():
+        parts.append(load_couplings(file, model.position_names))
+    whole = stack(parts, model.position_names)
+    inner_point(whole)
+    return say_if_unlimited(whole, str(model.path))
+
+
+def _read(file: Path) -> Couplings:
+    try:
+        if file.stat().st_size > _LARGEST_FILE:
+            raise ModelError(f"{file}: larger than {_LARGEST_FILE} bytes, which is no couplings")
+        content = yaml_load_typed(schema=Couplings, data=file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ModelError(f"{file}: cannot read the couplings: {error.strerror}") from error
+    except (yaml.YAMLError, RuntimeError, ValueError, TypeError, AttributeError) as error:
+        raise ModelError(
+            f"{file}: not a couplings file ({' '.join(str(error).split())}); it has lists "
+            "'differences' and 'rows'"
+        ) from error
+    return content
+
+
+def _row(
+    columns: Sequence[str],
+    name: str,
+    terms: dict[str, float],
+    bounds: tuple[float, float],
+    unit: str,
+    where: str,
+) -> Inequalities:
+    if unit not in _UNITS:
+        known = ", ".join(key for key in _UNITS if key)
+        raise ModelError(f"{where}: unit '{unit}' is unknown; use one of {known}")
+    if not np.isfinite(bounds).any():
+        raise ModelError(f"{where}: nothing is bounded; give within, lower or upper")
+    lower, upper = (bound * _UNITS[unit] for bound in bounds)
+    row = row_from_terms(columns, terms, where)
+    try:
+        return two_sided(columns, name, row, lower, upper)
+    except SettingsError as error:
+        raise ModelError(f"{where}: {error}") from error

@@ -1,0 +1,266 @@
+"""The part of a normal distribution inside linear inequalities: its mean and its covariance."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drake_pose.errors import SettingsError
+from drake_pose.filtering.factors import (
+    check_moments,
+    covariance_from,
+    factor_and_kind,
+    is_inside,
+    lower_or_root,
+    margins_in_deviations,
+    outer_product,
+)
+from drake_pose.filtering.state import Belief
+from drake_pose.filtering.truncation.expectation_propagation import apply_sites, propagate
+from drake_pose.filtering.truncation.inequalities import Inequalities
+from drake_pose.filtering.truncation.row_by_row import cut_one_by_one
+
+Array = NDArray[np.float64]
+
+SKIP_ABOVE = 5.0
+"""Rows with a larger c_k are left out: they would move the mean by less than 2e-6 deviations."""
+
+_PATIENCE = 25
+
+
+@dataclass(frozen=True, eq=False)
+class Truncated:
+    """A truncated distribution.
+
+    Attributes:
+        mean: (n,).
+        covariance: (n, n), symmetric, and positive definite where the given one was.
+        c: (K,) of (24), before the truncation: how many standard deviations inside of each row
+            the mean was, negative if beyond; infinite where the row has no variance. For the
+            sequential form, at the row's turn.
+        active: (K,) whether the row took part (c_k at most SKIP_ABOVE).
+        log_probability: logarithm of the probability that all rows held, as estimated.
+        sites: what the joint form knows about each direction of ``JointRows`` (S, 2); empty for
+            the sequential form.
+    """
+
+    mean: Array
+    covariance: Array
+    c: Array
+    active: NDArray[np.bool_]
+    log_probability: float
+    sites: Array = field(default_factory=lambda: np.zeros((0, 2)))
+
+
+@dataclass(frozen=True, eq=False)
+class JointRows:
+    """Inequalities with parallel rows merged, in an order of their own.
+
+    Rows along one line, whatever their length and sign, become one pair of bounds, so that a row
+    given twice counts once.
+
+    Attributes:
+        inequalities: as given.
+        used: (m,) the elements of the state that occur in a row.
+        directions: (S, m) unit vectors over the used elements.
+        lower, upper: (S,) bounds along them, infinite for none.
+        group: (K,) the direction of each row.
+        whole: (S, n) the directions over all elements.
+    """
+
+    inequalities: Inequalities
+    used: NDArray[np.intp]
+    directions: Array
+    lower: Array
+    upper: Array
+    group: NDArray[np.intp]
+    whole: Array
+
+
+def join_rows(inequalities: Inequalities) -> JointRows:
+    """Prepare inequalities for ``truncate_joint``; worth keeping when they are used often.
+
+    Raises:
+        SettingsError: two parallel rows exclude each other; it names them.
+    """
+    phi = inequalities.phi
+    used = np.flatnonzero(phi.any(axis=0))
+    count = len(phi)
+    if count == 0:
+        nothing = np.zeros(0)
+        empty = np.zeros((0, phi.shape[1]))
+        return JointRows(inequalities, used, np.zeros((0, 0)), nothing, nothing, used, empty)
+    norms = np.linalg.norm(phi, axis=1)
+    unit = phi[:, used] / norms[:, None]
+    leading = unit[np.arange(count), np.argmax(np.abs(unit) > 1e-9, axis=1)]
+    signs = np.sign(leading)
+    unit, bounds = unit * signs[:, None], inequalities.b / norms
+    # Adding 0 makes -0 into 0, which np.unique tells apart.
+    keys = np.round(unit, 12) + 0.0
+    directions, group = np.unique(keys, axis=0, return_inverse=True)
+    group = group.ravel()
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    lower, upper = np.full(len(directions), -np.inf), np.full(len(directions), np.inf)
+    np.minimum.at(upper, group[signs > 0], bounds[signs > 0])
+    np.maximum.at(lower, group[signs < 0], -bounds[signs < 0])
+    for index in np.flatnonzero(~(lower < upper)):
+        names = [inequalities.rows[k] for k in np.flatnonzero(group == index)]
+        raise SettingsError(
+            f"the inequalities leave no room between them: {'; '.join(names)}. Loosen one of them"
+        )
+    whole = np.zeros((len(directions), phi.shape[1]))
+    whole[:, used] = directions
+    return JointRows(inequalities, used, directions, lower, upper, group, whole)
+
+
+def normalised_margins(mean: Array, covariance: Array, inequalities: Inequalities) -> Array:
+    """(K,) c_k of (24); a row without variance has an infinite one.
+
+    Raises:
+        SettingsError: a row without variance is not satisfied; it is named.
+    """
+    c, beyond = margins_in_deviations(mean, covariance, inequalities.phi, inequalities.b)
+    if beyond >= 0:
+        excess = -inequalities.margins(mean)[beyond]
+        raise SettingsError(
+            f"inequality '{inequalities.rows[beyond]}' is not satisfied by {excess:.3g}, and the "
+            "belief has no variance along it; start from a belief that allows it"
+        )
+    return c
+
+
+def truncate_sequential(
+    mean: ArrayLike,
+    covariance: ArrayLike,
+    inequalities: Inequalities,
+    skip_above: float = SKIP_ABOVE,
+) -> Truncated:
+    """Truncate by one row after the other: (21) to (29) of Shimada et al.
+
+    With s^2 = phi^T Q phi the rotations of (21) to (23) multiply out to
+    q + Q phi nu / s and Q - (Q phi)(Q phi)^T (1 - S) / s^2, with S = 1 + c nu - nu^2 of (26). The
+    covariance is changed through its factor, which keeps it positive definite.
+
+    The result depends on the order of the rows.
+
+    Args:
+        mean: (n,) q_0.
+        covariance: (n, n) Q_0.
+        inequalities: K rows over the same n elements.
+        skip_above: rows with a larger c_k are left out.
+
+    Raises:
+        SettingsError: sizes that do not fit, NaN, an indefinite covariance, or a row without
+            variance that is not satisfied.
+    """
+    q, Q = _check(mean, covariance, inequalities)
+    factor, definite = factor_and_kind(Q)
+    normalised_margins(q, Q, inequalities)
+    c = np.empty(len(inequalities))
+    factor = np.ascontiguousarray(factor)
+    total = cut_one_by_one(q, factor, inequalities.phi, inequalities.b, skip_above, c)
+    return Truncated(q, covariance_from(factor, definite), c, c <= skip_above, total)
+
+
+def truncate_joint(
+    mean: ArrayLike,
+    covariance: ArrayLike,
+    rows: JointRows | Inequalities,
+    contained: ArrayLike | None = None,
+    tolerance: float = 1e-9,
+    sweep_limit: int = 400,
+    start: Array | None = None,
+) -> Truncated:
+    """Truncate by all rows at once: moments by expectation propagation.
+
+    The result does not depend on the order of the rows, or on how often a row is given. It is
+    exact where all rows are parallel to one line; against long Gibbs sampling on table 1's rows
+    of Shimada et al. with table 2's variances it is within 0.06 standard deviations and 0.18 of
+    the covariance (the sequential form: 1.6 and 4.8).
+
+    Args:
+        mean: (n,).
+        covariance: (n, n).
+        rows: the inequalities, prepared by ``join_rows`` or not.
+        contained: (S, 2) sites of an earlier result that the given belief still contains: what is
+            known about elements that never change is then not counted twice.
+        tolerance: of the marginals' change from sweep to sweep.
+        sweep_limit: of expectation propagation.
+        start: (S, 2) sites of a similar problem to begin with, which saves sweeps.
+
+    Raises:
+        SettingsError: as for ``truncate_sequential``, or parallel rows that exclude each other.
+    """
+    joint = join_rows(rows) if isinstance(rows, Inequalities) else rows
+    q, Q = _check(mean, covariance, joint.inequalities)
+    c = normalised_margins(q, Q, joint.inequalities)
+    factor, definite = factor_and_kind(Q)
+    factor = np.ascontiguousarray(factor)
+    sites = np.zeros((len(joint.directions), 2))
+    if contained is not None:
+        sites[:] = np.asarray(contained, dtype=np.float64)
+        apply_sites(q, factor, joint.whole, sites, -1, -1.0)
+    elif start is not None:
+        sites[:] = start
+    base = lower_or_root(outer_product(factor[joint.used]))
+    free = q, factor
+    for limit in (sweep_limit, _PATIENCE * sweep_limit):
+        log_probability, sweeps = propagate(
+            free[0][joint.used],
+            base,
+            joint.directions,
+            joint.lower,
+            joint.upper,
+            sites,
+            tolerance,
+            limit,
+        )
+        q, factor = free[0].copy(), free[1].copy()
+        apply_sites(q, factor, joint.whole, sites, -1, 1.0)
+        # Rows thousands of deviations away, almost parallel, settle slowly.
+        if sweeps < limit or is_inside(q, joint.inequalities.phi, joint.inequalities.b):
+            break
+    active = (c <= SKIP_ABOVE) & (sites[joint.group, 0] > 0)
+    covariance_after = covariance_from(factor, definite)
+    return Truncated(q, covariance_after, c, active, log_probability, sites)
+
+
+def clip(mean: ArrayLike, covariance: ArrayLike, inequalities: Inequalities) -> Truncated:
+    """Move the mean to the nearest point inside the rows; the covariance stays as it is.
+
+    What is done where no truncation is at hand. Nearest in the sense of the covariance, one
+    violated row after the other, until none is left or 100 rounds are over.
+
+    Raises:
+        SettingsError: as for ``truncate_sequential``.
+    """
+    q, Q = _check(mean, covariance, inequalities)
+    c = normalised_margins(q, Q, inequalities)
+    for _ in range(100):
+        margins = inequalities.margins(q)
+        worst = int(np.argmin(margins)) if len(inequalities) else -1
+        if worst < 0 or margins[worst] >= -1e-12:
+            break
+        row = inequalities.phi[worst]
+        gain = Q @ row
+        q = q + gain * margins[worst] / float(row @ gain)
+    return Truncated(q, Q, c, c < 0, 0.0)
+
+
+def unlimited(belief: Belief) -> Truncated:
+    """A belief that no row cuts."""
+    nothing = np.zeros(0)
+    active = np.zeros(0, dtype=np.bool_)
+    return Truncated(belief.mean, belief.covariance, nothing, active, 0.0)
+
+
+def _check(
+    mean: ArrayLike, covariance: ArrayLike, inequalities: Inequalities
+) -> tuple[Array, Array]:
+    q, Q = check_moments(mean, covariance)
+    if inequalities.phi.shape[1] != q.size:
+        raise SettingsError(
+            f"the inequalities are about {inequalities.phi.shape[1]} elements, the belief about "
+            f"{q.size}; use Inequalities.for_columns"
+        )
+    return q, Q

@@ -1,0 +1,63 @@
+"""Settings of the whole search."""
+
+import math
+from dataclasses import dataclass, field
+
+from drake_pose.errors import SettingsError
+from drake_pose.matching.continuous.equivalent_poses import RobustFamilySettings
+from drake_pose.matching.fit.robust_fit import RobustPass
+from drake_pose.matching.grid.families.examination import ExaminationSettings
+from drake_pose.matching.grid.settings import WideSearchSettings
+from drake_pose.matching.starts.coarse_search import RoughSettings
+
+FROM_AFAR = RobustPass((0.1, 0.05), 3, 0.04)
+HALFWAY = RobustPass((0.05, 0.025), 4, 0.026)
+IN_THE_END = RobustPass((0.0125,), 6, 0.0125)
+
+
+@dataclass(frozen=True)
+class WholeSearchSettings:
+    """Parameters of the whole search.
+
+    Args:
+        wide: of the search on the grid. Its time limit is that of the whole search.
+        continuous: False: nothing but the search on the grid is run.
+        rough: of the search for rough poses.
+        starts: so many rough poses are refined.
+        apart: rough poses differ where some part of the body is seen so far away, as a share of
+            the root of the silhouettes' mean area.
+        survivors: so many of them are refined on.
+        answers: so many are refined to the end.
+        rounds: how often other explanations are sought about the best poses.
+        sought_about: about so many of them.
+        tried: so many other explanations of each are refined.
+        flipped: so many more that flips of its joints make.
+        families: of the answer as a set; None: only the best pose is wanted.
+        examination: of an answer on the grid.
+
+    Raises:
+        SettingsError: if a value is out of its range.
+    """
+
+    wide: WideSearchSettings = field(default_factory=WideSearchSettings)
+    continuous: bool = True
+    rough: RoughSettings = field(default_factory=RoughSettings)
+    starts: int = 40
+    apart: float = 0.13
+    survivors: int = 12
+    answers: int = 4
+    rounds: int = 2
+    sought_about: int = 3
+    tried: int = 6
+    flipped: int = 3
+    families: RobustFamilySettings | None = field(default_factory=RobustFamilySettings)
+    examination: ExaminationSettings | None = field(default_factory=ExaminationSettings)
+
+    def __post_init__(self) -> None:
+        for name in ("starts", "survivors", "answers", "sought_about", "tried", "flipped"):
+            if getattr(self, name) < 1:
+                raise SettingsError(f"{name} must be 1 or more, not {getattr(self, name)}")
+        if self.rounds < 0:
+            raise SettingsError(f"rounds must be 0 or more, not {self.rounds}")
+        if not (math.isfinite(self.apart) and self.apart >= 0.0):
+            raise SettingsError(f"apart must be 0 or more, not {self.apart}")

@@ -1,0 +1,1 @@
+"""The continuous fit: a body's contour drawn to the silhouettes' edges."""

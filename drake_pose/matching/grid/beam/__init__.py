@@ -1,0 +1,1 @@
+"""Beam search: hypotheses grow node by node, the most promising are kept."""

@@ -1,0 +1,1 @@
+"""What silhouettes leave open on the grid: families of poses that look alike."""

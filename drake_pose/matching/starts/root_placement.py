@@ -1,0 +1,341 @@
+"""Where a body's root can be, told from silhouettes alone: positions, depths and scales to try.
+
+One parallel camera of unknown scale: a body twice as large looks like a camera with twice as many
+pixels a metre, so the scale is tried on the camera and the body keeps its size. One pinhole: what
+is unknown beside the place in the picture is the depth. Both are bounded by the silhouette's area,
+beside that of the body's own random poses, and tried in geometric steps. Several calibrated
+cameras: a grid in space, of which every camera leaves what lies in its silhouette.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from drake_pose.body import PoseTree
+from drake_pose.camera import Camera, ParallelCamera
+from drake_pose.errors import SettingsError
+from drake_pose.matching.grid.sampled_body import WideBody
+from drake_pose.matching.result import View
+from drake_pose.silhouette import score_bodies
+
+# The picture in which random poses are measured [pixel], and how many.
+_SIDE, _POSES = 240, 100
+# Shares of the random poses whose area is smaller and larger than what is reckoned with.
+_RARE = 0.03
+# Half the cube in space that the root is looked for in [the silhouette's extent].
+_HALF_CUBE = 0.75
+
+
+@dataclass(frozen=True)
+class PlacementSettings:
+    """What is unknown about the root, and how finely it is tried.
+
+    Args:
+        scale_unknown: the camera is parallel and its pixels_per_metre is not known.
+        positions_across: so many positions are tried across the silhouette.
+        ratio: of two scales or depths tried one after the other.
+        cut_off: where the silhouette touches the picture's edge the body may be larger by this
+            factor than it looks, and the root that share of the silhouette's extent, less one,
+            beyond the edge.
+        hypotheses: so many are kept, shared among the scales or depths.
+        quota: the share of them that may have the root at one position.
+        starts: how many poses are refined from far.
+        finalists: at so many of the places where they then have their roots, the poses are searched
+            again; so many of all poses are refined to the end.
+        again: how many poses are refined of those found by each of these searches.
+
+    Raises:
+        SettingsError: if a value is out of its range.
+    """
+
+    scale_unknown: bool = False
+    positions_across: int = 12
+    ratio: float = 1.12
+    cut_off: float = 1.5
+    hypotheses: int = 1000
+    quota: float = 0.05
+    starts: int = 24
+    finalists: int = 3
+    again: int = 4
+
+    def __post_init__(self) -> None:
+        for name in ("positions_across", "hypotheses", "starts", "finalists", "again"):
+            if getattr(self, name) < 1:
+                raise SettingsError(f"{name} must be 1 or more, not {getattr(self, name)}")
+        if not 0.0 < self.quota <= 1.0:
+            raise SettingsError(f"quota must lie between 0 and 1, not {self.quota}")
+        if not 1.0 < self.ratio < 2.0:
+            raise SettingsError(f"ratio must lie between 1 and 2, not {self.ratio}")
+        if not self.cut_off >= 1.0:
+            raise SettingsError(f"cut_off must be 1 or more, not {self.cut_off}")
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """Root positions that are tried together.
+
+    Attributes:
+        views: the silhouettes, with a parallel camera's scale as it is tried.
+        positions: (n, 3) of the root's origin in the world [m].
+        scale: of the camera, times what it was given as.
+    """
+
+    views: tuple[View, ...]
+    positions: np.ndarray
+    scale: float
+
+
+def find_layers(
+    body: WideBody, views: Sequence[View], settings: PlacementSettings, known: np.ndarray | None
+) -> list[Layer]:
+    """Where the root can be, the likeliest scales and depths first.
+
+    Args:
+        body: the body, its root anywhere.
+        views: the silhouettes.
+        settings: what is unknown.
+        known: (3,) the root's position [m] if only the scale is unknown.
+
+    Raises:
+        SettingsError: the scale is unknown, but there is not just one parallel camera.
+    """
+    main = max(views, key=lambda view: int(view.mask.sum()))
+    camera = main.camera
+    if settings.scale_unknown and (len(views) > 1 or not isinstance(camera, ParallelCamera)):
+        raise SettingsError(
+            "an unknown scale needs one parallel camera, but there are: "
+            f"{', '.join(view.camera.name for view in views)}; a pinhole's or several cameras' "
+            "scale follows from their calibration"
+        )
+    if known is not None and not settings.scale_unknown:
+        return [Layer(tuple(views), known[None], 1.0)]
+    sizes = _pixel_sizes(body, main, settings)
+    if len(views) > 1:
+        middle = _meeting_point(views)
+        if middle is not None:
+            return [_space_layer(views, middle, sizes, settings)]
+    p_CR = _in_camera(camera, body.sampled.X_PN[0][0, :3, 3])
+    places = _picture_grid(main, settings)
+    if not isinstance(camera, ParallelCamera):
+        focal = 0.5 * (camera.focal_x + camera.focal_y)
+        return [Layer(tuple(views), _lift(camera, places, focal / size), 1.0) for size in sizes]
+    scales = sizes / camera.pixels_per_metre if settings.scale_unknown else np.ones(1)
+    layers = []
+    for scale in scales:
+        scaled = scale_camera(camera, float(scale))
+        positions = _lift(scaled, places, p_CR[2]) if known is None else known[None]
+        layers.append(Layer((View(scaled, main.mask),), positions, float(scale)))
+    return layers
+
+
+def hub(tree: PoseTree) -> str:
+    """The name of the node with geometry that has the most neighbours, the first of equals."""
+    counts = [
+        len(node.children) + (node.parent >= 0) if len(node.mesh.triangles) else -1
+        for node in tree.nodes
+    ]
+    return tree.nodes[int(np.argmax(counts))].name
+
+
+def turns_freely(tree: PoseTree) -> bool:
+    """Whether the plant's own joints at the tree's only root turn it in all ways."""
+    if sum(node.parent < 0 for node in tree.nodes) != 1 or not tree.nodes[0].positions:
+        return False
+    kinds = [tree.model.position_kinds[position] for position in tree.nodes[0].positions]
+    lower, upper = tree.value_bounds(0)
+    ranges = np.sort((upper - lower)[[kind == "angle" for kind in kinds]])
+    wanted = np.array([np.pi, 2.0 * np.pi, 2.0 * np.pi])
+    return len(ranges) == 3 and bool(np.all(ranges >= wanted - 1e-6))
+
+
+def scale_camera(camera: ParallelCamera, scale: float) -> ParallelCamera:
+    """The camera with so many times its pixels a metre."""
+    return dataclasses.replace(camera, pixels_per_metre=scale * camera.pixels_per_metre)
+
+
+def whereabouts(views: Sequence[View], p_WR: np.ndarray, settings: PlacementSettings) -> np.ndarray:
+    """Where a root (3,) is seen, and how large: 1 apart is one step of what is tried.
+
+    Returns:
+        (3 n,) for each of n views the root's place in its picture, and the logarithm of the pixels
+        a metre there.
+    """
+    here: list[float] = []
+    for view in views:
+        camera = view.camera
+        place, depth = camera.project(p_WR[None])
+        if isinstance(camera, ParallelCamera):
+            size = camera.pixels_per_metre
+        else:
+            size = 1.0 / max(float(depth[0]), camera.near)
+        spacing = _extent(view.mask) / settings.positions_across
+        here += [*(place[0] / spacing), np.log(size) / np.log(settings.ratio)]
+    return np.array(here)
+
+
+def place_body(body: WideBody, positions: np.ndarray) -> WideBody:
+    """The body whose root is sampled at all combinations of positions (n, 3) and its rotations.
+
+    Sample i of the root is rotation i % r at position i // r, of r rotations.
+    """
+    placed, sampled = copy.copy(body), copy.copy(body.sampled)
+    X_WR = sampled.X_PN[0]
+    shifts = positions - X_WR[0, :3, 3]
+    X = np.repeat(X_WR[None], len(shifts), axis=0)
+    X[:, :, :3, 3] += shifts[:, None]
+    sampled.X_PN = [X.reshape(-1, 4, 4), *sampled.X_PN[1:]]
+    sampled.values = [np.tile(sampled.values[0], (len(shifts), 1)), *sampled.values[1:]]
+    band = sampled.bands[0]
+    if band is not None:
+        sampled.bands = [np.tile(band, (len(shifts), 1, 1)), *sampled.bands[1:]]
+    placed.sampled = sampled
+    balls = body.p_PB[0][None] + shifts[:, None, None]
+    placed.p_PB = [np.ascontiguousarray(balls.reshape(-1, *balls.shape[2:])), *body.p_PB[1:]]
+    return placed
+
+
+def _pixel_sizes(body: WideBody, view: View, settings: PlacementSettings) -> np.ndarray:
+    """How many pixels a metre at the body may have (n,), the likeliest first."""
+    area = float(view.mask.sum())
+    low, middle, high = np.quantile(_random_areas(body, view.camera), [_RARE, 0.5, 1.0 - _RARE])
+    smallest, likely, largest = np.sqrt(area / np.array([high, middle, low]))
+    if _touches_edge(view.mask):
+        largest *= settings.cut_off
+    step = np.log(settings.ratio)
+    steps = np.arange(
+        np.floor(np.log(smallest / likely) / step), np.ceil(np.log(largest / likely) / step) + 1
+    )
+    steps = steps[np.argsort(np.abs(steps), kind="stable")]
+    return np.asarray(likely * settings.ratio**steps)
+
+
+def _random_areas(body: WideBody, camera: Camera) -> np.ndarray:
+    """Areas of parallel projections of random poses of the grid, seen along the camera's axis."""
+    generator = np.random.default_rng(1)
+    sampled, nodes = body.sampled, body.sampled.tree.nodes
+    X_WN = np.empty((_POSES, len(nodes), 4, 4))
+    samples = np.empty((_POSES, len(nodes)), dtype=np.int64)
+    for i, node in enumerate(nodes):
+        samples[:, i] = generator.integers(len(sampled.X_PN[i]), size=_POSES)
+        X_PN = sampled.X_PN[i][samples[:, i]]
+        X_WN[:, i] = X_PN if node.parent < 0 else X_WN[:, node.parent] @ X_PN
+    balls = np.array([outline.ball for outline in sampled.outlines])
+    X_CN = camera.X_CW @ X_WN
+    centers = np.einsum("nkij,kj->nki", X_CN[..., :3, :3], balls[:, :3]) + X_CN[..., :3, 3]
+    low = (centers - balls[:, 3:]).min(axis=1)
+    high = (centers + balls[:, 3:]).max(axis=1)
+    X_CN[..., :3, 3] -= 0.5 * (low + high)[:, None]
+    scale = _SIDE / float((high - low)[:, :2].max())
+    middle = 0.5 * (_SIDE - 1)
+    measuring = ParallelCamera("", _SIDE, _SIDE, scale, middle, middle, np.eye(4))
+    nothing = np.zeros((0, _SIDE, _SIDE + 1), dtype=np.int32)
+    areas = score_bodies(
+        sampled.outlines_at(range(len(nodes)), samples[0]), X_CN, measuring, nothing
+    )
+    return np.asarray(areas[:, 0] / scale**2)
+
+
+def _touches_edge(mask: np.ndarray) -> bool:
+    return bool(mask[[0, -1]].any() or mask[:, [0, -1]].any())
+
+
+def _box(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The least and greatest u and v of a silhouette, (2,) each."""
+    v, u = np.nonzero(mask)
+    return np.array([u.min(), v.min()], float), np.array([u.max(), v.max()], float)
+
+
+def _extent(mask: np.ndarray) -> float:
+    """The silhouette's extent [pixel]: of a square as large as its bounding box."""
+    low, high = _box(mask)
+    return float(np.sqrt(np.prod(high - low + 1.0)))
+
+
+def _picture_grid(view: View, settings: PlacementSettings) -> np.ndarray:
+    """Places (n, 2) in the picture where the root can be seen, or beyond its edge [pixel]."""
+    low, high = _box(view.mask)
+    extent = _extent(view.mask)
+    spacing = extent / settings.positions_across
+    beyond = (settings.cut_off - 1.0) * extent
+    size = np.array([view.camera.width, view.camera.height])
+    low = np.where(low < 1, -beyond, low - 0.5 * spacing)
+    high = np.where(high > size - 2, size - 1 + beyond, high + 0.5 * spacing)
+    axes = [low[k] + spacing * np.arange(int((high[k] - low[k]) / spacing) + 1) for k in range(2)]
+    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    return places[_near(view, places, 0.75 * spacing, beyond)]
+
+
+def _near(view: View, places: np.ndarray, spacing: float, beyond: float) -> np.ndarray:
+    """Which places (n, 2) [pixel] lie at the silhouette, or beyond it out of the picture."""
+    distances = distance_transform_edt(~view.mask)
+    inside = np.clip(places, 0, np.array(view.mask.shape)[::-1] - 1)
+    column, row = np.rint(inside).astype(np.int64).T
+    over = np.linalg.norm(places - inside, axis=1)
+    return np.asarray((distances[row, column] <= spacing) & (over <= beyond))
+
+
+def _lift(camera: Camera, places: np.ndarray, depth: float) -> np.ndarray:
+    """The points (n, 3) of the world that are seen at places (n, 2) [pixel] in a depth [m]."""
+    if isinstance(camera, ParallelCamera):
+        scale = np.full(2, 1.0 / camera.pixels_per_metre)
+    else:
+        scale = depth / np.array([camera.focal_x, camera.focal_y])
+    p_C = np.empty((len(places), 3))
+    p_C[:, :2] = (places - [camera.center_x, camera.center_y]) * scale
+    p_C[:, 2] = depth
+    return np.asarray(p_C @ camera.X_WC[:3, :3].T + camera.X_WC[:3, 3])
+
+
+def _in_camera(camera: Camera, p_W: np.ndarray) -> np.ndarray:
+    return np.asarray(camera.X_CW[:3, :3] @ p_W + camera.X_CW[:3, 3])
+
+
+def _meeting_point(views: Sequence[View]) -> np.ndarray | None:
+    """The point (3,) nearest to the rays through all silhouettes' middles; None: parallel ones."""
+    A, b = np.zeros((3, 3)), np.zeros(3)
+    for view in views:
+        low, high = _box(view.mask)
+        ends = np.array([_lift(view.camera, 0.5 * (low + high)[None], z)[0] for z in (1.0, 2.0)])
+        along = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+        across = np.eye(3) - np.outer(along, along)
+        A += across
+        b += across @ ends[0]
+    # The smallest eigenvalue is about the squared sine of half the angle between two rays.
+    if np.linalg.eigvalsh(A)[0] < 0.01:
+        return None
+    return np.asarray(np.linalg.solve(A, b))
+
+
+def _space_layer(
+    views: Sequence[View], middle: np.ndarray, sizes: np.ndarray, settings: PlacementSettings
+) -> Layer:
+    """A grid in space about a point, of which all views leave what lies in their silhouettes.
+
+    Args:
+        views: the silhouettes.
+        middle: (3,) about the body's middle [m].
+        sizes: the pixels a metre in the largest silhouette, the likeliest first.
+        settings: how finely.
+    """
+    main = max(views, key=lambda view: int(view.mask.sum()))
+    extent = _extent(main.mask) / float(sizes[0])
+    half = _HALF_CUBE * extent * (settings.cut_off if _touches_edge(main.mask) else 1.0)
+    spacing = extent / settings.positions_across
+    steps = spacing * np.arange(-np.ceil(half / spacing), np.ceil(half / spacing) + 1)
+    points = middle + np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
+    for view in views:
+        places, depth = view.camera.project(points)
+        seen = np.ones(len(points), dtype=np.bool_)
+        if not isinstance(view.camera, ParallelCamera):
+            seen = depth > view.camera.near
+        wide = _extent(view.mask) / settings.positions_across
+        beyond = (settings.cut_off - 1.0) * _extent(view.mask)
+        seen[seen] = _near(view, places[seen], 0.75 * wide, beyond)
+        points = points[seen]
+    return Layer(tuple(views), points, 1.0)

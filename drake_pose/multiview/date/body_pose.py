@@ -1,0 +1,152 @@
+"""A frame's pose the paper's way, from features, face and silhouettes (Date et al., section 4)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.camera import Camera
+from drake_pose.multiview.date.inverse_kinematics import aim_trunk, move_limb, upper_body
+from drake_pose.multiview.date.limb_search import joint_circle, limb_angles, search_circle
+from drake_pose.multiview.date.skeleton import LIMBS, Limb, Skeleton, rotation
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Waist:
+    """The constants of the waist formula (4.2). They are a person's; the defaults are the paper's.
+
+    Args:
+        head_share: the head's share in the waist's height.
+        ahead: how far the waist of a person standing upright is ahead of the head's middle [m].
+    """
+
+    head_share: float = 0.55
+    ahead: float = 0.0
+
+    def place(self, features: Array, heading: float) -> Array:
+        """The waist (3,): at the head's place, at a height between head and feet (z upwards).
+
+        Args:
+            features: (5, 3) head, hands and feet in the order of FEATURES [m].
+            heading: where the head looks, from the world's x axis [rad].
+        """
+        head, _, _, left_foot, right_foot = features
+        feet = 0.5 * (right_foot[2] + left_foot[2])
+        height = self.head_share * head[2] + (1.0 - self.head_share) * feet
+        forward = self.ahead * np.array([np.cos(heading), np.sin(heading)])
+        return np.array([*(head[:2] + forward), height])
+
+
+def waist_of(skeleton: Skeleton) -> Waist:
+    """The constants that are right for this person standing upright.
+
+    A centimetre of error here makes the knees of a standing person bend by ten.
+    """
+    q = np.zeros(len(skeleton.lower))
+    head, _, _, left_foot, right_foot = skeleton.features(q)
+    hips = np.mean([skeleton.limb_points(q, name)[0] for name in LIMBS[2:]], axis=0)
+    feet = 0.5 * (left_foot[2] + right_foot[2])
+    return Waist(float((hips[2] - feet) / (head[2] - feet)), float(hips[0] - head[0]))
+
+
+@dataclass(frozen=True, eq=False)
+class PaperPose:
+    """A pose estimated the paper's way.
+
+    Args:
+        q: (nq,) positions inside their limits: the model's trunk points from the neck's base to the
+            waist, its limbs go from there to the middle joints and ends below.
+        limbs: by name, (3, 3) shoulder, elbow and hand, or hip, knee and foot, as found [m].
+        neck: (3,) the neck's base [m].
+        waist: (3,) half-way between the hips, by the paper's formula [m].
+        scores: by limb: the correlation C of its middle joint; nan without the search.
+    """
+
+    q: Array
+    limbs: Mapping[str, Array]
+    neck: Array
+    waist: Array
+    scores: Mapping[str, float]
+
+
+def estimate_pose(
+    skeleton: Skeleton,
+    last: Array,
+    features: Array,
+    head_angles: Array | None,
+    cameras: Sequence[Camera],
+    regions: Sequence[Mask],
+    *,
+    search: bool = True,
+    waist: Waist | None = None,
+) -> PaperPose:
+    """Estimates a frame's pose.
+
+    Args:
+        skeleton: the person.
+        last: (nq,) the last frame's positions.
+        features: (5, 3) head, hands and feet in the order of FEATURES [m].
+        head_angles: (2,) the head's angles [rad] where the face was seen; None: the last frame's,
+            which inverse kinematics may then move.
+        cameras: the cameras on the circle.
+        regions: (H, W) the person in each of their pictures.
+        search: whether elbows and knees are searched on their circles; otherwise they stay where
+            inverse kinematics puts them.
+        waist: the constants of the waist formula; the paper's where not given.
+    """
+    q = _head_and_arms(skeleton, last, features, head_angles)
+    R_WT, neck = skeleton.trunk_pose(q)
+    place = (waist or Waist()).place(features, float(q[skeleton.head_angles[0]]))
+    # The model's trunk is one piece: it cannot hold shoulders and waist found apart. For its
+    # positions the waist counts; so the neck's base cannot wander off from frame to frame either.
+    aimed = aim_trunk(skeleton, q, place)
+    R_aimed, _ = skeleton.trunk_pose(aimed)
+    limbs, scores = {}, {}
+    for k, name in enumerate(LIMBS):
+        limb, end = skeleton.limbs[name], features[1 + k]
+        if name.endswith("arm"):
+            root, outward = neck + R_WT @ limb.root_T, R_WT @ limb.root_T
+            found = np.array([root, _middle(limb, R_WT, root, q[limb.positions]), end])
+        else:
+            outward = R_aimed @ (limb.root_T - skeleton.waist_T)
+            root = place + outward
+            angles = move_limb(limb, R_aimed, root, q[limb.positions], end)
+            found = np.array([root, _middle(limb, R_aimed, root, angles), end])
+        scores[name] = float("nan")
+        if search:
+            circle = joint_circle(limb, root, end, outward)
+            found[1], _, scores[name] = search_circle(
+                limb, circle, root, end, cameras, regions, found[1]
+            )
+        own_root = neck + R_aimed @ limb.root_T
+        angles = limb_angles(limb, R_aimed, own_root, found[1], end, q[limb.positions])
+        # Where limits forbid that, the hand or foot counts more than the elbow or knee.
+        aimed[limb.positions] = move_limb(limb, R_aimed, own_root, angles, end)
+        limbs[name] = found
+    return PaperPose(skeleton.clip(aimed), limbs, neck, place, scores)
+
+
+def _head_and_arms(
+    skeleton: Skeleton, last: Array, features: Array, head_angles: Array | None
+) -> Array:
+    """Positions (nq,) with head and hands where they were measured; legs as in the last frame."""
+    q = np.array(last, dtype=np.float64)
+    if head_angles is not None:
+        index = skeleton.head_angles
+        q[index] = np.clip(head_angles, skeleton.lower[index], skeleton.upper[index])
+    q[skeleton.head_positions] = features[0] - skeleton.head_rotation(q) @ skeleton.face_H
+    q = upper_body(skeleton, q, features, face_known=head_angles is not None)
+    # Where the head's angles moved, its middle must still be where it was measured.
+    q[skeleton.head_positions] = features[0] - skeleton.head_rotation(q) @ skeleton.face_H
+    return q
+
+
+def _middle(limb: Limb, R_WT: Array, root: Array, angles: Array) -> Array:
+    """(3,) the middle joint of a limb at angles (4,) [m]."""
+    return np.asarray(root + R_WT @ rotation(limb.axes[:3], angles[:3]) @ limb.middle_U)

@@ -1,0 +1,278 @@
+"""Elbows and knees on their circles, by back-projected rectangles (Date et al., 4.1.2 and 4.2)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.camera import Camera
+from drake_pose.compiled import compiled
+from drake_pose.multiview.date.skeleton import Limb, rotation
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+ELBOW_RANGE = (0.0, 120.0)
+"""Where an elbow may be on its circle [deg]: from behind, over outwards, to a little in front."""
+
+KNEE_RANGE = (-40.0, 80.0)
+"""Where a knee may be on its circle [deg]: 0 is in front, positive outwards."""
+
+_STEP_DEG = 5.0
+_SAMPLES_ALONG = 12
+_SAMPLES_ACROSS = 5
+_STRAIGHT = 1e-9
+_STRETCHED = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Circle:
+    """Where a middle joint can be: center + radius (sin(theta) i + cos(theta) j).
+
+    Args:
+        center: (3,) [m].
+        radius: [m]; 0 where the limb is stretched out.
+        i, j: (3,) orthogonal directions of length 1: outwards; and behind (arm) or in front (leg).
+    """
+
+    center: Array
+    radius: float
+    i: Array
+    j: Array
+
+    def points(self, degrees: Array) -> Array:
+        """(n, 3) the circle's points at angles (n,) [deg]."""
+        theta = np.radians(np.asarray(degrees, dtype=np.float64))[:, None]
+        return np.asarray(
+            self.center + self.radius * (np.sin(theta) * self.i + np.cos(theta) * self.j)
+        )
+
+
+def joint_circle(limb: Limb, root: Array, end: Array, outward: Array) -> Circle:
+    """The circle of an elbow or knee.
+
+    i is the direction in the circle's plane that agrees best with the horizontal part of `outward`;
+    j = i x z for the left arm, z from shoulder to hand (for the right arm and for legs mirrored, so
+    that it points behind the arm and in front of the leg).
+
+    Args:
+        limb: the limb.
+        root: (3,) shoulder or hip [m].
+        end: (3,) hand or foot [m].
+        outward: (3,) from the neck's base to the shoulder, or from the waist to the hip.
+    """
+    a, b = limb.lengths
+    across = end - root
+    distance = float(np.linalg.norm(across))
+    z = across / distance if distance > _STRAIGHT else np.array([0.0, 0.0, -1.0])
+    # Beyond the limb's reach it is stretched out (or folded), in proportion.
+    reach = min(max(distance, abs(a - b)), a + b)
+    along = (a * a - b * b + reach * reach) / (2.0 * reach) if reach > _STRAIGHT else 0.0
+    radius = math.sqrt(max(0.0, a * a - along * along))
+    center = root + z * along * (distance / reach if reach > _STRAIGHT else 1.0)
+    i = _unit_across(np.array([outward[0], outward[1], 0.0]), z)
+    j = limb.side * np.cross(i, z)
+    return Circle(center, radius, i, -j if limb.name.endswith("leg") else j)
+
+
+def search_circle(
+    limb: Limb,
+    circle: Circle,
+    root: Array,
+    end: Array,
+    cameras: Sequence[Camera],
+    regions: Sequence[Mask],
+    near: Array,
+) -> tuple[Array, float, float]:
+    """The place of an elbow or knee whose rectangles agree best with the silhouettes.
+
+    Args:
+        limb: the limb.
+        circle: where its middle joint can be.
+        root, end: (3,) shoulder and hand, or hip and foot [m].
+        cameras: the cameras.
+        regions: (H, W) the person in each camera's picture.
+        near: (3,) of equally good places, the one nearest to this is taken: inverse kinematics's.
+
+    Returns:
+        The joint (3,) [m], its angle on the circle [deg], and the correlation C there.
+    """
+    low, high = KNEE_RANGE if limb.name.endswith("leg") else ELBOW_RANGE
+    degrees = np.arange(low, high + 0.5 * _STEP_DEG, _STEP_DEG)
+    middles = circle.points(degrees)
+    samples = rectangles(root, middles, end, limb.half_widths)
+    scores = correlation(samples, cameras, regions)
+    best = np.flatnonzero(scores >= scores.max() - 1e-9)
+    chosen = best[np.argmin(np.linalg.norm(middles[best] - near, axis=1))]
+    return middles[chosen], float(degrees[chosen]), float(scores[chosen])
+
+
+def rectangles(root: Array, middles: Array, end: Array, half_widths: Array) -> Array:
+    """Points all over the two rectangles of a limb, for several places of its middle joint.
+
+    They lie in the plane of root, middle joint and end, one from the root to the middle joint, one
+    from there to the end.
+
+    Args:
+        root, end: (3,) [m].
+        middles: (n, 3) [m].
+        half_widths: (2,) of the rectangles [m].
+
+    Returns:
+        (n, m, 3) points.
+    """
+    normal = np.cross(middles - root, end - root)
+    along = ((np.arange(_SAMPLES_ALONG) + 0.5) / _SAMPLES_ALONG)[:, None, None]
+    across = np.linspace(-1.0, 1.0, _SAMPLES_ACROSS)[:, None]
+    parts = []
+    for start, stop, half in ((root, middles, half_widths[0]), (middles, end, half_widths[1])):
+        sideways = np.cross(normal, stop - start)
+        length = np.linalg.norm(sideways, axis=1, keepdims=True)
+        sideways = half * sideways / np.maximum(length, _STRAIGHT**2)
+        start_each = np.broadcast_to(start, middles.shape)[:, None, None]
+        step_each = (stop - start)[:, None, None]
+        points = start_each + along * step_each + across * sideways[:, None, None]
+        parts.append(points.reshape(len(middles), -1, 3))
+    return np.concatenate(parts, axis=1)
+
+
+def correlation(samples: Array, cameras: Sequence[Camera], regions: Sequence[Mask]) -> Array:
+    """C: how well rectangles agree with the silhouettes, mean over the cameras.
+
+    Args:
+        samples: (n, m, 3) points all over each candidate's rectangles [m].
+        cameras: the cameras; those that see nobody have no say.
+        regions: (H, W) the person in each camera's picture.
+
+    Returns:
+        (n,) mean share of the points, as far as they are in the picture, inside the silhouette.
+    """
+    total, seers = np.zeros(len(samples)), 0
+    for camera, region in zip(cameras, regions, strict=True):
+        if not region.any():
+            continue
+        total += _inside_share(
+            samples, camera.kernel_parameters(), np.ascontiguousarray(camera.X_CW), region
+        )
+        seers += 1
+    return total / max(1, seers)
+
+
+@compiled(error_model="python")
+def _inside_share(samples: Array, camera: Array, X_CW: Array, region: Mask) -> Array:
+    """(n,) share of points (n, m, 3) in the picture that lie inside the region (H, W)."""
+    shares = np.zeros(samples.shape[0])
+    height, width = region.shape
+    for n in range(samples.shape[0]):
+        seen, inside = 0, 0
+        for m in range(samples.shape[1]):
+            x, y, z = samples[n, m]
+            x_C = X_CW[0, 0] * x + X_CW[0, 1] * y + X_CW[0, 2] * z + X_CW[0, 3]
+            y_C = X_CW[1, 0] * x + X_CW[1, 1] * y + X_CW[1, 2] * z + X_CW[1, 3]
+            z_C = X_CW[2, 0] * x + X_CW[2, 1] * y + X_CW[2, 2] * z + X_CW[2, 3]
+            if camera[0] == 0.0:
+                if z_C <= camera[5]:
+                    continue
+                x_C, y_C = x_C / z_C, y_C / z_C
+            column = math.floor(camera[1] * x_C + camera[3] + 0.5)
+            row = math.floor(camera[2] * y_C + camera[4] + 0.5)
+            if 0 <= column < width and 0 <= row < height:
+                seen += 1
+                inside += region[row, column]
+        if seen > 0:
+            shares[n] = inside / seen
+    return shares
+
+
+def limb_angles(
+    limb: Limb, R_WT: Array, root: Array, middle: Array, end: Array, last: Array
+) -> Array:
+    """The joint angles (4,) that put a limb's joints where they were found, inside its limits.
+
+    Where the limits do not allow it, what is clipped goes at the end's expense.
+
+    Args:
+        limb: the limb.
+        R_WT: (3, 3) the trunk's axes in the world.
+        root, middle, end: (3,) [m].
+        last: (4,) angles to stay near where several sets do the same [rad].
+    """
+    bend = _middle_angle(limb, float(np.linalg.norm(end - root)), float(last[3]))
+    end_U = limb.middle_U + rotation(limb.axes[3:], np.array([bend])) @ limb.end_L
+    towards, upper = end - root, middle - root
+    if np.linalg.norm(np.cross(towards, upper)) < _STRETCHED * np.linalg.norm(upper) ** 2:
+        # A stretched limb does not tell how it is turned about itself: then as in the last frame.
+        R_last = R_WT @ rotation(limb.axes[:3], last[:3])
+        R_WU = _shortest_turn(R_last @ end_U, towards) @ R_last
+    else:
+        R_WU = _triad(towards, upper) @ _triad(end_U, limb.middle_U).T
+    angles = np.array([*_root_angles(limb, R_WT.T @ R_WU, last[:3]), bend])
+    return np.clip(angles, limb.lower, limb.upper)
+
+
+def _shortest_turn(old: Array, new: Array) -> Array:
+    """(3, 3) the smallest rotation that brings one direction (3,) to another."""
+    a = old / max(float(np.linalg.norm(old)), _STRAIGHT)
+    b = new / max(float(np.linalg.norm(new)), _STRAIGHT)
+    axis, cosine = np.cross(a, b), float(a @ b)
+    if cosine < -1.0 + 1e-9:
+        half_turn = _unit_across(np.zeros(3), a)
+        return np.asarray(2.0 * np.outer(half_turn, half_turn) - np.eye(3))
+    x, y, z = axis
+    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(np.eye(3) + skew + skew @ skew / (1.0 + cosine))
+
+
+def _middle_angle(limb: Limb, distance: float, last: float) -> float:
+    """The middle joint's angle at which root and end are a distance apart, inside its limits."""
+    axis = np.zeros(3)
+    axis[limb.axes[3]] = 1.0
+    along = (limb.middle_U @ axis) * (limb.end_L @ axis)
+    cosine = limb.middle_U @ limb.end_L - along
+    sine = limb.middle_U @ np.cross(axis, limb.end_L)
+    a, b = limb.lengths
+    wanted = float(0.5 * (distance**2 - a**2 - b**2) - along)
+    turn = math.acos(min(1.0, max(-1.0, wanted / math.hypot(cosine, sine))))
+    start = math.atan2(sine, cosine)
+    low, high = limb.lower[3], limb.upper[3]
+    options = [math.remainder(start + sign * turn, 2.0 * math.pi) for sign in (-1.0, 1.0)]
+    clipped = [min(max(option, low), high) for option in options]
+    costs = [abs(o - c) + 1e-3 * abs(o - last) for o, c in zip(options, clipped, strict=True)]
+    return clipped[int(np.argmin(costs))]
+
+
+def _root_angles(limb: Limb, R: Array, last: Array) -> Array:
+    """The three angles of a rotation about the limb's axes, inside the limits where possible."""
+    i, j, k = (int(axis) for axis in limb.axes[:3])
+    sign = 1.0 if (j - i) % 3 == 1 else -1.0
+    second = math.asin(min(1.0, max(-1.0, sign * R[i, k])))
+    first = math.atan2(-sign * R[j, k], R[k, k])
+    third = math.atan2(-sign * R[i, j], R[i, i])
+    other = (first + math.pi, math.pi - second, third + math.pi)
+    best, best_cost = np.zeros(3), math.inf
+    for option in ((first, second, third), other):
+        wrapped = np.array([math.remainder(angle, 2.0 * math.pi) for angle in option])
+        beyond = np.abs(wrapped - np.clip(wrapped, limb.lower[:3], limb.upper[:3])).sum()
+        cost = beyond + 1e-3 * np.abs(wrapped - last).sum()
+        if cost < best_cost:
+            best, best_cost = wrapped, cost
+    return best
+
+
+def _triad(first: Array, second: Array) -> Array:
+    """(3, 3) axes: along the first vector, then what of the second is across it."""
+    x = first / max(float(np.linalg.norm(first)), _STRAIGHT)
+    y = _unit_across(second, x)
+    return np.column_stack([x, y, np.cross(x, y)])
+
+
+def _unit_across(vector: Array, axis: Array) -> Array:
+    """The direction of a vector (3,) across an axis of length 1; any where there is none."""
+    across = vector - (vector @ axis) * axis
+    if np.linalg.norm(across) < _STRAIGHT:
+        across = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+    return np.asarray(across / np.linalg.norm(across))

@@ -1,0 +1,158 @@
+"""What the silhouette method knows of a body besides its surfaces: limbs, from landmarks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.body.landmarks import landmarks_of_nodes, load_landmarks
+from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.errors import ModelError
+
+Array = NDArray[np.float64]
+
+_LIMBS = {
+    "left_arm": ("left_shoulder", "left_elbow", "left_wrist"),
+    "right_arm": ("right_shoulder", "right_elbow", "right_wrist"),
+    "left_leg": ("left_hip", "left_knee", "left_ankle"),
+    "right_leg": ("right_hip", "right_knee", "right_ankle"),
+}
+_TRUNK = ("neck", "left_hip", "right_hip")
+PERSON_LANDMARKS = frozenset({*_TRUNK, *(name for limb in _LIMBS.values() for name in limb)})
+"""The anatomical joint centres that a model of a person has in its landmarks.yaml."""
+
+_POSES = 2048
+# One in so many of them is stretched.
+_STRETCHED = 8
+# Points of a limb that are nearer to each other fill the same space [m].
+_APART = 0.08
+# Where points are put on a limb: so far from root to middle joint, and on to the end; a hand's or
+# foot's middle lies farther.
+_ALONG = np.array([0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.6, 1.8, 2.0, 2.25])
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedLimb:
+    """An arm or leg of a pose tree.
+
+    Args:
+        nodes: the nodes that only it has.
+        values: (k,) which of the tree's values move it alone.
+        joints: (3,) its root, middle joint and end among the landmarks.
+        poses: (n, k) values all over its limits; the first is at rest.
+        stretched: (s,) in which of them the limb is stretched out.
+        samples_T: (n, m, 3) points along it in the trunk's frame at these [m].
+        weights: (n, m) their shares: less where others are beside them, as on a folded limb.
+        length: from its root to its end, stretched out [m].
+    """
+
+    nodes: NDArray[np.intp]
+    values: NDArray[np.intp]
+    joints: NDArray[np.intp]
+    poses: Array
+    stretched: NDArray[np.intp]
+    samples_T: Array
+    weights: Array
+    length: float
+
+
+class BodyPlan:
+    """A person's limbs and trunk in a pose tree.
+
+    Attributes:
+        kinematics: the pose tree's.
+        landmarks: the anatomical joint centres.
+        trunk: the node that the limbs hang on.
+        heading: the value that turns all of the body freely, about the vertical; None: no such.
+
+    Args:
+        kinematics: the pose tree's kinematics.
+
+    Raises:
+        ModelError: the model has no landmarks, or not those of trunk, arms and legs.
+    """
+
+    def __init__(self, kinematics: TreeKinematics) -> None:
+        self.kinematics = kinematics
+        tree = kinematics.tree
+        known = load_landmarks(tree.model.path)
+        missing = sorted(PERSON_LANDMARKS - set(known))
+        if missing:
+            raise ModelError(
+                f"{tree.model.path}: landmarks.yaml lacks {', '.join(missing)}, which the capture "
+                "of a person by its silhouettes needs"
+            )
+        self.landmarks = landmarks_of_nodes(tree, known)
+        self.trunk = int(self._node("neck"))
+        free = np.flatnonzero(kinematics.turns_around)
+        self.heading = int(free[0]) if len(free) else None
+
+    def trunk_middle(self, X_WN: Array) -> Array:
+        """(3,) the trunk's middle [m], half-way between neck and hips."""
+        places = dict(zip(self.landmarks.names, self.landmarks.positions(X_WN), strict=True))
+        hips = 0.5 * (places["left_hip"] + places["right_hip"])
+        return np.asarray(0.5 * (places["neck"] + hips))
+
+    @cached_property
+    def limbs(self) -> Mapping[str, PlannedLimb]:
+        """The limbs, by name."""
+        return {name: self._plan(*parts) for name, parts in _LIMBS.items()}
+
+    def _node(self, landmark: str) -> int:
+        return int(self.landmarks.nodes[self.landmarks.names.index(landmark)])
+
+    def _plan(self, root: str, middle: str, end: str) -> PlannedLimb:
+        from scipy.stats import qmc  # Slow to import, and needed for persons alone.
+
+        kinematics = self.kinematics
+        rest = kinematics.flatten(kinematics.tree.default_values())
+        moves = kinematics.motions(rest).moves
+        own = moves[self._node(end)] & ~moves[self._node("neck")]
+        free = kinematics.is_angle & (kinematics.upper > kinematics.lower)
+        values = np.flatnonzero(own & free)
+        nodes = np.flatnonzero((moves & own).any(axis=1))
+        share = qmc.Halton(len(values), scramble=False).random(_POSES)
+        lower, upper = (ends[values] for ends in kinematics.reach(rest))
+        poses = np.clip(rest[values], lower, upper) * np.ones((_POSES, 1))
+        poses[1:] = lower + share[1:] * (upper - lower)
+        # People stretch their limbs more often than chance would.
+        stretched = np.flatnonzero(kinematics.value_nodes[values] == self._node(end))
+        chosen = np.arange(_POSES // _STRETCHED)
+        poses[np.ix_(chosen, stretched)] = poses[0, stretched]
+        joints = np.array([self.landmarks.names.index(name) for name in (root, middle, end)])
+        X_WN = np.empty((_POSES, len(moves), 4, 4))
+        for k, pose in enumerate(poses):
+            posed = rest.copy()
+            posed[values] = pose
+            X_WN[k] = kinematics.poses(posed)
+        samples_W = self._samples(joints, X_WN)
+        R_WT, p_WT = X_WN[:, self.trunk, :3, :3], X_WN[:, self.trunk, :3, 3]
+        samples_T = np.einsum("nji,nmj->nmi", R_WT, samples_W - p_WT[:, None])
+        a, b, c = self.landmarks.positions(X_WN[0])[joints]
+        length = float(np.linalg.norm(b - a) + np.linalg.norm(c - b))
+        return PlannedLimb(
+            nodes, values, joints, poses, chosen, samples_T, crowding(samples_T), length
+        )
+
+    def samples(self, limb: PlannedLimb, X_WN: Array) -> Array:
+        """(m, 3) points along a limb in the world [m] where the nodes are at X_WN."""
+        return self._samples(limb.joints, X_WN[None])[0]
+
+    def _samples(self, joints: NDArray[np.intp], X_WN: Array) -> Array:
+        """(n, m, 3) points along a limb, given its three landmarks and X_WN (n, nodes, 4, 4)."""
+        a, b, c = np.moveaxis(self.landmarks.positions(X_WN)[:, joints], 1, 0)
+        upper = np.minimum(_ALONG, 1.0)[:, None]
+        lower = np.maximum(_ALONG - 1.0, 0.0)[:, None]
+        steps = upper * (b - a)[:, None] + lower * (c - b)[:, None]
+        return np.asarray(a[:, None] + steps)
+
+
+def crowding(samples: Array) -> Array:
+    """(n, m) what each of points (n, m, 3) counts: one over the points around it, and over m."""
+    off = samples[:, :, None] - samples[:, None]
+    near = np.einsum("nabi,nabi->nab", off, off) < _APART**2
+    return np.asarray(1.0 / (near.sum(axis=2) * samples.shape[1]))

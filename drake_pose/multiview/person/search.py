@@ -1,0 +1,380 @@
+"""Where a lost limb or a lost person is: rough guesses all over, the best of them fitted.
+
+Guesses are judged in small pictures of a few cameras; only what is promising is fitted to all.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.camera import Camera, ParallelCamera
+from drake_pose.errors import SettingsError
+from drake_pose.multiview.person.body_plan import BodyPlan, PlannedLimb, crowding
+from drake_pose.multiview.person.limb_placement import score_places, worth_of_pixels
+from drake_pose.multiview.person.silhouette_edges import EdgePoints
+from drake_pose.multiview.person.silhouette_fit import PoseFit, Prior, Round, SilhouetteFit
+from drake_pose.multiview.rays import meeting_of_all
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# Limbs whose tips are farther apart are not alike [m].
+_UNALIKE = 0.25
+# So much of its length a nearly stretched limb reaches.
+_NEARLY = 0.9
+# Tips that are nearer are about in the same place [m].
+_NEAR = 0.15
+# Guesses are judged by so many cameras, in pictures with about so many rows.
+_JUDGES = 5
+_ROWS = 120
+# How much of a fit tells which guess is promising.
+_JUDGED = 3
+_ROUGHER = 1.5
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """How a lost limb or person is searched.
+
+    Args:
+        rounds: the steps of a fit from a rough guess.
+        limb_fits: a limb is searched again where less of its own contour fits.
+        limb_gain: or where elsewhere so much more of it would lie in unexplained pixels.
+        limb_shows: or where it shows less contour than this share of its length in each camera.
+        headings: into how many directions a lost person is turned.
+        headings_a_frame: so many of them in each frame of a sequence.
+        limbs_a_frame: so many doubtful limbs are searched again in each frame of a sequence.
+        fitted: the share of the fresh starts, the most promising ones, that is fitted.
+        mended: where nothing is known yet, so many of these have all doubtful limbs searched again.
+    """
+
+    rounds: tuple[Round, ...] = (
+        Round(0.15, 0.06),
+        Round(0.10, 0.06),
+        Round(0.07, 0.06),
+        Round(0.05, 0.06),
+        Round(0.03, 0.05),
+        Round(0.02, 0.05),
+    )
+    limb_fits: float = 0.8
+    limb_gain: float = 0.15
+    limb_shows: float = 0.5
+    headings: int = 12
+    headings_a_frame: int = 3
+    limbs_a_frame: int = 2
+    fitted: float = 0.5
+    mended: int = 3
+
+    def __post_init__(self) -> None:
+        if not self.rounds:
+            raise SettingsError("a search needs one round or more")
+        for name in ("headings", "headings_a_frame", "limbs_a_frame", "mended"):
+            if getattr(self, name) < 1:
+                raise SettingsError(f"{name} must be 1 or more, not {getattr(self, name)}")
+        if not 0.0 < self.fitted <= 1.0:
+            raise SettingsError(f"fitted must be a share above 0, at most 1, not {self.fitted}")
+
+    @property
+    def cycle(self) -> int:
+        """In how many frames all headings are tried."""
+        return -(-self.headings // self.headings_a_frame)
+
+    def turns(self, frame: int) -> list[int]:
+        """The headings tried in a frame, counted since the trouble began: all around, then between.
+
+        Together the frames try all of them.
+        """
+        # Bits in reverse order make neighbours late.
+        order = sorted(range(self.cycle), key=lambda k: f"{k:032b}"[::-1])
+        return list(range(order[frame % self.cycle], self.headings, self.cycle))
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What all cameras say in a frame, and small pictures of a few, for rough judgement.
+
+    Args:
+        cameras: all that have a picture.
+        regions: (H, W) the person in each.
+        edges: their edges.
+    """
+
+    cameras: Sequence[Camera]
+    regions: Sequence[Mask]
+    edges: Sequence[EdgePoints]
+
+    @cached_property
+    def seers(self) -> list[int]:
+        """Which cameras see somebody."""
+        return [k for k, edge in enumerate(self.edges) if len(edge.uv)]
+
+    @cached_property
+    def judges(self) -> list[int]:
+        """Which of them judge guesses: a few, as far as possible all around."""
+        count = min(_JUDGES, len(self.seers))
+        chosen = np.linspace(0, len(self.seers), count, endpoint=False).astype(int)
+        return [self.seers[k] for k in chosen]
+
+    @cached_property
+    def small(self) -> tuple[list[Camera], list[Mask]]:
+        """The judges' cameras and regions with fewer pixels."""
+        strides = [max(1, self.regions[k].shape[0] // _ROWS) for k in self.judges]
+        return (
+            [_coarser(self.cameras[k], n) for k, n in zip(self.judges, strides, strict=True)],
+            [self.regions[k][::n, ::n] for k, n in zip(self.judges, strides, strict=True)],
+        )
+
+    @cached_property
+    def rough(self) -> tuple[list[Camera], list[EdgePoints]]:
+        """The judges' cameras and every other point of their edges."""
+        edges = [self.edges[k] for k in self.judges]
+        return [self.cameras[k] for k in self.judges], [
+            EdgePoints(edge.uv[::2], edge.normals[::2], 2.0 * edge.lengths[::2], edge.middle)
+            for edge in edges
+        ]
+
+    def middle(self) -> Array | None:
+        """(3,) where somebody is [m]; None where fewer than two cameras see one."""
+        if len(self.seers) < 2:
+            return None
+        return meeting_of_all(
+            [self.cameras[k] for k in self.seers], [self.edges[k].middle for k in self.seers]
+        )
+
+
+def _coarser(camera: Camera, stride: int) -> Camera:
+    """The camera of every so manieth pixel of every so manieth row."""
+    smaller = replace(
+        camera,
+        width=-(-camera.width // stride),
+        height=-(-camera.height // stride),
+        center_x=camera.center_x / stride,
+        center_y=camera.center_y / stride,
+    )
+    if isinstance(smaller, ParallelCamera):
+        return replace(smaller, pixels_per_metre=smaller.pixels_per_metre / stride)
+    return replace(smaller, focal_x=smaller.focal_x / stride, focal_y=smaller.focal_y / stride)
+
+
+class PersonSearch:
+    """Searches limbs and persons.
+
+    Attributes:
+        settings: how.
+
+    Args:
+        fit: what compares a pose with the regions.
+        plan: the person's limbs.
+        settings: how.
+        information: (m,) what is known of values near a guess.
+        held: (m,) values that stay.
+        rest: (m,) values of a person at rest, with the held ones.
+    """
+
+    def __init__(
+        self,
+        fit: SilhouetteFit,
+        plan: BodyPlan,
+        settings: SearchSettings,
+        information: Array,
+        held: Mask,
+        rest: Array,
+    ) -> None:
+        self.settings = settings
+        self._fit, self._plan = fit, plan
+        self._information, self._held, self._rest = information, held, rest
+        self._rough_rounds = [
+            replace(one, spacing=_ROUGHER * one.spacing) for one in settings.rounds[:_JUDGED]
+        ]
+
+    def mended(
+        self, fitted: PoseFit, sight: Sight, enough: float = math.inf, first: int = 0,
+        limbs: int | None = None,
+    ) -> PoseFit:  # fmt: skip
+        """A fit whose doubtful limbs were searched again, where that is better.
+
+        Args:
+            fitted: the fit.
+            sight: the frame.
+            enough: where so much of the contours fits, the search ends.
+            first: the doubtful limb to begin with; the worst is 0.
+            limbs: how many limbs are searched; None: all that are doubtful.
+        """
+        best = _better(fitted, self._refine(fitted.values, sight))
+        if best.share >= enough:
+            return best
+        doubtful = self._doubtful(best, sight)
+        begin = first % len(doubtful)
+        chosen = (doubtful[begin:] + doubtful[:begin])[:limbs]
+        return self._searched(best, chosen, sight, enough)
+
+    def _searched(
+        self, best: PoseFit, limbs: Iterable[PlannedLimb], sight: Sight, enough: float
+    ) -> PoseFit:
+        """A fit whose limbs were searched again, until enough of the contours fits."""
+        for limb in limbs:
+            guesses = self._placed(best.values, limb, sight)
+            for pose in (limb.poses[0], *self._stretched(best.values, limb)):
+                guesses.append(best.values.copy())
+                guesses[-1][limb.values] = pose
+            for values in guesses:
+                best = _better(best, self._refine(values, sight))
+            if best.share >= enough:
+                break
+        return best
+
+    def found(
+        self,
+        sight: Sight,
+        turns: Sequence[int],
+        known: Array | None = None,
+        enough: float = math.inf,
+    ) -> PoseFit | None:
+        """The best of fresh starts with some headings.
+
+        Args:
+            sight: the frame.
+            turns: which of the headings; where not all, only the best start's limbs are searched.
+            known: (m,) where held values are taken from; None: the person at rest.
+            enough: where so much of the contours fits, no more limbs are searched.
+
+        Returns:
+            None where fewer than two cameras see a person.
+        """
+        middle = sight.middle()
+        if middle is None:
+            return None
+        guesses = [self._guess(sight, turn, middle, known) for turn in turns]
+        guesses.sort(key=lambda one: -one.closeness)
+        promising = guesses[: math.ceil(self.settings.fitted * len(guesses))]
+        found = [self._refine(one.values, sight) for one in promising]
+        found.sort(key=lambda one: -one.closeness)
+        if len(turns) < self.settings.headings:
+            return self.mended(found[0], sight, enough, limbs=self.settings.limbs_a_frame)
+        mended = [self.mended(one, sight) for one in found[: self.settings.mended]]
+        best = max(mended, key=lambda one: one.closeness)
+        return self._searched(best, self._plan.limbs.values(), sight, math.inf)
+
+    def _guess(self, sight: Sight, turn: int, middle: Array, known: Array | None) -> PoseFit:
+        """A person turned somewhere, the trunk fitted roughly, then each limb placed."""
+        values = self._rest.copy() if known is None else np.where(self._held, known, self._rest)
+        if self._plan.heading is not None:
+            values[self._plan.heading] = 2.0 * np.pi * turn / self.settings.headings
+        values = self._judged(self._stand_at(values, middle), sight).values
+        placed = np.ones(len(self._fit.outlines), dtype=np.bool_)
+        for limb in self._plan.limbs.values():
+            placed[limb.nodes] = False
+        for limb in self._plan.limbs.values():
+            values = self._placed(values, limb, sight, placed, 1)[0]
+            placed[limb.nodes] = True
+        return self._judged(values, sight)
+
+    def _judged(self, values: Array, sight: Sight) -> PoseFit:
+        """A few steps of a fit to a few cameras."""
+        prior = Prior(values, 0.1 * self._information)
+        return self._fit.fit(*sight.rough, values, self._rough_rounds, prior, self._held)
+
+    def _refine(self, values: Array, sight: Sight) -> PoseFit:
+        """A fit from a rough guess, which is trusted little."""
+        prior = Prior(values, 0.1 * self._information)
+        rounds = self.settings.rounds
+        return self._fit.fit(sight.cameras, sight.edges, values, rounds, prior, self._held)
+
+    def _doubtful(self, fitted: PoseFit, sight: Sight) -> list[PlannedLimb]:
+        """The limbs that fit badly, hardly show, or would fill much more of the regions elsewhere.
+
+        The worst one is always among them: somewhere something does not fit.
+        """
+        settings = self.settings
+        lengths, fitting, _ = fitted.agreement.T
+        shares = np.where(lengths > 0.0, fitting / np.maximum(lengths, 1e-9), 1.0)
+        found = []
+        for limb in self._plan.limbs.values():
+            share = shares[limb.nodes].min()
+            shown = lengths[limb.nodes].sum() / (limb.length * len(sight.cameras))
+            scores, now = self._scores(fitted.values, limb, sight)
+            gain = float(scores.max() - now)
+            doubtful = (
+                share < settings.limb_fits
+                or shown < settings.limb_shows
+                or gain > settings.limb_gain
+            )
+            found.append((not doubtful, share - gain, limb))
+        found.sort(key=lambda one: one[:2])
+        return [limb for k, (good, _, limb) in enumerate(found) if k == 0 or not good]
+
+    def _scores(
+        self, values: Array, limb: PlannedLimb, sight: Sight, placed: Mask | None = None
+    ) -> tuple[Array, float]:
+        """How much each pose of a limb would fill, and how much the limb fills where it is."""
+        X_WN = self._fit.kinematics.poses(values)
+        others = np.ones(len(X_WN), dtype=np.bool_) if placed is None else placed.copy()
+        others[limb.nodes] = False
+        outlines = [self._fit.outlines[node] for node in np.flatnonzero(others)]
+        cameras, regions = sight.small
+        worth = worth_of_pixels(cameras, regions, outlines, X_WN[others])
+        X_WT = X_WN[self._plan.trunk]
+        places = limb.samples_T @ X_WT[:3, :3].T + X_WT[:3, 3]
+        here = self._plan.samples(limb, X_WN)[None]
+        now = score_places(here, crowding(here), cameras, worth)[0]
+        return score_places(places, limb.weights, cameras, worth), float(now)
+
+    def _placed(
+        self,
+        values: Array,
+        limb: PlannedLimb,
+        sight: Sight,
+        placed: Mask | None = None,
+        count: int = 2,
+    ) -> list[Array]:
+        """Values (m,) with a limb where it fills most, in a few ways that are not alike."""
+        scores, _ = self._scores(values, limb, sight, placed)
+        found: list[Array] = []
+        tips: list[Array] = []
+        for index in np.argsort(-scores):
+            tip = limb.samples_T[index, -1]
+            if all(np.linalg.norm(tip - other) > _UNALIKE for other in tips):
+                tips.append(tip)
+                found.append(values.copy())
+                found[-1][limb.values] = limb.poses[index]
+                if len(found) == count:
+                    break
+        return found
+
+    def _stretched(self, values: Array, limb: PlannedLimb) -> list[Array]:
+        """A nearly stretched limb's values, quite stretched: one slightly bent the wrong way is.
+
+        Of the poses about there it is the most relaxed one, as such a limb hardly shows its twist.
+        """
+        X_WN = self._fit.kinematics.poses(values)
+        root, _, end = self._plan.landmarks.positions(X_WN)[limb.joints]
+        if np.linalg.norm(end - root) < _NEARLY * limb.length:
+            return []
+        X_WT = X_WN[self._plan.trunk]
+        tip = (self._plan.samples(limb, X_WN)[-1] - X_WT[:3, 3]) @ X_WT[:3, :3]
+        off = np.linalg.norm(limb.samples_T[limb.stretched, -1] - tip, axis=1)
+        poses = limb.poses[limb.stretched[off < _NEAR]]
+        effort = np.abs(poses - limb.poses[0]).sum(axis=1)
+        return [] if not len(poses) else [poses[np.argmin(effort)]]
+
+    def _stand_at(self, values: Array, middle: Array) -> Array:
+        """Values (m,) with the trunk's middle at a place (3,) [m]."""
+        kinematics = self._fit.kinematics
+        off = middle - self._plan.trunk_middle(kinematics.poses(values))
+        motions = kinematics.motions(values)
+        root = np.flatnonzero(~kinematics.is_angle & motions.moves[0] & ~self._held)
+        # The root's place is three lengths along the world's axes.
+        for index in root:
+            values[index] += float(motions.twists[index, 3:6] @ off)
+        return values
+
+
+def _better(one: PoseFit, other: PoseFit) -> PoseFit:
+    """The one that fits better."""
+    return other if other.closeness > one.closeness else one

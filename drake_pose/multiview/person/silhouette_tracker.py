@@ -1,0 +1,272 @@
+"""A person followed by all silhouettes at once; a lost limb or track is searched again.
+
+Every frame is fitted from where the last ones point to. Where too little of the contours fits, the
+limbs that do not fit are placed anew where the regions are unexplained; where all is lost, the
+whole person is, turned to all sides in turn. No registered pose and no skin colour is needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.camera import Camera
+from drake_pose.errors import SettingsError
+from drake_pose.multiview.person.body_plan import BodyPlan
+from drake_pose.multiview.person.pose_uncertainty import PoseUncertainty, pose_uncertainty
+from drake_pose.multiview.person.search import PersonSearch, SearchSettings, Sight
+from drake_pose.multiview.person.silhouette_edges import EdgePoints, find_edge_points
+from drake_pose.multiview.person.silhouette_fit import PoseFit, Prior, Round, SilhouetteFit
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+# What share of the contours fits where the model is the person, until it is known better.
+_USUAL = 0.95
+
+
+@dataclass(frozen=True)
+class TrackerSettings:
+    """How a person is followed.
+
+    Args:
+        rounds: the steps of a frame's fit.
+        carry: the share of the last frame's step that is expected again.
+        angle_deviation, length_deviation: how far the expectation is off [rad, m].
+        retry_below: where so much less of the contours fits than usual, limbs are searched again.
+        lost_below: where less than this share of the usual fits, the whole person is.
+        memory: for how many frames the usual share is remembered.
+        search: how limbs and persons are searched.
+    """
+
+    rounds: tuple[Round, ...] = (
+        Round(0.08, 0.06),
+        Round(0.04, 0.06),
+        Round(0.02, 0.05),
+    )
+    carry: float = 0.7
+    angle_deviation: float = 0.3
+    length_deviation: float = 0.15
+    retry_below: float = 0.03
+    lost_below: float = 0.75
+    memory: float = 60.0
+    search: SearchSettings = field(default_factory=SearchSettings)
+
+    def __post_init__(self) -> None:
+        if not self.rounds:
+            raise SettingsError("a tracker needs one round or more")
+
+
+@dataclass(frozen=True, eq=False)
+class SilhouetteView:
+    """What one camera says.
+
+    Args:
+        region: (H, W) the person.
+        edge: points of the region's edge.
+    """
+
+    region: Mask
+    edge: EdgePoints
+
+
+@dataclass(frozen=True, eq=False)
+class TrackState:
+    """What the next frame is told of this one.
+
+    Args:
+        values: (m,) of the pose tree [rad or m].
+        step: (m,) how they changed from the frame before.
+        share: of the contours, what fits.
+        usual: the share that can be expected.
+        troubled: for how many frames too little has fitted; below 0: the person was found anew, and
+            in so many frames all directions will have been tried.
+    """
+
+    values: Array
+    step: Array
+    share: float
+    usual: float
+    troubled: int = 0
+
+
+def see_silhouette(region: Mask, spacing: float) -> SilhouetteView:
+    """One camera's share: the edge of the person's region, a point every so many pixels."""
+    return SilhouetteView(region, find_edge_points(region, spacing))
+
+
+class SilhouetteTracker:
+    """Follows a person.
+
+    Attributes:
+        fit: what compares a pose with the regions.
+        plan: the person's limbs.
+        settings: how.
+
+    Args:
+        fit: made for the person's pose tree.
+        settings: how.
+        held: (m,) values that stay, such as lengths; None: none.
+        rest: (m,) values of a person at rest, with the held ones; None: the tree's.
+
+    Raises:
+        ModelError: the model has no landmarks of trunk, arms and legs.
+        UnknownNameError: a value of the pose tree is no position of the plant.
+    """
+
+    def __init__(
+        self,
+        fit: SilhouetteFit,
+        settings: TrackerSettings | None = None,
+        held: Mask | None = None,
+        rest: Array | None = None,
+    ) -> None:
+        self.fit, self.settings = fit, settings or TrackerSettings()
+        self.plan = BodyPlan(fit.kinematics)
+        is_angle = fit.kinematics.is_angle
+        self._held = np.zeros(len(is_angle), dtype=np.bool_) if held is None else held
+        settings = self.settings
+        deviation = np.where(is_angle, settings.angle_deviation, settings.length_deviation)
+        self._information = 1.0 / deviation**2
+        model = fit.tree.model
+        self._order = np.array([model.position_index(name) for name in fit.kinematics.names])
+        usual = fit.kinematics.flatten(fit.tree.default_values())
+        self._search = PersonSearch(
+            fit,
+            self.plan,
+            settings.search,
+            self._information,
+            self._held,
+            usual if rest is None else rest,
+        )
+
+    def start(self, values: Array) -> TrackState:
+        """A state at rest at values (m,) of the pose tree."""
+        return TrackState(np.array(values, dtype=np.float64), np.zeros(len(values)), 1.0, _USUAL)
+
+    def positions(self, values: Array) -> Array:
+        """The plant's positions q (nq,) of values (m,), angles that turn freely within half a turn.
+
+        The pose tree's root must hang on joints, as that of urdf/person does.
+        """
+        free = np.isinf(self.fit.upper)
+        turned = np.where(free, np.remainder(values + np.pi, 2.0 * np.pi) - np.pi, values)
+        q = np.array(self.fit.tree.model.default_positions)
+        q[self._order] = turned
+        return q
+
+    def values(self, q: Array) -> Array:
+        """The pose tree's values (m,) of positions q (nq,)."""
+        return np.array(q, dtype=np.float64)[self._order]
+
+    def uncertainty(
+        self,
+        values: Array,
+        cameras: Sequence[Camera],
+        views: Sequence[SilhouetteView],
+        held_covariance: Array | None = None,
+    ) -> PoseUncertainty:
+        """How sure a frame's pose is, by its silhouettes alone.
+
+        Args:
+            values: (m,) of the frame's state.
+            cameras, views: as in follow.
+            held_covariance: (h, h) of the held values; None: they are exact.
+        """
+        return pose_uncertainty(
+            self.fit,
+            cameras,
+            [view.edge for view in views],
+            values,
+            self.settings.rounds[-1],
+            self._held,
+            held_covariance,
+        )
+
+    def deviations(self, covariance: Array) -> Array:
+        """(nq,) standard deviations of the plant's positions [rad or m] of a covariance (m, m).
+
+        Positions that are no values of the pose tree have none: 0.
+        """
+        deviations = np.zeros(len(self.fit.tree.model.position_names))
+        deviations[self._order] = np.sqrt(np.diag(covariance))
+        return deviations
+
+    def follow(
+        self,
+        last: TrackState | None,
+        cameras: Sequence[Camera],
+        views: Sequence[SilhouetteView],
+    ) -> TrackState | None:
+        """The next frame.
+
+        Args:
+            last: the last frame's state; None where nothing is known yet.
+            cameras: those that have a picture.
+            views: what each of them says.
+
+        Returns:
+            None where nothing is known yet and fewer than two cameras see a person.
+        """
+        sight = Sight(cameras, [view.region for view in views], [view.edge for view in views])
+        if last is None:
+            found = self._search.found(sight, range(self.settings.search.headings))
+            still = np.zeros(len(self._held))
+            if found is None:
+                return None
+            return TrackState(found.values, still, found.share, _USUAL)
+        fitted = self._fitted(last, sight)
+        settings, search = self.settings, self.settings.search
+        enough = last.usual - settings.retry_below
+        lost = fitted.share < settings.lost_below * last.usual
+        due = fitted.share < enough and _is_due(last.troubled)
+        if due and not lost:
+            fitted = self._search.mended(
+                fitted, sight, enough, last.troubled * search.limbs_a_frame, search.limbs_a_frame
+            )
+        doubted = last.troubled < 0
+        state = TrackState(
+            fitted.values,
+            fitted.values - last.values if last.troubled == 0 else np.zeros(len(last.values)),
+            fitted.share,
+            max(fitted.share, last.usual + (fitted.share - last.usual) / settings.memory),
+            last.troubled + 1 if doubted or fitted.share < enough else 0,
+        )
+        hopeless = due and fitted.share < enough and last.troubled > 0
+        return self._restarted(state, last, sight) if lost or doubted or hopeless else state
+
+    def _restarted(self, state: TrackState, last: TrackState, sight: Sight) -> TrackState:
+        """A state, or the person found anew with some headings, where that fits better.
+
+        The first heading that fits need not be the right one: people look alike from behind. So the
+        search goes on until all have been tried.
+        """
+        search = self.settings.search
+        turns = search.turns(last.troubled)
+        found = self._search.found(sight, turns, last.values, last.usual)
+        if found is None or found.share <= state.share:
+            return state
+        left = last.troubled + 1 if last.troubled < 0 else 1 - search.cycle
+        still = np.zeros(len(found.values))
+        return replace(state, values=found.values, step=still, share=found.share, troubled=left)
+
+    def _fitted(self, last: TrackState, sight: Sight) -> PoseFit:
+        """The frame fitted from where the last ones point to."""
+        expected = last.values + self.settings.carry * last.step
+        return self.fit.fit(
+            sight.cameras,
+            sight.edges,
+            expected,
+            self.settings.rounds,
+            Prior(expected, self._information),
+            self._held,
+        )
+
+
+def _is_due(troubled: int) -> bool:
+    """Whether to search again after so many troubled frames: 0 to 3, then every eighth time."""
+    return 0 <= troubled < 4 or troubled % 8 == 0

@@ -1,0 +1,147 @@
+"""Surfaces with a band of skin, which bends: a rigid part and a band whose vertices are given."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drake_pose.camera import Camera
+from drake_pose.silhouette.areas.bending_kernel import score_bent
+from drake_pose.silhouette.areas.outline import Outline, edge_records, outline_from_mesh
+from drake_pose.silhouette.areas.scoring import check_body, check_prefixes
+
+if TYPE_CHECKING:
+    from drake_pose.body import PoseTree, TriangleMesh
+
+
+class BendingOutline:
+    """A rigid surface and a band, whose triangles are always the same and whose vertices are not.
+
+    Attributes:
+        rigid: the rigid part.
+        rest: both, the band as the mesh has it. Its first vertices and triangles are the rigid
+            part's.
+
+    Args:
+        rigid: the rigid part, in its frame N.
+        band: the band at rest, in the same frame.
+    """
+
+    def __init__(self, rigid: Outline, band: TriangleMesh) -> None:
+        self.rigid = rigid
+        triangles = np.asarray(band.triangles, dtype=np.int32)
+        edges = edge_records(triangles)
+        edges[:, :2] += len(rigid.vertices)
+        edges[:, 2] += len(rigid.triangles)
+        edges[:, 4] += np.where(edges[:, 4] < 0, 0, len(rigid.triangles))
+        self.rest = Outline(
+            vertices=np.concatenate([rigid.vertices, band.vertices]),
+            triangles=np.concatenate([rigid.triangles, triangles + np.int32(len(rigid.vertices))]),
+            edges=np.concatenate([rigid.edges, edges]),
+        )
+
+    @cached_property
+    def _band_triangles(self) -> np.ndarray:
+        """(m, 3) the band's triangles, indices into the band's own vertices."""
+        return self.rest.triangles[len(self.rigid.triangles) :] - len(self.rigid.vertices)
+
+    def at(self, band: np.ndarray) -> Outline:
+        """The whole surface with the band's vertices at (v, 3) [m] in frame N."""
+        outline = Outline(
+            np.concatenate([self.rigid.vertices, band]),
+            self.rest.triangles,
+            self.rest.edges,
+            self.rest,
+        )
+        # Nothing but the band's own planes is new: a cached property may be set where it is kept.
+        bent = Outline(band, self._band_triangles, self.rest.edges[:0])
+        vars(outline)["planes"] = np.concatenate([self.rigid.planes, bent.planes])
+        return outline
+
+
+class TreeSurfaces:
+    """The surfaces of a pose tree's nodes at any values.
+
+    Attributes:
+        rigid: the rigid part of each node, in the node's frame.
+        bending: for each node its rigid part and its band; None for a node without one.
+
+    Args:
+        tree: the pose tree.
+    """
+
+    def __init__(self, tree: PoseTree) -> None:
+        self._nodes = tree.nodes
+        self.rigid = [outline_from_mesh(node.mesh) for node in tree.nodes]
+        self.bending = [
+            None if node.skin is None else BendingOutline(rigid, node.skin.mesh)
+            for node, rigid in zip(tree.nodes, self.rigid, strict=True)
+        ]
+
+    @property
+    def bends(self) -> bool:
+        """Whether any node has a band."""
+        return any(bending is not None for bending in self.bending)
+
+    def whole(self, node: int) -> Outline | BendingOutline:
+        """A node's surface: bending where the node has a band."""
+        return self.bending[node] or self.rigid[node]
+
+    def node_at(self, node: int, values: np.ndarray) -> Outline:
+        """A node's whole surface in its frame at its values (k,) [rad or m]."""
+        bending, skin = self.bending[node], self._nodes[node].skin
+        if bending is None or skin is None:
+            return self.rigid[node]
+        return bending.at(skin.vertices(np.asarray(values)[None])[0])
+
+    def at(self, values: Sequence[np.ndarray]) -> list[Outline]:
+        """All nodes' whole surfaces, each in its node's frame, at each node's values (k_i,)."""
+        return [self.node_at(node, part) for node, part in enumerate(values)]
+
+
+def score_bending(
+    surfaces: Sequence[Outline | BendingOutline],
+    bands: Sequence[np.ndarray],
+    X_CN: np.ndarray,
+    camera: Camera,
+    prefixes: np.ndarray,
+) -> np.ndarray:
+    """As score_bodies, for surfaces whose bands are different at every pose.
+
+    Args:
+        surfaces: the body's surfaces.
+        bands: for each of the bending ones (n, v, 3) its band's vertices in its frame N at each
+            pose [m].
+        X_CN: (n, nodes, 4, 4) the poses in the camera.
+        camera: the camera.
+        prefixes: (k, H, W + 1) int32 prefix sums of the sets; k may be 0.
+
+    Returns:
+        (n, 1 + k) int64 area of the union inside the picture, then of its intersection with each
+        set [pixel].
+    """
+    outlines = tuple(s.rest if isinstance(s, BendingOutline) else s for s in surfaces)
+    packed, poses = check_body(outlines, X_CN)
+    parts, sizes = [], [0]
+    for node, surface in enumerate(surfaces):
+        if isinstance(surface, BendingOutline):
+            rigid = surface.rigid
+            parts.append((node, len(rigid.vertices), len(rigid.triangles), sum(sizes)))
+            sizes.append(len(surface.rest.vertices) - len(rigid.vertices))
+    given = [band.shape for band in bands]
+    if given != [(len(poses), size, 3) for size in sizes[1:]]:
+        raise ValueError(f"bands of {sizes[1:]} vertices at {len(poses)} poses, not {given}")
+    vertices = np.concatenate([np.empty((len(poses), 0, 3)), *bands], axis=1)
+    if not np.all(np.isfinite(vertices)):
+        raise ValueError("bands must be finite")
+    return score_bent(
+        packed,
+        np.array(parts, dtype=np.int64).reshape(-1, 4),
+        vertices,
+        poses,
+        camera.kernel_parameters(),
+        check_prefixes(prefixes, camera),
+    )

@@ -1,0 +1,158 @@
+"""Areas and masks of projected surfaces, by the span kernel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from drake_pose.camera import Camera
+from drake_pose.silhouette.areas.outline import Outline, PackedOutlines, pack
+from drake_pose.silhouette.areas.prefix_sums import sum_rows
+from drake_pose.silhouette.areas.span_kernel import paint, score
+
+
+def prefix_sums(mask: np.ndarray) -> np.ndarray:
+    """Returns (H, W + 1) int32: how many pixels of a mask (H, W) lie left of each pixel."""
+    pixels = _as_bytes(mask)
+    prefix = np.empty((pixels.shape[0], pixels.shape[1] + 1), dtype=np.int32)
+    sum_rows(pixels, prefix, 0, pixels.shape[0])
+    return prefix
+
+
+def score_candidates(
+    outline: Outline, X_CN: np.ndarray, camera: Camera, prefixes: np.ndarray
+) -> np.ndarray:
+    """Returns the areas of one surface at many poses, and of its intersections with sets.
+
+    Args:
+        outline: the surface, in its frame N.
+        X_CN: (n, 4, 4) its poses in the camera.
+        camera: the camera.
+        prefixes: (k, H, W + 1) int32 prefix sums of the sets; k may be 0.
+
+    Returns:
+        (n, 1 + k) int64 area inside the picture, then of the intersection with each set [pixel].
+    """
+    poses = np.asarray(X_CN)
+    return score_bodies([outline], poses.reshape(-1, 1, *poses.shape[-2:]), camera, prefixes)
+
+
+def score_bodies(
+    outlines: Sequence[Outline], X_CN: np.ndarray, camera: Camera, prefixes: np.ndarray
+) -> np.ndarray:
+    """As score_candidates for whole bodies, whose surfaces are united exactly.
+
+    Args:
+        outlines: the body's surfaces.
+        X_CN: (n, nodes, 4, 4) their poses in the camera.
+        camera: the camera.
+        prefixes: (k, H, W + 1) int32 prefix sums of the sets; k may be 0.
+
+    Returns:
+        (n, 1 + k) int64 area of the union inside the picture, then of its intersection with each
+        set [pixel].
+    """
+    packed, poses = check_body(outlines, X_CN)
+    sums = check_prefixes(prefixes, camera)
+    return score(packed, poses, camera.kernel_parameters(), sums)
+
+
+def draw_mask(outlines: Sequence[Outline], X_CN: np.ndarray, camera: Camera) -> np.ndarray:
+    """Returns the mask (H, W) bool of a body at poses X_CN (nodes, 4, 4) in the camera."""
+    packed, poses = check_body(outlines, np.asarray(X_CN)[None])
+    mask = np.zeros((camera.height, camera.width), dtype=np.uint8)
+    paint(packed, poses[0], camera.kernel_parameters(), mask, 1)
+    return mask.view(np.bool_)
+
+
+def draw_segments(outlines: Sequence[Outline], X_CN: np.ndarray, camera: Camera) -> np.ndarray:
+    """Returns (H, W) uint8 which node of a body is seen in each pixel, counted from 1; 0: none.
+
+    Parts are painted one over the other, the one whose middle is farthest first, so their edges are
+    good to look at, not to measure by.
+
+    Args:
+        outlines: the surfaces of at most 255 nodes.
+        X_CN: (nodes, 4, 4) their poses in the camera.
+        camera: the camera.
+    """
+    shown = [k for k, outline in enumerate(outlines) if len(outline.vertices)]
+    middles = [X_CN[k, 2, :3] @ outlines[k].vertices.mean(axis=0) + X_CN[k, 2, 3] for k in shown]
+    segments = np.zeros((camera.height, camera.width), dtype=np.uint8)
+    for place in np.argsort(middles)[::-1]:
+        node = shown[place]
+        packed, poses = check_body([outlines[node]], np.asarray(X_CN)[None, [node]])
+        paint(packed, poses[0], camera.kernel_parameters(), segments, node + 1)
+    return segments
+
+
+def subtract_body(
+    mask: np.ndarray,
+    prefix: np.ndarray,
+    outlines: Outline | Sequence[Outline],
+    X_CN: np.ndarray,
+    camera: Camera,
+) -> None:
+    """Takes a body's picture out of a mask and brings the mask's prefix sums up to date.
+
+    Args:
+        mask: (H, W) bool or uint8, C-contiguous; changed in place.
+        prefix: (H, W + 1) int32 its prefix sums, C-contiguous; changed in place.
+        outlines: the body's surfaces, or its only one.
+        X_CN: (nodes, 4, 4) their poses in the camera (one surface: (4, 4) will do).
+        camera: the camera.
+
+    Raises:
+        ValueError: when an array has the wrong shape or type, or cannot be changed in place.
+    """
+    surfaces = [outlines] if isinstance(outlines, Outline) else outlines
+    poses = np.asarray(X_CN)
+    packed, poses = check_body(surfaces, poses.reshape(1, len(surfaces), *poses.shape[-2:]))
+    size = (camera.height, camera.width)
+    for name, array, shape in (("mask", mask, size), ("prefix", prefix, (size[0], size[1] + 1))):
+        if array.shape != shape or not (array.flags.c_contiguous and array.flags.writeable):
+            raise ValueError(
+                f"{name} of camera '{camera.name}' must be {shape}, C-contiguous and writeable"
+            )
+    if prefix.dtype != np.int32:
+        raise ValueError(f"prefix of camera '{camera.name}' must be int32, not {prefix.dtype}")
+    pixels = _as_bytes(mask)
+    first, end = paint(packed, poses[0], camera.kernel_parameters(), pixels, 0)
+    sum_rows(pixels, prefix, first, end)
+
+
+def check_prefixes(prefixes: np.ndarray, camera: Camera) -> np.ndarray:
+    """Returns prefix sums (k, H, W + 1) int32 as the kernel wants them.
+
+    Raises:
+        ValueError: when they are of another size than the camera's pictures.
+    """
+    sums = np.require(prefixes, dtype=np.int32, requirements=["C", "W"])
+    if sums.ndim != 3 or sums.shape[1:] != (camera.height, camera.width + 1):
+        raise ValueError(
+            f"prefixes of camera '{camera.name}' must be (k, {camera.height}, {camera.width + 1}), "
+            f"not {sums.shape}"
+        )
+    return sums
+
+
+def check_body(outlines: Sequence[Outline], X_CN: np.ndarray) -> tuple[PackedOutlines, np.ndarray]:
+    """Returns the kernel's arrays, and poses (n, nodes, 4, 4) as (n, nodes, 3, 4).
+
+    Raises:
+        ValueError: when the poses have the wrong shape or are not finite.
+    """
+    poses = np.asarray(X_CN)
+    if poses.ndim != 4 or poses.shape[1] != len(outlines) or poses.shape[2:] != (4, 4):
+        raise ValueError(f"poses must be (n, {len(outlines)}, 4, 4), not {poses.shape}")
+    if not np.all(np.isfinite(poses)):
+        raise ValueError("poses must be finite")
+    return pack(tuple(outlines)), np.array(poses[:, :, :3], dtype=np.float64, order="C")
+
+
+def _as_bytes(mask: np.ndarray) -> np.ndarray:
+    """Returns a mask (H, W) of bool or uint8 as uint8, without a copy where it can be."""
+    if mask.ndim != 2 or mask.dtype not in (np.bool_, np.uint8):
+        raise ValueError(f"a mask must be (H, W) bool or uint8, not {mask.shape} {mask.dtype}")
+    return np.require(mask, requirements=["C", "W"]).view(np.uint8)

@@ -1,0 +1,374 @@
+"""Bit masks of one surface at many poses.
+
+The pixels are those of the span kernel, decided by the same arithmetic; only the contour edges are
+looked for among the few that can be on the contour (contour_cells).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from drake_pose.compiled import compiled, with_room
+from drake_pose.silhouette.areas.bending_kernel import bend, own_copy
+from drake_pose.silhouette.areas.outline import PackedOutlines
+from drake_pose.silhouette.areas.span_kernel import (
+    _BIAS,
+    _SHIFT,
+    _fill_safely,
+    _find_facings,
+    _find_spans,
+    _make_work,
+    _project,
+    _walk_contour,
+    _Work,
+)
+from drake_pose.silhouette.bits.bit_view import WORD, BitView
+from drake_pose.silhouette.contours.direction_cells import CelledOutline, find_cell
+
+_FIRST_CAPACITY = 8
+_FULL = np.uint64(0xFFFFFFFFFFFFFFFF)
+
+
+class _Scratch(NamedTuple):
+    """What one surface at one pose needs for a moment.
+
+    contour: (e,) int32 contour edges; weights: (e,) int32 of the edges; lines: (e, 4) upper and
+    lower end u, v [pixel] of those that cross a row; firsts, lasts: (e,) int32 first row crossed
+    and the row after the last.
+    """
+
+    contour: np.ndarray
+    weights: np.ndarray
+    lines: np.ndarray
+    firsts: np.ndarray
+    lasts: np.ndarray
+
+
+@compiled
+def _make_scratch(edges: int) -> _Scratch:
+    """Returns room for a surface of so many edges."""
+    return _Scratch(
+        np.empty(edges + 1, dtype=np.int32),
+        np.empty(edges + 1, dtype=np.int32),
+        np.empty((edges + 1, 4)),
+        np.empty(edges + 1, dtype=np.int32),
+        np.empty(edges + 1, dtype=np.int32),
+    )
+
+
+@compiled
+def multiply(X_AB: np.ndarray, X_BC: np.ndarray, X_AC: np.ndarray) -> None:
+    """Writes the upper three rows of X_AB X_BC."""
+    for i in range(3):
+        for j in range(4):
+            total = X_AB[i, 0] * X_BC[0, j]
+            for k in range(1, 4):
+                total += X_AB[i, k] * X_BC[k, j]
+            X_AC[i, j] = total
+
+
+@compiled
+def draw_bits(
+    celled: CelledOutline,
+    view: BitView,
+    X_WP: np.ndarray,
+    X_PN: np.ndarray,
+    pairs: np.ndarray,
+    limit: float,
+    one_enough: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Draws a surface at many poses as bits.
+
+    Args:
+        celled: the surface; if it has a band of skin, the band is that of the pair's sample.
+        view: the silhouette.
+        X_WP: (g, 4, 4) poses of the parent.
+        X_PN: (n, 4, 4) poses of the node in its parent at its samples.
+        pairs: (m, 2) int32 parent pose and sample.
+        limit: the area that may lie outside the silhouette [pixel].
+        one_enough: (g,) bool the parent poses for which one pose that stays inside will do.
+
+    Returns:
+        kept (m,) bool: the pairs that stay inside the limit. The rest is about them alone, in the
+        order of the pairs: areas (m', 3) int32 inside the silhouette, in the band, and outside of
+        both; runs (m', 2, 3) int64 for the silhouette and the band the first word, the number of
+        words, and where they begin in words; words (n,) uint64.
+    """
+    packed, camera = celled.packed, view.camera
+    bends = celled.bands.shape[0] > 0
+    work, scratch = _make_work(celled.whole, camera), _make_scratch(packed.edges.shape[1])
+    band, whole = celled.band, celled.whole
+    if bends:
+        band, whole = own_copy(band), own_copy(whole)
+    crossings = np.empty((int(camera[7]), _FIRST_CAPACITY), dtype=np.int32)
+    X_WN, X_CN = np.zeros((4, 4)), np.empty((1, 3, 4))
+    X_WN[3, 3] = 1.0
+    kept = np.zeros(pairs.shape[0], dtype=np.bool_)
+    areas = np.empty((pairs.shape[0], 3), dtype=np.int32)
+    runs = np.zeros((pairs.shape[0], 2, 3), dtype=np.int64)
+    inside_size = view.inside[-1, -1] // WORD + 1
+    band_size = view.band[-1, -1] // WORD + 1 if view.band.shape[0] else 0
+    words = np.empty(16 * (inside_size + band_size) + pairs.shape[0], dtype=np.uint64)
+    spans = np.empty((4 * int(camera[7]) + int(camera[6]), 3), dtype=np.int32)
+    found, used, satisfied = 0, 0, -1
+    for i in range(pairs.shape[0]):
+        if pairs[i, 0] == satisfied:
+            continue
+        multiply(X_WP[pairs[i, 0]], X_PN[pairs[i, 1]], X_WN)
+        multiply(view.X_CW, X_WN, X_CN[0])
+        filled = _fill_celled(celled, X_CN, camera, crossings, work, scratch)
+        if bends and filled:
+            bend(band, np.zeros(4, dtype=np.int64), celled.bands[pairs[i, 1]])
+            filled = _add_band(band, X_CN, camera, crossings, work)
+        if not filled:
+            if bends:
+                bend(whole, celled.part, celled.bands[pairs[i, 1]])
+            crossings = _fill_safely(whole, X_CN, camera, crossings, work)
+        count, spans = _gather_spans(view, crossings, work, limit, spans, areas[found])
+        if count < 0:
+            continue
+        if words.shape[0] < used + inside_size + band_size:
+            words = with_room(words, used, 2 * words.shape[0] + inside_size + band_size)
+        used = write_runs(view.inside, view.window, spans, count, words, used, runs[found, 0])
+        if band_size:
+            used = write_runs(view.band, view.window, spans, count, words, used, runs[found, 1])
+        kept[i] = True
+        found += 1
+        if one_enough[pairs[i, 0]]:
+            satisfied = pairs[i, 0]
+    return kept, areas[:found].copy(), runs[:found].copy(), words[:used].copy()
+
+
+@compiled
+def _fill_celled(
+    celled: CelledOutline,
+    X_CN: np.ndarray,
+    camera: np.ndarray,
+    crossings: np.ndarray,
+    work: _Work,
+    scratch: _Scratch,
+) -> bool:
+    """As the kernel's _fill_rows; False (and nothing done) where the cell's edges will not do."""
+    packed = celled.packed
+    work.reach[0], work.reach[1], work.reach[2] = int(camera[7]), 0, 0
+    if packed.planes.shape[1] == 0:
+        return True
+    X, ball, parallel = X_CN[0], packed.balls[0], camera[0] == 1.0
+    e0, e1, e2, share = X[2, 0], X[2, 1], X[2, 2], 0.0
+    d0, d1, d2 = e0, e1, e2
+    if not parallel:
+        t0, t1, t2, share = X[0, 3], X[1, 3], X[2, 3], 1.0
+        e0 = -(X[0, 0] * t0 + X[1, 0] * t1 + X[2, 0] * t2)
+        e1 = -(X[0, 1] * t0 + X[1, 1] * t1 + X[2, 1] * t2)
+        e2 = -(X[0, 2] * t0 + X[1, 2] * t1 + X[2, 2] * t2)
+        d0, d1, d2 = e0 - ball[0], e1 - ball[1], e2 - ball[2]
+        distance = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
+        depth = X[2, 0] * ball[0] + X[2, 1] * ball[1] + X[2, 2] * ball[2] + X[2, 3]
+        if depth - 1.000001 * ball[3] < camera[5] or ball[3] > celled.reach[0] * distance:
+            return False
+    facing = (e0, e1, e2, share)
+    view_matrix = _picture_rows(X, camera)
+    cell = find_cell(d0, d1, d2)
+    begin, end = celled.cell_starts[cell], celled.cell_starts[cell + 1]
+    _walk_cell(
+        celled, begin, end, facing, view_matrix, camera, crossings, work.counts, work.reach, scratch
+    )
+    if work.reach[2] != 0:
+        for row in range(work.reach[0], work.reach[1]):
+            work.counts[row] = 0
+        return False
+    return True
+
+
+@compiled
+def _add_band(
+    band: PackedOutlines, X_CN: np.ndarray, camera: np.ndarray, crossings: np.ndarray, work: _Work
+) -> bool:
+    """Adds a surface's crossings to those in the rows; False (and the rows empty) if it cannot."""
+    possible = True
+    if camera[0] == 0.0:
+        X, ball = X_CN[0], band.balls[0]
+        depth = X[2, 0] * ball[0] + X[2, 1] * ball[1] + X[2, 2] * ball[2] + X[2, 3]
+        possible = depth - 1.000001 * ball[3] >= camera[5]
+    if possible:
+        _project(band, 0, X_CN, camera, work)
+        _find_facings(band, 0, X_CN, camera, work)
+        _walk_contour(band, 0, camera, crossings, work)
+        possible = work.reach[2] == 0
+    if not possible:
+        for row in range(work.reach[0], work.reach[1]):
+            work.counts[row] = 0
+    return possible
+
+
+@compiled
+def _picture_rows(X: np.ndarray, camera: np.ndarray) -> np.ndarray:
+    """Returns (3, 4): a point's u and v [pixel], before the division by the third of a pinhole."""
+    rows = np.empty((3, 4))
+    for j in range(4):
+        rows[0, j], rows[1, j], rows[2, j] = camera[1] * X[0, j], camera[2] * X[1, j], X[2, j]
+    if camera[0] == 1.0:
+        rows[0, 3] += camera[3]
+        rows[1, 3] += camera[4]
+    return rows
+
+
+@compiled
+def _walk_cell(
+    celled: CelledOutline,
+    begin: int,
+    end: int,
+    facing: tuple[float, float, float, float],
+    rows: np.ndarray,
+    camera: np.ndarray,
+    crossings: np.ndarray,
+    counts: np.ndarray,
+    reach: np.ndarray,
+    scratch: _Scratch,
+) -> None:
+    """Walks the contour edges among cell_edges[begin:end] exactly as the span kernel does."""
+    parallel, cx, cy = camera[0] == 1.0, camera[3], camera[4]
+    width, height, capacity = camera[6], camera[7], crossings.shape[1]
+    a0, a1, a2, a3 = rows[0, 0], rows[0, 1], rows[0, 2], rows[0, 3]
+    b0, b1, b2, b3 = rows[1, 0], rows[1, 1], rows[1, 2], rows[1, 3]
+    c0, c1, c2, c3 = rows[2, 0], rows[2, 1], rows[2, 2], rows[2, 3]
+    e0, e1, e2, share = facing
+    planes, edges, points, chosen = celled.planes, celled.edges, celled.points, celled.cell_edges
+    # Three passes without unforeseeable branches in the first two: a mispredicted branch costs as
+    # much as all the arithmetic of an edge.
+    contour, weights, number = scratch.contour, scratch.weights, 0
+    for k in range(begin, end):
+        e = chosen[k]
+        t = edges[e, 2]
+        side = planes[t, 0] * e0 + planes[t, 1] * e1 + planes[t, 2] * e2 - planes[t, 3] * share
+        weight = int(side > 0.0) - int(side < 0.0)
+        t = edges[e, 3]
+        side = planes[t, 0] * e0 + planes[t, 1] * e1 + planes[t, 2] * e2 - planes[t, 3] * share
+        weight += edges[e, 4] * (int(side > 0.0) - int(side < 0.0))
+        contour[number], weights[number] = e, weight
+        number += weight != 0
+    lines, firsts, lasts, crossing = scratch.lines, scratch.firsts, scratch.lasts, 0
+    for k in range(number):
+        e = contour[k]
+        i, j = edges[e, 0], edges[e, 1]
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        ua, va = a0 * x + a1 * y + a2 * z + a3, b0 * x + b1 * y + b2 * z + b3
+        if not parallel:
+            inverse = 1.0 / (c0 * x + c1 * y + c2 * z + c3)
+            ua, va = ua * inverse + cx, va * inverse + cy
+        x, y, z = points[j, 0], points[j, 1], points[j, 2]
+        ub, vb = a0 * x + a1 * y + a2 * z + a3, b0 * x + b1 * y + b2 * z + b3
+        if not parallel:
+            inverse = 1.0 / (c0 * x + c1 * y + c2 * z + c3)
+            ub, vb = ub * inverse + cx, vb * inverse + cy
+        down = va <= vb
+        u0, v0 = (ua if down else ub), (va if down else vb)
+        u1, v1 = (ub if down else ua), (vb if down else va)
+        first = math.ceil(min(max(v0, 0.0), height))
+        last = math.ceil(min(max(v1, 0.0), height))
+        lines[crossing, 0], lines[crossing, 1] = u0, v0
+        lines[crossing, 2], lines[crossing, 3] = u1, v1
+        firsts[crossing], lasts[crossing] = first, last
+        weights[crossing] = weights[k] if down else -weights[k]
+        crossing += first < last
+    lowest, highest = reach[0], reach[1]
+    for k in range(crossing):
+        u0, v0 = lines[k, 0], lines[k, 1]
+        slope = (lines[k, 2] - u0) / (lines[k, 3] - v0)
+        first, last, mark = firsts[k], lasts[k], weights[k] + _BIAS
+        lowest, highest = min(lowest, first), max(highest, last)
+        for row in range(first, last):
+            u = u0 + (row - v0) * slope
+            pixel = math.ceil(min(max(u, 0.0), width))
+            count = counts[row]
+            if count < capacity:
+                crossings[row, count] = (pixel << _SHIFT) + mark
+            else:
+                reach[2] = 1
+            counts[row] = count + 1
+    reach[0], reach[1] = lowest, highest
+
+
+@compiled
+def _gather_spans(
+    view: BitView,
+    crossings: np.ndarray,
+    work: _Work,
+    limit: float,
+    spans: np.ndarray,
+    areas: np.ndarray,
+) -> tuple[int, np.ndarray]:
+    """Reads the rows' spans and empties the rows.
+
+    Returns:
+        The number of spans in the window, -1 where more than the limit lies outside, and the spans
+        (n, 3) row, a, b [window].
+    """
+    window, inside, band = view.window, view.inside, view.band
+    first_row, end_row = window[0], window[0] + window[2]
+    first_column, width = window[1], window[3]
+    has_band = band.shape[0] > 0
+    covered, near, total, count = 0, 0, 0, 0
+    for row in range(work.reach[0], work.reach[1]):
+        number = _find_spans(row, crossings, work.counts, work.changes, work.spans)
+        if count + number > spans.shape[0]:
+            spans = with_room(spans, count, 2 * spans.shape[0] + number)
+        for k in range(number):
+            a, b = work.spans[k, 0], work.spans[k, 1]
+            total += b - a
+            if row < first_row or row >= end_row:
+                continue
+            r = row - first_row
+            a, b = max(0, a - first_column), min(width, b - first_column)
+            if a < b:
+                covered += inside[r, b] - inside[r, a]
+                if has_band:
+                    near += band[r, b] - band[r, a]
+                spans[count, 0], spans[count, 1], spans[count, 2] = r, a, b
+                count += 1
+        if total - covered > limit:
+            for later in range(row + 1, work.reach[1]):
+                work.counts[later] = 0
+            return -1, spans
+    areas[0], areas[1], areas[2] = covered, near, total - covered - near
+    return count, spans
+
+
+@compiled
+def write_runs(
+    numbers: np.ndarray,
+    window: np.ndarray,
+    spans: np.ndarray,
+    count: int,
+    words: np.ndarray,
+    used: int,
+    run: np.ndarray,
+) -> int:
+    """Writes the bits of spans behind the words in use; returns how many words are then in use."""
+    first, last = -1, -1
+    for k in range(count):
+        row = spans[k, 0]
+        a, b = numbers[row, spans[k, 1]], numbers[row, spans[k, 2]]
+        if a == b:
+            continue
+        low, high = a // WORD, (b - 1) // WORD
+        if first < 0:
+            first, last = low, low - 1
+        for word in range(last + 1, high + 1):
+            words[used + word - first] = 0
+        last = max(last, high)
+        low_bits = _FULL << np.uint64(a % WORD)
+        high_bits = _FULL >> np.uint64(WORD - 1 - (b - 1) % WORD)
+        place = used + low - first
+        if low == high:
+            words[place] |= low_bits & high_bits
+        else:
+            words[place] |= low_bits
+            for word in range(low + 1, high):
+                words[used + word - first] = _FULL
+            words[used + high - first] |= high_bits
+    run[0], run[1], run[2] = max(first, 0), 0 if first < 0 else last - first + 1, used
+    return used + run[1]

@@ -1,0 +1,1 @@
+"""The visible contour of a projected body, as edges and as points."""

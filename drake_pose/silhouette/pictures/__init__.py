@@ -1,0 +1,1 @@
+"""Pictures of silhouettes: mask files, scenes, and Drake's label images."""

@@ -1,0 +1,160 @@
+"""Reference silhouettes: the label images of Drake's render engine."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from pydrake.geometry import (
+    FrameId,
+    FramePoseVector,
+    MakeRenderEngineVtk,
+    RenderEngineVtkParams,
+    Role,
+    SceneGraph,
+)
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex
+
+from drake_pose.body import ModelSkin
+from drake_pose.body.model import link_names
+from drake_pose.camera import Camera, ParallelCamera
+from drake_pose.silhouette.pictures.drake_skin import DeformableSkin
+from drake_pose.silhouette.pictures.label_images import EMPTY, label_data
+
+if TYPE_CHECKING:
+    from drake_pose.body import ArticulatedModel
+
+_RENDERER = "silhouette"
+_DEPTH_MARGIN = 0.01
+
+
+class LabelRenderer:
+    """Renders label images of a model with RenderEngineVtk, without a display or a diagram.
+
+    Args:
+        model: the model.
+        camera: the camera.
+
+    Raises:
+        CameraError: on rendering, when Drake cannot draw for the camera.
+        RuntimeError: on rendering in another thread than the one that made the renderer: the
+            engine would give wrong images.
+    """
+
+    def __init__(self, model: ArticulatedModel, camera: Camera) -> None:
+        self.camera = camera
+        self._thread = threading.get_ident()
+        self._scene_graph = SceneGraph()
+        self._plant = MultibodyPlant(time_step=0.0)
+        self._source = self._plant.RegisterAsSourceForSceneGraph(self._scene_graph)
+        model.add_to(self._plant, self._scene_graph)
+        labels = {name: label for label, name in enumerate(link_names(self._plant))}
+        self._skin = DeformableSkin(ModelSkin(model), self._scene_graph, labels)
+        self._scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(RenderEngineVtkParams()))
+        self._plant.Finalize()
+        self._plant_context = self._plant.CreateDefaultContext()
+        self._context = self._scene_graph.CreateDefaultContext()
+        self._corners = self._find_corners()
+        self._world = self._scene_graph.world_frame_id()
+
+    @property
+    def link_names(self) -> dict[int, str]:
+        """The link of each label; a label is Drake's body index."""
+        return dict(enumerate(link_names(self._plant)))
+
+    def label_image(self, q: np.ndarray, X_WB: np.ndarray | None = None) -> np.ndarray:
+        """Renders the model.
+
+        Args:
+            q: (nq,) the plant's positions.
+            X_WB: (4, 4) pose in the world of the frame B that the plant takes for its world;
+                left out, the world itself.
+
+        Returns:
+            (H, W) int16 labels; EMPTY where there is no body.
+        """
+        if threading.get_ident() != self._thread:
+            raise RuntimeError("a LabelRenderer must be used in the thread that made it")
+        self._set_positions(q)
+        poses = self._plant.get_geometry_pose_output_port().Eval(self._plant_context)
+        X_BW = RigidTransform()
+        if X_WB is not None:
+            rotation = RotationMatrix.ProjectToRotationMatrix(np.asarray(X_WB)[:3, :3])
+            X_BW = RigidTransform(rotation, np.asarray(X_WB)[:3, 3]).inverse()
+        self._scene_graph.get_source_pose_port(self._source).FixValue(self._context, poses)
+        p_B = self._skin.skin.vertices(np.asarray(q, dtype=np.float64))
+        port = self._scene_graph.get_source_configuration_port(self._skin.source)
+        port.FixValue(self._context, self._skin.configuration(p_B))
+        if isinstance(self.camera, ParallelCamera):
+            depths = self._depths(poses, p_B, X_BW.inverse().GetAsMatrix4())
+            color, _, X_WC = self.camera.to_drake(renderer_name=_RENDERER, depth_range=depths)
+        else:
+            color, _, X_WC = self.camera.to_drake(renderer_name=_RENDERER)
+        query = self._scene_graph.get_query_output_port().Eval(self._context)
+        image = query.RenderLabelImage(color, self._world, X_BW @ X_WC)
+        return label_data(image).copy()
+
+    def mask(self, q: np.ndarray, X_WB: np.ndarray | None = None) -> np.ndarray:
+        """Returns the model's mask (H, W) bool; arguments as label_image."""
+        return self.label_image(q, X_WB) != EMPTY
+
+    def segments(self, q: np.ndarray, X_WB: np.ndarray | None = None) -> np.ndarray:
+        """Returns (H, W) int16 the link (see link_names) seen at each pixel, -1 where none is."""
+        labels = self.label_image(q, X_WB)
+        return np.where(labels == EMPTY, np.int16(-1), labels)
+
+    def link_poses(self, q: np.ndarray) -> np.ndarray:
+        """Returns (bodies, 4, 4) the links' poses in the plant's world, by body index."""
+        self._set_positions(q)
+        count = self._plant.num_bodies()
+        bodies = [self._plant.get_body(BodyIndex(i)) for i in range(count)]
+        return np.array(
+            [
+                self._plant.EvalBodyPoseInWorld(self._plant_context, body).GetAsMatrix4()
+                for body in bodies
+            ]
+        )
+
+    def _set_positions(self, q: np.ndarray) -> None:
+        """Puts the plant at positions q (nq,)."""
+        positions = np.asarray(q, dtype=np.float64)
+        if positions.shape != (self._plant.num_positions(),) or not np.isfinite(positions).all():
+            # Drake ends the whole process here.
+            raise ValueError(f"q must be ({self._plant.num_positions()},) finite numbers")
+        self._plant.SetPositions(self._plant_context, positions)
+
+    def _find_corners(self) -> list[tuple[FrameId, np.ndarray]]:
+        """Returns the corners (8, 3) of a box around every drawn shape, in its frame."""
+        inspector = self._scene_graph.model_inspector()
+        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        corners = []
+        for shape in inspector.GetAllGeometryIds(Role.kPerception):
+            box = inspector.GetObbInGeometryFrame(shape)
+            X_FG = inspector.GetPoseInFrame(shape)
+            if box is None:
+                continue
+            points = (X_FG @ box.pose()).multiply((signs * box.half_width()).T).T
+            corners.append((inspector.GetFrameId(shape), points))
+        return corners
+
+    def _depths(
+        self, poses: FramePoseVector, bands: Sequence[np.ndarray], X_WB: np.ndarray
+    ) -> tuple[float, float]:
+        """Returns the least and greatest depth of the body in the camera [m], with a margin."""
+        nearest, farthest = np.inf, -np.inf
+        X_CB = self.camera.X_CW @ X_WB
+        for frame, p_F in self._corners:
+            X_BF = np.eye(4) if frame == self._world else poses.value(frame).GetAsMatrix4()
+            row = (X_CB @ X_BF)[2]
+            depth = p_F @ row[:3] + row[3]
+            nearest, farthest = min(nearest, depth.min()), max(farthest, depth.max())
+        for p_B in bands:
+            depth = p_B @ X_CB[2, :3] + X_CB[2, 3]
+            nearest, farthest = min(nearest, depth.min()), max(farthest, depth.max())
+        if nearest > farthest:
+            return -1.0, 1.0
+        return nearest - _DEPTH_MARGIN, farthest + _DEPTH_MARGIN

@@ -1,0 +1,176 @@
+"""Scenes: a folder of cameras and recorded masks."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from drake_pose.camera import Camera, ParallelCamera, load_cameras
+from drake_pose.errors import SceneError, UnknownNameError
+from drake_pose.silhouette.pictures.masks import read_mask
+from drake_pose.silhouette.pictures.scene_files import Leftovers, SceneFiles, find_masks
+from drake_pose.yaml_files import read_yaml
+
+_FIELDS = ("sequence", "frame_rate_hz")
+
+# A camera nobody knows looks along the world's -x: the picture's right is y, its up is z.
+_LOOKING_BACK = np.array(
+    [[0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+_ANY_SCALE = 1000.0
+_UNKNOWN = "camera"
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A folder of masks, and the cameras that took them.
+
+    Args:
+        path: the folder.
+        cameras: the cameras by name, in the camera file's order.
+        frames: the frames' names in natural order, 2 before 10; a frame may lack some cameras.
+        masks: the mask file of (camera, frame).
+        sequence: whether the frames follow each other in time.
+        frame_rate_hz: frames a second, where the scene says.
+        scale_unknown: whether nobody knows the cameras: each is a parallel camera that looks along
+            the world's -x, and its pixels_per_metre and what it looks at are to be found.
+        leftovers: what lies in the folder and is not used.
+    """
+
+    path: Path
+    cameras: Mapping[str, Camera]
+    frames: tuple[str, ...]
+    masks: Mapping[tuple[str, str], Path]
+    sequence: bool = False
+    frame_rate_hz: float | None = None
+    scale_unknown: bool = False
+    leftovers: Leftovers = field(default_factory=Leftovers)
+
+    def cameras_of(self, frame: str) -> tuple[str, ...]:
+        """Returns the names of the cameras that have a mask of a frame.
+
+        Raises:
+            UnknownNameError: when there is no such frame.
+        """
+        names = tuple(camera for camera in self.cameras if (camera, frame) in self.masks)
+        if not names and frame not in self.frames:
+            raise UnknownNameError("frame", frame, self.frames, str(self.path))
+        return names
+
+    def mask_path(self, camera: str, frame: str) -> Path:
+        """Returns the mask file of a camera's frame.
+
+        Raises:
+            UnknownNameError: when there is no such camera, or it has no such frame.
+        """
+        if camera not in self.cameras:
+            raise UnknownNameError("camera", camera, self.cameras, str(self.path))
+        if (camera, frame) not in self.masks:
+            known = sorted(name for owner, name in self.masks if owner == camera)
+            raise UnknownNameError("frame", frame, known, f"{self.path}: camera '{camera}'")
+        return self.masks[camera, frame]
+
+    def read(self, camera: str, frame: str, *, may_be_empty: bool = False) -> np.ndarray:
+        """Returns the mask (H, W) bool of a camera's frame.
+
+        Args:
+            camera: the camera's name.
+            frame: the frame's name.
+            may_be_empty: whether a picture that shows nobody is as good as any.
+
+        Raises:
+            UnknownNameError: when there is no such camera, or it has no such frame.
+            MaskError: when the file is not a mask of the camera's size.
+        """
+        path = self.mask_path(camera, frame)
+        size = self.cameras[camera]
+        return read_mask(path, size.width, size.height, may_be_empty=may_be_empty)
+
+
+def load_scene(path: str | Path, cameras: Mapping[str, Camera] | None = None) -> Scene:
+    """Reads what a scene's folder holds; masks are read when they are asked for.
+
+    The folder has `cameras.yaml`, `masks/<camera>/<frame>.png` and perhaps `scene.yaml`
+    (`sequence: true|false`, `frame_rate_hz`). With a single camera the masks may lie in
+    `masks/<frame>.png`. Such masks need no camera file: without one they were taken by a camera
+    that nobody knows, or by several where the pictures' sizes differ. Masks of cameras that are not
+    in the camera file are left over, see `Scene.leftovers`.
+
+    Args:
+        path: the folder.
+        cameras: the cameras, where the folder has no `cameras.yaml`, or to be used instead of it.
+
+    Raises:
+        SceneError: names the folder and what is missing or wrong in it.
+        CameraError: when the camera file is wrong.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        raise SceneError(f"{folder}: no such folder; a scene has cameras.yaml and masks")
+    sequence, frame_rate_hz = _read_settings(folder / "scene.yaml")
+    if cameras is None:
+        if not os.path.lexists(folder / "cameras.yaml"):
+            cameras, files = _unknown_cameras(folder)
+            return Scene(folder, cameras, files.frames, files.masks, sequence, frame_rate_hz, True)
+        cameras = load_cameras(folder / "cameras.yaml")
+    files = find_masks(folder, cameras)
+    return Scene(
+        folder,
+        dict(cameras),
+        files.frames,
+        files.masks,
+        sequence,
+        frame_rate_hz,
+        leftovers=files.leftovers,
+    )
+
+
+def _unknown_cameras(folder: Path) -> tuple[dict[str, Camera], SceneFiles]:
+    """Returns a camera for every size of picture, and the masks."""
+    if not (folder / "masks").is_dir() or not any((folder / "masks").glob("*.png")):
+        raise SceneError(
+            f"{folder}: has no cameras.yaml, so its cameras must be given; only masks that lie in "
+            "masks/<frame>.png need none"
+        )
+    found = find_masks(folder, [_UNKNOWN])
+    sizes = {frame: read_mask(file).shape[::-1] for (_, frame), file in found.masks.items()}
+    several = len(set(sizes.values())) > 1
+    names = {
+        size: f"{_UNKNOWN}_{size[0]}x{size[1]}" if several else _UNKNOWN for size in sizes.values()
+    }
+    cameras: dict[str, Camera] = {
+        name: ParallelCamera(
+            name, width, height, _ANY_SCALE, (width - 1) / 2, (height - 1) / 2, _LOOKING_BACK
+        )
+        for (width, height), name in names.items()
+    }
+    masks = {(names[sizes[frame]], frame): file for (_, frame), file in found.masks.items()}
+    return cameras, SceneFiles(masks, found.frames)
+
+
+def _read_settings(path: Path) -> tuple[bool, float | None]:
+    """Returns sequence and frame_rate_hz of a scene.yaml, which may be missing."""
+    if not path.exists():
+        return False, None
+    content = read_yaml(path, SceneError)
+    if not isinstance(content, dict):
+        raise SceneError(f"{path}: expected a mapping with {', '.join(_FIELDS)}")
+    unknown = [str(field)[:40] for field in content if field not in _FIELDS]
+    if unknown:
+        raise SceneError(
+            f"{path}: unknown field {', '.join(unknown)}; a scene has: {', '.join(_FIELDS)}"
+        )
+    sequence = content.get("sequence", False)
+    if not isinstance(sequence, bool):
+        raise SceneError(f"{path}: sequence must be true or false")
+    rate = content.get("frame_rate_hz")
+    if rate is None:
+        return sequence, None
+    if isinstance(rate, bool) or not isinstance(rate, int | float) or not 0.0 < rate < math.inf:
+        raise SceneError(f"{path}: frame_rate_hz must be a finite positive number")
+    return sequence, float(rate)

@@ -1,0 +1,191 @@
+"""A body's skin in a diagram: for the sensors of a SceneGraph, and for the eye in Meshcat."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.geometry import GeometryConfigurationVector, Meshcat, Rgba, SceneGraph
+from pydrake.systems.framework import (
+    Context,
+    DiagramBuilder,
+    EventStatus,
+    LeafSystem,
+    OutputPort,
+)
+
+from drake_pose.body import ArticulatedModel, ModelSkin
+from drake_pose.silhouette.pictures.drake_skin import DeformableSkin
+
+MESHCAT_PERIOD = 1.0 / 64.0
+"""Time between two drawings [s]: that of Drake's MeshcatVisualizer."""
+
+
+class SkinPoser(LeafSystem):
+    """Bends a skin in a SceneGraph, where sensors see it.
+
+    .. pydrake_system::
+
+        name: SkinPoser
+        input_ports:
+        - positions
+        output_ports:
+        - geometry_configuration
+
+    Args:
+        deformable: the skin, registered with the SceneGraph.
+        position_count: how many positions its model has.
+    """
+
+    def __init__(self, deformable: DeformableSkin, position_count: int) -> None:
+        super().__init__()
+        self._deformable = deformable
+        self._positions = self.DeclareVectorInputPort("positions", position_count)
+        self.DeclareAbstractOutputPort(
+            "geometry_configuration",
+            lambda: AbstractValue.Make(GeometryConfigurationVector()),
+            self._calc_configuration,
+            {self._positions.ticket()},
+        )
+
+    def _calc_configuration(self, context: Context, output: AbstractValue) -> None:
+        vertices = self._deformable.skin.vertices(self._positions.Eval(context))
+        output.set_value(self._deformable.configuration(vertices))
+
+
+class MeshcatSkin(LeafSystem):
+    """Draws a skin in Meshcat, whose visualizer passes over deformable geometry.
+
+    .. pydrake_system::
+
+        name: MeshcatSkin
+        input_ports:
+        - positions
+
+    Args:
+        meshcat: where to draw.
+        skin: the skin.
+        position_count: how many positions its model has.
+        path: where in Meshcat's tree.
+        colour: in place of the bands' own colours.
+        recorded: Meshcat records the motion of objects, not of their vertices: draw each new shape
+            as an object of its own, that is seen for its time only.
+    """
+
+    def __init__(
+        self,
+        meshcat: Meshcat,
+        skin: ModelSkin,
+        position_count: int,
+        path: str,
+        colour: Rgba | None = None,
+        *,
+        recorded: bool = False,
+    ) -> None:
+        super().__init__()
+        self._meshcat = meshcat
+        self._skin = skin
+        self._path = path
+        self._colour = colour
+        self._recorded = recorded
+        self._shapes = 0
+        self._drawn: np.ndarray | None = None
+        self._positions = self.DeclareVectorInputPort("positions", position_count)
+        self.DeclarePeriodicPublishEvent(MESHCAT_PERIOD, 0.0, self._draw)
+        self.DeclareForcedPublishEvent(self._draw)
+
+    def _draw(self, context: Context) -> EventStatus:
+        positions = np.array(self._positions.Eval(context))
+        if self._drawn is not None and np.array_equal(positions, self._drawn):
+            return EventStatus.DidNothing()
+        path = self._path
+        if self._recorded:
+            path = f"{self._path}/{self._shapes}"
+            self._show_alone(context.get_time())
+        for band, vertices in zip(self._skin.bands, self._skin.vertices(positions), strict=True):
+            self._meshcat.SetTriangleMesh(
+                f"{path}/{band.child}",
+                np.asfortranarray(vertices.T),
+                np.asfortranarray(band.mesh.triangles.T),
+                self._colour or Rgba(*band.colour, 1.0),
+            )
+        self._drawn = positions
+        self._shapes += 1
+        return EventStatus.Succeeded()
+
+    def _show_alone(self, time: float) -> None:
+        """From now on show the shape that is about to be drawn, and not the one before."""
+        here = f"{self._path}/{self._shapes}"
+        if self._shapes:
+            self._meshcat.SetProperty(f"{self._path}/{self._shapes - 1}", "visible", False, time)
+            if time > 0.0:
+                self._meshcat.SetProperty(here, "visible", False, 0.0)
+        self._meshcat.SetProperty(here, "visible", True, time)
+
+
+def add_skin(
+    builder: DiagramBuilder,
+    scene_graph: SceneGraph,
+    model: ArticulatedModel,
+    positions: OutputPort,
+    name: str,
+    labels: Mapping[str, int] | None = None,
+) -> None:
+    """Add a model's skin to a diagram, so that cameras see it; nothing where it has none.
+
+    Args:
+        builder: the diagram under construction.
+        scene_graph: the SceneGraph that the body's rigid parts are in.
+        model: the body.
+        positions: the body's positions (nq,) in its model's order.
+        name: of the new source and, with ``_skin_poser``, of the new system.
+        labels: the render label of each link, by name; Drake's own are the links' body indices.
+    """
+    if not model.skin:
+        return
+    deformable = DeformableSkin(ModelSkin(model), scene_graph, labels or {}, f"{name}_skin")
+    poser = builder.AddNamedSystem(
+        f"{name}_skin_poser", SkinPoser(deformable, model.plant.num_positions())
+    )
+    builder.Connect(positions, poser.get_input_port())
+    builder.Connect(
+        poser.get_output_port(), scene_graph.get_source_configuration_port(deformable.source)
+    )
+
+
+def add_meshcat_skin(
+    builder: DiagramBuilder,
+    meshcat: Meshcat,
+    model: ArticulatedModel,
+    positions: OutputPort,
+    name: str,
+    colour: Rgba | None = None,
+    *,
+    prefix: str = "visualizer",
+    recorded: bool = False,
+) -> None:
+    """Show a model's skin in Meshcat; nothing where it has none.
+
+    Args:
+        builder: the diagram under construction.
+        meshcat: where to draw.
+        model: the body.
+        positions: the body's positions (nq,) in its model's order.
+        name: of the skin in Meshcat's tree and, with ``_meshcat_skin``, of the new system.
+        colour: in place of the bands' own colours.
+        prefix: what it lies under in Meshcat's tree: that of the MeshcatVisualizer.
+        recorded: as in MeshcatSkin.
+    """
+    if not model.skin:
+        return
+    drawer = builder.AddNamedSystem(
+        f"{name}_meshcat_skin",
+        MeshcatSkin(
+            meshcat,
+            ModelSkin(model),
+            model.plant.num_positions(),
+            f"{prefix}/{name}_skin",
+            colour,
+            recorded=recorded,
+        ),
+    )
+    builder.Connect(positions, drawer.get_input_port())

@@ -1,0 +1,1 @@
+"""Date's stages as Drake systems, and their diagram."""

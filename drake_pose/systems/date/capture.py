@@ -1,0 +1,195 @@
+"""The paper's whole capture as a ready diagram (Date et al., figure 1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pydrake.geometry import Meshcat
+from pydrake.systems.framework import (
+    DiagramBuilder,
+    InputPortIndex,
+    LeafSystem,
+    OutputPort,
+    System,
+)
+
+from drake_pose.camera import Camera
+from drake_pose.errors import SettingsError
+from drake_pose.multiview.date.capture import CaptureSetup
+from drake_pose.systems.bodies.posed_geometry import add_avatar
+from drake_pose.systems.date.face_direction_finder import FaceDirectionFinder
+from drake_pose.systems.date.feature_finder import FeatureFinder
+from drake_pose.systems.date.horizontal_image import HorizontalImage
+from drake_pose.systems.date.pose_estimator import PaperPoseEstimator
+from drake_pose.systems.date.pose_recogniser import PoseRecogniser
+from drake_pose.systems.staged_diagram import StagedDiagram
+
+
+@dataclass(frozen=True, eq=False)
+class PaperCapture(StagedDiagram):
+    """A diagram of the paper's capture, and the part of it that one asks afterwards.
+
+    Args:
+        estimator: keeps what one frame hands to the next.
+    """
+
+    estimator: PaperPoseEstimator
+
+
+def build_paper_capture(
+    setup: CaptureSetup,
+    source: System | None = None,
+    period: float = 1.0 / 30.0,
+    meshcat: Meshcat | None = None,
+) -> PaperCapture:
+    """Wire images to the paper's stages, these to the pose, and that to the avatar.
+
+    The diagram's outputs are those of ``PaperPoseEstimator``, ``person_view_<camera>`` and, where
+    the setup has what they need, ``face_direction``, ``recognised_positions`` and ``similarity``.
+    The source's inputs are the diagram's, by their names.
+
+    Args:
+        setup: the person, the cameras, and how to capture. Without a registered pose nobody is
+            found by itself: see ``PaperPoseEstimator.set_person``.
+        source: what has the output ``color_image_<camera>`` of each camera: a rig's diagram
+            (``build_camera_rig``), recorded pictures, live cameras. A camera without a background
+            in the setup needs ``label_image_<camera>``, too. A source that is not new in every
+            period has the output ``fresh``. None: the images are the diagram's inputs.
+        period: time between two frames [s].
+        meshcat: where the avatar is shown; None: nowhere.
+
+    Raises:
+        SettingsError: the source lacks an output, or the period is not positive.
+    """
+    wiring = _Wiring(setup, source)
+    estimator = wiring.add("pose", PaperPoseEstimator(setup, period))
+    wiring.add_eyes()
+    wiring.watch(estimator)
+    wiring.add_recognition(estimator)
+    wiring.add_features(estimator)
+    wiring.add_face(estimator)
+    if source is not None and source.HasOutputPort("fresh"):
+        wiring.builder.Connect(source.GetOutputPort("fresh"), estimator.GetInputPort("fresh"))
+    for port in range(estimator.num_output_ports()):
+        wiring.export(estimator.get_output_port(port))
+    if meshcat is not None:
+        positions = estimator.GetOutputPort("estimated_positions")
+        model = setup.skeleton.model
+        add_avatar(wiring.builder, model, positions, meshcat, "avatar", period)
+    return PaperCapture(wiring.builder.Build(), wiring.stages, estimator)
+
+
+class _Wiring:
+    """The diagram under construction; see build_paper_capture."""
+
+    def __init__(self, setup: CaptureSetup, source: System | None) -> None:
+        self.setup, self.source = setup, source
+        self.builder = DiagramBuilder()
+        self.stages: dict[str, tuple[OutputPort, ...]] = {}
+        self._eyes: dict[str, HorizontalImage] = {}
+        self._inputs: set[str] = set()
+        if source is not None:
+            self.builder.AddNamedSystem("source", source)
+            for index in range(source.num_input_ports()):
+                port = source.get_input_port(InputPortIndex(index))
+                self.builder.ExportInput(port, port.get_name())
+
+    def add(self, name: str, system: LeafSystem) -> LeafSystem:
+        return self.builder.AddNamedSystem(name, system)
+
+    def export(self, port: OutputPort, name: str | None = None) -> None:
+        self.builder.ExportOutput(port, name or port.get_name())
+
+    def add_eyes(self) -> None:
+        """One HorizontalImage a camera, the face camera's last."""
+        face = self.setup.face_camera
+        for camera in [*self.setup.cameras.values(), *([] if face is None else [face])]:
+            self._eyes[camera.name] = self._add_eye(camera)
+        for stage, name in (("region", "region"), ("skin", "person_view")):
+            self.stages[stage] = tuple(eye.GetOutputPort(name) for eye in self._eyes.values())
+        for name, eye in self._eyes.items():
+            self.export(eye.GetOutputPort("person_view"), f"person_view_{name}")
+
+    def _add_eye(self, camera: Camera) -> HorizontalImage:
+        name, background = camera.name, self.setup.backgrounds.get(camera.name)
+        eye = HorizontalImage(camera, background, self.setup.settings.skin)
+        self.add(f"horizontal_image_{name}", eye)
+        self._connect_image("color_image", name, eye)
+        if background is None:
+            self._connect_image("label_image", name, eye)
+        return eye
+
+    def _connect_image(self, kind: str, camera: str, system: LeafSystem) -> None:
+        """Connects a camera's image of a kind to a system's input of that name."""
+        name, port = f"{kind}_{camera}", system.GetInputPort(kind)
+        if self.source is None:
+            if name in self._inputs:
+                self.builder.ConnectInput(name, port)
+            else:
+                self.builder.ExportInput(port, name)
+                self._inputs.add(name)
+            return
+        if not self.source.HasOutputPort(name):
+            background = " (or a background in the setup)" if kind == "label_image" else ""
+            raise SettingsError(
+                f"camera '{camera}': the source needs an output port {name}{background}; it has: "
+                + ", ".join(
+                    self.source.get_output_port(k).get_name()
+                    for k in range(self.source.num_output_ports())
+                )
+            )
+        self.builder.Connect(self.source.GetOutputPort(name), port)
+
+    def watch(self, system: LeafSystem) -> None:
+        """Connects what the cameras on the circle saw."""
+        for name in self.setup.cameras:
+            view = self._eyes[name].GetOutputPort("person_view")
+            self.builder.Connect(view, system.GetInputPort(f"person_view_{name}"))
+
+    def add_recognition(self, estimator: PaperPoseEstimator) -> None:
+        """The registered pose, where there is one."""
+        setup = self.setup
+        if setup.registered is None:
+            return
+        cameras = list(setup.cameras.values())
+        recogniser = PoseRecogniser(
+            setup.skeleton, setup.registered, cameras, setup.settings.recognition
+        )
+        self.add("recognition", recogniser)
+        self.watch(recogniser)
+        self._finish("recognition", recogniser, "recognised_positions", estimator)
+        self.export(recogniser.GetOutputPort("recognised_positions"))
+        self.export(recogniser.GetOutputPort("similarity"))
+
+    def add_features(self, estimator: PaperPoseEstimator) -> None:
+        """Head, hands and feet."""
+        cameras = list(self.setup.cameras.values())
+        finder = FeatureFinder(cameras, self.setup.settings.features)
+        self.add("features", finder)
+        self.watch(finder)
+        self.builder.Connect(
+            estimator.GetOutputPort("last_features"), finder.GetInputPort("last_features")
+        )
+        self._finish("features", finder, "features", estimator)
+        self.builder.Connect(finder.GetOutputPort("support"), estimator.GetInputPort("support"))
+
+    def add_face(self, estimator: PaperPoseEstimator) -> None:
+        """The face's direction, where there is a face camera and it knows faces."""
+        camera, faces = self.setup.face_camera, self.setup.faces
+        if camera is None or faces is None:
+            return
+        finder = FaceDirectionFinder(camera, faces, self.setup.settings.farthest_face)
+        self.add("face", finder)
+        self._connect_image("color_image", camera.name, finder)
+        view = self._eyes[camera.name].GetOutputPort("person_view")
+        self.builder.Connect(view, finder.GetInputPort("person_view"))
+        self._finish("face", finder, "face_direction", estimator)
+        self.export(finder.GetOutputPort("face_direction"))
+
+    def _finish(
+        self, stage: str, system: LeafSystem, name: str, estimator: PaperPoseEstimator
+    ) -> None:
+        """A stage ends in an output that the estimator needs."""
+        port = system.GetOutputPort(name)
+        self.stages[stage] = (port,)
+        self.builder.Connect(port, estimator.GetInputPort(name))

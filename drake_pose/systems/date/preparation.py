@@ -1,0 +1,148 @@
+"""What the paper's capture must know of a person beforehand, from pictures that Drake renders."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.body import ArticulatedModel
+from drake_pose.camera import Camera, PinholeCamera
+from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.errors import UnknownNameError
+from drake_pose.multiview.date.body_pose import waist_of
+from drake_pose.multiview.date.capture import CaptureSettings, CaptureSetup, see_person
+from drake_pose.multiview.date.faces import FaceTemplates, cut_face, learn_faces
+from drake_pose.multiview.date.features import find_features
+from drake_pose.multiview.date.recognition import register_pose
+from drake_pose.multiview.date.skeleton import Skeleton, load_skeleton
+from drake_pose.multiview.date.skin_blobs import SkinColour
+from drake_pose.multiview.regions import Background, person_region
+from drake_pose.systems.pictures.camera_rig import build_camera_rig
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+
+_TURNS_DEG = np.linspace(-80.0, 80.0, 20)
+_NODS_DEG = np.linspace(-35.0, 50.0, 15)
+_FACE_SIZE = (200, 200)
+_FACE_VIEW = math.radians(11.0)
+_ONLY_CAMERA = "camera_0"
+
+
+def prepare_paper_capture(
+    model: ArticulatedModel,
+    cameras: Mapping[str, PinholeCamera],
+    face_camera: str | None,
+    q: Array,
+    pictures: Mapping[str, Picture],
+    backgrounds: Mapping[str, Background],
+    settings: CaptureSettings | None = None,
+    faces: FaceTemplates | None = None,
+) -> CaptureSetup:
+    """Makes the setup of a capture while the person shows the registered pose.
+
+    The pictures say where in its parts the person's skin is seen; the registered pose's
+    templates are rendered.
+
+    Args:
+        model: the person.
+        cameras: all of them, by name.
+        face_camera: which of them is the face camera; None: there is none.
+        q: (nq,) where the person stands, in the registered pose [rad or m].
+        pictures: (H, W, 3) that the cameras on the circle take of it, red, green, blue.
+        backgrounds: by camera.
+        settings: how to capture; the waist's constants become those of this person.
+        faces: templates of the person's face; rendered ones where not given.
+
+    Raises:
+        UnknownNameError: there is no such face camera.
+        SettingsError: fewer than two other cameras.
+        ModelError: the model is not made like the bundled person.
+    """
+    if face_camera is not None and face_camera not in cameras:
+        raise UnknownNameError("camera", face_camera, cameras, "the rig")
+    settings = settings or CaptureSettings()
+    ring = {name: camera for name, camera in cameras.items() if name != face_camera}
+    own = load_skeleton(model)
+    skeleton = own.with_features(q, _features_of(own, q, ring, pictures, backgrounds, settings))
+    rig = build_camera_rig(model, ring)
+    context = rig.diagram.CreateDefaultContext()
+
+    def draw(camera: Camera, positions: Array) -> Mask:
+        rig.set_positions(context, positions)
+        return rig.mask(context, camera.name)
+
+    registered = register_pose(skeleton, q, list(ring.values()), draw)
+    if face_camera is not None and faces is None:
+        faces = learn_rendered_faces(model, own, q, settings.skin)
+    return CaptureSetup(
+        skeleton,
+        ring,
+        None if face_camera is None else cameras[face_camera],
+        faces,
+        registered,
+        backgrounds,
+        replace(settings, waist=waist_of(skeleton)),
+    )
+
+
+def _features_of(
+    skeleton: Skeleton,
+    q: Array,
+    cameras: Mapping[str, Camera],
+    pictures: Mapping[str, Picture],
+    backgrounds: Mapping[str, Background],
+    settings: CaptureSettings,
+) -> Array:
+    """(5, 3) where the cameras see the skin of a person at q (nq,) [m]; nan where they do not."""
+    views = [
+        see_person(pictures[n], person_region(pictures[n], backgrounds[n]), settings.skin)
+        for n in cameras
+    ]
+    seen = find_features(
+        list(cameras.values()),
+        [view.blobs.centroids for view in views],
+        [view.region for view in views],
+        skeleton.features(q),
+        settings.features,
+    )
+    return np.where(seen.support[:, None] > 0, seen.places, np.nan)
+
+
+def learn_rendered_faces(
+    model: ArticulatedModel, skeleton: Skeleton, q: Array, skin: SkinColour
+) -> FaceTemplates:
+    """Templates of a model's face: 300 rendered pictures, 20 turns times 15 nods.
+
+    Args:
+        model: the person.
+        skeleton: the person's.
+        q: (nq,) positions of the rest of the body.
+        skin: which colours are skin.
+    """
+    head = skeleton.features(q)[0]
+    camera = circle_of_cameras(
+        1, height=float(head[2]), target=head, field_of_view=_FACE_VIEW, size=_FACE_SIZE
+    )[_ONLY_CAMERA]
+    azimuth = math.atan2(camera.X_WC[1, 3] - head[1], camera.X_WC[0, 3] - head[0])
+    rig = build_camera_rig(model, {_ONLY_CAMERA: camera})
+    context = rig.diagram.CreateDefaultContext()
+    faces, directions = [], []
+    for turn in np.radians(_TURNS_DEG):
+        for nod in np.radians(_NODS_DEG):
+            posed = np.array(q)
+            posed[skeleton.head_angles] = azimuth + turn, nod
+            posed[skeleton.head_positions] += head - skeleton.features(posed)[0]
+            rig.set_positions(context, posed)
+            picture = rig.picture(context, _ONLY_CAMERA)
+            view = see_person(picture, rig.mask(context, _ONLY_CAMERA), skin)
+            face = cut_face(picture, view.blobs)
+            if face is not None:
+                faces.append(face)
+                directions.append((turn, nod))
+    return learn_faces(faces, np.array(directions))

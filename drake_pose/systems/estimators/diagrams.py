@@ -1,0 +1,283 @@
+"""Ready diagrams: a simulated camera or recorded masks, the matcher, the estimated body, logs."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.geometry import (
+    ColorRenderCamera,
+    DepthRenderCamera,
+    IllustrationProperties,
+    MakeRenderEngineVtk,
+    Meshcat,
+    MeshcatVisualizer,
+    RenderEngineVtkParams,
+    Rgba,
+    Role,
+    RoleAssign,
+    SceneGraph,
+)
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex
+from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, OutputPort
+from pydrake.systems.primitives import LogVectorOutput, TrajectorySource, VectorLogSink
+from pydrake.systems.sensors import RgbdSensor
+from pydrake.trajectories import PiecewisePolynomial, Trajectory
+
+from drake_pose.body import ArticulatedModel
+from drake_pose.camera import Camera, PinholeCamera
+from drake_pose.filtering.tracking.contour_tracker import TrackingSettings
+from drake_pose.matching import PoseSearch
+from drake_pose.silhouette import Scene
+from drake_pose.systems.bodies.posed_geometry import pose_plant
+from drake_pose.systems.bodies.skin import add_meshcat_skin, add_skin
+from drake_pose.systems.estimators.mask_player import MaskPlayer
+from drake_pose.systems.estimators.silhouette_matcher import SilhouetteMatcher, label_image_port
+from drake_pose.systems.estimators.silhouette_tracker import SilhouetteTracker
+
+ESTIMATE_COLOUR = Rgba(0.0, 0.45, 0.70, 0.6)
+_RENDERER = "label_renderer"
+
+
+@dataclass(frozen=True)
+class MatchingDiagram:
+    """A diagram that matches silhouettes, and the parts of it that one asks afterwards.
+
+    Args:
+        diagram: the whole diagram.
+        matcher: the matcher in it.
+        positions_log: logs ``estimated_positions`` once a period.
+        error_log: logs ``error`` once a period.
+        player: what plays the masks; None where a camera is simulated.
+    """
+
+    diagram: Diagram
+    matcher: SilhouetteMatcher
+    positions_log: VectorLogSink
+    error_log: VectorLogSink
+    player: MaskPlayer | None = None
+
+
+def build_recorded_matching(
+    scene: Scene,
+    search: PoseSearch,
+    cameras: Sequence[Camera],
+    frames: Sequence[str] | None = None,
+    root_positions: Mapping[str, np.ndarray] | None = None,
+    meshcat: Meshcat | None = None,
+    tracking: TrackingSettings | None = None,
+) -> MatchingDiagram:
+    """Wire recorded masks to the matcher: MaskPlayer -> SilhouetteMatcher -> logs, Meshcat.
+
+    Args:
+        scene: the recorded scene.
+        search: the search, made for the body's pose tree.
+        cameras: the cameras to use, matched together.
+        frames: the frames to play; all where not given.
+        root_positions: the root's position (3,) in the world for each frame [m]; the pose tree's
+            own where not given.
+        meshcat: where to show the estimated body; nowhere where not given.
+        tracking: how the body moves from frame to frame: it is matched in the first one, tracked
+            from there, and matched again after a loss. Every frame is matched where not given.
+
+    Returns:
+        The diagram; frame k is matched at time k times the player's period.
+    """
+    builder = DiagramBuilder()
+    player = builder.AddNamedSystem("mask_player", MaskPlayer(scene, cameras, frames))
+    matcher = builder.AddNamedSystem(
+        "silhouette_matcher", _make_matcher(search, cameras, player.period, tracking)
+    )
+    for camera in cameras:
+        port = label_image_port(camera, cameras)
+        builder.Connect(player.GetOutputPort(port), matcher.GetInputPort(port))
+    if root_positions is not None:
+        values = np.array([root_positions[frame] for frame in player.frames], dtype=float)
+        # A hold needs two breaks; the last position is held on behind the last frame.
+        values = np.vstack([values, values[-1:]])
+        # A frame's position must stand just before its match is computed, in spite of rounding.
+        breaks = player.period * (np.arange(len(values)) - 1e-6)
+        breaks[0] = 0.0
+        positions = PiecewisePolynomial.ZeroOrderHold(breaks, values.T)
+        source = builder.AddNamedSystem("root_position", TrajectorySource(positions))
+        builder.Connect(source.get_output_port(), matcher.GetInputPort("root_position"))
+    if meshcat is not None:
+        scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
+        model, estimate = search.tree.model, matcher.GetOutputPort("estimated_positions")
+        add_posed_body(builder, scene_graph, model, matcher, "estimated")
+        MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
+        add_meshcat_skin(builder, meshcat, model, estimate, "estimated")
+    return _finish(builder, matcher, player.period, player)
+
+
+def build_simulated_matching(
+    search: PoseSearch,
+    cameras: Sequence[Camera],
+    true_positions: Trajectory | np.ndarray,
+    period: float,
+    meshcat: Meshcat | None = None,
+    tracking: TrackingSettings | None = None,
+) -> MatchingDiagram:
+    """Wire a simulated body and camera to the matcher, and show the estimate beside the truth.
+
+    The true body moves on a given trajectory; RgbdSensors see it; the matcher's estimate poses a
+    second body in the same SceneGraph, which the sensors do not see.
+
+    Args:
+        search: the search, made for the body's pose tree.
+        cameras: where the sensors are.
+        true_positions: the true body's positions (nq,), constant or over time.
+        period: time between two images, and two matches [s].
+        meshcat: where to show both bodies; nowhere where not given.
+        tracking: as for ``build_recorded_matching``.
+
+    Returns:
+        The diagram.
+    """
+    builder = DiagramBuilder()
+    model = search.tree.model
+    scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
+    matcher = builder.AddNamedSystem(
+        "silhouette_matcher", _make_matcher(search, cameras, period, tracking)
+    )
+    truth, images = add_simulated_cameras(builder, scene_graph, model, cameras, true_positions)
+    for camera, image in zip(cameras, images, strict=True):
+        builder.Connect(image, matcher.GetInputPort(label_image_port(camera, cameras)))
+    if meshcat is not None:
+        add_posed_body(builder, scene_graph, model, matcher, "estimated", ESTIMATE_COLOUR)
+        MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
+        estimate = matcher.GetOutputPort("estimated_positions")
+        add_meshcat_skin(builder, meshcat, model, truth, "true")
+        add_meshcat_skin(builder, meshcat, model, estimate, "estimated", ESTIMATE_COLOUR)
+    return _finish(builder, matcher, period, None)
+
+
+def add_simulated_cameras(
+    builder: DiagramBuilder,
+    scene_graph: SceneGraph,
+    model: ArticulatedModel,
+    cameras: Sequence[Camera],
+    true_positions: Trajectory | np.ndarray,
+) -> tuple[OutputPort, list[OutputPort]]:
+    """Add a body that moves on a given trajectory, and RgbdSensors that see it.
+
+    Args:
+        builder: the diagram under construction.
+        scene_graph: where the body's geometry goes.
+        model: the body.
+        cameras: where the sensors are.
+        true_positions: the body's positions (nq,), constant or over time.
+
+    Returns:
+        The port of the positions, and that of each camera's label image.
+    """
+    if isinstance(true_positions, np.ndarray):
+        true_positions = PiecewisePolynomial(true_positions.reshape(-1, 1))
+    truth = builder.AddNamedSystem("true_positions", TrajectorySource(true_positions))
+    plant = MultibodyPlant(0.0)
+    plant.RegisterAsSourceForSceneGraph(scene_graph)
+    model.add_to(plant, scene_graph, prefix="true")
+    scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(RenderEngineVtkParams()))
+    pose_plant(builder, scene_graph, plant, truth.get_output_port(), "true_geometry_pose")
+    labels = {name: label for label, name in enumerate(model.link_names)}
+    add_skin(builder, scene_graph, model, truth.get_output_port(), "true", labels)
+    images = []
+    for camera in cameras:
+        colour_camera, depth_camera, X_WC = _drake_camera(camera, model, true_positions)
+        sensor = builder.AddNamedSystem(
+            f"camera_{camera.name}",
+            RgbdSensor(scene_graph.world_frame_id(), X_WC, colour_camera, depth_camera),
+        )
+        builder.Connect(scene_graph.get_query_output_port(), sensor.query_object_input_port())
+        images.append(sensor.label_image_output_port())
+    return truth.get_output_port(), images
+
+
+def _make_matcher(
+    search: PoseSearch,
+    cameras: Sequence[Camera],
+    period: float,
+    tracking: TrackingSettings | None,
+) -> SilhouetteMatcher:
+    if tracking is None:
+        return SilhouetteMatcher(search, cameras, period)
+    return SilhouetteTracker(search, cameras, period, tracking=tracking)
+
+
+def _drake_camera(
+    camera: Camera, model: ArticulatedModel, true_positions: Trajectory
+) -> tuple[ColorRenderCamera, DepthRenderCamera, RigidTransform]:
+    """Drake's cameras; a parallel one becomes a tele camera that is clipped about the body."""
+    if isinstance(camera, PinholeCamera):
+        return camera.to_drake(renderer_name=_RENDERER)
+    start, end = true_positions.start_time(), true_positions.end_time()
+    # A constant has no end.
+    times = np.linspace(start, end, 100) if np.isfinite([start, end]).all() else np.zeros(1)
+    tree = model.pose_tree()
+    depths = []
+    for time in times:
+        values = tree.values_from_positions(true_positions.value(time).ravel())
+        for node, taken, X_WN in zip(tree.nodes, values, tree.node_poses(values), strict=True):
+            p_N = node.surface(taken).vertices
+            depths.append(camera.project(p_N @ X_WN[:3, :3].T + X_WN[:3, 3])[1])
+    everything = np.concatenate(depths)
+    # A body that moves fast may reach further between the times looked at.
+    margin = 0.5 + 0.1 * float(np.ptp(everything))
+    depth_range = (float(everything.min()) - margin, float(everything.max()) + margin)
+    return camera.to_drake(renderer_name=_RENDERER, depth_range=depth_range)
+
+
+def add_posed_body(
+    builder: DiagramBuilder,
+    scene_graph: SceneGraph,
+    model: ArticulatedModel,
+    estimator: LeafSystem,
+    name: str,
+    colour: Rgba | None = None,
+) -> MultibodyPlant:
+    """Add a body that stands as is estimated, for the eye only: no sensor sees it.
+
+    Args:
+        builder: the diagram under construction.
+        scene_graph: where the body's geometry goes.
+        model: the body.
+        estimator: its output ``estimated_positions`` poses the body.
+        name: prefix of the body's name in the SceneGraph.
+        colour: in place of the body's own colours.
+
+    Returns:
+        The body's plant, finalized.
+    """
+    plant = MultibodyPlant(0.0)
+    plant.RegisterAsSourceForSceneGraph(scene_graph)
+    model.add_to(plant, scene_graph, prefix=name)
+    estimate = estimator.GetOutputPort("estimated_positions")
+    pose_plant(builder, scene_graph, plant, estimate, f"{name}_geometry_pose")
+    source = plant.get_source_id()
+    inspector = scene_graph.model_inspector()
+    for index in range(plant.num_bodies()):
+        frame = plant.GetBodyFrameIdOrThrow(BodyIndex(index))
+        for geometry in inspector.GetGeometries(frame):
+            # Other bodies' skin hangs on the world's frame, too.
+            if not inspector.BelongsToSource(geometry, source):
+                continue
+            if inspector.GetPerceptionProperties(geometry) is not None:
+                scene_graph.RemoveRole(source, geometry, Role.kPerception)
+            if colour is not None and inspector.GetIllustrationProperties(geometry) is not None:
+                properties = IllustrationProperties()
+                properties.AddProperty("phong", "diffuse", colour)
+                scene_graph.AssignRole(source, geometry, properties, RoleAssign.kReplace)
+    return plant
+
+
+def _finish(
+    builder: DiagramBuilder, matcher: SilhouetteMatcher, period: float, player: MaskPlayer | None
+) -> MatchingDiagram:
+    """Add the logs and build."""
+    # A log samples just before the update of the same time: sample k + 1 holds frame k's estimate.
+    positions_log = LogVectorOutput(
+        matcher.GetOutputPort("estimated_positions"), builder, publish_period=period
+    )
+    error_log = LogVectorOutput(matcher.GetOutputPort("error"), builder, publish_period=period)
+    return MatchingDiagram(builder.Build(), matcher, positions_log, error_log, player)

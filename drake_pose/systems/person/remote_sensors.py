@@ -1,0 +1,57 @@
+"""What cameras elsewhere say of the person, as a Drake system."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import Context, DependencyTicket
+
+from drake_pose.camera import Camera
+from drake_pose.camera.sources.frame_source import FrameSource
+from drake_pose.multiview.person.view_packing import unpack_view
+from drake_pose.systems.pictures.picture_capture import PictureCapture
+
+
+class RemoteEyes(PictureCapture):
+    """Gives the synchronised views of cameras whose pictures stay on other machines.
+
+    .. pydrake_system::
+
+        name: RemoteEyes
+        output_ports:
+        - silhouette_<camera>
+        - time
+        - fresh
+
+    As PictureCapture, but its sources deliver packed views (bytes (n,) of pack_view) in place of
+    pictures, and its outputs are what SilhouetteEye gives: a SilhouetteView, or None where the
+    camera gave no picture at that moment.
+    """
+
+    def _declare_outputs(
+        self, cameras: Mapping[str, Camera], ticket: set[DependencyTicket]
+    ) -> None:
+        for name in self._sources:
+            self.DeclareAbstractOutputPort(
+                f"silhouette_{name}",
+                lambda: AbstractValue.Make(None),
+                self._calc_silhouette(name),
+                ticket,
+            )
+
+    def overdue(self, camera: str) -> float:
+        """The time stamp up to which a camera's pictures come too late [s]."""
+        return -np.inf if self.moment is None else self._origins[camera] + self.moment.time
+
+    def _feed(self, name: str, source: FrameSource, now: float) -> None:
+        """Hands on the views of a camera that are due; one that is silent is waited for."""
+        self._feed_due(name, source, now)
+
+    def _calc_silhouette(self, name: str) -> Callable[[Context, AbstractValue], None]:
+        def calc(context: Context, output: AbstractValue) -> None:
+            packed = self._picture(name)
+            output.set_value(None if packed is None else unpack_view(packed.tobytes()))
+
+        return calc

@@ -1,0 +1,1 @@
+"""Pictures as Drake systems: simulated cameras, recordings, live cameras."""

@@ -1,0 +1,1 @@
+"""The walk-through: a captured person walks through a garden by gestures."""

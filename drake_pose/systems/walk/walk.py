@@ -1,0 +1,322 @@
+"""The walk-through (Date, section 6.2): a captured person walks through a place by gestures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import Meshcat
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    Diagram,
+    DiagramBuilder,
+    DiscreteValues,
+    EventStatus,
+    LeafSystem,
+    OutputPort,
+)
+from pydrake.systems.primitives import TrajectorySource
+from pydrake.trajectories import Trajectory
+
+from drake_pose.body import ArticulatedModel
+from drake_pose.errors import SettingsError, UnknownNameError
+from drake_pose.multiview.date.walk_commands import (
+    NO_COMMAND,
+    WalkSettings,
+    follow_command,
+    recognise_command,
+    stance_of,
+)
+from drake_pose.systems.bodies.posed_geometry import add_avatar
+from drake_pose.systems.walk.garden import (
+    HALF_SIZE,
+    START,
+    draw_place,
+    look_over_shoulder,
+    place_obstacles,
+    walker_transform,
+)
+
+Array = NDArray[np.float64]
+
+KEYS = {"ahead": "ArrowUp", "behind": "ArrowDown", "left": "ArrowLeft", "right": "ArrowRight"}
+"""Meshcat's buttons and the keys that press them."""
+
+_PARTS = ("head", "left_foot", "right_foot")
+_WALKER = "walker"
+# Who stands still moves head and feet by no more [m], and turns the face by no more [rad].
+_STILL, _FACING = 0.08, 0.25
+# Nobody turns the face by more from one frame to the next [rad].
+_AROUND = math.radians(100.0)
+# A key that is held down is pressed again and again, but first after half a second.
+_HELD = 0.55
+
+
+class Walker(LeafSystem):
+    """Recognises commands in a person's poses and follows them through a place.
+
+    .. pydrake_system::
+
+        name: Walker
+        input_ports:
+        - positions
+        - keys
+        output_ports:
+        - walker_pose
+        - command
+        - rest
+        - avatar_positions
+
+    The first pose in which the person stands still is the rest: where and which way the person
+    stands without a command. Until then, and while ``positions`` are not finite, nobody is there
+    who could command. Whoever turns around from one frame to the next was taken for facing the
+    wrong way, at rest too: the rest turns around with the person. ``keys`` (turn,
+    walk) may stay unconnected; where not 0 it goes before the gestures. Outputs: the walker's x, y
+    [m] and heading [rad] in the place; the command (turn, walk); the rest (5), nan until somebody
+    was seen; and the last known positions (nq).
+
+    Args:
+        model: the person, with the links head, left_foot and right_foot.
+        standing: (nq,) avatar_positions until somebody was seen [rad or m].
+        period: time between two frames [s].
+        settings: thresholds and speeds.
+        settle: how long the person must stand still at first [s]; 0: the first pose is the rest.
+
+    Raises:
+        SettingsError: the period is not positive, or the time to settle negative.
+        UnknownNameError: a link is missing.
+    """
+
+    def __init__(
+        self,
+        model: ArticulatedModel,
+        standing: Array,
+        period: float,
+        settings: WalkSettings | None = None,
+        settle: float = 0.0,
+    ) -> None:
+        super().__init__()
+        if not period > 0:
+            raise SettingsError(f"the walker's period must be positive, not {period}")
+        if not settle >= 0:
+            raise SettingsError(f"the time to settle must be 0 s or more, not {settle}")
+        for part in _PARTS:
+            if part not in model.link_names:
+                raise UnknownNameError("link", part, model.link_names, str(model.path))
+        self._plant, self._period = model.plant, period
+        self._plant_context = model.plant.CreateDefaultContext()
+        self._settings = settings or WalkSettings()
+        self._obstacles = place_obstacles()
+        self._positions = self.DeclareVectorInputPort("positions", len(standing))
+        self._keys = self.DeclareVectorInputPort("keys", 2)
+        starts = {
+            "walker_pose": np.array(START),
+            "command": np.zeros(2),
+            "rest": np.full(5, np.nan),
+            "avatar_positions": standing,
+        }
+        self._settle = settle
+        # The stance that the person may be settling in, and since when [s].
+        self._settling = self.DeclareDiscreteState(np.append(np.full(5, np.nan), 0.0))
+        self._heading = self.DeclareDiscreteState(np.full(1, np.nan))
+        self._states = {name: self.DeclareDiscreteState(start) for name, start in starts.items()}
+        for name, state in self._states.items():
+            self.DeclareStateOutputPort(name, state)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._walk)
+
+    def _walk(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        states = {
+            name: context.get_discrete_state(index).value() for name, index in self._states.items()
+        }
+        turn, walk = NO_COMMAND
+        q = self._positions.Eval(context)
+        heading = np.nan
+        if np.isfinite(q).all():
+            discrete_state.set_value(self._states["avatar_positions"], q)
+            stance, rest = self._stance(q), states["rest"]
+            heading = stance[0]
+            turned = math.remainder(
+                heading - context.get_discrete_state(self._heading).value()[0], 2.0 * math.pi
+            )
+            if abs(turned) > _AROUND:
+                rest = rest + np.array([turned, 0.0, 0.0, 0.0, 0.0])
+                discrete_state.set_value(self._states["rest"], rest)
+            if not np.isfinite(rest).all() and self._is_settled(stance, context, discrete_state):
+                rest = stance
+                discrete_state.set_value(self._states["rest"], rest)
+            if np.isfinite(rest).all():
+                last = states["command"].astype(int)
+                turn, walk = recognise_command(stance, rest, (last[0], last[1]), self._settings)
+        discrete_state.set_value(self._heading, np.array([heading]))
+        if self._keys.HasValue(context):
+            pressed = self._keys.Eval(context).astype(int)
+            turn, walk = int(pressed[0]) or turn, int(pressed[1]) or walk
+        pose = follow_command(
+            states["walker_pose"],
+            (turn, walk),
+            self._period,
+            self._settings,
+            HALF_SIZE,
+            self._obstacles,
+        )
+        discrete_state.set_value(self._states["command"], np.array([turn, walk], dtype=float))
+        discrete_state.set_value(self._states["walker_pose"], pose)
+        return EventStatus.Succeeded()
+
+    def _is_settled(self, stance: Array, context: Context, discrete_state: DiscreteValues) -> bool:
+        """Whether the person has stood still for long enough."""
+        settling = context.get_discrete_state(self._settling).value()
+        moved = np.abs(stance - settling[:5])
+        still = bool((moved[1:] <= _STILL).all() and moved[0] <= _FACING)
+        if not still:
+            settling = np.append(stance, context.get_time())
+            discrete_state.set_value(self._settling, settling)
+        return bool(context.get_time() - settling[5] >= self._settle)
+
+    def _stance(self, q: Array) -> Array:
+        self._plant.SetPositions(self._plant_context, q)
+        X_WL = [
+            self._plant.GetBodyByName(part).EvalPoseInWorld(self._plant_context) for part in _PARTS
+        ]
+        left_W = X_WL[0].rotation().col(0)
+        feet = np.array([X.translation() for X in X_WL[1:]])
+        return stance_of(left_W, X_WL[0].translation(), feet)
+
+
+class WalkKeys(LeafSystem):
+    """Reads Meshcat's buttons, or the arrow keys, as commands.
+
+    .. pydrake_system::
+
+        name: WalkKeys
+        output_ports:
+        - keys
+        - positions
+
+    ``keys`` is turn (1 left, -1 right) and walk (1 ahead, -1 behind); ``positions`` is a person
+    who strides while a key is held, and stands otherwise.
+
+    Args:
+        meshcat: gets the buttons.
+        stride: (n, nq) positions of one stride that ends standing [rad or m].
+        period: time between two looks at the buttons, and between two of these [s].
+    """
+
+    def __init__(self, meshcat: Meshcat, stride: Array, period: float) -> None:
+        super().__init__()
+        self._meshcat, self._stride, self._period = meshcat, stride, period
+        for name, key in KEYS.items():
+            meshcat.AddButton(name, key)
+        # By button: how often it was pressed, and how much longer that counts [s].
+        self._pressed = self.DeclareDiscreteState(len(KEYS))
+        self._left = self.DeclareDiscreteState(len(KEYS))
+        self._frame = self.DeclareDiscreteState(1)
+        ticket = {self.discrete_state_ticket(self._left)}
+        self.DeclareVectorOutputPort("keys", 2, self._calc_keys, ticket)
+        ticket = {self.discrete_state_ticket(self._frame)}
+        self.DeclareVectorOutputPort("positions", stride.shape[1], self._calc_positions, ticket)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._look)
+
+    def _look(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        before = context.get_discrete_state(self._pressed).value()
+        left = context.get_discrete_state(self._left).value()
+        pressed = np.array([float(self._meshcat.GetButtonClicks(name)) for name in KEYS])
+        left = np.where(pressed > before, _HELD, np.maximum(left - self._period, 0.0))
+        frame = int(context.get_discrete_state(self._frame).value()[0])
+        if left.any() or frame:
+            frame = (frame + 1) % len(self._stride)
+        discrete_state.set_value(self._pressed, pressed)
+        discrete_state.set_value(self._left, left)
+        discrete_state.set_value(self._frame, np.array([float(frame)]))
+        return EventStatus.Succeeded()
+
+    def _calc_keys(self, context: Context, output: BasicVector) -> None:
+        ahead, behind, left, right = context.get_discrete_state(self._left).value() > 0.0
+        output.SetFromVector([float(left) - float(right), float(ahead) - float(behind)])
+
+    def _calc_positions(self, context: Context, output: BasicVector) -> None:
+        frame = int(context.get_discrete_state(self._frame).value()[0])
+        output.SetFromVector(self._stride[frame - 1])
+
+
+class WalkView(LeafSystem):
+    """Moves the avatar through the place in Meshcat, and the view with it.
+
+    .. pydrake_system::
+
+        name: WalkView
+        input_ports:
+        - walker_pose
+        - rest
+
+    Args:
+        meshcat: where the avatar is drawn, below the path ``walker``.
+        period: time between two pictures [s].
+    """
+
+    def __init__(self, meshcat: Meshcat, period: float) -> None:
+        super().__init__()
+        self._meshcat = meshcat
+        self._pose = self.DeclareVectorInputPort("walker_pose", 3)
+        self._rest = self.DeclareVectorInputPort("rest", 5)
+        self.DeclarePeriodicPublishEvent(period, 0.0, self._show)
+        self.DeclareForcedPublishEvent(self._show)
+
+    def _show(self, context: Context) -> EventStatus:
+        pose, rest = self._pose.Eval(context), self._rest.Eval(context)
+        if np.isfinite(rest).all():
+            self._meshcat.SetTransform(_WALKER, walker_transform(pose, rest))
+        look_over_shoulder(self._meshcat, pose)
+        return EventStatus.Succeeded()
+
+
+AddPositions = Callable[[DiagramBuilder], OutputPort]
+"""Adds systems to a diagram under construction; the port is that of the person's positions (nq)."""
+
+
+def build_walk(
+    model: ArticulatedModel,
+    meshcat: Meshcat,
+    positions: Trajectory | AddPositions | None,
+    stride: Array,
+    period: float = 1.0 / 30.0,
+    settings: WalkSettings | None = None,
+    settle: float = 0.0,
+) -> Diagram:
+    """A place in Meshcat and a person who walks through it by gestures or keys.
+
+    The diagram's outputs are ``walker_pose`` and ``command``.
+
+    Args:
+        model: the person.
+        meshcat: where all is drawn.
+        positions: the person's positions (nq,) over time, in a room with z upward, nan where not
+            found; or what adds the systems that give them; None: the keys alone.
+        stride: (n, nq) one stride on the spot that ends standing, for the keys.
+        period: time between two frames [s].
+        settings: thresholds and speeds.
+        settle: how long the person must stand still at first [s]; 0: the first pose is the rest.
+    """
+    draw_place(meshcat)
+    builder = DiagramBuilder()
+    keys = builder.AddNamedSystem("keys", WalkKeys(meshcat, stride, period))
+    walker = builder.AddNamedSystem("walker", Walker(model, stride[-1], period, settings, settle))
+    if positions is None:
+        source = keys.GetOutputPort("positions")
+    elif callable(positions):
+        source = positions(builder)
+    else:
+        source = builder.AddNamedSystem("positions", TrajectorySource(positions)).get_output_port()
+    builder.Connect(source, walker.GetInputPort("positions"))
+    builder.Connect(keys.GetOutputPort("keys"), walker.GetInputPort("keys"))
+    view = builder.AddNamedSystem("view", WalkView(meshcat, period))
+    for name in ("walker_pose", "rest"):
+        builder.Connect(walker.GetOutputPort(name), view.GetInputPort(name))
+    avatar = walker.GetOutputPort("avatar_positions")
+    add_avatar(builder, model, avatar, meshcat, f"{_WALKER}/avatar", period)
+    for name in ("walker_pose", "command"):
+        builder.ExportOutput(walker.GetOutputPort(name), name)
+    return builder.Build()

@@ -1,0 +1,153 @@
+import re
+import struct
+import time
+
+import numpy as np
+import pytest
+import trimesh
+from pydrake.geometry import ReadObjToTriangleSurfaceMesh
+
+from drake_pose.body import load_model
+from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.body.surfaces.mesh_files import drawable_file, read_mesh_file, write_obj
+from drake_pose.errors import ModelError
+from tests.body.models import write
+
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]], dtype=float)
+FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+
+
+def tetrahedron() -> trimesh.Trimesh:
+    return trimesh.Trimesh(CORNERS, FACES, process=False)
+
+
+def assert_tetrahedron(mesh: TriangleMesh, scale: float = 1.0) -> None:
+    assert len(mesh.vertices) == 4
+    places = {tuple(np.round(corner, 6)) for corner in mesh.vertices[mesh.triangles].reshape(-1, 3)}
+    assert places == {tuple(corner) for corner in np.round(CORNERS * scale, 6)}
+    # The divergence theorem: right only where every triangle looks outward.
+    a, b, c = mesh.vertices[mesh.triangles].transpose(1, 0, 2)
+    assert np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0 == pytest.approx(scale**3)
+
+
+def binary_stl() -> bytes:
+    return tetrahedron().export(file_type="stl")
+
+
+def text_stl() -> str:
+    return tetrahedron().export(file_type="stl_ascii")
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        binary_stl(),
+        b"solid made by a program".ljust(80) + binary_stl()[80:],
+        text_stl().encode(),
+        text_stl().replace("solid", "solid Gelenk", 1).encode(),
+        "solid Gelenkst\xfcck\n".encode("latin-1") + text_stl().split("\n", 1)[1].encode(),
+        text_stl().replace("\n", "\r\n").upper().encode(),
+    ],
+    ids=["binary", "binary solid", "text", "named", "latin1", "upper"],
+)
+def test_stl_files_of_every_kind_are_read(tmp_path, data):
+    (tmp_path / "t.stl").write_bytes(data)
+    assert_tetrahedron(read_mesh_file(tmp_path / "t.stl"))
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        binary_stl()[:-20],
+        binary_stl()[:80] + struct.pack("<I", 3) + binary_stl()[84:],
+        binary_stl()[:80] + struct.pack("<I", 2**31) + binary_stl()[84:],
+        b"solid".ljust(80) + struct.pack("<I", 9) + binary_stl()[84:],
+        text_stl()[: len(text_stl()) // 2].encode(),
+        text_stl().replace("vertex", "vortex", 1).encode(),
+        text_stl().replace("3.0", "3,x").encode(),
+        b"",
+    ],
+    ids=["truncated", "fewer", "more", "solid", "half text", "spoiled text", "no number", "empty"],
+)
+def test_stl_files_that_lie_or_end_early_are_refused_with_link_and_mesh(tmp_path, data):
+    (tmp_path / "t.stl").write_bytes(data)
+    text = (
+        '<robot name="r"><link name="hand"><visual><geometry><mesh filename="t.stl"/></geometry>'
+        "</visual></link></robot>"
+    )
+    with pytest.raises(ModelError, match=r"'hand'.*t\.stl") as caught:
+        load_model(write(tmp_path, text), check=False)
+    assert "charset" not in str(caught.value)
+
+
+def test_a_dae_file_needs_no_texture_and_is_in_metres(tmp_path):
+    mesh = tetrahedron()
+    pixels = trimesh.visual.texture.SimpleMaterial()
+    mesh.visual = trimesh.visual.TextureVisuals(uv=np.zeros((4, 2)), material=pixels)
+    text = mesh.export(file_type="dae").decode()
+    image = '<library_images><image id="i"><init_from>no.png</init_from></image></library_images>'
+    sampler = (
+        '<newparam sid="s"><surface type="2D"><init_from>i</init_from></surface></newparam>'
+        '<newparam sid="p"><sampler2D><source>s</source></sampler2D></newparam>'
+    )
+    text = text.replace("<library_effects>", f"{image}<library_effects>")
+    text = text.replace("<profile_COMMON>", f"<profile_COMMON>{sampler}")
+    colour = r"<diffuse>.*?</diffuse>"
+    text = re.sub(colour, '<diffuse><texture texture="p" texcoord="u"/></diffuse>', text, flags=16)
+    assert "no.png" in text
+    assert 'texture="p"' in text
+    unit = '<unit name="inch" meter="0.0254"/><up_axis>'
+    path = write(tmp_path, text.replace("<up_axis>", unit), "t.dae")
+    assert_tetrahedron(read_mesh_file(path), 0.0254)
+    broken = write(tmp_path, text.replace("<source>s<", "<source>gone<"), "broken.dae")
+    assert_tetrahedron(read_mesh_file(broken))
+
+
+def test_mujocos_own_mesh_files_are_read(tmp_path):
+    counts = struct.pack("<4i", 4, 1, 2, 4)
+    floats = np.concatenate([CORNERS.ravel(), np.zeros(3 + 4)]).astype("<f4").tobytes()
+    data = counts + floats + FACES.astype("<i4").tobytes()
+    (tmp_path / "t.msh").write_bytes(data)
+    assert_tetrahedron(read_mesh_file(tmp_path / "t.msh"))
+    (tmp_path / "short.msh").write_bytes(data[:-4])
+    with pytest.raises(ModelError, match=r"short\.msh.*truncated"):
+        read_mesh_file(tmp_path / "short.msh")
+
+
+def test_written_meshes_are_what_drake_reads(tmp_path):
+    random = np.random.default_rng(2)
+    points = random.normal(size=(70000, 3))
+    triangles = random.integers(0, len(points), size=(70000, 3), dtype=np.int32)
+    path = write_obj(TriangleMesh(points, triangles), "name with / and \xe9")
+    surface = ReadObjToTriangleSurfaceMesh(path)
+    np.testing.assert_allclose(np.array(surface.vertices()), points, rtol=1e-14, atol=0.0)
+    faces = surface.triangles()
+    for index in random.integers(0, len(faces), size=1000):
+        assert [faces[index].vertex(corner) for corner in range(3)] == list(triangles[index])
+    # Another surface of the same name is another file, and the same one is not.
+    assert write_obj(TriangleMesh(points + 1.0, triangles), "name with / and \xe9") != path
+    (tmp_path / "t.stl").write_bytes(binary_stl())
+    assert drawable_file(tmp_path / "t.stl") == drawable_file(tmp_path / "t.stl")
+
+
+@pytest.mark.slow
+def test_a_million_triangles_are_read_within_15_seconds(tmp_path):
+    side = 708
+    x, y = np.meshgrid(np.arange(side, dtype=float), np.arange(side, dtype=float))
+    points = np.stack([x, y, np.sin(x) * np.cos(y)], axis=-1).reshape(-1, 3)
+    index = np.arange(side * side, dtype=np.int32).reshape(side, side)
+    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
+    triangles = np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
+    corners = np.zeros(len(triangles), [("n", "<f4", 3), ("v", "<f4", (3, 3)), ("a", "<u2")])
+    corners["v"] = points[triangles]
+    count = struct.pack("<I", len(triangles))
+    (tmp_path / "t.stl").write_bytes(bytes(80) + count + corners.tobytes())
+    text = (
+        '<robot name="r"><link name="hand"><visual><geometry><mesh filename="t.stl"/></geometry>'
+        "</visual></link></robot>"
+    )
+    begin = time.process_time()
+    mesh = load_model(write(tmp_path, text), check=False).link_meshes["hand"]
+    assert time.process_time() - begin < 15.0
+    assert len(mesh.triangles) == len(triangles) > 999_000
+    assert len(mesh.vertices) == side * side

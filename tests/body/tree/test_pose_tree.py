@@ -1,0 +1,362 @@
+import numpy as np
+import pytest
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+
+from drake_pose.body import ArticulatedModel, PoseTree, RootRotation, bundled_model, load_model
+from drake_pose.body.tree.joint_map import JointMap
+from drake_pose.errors import ModelError, SettingsError, UnknownNameError
+from tests.body.models import (
+    FLOATING_URDF,
+    JOINTED_BASE_URDF,
+    JOINTS_SDF,
+    SPHERE,
+    WELDED_URDF,
+    joint,
+    link,
+    urdf,
+    write,
+)
+
+
+def largest_difference_from_drake(
+    model: ArticulatedModel, tree: PoseTree, *, samples: int = 20
+) -> float:
+    """Compare node_poses, positions_from and values_from_positions with the plant."""
+    random = np.random.default_rng(1)
+    context = model.plant.CreateDefaultContext()
+    worst = 0.0
+    for _ in range(samples):
+        values = [random.uniform(*tree.value_bounds(i)) for i in range(len(tree.nodes))]
+        X_WN = tree.node_poses(values)
+        q, X_WB = tree.positions_from(values)
+        model.plant.SetPositions(context, q)
+        again = tree.node_poses(tree.values_from_positions(q, X_WB))
+        worst = max(worst, np.abs(again - X_WN).max())
+        for node, X in zip(tree.nodes, X_WN, strict=True):
+            body = model.plant.GetBodyByName(node.name)
+            X_BN = model.plant.EvalBodyPoseInWorld(context, body).GetAsMatrix4()
+            worst = max(worst, np.abs(X_WB @ X_BN - X).max())
+        for node, node_values in zip(tree.nodes, values, strict=True):
+            assert np.all(q[list(node.positions)] == node_values[: len(node.positions)])
+    return worst
+
+
+@pytest.fixture(scope="module")
+def floating(tmp_path_factory):
+    return load_model(write(tmp_path_factory.mktemp("f"), FLOATING_URDF), check=False)
+
+
+@pytest.fixture(scope="module")
+def jointed(tmp_path_factory):
+    return load_model(write(tmp_path_factory.mktemp("j"), JOINTED_BASE_URDF), check=False)
+
+
+@pytest.fixture(scope="module")
+def welded(tmp_path_factory):
+    return load_model(write(tmp_path_factory.mktemp("w"), WELDED_URDF), check=False)
+
+
+@pytest.fixture(scope="module")
+def all_joints(tmp_path_factory):
+    path = write(tmp_path_factory.mktemp("s"), JOINTS_SDF, "joints.sdf")
+    return load_model(path, check=False)
+
+
+def test_links_without_geometry_make_one_node_and_welded_links_merge(floating):
+    tree = floating.pose_tree()
+    assert [node.name for node in tree.nodes] == ["trunk", "arm", "leg", "hand"]
+    assert [node.parent for node in tree.nodes] == [-1, 0, 0, 1]
+    assert [node.depth for node in tree.nodes] == [0, 1, 1, 2]
+    assert tree.nodes[0].children == (1, 2)
+    assert tree.nodes[1].position_names == ("shoulder_x", "shoulder_y")
+    assert tree.leaves == (2, 3)
+    assert tree.unobserved_positions == ("toe_joint",)
+    hand = floating.link_meshes["hand"].triangles
+    welded = floating.link_meshes["welded"].triangles
+    assert len(tree.nodes[3].mesh.triangles) == len(hand) + len(welded)
+
+
+@pytest.mark.parametrize(
+    "rotation",
+    [
+        None,
+        RootRotation.fixed(),
+        RootRotation.limited([("y", -170.0, 180.0), ("z", -10.0, 10.0)]),
+    ],
+)
+@pytest.mark.parametrize("root", [None, "trunk", "arm", "hand", "welded", "leg"])
+def test_floating_base_agrees_with_drake(floating, root, rotation):
+    tree = floating.pose_tree(root, root_position=[0.3, 0.2, 0.1], root_rotation=rotation)
+    assert largest_difference_from_drake(floating, tree) < 1e-9
+    if root is not None:
+        assert tree.nodes[0].name == root
+        np.testing.assert_allclose(
+            tree.node_poses(tree.default_values())[0][:3, 3], [0.3, 0.2, 0.1]
+        )
+
+
+@pytest.mark.parametrize("root", ["head", "chest", "arm"])
+@pytest.mark.parametrize("rotation", [None, RootRotation.free(20.0)])
+def test_jointed_base_agrees_with_drake(jointed, root, rotation):
+    tree = jointed.pose_tree(root, root_position=[0.3, 0.2, 0.1], root_rotation=rotation)
+    assert largest_difference_from_drake(jointed, tree, samples=8) < 1e-9
+    _, X_WB = tree.positions_from(tree.default_values())
+    np.testing.assert_array_equal(X_WB, np.eye(4))
+
+
+def test_own_root_keeps_its_joints_and_is_held_at_root_position(jointed):
+    tree = jointed.pose_tree("head", root_position=[0.3, 0.2, 0.1])
+    assert tree.nodes[0].position_names == ("x", "y", "z", "head_y", "head_z", "head_x")
+    grid = tree.grid(0, np.radians(20.0))
+    assert len(grid) == 5**3
+    origins = tree.relative_transforms(0, grid)[:, :3, 3]
+    np.testing.assert_allclose(origins, np.tile([0.3, 0.2, 0.1], (len(grid), 1)), atol=1e-12)
+
+
+def test_base_outside_its_limits_is_reported(jointed):
+    turned = RootRotation.fixed(np.diag([-1.0, -1.0, 1.0]))
+    near = jointed.pose_tree("head", root_position=[0, 0, 0])
+    q, _ = near.positions_from(near.default_values())
+    assert near.base_within_limits(q)
+    far = jointed.pose_tree("head", root_position=[20, 0, 0], root_rotation=turned)
+    q, _ = far.positions_from(far.default_values())
+    assert not far.base_within_limits(q)
+
+
+@pytest.mark.parametrize("root", [None, "base", "upper", "lower"])
+@pytest.mark.parametrize("rotation", [None, RootRotation.free()])
+def test_welded_base_moves_the_whole_plant(welded, root, rotation):
+    if root is None and rotation is None:
+        tree = welded.pose_tree()
+        assert [node.parent for node in tree.nodes] == [-1, 0, 1]
+        assert tree.nodes[0].positions == ()
+    else:
+        tree = welded.pose_tree(root, root_position=[1.0, 2.0, 3.0], root_rotation=rotation)
+        origin = tree.node_poses(tree.default_values())[0][:3, 3]
+        np.testing.assert_allclose(origin, [1.0, 2.0, 3.0], atol=1e-12)
+    assert largest_difference_from_drake(welded, tree) < 1e-9
+
+
+@pytest.mark.parametrize("root", [None, "a", "c", "e", "f"])
+def test_every_joint_type_agrees_with_drake(all_joints, root):
+    tree = all_joints.pose_tree(root, root_position=[0.1, 0.2, 0.3])
+    assert largest_difference_from_drake(all_joints, tree) < 1e-9
+    assert [len(node.positions) for node in all_joints.pose_tree().nodes] == [0, 2, 3, 1, 1, 1]
+
+
+def test_limits_that_drake_does_not_read_are_kept(all_joints):
+    names = ("u_qx", "u_qy", "ball_qx", "screw", "back", "turn")
+    index = [all_joints.position_index(name) for name in names]
+    np.testing.assert_allclose(all_joints.upper[index], [1, 1, np.pi, 3, 2, np.pi])
+
+
+def planar_robot(more: str = "") -> str:
+    """A body that slides and turns in a plane, and an arm."""
+    return urdf(
+        *(link(name, "") for name in ("bx", "bz")),
+        link("body"),
+        link("arm"),
+        joint("x", "prismatic", "world", "bx", axis="1 0 0", limits=None),
+        joint("z", "prismatic", "bx", "bz", axis="0 0 1", limits=None, origin=""),
+        joint("turn", "continuous", "bz", "body", axis="0 1 0", limits=None, origin=""),
+        joint("shoulder", "revolute", "body", "arm"),
+        more,
+    )
+
+
+def test_slides_without_limits_say_where_the_only_object_stands(tmp_path):
+    model = load_model(write(tmp_path, planar_robot()), check=False)
+    tree = model.pose_tree()
+    slides = [model.position_index("x"), model.position_index("z")]
+    assert dict(tree.held) == dict.fromkeys(slides, 0.0)
+    assert largest_difference_from_drake(model, tree) < 1e-9
+    moved = model.pose_tree(root_position=(1.0, -2.0, 3.0))
+    assert largest_difference_from_drake(model, moved) < 1e-9
+    X_WN = moved.node_poses(moved.default_values())
+    np.testing.assert_allclose(X_WN[0, :3, 3], (1.0, -2.0, 3.0), atol=1e-12)
+    assert dict(moved.held) == dict(tree.held)
+    turned = model.pose_tree("arm", root_position=(0.0, 0.0, 0.0))
+    assert largest_difference_from_drake(model, turned) < 1e-9
+
+
+def test_what_hangs_on_an_unseen_world_is_in_the_tree_of_a_floating_object(tmp_path):
+    arm = joint("a1", "revolute", "world", "upper") + joint("a2", "revolute", "upper", "lower")
+    text = urdf(link("ball", SPHERE), link("upper"), link("lower"), arm)
+    model = load_model(write(tmp_path, text), check=False)
+    tree = model.pose_tree()
+    assert [node.name for node in tree.nodes] == ["ball", "upper", "lower"]
+    assert largest_difference_from_drake(model, tree) < 1e-9
+
+
+def test_slides_without_limits_are_refused_where_they_must_be_searched(tmp_path):
+    ball = link("ball") + joint("y", "prismatic", "world", "ball", limits=None)
+    model = load_model(write(tmp_path, planar_robot(ball)), check=False)
+    with pytest.raises(ModelError, match=r"'x', 'z', 'y' have no limits.*of 2 objects"):
+        model.pose_tree()
+    model.pose_tree(held={"x": 0.0, "z": 0.1, "y": 0.2})
+    hand = link("hand") + joint("grip", "prismatic", "arm", "hand", limits=None)
+    model = load_model(write(tmp_path, planar_robot(hand)), check=False)
+    with pytest.raises(ModelError, match="joint 'grip' has no limits"):
+        model.pose_tree()
+
+
+def test_planar_joint_agrees_with_drake_and_needs_limits(tmp_path):
+    planar = """<sdf version="1.9" xmlns:drake="http://drake.mit.edu"><model name="m">
+    <link name="a"><visual name="v"><geometry><sphere><radius>0.1</radius></sphere></geometry>
+    </visual></link><link name="b"><pose>1 2 3 0.1 0.2 0.3</pose><visual name="v"><geometry><sphere>
+    <radius>0.1</radius></sphere></geometry></visual></link>
+    <drake:joint name="p" type="planar"><drake:parent>a</drake:parent>
+    <drake:child>b</drake:child><drake:damping>0 0 0</drake:damping></drake:joint></model></sdf>"""
+    path = write(tmp_path, planar, "planar.sdf")
+    with pytest.raises(ModelError, match=r"joints 'p_x', 'p_y' have no limits"):
+        load_model(path, check=False).pose_tree()
+    limits = {"p_x": (-1.0, 1.0), "p_y": (0.0, 2.0)}
+    model = load_model(path, limits=limits, check=False)
+    assert model.upper[model.position_index("p_y")] == 2.0
+    assert largest_difference_from_drake(model, model.pose_tree()) < 1e-9
+    with pytest.raises(UnknownNameError, match="joint 'nose'"):
+        load_model(path, limits={"nose": (0.0, 1.0)}, check=False)
+    plant = MultibodyPlant(0.0)
+    Parser(plant).AddModels(path)
+    plant.Finalize()
+    context = plant.CreateDefaultContext()
+
+    def pose(values):
+        q = np.concatenate([[1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], values])
+        plant.SetPositions(context, q)
+        frame = plant.GetFrameByName("b")
+        return frame.CalcPose(context, plant.GetFrameByName("a")).GetAsMatrix4()
+
+    measured = JointMap.measure(pose, 3, "p")
+    values = np.random.default_rng(5).uniform(-3.0, 3.0, (20, 3))
+    for row, X in zip(values, measured.transforms(values), strict=True):
+        np.testing.assert_allclose(X, pose(row), atol=1e-12)
+
+
+def test_links_on_an_unseen_link_make_a_node_with_an_empty_mesh(tmp_path):
+    text = urdf(
+        link("palm", ""),
+        link("thumb"),
+        link("finger"),
+        joint("wrist", "revolute", "world", "palm"),
+        joint("t", "revolute", "palm", "thumb"),
+        joint("f", "revolute", "palm", "finger"),
+    )
+    model = load_model(write(tmp_path, text), check=False)
+    tree = model.pose_tree()
+    assert [(node.name, node.parent) for node in tree.nodes] == [
+        ("palm", -1),
+        ("thumb", 0),
+        ("finger", 0),
+    ]
+    assert tree.nodes[0].mesh.is_empty
+    assert largest_difference_from_drake(model, tree) < 1e-9
+    turned = model.pose_tree("finger", root_position=[0, 0, 1])
+    assert [node.name for node in turned.nodes] == ["finger", "thumb"]
+    assert largest_difference_from_drake(model, turned) < 1e-9
+
+
+def test_world_geometry_stands_beside_a_floating_body(tmp_path):
+    text = urdf(
+        link("table"),
+        link("cup"),
+        link("handle"),
+        joint("t", "fixed", "world", "table", limits=None),
+        joint("h", "revolute", "cup", "handle"),
+    )
+    model = load_model(write(tmp_path, text), check=False)
+    tree = model.pose_tree("handle", root_position=[0, 0, 1])
+    assert [(node.name, node.parent) for node in tree.nodes] == [
+        ("handle", -1),
+        ("cup", 0),
+        ("table", -1),
+    ]
+    assert largest_difference_from_drake(model, tree) < 1e-9
+
+
+def test_batch_equals_single_poses(floating):
+    tree = floating.pose_tree("leg", root_position=[0, 0, 0])
+    random = np.random.default_rng(2)
+    values = [random.uniform(-0.2, 0.3, (5, len(node.value_names))) for node in tree.nodes]
+    batch = tree.node_poses_batch(values)
+    for row in range(5):
+        single = tree.node_poses([array[row] for array in values])
+        np.testing.assert_allclose(batch[row], single, atol=1e-14)
+
+
+def test_moving_the_root_equals_building_the_tree_there(jointed, floating, welded):
+    for model, root in ((jointed, "arm"), (floating, "leg"), (welded, None), (jointed, "head")):
+        moved = model.pose_tree(root, root_position=[0, 0, 0]).with_root_position([1, 2, 3])
+        built = model.pose_tree(root, root_position=[1, 2, 3])
+        values = built.default_values()
+        np.testing.assert_allclose(moved.node_poses(values), built.node_poses(values), atol=1e-12)
+
+
+def test_held_joint_has_one_sample(floating):
+    tree = floating.pose_tree(held={"shoulder_y": 0.4})
+    arm = tree.node_index("arm")
+    grid = tree.grid(arm, np.radians(20.0))
+    assert set(grid[:, 1]) == {0.4}
+    assert len(grid) == 5
+
+
+def test_woman_can_stand_on_any_link():
+    model = load_model(bundled_model("woman"), check=False)
+    for root in ("head", "right_foot", "left_forearm", "waist"):
+        tree = model.pose_tree(root, root_position=[0.0, 0.1, 0.9])
+        assert len(tree.nodes) == 15
+        assert tree.nodes[0].name == root
+        assert largest_difference_from_drake(model, tree, samples=4) < 1e-9
+
+
+def test_real_arm_agrees_with_drake(shared_data):
+    model = load_model(shared_data / "arm_two_views" / "med7" / "med7.urdf", check=False)
+    fixed = model.pose_tree(root_position=[0, 0, 0], root_rotation=RootRotation.fixed())
+    assert [node.name for node in fixed.nodes] == [f"link_{i}" for i in range(8)]
+    assert largest_difference_from_drake(model, fixed) < 1e-9
+    turned = model.pose_tree("link_5", root_position=[0, 0, 0])
+    assert largest_difference_from_drake(model, turned) < 1e-9
+
+
+def test_model_directives_are_read(tmp_path):
+    write(tmp_path, WELDED_URDF, "arm.urdf")
+    text = "directives:\n- add_model:\n    name: left\n    file: package://mine/arm.urdf\n"
+    text += "- add_model:\n    name: right\n    file: package://mine/arm.urdf\n"
+    path = write(tmp_path, text, "two.dmd.yaml")
+    model = load_model(path, package_paths={"mine": tmp_path}, check=False)
+    assert model.position_names == ("left_a1", "left_a2", "right_a1", "right_a2")
+    assert "left::upper" in model.link_names
+    plant = MultibodyPlant(0.0)
+    assert len(model.add_to(plant)) == 2
+
+
+def test_bad_arguments_name_what_exists(floating, jointed):
+    with pytest.raises(UnknownNameError, match=r"link 'nose'.*trunk"):
+        floating.pose_tree("nose")
+    with pytest.raises(ModelError, match="'between' has no visual geometry"):
+        floating.pose_tree("between")
+    with pytest.raises(UnknownNameError, match="joint 'nose'"):
+        floating.pose_tree(held={"nose": 1.0})
+    with pytest.raises(SettingsError, match="root_position"):
+        floating.pose_tree("leg")
+    with pytest.raises(SettingsError, match="three finite"):
+        floating.pose_tree(root_position=[0, 0, np.nan])
+    with pytest.raises(SettingsError, match="finite number"):
+        floating.pose_tree(held={"slide": np.inf})
+    with pytest.raises(SettingsError, match="cannot be held"):
+        jointed.pose_tree("arm", root_position=[0, 0, 0], held={"head_y": 0.0})
+    tree = floating.pose_tree()
+    with pytest.raises(UnknownNameError, match="joint 'nose'"):
+        tree.grid(0, 0.3, {"nose": 0.1})
+    with pytest.raises(SettingsError, match="positive"):
+        tree.grid(0, 0.0)
+    with pytest.raises(SettingsError, match="shape"):
+        tree.relative_transforms(1, np.zeros((3, 1)))
+
+
+def test_two_floating_bodies_are_refused(tmp_path):
+    text = urdf(link("a"), link("b"))
+    model = load_model(write(tmp_path, text), check=False)
+    with pytest.raises(ModelError, match="a, b float freely"):
+        model.pose_tree()

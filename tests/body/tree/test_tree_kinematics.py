@@ -1,0 +1,150 @@
+import numpy as np
+import pytest
+from pydrake.multibody.tree import JacobianWrtVariable
+
+from drake_pose.body import RootRotation, bundled_model, load_model
+from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.errors import SettingsError
+from tests.body.models import FLOATING_URDF, JOINTED_BASE_URDF, JOINTS_SDF, WELDED_URDF, write
+
+_TREES = {
+    "floating": (FLOATING_URDF, "f.urdf", {"root_position": (0.3, -0.2, 0.9)}),
+    "turned over": (FLOATING_URDF, "f.urdf", {"root": "hand", "root_position": (0.3, 0.2, 0.1)}),
+    "turned over, limited": (
+        FLOATING_URDF,
+        "f.urdf",
+        {
+            "root": "leg",
+            "root_position": (0.0, 0.2, 0.0),
+            "root_rotation": RootRotation.limited(
+                [("y", -90, 90), ("z", -20, 30)],
+                rotation=[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]],
+            ),
+        },
+    ),
+    "jointed base": (JOINTED_BASE_URDF, "j.urdf", {}),
+    "known root": (JOINTED_BASE_URDF, "j.urdf", {"root_position": (1.0, 2.0, 3.0)}),
+    "welded": (WELDED_URDF, "w.urdf", {}),
+    "held": (WELDED_URDF, "w.urdf", {"held": {"a1": 0.3}}),
+    "all joints": (JOINTS_SDF, "j.sdf", {}),
+    "all joints turned over": (JOINTS_SDF, "j.sdf", {"root": "f", "root_position": (0, 0, 0)}),
+}
+
+
+@pytest.fixture(scope="module", params=list(_TREES))
+def kinematics(request, tmp_path_factory):
+    text, name, arguments = _TREES[request.param]
+    path = write(tmp_path_factory.mktemp("model"), text, name)
+    return TreeKinematics(load_model(path, check=False).pose_tree(**arguments))
+
+
+def draw(kinematics, seed):
+    lower, upper = (np.clip(b, -5.0, 5.0) for b in (kinematics.lower, kinematics.upper))
+    return np.random.default_rng(seed).uniform(lower, upper)
+
+
+def move(motions, j, points):
+    """Velocities (nodes, n, 3) of points (nodes, n, 3) of the world with parameter j."""
+    omega, v, sigma = motions.twists[j, :3], motions.twists[j, 3:6], motions.twists[j, 6]
+    velocities = np.cross(np.broadcast_to(omega, points.shape), points) + v + sigma * points
+    return velocities * motions.moves[:, j, None, None]
+
+
+def test_poses_are_the_trees(kinematics):
+    for seed in range(5):
+        values = draw(kinematics, seed)
+        expected = kinematics.tree.node_poses(kinematics.split(values))
+        assert np.abs(kinematics.poses(values) - expected).max() < 1e-12
+        assert np.array_equal(kinematics.flatten(kinematics.split(values)), values)
+
+
+def test_motions_are_the_derivatives_of_the_poses(kinematics):
+    p_N = np.random.default_rng(3).normal(size=(len(kinematics.tree.nodes), 4, 3))
+    step = 1e-6
+    for seed in range(3):
+        values = draw(kinematics, seed)
+        motions = kinematics.motions(values)
+
+        def place(values):
+            X_WN = kinematics.poses(values)
+            return np.einsum("nij,nkj->nki", X_WN[:, :3, :3], p_N) + X_WN[:, None, :3, 3]
+
+        for j in range(len(values)):
+            shift = step * np.eye(len(values))[j]
+            difference = (place(values + shift) - place(values - shift)) / (2 * step)
+            assert np.abs(move(motions, j, place(values)) - difference).max() < 1e-7
+
+
+def test_the_derivative_of_a_free_root_holds_near_no_turn(tmp_path):
+    tree = load_model(write(tmp_path, FLOATING_URDF), check=False).pose_tree()
+    kinematics = TreeKinematics(tree)
+    for size in (0.0, 1e-6, 1e-4, 1e-3):
+        values = np.zeros(len(kinematics.names))
+        values[:3] = size * np.array([0.4, -0.7, 0.5])
+        motions = kinematics.motions(values)
+        for j in range(3):
+            step = 1e-5 * np.eye(len(values))[j]
+            turned = kinematics.poses(values + step) - kinematics.poses(values - step)
+            W = (turned[0] / 2e-5)[:3, :3] @ motions.X_WN[0, :3, :3].T
+            found = np.array([W[2, 1], W[0, 2], W[1, 0]])
+            assert np.abs(found - motions.twists[j, :3]).max() < 1e-8
+
+
+def test_motions_are_drakes_jacobian():
+    model = load_model(bundled_model("woman"))
+    tree = model.pose_tree()
+    kinematics = TreeKinematics(tree)
+    context = model.plant.CreateDefaultContext()
+    values = draw(kinematics, 1)
+    motions = kinematics.motions(values)
+    q, _ = tree.positions_from(kinematics.split(values))
+    model.plant.SetPositions(context, q)
+    world = model.plant.world_frame()
+    p_N = np.array([0.03, -0.2, 0.1])
+    columns = [position for node in tree.nodes for position in node.positions]
+    for i, node in enumerate(tree.nodes):
+        J = model.plant.CalcJacobianTranslationalVelocity(
+            context, JacobianWrtVariable.kQDot, model.plant.GetFrameByName(node.name), p_N,
+            world, world,
+        )  # fmt: skip
+        p_W = motions.X_WN[i, :3, :3] @ p_N + motions.X_WN[i, :3, 3]
+        points = np.broadcast_to(p_W, (len(tree.nodes), 1, 3))
+        mine = np.array([move(motions, j, points)[i, 0] for j in range(len(values))])
+        assert np.abs(mine.T - J[:, columns]).max() < 1e-12
+
+
+def test_shift_and_growth_move_the_root_and_all_behind_it(kinematics):
+    values = draw(kinematics, 2)
+    motions = kinematics.motions(values, translation=True, scale=True)
+    m = len(values)
+    assert motions.twists.shape == (m + 4, 7)
+    points = np.random.default_rng(1).normal(size=(len(motions.X_WN), 3, 3))
+    for k in range(3):
+        assert np.allclose(move(motions, m + k, points)[0], np.eye(3)[k])
+    growth = move(motions, m + 3, points)[0]
+    assert np.allclose(growth, points[0] - motions.X_WN[0, :3, 3])
+    assert motions.moves[:, m:].any(axis=1).tolist() == [
+        _root_of(kinematics.tree, i) == 0 for i in range(len(motions.X_WN))
+    ]
+
+
+def _root_of(tree, node):
+    while tree.nodes[node].parent >= 0:
+        node = tree.nodes[node].parent
+    return node
+
+
+def test_limits_and_kinds_are_the_trees(tmp_path):
+    path = write(tmp_path, FLOATING_URDF)
+    kinematics = TreeKinematics(load_model(path, check=False).pose_tree())
+    slide = kinematics.names.index("slide")
+    assert kinematics.is_angle.tolist() == [name != "slide" for name in kinematics.names]
+    assert (kinematics.lower[slide], kinematics.upper[slide]) == (-0.2, 0.3)
+    assert kinematics.tree.nodes[kinematics.value_nodes[slide]].name == "hand"
+
+
+def test_values_of_the_wrong_number_are_refused(kinematics):
+    with pytest.raises(SettingsError, match="values expected"):
+        kinematics.motions(np.zeros(len(kinematics.names) + 1))
+    with pytest.raises(SettingsError, match="numbers a node expected"):
+        kinematics.flatten([np.zeros(9) for _ in kinematics.tree.nodes])

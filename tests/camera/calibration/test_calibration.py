@@ -1,0 +1,361 @@
+"""Calibration of known cameras, from sightings and pictures made by formulas of our own."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+
+from drake_pose.camera.calibration.board import Board, Sighting, load_board
+from drake_pose.camera.calibration.calibrate import CalibrationSettings, calibrate
+from drake_pose.camera.calibration.lens import load_lenses, save_lenses
+from drake_pose.errors import CameraError, UnknownNameError
+from tests.camera.boards import (
+    CHARUCO,
+    CHECKERBOARD,
+    drawn_board,
+    facing,
+    inside,
+    photograph,
+    poses_for_pairs,
+    ring,
+    sightings_of,
+)
+
+
+def rotation_angle(R):
+    return np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
+
+
+def pose_error(X_true, X):
+    """Distance [mm] and angle [deg] between two poses."""
+    D = np.linalg.inv(X_true) @ X
+    return 1e3 * np.linalg.norm(D[:3, 3]), rotation_angle(D[:3, :3])
+
+
+def rig(count=6, pictures=36, noise=0.1, seed=0, board=CHECKERBOARD):
+    generator = np.random.default_rng(seed)
+    cameras = ring(count, generator, spread=360.0 if count > 5 else 45.0 * count)
+    poses = poses_for_pairs(cameras, board, generator, pictures)
+    return cameras, poses, sightings_of(cameras, board, poses, generator, noise)
+
+
+def changed(seen, camera, frame, change):
+    """The sightings with one picture's corners changed."""
+    sightings = {name: dict(frames) for name, frames in seen.sightings.items()}
+    old = sightings[camera][frame]
+    sightings[camera][frame] = Sighting(old.corners, change(old.uv))
+    return dataclasses.replace(seen, sightings=sightings)
+
+
+def shared_frame(seen, camera, seers):
+    """A frame that so many cameras saw, this one among them."""
+    for frame in seen.sightings[camera]:
+        if sum(frame in frames for frames in seen.sightings.values()) == seers:
+            return frame
+    raise AssertionError(f"{camera} has no frame that {seers} cameras saw")
+
+
+@pytest.mark.slow
+class TestKnownCameras:
+    @pytest.mark.parametrize("count", [1, 4, 8])
+    def test_without_noise_everything_is_found_exactly(self, count):
+        cameras, _, seen = rig(count, 6 * max(count, 2), noise=0.0)
+        found = calibrate(seen, CalibrationSettings(world="camera:c0"))
+        X_W0 = np.linalg.inv(cameras["c0"].X_WC)
+        for name, true in cameras.items():
+            lens = found.lenses[name]
+            assert lens.focal_x == pytest.approx(true.focal, rel=1e-6)
+            assert (lens.center_x, lens.center_y) == pytest.approx(tuple(true.center), abs=1e-3)
+            assert lens.distortion[:4] == pytest.approx(true.distortion, abs=1e-5)
+            distance, angle = pose_error(X_W0 @ true.X_WC, found.cameras[name].X_WC)
+            assert distance < 0.01
+            assert angle < 1e-3
+            assert found.camera_errors[name] < 1e-4
+
+    def test_noise_is_reported_and_does_little_harm(self):
+        cameras, _, seen = rig(8, 48, noise=0.1)
+        found = calibrate(seen)
+        assert found.world == "camera:c0"
+        X_W0 = np.linalg.inv(cameras["c0"].X_WC)
+        for name, true in cameras.items():
+            # Two coordinates of 0.1 pixel, less what the unknowns take up.
+            assert found.camera_errors[name] == pytest.approx(0.1 * np.sqrt(2), rel=0.2)
+            distance, angle = pose_error(X_W0 @ true.X_WC, found.cameras[name].X_WC)
+            assert distance < 50.0
+            assert angle < 1.5
+
+    def test_points_are_where_the_undistorted_cameras_see_them(self):
+        cameras, poses, seen = rig(5, 30, noise=0.0)
+        frame = shared_frame(seen, "c1", 3)
+        found = calibrate(seen, CalibrationSettings(world=f"board:{frame}"))
+        assert pose_error(np.eye(4), found.X_WB[frame])[0] < 1e-6
+        p_B = np.random.default_rng(1).uniform(-0.2, 0.6, (20, 3))
+        p_W = p_B @ poses[frame][:3, :3].T + poses[frame][:3, 3]
+        for name, true in cameras.items():
+            straight, _ = found.cameras[name].project(p_B)
+            np.testing.assert_allclose(
+                found.lenses[name].undistort_points(true.project(p_W)), straight, atol=0.01
+            )
+
+    def test_lens_without_distortion_is_left_alone(self):
+        generator = np.random.default_rng(3)
+        cameras = ring(4, generator, spread=180.0, distorted=False)
+        poses = poses_for_pairs(cameras, CHECKERBOARD, generator, 24)
+        seen = sightings_of(cameras, CHECKERBOARD, poses, generator, 0.05)
+        found = calibrate(seen, CalibrationSettings(lens="none"))
+        for name, true in cameras.items():
+            lens = found.lenses[name]
+            assert not lens.distortion.any()
+            assert (
+                found.cameras[name].focal_x == lens.focal_x == pytest.approx(true.focal, rel=0.01)
+            )
+
+
+@pytest.mark.slow
+class TestSpoiltPictures:
+    def test_picture_that_contradicts_its_own_lens_is_named(self):
+        _, _, seen = rig()
+        frame = list(seen.sightings["c2"])[3]
+        bent = changed(seen, "c2", frame, lambda uv: uv + 8 * np.sin(uv[:, ::-1] / 30))
+        with pytest.raises(
+            CameraError, match=f"camera 'c2', picture '{frame}'.*leave out c2/{frame}"
+        ):
+            calibrate(bent)
+
+    def test_picture_of_another_instant_is_named_where_a_third_camera_tells(self):
+        _, _, seen = rig(5, 30)
+        frame = shared_frame(seen, "c1", 3)
+        other = next(f for f in seen.sightings["c1"] if f != frame)
+        late = changed(seen, "c1", frame, lambda _: seen.sightings["c1"][other].uv)
+        with pytest.raises(CameraError, match=f"camera 'c1', picture '{frame}'.*same instant"):
+            calibrate(late)
+        found = calibrate(late, CalibrationSettings(drop_spoilt=True))
+        assert set(found.left_out) == {("c1", frame)}
+        asked = calibrate(late, CalibrationSettings(leave_out=[f"c1/{frame}"]))
+        assert ("c1", frame) in asked.left_out
+        for name in found.cameras:
+            np.testing.assert_allclose(
+                found.cameras[name].X_WC, asked.cameras[name].X_WC, atol=1e-5
+            )
+
+    def test_two_cameras_that_disagree_are_both_named(self):
+        _, _, seen = rig(4, 20)
+        frame = shared_frame(seen, "c3", 2)
+        other = next(f for f in seen.sightings["c3"] if f != frame)
+        late = changed(seen, "c3", frame, lambda _: seen.sightings["c3"][other].uv)
+        found = calibrate(late, CalibrationSettings(drop_spoilt=True))
+        pair = {name for name, frames in seen.sightings.items() if frame in frames}
+        assert set(found.left_out) == {(name, frame) for name in pair}
+        with pytest.raises(CameraError, match="no third camera tells"):
+            calibrate(late)
+
+    def test_calibration_goes_on_as_well_without_the_spoilt_picture(self):
+        cameras, _, seen = rig(6, 48)
+        frame = list(seen.sightings["c2"])[3]
+        bent = changed(seen, "c2", frame, lambda uv: uv + 8 * np.sin(uv[:, ::-1] / 30))
+        found = calibrate(bent, CalibrationSettings(drop_spoilt=True))
+        clean = calibrate(seen, CalibrationSettings(leave_out=[f"c2/{frame}"]))
+        for name in cameras:
+            assert pose_error(clean.cameras[name].X_WC, found.cameras[name].X_WC)[0] < 1e-3
+
+    def test_nothing_is_called_spoilt_in_good_pictures(self):
+        for seed in range(4):
+            _, _, seen = rig(4, 20, noise=0.3, seed=seed)
+            assert not calibrate(seen).left_out
+
+
+@pytest.mark.slow
+class TestCamerasThatDoNotFit:
+    def test_camera_that_shares_no_picture_is_named(self):
+        _, _, seen = rig()
+        sightings = {name: dict(frames) for name, frames in seen.sightings.items()}
+        sightings["c4"] = {f"alone_{frame}": s for frame, s in sightings["c4"].items()}
+        apart = dataclasses.replace(seen, sightings=sightings)
+        with pytest.raises(CameraError, match="camera 'c4' shares no picture"):
+            calibrate(apart)
+        found = calibrate(apart, CalibrationSettings(leave_out=["c4"]))
+        assert set(found.cameras) == {"c0", "c1", "c2", "c3", "c5"}
+
+    def test_camera_with_too_few_pictures_is_named(self):
+        _, _, seen = rig()
+        sightings = {**seen.sightings, "c1": dict(list(seen.sightings["c1"].items())[:2])}
+        with pytest.raises(CameraError, match="camera 'c1': the board was found in 2 pictures"):
+            calibrate(dataclasses.replace(seen, sightings=sightings))
+
+    @pytest.mark.parametrize("board", [CHECKERBOARD, Board("checkerboard", 7, 6, 0.12)])
+    def test_mirrored_checkerboard_pictures_are_recognised(self, board):
+        generator = np.random.default_rng(5)
+        cameras = ring(4, generator, spread=180.0)
+        poses = poses_for_pairs(cameras, board, generator, 24)
+        seen = sightings_of(cameras, board, poses, generator)
+        columns, rows = board.columns - 1, board.rows - 1
+        row, column = np.divmod(np.arange(columns * rows), columns)
+        # A mirror image of the board is the board with rows (or columns) exchanged: the colours
+        # of the squares decide which.
+        even = board.rows % 2 == 1
+        turned = (
+            (rows - 1 - row) * columns + column if even else row * columns + columns - 1 - column
+        )
+        mirrored = {}
+        for frame, s in seen.sightings["c3"].items():
+            uv = np.column_stack([640 - 1 - s.uv[:, 0], s.uv[:, 1]])
+            mirrored[frame] = Sighting(s.corners, uv[turned])
+        sightings = {**seen.sightings, "c3": mirrored}
+        with pytest.raises(CameraError, match="camera 'c3': its pictures are mirrored"):
+            calibrate(dataclasses.replace(seen, sightings=sightings))
+
+    def test_camera_that_was_moved_meanwhile_is_named(self):
+        generator = np.random.default_rng(6)
+        cameras = ring(5, generator, spread=225.0)
+        poses = poses_for_pairs(cameras, CHECKERBOARD, generator, 30)
+        seen = sightings_of(cameras, CHECKERBOARD, poses, generator)
+        moved = dict(cameras)
+        shift = np.eye(4)
+        shift[:3, 3] = [0.3, 0.0, 0.0]
+        moved["c2"] = dataclasses.replace(cameras["c2"], X_WC=cameras["c2"].X_WC @ shift)
+        late = sightings_of(moved, CHECKERBOARD, poses, generator)
+        both = {
+            frame: (late if frame >= "0022" else seen).sightings["c2"].get(frame) for frame in poses
+        }
+        sightings = {**seen.sightings, "c2": {f: s for f, s in both.items() if s is not None}}
+        with pytest.raises(CameraError, match=r"Camera 'c2' takes part in all.*was it moved"):
+            calibrate(dataclasses.replace(seen, sightings=sightings))
+
+    def test_camera_with_pictures_of_other_instants_is_named(self):
+        _, _, seen = rig(5, 30)
+        frames = list(seen.sightings["c2"])
+        old = list(seen.sightings["c2"].values())
+        shuffled = dict(zip(frames, old[1:] + old[:1], strict=True))
+        sightings = {**seen.sightings, "c2": shuffled}
+        with pytest.raises(CameraError, match="camera 'c2' contradicts the others"):
+            calibrate(dataclasses.replace(seen, sightings=sightings))
+
+    def test_pictures_too_much_alike_are_refused(self):
+        cameras, poses, _ = rig(1, 4)
+        still = {f"{k}": next(iter(poses.values())) for k in range(4)}
+        seen = sightings_of(cameras, CHECKERBOARD, still, np.random.default_rng(0))
+        with pytest.raises(CameraError, match=r"camera 'c0'.*tilt the board"):
+            calibrate(seen)
+
+    def test_ambiguous_board_is_refused_for_several_cameras(self):
+        board = Board("checkerboard", 8, 6, 0.1)
+        _, _, seen = rig(3, 9, board=board)
+        with pytest.raises(CameraError, match="looks the same"):
+            calibrate(seen)
+
+    def test_unknown_names(self):
+        _, _, seen = rig(2, 12)
+        with pytest.raises(UnknownNameError, match="c9"):
+            calibrate(seen, CalibrationSettings(leave_out=["c9"]))
+        with pytest.raises(UnknownNameError, match="c9"):
+            calibrate(seen, CalibrationSettings(world="camera:c9"))
+        with pytest.raises(UnknownNameError, match="0099"):
+            calibrate(seen, CalibrationSettings(world="board:0099"))
+
+    @pytest.mark.parametrize(
+        "wrong", [{"world": "left"}, {"lens": "fisheye"}, {"largest_error": 0.0}]
+    )
+    def test_settings_out_of_range(self, wrong):
+        with pytest.raises(CameraError):
+            CalibrationSettings(**wrong)
+
+
+class TestPictures:
+    @pytest.mark.parametrize("board", [CHECKERBOARD, CHARUCO], ids=["checkerboard", "charuco"])
+    def test_corners_are_found_in_drawn_pictures(self, board):
+        generator = np.random.default_rng(2)
+        cameras = ring(4, generator, radius=1.9)
+        errors = []
+        for X_WB in poses_for_pairs(cameras, board, generator, 4).values():
+            for camera in cameras.values():
+                uv = camera.project(board.points @ X_WB[:3, :3].T + X_WB[:3, 3])
+                if not (facing(X_WB, camera, 0.6) and inside(uv, camera)):
+                    continue
+                sighting = board.find(photograph(camera, board, X_WB, generator))
+                if sighting is None:
+                    assert board.kind == "charuco"  # Small markers may escape.
+                    continue
+                errors.append(np.linalg.norm(sighting.uv - uv[sighting.corners], axis=1))
+        assert len(errors) >= 4
+        everything = np.concatenate(errors)
+        assert np.sqrt(np.mean(everything**2)) < 0.4
+        assert everything.max() < 2.0
+
+    def test_no_board_is_found_in_noise(self):
+        picture = np.random.default_rng(0).integers(0, 255, (240, 320)).astype(np.uint8)
+        assert CHECKERBOARD.find(picture) is None
+        assert CHARUCO.find(picture) is None
+
+    def test_board_upside_down_has_the_same_corners(self):
+        picture = cv2.resize(drawn_board(CHECKERBOARD), None, fx=0.5, fy=0.5)
+        upright = CHECKERBOARD.find(picture)
+        down = CHECKERBOARD.find(np.ascontiguousarray(picture[::-1, ::-1]))
+        height, width = picture.shape
+        np.testing.assert_allclose(down.uv, [width - 1, height - 1] - upright.uv, atol=0.05)
+
+    def test_colour_pictures_are_taken_too(self):
+        picture = cv2.cvtColor(drawn_board(CHARUCO), cv2.COLOR_GRAY2BGR)
+        assert len(CHARUCO.find(picture).corners) == len(CHARUCO.points)
+
+
+class TestLens:
+    def test_lenses_are_read_back(self, tmp_path):
+        _, _, seen = rig(2, 12)
+        lenses = calibrate(seen).lenses
+        save_lenses(tmp_path / "lenses.yaml", lenses)
+        for name, lens in load_lenses(tmp_path / "lenses.yaml").items():
+            assert lens.matrix.tolist() == lenses[name].matrix.tolist()
+            assert lens.distortion.tolist() == lenses[name].distortion.tolist()
+
+    def test_undistorted_picture_was_seen_to_its_edges(self):
+        _, _, seen = rig(2, 12)
+        lens = calibrate(seen).lenses["c0"]
+        assert lens.distortion[0] < 0  # A barrel.
+        white = np.full((480, 640), 255, np.uint8)
+        assert lens.undistort(white, exact=True).min() == 255
+        assert lens.undistort(white).min() == 255
+        with pytest.raises(CameraError, match="480 x 640"):
+            lens.undistort(white.T)
+
+
+class TestBoardFiles:
+    def test_good_files(self, tmp_path):
+        path = tmp_path / "board.yaml"
+        path.write_text("kind: checkerboard\nsquares: [9, 6]\nsquare_length: 0.03\n")
+        assert load_board(path) == Board("checkerboard", 9, 6, 0.03)
+        path.write_text(
+            "kind: charuco\nsquares: [7, 5]\nsquare_length: 0.04\nmarker_length: 0.03\n"
+            "dictionary: DICT_5X5_100\n"
+        )
+        board = load_board(path)
+        assert len(board.points) == 24
+        assert board.points[0].tolist() == pytest.approx([0.04, 0.16, 0.0])
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("kind: circles\n", "kind"),
+            ("kind: checkerboard\nsquares: [9, 6]\n", "square_length"),
+            ("kind: checkerboard\nsquares: 9\nsquare_length: 1\n", "squares"),
+            ("kind: checkerboard\nsquares: [9, 2]\nsquare_length: 1\n", "squares"),
+            ("kind: checkerboard\nsquares: [9, 6]\nsquare_length: -1\n", "square_length"),
+            ("kind: checkerboard\nsquares: [9, 6]\nsquare_length: 1\ncolour: red\n", "colour"),
+            (
+                "kind: charuco\nsquares: [7, 5]\nsquare_length: 0.04\nmarker_length: 0.05\n"
+                "dictionary: 4X4_50\n",
+                "marker_length",
+            ),
+            (
+                "kind: charuco\nsquares: [7, 5]\nsquare_length: 0.04\nmarker_length: 0.03\n"
+                "dictionary: 3X3\n",
+                "dictionary",
+            ),
+        ],
+    )
+    def test_bad_files_are_named(self, tmp_path, text, message):
+        path = tmp_path / "board.yaml"
+        path.write_text(text)
+        with pytest.raises(CameraError, match=message) as caught:
+            load_board(path)
+        assert str(path) in str(caught.value)

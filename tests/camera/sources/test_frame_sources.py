@@ -1,0 +1,324 @@
+import pickle
+import time
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from drake_pose.camera import save_cameras
+from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.camera.sources.files import load_background_pictures, load_sources
+from drake_pose.camera.sources.frame_source import SourceSpecification, open_source
+from drake_pose.errors import SceneError, SettingsError
+
+WIDTH, HEIGHT = 32, 24
+
+
+def picture(value):
+    """A picture (blue, green, red) whose red tells which one it is."""
+    seen = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    seen[:, :, 2] = value
+    return seen
+
+
+def write_folder(folder, names, suffix=".png"):
+    folder.mkdir(parents=True, exist_ok=True)
+    for k, name in enumerate(names):
+        cv2.imwrite(str(folder / f"{name}{suffix}"), picture(10 * k))
+    return folder
+
+
+def specify(folder, kind="folder", **more):
+    given = {"rate_hz": 10.0, "background": "empty", **more}
+    return SourceSpecification("front", kind, str(folder), WIDTH, HEIGHT, **given)
+
+
+def read_all(source):
+    found = []
+    while (one := source.read()) is not None:
+        found.append(one)
+    assert source.ended
+    return found
+
+
+class TestFolder:
+    def test_pictures_come_in_order_at_the_rate(self, tmp_path):
+        names = ["a0", "a1", "a3"]
+        found = read_all(open_source(specify(write_folder(tmp_path, names), offset=5.0)))
+        assert [one.frame for one in found] == names
+        assert [one.time for one in found] == pytest.approx([5.0, 5.1, 5.2])
+        assert [one.picture[0, 0].tolist() for one in found] == [[0, 0, 0], [10, 0, 0], [20, 0, 0]]
+
+    def test_frames_of_other_folders_tell_what_is_missing(self, tmp_path):
+        own = write_folder(tmp_path / "own", ["0000", "0001", "0003"])
+        other = write_folder(tmp_path / "other", ["0000", "0001", "0002", "0003"], ".jpg")
+        source = open_source(specify(own, beside=(str(other),)))
+        assert [one.time for one in read_all(source)] == pytest.approx([0.0, 0.1, 0.3])
+        assert source.dropped == 1
+        assert "front" in source.problems[0]
+        assert "0002" in source.problems[0]
+
+    def test_time_stamps(self, tmp_path):
+        folder = write_folder(tmp_path, ["9", "10", "11", "12", "extra"])
+        rows = ["9,0.0", "10,0.11", "11,0.11", "12,0.05", "13,0.4"]
+        (folder / "timestamps.csv").write_text("\n".join(["frame,time", *rows]) + "\n")
+        source = open_source(specify(folder, rate_hz=None))
+        assert source.rate_hz == pytest.approx(1 / 0.11)
+        assert [(one.frame, one.time) for one in read_all(source)] == [("9", 0.0), ("10", 0.11)]
+        assert source.dropped == 4
+        text = "\n".join(source.problems)
+        assert "frame 11 has the same time stamp as frame 10" in text
+        assert "frame 12 has a time stamp before frame 10" in text
+        assert "no picture of frame 13" in text
+        assert "no time of frame extra" in text
+
+    @pytest.mark.parametrize("suffix", [".png", ".jpg"])
+    def test_corrupt_picture_costs_only_itself(self, tmp_path, suffix):
+        folder = write_folder(tmp_path, ["0", "1", "2", "3"], suffix)
+        whole = (folder / f"1{suffix}").read_bytes()
+        (folder / f"1{suffix}").write_bytes(whole[: len(whole) // 2])
+        cv2.imwrite(str(folder / f"2{suffix}"), np.zeros((5, 7, 3), np.uint8))
+        source = open_source(specify(folder))
+        assert [one.frame for one in read_all(source)] == ["0", "3"]
+        assert source.dropped == 2
+        assert "cut short" in source.problems[0]
+        assert "7 x 5" in source.problems[1]
+
+    def test_masks(self, tmp_path):
+        mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+        mask[4:9, 3:6] = 200
+        cv2.imwrite(str(tmp_path / "0.png"), mask)
+        cv2.imwrite(str(tmp_path / "1.jpg"), mask)
+        cv2.imwrite(str(tmp_path / "2.png"), 0 * mask)
+        cv2.imwrite(str(tmp_path / "3.png"), np.arange(WIDTH * HEIGHT).reshape(HEIGHT, WIDTH) % 256)
+        cv2.imwrite(str(tmp_path / "4.png"), np.full_like(mask, 255))
+        source = open_source(specify(tmp_path, background=None))
+        found = read_all(source)
+        assert [one.picture.dtype for one in found] == [bool, bool, bool]
+        np.testing.assert_array_equal(found[0].picture, mask > 0)
+        np.testing.assert_array_equal(found[1].picture, mask > 0)
+        assert not found[2].picture.any(), "nobody is there: no fault"
+        assert "two values" in source.problems[0]
+        assert "full" in source.problems[1]
+
+    @pytest.mark.parametrize(
+        ("names", "more", "why"),
+        [
+            ([], {}, "no picture"),
+            (["0"], {"rate_hz": None}, "rate_hz"),
+            (["9", "10"], {}, "different lengths"),
+            (["0"], {"beside": ("nowhere",)}, "nowhere"),
+        ],
+    )
+    def test_what_cannot_be_read_says_why(self, tmp_path, names, more, why):
+        with pytest.raises(SceneError, match=why):
+            open_source(specify(write_folder(tmp_path, names), **more))
+
+    def test_wrong_size_and_broken_times_are_refused_at_once(self, tmp_path):
+        cv2.imwrite(str(tmp_path / "0.png"), np.zeros((5, 7, 3), np.uint8))
+        with pytest.raises(SceneError, match=r"7 x 5.*calibrated for 32 x 24"):
+            open_source(specify(tmp_path))
+        for text, why in (("frame\n0\n", "columns"), ("frame,time\n0,soon\n", "line 2")):
+            (tmp_path / "timestamps.csv").write_text(text)
+            with pytest.raises(SceneError, match=why):
+                open_source(specify(tmp_path))
+
+
+def write_video(path, count, size=(WIDTH, HEIGHT), rate=12.5):
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), rate, size)
+    for k in range(count):
+        writer.write(np.full((size[1], size[0], 3), 25 * k, np.uint8))
+    writer.release()
+    return path
+
+
+class TestVideo:
+    def test_times_are_the_files_own_or_the_given_rate(self, tmp_path):
+        path = write_video(tmp_path / "v.avi", 6)
+        source = open_source(specify(path, "video", rate_hz=None))
+        assert source.rate_hz == pytest.approx(12.5)
+        found = read_all(source)
+        assert [one.time for one in found] == pytest.approx(0.08 * np.arange(6))
+        assert [one.picture.mean() for one in found] == pytest.approx(25 * np.arange(6), abs=4)
+        assert not source.problems
+        found = read_all(open_source(specify(path, "video", rate_hz=50.0)))
+        assert [one.time for one in found] == pytest.approx(0.02 * np.arange(6))
+
+    def test_video_of_masks_is_what_is_light(self, tmp_path):
+        path = write_video(tmp_path / "v.avi", 11)
+        found = read_all(open_source(specify(path, "video", background=None)))
+        assert [bool(one.picture.all()) for one in found] == [k > 5 for k in range(11)]
+
+    def test_what_is_no_video_or_of_another_size_is_refused(self, tmp_path):
+        (tmp_path / "text.avi").write_text("no video")
+        with pytest.raises(SceneError, match="not a video"):
+            open_source(specify(tmp_path / "text.avi", "video"))
+        with pytest.raises(SceneError, match="no such video"):
+            open_source(specify(tmp_path / "none.avi", "video"))
+        large = write_video(tmp_path / "large.avi", 2, (64, 48))
+        with pytest.raises(SceneError, match="64 x 48"):
+            open_source(specify(large, "video"))
+
+
+class FakeCamera:
+    """Stands for cv2.VideoCapture: a device that fails now and then."""
+
+    opened = 0
+
+    def __init__(self, place):
+        FakeCamera.opened += 1
+        self._works, self._left = FakeCamera.opened != 1, 3
+        assert place == 7
+
+    def isOpened(self):
+        return self._works
+
+    def set(self, what, value):
+        return True
+
+    def read(self):
+        time.sleep(0.01)
+        self._left -= 1
+        if self._left < 0:
+            return False, None
+        return True, picture(FakeCamera.opened)
+
+    def release(self):
+        pass
+
+
+def wait_for(what, patience=10.0):
+    end = time.monotonic() + patience
+    while not what():
+        assert time.monotonic() < end, "nothing happened"
+        time.sleep(0.005)
+
+
+class TestDevice:
+    def test_newest_picture_is_kept_and_the_camera_opened_again(self, monkeypatch):
+        FakeCamera.opened = 0
+        monkeypatch.setattr(cv2, "VideoCapture", FakeCamera)
+        monkeypatch.setattr("drake_pose.camera.sources.live.FIRST_PAUSE", 0.02)
+        source = open_source(specify("7", "device"))
+        try:
+            # It cannot be opened at first, then gives three pictures at a time, and fails again.
+            wait_for(lambda: FakeCamera.opened >= 4)
+            one = source.read()
+            assert int(one.frame) >= 5, "older ones are gone"
+            assert abs(one.time - time.monotonic()) < 5.0
+            assert not source.ended
+            assert "cannot be opened" in source.problems[0]
+            assert "answers again" in source.problems[1]
+            assert "stopped" in source.problems[2]
+        finally:
+            source.close()
+        assert source.ended
+
+    def test_wrong_size_ends_it(self, monkeypatch):
+        FakeCamera.opened = 1
+        monkeypatch.setattr(cv2, "VideoCapture", FakeCamera)
+        given = SourceSpecification("front", "device", "7", 640, 480, background="empty")
+        source = open_source(given)
+        wait_for(lambda: source.ended)
+        assert source.read() is None
+        assert "32 x 24" in source.problems[0]
+        source.close()
+
+
+class TestSourcesFile:
+    @pytest.fixture
+    def studio(self, tmp_path):
+        cameras = circle_of_cameras(2, size=(WIDTH, HEIGHT), face_camera=False)
+        save_cameras(tmp_path / "cameras.yaml", cameras)
+        for name in cameras:
+            write_folder(tmp_path / "images" / name, ["0", "1"])
+            write_folder(tmp_path / "empty" / name, ["0"])
+        return tmp_path
+
+    @staticmethod
+    def entries():
+        return {
+            name: {
+                "kind": "folder",
+                "location": f"images/{name}",
+                "rate_hz": 10,
+                "background": f"empty/{name}",
+            }
+            for name in ("camera_1", "camera_0")
+        }
+
+    def save(self, studio, entries):
+        (studio / "sources.yaml").write_text(yaml.safe_dump(entries, sort_keys=False))
+
+    def test_file_is_read_in_the_order_of_the_cameras(self, studio):
+        self.save(studio, self.entries())
+        found = load_sources(studio)
+        assert list(found) == ["camera_0", "camera_1"]
+        one = found["camera_0"]
+        assert (one.width, one.height, one.rate_hz) == (WIDTH, HEIGHT, 10.0)
+        assert one.beside == (str(studio / "images" / "camera_1"),)
+        assert pickle.loads(pickle.dumps(one)) == one
+        assert len(read_all(open_source(one))) == 2
+        (empty,) = load_background_pictures(one)
+        assert empty.shape == (HEIGHT, WIDTH, 3)
+
+    def test_device_may_have_a_number_or_an_address(self, studio):
+        entries = self.entries()
+        entries["camera_0"] = {"kind": "device", "location": 0, "masks": True}
+        entries["camera_1"] = {"kind": "device", "location": "rtsp://x/y", "masks": True}
+        self.save(studio, entries)
+        found = load_sources(studio / "sources.yaml")
+        assert [one.location for one in found.values()] == ["0", "rtsp://x/y"]
+        assert all(one.live and one.gives_masks for one in found.values())
+
+    @pytest.mark.parametrize(
+        ("change", "why"),
+        [
+            ({"camera_9": {}}, "'camera_9' is not calibrated"),
+            ({"camera_1": None}, "camera_1.*mapping"),
+            ({"camera_1": {"kind": "film"}}, "kind must be"),
+            ({"camera_1": {"kind": "video"}}, "location"),
+            ({"camera_1": {"kind": "video", "location": "a", "colour": 1}}, "unknown field colour"),
+            ({"camera_1": {"kind": "video", "location": "a"}}, "masks: true"),
+            (
+                {"camera_1": {"kind": "video", "location": "a", "masks": True, "background": "b"}},
+                "either",
+            ),
+            (
+                {"camera_1": {"kind": "video", "location": "a", "masks": True, "rate_hz": -1}},
+                "rate_hz",
+            ),
+        ],
+    )
+    def test_wrong_entries_are_named(self, studio, change, why):
+        self.save(studio, {**self.entries(), **change})
+        with pytest.raises(SceneError, match=why) as error:
+            load_sources(studio)
+        assert "sources.yaml" in str(error.value)
+
+    def test_calibrated_camera_without_source_is_named(self, studio):
+        entries = self.entries()
+        del entries["camera_1"]
+        self.save(studio, entries)
+        with pytest.raises(SceneError, match=r"'camera_1' of .* has no source"):
+            load_sources(studio)
+
+    def test_background_that_is_missing_or_of_another_size_is_named(self, studio):
+        entries = self.entries()
+        entries["camera_0"]["background"] = "nothing"
+        self.save(studio, entries)
+        with pytest.raises(SceneError, match="empty-room"):
+            load_background_pictures(load_sources(studio)["camera_0"])
+        cv2.imwrite(str(studio / "empty/camera_1/0.png"), np.zeros((5, 7, 3), np.uint8))
+        with pytest.raises(SceneError, match="7 x 5"):
+            load_background_pictures(load_sources(studio)["camera_1"])
+
+
+def test_specification_checks_itself():
+    with pytest.raises(SettingsError, match="kind"):
+        SourceSpecification("a", "film", "x", 1, 1)
+    with pytest.raises(SettingsError, match="rate_hz"):
+        SourceSpecification("a", "video", "x", 1, 1, rate_hz=0.0)
+    with pytest.raises(SettingsError, match="cannot be"):
+        SourceSpecification("a", "video", "x", 0, 1)

@@ -1,0 +1,143 @@
+import math
+
+import numpy as np
+import pytest
+
+from drake_pose.camera.sources.synchroniser import CameraChange, Synchroniser
+from drake_pose.errors import SettingsError, UnknownNameError
+
+PERIOD = 0.1
+
+
+def streams(generator, cameras, moments, jitter, lost):
+    """By camera, the moments it saw and its time stamps; neither order nor count is known to it."""
+    found = {}
+    for name in cameras:
+        seen = np.flatnonzero(generator.random(moments) >= lost)
+        found[name] = [(PERIOD * k + generator.uniform(0.0, jitter), int(k)) for k in seen]
+    return found
+
+
+def play(synchroniser, recorded, delays, now=None):
+    """Adds pictures in the order in which they arrive; the moments as (time, items)."""
+    arrivals = sorted(
+        (time + delay, camera, time, k)
+        for camera, stream in recorded.items()
+        for (time, k), delay in zip(stream, delays[camera], strict=True)
+    )
+    found = []
+    for _, camera, time, k in arrivals:
+        synchroniser.add(camera, time, k)
+        while (moment := synchroniser.take(now)) is not None:
+            found.append(moment)
+    for camera in recorded:
+        synchroniser.finish(camera)
+    while (moment := synchroniser.take()) is not None:
+        found.append(moment)
+    return found
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_jittered_streams_with_drops_are_grouped_by_their_true_moments(seed):
+    generator = np.random.default_rng(seed)
+    cameras = [f"c{k}" for k in range(generator.integers(2, 6))]
+    recorded = streams(generator, cameras, 60, 0.4 * PERIOD, 0.2)
+    # Pictures arrive late and across each other, but every camera's own in order.
+    delays = {
+        name: 0.5 * PERIOD * generator.random() + 0.1 * PERIOD * generator.random(len(stream))
+        for name, stream in recorded.items()
+    }
+    synchroniser = Synchroniser(cameras, 0.5 * PERIOD, 20 * PERIOD)
+    found = play(synchroniser, recorded, delays)
+    truth = {}
+    for name, stream in recorded.items():
+        for time, k in stream:
+            truth.setdefault(k, {})[name] = time
+    assert len(found) == len(truth)
+    for moment, k in zip(found, sorted(truth), strict=True):
+        assert dict(moment.items) == dict.fromkeys(truth[k], k)
+        assert moment.time == min(truth[k].values())
+    assert not any(synchroniser.late.values())
+    assert not synchroniser.take_changes()
+
+
+def brute_force(recorded, tolerance):
+    """Scans all pictures again for every moment."""
+    rest = {name: list(stream) for name, stream in recorded.items()}
+    found = []
+    while any(rest.values()):
+        begin = min(time for stream in rest.values() for time, _ in stream)
+        group = {}
+        for name, stream in rest.items():
+            near = [one for one in stream if one[0] - begin <= tolerance]
+            if near:
+                group[name] = near[0][1]
+                stream.remove(near[0])
+        found.append((begin, group))
+    return found
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_streams_of_any_rate_are_grouped_as_brute_force_groups_them(seed):
+    generator = np.random.default_rng(100 + seed)
+    recorded = {
+        f"c{k}": [(float(t), i) for i, t in enumerate(np.cumsum(generator.exponential(0.1, 80)))]
+        for k in range(3)
+    }
+    none = {name: np.zeros(len(stream)) for name, stream in recorded.items()}
+    found = play(Synchroniser(recorded, 0.04, 1e9), recorded, none)
+    assert [(one.time, dict(one.items)) for one in found] == brute_force(recorded, 0.04)
+
+
+def test_camera_that_stops_is_waited_for_left_out_and_taken_back():
+    synchroniser = Synchroniser(["a", "b"], 0.05, 0.25)
+    synchroniser.add("a", 0.0, "a0")
+    synchroniser.add("b", 0.01, "b0")
+    assert dict(synchroniser.take().items) == {"a": "a0", "b": "b0"}
+    for k in (1, 2, 3):
+        synchroniser.add("a", 0.1 * k, f"a{k}")
+        assert synchroniser.take() is None
+    assert synchroniser.take(now=0.36).time == pytest.approx(0.1)
+    assert synchroniser.take_changes() == [CameraChange("b", 0.01, stopped=True)]
+    assert synchroniser.left_out == ("b",)
+    # Nobody waits for it any more, and nothing is said twice.
+    assert dict(synchroniser.take().items) == {"a": "a2"}
+    assert dict(synchroniser.take().items) == {"a": "a3"}
+    assert synchroniser.take() is None
+    assert not synchroniser.take_changes()
+    # Its picture of a moment that is over is too late, and no return.
+    assert not synchroniser.add("b", 0.31, "b3")
+    assert synchroniser.late == {"a": 0, "b": 1}
+    assert synchroniser.left_out == ("b",)
+    assert synchroniser.add("b", 0.41, "b4")
+    assert synchroniser.take_changes() == [CameraChange("b", 0.41, stopped=False)]
+    assert synchroniser.take() is None, "a is waited for"
+    synchroniser.add("a", 0.4, "a4")
+    assert dict(synchroniser.take().items) == {"a": "a4", "b": "b4"}
+
+
+def test_camera_that_never_gave_a_picture_is_reported_so():
+    synchroniser = Synchroniser(["a", "b"], 0.0, 0.1)
+    synchroniser.add("a", 0.0, 0)
+    assert synchroniser.take() is None
+    assert synchroniser.take(now=0.1) is not None
+    (change,) = synchroniser.take_changes()
+    assert change.camera == "b"
+    assert math.isnan(change.time)
+
+
+def test_what_cannot_be_is_refused():
+    for cameras, tolerance, patience in (
+        ([], 0.1, 0.1),
+        (["a", "a"], 0.1, 0.1),
+        (["a"], -0.1, 0.1),
+        (["a"], 0.1, 0.05),
+        (["a"], 0.1, math.inf),
+    ):
+        with pytest.raises(SettingsError):
+            Synchroniser(cameras, tolerance, patience)
+    synchroniser = Synchroniser(["a"], 0.1, 0.1)
+    with pytest.raises(UnknownNameError, match="'b'"):
+        synchroniser.add("b", 0.0, None)
+    assert synchroniser.add("a", 1.0, None)
+    assert not synchroniser.add("a", 1.0, None), "a time stamp that does not go on"

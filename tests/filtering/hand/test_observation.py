@@ -1,0 +1,163 @@
+import numpy as np
+import pytest
+from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+
+from drake_pose.body import bundled_model
+from drake_pose.errors import SettingsError
+from drake_pose.filtering.hand.observation import HAND_STATE, HandObservation, plant_positions
+from drake_pose.filtering.hand.projection import scaled_rotation
+from drake_pose.filtering.state import Belief
+
+OBSERVATION = HandObservation()
+
+
+def random_state(seed):
+    generator = np.random.default_rng(seed)
+    x = np.zeros(len(HAND_STATE))
+    x[:2] = generator.uniform(-60, 60, 2)
+    quaternion = generator.normal(size=4)
+    x[2:6] = quaternion / np.linalg.norm(quaternion) * generator.uniform(0.8, 1.2)
+    x[6:8] = generator.uniform(-0.3, 0.3, 2)
+    x[8:14] = generator.uniform(0, 1.2, 6)
+    x[14:28] = generator.normal(size=14)
+    x[28:34] = generator.uniform(0.03, 0.07, 6)
+    x[34:] = generator.uniform(0.02, 0.1, 3)
+    return x
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_jacobian_against_central_differences(seed):
+    x = random_state(seed)
+    h, H = OBSERVATION.predict(x)
+    step = 1e-6
+    for e in range(len(x)):
+        d = np.zeros_like(x)
+        d[e] = step
+        forward, backward = OBSERVATION.predict(x + d)[0], OBSERVATION.predict(x - d)[0]
+        change = forward - backward
+        change[OBSERVATION.wraps] = (
+            np.remainder(change[OBSERVATION.wraps] + np.pi, 2 * np.pi) - np.pi
+        )
+        numeric = change / (2 * step)
+        defined = np.isfinite(h)
+        np.testing.assert_allclose(H[defined, e], numeric[defined], rtol=1e-5, atol=2e-4)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_points_and_jacobian_against_drake(seed):
+    """Joints and tips of the plant of urdf/two_finger_hand, by AutoDiff through the whole model."""
+    plant = MultibodyPlant(0.0)
+    Parser(plant).AddModels(str(bundled_model("two_finger_hand")))
+    plant.Finalize()
+    names = tuple(plant.GetPositionNames(add_model_instance_prefix=False, always_add_suffix=False))
+    x = random_state(seed)
+    h, H = OBSERVATION.predict(x)
+    ad_plant = plant.ToAutoDiffXd()
+    context = ad_plant.CreateDefaultContext()
+    ad = InitializeAutoDiff(x)[:, 0]
+    value = dict(zip(HAND_STATE.names, ad, strict=True))
+    quaternion = [value[f"palm_q{c}"] for c in "wxyz"]
+    norm2 = sum(c * c for c in quaternion)
+    unit = [c / np.sqrt(norm2) for c in quaternion]
+    value.update({f"palm_q{c}": u for c, u in zip("wxyz", unit, strict=True)})
+    value.update({f"palm_{c}": 0 * norm2 for c in "xyz"})
+    for i in (1, 2):
+        value[f"base_height_{i}"] = value["palm_height"]
+        value[f"base_side_{i}"] = 0.25 * value["palm_width"]
+    ad_plant.SetPositions(context, np.array([value[name] for name in names]))
+    row = 2
+    for i in (1, 2):
+        for j in (0, 1, 2, 3):
+            frame = ad_plant.GetFrameByName(f"end_{i}{j}" if j else f"base_side_{i}")
+            p_W = ad_plant.CalcPointsPositions(
+                context, frame, np.zeros((3, 1)), ad_plant.world_frame()
+            )[:, 0]
+            wrist = np.array([value["wrist_x"], value["wrist_y"]])
+            pixel = 1000.0 * norm2 * p_W[:2] + wrist
+            np.testing.assert_allclose(ExtractValue(pixel)[:, 0], h[row : row + 2], atol=1e-9)
+            np.testing.assert_allclose(ExtractGradient(pixel), H[row : row + 2], atol=1e-7)
+            row += 2
+    q = plant_positions(x, names, 1000.0)
+    plain = plant.CreateDefaultContext()
+    plant.SetPositions(plain, q)
+    tip = plant.CalcPointsPositions(
+        plain, plant.GetFrameByName("end_23"), np.zeros((3, 1)), plant.world_frame()
+    )[:2, 0]
+    scale = np.sum(x[2:6] ** 2)
+    base = x[:2] / 1000.0
+    np.testing.assert_allclose((tip - base) * 1000 * scale + x[:2], h[16:18], atol=1e-9)
+
+
+def test_lines_pass_through_their_points():
+    x = random_state(1)
+    h, _ = OBSERVATION.predict(x)
+    points = OBSERVATION.drawing(x)
+    for i in range(2):
+        for j in range(3):
+            alpha, rho = h[18 + 2 * (3 * i + j) : 20 + 2 * (3 * i + j)]
+            normal = np.array([-np.sin(alpha), np.cos(alpha)])
+            for point in (points[4 * i + j], points[4 * i + j + 1]):
+                assert normal @ point == pytest.approx(rho, abs=1e-9)
+
+
+def test_the_palms_edges_are_the_outermost():
+    for seed in range(20):
+        x = random_state(seed)
+        points = OBSERVATION.drawing(x)
+        M, _ = scaled_rotation(x[2:6])
+        width, height, thickness = x[34:]
+        corners = np.array(
+            [
+                [a * height, b * thickness / 2, c * width / 2]
+                for a in (0, 1)
+                for b in (-1, 1)
+                for c in (-1, 1)
+            ]
+        )
+        pixels = 1000 * corners @ M[:2].T + x[:2]
+        across = np.array([-M[1, 0], M[0, 0]])
+        seen = points[8:12] @ across
+        assert seen.max() == pytest.approx((pixels @ across).max())
+        assert seen.min() == pytest.approx((pixels @ across).min())
+        assert (points[12:] @ M[:2, 0]).max() == pytest.approx((pixels @ M[:2, 0]).max())
+
+
+def test_a_segment_towards_the_camera_has_no_axis():
+    x = np.zeros(len(HAND_STATE))
+    x[2] = 1.0
+    x[28:34] = 0.04
+    x[34:] = 0.06, 0.08, 0.02
+    # Turned about the image's vertical by 90 degrees: the hand points along the depth.
+    x[2:6] = np.sqrt(0.5), 0, np.sqrt(0.5), 0
+    h, _ = OBSERVATION.predict(x)
+    assert np.isnan(h[18:30]).all()
+    assert np.isfinite(h[:18]).all()
+
+
+def test_the_mirrored_prediction_looks_the_same_and_changes_one_angle():
+    x = np.zeros(len(HAND_STATE))
+    # The plane of flexion is seen from its edge: flexion turns the finger out of the image.
+    x[2:6] = np.sqrt(0.5), np.sqrt(0.5), 0, 0
+    x[8:14] = 0.3, 0.2, 0.2, 0.3, 0.2, 0.2
+    x[28:34] = 0.06, 0.04, 0.035, 0.06, 0.04, 0.035
+    x[34:] = 0.06, 0.08, 0.02
+    belief = Belief(x, np.diag(np.full(len(x), 0.5**2)))
+    mirrored = HandObservation(mirror_slope=0.9).mirrors(belief)
+    assert mirrored
+    h, _ = OBSERVATION.predict(x)
+    for other in mirrored:
+        (changed,) = np.flatnonzero(other != x)
+        assert HAND_STATE.names[changed].startswith("flexion")
+        joint = changed - 8
+        start = 2 + 2 * (4 * (joint // 3) + joint % 3 + 1)
+        end = slice(start, start + 2)
+        np.testing.assert_allclose(OBSERVATION.predict(other)[0][end], h[end], atol=1e-9)
+    sure = Belief(x, np.diag(np.full(len(x), 1e-4)))
+    assert not HandObservation(mirror_slope=0.9).mirrors(sure)
+
+
+def test_a_noise_of_zero_is_refused():
+    with pytest.raises(SettingsError, match="angle_deviation"):
+        HandObservation(angle_deviation=0.0)

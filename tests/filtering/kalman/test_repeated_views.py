@@ -1,0 +1,133 @@
+import numpy as np
+import pytest
+
+from drake_pose.apps.experiments.shimada.experiment import experiment_filter
+from drake_pose.apps.experiments.shimada.motion import make_sequence
+from drake_pose.errors import SettingsError
+from drake_pose.filtering import Belief, FilterSettings, update
+from drake_pose.filtering.hand.observation import HAND_STATE
+from drake_pose.filtering.kalman.repeated_views import (
+    AnchoredObservation,
+    Stare,
+    begin_stare,
+    measure_curvature,
+    next_view,
+)
+
+CHANCE = 1e-9
+
+
+@pytest.fixture(scope="module")
+def hand():
+    f, observation = experiment_filter()
+    sequence = make_sequence(35.0, "full", observation, np.random.default_rng(0))
+    return f, observation, sequence
+
+
+def test_a_view_lasts_while_only_noise_changes(hand):
+    _, observation, sequence = hand
+    y = sequence.measurements[3]
+    noise = np.sqrt(observation.variances)
+    generator = np.random.default_rng(1)
+    view = next_view(None, y, observation, CHANCE)
+    assert view.count == 1
+    for count in range(2, 500):
+        again = y + noise * generator.normal(size=len(y))
+        view = next_view(view, again, observation, CHANCE)
+        assert view.count == count
+    assert next_view(view, y + 4 * noise, observation, CHANCE).count == 1
+    assert next_view(view, y, observation, 0.0).count == 1
+    # An angle that jumps by a full turn has not changed.
+    turned = y + 2 * np.pi * observation.wraps
+    assert next_view(view, turned, observation, CHANCE).count == view.count + 1
+
+
+def test_a_few_numbers_may_differ_more_than_many(hand):
+    """The threshold is a probability, whatever is hidden."""
+    _, observation, sequence = hand
+    y = sequence.measurements[3].copy()
+    y[4:] = np.nan
+    view = next_view(None, y, observation, CHANCE)
+    noise = np.sqrt(observation.variances)
+    assert next_view(view, y + 3.5 * noise, observation, CHANCE).count == 2
+    assert next_view(view, y + 9 * noise, observation, CHANCE).count == 1
+
+
+def test_something_that_was_hidden_makes_a_new_view(hand):
+    _, observation, sequence = hand
+    y = sequence.measurements[3]
+    hidden = y.copy()
+    hidden[5] = np.nan
+    view = next_view(None, hidden, observation, CHANCE)
+    assert next_view(view, y, observation, CHANCE).count == 1
+    assert next_view(view, np.full(len(y), np.nan), observation, CHANCE).count == 1
+
+
+class Parabola:
+    """h = x^2 / 2 + x: its tangent at 0 leaves out x^2 / 2."""
+
+    names = ("h",)
+    variances = np.array([1e-4])
+    wraps = np.zeros(1, dtype=bool)
+
+    def predict(self, x):
+        return np.array([0.5 * x[0] ** 2 + x[0]]), np.array([[x[0] + 1.0]])
+
+    def mirrors(self, belief):
+        return []
+
+
+def test_the_curvature_is_the_mean_square_of_what_the_tangent_leaves_out():
+    deviation = 0.3
+    belief = Belief(np.zeros(1), np.array([[deviation**2]]))
+    draws = np.random.default_rng(0).normal(size=200000) * deviation
+    expected = np.mean((0.5 * draws**2) ** 2)
+    assert measure_curvature(Parabola(), belief) == pytest.approx([expected], rel=0.03)
+
+
+def test_a_thousand_frames_tell_the_sum_of_state_and_offset_and_no_more():
+    """Against the closed form: prior, offset and mean noise as one normal distribution."""
+    prior = Belief(np.zeros(1), np.array([[0.09]]))
+    stare = begin_stare(Parabola(), prior, prior, np.zeros(1))
+    anchored = AnchoredObservation(Parabola(), stare.tangent)
+    C = measure_curvature(Parabola(), prior)[0]
+    frames, y = 1000, 0.4
+    for _ in range(frames):
+        stare = Stare(stare.tangent, update(stare.belief, np.array([y]), anchored).belief)
+    noise = Parabola.variances[0] / frames + C
+    assert stare.state().covariance[0, 0] == pytest.approx(1 / (1 / 0.09 + 1 / noise), rel=1e-6)
+    assert stare.state().mean[0] == pytest.approx(y * 0.09 / (0.09 + noise), rel=1e-6)
+    total = np.ones(2) @ stare.belief.covariance @ np.ones(2)
+    assert total == pytest.approx(Parabola.variances[0] / frames, rel=1e-2)
+
+
+def test_the_anchored_jacobian_against_differences(hand):
+    _, observation, sequence = hand
+    x = sequence.states[5]
+    anchored = AnchoredObservation(observation, x)
+    n, m = len(x), len(observation.names)
+    z = np.r_[sequence.states[6], np.random.default_rng(0).normal(size=m)]
+    h, H = anchored.predict(z)
+    step = np.random.default_rng(1).normal(size=n + m) * 1e-3
+    np.testing.assert_allclose(anchored.predict(z + step)[0] - h, H @ step, atol=1e-9)
+    h0, _ = observation.predict(x)
+    np.testing.assert_allclose(anchored.predict(np.r_[x, np.zeros(m)])[0], h0)
+
+
+def test_offsets_stay_while_the_state_moves(hand):
+    f, observation, sequence = hand
+    guess = f.start(sequence.guess).best
+    stare = begin_stare(observation, guess, guess, guess.mean)
+    A, U = HAND_STATE.transition(), f.predict(f.start(sequence.guess)).hypotheses[0].free.covariance
+    moved = stare.moved(A, U)
+    n = len(HAND_STATE)
+    np.testing.assert_allclose(moved.state().mean, A @ guess.mean)
+    np.testing.assert_allclose(moved.state().covariance, A @ guess.covariance @ A.T + U)
+    np.testing.assert_allclose(moved.belief.mean[n:], stare.belief.mean[n:])
+    np.testing.assert_array_equal(moved.belief.covariance, moved.belief.covariance.T)
+
+
+def test_novelty_is_a_probability():
+    for bad in (-1.0, 1.0, 6.0):
+        with pytest.raises(SettingsError, match="novelty"):
+            FilterSettings(novelty=bad)

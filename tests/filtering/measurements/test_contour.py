@@ -1,0 +1,163 @@
+import numpy as np
+import pytest
+
+from drake_pose.body import bundled_model, load_model
+from drake_pose.camera import PinholeCamera
+from drake_pose.errors import SettingsError, UnknownNameError
+from drake_pose.filtering import ContourObservation, ContourSettings
+from drake_pose.filtering.measurements.contour import ROOT_SHIFT
+from drake_pose.filtering.measurements.contour_edges import find_edges
+from drake_pose.silhouette import LabelRenderer
+from tests.matching.bodies import forked_body, front_camera
+
+
+def pinhole(name, turn_deg, side=260, focal=330.0, distance=2.9, height=0.9):
+    """A camera that looks at the world's axis from all around."""
+    c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+    X_WC = np.eye(4)
+    X_WC[:3, :3] = np.column_stack([[-s, c, 0.0], [0.0, 0.0, -1.0], [-c, -s, 0.0]])
+    X_WC[:3, 3] = [distance * c, distance * s, height]
+    middle = 0.5 * (side - 1)
+    return PinholeCamera(name, side, side, focal, focal, middle, middle, X_WC)
+
+
+def descend(observation, masks, x, steps=8):
+    """Gauss and Newton's steps from a state."""
+    moving = len(observation.layout.moving)
+    for _ in range(steps):
+        measured = observation.measure(masks, x)
+        H = measured.H[:, :moving]
+        step = np.linalg.solve(H.T @ H + 1e-3 * np.eye(moving), H.T @ measured.y)
+        x = x.copy()
+        x[:moving] += step
+    return x, measured
+
+
+def test_edges_of_a_disc_are_where_its_radius_says():
+    v, u = np.mgrid[:120, :120]
+    mask = np.hypot(u - 60.3, v - 58.8) < 30.0
+    turns = np.linspace(0, 2 * np.pi, 50, endpoint=False)
+    normals = np.column_stack([np.cos(turns), np.sin(turns)])
+    for radius in (22.0, 29.6, 37.0):
+        uv = [60.3, 58.8] + radius * normals
+        distances = find_edges(mask, uv, normals, 12.0)
+        np.testing.assert_allclose(distances, 30.0 - radius, atol=0.8)
+        assert abs(distances.mean() - (30.0 - radius)) < 0.15
+    assert np.isnan(find_edges(mask, [60.3, 58.8] + 10 * normals, normals, 12.0)).all()
+
+
+def test_an_edge_beyond_the_picture_is_none():
+    mask = np.ones((20, 20), dtype=bool)
+    normals = np.array([[1.0, 0.0]])
+    assert np.isnan(find_edges(mask, np.array([[15.0, 10.0]]), normals, 30.0)).all()
+
+
+def test_it_leads_back_to_the_truth_that_drake_rendered(tmp_path):
+    model = forked_body(tmp_path)
+    camera = front_camera(200, shift=0.2)
+    observation = ContourObservation(model.pose_tree(), [camera])
+    truth = np.array([0.2, 0.9, -0.6])
+    x_true = observation.state(truth)
+    masks = [LabelRenderer(model, camera).mask(truth)]
+    x, measured = descend(observation, masks, x_true + np.r_[0.12, -0.15, 0.1, np.zeros(3)])
+    q, X_WB = observation.positions(x)
+    # Segments of 12 to 24 pixels: a quarter of a pixel is a degree.
+    np.testing.assert_allclose(q, truth, atol=np.radians(2.0))
+    np.testing.assert_allclose(X_WB, np.eye(4), atol=1e-9)
+    assert measured.distance < 0.6
+    assert measured.share > 0.95
+    drawn = observation.draw(x, camera)
+    assert np.count_nonzero(drawn != masks[0]) < 0.02 * np.count_nonzero(masks[0])
+
+
+def test_an_occluder_pulls_little(tmp_path):
+    model = forked_body(tmp_path)
+    camera = front_camera(200, shift=0.2)
+    observation = ContourObservation(model.pose_tree(), [camera])
+    truth = np.array([0.1, 1.2, -1.0])
+    mask = LabelRenderer(model, camera).mask(truth).copy()
+    rows, columns = np.nonzero(mask)
+    at = int(np.argmax(columns))
+    # A blob beside the outermost arm.
+    mask[rows[at] - 5 : rows[at] + 6, columns[at] : columns[at] + 8] = True
+    x, _ = descend(observation, [mask], observation.state(truth))
+    np.testing.assert_allclose(observation.positions(x)[0], truth, atol=np.radians(2.5))
+
+
+def test_a_body_with_skin():
+    """The bundled man, in two of Drake's cameras."""
+    model = load_model(bundled_model("man"), check=False)
+    q = model.default_positions.copy()
+    tree = model.pose_tree()
+    cameras = [pinhole("a", 15.0, height=-0.6), pinhole("b", 105.0, height=-0.6)]
+    generator = np.random.default_rng(4)
+    observation = ContourObservation(tree, cameras)
+    x_true = observation.state(q)
+    moving = len(observation.layout.moving)
+    x_true[:moving] += generator.uniform(-0.1, 0.1, moving)
+    q_true = np.clip(observation.positions(x_true)[0], model.lower, model.upper)
+    x_true = observation.state(q_true)
+    masks = [LabelRenderer(model, camera).mask(q_true) for camera in cameras]
+    drawn = [observation.draw(x_true, camera) for camera in cameras]
+    for mask, own in zip(masks, drawn, strict=True):
+        assert np.count_nonzero(mask != own) < 0.03 * np.count_nonzero(mask)
+    start = x_true.copy()
+    start[:moving] += generator.uniform(-0.04, 0.04, moving)
+    before = observation.measure(masks, start)
+    x, after = descend(observation, masks, start, steps=5)
+    assert after.distance < 0.7 < before.distance
+    assert np.median(np.abs(x - x_true)[:moving]) < np.median(np.abs(start - x_true)[:moving])
+
+
+def test_a_root_that_is_known_elsewhere_and_one_that_is_estimated_there(tmp_path):
+    model = forked_body(tmp_path)
+    tree = model.pose_tree("trunk", root_position=np.zeros(3))
+    camera = front_camera(200, shift=0.2)
+    held, moves = ContourObservation(tree, [camera]), ContourObservation(tree, [camera], moves=True)
+    q, there = np.array([0.2, 0.9, -0.6]), np.array([0.0, 0.03, -0.02])
+    x = moves.state(q)
+    at_home = moves.draw(x, camera)
+    x[moves.layout.indices(ROOT_SHIFT)] = there
+    seen = held.with_root_position(there).draw(held.state(q), camera)
+    assert not np.array_equal(seen, at_home)
+    np.testing.assert_array_equal(moves.draw(x, camera), seen)
+    start = moves.state(q)
+    found, _ = descend(moves, [seen], start)
+    np.testing.assert_allclose(found[moves.layout.indices(ROOT_SHIFT)][1:], there[1:], atol=0.004)
+
+
+def test_slopes_agree_with_finite_differences_of_the_contour(tmp_path):
+    """The measured distances change with the state as H says, where nothing is robust."""
+    model = forked_body(tmp_path)
+    camera = front_camera(400, shift=0.2)
+    observation = ContourObservation(
+        model.pose_tree(), [camera], settings=ContourSettings(spacing=1.0, deviation=30.0)
+    )
+    truth = observation.state(np.array([0.2, 0.9, -0.6]))
+    mask = observation.draw(truth, camera)
+    for element in range(3):
+        for step in (0.1, -0.1):
+            x = truth.copy()
+            x[element] += step
+            measured = observation.measure([mask], x)
+            expected = measured.H @ (truth - x)
+            assert np.linalg.norm(measured.y - expected) < 0.3 * np.linalg.norm(measured.y)
+
+
+def test_nothing_seen_and_bad_arguments(tmp_path):
+    model = forked_body(tmp_path)
+    camera = front_camera(100)
+    observation = ContourObservation(model.pose_tree(), [camera])
+    x = observation.state(np.zeros(3))
+    assert observation.measure([None], x) is None
+    assert observation.measure([np.zeros((100, 100), dtype=bool)], x) is None
+    with pytest.raises(SettingsError, match="1 masks expected"):
+        observation.measure([], x)
+    with pytest.raises(SettingsError, match="50 x 50"):
+        observation.measure([np.zeros((50, 50), dtype=bool)], x)
+    with pytest.raises(SettingsError, match="one camera"):
+        ContourObservation(model.pose_tree(), [])
+    with pytest.raises(UnknownNameError, match="tail"):
+        ContourObservation(model.pose_tree(), [camera], constant=("tail",))
+    with pytest.raises(SettingsError, match="spacing"):
+        ContourSettings(spacing=0.0)

@@ -1,0 +1,151 @@
+import math
+
+import numpy as np
+import pytest
+
+from drake_pose.body import bundled_model, load_model
+from drake_pose.errors import SettingsError
+from drake_pose.filtering import (
+    TRACKED,
+    ContourObservation,
+    ContourTracker,
+    Followed,
+    MatchAndTrack,
+    TrackingSettings,
+)
+from drake_pose.matching import PaperSearch, PaperSearchSettings, View
+from drake_pose.silhouette import LabelRenderer
+from tests.filtering.measurements.test_contour import pinhole
+from tests.matching.bodies import forked_body, front_camera
+
+PERIOD = 1 / 30
+
+
+def swings(frames, centre, amplitude, generator):
+    """(frames, n) smooth motion about a centre, about one swing in 1.3 s."""
+    t = np.arange(frames)[:, None] / 40
+    rate = generator.uniform(0.6, 1.4, len(centre))
+    phase = generator.uniform(0, 2 * np.pi, len(centre))
+    return centre + amplitude * np.sin(2 * np.pi * rate * t + phase)
+
+
+class CountingSearch:
+    """A search that counts how often it is asked."""
+
+    def __init__(self, search):
+        self.search, self.calls = search, 0
+        self.tree, self.sampled = search.tree, search.sampled
+
+    def match(self, views, root_position=None):
+        self.calls += 1
+        return self.search.match(views, root_position)
+
+
+@pytest.fixture
+def body(tmp_path):
+    return forked_body(tmp_path)
+
+
+def paper_search(model):
+    settings = PaperSearchSettings(interval=math.radians(20), outside_limit=60.0)
+    return CountingSearch(PaperSearch(model.pose_tree(), settings))
+
+
+def test_tracked_after_one_match_and_matched_again_after_a_jump(body):
+    camera = front_camera(200, shift=0.2)
+    search = paper_search(body)
+    follower = MatchAndTrack(search, [camera], PERIOD)
+    generator = np.random.default_rng(7)
+    first = swings(12, np.array([0.1, 0.4, -0.4]), 0.25, generator)
+    # Cut: the body stands otherwise in the next frame.
+    second = swings(12, np.array([-0.3, 1.7, -1.7]), 0.25, generator)
+    renderer = LabelRenderer(body, camera)
+    followed, errors, asked = Followed(), [], []
+    for q in np.vstack([first, second]):
+        followed, result = follower.next(followed, [View(camera, renderer.mask(q))])
+        errors.append(np.degrees(np.abs(result.q - q)).max())
+        asked.append(search.calls)
+        assert followed.matches == search.calls
+    assert asked[0] == asked[11] == 1
+    assert asked[12] == 2
+    assert asked[-1] <= 3
+    # Segments of 12 to 24 pixels.
+    assert np.median(errors[:12]) < 3.0
+    assert np.median(errors[12:]) < 3.5
+    assert result.stopped_by == TRACKED
+
+
+def test_no_pose_found_is_said_and_asked_again(body):
+    camera = front_camera(200, shift=0.2)
+    settings = PaperSearchSettings(interval=math.radians(20), outside_limit=0.0)
+    search = CountingSearch(PaperSearch(body.pose_tree(), settings))
+    follower = MatchAndTrack(search, [camera], PERIOD)
+    speck = np.zeros((200, 200), dtype=bool)
+    speck[3:5, 3:5] = True
+    followed, result = follower.next(Followed(), [View(camera, speck)])
+    assert not result.found
+    assert followed.track is None
+    followed, _ = follower.next(followed, [View(camera, speck)])
+    assert followed.matches == search.calls == 2
+
+
+@pytest.mark.slow
+def test_the_man_is_followed_through_two_cameras():
+    """A body with skin: errors against the truth, and honest deviations."""
+    model = load_model(bundled_model("man"), check=False)
+    cameras = [pinhole("a", 15.0, height=-0.6), pinhole("b", 105.0, height=-0.6)]
+    observation = ContourObservation(model.pose_tree(), cameras)
+    tracker = ContourTracker(observation, PERIOD)
+    generator = np.random.default_rng(1)
+    layout = observation.layout
+    moving = len(layout.moving)
+    names = model.position_names
+    inside = 0.1 * (model.upper - model.lower)
+    centre = np.clip(model.default_positions, model.lower + inside, model.upper - inside)
+    amplitude = np.where(
+        [kind == "angle" for kind in model.position_kinds], np.minimum(inside, 0.25), 0.0
+    )
+    truth = swings(12, centre, amplitude, generator)
+    renderers = [LabelRenderer(model, camera) for camera in cameras]
+    index = [names.index(name) for name in layout.moving]
+    angles = np.array([observation.is_angle(name) for name in layout.moving])
+    start = observation.state(truth[0])
+    start[:moving] += np.where(angles, 0.08, 0.01) * generator.normal(size=moving)
+    track = tracker.start(start)
+    errors, scaled = [], []
+    for k, q in enumerate(truth):
+        masks = [renderer.mask(q) for renderer in renderers]
+        # A camera is late once.
+        track = tracker.follow(track, [None if k == 5 else masks[0], masks[1]], first=k == 0)
+        assert not track.lost
+        error = track.state.best.mean[:moving] - q[index]
+        errors.append(np.degrees(np.abs(error[angles])))
+        scaled.append(np.abs(error) / track.state.best.deviations()[:moving])
+    assert np.median(errors[4:]) < 2.5
+    assert np.mean(np.array(scaled[4:]) < 2) > 0.85
+
+
+def test_lost_when_the_body_is_elsewhere(body):
+    camera = front_camera(200, shift=0.2)
+    observation = ContourObservation(body.pose_tree(), [camera])
+    tracker = ContourTracker(observation, PERIOD)
+    track = tracker.start(observation.state(np.array([0.1, 0.5, -0.5])))
+    assert not track.lost
+    empty = np.zeros((200, 200), dtype=bool)
+    empty[:3, :3] = True
+    assert tracker.follow(track, [empty]).lost
+    waited = tracker.follow(track, [None])
+    assert not waited.lost
+    assert waited.measurement is None
+
+
+@pytest.mark.parametrize("bad", [{"rounds": 0}, {"memory": -1.0}, {"lost_share": math.nan}])
+def test_bad_settings_are_named(bad):
+    with pytest.raises(SettingsError, match=next(iter(bad))):
+        TrackingSettings(**bad)
+
+
+def test_a_bad_period_is_refused(body):
+    observation = ContourObservation(body.pose_tree(), [front_camera()])
+    with pytest.raises(SettingsError, match="period"):
+        ContourTracker(observation, 0.0)

@@ -1,0 +1,100 @@
+"""The rough search: what is right in the rough is among the few that are refined."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from drake_pose.body import PoseTree
+from drake_pose.errors import SettingsError
+from drake_pose.matching import View
+from drake_pose.matching.grid.sampled_body import WideBody
+from drake_pose.matching.grid.settings import WideSearchSettings
+from drake_pose.matching.starts.coarse_kernel import fill_cover
+from drake_pose.matching.starts.coarse_search import RoughSearch, RoughSettings
+from tests.matching.arms import arm_cameras, arm_tree, damaged_views, draw_pose, draw_view, split
+
+SETTINGS = RoughSettings()
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory: pytest.TempPathFactory) -> PoseTree:
+    return arm_tree(tmp_path_factory.mktemp("arm"))
+
+
+@pytest.fixture(scope="module")
+def body(tree: PoseTree) -> WideBody:
+    return WideBody(tree, WideSearchSettings(interval=SETTINGS.interval))
+
+
+def nearest(tree: PoseTree, X_WN: np.ndarray, values: np.ndarray) -> float:
+    """How far the joints of the nearest pose are from where they should be, at most [m]."""
+    gaps = X_WN[:, :, :3, 3] - tree.node_poses(split(tree, values))[:, :3, 3]
+    return float(np.linalg.norm(gaps, axis=2).max(axis=1).min())
+
+
+@pytest.mark.slow
+def test_the_pose_is_among_the_few(tree: PoseTree, body: WideBody) -> None:
+    found = []
+    for seed in range(10):
+        values = draw_pose(tree, np.random.default_rng(40 + seed))
+        search = RoughSearch(body, damaged_views(tree, values, seed), SETTINGS)
+        poses = search.choose_distinct(search.find(), 40, 0.13)
+        assert 1 <= len(poses) <= 40
+        assert (np.diff(poses.costs) >= 0.0).all()
+        found.append(nearest(tree, poses.X_WN, values))
+    # The arm is 1.1 m long; half a step of 15 degrees moves its end by up to 14 cm.
+    assert np.mean(np.array(found) < 0.15) >= 0.9
+
+
+def test_poses_are_those_of_their_samples(tree: PoseTree, body: WideBody) -> None:
+    views = [draw_view(tree, draw_pose(tree, np.random.default_rng(1)), arm_cameras()[0])]
+    poses = RoughSearch(body, views, SETTINGS).find()
+    for samples, X_WN in zip(poses.samples[:20], poses.X_WN[:20], strict=True):
+        values = [grid[t] for grid, t in zip(body.sampled.values, samples, strict=True)]
+        np.testing.assert_allclose(X_WN, tree.node_poses(values), atol=1e-9)
+
+
+def test_a_limb_searched_again_leaves_the_rest(tree: PoseTree, body: WideBody) -> None:
+    values = draw_pose(tree, np.random.default_rng(2))
+    views = [draw_view(tree, values, camera) for camera in arm_cameras()]
+    X_WN = tree.node_poses(split(tree, values))
+    hand = len(tree.nodes) - 1
+    poses = RoughSearch(body, views, SETTINGS).find_again(X_WN, [hand])
+    np.testing.assert_array_equal(poses.X_WN[:, :hand], np.tile(X_WN[:hand], (len(poses), 1, 1, 1)))
+    assert (poses.samples[:, :hand] == -1).all()
+    best = body.sampled.values[hand][poses.samples[0, hand], 0]
+    assert abs(best - values[-1]) <= SETTINGS.interval
+
+
+@pytest.mark.parametrize("longer", [1e3, 1e9])
+def test_a_lens_that_is_far_too_long_does_not_fill_the_memory(
+    tree: PoseTree, body: WideBody, longer: float
+) -> None:
+    view = draw_view(tree, draw_pose(tree, np.random.default_rng(3)), arm_cameras()[0])
+    focal = longer * arm_cameras()[0].focal_x
+    wrong = View(replace(arm_cameras()[0], focal_x=focal, focal_y=focal), view.mask)
+    search = RoughSearch(body, [wrong], SETTINGS)
+    assert sum(view.cover.nbytes for view in search._views) < 1e8
+    assert len(search.find()) >= 1
+
+
+def test_cover_holds_the_points_within_the_radius() -> None:
+    generator = np.random.default_rng(3)
+    points, origin = generator.uniform(0.0, 30.0, (100, 2)), np.array([-3.0, -4.0])
+    radii = np.array([2.0, 5.0])
+    cover = np.zeros((2, 12, 13, 2), dtype=np.uint64)
+    fill_cover(cover, points, origin, 3.0, radii)
+    for level, i, j in ((0, 2, 3), (1, 5, 6), (1, 11, 0)):
+        middle = origin + 3.0 * (np.array([i, j]) + 0.5)
+        expected = np.linalg.norm(points - middle, axis=1) <= radii[level]
+        bits = [int(cover[level, i, j, p // 64]) >> (p % 64) & 1 for p in range(100)]
+        np.testing.assert_array_equal(bits, expected)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("interval", 0.0), ("hypotheses", 0), ("slack", -1.0), ("alike", 0.0)]
+)
+def test_settings_out_of_range(name: str, value: float) -> None:
+    with pytest.raises(SettingsError, match=name):
+        RoughSettings(**{name: value})

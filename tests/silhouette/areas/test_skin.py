@@ -1,0 +1,269 @@
+"""Surfaces with bands of skin: kernel, brute force and Drake's renderer agree; gaps are closed."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from drake_pose.body import ArticulatedModel, TriangleMesh, bundled_model, load_model
+from drake_pose.camera import Camera, ParallelCamera, PinholeCamera
+from drake_pose.silhouette import (
+    BendingOutline,
+    LabelRenderer,
+    TreeSurfaces,
+    draw_mask,
+    measure_agreement,
+    outline_from_mesh,
+    prefix_sums,
+    require_visible,
+    score_bending,
+    score_bodies,
+    subtract_body,
+)
+from drake_pose.silhouette.bits.bit_kernel import draw_bits
+from drake_pose.silhouette.bits.bit_view import make_bit_view
+from drake_pose.silhouette.contours.direction_cells import divide_outline
+from tests.body.skins import HALF, load_limb
+from tests.silhouette.shapes import brute_force_mask
+
+SIDE = 160
+
+
+def looking_along(direction: np.ndarray, distance: float) -> np.ndarray:
+    """A camera's pose (4, 4) in the limb's world, its middle in view."""
+    z = np.asarray(direction, dtype=float) / np.linalg.norm(direction)
+    x = np.cross(z, [0.0, 0.0, 1.0]) if abs(z[2]) < 0.9 else np.cross(z, [0.0, 1.0, 0.0])
+    x /= np.linalg.norm(x)
+    X = np.eye(4)
+    X[:3, :3] = np.column_stack([x, np.cross(z, x), z])
+    X[:3, 3] = np.array([0.0, 0.0, 0.1]) - distance * z
+    return X
+
+
+def cameras(rng: np.random.Generator) -> list[Camera]:
+    X_WC = [looking_along(rng.normal(size=3), 1.2) for _ in range(2)]
+    middle = SIDE / 2 + 0.137
+    return [
+        ParallelCamera("parallel", SIDE, SIDE, 180.0, middle, middle, X_WC[0]),
+        PinholeCamera("pinhole", SIDE, SIDE, 220.0, 220.0, middle, middle, X_WC[1]),
+    ]
+
+
+def pose(
+    model: ArticulatedModel, q: np.ndarray, camera: Camera
+) -> tuple[list[np.ndarray], np.ndarray]:
+    tree = model.pose_tree()
+    values = tree.values_from_positions(q)
+    return values, camera.X_CW @ tree.node_poses(values)
+
+
+def test_kernel_and_brute_force_agree(tmp_path: Path) -> None:
+    model = load_limb(tmp_path)
+    tree = model.pose_tree()
+    surfaces = TreeSurfaces(tree)
+    rng = np.random.default_rng(0)
+    gained = 0
+    for camera in cameras(rng):
+        for _ in range(3):
+            values, X_CN = pose(model, rng.uniform(model.lower, model.upper), camera)
+            expected = np.zeros((SIDE, SIDE), dtype=bool)
+            for node, part, X in zip(tree.nodes, values, X_CN, strict=True):
+                expected |= brute_force_mask(node.surface(part), X, camera)
+            drawn = draw_mask(surfaces.at(values), X_CN, camera)
+            assert np.count_nonzero(drawn != expected) <= 2
+            gained += np.count_nonzero(draw_mask(surfaces.rigid, X_CN, camera) != drawn)
+    assert gained > 100
+
+
+def test_many_poses_at_once_are_scored_as_one_by_one(tmp_path: Path) -> None:
+    model = load_limb(tmp_path)
+    surfaces = TreeSurfaces(model.pose_tree())
+    rng = np.random.default_rng(1)
+    for camera in cameras(rng):
+        sets = rng.random((2, SIDE, SIDE)) < 0.4
+        prefixes = np.array([prefix_sums(mask) for mask in sets])
+        posed = [pose(model, rng.uniform(model.lower, model.upper), camera) for _ in range(6)]
+        X_CN = np.array([X for _, X in posed])
+        bands = [
+            np.concatenate([node.skin.vertices(values[i][None]) for values, _ in posed])
+            for i, node in enumerate(model.pose_tree().nodes)
+            if node.skin is not None
+        ]
+        whole = [surfaces.whole(i) for i in range(3)]
+        found = score_bending(whole, bands, X_CN, camera, prefixes)
+        for areas, (values, X) in zip(found, posed, strict=True):
+            outlines = surfaces.at(values)
+            np.testing.assert_array_equal(
+                areas, score_bodies(outlines, X[None], camera, prefixes)[0]
+            )
+            mask = draw_mask(outlines, X, camera)
+            assert list(areas) == [mask.sum(), *((mask & s).sum() for s in sets)]
+            left, prefix = sets[0].copy(), prefixes[0].copy()
+            subtract_body(left, prefix, outlines, X, camera)
+            np.testing.assert_array_equal(left, sets[0] & ~mask)
+
+
+def test_bits_have_the_band_of_their_sample(tmp_path: Path) -> None:
+    """The wide search's pictures are the kernel's, for each of many samples of a node."""
+    model = load_limb(tmp_path)
+    tree = model.pose_tree()
+    surfaces = TreeSurfaces(tree)
+    rng = np.random.default_rng(2)
+    skin = tree.nodes[2].skin
+    values = rng.uniform(-2.0, 2.0, (12, 3))
+    X_PN = tree.relative_transforms(2, values)
+    X_WP = tree.node_poses([np.array([0.3]), np.array([0.5]), np.zeros(3)])[1:2]
+    pairs = np.column_stack([np.zeros(12), np.arange(12)]).astype(np.int32)
+    near = PinholeCamera("near", SIDE, SIDE, 60.0, 60.0, 80.1, 80.1, looking_along([0, 1, 0], 0.2))
+    for camera, spread in zip([*cameras(rng), near], (0.0, 0.3, 0.3), strict=True):
+        silhouette = rng.random((SIDE, SIDE)) < 0.5
+        view = make_bit_view(silhouette, camera.kernel_parameters(), camera.X_CW, 0)
+        celled = divide_outline(surfaces.rigid[2], spread, skin.mesh, skin.vertices(values))
+        never = np.zeros(1, dtype=bool)
+        kept, areas, runs, words = draw_bits(celled, view, X_WP, X_PN, pairs, np.inf, never)
+        assert kept.all()
+        for i in range(12):
+            X_CN = camera.X_CW @ X_WP @ X_PN[i]
+            mask = draw_mask([surfaces.node_at(2, values[i])], X_CN, camera)
+            inside = int((mask & silhouette).sum())
+            assert list(areas[i]) == [inside, 0, mask.sum() - inside]
+            _, count, begin = runs[i, 0]
+            assert np.bitwise_count(words[begin : begin + count]).sum() == inside
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_drake_draws_the_same(tmp_path: Path, seed: int) -> None:
+    model = load_limb(tmp_path)
+    rng = np.random.default_rng(10 + seed)
+    for camera in cameras(rng):
+        agreement = measure_agreement(model, camera, 8, seed)
+        assert agreement.holds, (camera.name, agreement.worst)
+        assert (agreement.areas > 500).all()
+    # The band is drawn as its child link, wherever the plant's own world is.
+    renderer = LabelRenderer(model, camera)
+    q = rng.uniform(model.lower, model.upper)
+    X_WB = np.eye(4)
+    X_WB[:3, :3] = Rotation.from_rotvec([0.1, 0.2, 0.3]).as_matrix()
+    moved = LabelRenderer(model, camera.with_pose(X_WB @ camera.X_WC)).segments(q, X_WB)
+    there = renderer.segments(q)
+    assert np.count_nonzero(moved != there) <= 0.004 * (there >= 0).sum()
+    names = {renderer.link_names[label] for label in np.unique(there) if label >= 0}
+    assert names <= {"upper", "lower", "hand"}
+
+
+def gap_at_elbow(model: ArticulatedModel, *, skin: bool) -> tuple[int, int]:
+    """Background pixels in the corner outside a right-angled elbow, and the corner's pixels.
+
+    Seen along the elbow's axis, the corner is the quarter of a disc, as wide as the limb, that
+    lies neither over the upper prism's end nor over the lower one's.
+    """
+    scale, side = 2000.0, 400
+    camera = ParallelCamera(
+        "side", side, side, scale, side / 2 + 0.3, side / 2 + 0.3, looking_along([1.0, 0, 0], 1.0)
+    )
+    values, X_CN = pose(model, np.array([0.0, np.pi / 2, 0, 0, 0]), camera)
+    surfaces = TreeSurfaces(model.pose_tree())
+    mask = draw_mask(surfaces.at(values) if skin else surfaces.rigid, X_CN, camera)
+    v, u = np.mgrid[:side, :side]
+    elbow = camera.project(np.array([[0.0, 0.0, 0.1]]))[0][0]
+    corner = np.hypot(u - elbow[0], v - elbow[1]) < 0.95 * HALF * scale
+    lower = camera.project(np.array([[0.0, 0.05, 0.1], [0.0, -0.05, 0.1]]))[0]
+    forward = max(lower, key=lambda uv: mask[int(uv[1]), int(uv[0])])
+    corner &= (u - elbow[0]) * np.sign(forward[0] - elbow[0]) < -1
+    corner &= v - elbow[1] > 1
+    return int((corner & ~mask).sum()), int(corner.sum())
+
+
+def test_the_band_closes_the_gap_at_a_right_angle(tmp_path: Path) -> None:
+    model = load_limb(tmp_path)
+    before, corner = gap_at_elbow(model, skin=False)
+    after, _ = gap_at_elbow(model, skin=True)
+    assert before == corner
+    assert corner > 2000
+    assert after == 0
+
+
+def test_a_band_cut_by_the_near_plane(tmp_path: Path) -> None:
+    model = load_limb(tmp_path)
+    tree = model.pose_tree()
+    surfaces = TreeSurfaces(tree)
+    camera = PinholeCamera(
+        "near", SIDE, SIDE, 60.0, 60.0, 80.2, 79.7, looking_along([0, 1, 0.1], 0.06), near=0.02
+    )
+    q = np.array([0.1, 0.8, 0.3, -0.2, 0.4])
+    values, X_CN = pose(model, q, camera)
+    drawn = draw_mask(surfaces.at(values), X_CN, camera)
+    expected = np.zeros_like(drawn)
+    for node, part, X in zip(tree.nodes, values, X_CN, strict=True):
+        expected |= brute_force_mask(node.surface(part), X, camera)
+    assert drawn.any()
+    assert np.count_nonzero(drawn != expected) <= 3
+    prefixes = np.zeros((0, SIDE, SIDE + 1), dtype=np.int32)
+    bands = [
+        node.skin.vertices(part[None])
+        for node, part in zip(tree.nodes, values, strict=True)
+        if node.skin is not None
+    ]
+    whole = [surfaces.whole(i) for i in range(3)]
+    assert score_bending(whole, bands, X_CN[None], camera, prefixes)[0, 0] == drawn.sum()
+
+
+def test_without_a_band_nothing_is_new(tmp_path: Path) -> None:
+    model = load_limb(tmp_path, "")
+    surfaces = TreeSurfaces(model.pose_tree())
+    assert not surfaces.bends
+    values = [np.zeros(1), np.zeros(1), np.zeros(3)]
+    assert all(a is b for a, b in zip(surfaces.at(values), surfaces.rigid, strict=True))
+    camera = cameras(np.random.default_rng(3))[0]
+    values, X_CN = pose(model, np.zeros(5), camera)
+    prefixes = np.zeros((0, SIDE, SIDE + 1), dtype=np.int32)
+    found = score_bending(surfaces.rigid, [], X_CN[None], camera, prefixes)
+    np.testing.assert_array_equal(found, score_bodies(surfaces.rigid, X_CN[None], camera, prefixes))
+    require_visible(surfaces.at(values), X_CN, camera)
+
+
+def test_wrong_bands_are_refused() -> None:
+    tetrahedron = TriangleMesh(
+        np.vstack([np.zeros(3), np.eye(3)]), np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    )
+    nothing = outline_from_mesh(TriangleMesh.empty())
+    bending = BendingOutline(nothing, tetrahedron)
+    camera = cameras(np.random.default_rng(4))[0]
+    prefixes = np.zeros((0, SIDE, SIDE + 1), dtype=np.int32)
+    X_CN = np.eye(4)[None, None]
+    for bands in ([], [np.zeros((1, 3, 3))], [np.zeros((2, 4, 3))]):
+        with pytest.raises(ValueError, match="bands of"):
+            score_bending([bending], bands, X_CN, camera, prefixes)
+    with pytest.raises(ValueError, match="finite"):
+        score_bending([bending], [np.full((1, 4, 3), np.nan)], X_CN, camera, prefixes)
+
+
+def woman_with_skin() -> ArticulatedModel:
+    model = load_model(bundled_model("woman"), check=False)
+    assert len(model.skin) == 14
+    return model
+
+
+def test_the_standing_womans_silhouette_is_that_of_her_segments() -> None:
+    model = woman_with_skin()
+    surfaces = TreeSurfaces(model.pose_tree())
+    for direction in ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (-0.6, 0.7, 0.2)):
+        X = looking_along(np.array(direction), 5.0)
+        X[2, 3] -= 0.75
+        camera = ParallelCamera("woman", 700, 700, 226.0, 350.2, 350.3, X)
+        values, X_CN = pose(model, np.zeros(len(model.lower)), camera)
+        mask = draw_mask(surfaces.at(values), X_CN, camera)
+        assert mask.sum() > 10_000
+        assert np.count_nonzero(mask != draw_mask(surfaces.rigid, X_CN, camera)) <= 2
+
+
+def test_drake_draws_the_same_woman() -> None:
+    model = woman_with_skin()
+    held = {f"position_{axis}": 0.0 for axis in "xyz"}
+    for direction in ((-1.0, 0.0, 0.0), (-0.6, 0.7, 0.2)):
+        camera = ParallelCamera(
+            "woman", 700, 700, 226.0, 350.2, 350.3, looking_along(np.array(direction), 5.0)
+        )
+        agreement = measure_agreement(model, camera, 10, 6, held)
+        assert agreement.holds, agreement.worst

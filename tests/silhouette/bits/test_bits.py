@@ -1,0 +1,185 @@
+"""Bit masks against the span kernel's masks, contour cells and balls against what they promise."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial.transform import Rotation
+
+from drake_pose.body import TriangleMesh
+from drake_pose.camera import Camera, ParallelCamera, PinholeCamera
+from drake_pose.silhouette import Outline, draw_mask, outline_from_mesh
+from drake_pose.silhouette.areas.inscribed_balls import VisualHull
+from drake_pose.silhouette.bits.bit_kernel import draw_bits
+from drake_pose.silhouette.bits.bit_view import BitView, make_bit_view
+from drake_pose.silhouette.bits.bounding_balls import draw_discs, sift_by_balls
+from drake_pose.silhouette.contours.direction_cells import divide_outline
+
+_POSES = 120
+
+
+def crooked_surface(seed: int, triangles: int = 60) -> Outline:
+    """Random triangles in a ball: open, crossing, with edges of one and of several triangles."""
+    generator = np.random.default_rng(seed)
+    vertices = generator.uniform(-0.12, 0.12, (triangles // 2, 3))
+    return outline_from_mesh(
+        TriangleMesh(vertices, generator.integers(0, len(vertices), (triangles, 3)))
+    )
+
+
+def picture_cameras() -> list[Camera]:
+    return [
+        ParallelCamera("parallel", 90, 70, 180.0, 40.3, 33.7, np.eye(4)),
+        PinholeCamera("pinhole", 90, 70, 150.0, 170.0, 40.3, 33.7, np.eye(4)),
+    ]
+
+
+def random_poses(seed: int, depth: float = 1.0) -> np.ndarray:
+    X = np.tile(np.eye(4), (_POSES, 1, 1))
+    generator = np.random.default_rng(seed)
+    X[:, :3, :3] = Rotation.random(_POSES, random_state=generator).as_matrix()
+    X[:, :3, 3] = generator.uniform(-0.25, 0.25, (_POSES, 3)) + np.array([0.0, 0.0, depth])
+    return X
+
+
+def random_mask(seed: int) -> np.ndarray:
+    mask = np.zeros((70, 90), dtype=bool)
+    mask[12:55, 20:71] = np.random.default_rng(seed).random((43, 51)) < 0.8
+    return mask
+
+
+def read_bits(view: BitView, numbers: np.ndarray, run: np.ndarray, words: np.ndarray) -> np.ndarray:
+    """The mask (H, W) that a run of words stands for."""
+    first, count, place = run
+    row = np.zeros(int(numbers[-1, -1]) // 64 + 1, dtype=np.uint64)
+    row[first : first + count] = words[place : place + count]
+    bits = np.unpackbits(row.view(np.uint8), bitorder="little")
+    is_pixel = np.diff(numbers, axis=1) > 0
+    part = np.zeros(is_pixel.shape, dtype=bool)
+    part[is_pixel] = bits[: int(is_pixel.sum())]
+    mask = np.zeros((int(view.camera[7]), int(view.camera[6])), dtype=bool)
+    top, left, height, width = view.window
+    mask[top : top + height, left : left + width] = part
+    return mask
+
+
+def pairs() -> np.ndarray:
+    return np.column_stack([np.zeros(_POSES), np.arange(_POSES)]).astype(np.int32)
+
+
+@pytest.mark.parametrize("camera", picture_cameras(), ids=lambda camera: camera.name)
+@pytest.mark.parametrize("spread", [0.0, 0.25])
+def test_bits_are_the_pixels_of_the_span_kernel(camera: Camera, spread: float) -> None:
+    outline, mask = crooked_surface(1), random_mask(2)
+    view = make_bit_view(mask, camera.kernel_parameters(), camera.X_CW, 5)
+    # Some poses come so near that no table suits, and some are cut by the near plane.
+    X_WN = np.concatenate([random_poses(3)[: _POSES // 2], random_poses(4, 0.2)[_POSES // 2 :]])
+    no = np.zeros(1, dtype=np.bool_)
+    kept, areas, runs, words = draw_bits(
+        divide_outline(outline, spread), view, np.eye(4)[None], X_WN, pairs(), np.inf, no
+    )
+    assert kept.all()
+    band = np.zeros(mask.shape, dtype=bool)
+    for i, X in enumerate(X_WN):
+        drawn = draw_mask([outline], (camera.X_CW @ X)[None], camera)
+        assert np.array_equal(read_bits(view, view.inside, runs[i, 0], words), drawn & mask)
+        near = read_bits(view, view.band, runs[i, 1], words)
+        band |= near
+        assert not (near & (mask | ~drawn)).any()
+        far = int((drawn & ~mask & ~near).sum())
+        assert areas[i].tolist() == [int((drawn & mask).sum()), int(near.sum()), far]
+    distance = distance_transform_edt(~mask)
+    assert band.any()
+    assert distance[band].max() <= 5 * np.sqrt(2.0)
+
+
+def test_poses_with_too_much_outside_are_left_out() -> None:
+    camera, outline, mask = picture_cameras()[0], crooked_surface(5), random_mask(6)
+    view = make_bit_view(mask, camera.kernel_parameters(), camera.X_CW, 0)
+    X_WN = random_poses(7)
+    masks = [draw_mask([outline], X[None], camera) for X in X_WN]
+    outside = np.array([int((drawn & ~mask).sum()) for drawn in masks])
+    limit = float(np.median(outside))
+    no = np.zeros(1, dtype=np.bool_)
+    celled = divide_outline(outline)
+    kept = draw_bits(celled, view, np.eye(4)[None], X_WN, pairs(), limit, no)[0]
+    assert np.array_equal(kept, outside <= limit)
+    one = draw_bits(celled, view, np.eye(4)[None], X_WN, pairs(), limit, ~no)[0]
+    assert np.flatnonzero(one).tolist() == [int(np.argmax(outside <= limit))]
+
+
+def thick_surface() -> Outline:
+    """An ellipsoid."""
+    u, v = np.meshgrid(np.linspace(0, np.pi, 13), np.linspace(0, 2 * np.pi, 21)[:-1])
+    ball = np.stack([np.sin(u) * np.cos(v), np.sin(u) * np.sin(v), np.cos(u)], axis=-1)
+    index = np.arange(u.size).reshape(u.shape)
+    a, b = index[:, :-1], index[:, 1:]
+    c, d = np.roll(a, -1, axis=0), np.roll(b, -1, axis=0)
+    triangles = np.concatenate(
+        [np.stack([a, b, c], -1).reshape(-1, 3), np.stack([c, b, d], -1).reshape(-1, 3)]
+    )
+    return outline_from_mesh(TriangleMesh(ball.reshape(-1, 3) * [0.05, 0.08, 0.2], triangles))
+
+
+def test_balls_lie_inside_and_reach_to_the_ends() -> None:
+    balls = VisualHull(thick_surface()).spread_balls(8)
+    # A ball inside an ellipsoid: its points in all directions are inside.
+    directions = Rotation.random(300, random_state=1).as_matrix()[:, 0]
+    points = balls[:, None, :3] + balls[:, None, 3:] * directions
+    assert np.linalg.norm(points / [0.05, 0.08, 0.2], axis=2).max() <= 1.0
+    assert 0.03 < balls[:, 3].max() < 0.05
+    assert np.ptp(balls[:, 2]) > 0.2
+
+
+def test_nothing_has_no_balls() -> None:
+    empty = outline_from_mesh(TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32)))
+    assert VisualHull(empty).spread_balls(5).shape == (0, 4)
+    assert VisualHull(empty).radii(np.zeros((2, 3))).tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("camera", picture_cameras(), ids=lambda camera: camera.name)
+@pytest.mark.parametrize("limit", [0.0, 40.0])
+def test_sifting_loses_no_pose_inside_the_limit(camera: Camera, limit: float) -> None:
+    outline = thick_surface()
+    mask = np.zeros((70, 90), dtype=bool)
+    mask[10:60, 15:80] = True
+    mask[30:34, 40:44] = False
+    view = make_bit_view(mask, camera.kernel_parameters(), camera.X_CW, 0)
+    X_WN = random_poses(8)
+    balls = VisualHull(outline).spread_balls(8)
+    p_PB = balls[:, :3] @ np.swapaxes(X_WN[:, :3, :3], 1, 2) + X_WN[:, None, :3, 3]
+    left = sift_by_balls(view, np.eye(4)[None], p_PB, balls[:, 3].copy(), pairs(), limit)
+    masks = [draw_mask([outline], X[None], camera) for X in X_WN]
+    outside = np.array([int((drawn & ~mask).sum()) for drawn in masks])
+    assert left[outside <= limit].all()
+    assert not left[outside > 400].all()
+
+
+@pytest.mark.parametrize("camera", picture_cameras(), ids=lambda camera: camera.name)
+def test_discs_hold_all_that_can_be_reached(camera: Camera) -> None:
+    outline, mask = thick_surface(), random_mask(9)
+    view = make_bit_view(mask, camera.kernel_parameters(), camera.X_CW, 0)
+    X_WN = random_poses(10)
+    runs, words = draw_discs(view, X_WN, outline.ball[:3], float(outline.ball[3]))
+    for X, run in zip(X_WN, runs, strict=True):
+        drawn = draw_mask([outline], X[None], camera)
+        disc = read_bits(view, view.inside, run, words)
+        assert not (drawn & mask & ~disc).any()
+
+
+def test_the_nearest_pixel_outside_is_the_nearest() -> None:
+    mask = np.zeros((70, 90), dtype=bool)
+    mask[:50, 20:71] = True
+    mask[20:23, 30:35] = False
+    camera = picture_cameras()[0]
+    view = make_bit_view(mask, camera.kernel_parameters(), camera.X_CW, 0)
+    distances = distance_transform_edt(mask)
+    top, left, height, width = view.window
+    for r in range(height):
+        for c in range(width):
+            row, column = r + top, c + left
+            if not mask[row, column]:
+                continue
+            place = int(view.nearest[r, c])
+            found = np.hypot(place // 32768 - row, place % 32768 - column)
+            assert not mask[place // 32768, place % 32768]
+            assert found == pytest.approx(distances[row, column])

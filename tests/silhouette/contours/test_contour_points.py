@@ -1,0 +1,124 @@
+import numpy as np
+import pytest
+
+from drake_pose.body import TriangleMesh
+from drake_pose.camera import ParallelCamera, PinholeCamera
+from drake_pose.errors import SettingsError
+from drake_pose.silhouette import draw_mask, outline_from_mesh
+from drake_pose.silhouette.contours.contour_points import find_contour_points
+from tests.silhouette.shapes import box, random_pose, soup
+
+CAMERAS = [
+    ParallelCamera("parallel", 90, 70, 40.0, 44.3, 35.2, np.eye(4)),
+    PinholeCamera("pinhole", 90, 70, 80.0, 84.0, 44.3, 35.2, np.eye(4)),
+]
+
+
+def covered(meshes, X_CN, camera, uv):
+    """Whether points (n, 2) of the picture lie in any projected triangle."""
+    inside = np.zeros(len(uv), dtype=bool)
+    for mesh, X in zip(meshes, X_CN, strict=True):
+        p_C = mesh.vertices @ X[:3, :3].T + X[:3, 3]
+        seen, _ = camera.project(p_C)  # X_WC is the identity
+        for a, b, c in seen[mesh.triangles]:
+            M = np.column_stack([b - a, c - a])
+            if abs(np.linalg.det(M)) < 1e-12:
+                continue
+            s, t = np.linalg.solve(M, (uv - a).T)
+            inside |= (s >= 0) & (t >= 0) & (s + t <= 1)
+    return inside
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=lambda camera: camera.name)
+@pytest.mark.parametrize("kind", ["boxes", "soup"])
+def test_points_lie_on_the_border_of_the_union(camera, kind):
+    rng = np.random.default_rng(5)
+    for _ in range(4):
+        meshes = [box(s) if kind == "boxes" else soup(rng, 5, 4, 0.5 * s) for s in (0.9, 0.6, 0.5)]
+        X = np.array([random_pose(rng, tuple(rng.normal((0.0, 0.0, 3.0), 0.3))) for _ in meshes])
+        outlines = tuple(outline_from_mesh(mesh) for mesh in meshes)
+        points = find_contour_points(outlines, X, camera)
+        assert len(points.uv) > 50
+        out = covered(meshes, X, camera, points.uv + 1e-4 * points.normals)
+        into = covered(meshes, X, camera, points.uv - 1e-4 * points.normals)
+        # Corners nearer than the step may fool the step.
+        assert out.mean() < 0.01
+        assert into.mean() > 0.99
+        p_C = np.einsum("nij,nj->ni", X[points.nodes][:, :3, :3], points.p_N)
+        seen, _ = camera.project(p_C + X[points.nodes][:, :3, 3])
+        assert np.abs(seen - points.uv).max() < 1e-9
+        assert np.allclose(np.linalg.norm(points.normals, axis=1), 1.0)
+        assert np.all(points.uv > -0.5)
+        assert np.all(points.uv < [camera.width - 0.5, camera.height - 0.5])
+
+
+def test_every_row_and_column_that_the_mask_changes_in_has_its_point():
+    rng = np.random.default_rng(6)
+    camera = CAMERAS[1]
+    X = np.array([random_pose(rng, (0.0, 0.1, 2.5)), random_pose(rng, (0.3, -0.2, 2.2))])
+    outlines = (outline_from_mesh(box(0.8)), outline_from_mesh(box(0.5)))
+    points = find_contour_points(outlines, X, camera)
+    mask = np.pad(draw_mask(outlines, X, camera), 1).astype(int)
+    ends = np.argwhere(np.diff(mask, axis=1))  # between u - 1 and u of the row v - 1, unpadded
+    steep = points.in_rows
+    rows = points.uv[steep]
+    for v, u in ends:
+        near = (rows[:, 1] == v - 1) & (rows[:, 0] > u - 1) & (rows[:, 0] <= u)
+        flat = np.abs(points.uv[~steep] - [u - 0.5, v - 1]).max(axis=1) < 1.5
+        assert near.any() or flat.any()
+
+
+def test_lengths_sum_to_the_perimeter():
+    camera = CAMERAS[0]
+    angles = np.linspace(0, 2 * np.pi, 65)[:-1]
+    ring = 0.7 * np.column_stack([np.cos(angles), np.sin(angles), 0 * angles])
+    triangles = [[64, i, (i + 1) % 64] for i in range(64)]
+    disc = outline_from_mesh(TriangleMesh(np.vstack([ring, np.zeros(3)]), np.array(triangles)))
+    X = np.eye(4)[None]
+    points = find_contour_points((disc,), X, camera, spacing=0.1)
+    assert abs(points.lengths.sum() - 2 * np.pi * 0.7 * 40.0) < 1.0
+    center = np.array([44.3, 35.2])
+    assert np.all(((points.uv - center) * points.normals).sum(axis=1) > 27.9)
+
+
+def test_what_lies_behind_or_within_has_no_points():
+    camera = CAMERAS[0]
+    X = np.tile(np.eye(4), (2, 1, 1))
+    X[1, :3, 3] = [0.05, 0.02, 4.0]
+    X[:, :3, :3] = random_pose(np.random.default_rng(1), (0, 0, 0))[:3, :3]
+    outlines = (outline_from_mesh(box(1.0)), outline_from_mesh(box(0.3)))
+    assert set(find_contour_points(outlines, X, camera).nodes) == {0}
+    # The same surface twice: one contour.
+    twice = find_contour_points((outlines[0], outlines[0]), X[[0, 0]], camera)
+    once = find_contour_points(outlines[:1], X[:1], camera)
+    assert np.allclose(np.sort(twice.uv, axis=0), np.sort(once.uv, axis=0))
+
+
+def test_a_scaled_body_in_a_parallel_camera():
+    camera = CAMERAS[0]
+    X = random_pose(np.random.default_rng(2), (0.0, 0.0, 0.0))
+    scaled = X.copy()
+    scaled[:3, :3] *= 1.3
+    small = find_contour_points((outline_from_mesh(box(0.5)),), scaled[None], camera)
+    large = find_contour_points((outline_from_mesh(box(0.65)),), X[None], camera)
+    assert np.allclose(small.uv, large.uv)
+    assert np.allclose(1.3 * small.p_N, large.p_N)
+
+
+def test_nothing_in_the_picture():
+    X = np.eye(4)
+    X[0, 3] = 50.0
+    outline = outline_from_mesh(box(0.5))
+    assert len(find_contour_points((outline,), X[None], CAMERAS[0]).uv) == 0
+    behind = np.eye(4)
+    behind[2, 3] = -2.0
+    assert len(find_contour_points((outline,), behind[None], CAMERAS[1]).uv) == 0
+    assert len(find_contour_points((), np.zeros((0, 4, 4)), CAMERAS[0]).uv) == 0
+
+
+def test_bad_arguments_are_refused():
+    outline = outline_from_mesh(box(0.5))
+    with pytest.raises(SettingsError, match="spacing"):
+        find_contour_points((outline,), np.eye(4)[None], CAMERAS[0], spacing=0.0)
+    with pytest.raises(ValueError, match="poses must be"):
+        find_contour_points((outline,), np.eye(4), CAMERAS[0])

@@ -1,0 +1,110 @@
+"""Skin in diagrams: sensors see it bend, Meshcat is sent it, and the matcher finds the pose."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.geometry import Meshcat, MeshcatParams, Rgba
+from pydrake.math import RigidTransform
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
+
+from drake_pose.apps.results.replay import make_replay
+from drake_pose.body import ArticulatedModel, ModelSkin
+from drake_pose.camera import ParallelCamera
+from drake_pose.matching import PaperSearch, PaperSearchSettings
+from drake_pose.silhouette import LabelRenderer
+from drake_pose.systems import MeshcatSkin, add_meshcat_skin, build_simulated_matching
+from tests.body.skins import load_limb
+
+
+@pytest.fixture
+def limb(tmp_path: Path) -> ArticulatedModel:
+    return load_limb(tmp_path)
+
+
+def camera() -> ParallelCamera:
+    X_WC = np.array([[0, 0, -1, 4.0], [1, 0, 0, 0], [0, -1, 0, 0.1], [0, 0, 0, 1.0]])
+    return ParallelCamera("front", 200, 200, 180.0, 100.2, 100.1, X_WC)
+
+
+class _Recorder:
+    """Stands in for Meshcat and keeps what it is sent."""
+
+    def __init__(self) -> None:
+        self.meshes: list[tuple[str, np.ndarray, np.ndarray]] = []
+        self.visible: list[tuple[str, bool, float]] = []
+
+    def SetTriangleMesh(self, path, vertices, faces, rgba):
+        assert isinstance(rgba, Rgba)
+        self.meshes.append((path, np.array(vertices), np.array(faces)))
+
+    def SetProperty(self, path, name, value, time):
+        assert name == "visible"
+        self.visible.append((path, value, time))
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+def test_meshcat_is_sent_the_bent_bands(limb: ArticulatedModel, recorded: bool) -> None:
+    recorder = _Recorder()
+    skin = ModelSkin(limb)
+    drawer = MeshcatSkin(recorder, skin, 5, "body/skin", recorded=recorded)
+    context = drawer.CreateDefaultContext()
+    q = np.array([0.1, 1.2, 0.3, -0.4, 0.5])
+    for time, positions in ((0.0, np.zeros(5)), (0.5, np.zeros(5)), (1.0, q)):
+        context.SetTime(time)
+        drawer.get_input_port().FixValue(context, positions)
+        drawer.ForcedPublish(context)
+    # What did not move is not sent again.
+    assert len(recorder.meshes) == 4
+    for k, expected in enumerate([*skin.vertices(np.zeros(5)), *skin.vertices(q)]):
+        path, vertices, faces = recorder.meshes[k]
+        shape = f"/{k // 2}" if recorded else ""
+        assert path == f"body/skin{shape}/{skin.bands[k % 2].child}"
+        np.testing.assert_array_equal(vertices.T, expected)
+        np.testing.assert_array_equal(faces.T, skin.bands[k % 2].mesh.triangles)
+    assert len(recorder.visible) == (4 if recorded else 0)
+    if recorded:
+        seen = {(path, value) for path, value, time in recorder.visible if time == 1.0}
+        assert seen == {("body/skin/0", False), ("body/skin/1", True)}
+
+
+def test_a_simulated_camera_sees_the_skin(limb: ArticulatedModel) -> None:
+    """The matcher, whose bodies have skin, finds the pose that the sensor saw, with E near 0."""
+    search = PaperSearch(
+        limb.pose_tree(), PaperSearchSettings(interval=0.6, outside_limit=3.0, candidate_limit=20)
+    )
+    truth = np.array([0.6, -1.2, 0.6, 0.0, -0.6])
+    meshcat = Meshcat(MeshcatParams(host="localhost", port=0))
+    built = build_simulated_matching(search, [camera()], truth, 0.1, meshcat)
+    simulator = Simulator(built.diagram)
+    simulator.AdvanceTo(0.15)
+    context = simulator.get_context()
+    sensor = built.diagram.GetSubsystemByName("camera_front")
+    image = sensor.label_image_output_port().Eval(sensor.GetMyContextFromRoot(context))
+    reference = LabelRenderer(limb, camera()).segments(truth)
+    seen = image.data[..., 0]
+    assert np.count_nonzero((seen < 32000) != (reference >= 0)) <= 3
+    assert set(np.unique(seen[seen < 32000])) <= set(np.unique(reference))
+    matcher = built.matcher
+    error = matcher.GetOutputPort("error").Eval(matcher.GetMyContextFromRoot(context))[0]
+    assert error < 0.01
+    for name in ("true", "estimated"):
+        for child in ("lower", "hand"):
+            assert meshcat.HasPath(f"visualizer/{name}_skin/{child}")
+
+
+def test_models_without_skin_get_no_system(tmp_path: Path) -> None:
+    plain = load_limb(tmp_path, "")
+    builder = DiagramBuilder()
+    source = builder.AddSystem(ConstantVectorSource(np.zeros(5)))
+    add_meshcat_skin(builder, _Recorder(), plain, source.get_output_port(), "plain")
+    assert len(builder.GetSystems()) == 1
+
+
+def test_a_replay_holds_each_shape(limb: ArticulatedModel) -> None:
+    positions = np.array([np.zeros(5), [0.1, 1.0, 0.2, 0.3, 0.4], [0.1, 1.5, 0.2, 0.3, 0.4]])
+    page = make_replay(limb, positions, [RigidTransform()] * 3, [camera()], 0.1)
+    assert page.count("body_skin") >= 0
+    assert len(page) > 10_000

@@ -1,0 +1,289 @@
+"""The paper's ready diagram, before a person that Drake renders."""
+
+import cv2
+import numpy as np
+import pytest
+from pydrake.common.value import AbstractValue
+from pydrake.geometry import Meshcat, MeshcatParams
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import LeafSystem
+from pydrake.systems.sensors import ImageRgba8U
+from pydrake.trajectories import PiecewisePolynomial
+
+from drake_pose.camera.rigs import FACE_CAMERA
+from drake_pose.camera.sources.frame_source import SourceSpecification, open_source
+from drake_pose.errors import SettingsError
+from drake_pose.multiview.date.body_pose import estimate_pose, waist_of
+from drake_pose.multiview.date.capture import CaptureSettings, CaptureSetup, see_person
+from drake_pose.multiview.date.faces import find_face, head_angles
+from drake_pose.multiview.date.features import find_features
+from drake_pose.multiview.date.recognition import recognise
+from drake_pose.multiview.date.skeleton import LIMBS
+from drake_pose.multiview.regions import person_region
+from drake_pose.systems.date.capture import build_paper_capture
+from drake_pose.systems.date.pose_estimator import PaperPoseEstimator
+from drake_pose.systems.pictures.camera_rig import build_camera_rig
+from drake_pose.systems.pictures.colour_images import picture_to_colour_image
+from drake_pose.systems.pictures.picture_capture import PictureCapture
+from tests.multiview.studio import shared_studio
+
+PERIOD = 0.1
+
+
+@pytest.fixture(scope="module")
+def studio():
+    return shared_studio()
+
+
+@pytest.fixture(scope="module")
+def setup(studio):
+    return CaptureSetup(
+        studio.calibrated,
+        studio.ring,
+        studio.cameras[FACE_CAMERA],
+        studio.templates,
+        studio.registered,
+        studio.backgrounds,
+        CaptureSettings(waist=waist_of(studio.calibrated)),
+    )
+
+
+@pytest.fixture(scope="module")
+def film(studio):
+    """Positions of a person who shows the registered pose, then moves; and the pictures."""
+    start = studio.posed(left_upper_arm_z=80, right_upper_arm_z=-80)
+    goal = studio.posed(
+        left_upper_arm_x=-50, left_upper_arm_z=30, left_forearm_x=-50, right_upper_arm_z=-50,
+        left_thigh_x=-25, left_shin_x=30, head_y=12,
+    )  # fmt: skip
+    path = [start] * 2 + [start + share * (goal - start) for share in np.linspace(0.25, 1, 6)]
+    return path, [{n: studio.picture(q, n) for n in studio.cameras} for q in path]
+
+
+class Run:
+    """The diagram, frame by frame, in a context of its own."""
+
+    def __init__(self, capture):
+        self.diagram, self.simulator = capture.diagram, Simulator(capture.diagram)
+        self.context = self.simulator.get_mutable_context()
+        self.estimator = capture.estimator
+        self.frames = 0
+
+    def step(self, pictures):
+        if self.frames:
+            self.simulator.AdvanceTo(PERIOD * self.frames)
+        self.frames += 1
+        for name, picture in pictures.items():
+            image = AbstractValue.Make(picture_to_colour_image(picture))
+            self.diagram.GetInputPort(f"color_image_{name}").FixValue(self.context, image)
+        self.simulator.AdvancePendingEvents()
+        return self.output("estimated_positions")
+
+    def output(self, name):
+        return np.array(self.diagram.GetOutputPort(name).Eval(self.context))
+
+    def set_person(self, q):
+        context = self.estimator.GetMyMutableContextFromRoot(self.context)
+        self.estimator.set_person(context, q)
+
+
+class Core:
+    """The same by the plain functions alone, one after the other."""
+
+    def __init__(self, setup):
+        self.setup, self.q, self.features = setup, None, None
+
+    def step(self, pictures):
+        setup, settings = self.setup, self.setup.settings
+        views = {
+            name: see_person(shot, person_region(shot, setup.backgrounds[name]), settings.skin)
+            for name, shot in pictures.items()
+            if shot is not None
+        }
+        names = [name for name in setup.cameras if name in views]
+        cameras, seen = [setup.cameras[n] for n in names], [views[n] for n in names]
+        found = recognise(
+            setup.skeleton, setup.registered, cameras, [view.contour for view in seen],
+            settings.recognition,
+        )  # fmt: skip
+        if found is not None:
+            self.q, self.features = found.q, setup.skeleton.features(found.q)
+            return self.q
+        regions = [view.region for view in seen]
+        centroids = [view.blobs.centroids for view in seen]
+        self.features = find_features(cameras, centroids, regions, self.features).places
+        angles = None
+        if FACE_CAMERA in views:
+            blobs = views[FACE_CAMERA].blobs
+            direction = find_face(pictures[FACE_CAMERA], blobs, setup.faces, settings.farthest_face)
+            if np.isfinite(direction).all():
+                angles = head_angles(direction, self.features[0], setup.face_camera)
+        pose = estimate_pose(
+            setup.skeleton, self.q, self.features, angles, cameras, regions, waist=settings.waist
+        )
+        self.q = pose.q
+        return self.q
+
+
+class PassImages(LeafSystem):
+    """A source of pictures that says when they are fresh."""
+
+    def __init__(self, cameras, fresh):
+        super().__init__()
+        self.pictures = None
+        for name in cameras:
+            self.DeclareAbstractOutputPort(
+                f"color_image_{name}",
+                lambda: AbstractValue.Make(ImageRgba8U()),
+                lambda _, out, name=name: out.set_value(
+                    picture_to_colour_image(self.pictures[name])
+                ),
+                {self.time_ticket()},
+            )
+        self.DeclareVectorOutputPort(
+            "fresh", 1, lambda context, out: out.SetFromVector([fresh(context.get_time())])
+        )
+
+
+class TestPaperCapture:
+    def test_diagram_is_the_core_bit_for_bit_and_near_the_truth(self, setup, film):
+        capture = build_paper_capture(setup, period=PERIOD)
+        run, core = Run(capture), Core(setup)
+        path, pictures = film
+        for k, shots in enumerate(pictures):
+            shots = dict(shots)
+            if k in (4, 5):
+                # Two cameras stop, and return.
+                shots["camera_2"] = shots[FACE_CAMERA] = None
+            np.testing.assert_array_equal(run.step(shots), core.step(shots))
+            np.testing.assert_array_equal(run.output("last_features"), core.features.ravel())
+            assert (run.output("similarity")[0] > 0) == (k < 2)
+            assert np.isnan(run.output("face_direction")).all() == (k in (4, 5))
+        limbs = run.output("limb_points").reshape(4, 3, 3)
+        true = np.array([setup.skeleton.limb_points(path[-1], name) for name in LIMBS])
+        errors = np.linalg.norm(limbs - true, axis=2).max(axis=0)
+        assert (errors < [0.06, 0.10, 0.04]).all()
+        assert (run.output("last_support") > 0).all()
+
+    def test_contexts_do_not_know_of_each_other(self, setup, film):
+        capture = build_paper_capture(setup, period=PERIOD)
+        _, pictures = film
+        alone = [run.step(shots) for run in [Run(capture)] for shots in pictures[1:5]]
+        first, second = Run(capture), Run(capture)
+        for k, shots in enumerate(pictures[1:5]):
+            np.testing.assert_array_equal(first.step(shots), alone[k])
+            second.step(pictures[0] if k == 0 else pictures[-k])
+        assert np.abs(first.output("last_features") - second.output("last_features")).max() > 0.01
+
+    def test_lost_track_is_mended_without_a_reset(self, studio, setup, film):
+        run = Run(build_paper_capture(setup, period=PERIOD))
+        path, pictures = film
+        run.set_person(studio.posed(head_y=150, left_thigh_x=-90))
+        lost = run.step(pictures[-1])
+        names = [studio.model.position_index(n) for n in ("left_thigh_x", "right_thigh_x")]
+        assert np.degrees(np.abs(lost - path[-1]))[names].max() > 20.0
+        mended = run.step(pictures[0])
+        assert run.output("similarity")[0] > 0.93
+        assert np.isnan(run.output("limb_points")).all()
+        np.testing.assert_allclose(mended[:3], path[0][:3], atol=0.06)
+        for shots in pictures[2:5]:
+            found = run.step(shots)
+        ends = [
+            setup.skeleton.limb_points(found, name)[2]
+            - setup.skeleton.limb_points(path[4], name)[2]
+            for name in LIMBS
+        ]
+        assert np.linalg.norm(ends, axis=1).max() < 0.06
+
+    def test_nobody_known_yet_and_all_cameras_gone(self, studio, setup, film):
+        run = Run(build_paper_capture(setup, period=PERIOD))
+        _, pictures = film
+        assert np.isnan(run.step(pictures[-1])).all()
+        known = run.step(pictures[0])
+        silent = run.step(dict.fromkeys(studio.cameras))
+        # Head, hands and feet stay where they were.
+        np.testing.assert_allclose(silent[:3], known[:3], atol=1e-3)
+        assert not run.output("last_support").any()
+
+    def test_images_that_are_not_fresh_are_passed_over(self, studio, setup, film):
+        _, pictures = film
+
+        def run(fresh):
+            source = PassImages(studio.cameras, fresh)
+            capture = build_paper_capture(setup, source, PERIOD)
+            simulator = Simulator(capture.diagram)
+            source.pictures = pictures[0]
+            simulator.AdvanceTo(0.5 * PERIOD)
+            source.pictures = pictures[2]
+            simulator.AdvanceTo(1.5 * PERIOD)
+            return capture.diagram.GetOutputPort("last_features").Eval(simulator.get_context())
+
+        start, moved = (setup.skeleton.features(film[0][k]).ravel() for k in (0, 2))
+        np.testing.assert_allclose(run(lambda time: time == 0.0), start, atol=0.08)
+        assert np.abs(run(lambda time: 1.0) - run(lambda time: time == 0.0)).max() > 0.05
+        np.testing.assert_allclose(run(lambda time: 1.0), moved, atol=0.05)
+
+    def test_recorded_pictures_are_a_source(self, setup, film, tmp_path):
+        _, pictures = film
+        sources = {}
+        cameras = {**setup.cameras, FACE_CAMERA: setup.face_camera}
+        for name, camera in cameras.items():
+            folder = tmp_path / name
+            folder.mkdir()
+            for k, shots in enumerate(pictures[1:4]):
+                cv2.imwrite(str(folder / f"{k}.png"), shots[name][:, :, ::-1])
+            specification = SourceSpecification(
+                name, "folder", str(folder), camera.width, camera.height, 1 / PERIOD, "empty"
+            )
+            sources[name] = open_source(specification)
+        source = PictureCapture(sources, cameras)
+        capture = build_paper_capture(setup, source, PERIOD)
+        simulator = Simulator(capture.diagram)
+        simulator.AdvanceTo(10 * PERIOD)
+        found = capture.diagram.GetOutputPort("estimated_positions").Eval(simulator.get_context())
+        run = Run(build_paper_capture(setup, period=PERIOD))
+        expected = [run.step(shots) for shots in pictures[1:4]][-1]
+        np.testing.assert_array_equal(found, expected)
+
+    def test_stages_are_what_the_pose_needs(self, setup, film):
+        capture = build_paper_capture(setup, period=PERIOD)
+        assert list(capture.stages) == ["region", "skin", "recognition", "features", "face"]
+        run = Run(capture)
+        run.step(film[1][0])
+        for stage in capture.stages:
+            capture.evaluate(run.context, stage)
+
+    def test_simulated_rig_and_avatar(self, studio):
+        registered = studio.registered
+        end = np.array(registered.q)
+        end[studio.model.position_index("left_upper_arm_z")] = np.radians(20.0)
+        breaks, samples = [0.0, 0.15, 0.75], np.column_stack([registered.q, registered.q, end])
+        path = PiecewisePolynomial.FirstOrderHold(breaks, samples)
+        ring = {name: studio.ring[name] for name in ("camera_0", "camera_2", "camera_5")}
+        setup = CaptureSetup(studio.calibrated, ring, registered=registered)
+        meshcat = Meshcat(MeshcatParams(host="localhost"))
+        rig = build_camera_rig(studio.model, ring, path)
+        capture = build_paper_capture(setup, rig.diagram, 0.15, meshcat)
+        simulator = Simulator(capture.diagram)
+        simulator.Initialize()
+        assert meshcat.HasPath("avatar")
+        simulator.AdvanceTo(0.76)
+        found = capture.diagram.GetOutputPort("last_features").Eval(simulator.get_context())
+        true = studio.calibrated.features(end)
+        assert np.linalg.norm(found.reshape(5, 3) - true, axis=1).max() < 0.06
+        view = capture.diagram.GetOutputPort("person_view_camera_2").Eval(simulator.get_context())
+        assert view.region.any()
+
+    def test_rig_without_a_camera_is_refused(self, studio, setup):
+        rig = build_camera_rig(studio.model, {"camera_0": studio.ring["camera_0"]})
+        with pytest.raises(SettingsError, match=r"color_image_camera_1.*it has: color_image_cam"):
+            build_paper_capture(setup, rig.diagram)
+
+    def test_arguments_are_checked(self, setup):
+        with pytest.raises(SettingsError, match="period"):
+            PaperPoseEstimator(setup, 0.0)
+        estimator = PaperPoseEstimator(setup, PERIOD)
+        context, q = estimator.CreateDefaultContext(), np.zeros(len(setup.skeleton.lower))
+        for positions, features in ((q[1:], None), (np.nan * q, None), (q, np.zeros((4, 3)))):
+            with pytest.raises(SettingsError, match=r"must be .* finite numbers"):
+                estimator.set_person(context, positions, features)

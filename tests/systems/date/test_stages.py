@@ -1,0 +1,208 @@
+"""The paper's stages as systems, before a person that Drake renders."""
+
+import numpy as np
+import pytest
+from pydrake.common.value import AbstractValue
+
+from drake_pose.camera.rigs import FACE_CAMERA
+from drake_pose.errors import CameraError, SettingsError, UnknownNameError
+from drake_pose.multiview.date.capture import see_person
+from drake_pose.multiview.date.skin_blobs import SkinColour
+from drake_pose.multiview.regions import learn_background, person_region
+from drake_pose.silhouette import mask_to_label_image
+from drake_pose.systems.date.face_direction_finder import FaceDirectionFinder
+from drake_pose.systems.date.feature_finder import FeatureFinder
+from drake_pose.systems.date.horizontal_image import HorizontalImage
+from drake_pose.systems.date.pose_recogniser import PoseRecogniser
+from drake_pose.systems.date.preparation import prepare_paper_capture
+from drake_pose.systems.pictures.colour_images import (
+    colour_image_to_picture,
+    picture_to_colour_image,
+)
+from tests.multiview.studio import shared_studio
+
+
+@pytest.fixture(scope="module")
+def studio():
+    return shared_studio()
+
+
+@pytest.fixture(scope="module")
+def backgrounds(studio):
+    return studio.backgrounds
+
+
+def evaluated(system, port="person_view", **values):
+    """The value of a system's output at given inputs."""
+    context = system.CreateDefaultContext()
+    for name, value in values.items():
+        if not isinstance(value, np.ndarray):
+            value = AbstractValue.Make(value)
+        system.GetInputPort(name).FixValue(context, value)
+    return system.GetOutputPort(port).Eval(context)
+
+
+class TestColourImages:
+    def test_there_and_back(self):
+        picture = np.random.default_rng(0).integers(0, 255, (4, 6, 3)).astype(np.uint8)
+        image = picture_to_colour_image(picture)
+        assert (image.width(), image.height()) == (6, 4)
+        np.testing.assert_array_equal(image.at(5, 3), [*picture[3, 5], 255])
+        np.testing.assert_array_equal(colour_image_to_picture(image), picture)
+
+    def test_nothing_to_show(self):
+        assert colour_image_to_picture(picture_to_colour_image(None)).shape == (0, 0, 3)
+
+
+class TestHorizontalImage:
+    def test_person_by_background_or_by_mask(self, studio, backgrounds):
+        camera, q = studio.ring["camera_1"], studio.posed(left_upper_arm_z=60)
+        picture, mask = studio.picture(q, camera.name), studio.mask(q, camera.name)
+        image = picture_to_colour_image(picture)
+        by_background = HorizontalImage(camera, backgrounds[camera.name])
+        view = evaluated(by_background, color_image=image)
+        assert (view.region & mask).sum() / (view.region | mask).sum() > 0.93
+        # Head, hands and feet: five patches at most, some of them hidden.
+        assert 2 <= len(view.blobs.areas) <= 5
+        label = mask_to_label_image(mask)
+        given = evaluated(HorizontalImage(camera), color_image=image, label_image=label)
+        np.testing.assert_array_equal(given.region, mask)
+        region = evaluated(by_background, "region", color_image=image, label_image=label)
+        np.testing.assert_array_equal(region, mask)
+        assert given.contour is not None
+
+    def test_camera_that_stopped(self, studio, backgrounds):
+        system = HorizontalImage(studio.ring["camera_1"], backgrounds["camera_1"])
+        assert evaluated(system) is None
+        assert evaluated(system, color_image=picture_to_colour_image(None)) is None
+        assert evaluated(system, "region") is None
+
+    def test_bad_input_is_named(self, studio, backgrounds):
+        camera = studio.ring["camera_1"]
+        whole = picture_to_colour_image(np.zeros((240, 320, 3), np.uint8))
+        small = picture_to_colour_image(np.zeros((120, 160, 3), np.uint8))
+        with pytest.raises(SettingsError, match=r"camera 'camera_1'.*background"):
+            evaluated(HorizontalImage(camera), color_image=whole)
+        system = HorizontalImage(camera, backgrounds[camera.name])
+        with pytest.raises(CameraError, match=r"camera 'camera_1'.*160 x 120.*320 x 240"):
+            evaluated(system, color_image=small)
+        label = mask_to_label_image(np.zeros((120, 160), bool))
+        with pytest.raises(CameraError, match="'camera_1': its label image"):
+            evaluated(system, color_image=whole, label_image=label)
+        with pytest.raises(SettingsError, match=r"'camera_1'.*background 5 x 4"):
+            HorizontalImage(camera, learn_background([np.zeros((4, 5, 3), np.uint8)]))
+
+
+class TestFeatureFinder:
+    def inputs(self, studio, q, names):
+        return {f"person_view_{name}": studio.view(q, name) for name in names}
+
+    def test_features_are_where_the_person_has_them(self, studio):
+        q = studio.posed(left_upper_arm_x=-60, left_upper_arm_z=20, right_upper_arm_z=-40)
+        true = studio.calibrated.features(q)
+        last = true + np.random.default_rng(4).normal(0, 0.03, (5, 3))
+        system = FeatureFinder(list(studio.ring.values()))
+        inputs = self.inputs(studio, q, studio.ring)
+        found = evaluated(system, "features", **inputs, last_features=last.ravel())
+        assert np.linalg.norm(found.reshape(5, 3) - true, axis=1).max() < 0.03
+        support = evaluated(system, "support", **inputs, last_features=last.ravel())
+        assert (support > 0).all()
+        # One camera gone, one without a picture.
+        inputs.pop("person_view_camera_0")
+        inputs["person_view_camera_5"] = None
+        some = evaluated(system, "features", **inputs, last_features=last.ravel())
+        assert np.linalg.norm(some.reshape(5, 3) - true, axis=1).max() < 0.04
+        fewer = evaluated(system, "support", **inputs, last_features=last.ravel())
+        assert (fewer < support).any()
+
+    def test_nothing_measured_and_nobody_known(self, studio):
+        system = FeatureFinder(list(studio.ring.values()))
+        last = np.arange(15.0)
+        np.testing.assert_array_equal(evaluated(system, "features", last_features=last), last)
+        assert not evaluated(system, "support", last_features=last).any()
+        unknown = np.full(15, np.nan)
+        assert np.isnan(evaluated(system, "features", last_features=unknown)).all()
+        assert evaluated(system, "found", last_features=unknown) is None
+
+    def test_cameras_are_checked(self, studio):
+        camera = studio.ring["camera_0"]
+        for cameras in ([camera], [camera, camera]):
+            with pytest.raises(SettingsError, match="two or more different cameras"):
+                FeatureFinder(cameras)
+
+
+class TestPoseRecogniser:
+    def test_where_the_person_stands(self, studio):
+        system = PoseRecogniser(studio.skeleton, studio.registered, list(studio.ring.values()))
+        q = np.array(studio.registered.q)
+        q[:2] = 0.2, -0.1
+        q[studio.registered.heading_position] = 0.7
+        inputs = {f"person_view_{name}": view for name, view in studio.views(q).items()}
+        found = evaluated(system, "recognised_positions", **inputs)
+        np.testing.assert_allclose(found[:3], q[:3], atol=0.06)
+        assert np.degrees(found[3:]) == pytest.approx(np.degrees(q[3:]), abs=5.0)
+        assert 0.93 <= evaluated(system, "similarity", **inputs)[0] <= 1.0
+        one = {"person_view_camera_1": inputs["person_view_camera_1"]}
+        assert np.isnan(evaluated(system, "recognised_positions", **one)).all()
+        assert evaluated(system, "similarity", **one)[0] == 0.0
+
+
+class TestFaceDirectionFinder:
+    def test_direction(self, studio):
+        system = FaceDirectionFinder(studio.cameras[FACE_CAMERA], studio.templates)
+        direction = np.radians([-22.0, 8.0])
+        q = studio.posed()
+        q[studio.skeleton.head_angles] = direction
+        picture, view = studio.face(q)
+        image = picture_to_colour_image(picture)
+        found = evaluated(system, "face_direction", color_image=image, person_view=view)
+        # The templates are 15 and 12 degrees apart.
+        assert np.degrees(np.abs(found - direction)).max() < 8.0
+        back = studio.posed(head_y=180)
+        picture, view = studio.face(back)
+        image = picture_to_colour_image(picture)
+        nobody = see_person(picture, np.zeros(picture.shape[:2], bool), SkinColour())
+        for inputs in (
+            {},
+            {"color_image": image},
+            {"color_image": image, "person_view": None},
+            {"color_image": image, "person_view": nobody},
+            {"color_image": picture_to_colour_image(None), "person_view": view},
+        ):
+            assert np.isnan(evaluated(system, "face_direction", **inputs)).all()
+
+
+class TestPreparation:
+    def test_skin_is_where_the_cameras_see_it(self, studio, backgrounds):
+        q = studio.registered.q
+        names = ("camera_0", "camera_1", "camera_3", "camera_6")
+        ring = {name: studio.ring[name] for name in names}
+        pictures = {name: studio.picture(q, name) for name in names}
+        setup = prepare_paper_capture(studio.model, ring, None, q, pictures, backgrounds)
+        assert setup.face_camera is None
+        assert list(setup.cameras) == list(names)
+        views = {
+            f"person_view_{name}": see_person(
+                shot, person_region(shot, backgrounds[name]), SkinColour()
+            )
+            for name, shot in pictures.items()
+        }
+        last = studio.skeleton.features(q)
+        seen = evaluated(
+            FeatureFinder(list(ring.values())), "features", **views, last_features=last.ravel()
+        )
+        off = [
+            np.linalg.norm(s.features(q) - seen.reshape(5, 3))
+            for s in (setup.skeleton, studio.skeleton)
+        ]
+        assert off[0] < 0.25 * off[1]
+        recogniser = PoseRecogniser(setup.skeleton, setup.registered, list(ring.values()))
+        np.testing.assert_allclose(
+            evaluated(recogniser, "recognised_positions", **views)[:3], q[:3], atol=0.03
+        )
+
+    def test_face_camera_must_be_there(self, studio, backgrounds):
+        with pytest.raises(UnknownNameError, match="camera 'nose'"):
+            prepare_paper_capture(
+                studio.model, studio.ring, "nose", studio.posed(), {}, backgrounds
+            )

@@ -1,0 +1,107 @@
+"""The ready diagram of all silhouettes at once against the plain functions, frame by frame."""
+
+import numpy as np
+import pytest
+from pydrake.common.value import AbstractValue
+from pydrake.systems.analysis import Simulator
+
+from drake_pose.errors import SettingsError
+from drake_pose.multiview.person.silhouette_fit import SilhouetteFit
+from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker, see_silhouette
+from drake_pose.multiview.regions import person_region
+from drake_pose.systems.person.silhouette_capture import build_silhouette_capture
+from drake_pose.systems.person.silhouette_sensor import edge_spacing
+from drake_pose.systems.pictures.colour_images import picture_to_colour_image
+from tests.multiview.studio import Studio
+
+# A power of two, for times between frames that are all exactly the same.
+PERIOD = 1.0 / 32.0
+
+
+@pytest.fixture(scope="module")
+def studio():
+    return Studio()
+
+
+@pytest.fixture(scope="module")
+def cameras(studio):
+    return dict(list(studio.ring.items())[::2])
+
+
+@pytest.fixture(scope="module")
+def backgrounds(studio, cameras):
+    return {name: studio.backgrounds[name] for name in cameras}
+
+
+@pytest.fixture(scope="module")
+def tracker(studio):
+    return SilhouetteTracker(SilhouetteFit(studio.model.pose_tree()))
+
+
+@pytest.fixture(scope="module")
+def path(studio):
+    return [studio.posed(left_upper_arm_z=40.0 + 4.0 * k, right_thigh_x=-5.0 * k) for k in range(5)]
+
+
+@pytest.fixture(scope="module")
+def frames(studio, cameras, path):
+    return [{name: studio.picture(q, name) for name in cameras} for q in path]
+
+
+def test_diagram_is_the_plain_functions_in_turn(
+    studio, cameras, backgrounds, tracker, path, frames
+):
+    capture = build_silhouette_capture(tracker, cameras, backgrounds, PERIOD)
+    assert list(capture.stages) == ["region", "edge"]
+    simulator = Simulator(capture.diagram)
+    context = simulator.get_mutable_context()
+    own = capture.person.GetMyMutableContextFromRoot(context)
+    assert capture.person.known_person(own) is None
+    state = tracker.start(tracker.values(path[0]))
+    capture.person.set_person(own, state)
+    for k, pictures in enumerate(frames):
+        if k:
+            simulator.AdvanceTo(PERIOD * k)
+        for name, shot in pictures.items():
+            image = AbstractValue.Make(picture_to_colour_image(shot))
+            capture.diagram.GetInputPort(f"color_image_{name}").FixValue(context, image)
+        for stage in capture.stages:
+            capture.evaluate(context, stage)
+        simulator.AdvancePendingEvents()
+        views = [
+            see_silhouette(person_region(shot, backgrounds[name]), edge_spacing(cameras[name]))
+            for name, shot in pictures.items()
+        ]
+        state = tracker.follow(state, list(cameras.values()), views)
+        found = capture.diagram.GetOutputPort("estimated_positions").Eval(context)
+        np.testing.assert_array_equal(found, tracker.positions(state.values))
+        known = capture.person.known_person(own)
+        assert (known.share, known.usual, known.troubled) == (
+            state.share,
+            state.usual,
+            state.troubled,
+        )
+        np.testing.assert_array_equal(known.step, state.step)
+    elbow = studio.model.position_index("left_upper_arm_z")
+    assert np.degrees(found[elbow] - path[-1][elbow]) == pytest.approx(0.0, abs=3.0)
+
+
+def test_person_said_to_be_lost_has_no_estimated_positions(cameras, backgrounds, tracker, path):
+    capture = build_silhouette_capture(tracker, cameras, backgrounds, PERIOD)
+    context = capture.diagram.CreateDefaultContext()
+    own = capture.person.GetMyMutableContextFromRoot(context)
+    estimated = capture.diagram.GetOutputPort("estimated_positions")
+    state = tracker.start(tracker.values(path[1]))
+    capture.person.set_person(own, state)
+    np.testing.assert_allclose(estimated.Eval(context), path[1])
+    lost = type(state)(state.values, state.step, 0.1, state.usual)
+    capture.person.set_person(own, lost)
+    assert np.isnan(estimated.Eval(context)).all()
+    assert capture.person.known_person(own).share == 0.1
+
+
+def test_every_camera_needs_a_background(cameras, backgrounds, tracker):
+    last = list(cameras)[-1]
+    known = {name: one for name, one in backgrounds.items() if name != last}
+    with pytest.raises(SettingsError, match=last):
+        build_silhouette_capture(tracker, cameras, known)

@@ -1,0 +1,99 @@
+"""The rig in Drake: its pictures against the span kernel and the cameras' own projection."""
+
+import cv2
+import numpy as np
+import pytest
+from pydrake.trajectories import PiecewisePolynomial
+
+from drake_pose.body import bundled_model, load_model
+from drake_pose.camera import load_cameras, save_cameras
+from drake_pose.camera.rigs import FACE_CAMERA, circle_of_cameras, look_at
+from drake_pose.errors import CameraError, UnknownNameError
+from drake_pose.silhouette import LabelRenderer
+from drake_pose.systems.pictures.camera_rig import build_camera_rig
+
+SIZE = (160, 120)
+
+
+@pytest.fixture(scope="module")
+def person():
+    return load_model(bundled_model("person"), check=False)
+
+
+@pytest.fixture(scope="module")
+def standing(person):
+    q = np.array(person.default_positions)
+    q[person.position_index("position_z")] = 1.5
+    q[person.position_index("left_upper_arm_z")] = 1.3
+    return q
+
+
+def test_circle_of_cameras():
+    cameras = circle_of_cameras(8, radius=3.0)
+    assert len(cameras) == 9
+    eyes = np.array([camera.X_WC[:3, 3] for name, camera in cameras.items() if name != FACE_CAMERA])
+    angles = np.unwrap(np.arctan2(eyes[:, 1], eyes[:, 0]))
+    np.testing.assert_allclose(np.diff(np.degrees(angles)), 45.0)
+    for camera in cameras.values():
+        middle = [camera.center_x, camera.center_y]
+        target = [0, 0, camera.X_WC[2, 3] if camera.name == FACE_CAMERA else 0.95]
+        np.testing.assert_allclose(camera.project(np.array([target]))[0][0], middle, atol=1e-9)
+        above = camera.project(np.array([[0, 0, 1.9]]))[0][0]
+        assert above[1] < middle[1]
+
+
+@pytest.mark.parametrize("wrong", [{"count": 0, "face_camera": False}, {"radius": -1.0}])
+def test_rigs_that_cannot_be(wrong):
+    with pytest.raises(CameraError):
+        circle_of_cameras(**wrong)
+    with pytest.raises(CameraError, match="cannot look"):
+        look_at([0, 0, 2], [0, 0, 1])
+
+
+def test_masks_are_those_of_the_label_renderer(person, standing, tmp_path):
+    save_cameras(tmp_path / "cameras.yaml", circle_of_cameras(3, size=SIZE))
+    cameras = load_cameras(tmp_path / "cameras.yaml")
+    rig = build_camera_rig(person, cameras)
+    context = rig.diagram.CreateDefaultContext()
+    rig.set_positions(context, standing)
+    for name, camera in cameras.items():
+        mask = rig.mask(context, name)
+        assert mask.any()
+        assert np.array_equal(mask, LabelRenderer(person, camera).mask(standing))
+        picture = rig.picture(context, name)
+        assert picture.shape == (120, 160, 3)
+        near = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        assert np.ptp(picture[~near], axis=0).max() <= 1  # The background has one colour.
+
+
+def test_pictures_follow_the_positions(person, standing):
+    rig = build_camera_rig(person, circle_of_cameras(1, size=SIZE, face_camera=False))
+    context = rig.diagram.CreateDefaultContext()
+    rig.set_positions(context, standing)
+    before = rig.mask(context, "camera_0")
+    moved = standing.copy()
+    moved[person.position_index("position_y")] += 0.5
+    rig.set_positions(context, moved)
+    assert not np.array_equal(before, rig.mask(context, "camera_0"))
+    rig.set_positions(context, standing)
+    assert np.array_equal(before, rig.mask(context, "camera_0"))
+
+
+def test_trajectory_moves_the_body(person, standing):
+    moved = standing.copy()
+    moved[person.position_index("position_y")] += 0.5
+    path = PiecewisePolynomial.FirstOrderHold([0.0, 1.0], np.column_stack([standing, moved]))
+    rig = build_camera_rig(person, circle_of_cameras(1, size=SIZE, face_camera=False), path)
+    context = rig.diagram.CreateDefaultContext()
+    first = rig.mask(context, "camera_0").nonzero()[1].mean()
+    context.SetTime(1.0)
+    last = rig.mask(context, "camera_0").nonzero()[1].mean()
+    assert abs(last - first) > 5
+
+
+def test_unknown_camera_and_no_camera(person):
+    rig = build_camera_rig(person, circle_of_cameras(1, size=SIZE, face_camera=False))
+    with pytest.raises(UnknownNameError, match="camera_9"):
+        rig.picture(rig.diagram.CreateDefaultContext(), "camera_9")
+    with pytest.raises(CameraError, match="at least one"):
+        build_camera_rig(person, {})

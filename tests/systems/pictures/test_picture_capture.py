@@ -1,0 +1,263 @@
+import cv2
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator, SimulatorStatus
+from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
+
+from drake_pose.body import bundled_model, load_model
+from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecification, TimedPicture
+from drake_pose.errors import SettingsError, UnknownNameError
+from drake_pose.multiview.person.silhouette_tracker import see_silhouette
+from drake_pose.multiview.regions import learn_background, person_region
+from drake_pose.silhouette import label_image_to_mask, mask_to_label_image
+from drake_pose.systems.person.silhouette_sensor import SilhouetteEye, edge_spacing, shows_somebody
+from drake_pose.systems.pictures.camera_rig import build_camera_rig
+from drake_pose.systems.pictures.picture_capture import PictureCapture
+
+SIZE = (40, 30)
+PERIOD = 0.1
+CAMERAS = circle_of_cameras(3, size=SIZE, face_camera=False)
+
+
+class Recording(FrameSource):
+    """A source that holds its pictures: each tells by its value which one it is."""
+
+    def __init__(self, camera, times, masks=False, kind="video"):
+        background = None if masks else "empty"
+        super().__init__(
+            SourceSpecification(camera, kind, "-", *SIZE, 1 / PERIOD, background=background)
+        )
+        self._rest = [(k, time) for k, time in enumerate(times)]
+        self.closed = False
+
+    @property
+    def ended(self):
+        return not self._rest
+
+    def close(self):
+        self.closed = True
+
+    def _read(self):
+        if not self._rest:
+            return None
+        k, time = self._rest.pop(0)
+        if self.specification.gives_masks:
+            picture = np.zeros(SIZE[::-1], dtype=bool)
+            picture[: k + 1] = True
+        else:
+            picture = np.full((*SIZE[::-1], 3), (k, 100, 200), dtype=np.uint8)
+        return TimedPicture(time, f"{k}", picture)
+
+
+def play(capture, names, end=10.0):
+    """By period in which there is something new: its time, and what each camera shows."""
+    simulator = Simulator(capture)
+    found = []
+
+    def look(context):
+        if capture.GetOutputPort("fresh").Eval(context)[0]:
+            images = [capture.GetOutputPort(name).Eval(context) for name in names]
+            shown = [int(image.data[0, 0, 0]) if image.size() else None for image in images]
+            found.append((float(capture.GetOutputPort("time").Eval(context)[0]), *shown))
+
+    simulator.set_monitor(look)
+    return simulator.AdvanceTo(end), found
+
+
+def test_recorded_moments_are_all_shown_and_the_end_is_told():
+    times = [7.0 + PERIOD * k for k in range(5)]
+    sources = {
+        "camera_0": Recording("camera_0", times),
+        "camera_1": Recording("camera_1", [time + 0.02 for time in times]),
+    }
+    capture = PictureCapture(sources, CAMERAS)
+    assert capture.period == pytest.approx(PERIOD)
+    assert not capture.live
+    status, found = play(capture, ["color_image_camera_0", "color_image_camera_1"])
+    assert status.reason() == SimulatorStatus.ReturnReason.kReachedTerminationCondition
+    assert [row[1:] for row in found] == [(k, k) for k in range(5)]
+    assert [row[0] for row in found] == pytest.approx([PERIOD * k for k in range(5)])
+    assert not capture.take_reports()
+    assert capture.counts()["camera_1"].used == 5
+    capture.close()
+    assert sources["camera_0"].closed
+
+
+def test_images_are_those_of_the_sources():
+    sources = {
+        "camera_0": Recording("camera_0", [0.0]),
+        "camera_1": Recording("camera_1", [0.0], masks=True),
+    }
+    capture = PictureCapture(sources, CAMERAS)
+    simulator = Simulator(capture)
+    simulator.AdvanceTo(0.5 * PERIOD)
+    context = simulator.get_context()
+    colour = capture.GetOutputPort("color_image_camera_0").Eval(context)
+    assert (colour.data == (0, 100, 200, 255)).all()
+    mask = label_image_to_mask(capture.GetOutputPort("label_image_camera_1").Eval(context))
+    assert mask.sum() == SIZE[0]
+    assert mask[0].all()
+
+
+def test_camera_that_stops_and_returns_costs_only_its_own_pictures():
+    times = [PERIOD * k for k in range(20)]
+    sources = {
+        "camera_0": Recording("camera_0", times),
+        "camera_1": Recording("camera_1", [time for time in times if not 0.45 < time < 1.45]),
+    }
+    capture = PictureCapture(sources, CAMERAS)
+    _, found = play(capture, ["color_image_camera_0", "color_image_camera_1"])
+    assert [row[1] for row in found] == list(range(20))
+    there = [row[0] for row in found if row[2] is not None]
+    assert there == pytest.approx([time for time in times if not 0.45 < time < 1.45])
+    stopped, returned = capture.take_reports()
+    assert "'camera_1' stopped at 0.40 s" in stopped
+    assert "'camera_1' returned at 1.50 s" in returned
+    assert [change.stopped for change in capture.counts()["camera_1"].changes] == [True, False]
+
+
+def test_live_shows_the_newest_moment_only():
+    sources = {name: Recording(name, [PERIOD * k for k in range(9)]) for name in CAMERAS}
+    # Twice before it begins, then at every look.
+    clock = iter([100.0, 100.0, 100.0, 100.0, 100.35, 100.36, 101.0, 101.1]).__next__
+    capture = PictureCapture(sources, CAMERAS, live=True, clock=clock)
+    _, found = play(capture, [f"color_image_{name}" for name in CAMERAS], 0.45)
+    assert [row[1:] for row in found] == [(0, 0, 0), (3, 3, 3), (8, 8, 8)]
+    assert capture.skipped == 2 + 4
+
+
+class Device(Recording):
+    """A live camera: silent until it is asked for the third time."""
+
+    def __init__(self, camera, clock, silent):
+        super().__init__(camera, [], kind="device")
+        self._clock, self._silent, self._count, self._shown = clock, silent, 0, None
+
+    @property
+    def ended(self):
+        return False
+
+    def _read(self):
+        self._count += 1
+        if self._count <= self._silent or self._shown == self._clock["now"]:
+            return None
+        self._shown = self._clock["now"]
+        picture = np.full((*SIZE[::-1], 3), self._count % 200, dtype=np.uint8)
+        return TimedPicture(self._clock["now"] - 0.01, "x", picture)
+
+
+@pytest.mark.parametrize("silent", [3, 1000])
+def test_live_cameras_may_take_their_time_to_open(silent):
+    clock = {"now": 50.0}
+    sources = {
+        "camera_0": Device("camera_0", clock, 0),
+        "camera_1": Device("camera_1", clock, silent),
+    }
+    capture = PictureCapture(sources, CAMERAS, clock=lambda: clock["now"])
+    simulator = Simulator(capture)
+    times = []
+    for k in range(200):
+        clock["now"] += PERIOD
+        simulator.AdvanceTo((k + 0.5) * PERIOD)
+        if capture.moment is not None:
+            times.append(capture.moment.time)
+    reports = "\n".join(capture.take_reports())
+    # Without the second camera, the first moment waits for it once.
+    assert times[0] < (2 if silent == 3 else 6) * PERIOD
+    if silent == 3:
+        assert not reports
+        assert set(capture.moment.items) == {"camera_0", "camera_1"}
+        assert len(times) > 190
+    else:
+        assert "'camera_1' gives no picture" in reports
+        assert set(capture.moment.items) == {"camera_0"}
+        assert 100 < len(times) < 130, "it was waited for, but not for ever"
+
+
+def test_what_cannot_be_is_refused():
+    with pytest.raises(UnknownNameError, match="stranger"):
+        PictureCapture({"stranger": Recording("stranger", [0.0])}, CAMERAS)
+    device = {"camera_0": Recording("camera_0", [0.0], kind="device")}
+    with pytest.raises(SettingsError, match="live"):
+        PictureCapture(device, CAMERAS, live=False)
+    assert PictureCapture(device, CAMERAS).live
+    with pytest.raises(SettingsError, match="period"):
+        PictureCapture({"camera_0": Recording("camera_0", [0.0])}, CAMERAS, period=0.0)
+
+
+@pytest.fixture(scope="module")
+def rig():
+    person = load_model(bundled_model("person"), check=False)
+    cameras = circle_of_cameras(1, size=(160, 120), face_camera=False)
+    rig = build_camera_rig(person, cameras)
+    context = rig.diagram.CreateDefaultContext()
+    q = np.array(person.default_positions)
+    q[person.position_index("position_z")] = -9.0
+    rig.set_positions(context, q)
+    empty = rig.picture(context, "camera_0")
+    q[person.position_index("position_z")] = 1.5
+    return rig, cameras["camera_0"], q, learn_background([empty])
+
+
+class TestEye:
+    @pytest.mark.parametrize("kind", ["label", "color"])
+    def test_drakes_sensors_connect(self, rig, kind):
+        rig, camera, q, background = rig
+        eye = SilhouetteEye(camera, background if kind == "color" else None)
+        context = rig.diagram.CreateDefaultContext()
+        rig.set_positions(context, q)
+        image = rig.diagram.GetOutputPort(f"{kind}_image_camera_0").Eval(context)
+        own = eye.CreateDefaultContext()
+        eye.get_input_port().FixValue(own, image)
+        found = eye.GetOutputPort("silhouette").Eval(own)
+        if kind == "label":
+            region = rig.mask(context, "camera_0")
+        else:
+            region = person_region(rig.picture(context, "camera_0"), background)
+        expected = see_silhouette(region, edge_spacing(camera))
+        np.testing.assert_array_equal(found.region, region)
+        np.testing.assert_array_equal(found.edge.uv, expected.edge.uv)
+        assert len(found.edge.uv) > 20
+
+    def test_nothing_shown_is_none(self, rig):
+        _, camera, _, background = rig
+        for eye, image in (
+            (SilhouetteEye(camera), ImageLabel16I()),
+            (SilhouetteEye(camera, background), ImageRgba8U()),
+        ):
+            context = eye.CreateDefaultContext()
+            assert eye.GetOutputPort("silhouette").Eval(context) is None
+            eye.get_input_port().FixValue(context, image)
+            assert eye.GetOutputPort("silhouette").Eval(context) is None
+
+    def test_nobody_shown_is_an_empty_region(self, rig):
+        _, camera, _, _ = rig
+        eye = SilhouetteEye(camera)
+        context = eye.CreateDefaultContext()
+        empty = np.zeros((camera.height, camera.width), dtype=bool)
+        eye.get_input_port().FixValue(context, mask_to_label_image(empty))
+        found = eye.GetOutputPort("silhouette").Eval(context)
+        assert not found.region.any()
+        assert len(found.edge.uv) == 0
+        assert not shows_somebody(found)
+        assert not shows_somebody(None)
+        empty[40:43, 70:73] = True
+        assert not shows_somebody(see_silhouette(empty, 2.0)), "a speck is nobody"
+        empty[20:100, 60:80] = True
+        assert shows_somebody(see_silhouette(empty, 2.0))
+
+
+def test_rgba_alpha_is_ignored():
+    camera = CAMERAS["camera_0"]
+    picture = np.full((*SIZE[::-1], 3), 90, np.uint8)
+    eye = SilhouetteEye(camera, learn_background([picture]))
+    image = ImageRgba8U(*SIZE)
+    cv2.cvtColor(picture, cv2.COLOR_RGB2RGBA, dst=image.mutable_data)
+    image.mutable_data[10:20, 10:20, :3] = 250
+    image.mutable_data[:, :, 3] = 7
+    context = eye.CreateDefaultContext()
+    eye.get_input_port().FixValue(context, image)
+    region = eye.GetOutputPort("silhouette").Eval(context).region
+    assert region[12:18, 12:18].all()
+    assert not region[:8].any()

@@ -1,0 +1,155 @@
+import math
+
+import numpy as np
+import pytest
+from pydrake.geometry import Meshcat, MeshcatParams
+from pydrake.systems.analysis import Simulator
+from pydrake.trajectories import PiecewisePolynomial
+
+from drake_pose.body import bundled_model, load_model
+from drake_pose.errors import SettingsError, UnknownNameError
+from drake_pose.multiview.date.walk_commands import WalkSettings
+from drake_pose.systems.walk.garden import (
+    HALF_SIZE,
+    START,
+    place_objects,
+    place_obstacles,
+    walker_transform,
+)
+from drake_pose.systems.walk.walk import KEYS, Walker, build_walk
+
+PERIOD = 1 / 30
+SETTINGS = WalkSettings()
+
+
+@pytest.fixture(scope="module")
+def person():
+    return load_model(bundled_model("person"), check=False)
+
+
+@pytest.fixture(scope="module")
+def page():
+    return Meshcat(MeshcatParams(host="localhost"))
+
+
+def standing(person, x=0.0, head_deg=0.0):
+    q = np.zeros(len(person.position_names))
+    q[person.position_index("position_x")] = x
+    q[person.position_index("position_z")] = 1.55
+    q[person.position_index("head_y")] = math.radians(head_deg)
+    return q
+
+
+def run(person, page, stances, seconds_each=1.0):
+    """Shows each stance for a while; the pose and the command after each."""
+    times = seconds_each * np.arange(len(stances) + 1)
+    path = PiecewisePolynomial.ZeroOrderHold(times, np.array([*stances, stances[-1]]).T)
+    diagram = build_walk(person, page, path, np.array([standing(person)]), PERIOD, SETTINGS)
+    simulator, found = Simulator(diagram), []
+    for time in times[1:]:
+        simulator.AdvanceTo(time - 0.5 * PERIOD)
+        context = simulator.get_context()
+        found.append(
+            [diagram.GetOutputPort(n).Eval(context).copy() for n in ("walker_pose", "command")]
+        )
+    return found
+
+
+def test_gestures_walk_and_turn(person, page):
+    lost = np.full(len(person.position_names), np.nan)
+    stances = [
+        standing(person, 0.1),
+        standing(person, 0.4),
+        standing(person, 0.1, 40.0),
+        lost,
+        standing(person, -0.2),
+    ]
+    found = run(person, page, stances)
+    assert [tuple(command) for _, command in found] == [(0, 0), (0, 1), (1, 0), (0, 0), (0, -1)]
+    ways = np.diff([pose for pose, _ in found], axis=0)
+    np.testing.assert_allclose(ways[0], [SETTINGS.speed, 0.0, 0.0], atol=0.05)
+    np.testing.assert_allclose(ways[1], [0.0, 0.0, SETTINGS.turn_rate], atol=0.05)
+    np.testing.assert_allclose(ways[2], 0.0, atol=0.05)
+    heading = found[2][0][2]
+    back = -SETTINGS.speed * np.array([math.cos(heading), math.sin(heading), 0.0])
+    np.testing.assert_allclose(ways[3], back, atol=0.06)
+    assert page.HasPath("/drake/walker/avatar")
+    assert page.HasPath("/drake/place/lawn")
+
+
+def test_who_was_taken_for_facing_the_wrong_way_turns_the_rest_around(person, page):
+    """The tracker mends itself: no command to turn, and ahead is where the person faces."""
+    stances = [standing(person, 0.0, 179.0), standing(person), standing(person, 0.4)]
+    found = run(person, page, stances)
+    assert [tuple(command) for _, command in found] == [(0, 0), (0, 0), (0, 1)]
+
+
+def test_rest_is_where_the_person_stands_still(person, page):
+    ways = [standing(person, x) for x in np.linspace(-0.5, 0.0, 30)]
+    times = PERIOD * np.arange(30 + 40 + 30)
+    q = np.array([*ways, *[standing(person)] * 40, *[standing(person, 0.4)] * 30])
+    path = PiecewisePolynomial.ZeroOrderHold(times, q.T)
+    stride = np.array([standing(person)])
+    diagram = build_walk(person, page, path, stride, PERIOD, SETTINGS, settle=1.0)
+    simulator = Simulator(diagram)
+    rest = diagram.GetSubsystemByName("walker").GetOutputPort("rest")
+    own = diagram.GetSubsystemByName("walker").GetMyContextFromRoot(simulator.get_context())
+    simulator.AdvanceTo(1.5)
+    assert np.isnan(rest.Eval(own)).all()
+    simulator.AdvanceTo(3.2)
+    assert rest.Eval(own)[3] == pytest.approx(0.0, abs=0.09)
+    assert tuple(diagram.GetOutputPort("command").Eval(simulator.get_context())) == (0, 1)
+
+
+def press(page, button):
+    """What the browser sends for a button: a map of two texts as MessagePack."""
+    texts = ["type", "button", "name", button]
+    packed = b"".join(bytes([0xA0 + len(text)]) + text.encode() for text in texts)
+    page._InjectWebsocketMessage(message=b"\x82" + packed)
+
+
+def test_keys_walk_where_nobody_is_captured(person):
+    page = Meshcat(MeshcatParams(host="localhost"))
+    stride = np.array([standing(person, head_deg=d) for d in (5.0, 10.0, 5.0, 0.0)])
+    diagram = build_walk(person, page, None, stride, PERIOD)
+    assert set(page.GetButtonNames()) == set(KEYS)
+    simulator = Simulator(diagram)
+    simulator.AdvanceTo(1.0)
+    pose = diagram.GetOutputPort("walker_pose")
+    np.testing.assert_allclose(pose.Eval(simulator.get_context()), START)
+    press(page, "ahead")
+    press(page, "left")
+    simulator.AdvanceTo(3.0)
+    x, y, heading = pose.Eval(simulator.get_context())
+    # A press counts for about half a second, on an arc to the left.
+    assert 0.5 < np.hypot(x - START[0], y - START[1]) / SETTINGS.speed < 0.7
+    assert 0.5 < heading / SETTINGS.turn_rate < 0.7
+    assert y > 0.02
+
+
+def test_who_stands_at_rest_is_where_the_walker_is():
+    pose, rest = np.array([3.0, -2.0, 1.1]), np.array([0.4, 9.0, 9.0, 0.5, 0.7])
+    X_PR = walker_transform(pose, rest)
+    np.testing.assert_allclose(X_PR.multiply([0.5, 0.7, 0.0]), [3.0, -2.0, 0.0], atol=1e-12)
+    ahead = X_PR.multiply([0.5 + math.cos(0.4), 0.7 + math.sin(0.4), 0.0])
+    np.testing.assert_allclose(ahead, [3.0 + math.cos(1.1), -2.0 + math.sin(1.1), 0.0], atol=1e-12)
+
+
+def test_place_lies_within_its_walls_and_the_start_is_free():
+    names = [one.name for one in place_objects()]
+    assert len(set(names)) == len(names)
+    obstacles = place_obstacles()
+    assert np.abs(obstacles[:, :2]).max() < HALF_SIZE
+    distance = np.linalg.norm(obstacles[:, :2] - START[:2], axis=1) - obstacles[:, 2]
+    assert distance.min() > 2 * SETTINGS.body_radius
+
+
+def test_wrong_period_and_body_are_refused(person):
+    q = standing(person)
+    with pytest.raises(SettingsError, match="period"):
+        Walker(person, q, 0.0)
+    with pytest.raises(SettingsError, match="settle"):
+        Walker(person, q, PERIOD, settle=-1.0)
+    arm = load_model(bundled_model("hand"), check=False)
+    with pytest.raises(UnknownNameError, match="head"):
+        Walker(arm, arm.default_positions, PERIOD)

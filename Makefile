@@ -1,4 +1,4 @@
-.PHONY: demo test test-slow robots bench clean
+.PHONY: demo test test-slow robots docs bench clean
 
 VENV := .venv
 PYTHON := $(VENV)/bin/python
@@ -33,6 +33,10 @@ test-slow: $(VENV)/ready-test
 
 # Other people's robots for the tests, which are skipped without: 1.3 GB.
 robots: $(VENV)/ready-robots
+
+# The Python API as web pages: build/docs/index.html. A broken reference is an error.
+docs: $(VENV)/ready-docs
+	$(PYTHON) -m sphinx -n -W --keep-going -q -d build/docs-cache docs build/docs
 
 bench: $(VENV)/ready-cluster
 	$(PYTHON) -m drake_pose.apps.benchmarks.speed

@@ -1,0 +1,196 @@
+"""README, CONTRIBUTING and the pages under tutorials: links, examples, commands, formats."""
+
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from drake_pose.apps.batch_job import read_job
+from drake_pose.apps.main import app
+from drake_pose.body import load_landmarks
+from drake_pose.camera import load_cameras
+from drake_pose.camera.calibration_board import load_board
+from drake_pose.camera.source_files import load_sources
+from drake_pose.filtering import load_couplings
+
+ROOT = Path(__file__).resolve().parents[2]
+TUTORIALS = ROOT / "tutorials"
+FOLDERS = (ROOT, ROOT / "docs", TUTORIALS, ROOT / "urdf")
+PAGES = sorted(
+    {page for folder in FOLDERS for page in folder.glob("*.md")} | {*ROOT.glob("urdf/*/*.md")}
+)
+TEXTS = {page.relative_to(ROOT).as_posix(): page.read_text(encoding="utf-8") for page in PAGES}
+# Those that show how the program is used.
+SHOWN = {name: text for name, text in TEXTS.items() if not name.startswith("urdf/")}
+ENVIRONMENT = {"COLUMNS": "200", "NO_COLOR": "1", "TERM": "dumb"}
+
+each_page = pytest.mark.parametrize("page", TEXTS)
+
+
+def blocks(text: str, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```$", text, flags=re.MULTILINE | re.DOTALL)
+
+
+def shell_lines(text: str) -> Iterator[list[str]]:
+    for block in blocks(text, "sh"):
+        for line in block.replace("\\\n", " ").splitlines():
+            if words := shlex.split(line, comments=True):
+                yield words
+
+
+PYTHON = [(name, code) for name, text in SHOWN.items() for code in blocks(text, "python")]
+COMMANDS = [
+    words[1:] for text in SHOWN.values() for words in shell_lines(text) if words[0] == "drake-pose"
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("index", range(len(PYTHON)), ids=[name for name, _ in PYTHON])
+def test_python_examples_run(
+    index: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(ROOT)
+    name, code = PYTHON[index]
+    exec(compile(code, f"{name}, an example", "exec"), {})
+    printed = capsys.readouterr().out
+    assert printed
+    assert "nan" not in printed
+
+
+@pytest.mark.slow
+def test_the_readme_s_command_runs_as_pasted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("tutorials", "urdf"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    monkeypatch.chdir(tmp_path)
+    (words,) = [line for line in shell_lines(TEXTS["README.md"]) if line[0] == "drake-pose"]
+    result = CliRunner().invoke(app, words[1:])
+    assert result.exit_code == 0, result.output
+    out = tmp_path / words[words.index("--out") + 1]
+    for file in ("report.html", "poses.csv", "joints.csv", "families.csv"):
+        assert file in TEXTS["README.md"]
+        assert (out / file).is_file()
+
+
+def test_the_readme_has_one_example_of_each_kind() -> None:
+    assert [name for name, _ in PYTHON].count("README.md") == 1
+    assert [words[0] for words in shell_lines(TEXTS["README.md"])].count("drake-pose") == 1
+    assert len(re.findall(r"!\[|<img", TEXTS["README.md"])) == 1
+    assert len(TEXTS["README.md"].splitlines()) < 130
+
+
+def test_every_command_has_an_example() -> None:
+    listed = {command.name or command.callback.__name__ for command in app.registered_commands}
+    listed |= {group.name for group in app.registered_groups}
+    shown = {words[1] for words in shell_lines(TEXTS["tutorials/commands.md"])}
+    assert shown == listed
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_command_line_examples_use_options_that_exist(words: list[str]) -> None:
+    command = words[:2] if words[0] == "reproduce" else words[:1]
+    shown = CliRunner().invoke(app, [*command, "--help"], env=ENVIRONMENT)
+    assert shown.exit_code == 0
+    known = set(re.findall(r"--[a-z][a-z-]*", shown.output))
+    used = {word for word in words if word.startswith("--")}
+    assert used <= known
+
+
+def test_options_named_in_the_text_exist() -> None:
+    commands = [[command] for command in ("estimate", "capture", "batch", "walk", "calibrate")]
+    commands += [["reproduce", paper] for paper in ("kameda", "shimada", "date")]
+    shown = [CliRunner().invoke(app, [*one, "--help"], env=ENVIRONMENT) for one in commands]
+    known = {word for one in shown for word in re.findall(r"--[a-z][a-z-]*", one.output)}
+    named = {word for text in SHOWN.values() for word in re.findall(r"`(--[a-z][a-z-]*)", text)}
+    assert {"--json", "--resume", "--package"} <= named
+    assert named - known - {"--help"} == set()
+
+
+def test_make_targets_exist() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    text = "\n".join(SHOWN.values())
+    named = set(re.findall(r"`make ([a-z-]+)`", text))
+    named |= set(re.findall(r"^make ([a-z-]+)", text, flags=re.MULTILINE))
+    assert {"demo", "test", "test-slow", "docs", "bench"} <= named
+    for target in named:
+        assert re.search(rf"^{target}:", makefile, flags=re.MULTILINE), target
+
+
+def anchors(page: Path) -> set[str]:
+    """A page's headings as GitHub makes anchors of them."""
+    text = re.sub(r"^```.*?^```$", "", page.read_text("utf-8"), flags=re.MULTILINE | re.DOTALL)
+    headings = re.findall(r"^#+ (.*)$", text, flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", one.lower()).replace(" ", "-") for one in headings}
+
+
+@each_page
+def test_links_lead_somewhere(page: str) -> None:
+    targets = re.findall(r"\]\(([^)\s]+)\)", TEXTS[page])
+    targets += re.findall(r'src="([^"]+)"', TEXTS[page])
+    for target in targets:
+        if target.startswith("https://"):
+            continue
+        file, _, anchor = target.partition("#")
+        place = (ROOT / page).parent / file if file else ROOT / page
+        assert place.exists(), target
+        if anchor:
+            assert anchor in anchors(place), target
+
+
+def test_the_overview_names_every_page() -> None:
+    listed = re.findall(r"^\| \[\w+\]\((\w+\.md)\)", TEXTS["tutorials/README.md"], re.MULTILINE)
+    assert sorted(listed) == sorted(
+        page.name for page in TUTORIALS.glob("*.md") if page.name != "README.md"
+    )
+
+
+def test_the_folders_are_those_of_the_library() -> None:
+    listed = re.findall(r"^\| `drake_pose/(\w+)` \|", TEXTS["CONTRIBUTING.md"], re.MULTILINE)
+    folders = {path.parent.name for path in (ROOT / "drake_pose").glob("*/__init__.py")}
+    assert set(listed) == folders
+    assert len(listed) == len(folders)
+
+
+def test_pictures_are_small() -> None:
+    pictures = list((TUTORIALS / "pictures").glob("*.png"))
+    assert {picture.name for picture in pictures} == {"demo.png", "woman.png"}
+    assert sum(picture.stat().st_size for picture in pictures) < 200_000
+
+
+@each_page
+def test_no_absolute_path(page: str) -> None:
+    assert not re.search(r"(?<![\w.)/:])/(home|root|tmp|usr|work|Users|opt|var)/", TEXTS[page])
+
+
+def yaml_example(page: str, word: str) -> str:
+    (found,) = [block for block in blocks(TEXTS[page], "yaml") if word in block]
+    return found
+
+
+def test_the_examples_of_files_can_be_read(tmp_path: Path) -> None:
+    formats, models = "tutorials/file_formats.md", "tutorials/models.md"
+
+    def write(name: str, page: str, word: str) -> Path:
+        path = tmp_path / name
+        path.write_text(yaml_example(page, word), encoding="utf-8")
+        return path
+
+    (left,) = load_cameras(write("cameras.yaml", formats, "X_WC")).values()
+    cameras = {name: left for name in ("front", "side", "top")}
+    sources = load_sources(write("sources.yaml", formats, "location"), cameras)
+    assert [one.kind for one in sources.values()] == ["device", "video", "folder"]
+    jobs = read_job(write("jobs.yaml", formats, "scenes:"))
+    assert [job.name for job in jobs] == ["monday", "tuesday", "walker"]
+    assert load_board(write("board.yaml", formats, "square_length")).columns == 8
+    assert "left_elbow" in load_landmarks(write("landmarks.yaml", models, "landmarks:"))
+    columns = ("flexion_11", "flexion_12", "flexion_13")
+    rows = load_couplings(write("hand.couplings.yaml", models, "differences"), columns)
+    assert len(rows) == 3
+    for page in (formats, models):
+        for block in blocks(TEXTS[page], "yaml"):
+            assert yaml.safe_load(block)

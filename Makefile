@@ -44,4 +44,4 @@ bench: $(VENV)/ready-cluster
 	$(PYTHON) -m drake_pose.apps.benchmarks.cluster
 
 clean:
-	rm -rf $(VENV) results
+	rm -rf $(VENV) results build

@@ -1,7 +1,8 @@
 """Pose estimation of articulated objects from silhouettes, as Drake systems.
 
-The names that most programs need are here; each is loaded when it is first used. The rooms are
-``drake_pose.body``, ``camera``, ``silhouette``, ``matching``, ``systems`` and ``apps``.
+The names that most programs need are here; each is loaded when it is first used. The packages are
+``drake_pose.body``, ``camera``, ``silhouette``, ``matching``, ``filtering``, ``multiview``,
+``systems`` and ``apps``.
 """
 
 from __future__ import annotations

@@ -186,6 +186,7 @@ class ParallelCamera:
 
 
 Camera = PinholeCamera | ParallelCamera
+"""A camera of either kind."""
 
 
 def _set_sides_and_center(camera: Camera, where: str) -> None:

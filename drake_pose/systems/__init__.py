@@ -26,7 +26,7 @@ from drake_pose.systems.person.live_capture import EyePorts, LiveEyes, LocalEyes
 from drake_pose.systems.person.person_tracker import PersonTracker, build_person_capture
 from drake_pose.systems.person.silhouette_capture import SilhouetteCapture, build_silhouette_capture
 from drake_pose.systems.person.silhouette_sensor import SilhouetteEye
-from drake_pose.systems.pictures.picture_capture import PictureCapture
+from drake_pose.systems.pictures.picture_capture import CameraCount, PictureCapture
 from drake_pose.systems.walk.walk import Walker, WalkKeys, WalkView, build_walk
 
 __all__ = [
@@ -34,6 +34,7 @@ __all__ = [
     "TRACK",
     "AxisSensor",
     "BodyBelief",
+    "CameraCount",
     "EyePorts",
     "FaceDirectionFinder",
     "FeatureFinder",

@@ -9,12 +9,12 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from drake_pose.apps.batch_job import read_job
+from drake_pose.apps.batch.job import read_job
 from drake_pose.apps.main import app
 from drake_pose.body import load_landmarks
 from drake_pose.camera import load_cameras
-from drake_pose.camera.calibration_board import load_board
-from drake_pose.camera.source_files import load_sources
+from drake_pose.camera.calibration.board import load_board
+from drake_pose.camera.sources.files import load_sources
 from drake_pose.filtering import load_couplings
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -154,6 +154,12 @@ def test_the_folders_are_those_of_the_library() -> None:
     folders = {path.parent.name for path in (ROOT / "drake_pose").glob("*/__init__.py")}
     assert set(listed) == folders
     assert len(listed) == len(folders)
+
+
+def test_every_package_has_an_api_page() -> None:
+    pages = {page.stem for page in (ROOT / "docs").glob("*.rst")}
+    folders = {path.parent.name for path in (ROOT / "drake_pose").glob("*/__init__.py")}
+    assert pages == {"index", "errors", *folders}
 
 
 def test_pictures_are_small() -> None:

@@ -18,7 +18,7 @@ from drake_pose.regular_files import read_regular
 _SUFFIXES = (".png", ".jpg", ".jpeg")
 
 Picture = tuple[str, str]
-"""A camera's name and a frame's name: pictures of the same frame were taken at the same instant."""
+"""A camera's name and a frame's name; pictures of the same frame were taken at the same instant."""
 
 
 @dataclass(frozen=True, eq=False)

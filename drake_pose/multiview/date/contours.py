@@ -37,8 +37,8 @@ def measure_contour(region: Mask) -> Contour | None:
         region: (H, W) the person.
 
     Returns:
-        None where nobody is seen, or the region touches the picture's edge: then a part of the
-        contour is not the person's.
+        The contour. None where nobody is seen, or the region touches the picture's edge and so a
+        part of the contour is not the person's.
     """
     if not region.any() or _touches_edge(region):
         return None

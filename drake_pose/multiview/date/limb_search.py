@@ -17,10 +17,10 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 ELBOW_RANGE = (0.0, 120.0)
-"""Where an elbow may be on its circle [deg]: from behind, over outwards, to a little in front."""
+"""Where an elbow may be on its circle [deg], from behind, over outwards, to a little in front."""
 
 KNEE_RANGE = (-40.0, 80.0)
-"""Where a knee may be on its circle [deg]: 0 is in front, positive outwards."""
+"""Where a knee may be on its circle [deg]; 0 is in front, positive outwards."""
 
 _STEP_DEG = 5.0
 _SAMPLES_ALONG = 12

@@ -22,7 +22,7 @@ LIMBS = ("left_arm", "right_arm", "left_leg", "right_leg")
 """The limbs' names."""
 
 FEATURES = ("head", "left_hand", "right_hand", "left_foot", "right_foot")
-"""The skin-coloured parts that are measured: head and the limbs' ends, in the limbs' order."""
+"""The skin-coloured parts that are measured, head and the limbs' ends, in the limbs' order."""
 
 _SEGMENTS = {"arm": ("upper_arm", "forearm", "hand"), "leg": ("thigh", "shin", "foot")}
 _FARTHEST_FEATURE = 0.05

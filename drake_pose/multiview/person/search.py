@@ -116,7 +116,7 @@ class Sight:
 
     @cached_property
     def judges(self) -> list[int]:
-        """Which of them judge guesses: a few, as far as possible all around."""
+        """Which of them judge guesses; a few, as far as possible all around."""
         count = min(_JUDGES, len(self.seers))
         chosen = np.linspace(0, len(self.seers), count, endpoint=False).astype(int)
         return [self.seers[k] for k in chosen]

@@ -97,7 +97,7 @@ class PoseFit:
 
     @property
     def closeness(self) -> float:
-        """How well both contours fit, 0 to 1: what tells the better one of two fits."""
+        """How well both contours fit, 0 to 1; it tells the better one of two fits."""
         compared, _, close = self.agreement.sum(axis=0)
         return float(close / max(compared, 1e-9))
 

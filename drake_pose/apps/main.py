@@ -90,7 +90,9 @@ def _print_version(wanted: bool) -> None:
 def prepare(
     version: Annotated[
         bool,
-        typer.Option("--version", callback=_print_version, is_eager=True, help="Print it."),
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version."
+        ),
     ] = False,
 ) -> None:
     """Options of the program itself."""
@@ -203,23 +205,31 @@ def check(
 @app.command(help=help_texts.CALIBRATE)
 def calibrate(
     folder: Annotated[
-        Path, typer.Argument(help="Holds images/<camera>/<frame>.png; same frame, same instant.")
+        Path,
+        typer.Argument(
+            help="Folder with images/<camera>/<frame>.png; the same frame is the same instant."
+        ),
     ],
     board: Annotated[Path, typer.Option(help="The board's YAML file.")],
     out: Annotated[
-        Path, typer.Option("--out", "-o", help="The camera file to write; the lenses go beside it.")
+        Path,
+        typer.Option(
+            "--out", "-o", help="Camera file to write; the lens file is written beside it."
+        ),
     ],
     world: Annotated[
-        str, typer.Option(help="board:FRAME or camera:NAME; the first camera if not given.")
+        str,
+        typer.Option(help="World frame: board:FRAME or camera:NAME. Default: the first camera."),
     ] = "",
     lens: Annotated[
-        str, typer.Option(help="none, standard (k1, k2, p1, p2) or full (k3 too).")
+        str, typer.Option(help="Distortion: none, standard (k1, k2, p1, p2) or full (also k3).")
     ] = "standard",
     leave_out: Annotated[
-        list[str] | None, typer.Option(help="A camera, or a picture as CAMERA/FRAME; repeatable.")
+        list[str] | None,
+        typer.Option(help="Leave out a camera, or a picture CAMERA/FRAME; repeat for several."),
     ] = None,
     drop_spoilt: Annotated[
-        bool, typer.Option("--drop-spoilt", help="Go on without pictures that spoil it.")
+        bool, typer.Option("--drop-spoilt", help="Leave out pictures that spoil the calibration.")
     ] = False,
     json: JsonOption = False,
 ) -> None:
@@ -244,7 +254,9 @@ def calibrate(
 
 @app.command(help=help_texts.UNDISTORT)
 def undistort(
-    folder: Annotated[Path, typer.Argument(help="Holds images/<camera>/<frame>.png or .jpg.")],
+    folder: Annotated[
+        Path, typer.Argument(help="Folder with images/<camera>/<frame>.png or .jpg.")
+    ],
     lenses: Annotated[Path, typer.Option(help="The lens file that calibrate wrote.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the pictures.")],
 ) -> None:

@@ -21,10 +21,12 @@ def batch(
     scheduler: SchedulerOption = None,
     chunk: Annotated[
         int | None,
-        typer.Option(min=1, metavar="FRAMES", help="Frames in a chunk, in place of the file's."),
+        typer.Option(
+            min=1, metavar="FRAMES", help="Frames in a chunk. Default: that of the job file."
+        ),
     ] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with what is in --out; compute what is missing.")
+        bool, typer.Option("--resume", help="Continue an interrupted batch in --out.")
     ] = False,
     json: JsonOption = False,
 ) -> None:

@@ -39,7 +39,7 @@ def capture(
     out: OutOption,
     model: Annotated[
         Path | None,
-        typer.Option(help="A person with landmarks.yaml beside it; the bundled one if not given."),
+        typer.Option(help="A person with landmarks.yaml beside it. Default: the bundled one."),
     ] = None,
     package: PackageOption = None,
     camera: CameraOption = None,

@@ -12,14 +12,15 @@ import typer
 if TYPE_CHECKING:
     from distributed import Client
 
-_PANEL = "Who works"
+_PANEL = "Workers"
 
 WorkersOption = Annotated[
     int | None,
     typer.Option(
         min=0,
         metavar="N",
-        help="Processes on this machine; 0: no other than this one. Default: one for each core.",
+        help="Number of worker processes on this machine; 0: none, this process does the work. "
+        "Default: one for each core.",
         rich_help_panel=_PANEL,
     ),
 ]
@@ -29,8 +30,8 @@ WatchersOption = Annotated[
         "--workers",
         min=0,
         metavar="N",
-        help="Processes on this machine that look through the cameras of a sources.yaml, each "
-        "through its own; 0: this one does.",
+        help="Number of worker processes on this machine that process the pictures of a "
+        "sources.yaml, each those of its own cameras; 0: none, this process does it.",
         rich_help_panel=_PANEL,
     ),
 ]
@@ -38,7 +39,8 @@ SchedulerOption = Annotated[
     str | None,
     typer.Option(
         metavar="ADDRESS",
-        help="Use the workers of a Dask scheduler instead, like tcp://10.0.0.7:8786.",
+        help="Address of a Dask scheduler whose workers are used instead, like "
+        "tcp://10.0.0.7:8786.",
         rich_help_panel=_PANEL,
     ),
 ]

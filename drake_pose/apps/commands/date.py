@@ -13,17 +13,24 @@ from drake_pose.apps.commands.terminal import errors_as_messages, print_json
 
 def date(
     cameras: Annotated[
-        int, typer.Option(min=3, help="How many, the face camera among them; the paper's is 9.")
+        int,
+        typer.Option(
+            min=3, help="Number of cameras, including the one at the face; the paper has 9."
+        ),
     ] = 9,
     frames: Annotated[
-        int, typer.Option(min=40, help="How many frames; fewer than 120 do not show all motions.")
+        int, typer.Option(min=40, help="Number of frames; fewer than 120 do not show all motions.")
     ] = 240,
-    seed: Annotated[int, typer.Option(min=0, help="Another seed draws other motions.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random motions.")] = 0,
     method: Annotated[
-        str, typer.Option(help="silhouette: all silhouettes at once; paper: the paper's way alone.")
+        str,
+        typer.Option(
+            help="silhouette: the paper's method and a fit to all silhouettes; paper: the former."
+        ),
     ] = "silhouette",
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for pictures; none without it.")
+        Path | None,
+        typer.Option("--out", "-o", help="Folder for pictures. Default: none are written."),
     ] = None,
     json: JsonOption = False,
 ) -> None:

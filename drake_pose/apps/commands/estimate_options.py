@@ -7,16 +7,16 @@ from typing import Annotated
 
 import typer
 
-_MATCHED = "What is matched"
-_ROOT = "Where the search begins"
-_SEARCH = "How finely and how long it searches"
-RESULT_PANEL = "The result"
+_MATCHED = "Input"
+_ROOT = "Root of the search"
+_SEARCH = "Search"
+RESULT_PANEL = "Output"
 
 SceneArgument = Annotated[
     Path,
     typer.Argument(
         help="Folder with cameras.yaml and masks/<camera>/<frame>.png; or with masks/<frame>.png "
-        "alone, of a camera that nobody knows."
+        "alone, of a camera without calibration."
     ),
 ]
 ModelOption = Annotated[
@@ -29,8 +29,9 @@ PackageOption = Annotated[
     list[str] | None,
     typer.Option(
         metavar="NAME=FOLDER",
-        help="Where the package of the model's package://NAME/... files lies; repeat for several. "
-        "Others are looked for on the way up from the model's file and in ROS_PACKAGE_PATH.",
+        help="Folder of the package of package://NAME/... files; repeat for several. Packages that "
+        "are not given are searched for in the folders above the model's file and in "
+        "ROS_PACKAGE_PATH.",
     ),
 ]
 OutOption = Annotated[
@@ -41,7 +42,7 @@ CameraOption = Annotated[
     list[str] | None,
     typer.Option(
         metavar="NAME",
-        help="Use this camera; repeat for several. Default: all, matched together.",
+        help="Use this camera; repeat for several. Default: all, used together.",
         rich_help_panel=_MATCHED,
     ),
 ]
@@ -56,8 +57,8 @@ FrameOption = Annotated[
 HoldOption = Annotated[
     list[str] | None,
     typer.Option(
-        metavar="NAME=DEG",
-        help=r"A joint whose position is known \[deg or m]; repeat for several.",
+        metavar="NAME=VALUE",
+        help=r"Hold this joint at a known position \[deg or m]; repeat for several.",
         rich_help_panel=_MATCHED,
     ),
 ]
@@ -65,8 +66,8 @@ TruthOption = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE",
-        help=r"Measured joint angles \[rad] to compare with, columns frame and joints. "
-        "Default: SCENE/joint_angles.csv, if it is there.",
+        help=r"Measured joint positions \[rad or m] to compare with: a CSV file with the column "
+        "frame and one for each joint. Default: SCENE/joint_angles.csv, if it exists.",
         rich_help_panel=_MATCHED,
     ),
 ]
@@ -74,7 +75,7 @@ RootOption = Annotated[
     str | None,
     typer.Option(
         metavar="LINK",
-        help="The link placed first; any link. Default: the model's own.",
+        help="The link that is placed first; any link. Default: the model's own root.",
         rich_help_panel=_ROOT,
     ),
 ]
@@ -82,36 +83,36 @@ RootPositionOption = Annotated[
     str | None,
     typer.Option(
         metavar="POINT",
-        help=r"Where its origin is in the world: X,Y,Z \[m], or FILE.csv:JOINT for the rows "
-        "frame,joint,x,y,z of that joint, one a frame; or unknown: it is searched, as it is where "
-        "the scene has no cameras.yaml.",
+        help=r"Position of the root's origin in the world: X,Y,Z \[m]; or FILE.csv:JOINT, a CSV "
+        "file with the columns frame,joint,x,y,z and a row of that joint for each frame; or "
+        "unknown, and it is searched (default if the scene has no cameras.yaml).",
         rich_help_panel=_ROOT,
     ),
 ]
 RootRotationOption = Annotated[
     str | None,
     typer.Option(
-        metavar="TURN",
-        help=r"fixed, free, or limits \[deg] about its axes in the order of rotation, like "
-        "y=-180:180,z=-10:10; zero is how the model's file has it stand. Default: the model's own "
-        "root stays as its file and joints say, any other link is free.",
+        metavar="ROTATION",
+        help=r"Rotation of the root: fixed, free, or limits \[deg] about its axes in the order of "
+        "rotation, like y=-180:180,z=-10:10; zero is as at the model's default positions. Default: "
+        "the model's own root moves as its joints allow, any other link is free.",
         rich_help_panel=_ROOT,
     ),
 ]
 IntervalOption = Annotated[
     float,
-    typer.Option(metavar="DEG", help="Sampling interval of angles.", rich_help_panel=_SEARCH),
+    typer.Option(metavar="DEG", help="Sampling interval of all angles.", rich_help_panel=_SEARCH),
 ]
 LengthIntervalOption = Annotated[
     float,
     typer.Option(
-        metavar="M", help="Sampling interval of prismatic joints.", rich_help_panel=_SEARCH
+        metavar="M", help="Sampling interval of all prismatic joints.", rich_help_panel=_SEARCH
     ),
 ]
 JointIntervalOption = Annotated[
     list[str] | None,
     typer.Option(
-        metavar="NAME=DEG",
+        metavar="NAME=VALUE",
         help=r"Sampling interval of one joint \[deg or m]; repeat for several.",
         rich_help_panel=_SEARCH,
     ),
@@ -120,8 +121,8 @@ OutsideLimitOption = Annotated[
     float | None,
     typer.Option(
         metavar="R",
-        help=r"How much of a segment may lie outside the silhouette \[pixel]. Default: as "
-        "little as is possible, found by doubling. Method paper only.",
+        help=r"The paper's r: area of a segment that may lie outside the silhouette \[pixel]. "
+        "Default: the smallest that gives a pose, found by doubling. Method paper only.",
         rich_help_panel=_SEARCH,
     ),
 ]
@@ -129,7 +130,7 @@ CandidatesOption = Annotated[
     int,
     typer.Option(
         metavar="K",
-        help="How many candidates a segment keeps; method paper.",
+        help="The paper's K: number of candidates kept for each segment. Method paper only.",
         rich_help_panel=_SEARCH,
     ),
 ]
@@ -137,7 +138,7 @@ RunLimitOption = Annotated[
     int,
     typer.Option(
         metavar="N",
-        help="Stop a frame's search after placing so many segments; method paper.",
+        help="Stop the search of a frame after placing this many segments. Method paper only.",
         rich_help_panel=_SEARCH,
     ),
 ]
@@ -146,7 +147,8 @@ TimeLimitOption = Annotated[
     typer.Option(
         metavar="SECONDS",
         min=0.0,
-        help="Answer with the best pose so far after this time a frame; method wide.",
+        help="Stop the search of a frame after this time and return the best pose so far. Method "
+        "wide only.",
         rich_help_panel=_SEARCH,
     ),
 ]
@@ -154,9 +156,9 @@ MethodOption = Annotated[
     str,
     typer.Option(
         metavar="NAME",
-        help="wide: many hypotheses side by side; paper: as published; person: one person followed "
-        "by several cameras at once; auto: person where model, cameras and options allow it, else "
-        "wide.",
+        help="wide: beam search and continuous fit; paper: Kameda, Minoh and Ikeda's search as "
+        "published; person: one person, fitted to all cameras' silhouettes at once; auto: "
+        "person if model, cameras and options allow it, else wide.",
         rich_help_panel=_SEARCH,
     ),
 ]
@@ -164,8 +166,8 @@ AnglesOption = Annotated[
     str,
     typer.Option(
         metavar="KIND",
-        help="continuous: refined to whatever fits; grid: multiples of the interval only. "
-        "Method wide only.",
+        help="continuous: poses are refined between the samples; grid: multiples of the sampling "
+        "interval only. Method wide only.",
         rich_help_panel=_SEARCH,
     ),
 ]
@@ -173,32 +175,30 @@ TrackOption = Annotated[
     bool,
     typer.Option(
         "--track/--no-track",
-        help="Whether the frames of a scene that is a sequence are tracked: matched first, and "
-        "after a loss. Otherwise every frame is matched on its own.",
+        help="Track the body through the frames of a sequence, searching only in the first frame "
+        "and after a loss; or search in every frame.",
         rich_help_panel=_SEARCH,
     ),
 ]
 ResumeOption = Annotated[
     bool,
     typer.Option(
-        "--resume", help="Go on with an interrupted result in --out.", rich_help_panel=RESULT_PANEL
+        "--resume", help="Continue an interrupted result in --out.", rich_help_panel=RESULT_PANEL
     ),
 ]
 ReplayOption = Annotated[
     bool,
-    typer.Option(
-        "--replay/--no-replay", help="Whether to write replay.html.", rich_help_panel=RESULT_PANEL
-    ),
+    typer.Option("--replay/--no-replay", help="Write replay.html.", rich_help_panel=RESULT_PANEL),
 ]
 OverlayOption = Annotated[
     bool,
     typer.Option(
         "--overlay/--no-overlay",
-        help="Whether to write overlay/<camera>/<frame>.png.",
+        help="Write overlay/<camera>/<frame>.png.",
         rich_help_panel=RESULT_PANEL,
     ),
 ]
 JsonOption = Annotated[
     bool,
-    typer.Option("--json", help="Print JSON for a program to read.", rich_help_panel=RESULT_PANEL),
+    typer.Option("--json", help="Print the result as JSON.", rich_help_panel=RESULT_PANEL),
 ]

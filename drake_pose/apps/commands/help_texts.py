@@ -16,10 +16,10 @@ def _help(text: str) -> str:
 PROGRAM = _help("""
 Joint angles of articulated objects from silhouettes.
 
-Give the body as any model file that Drake reads (URDF, SDFormat, MJCF), and the pictures as a
-scene: a folder with [bold]cameras.yaml[/bold] and black and white
-[bold]masks/<camera>/<frame>.png[/bold]. No training, no graphics card. Begin with
-[bold]drake-pose demo[/bold].
+Input: any model file that Drake reads (URDF, SDFormat, MJCF), and a scene: a folder with
+[bold]cameras.yaml[/bold] and black and white [bold]masks/<camera>/<frame>.png[/bold]. Output: the
+joint angles in each frame, which of them the silhouettes determine and how well, and other poses
+that look the same. No training, no GPU. For a first result run [bold]drake-pose demo[/bold].
 
 Exit status: 0 done, 1 failed (the message says what is at fault), 2 wrong usage.
 """)
@@ -27,26 +27,28 @@ Exit status: 0 done, 1 failed (the message says what is at fault), 2 wrong usage
 ESTIMATE = _help(r"""
 Estimate the joint angles in every frame of a scene.
 
-The body is placed segment by segment from the root outwards, in thousands of ways at once; those
-that cover most of the silhouettes are drawn to their edges, at continuous angles. Holes, shadows
-and what stands before the body may spoil the masks. Several cameras are matched together. --method
-paper is the search of Kameda, Minoh and Ikeda as they published it.
+A beam search places the body link by link from the root outwards; the best poses are refined to
+continuous angles by fitting the body's contour to the silhouettes' edges. Masks may have holes,
+shadows and occluders. All cameras are used together. With --method paper it is the search of
+Kameda, Minoh and Ikeda as published.
 
-Where scene.yaml says [bold]sequence: true[/bold], the body is searched in the first frame and
-tracked by its contour from there, inside its limits; it is searched again when the track is lost.
+If scene.yaml has [bold]sequence: true[/bold], the pose is searched in the first frame, tracked by
+the body's contour inside the joint limits from there on, and searched again when the track is lost.
 
-A person before two calibrated cameras or more is followed by all silhouettes at once, lengths and
-girths being fitted where the model has them, if the model has a person's landmarks and a root on
-joints, as urdf/person/person_shape.urdf does, and no option concerns a search (--method person).
+A person before two or more calibrated cameras is followed by all silhouettes at once (--method
+person), and lengths and girths are fitted where the model has joints for them. By default this is
+done if the model has a person's landmarks and joints that place its root, as
+urdf/person/person_shape.urdf does, and no option of the search is given.
 
-DIR gets report.html, which shows it all; poses.csv (a row a frame: every joint's position in rad or
-m, E_total, seconds); joints.csv (which joints the silhouettes determine, and in what interval);
-families.csv (poses that look the same); joint_centres.csv where landmarks.yaml lies beside the
-model; of a sequence joint_centres.trc, positions.mot and motion.bvh; summary.json;
-overlay/<camera>/<frame>.png to judge by; and replay.html. E_total is the area where body and
-silhouette differ over the silhouette's area. Ctrl-C keeps the finished frames; --resume goes on.
+Files in DIR: report.html, which shows all of it; poses.csv (a row a frame: every joint's position
+in rad or m, E_total, seconds); joints.csv (which joints the silhouettes determine, and their 95 %
+intervals); families.csv (poses that look the same); summary.json;
+overlay/<camera>/<frame>.png; replay.html; joint_centres.csv if landmarks.yaml lies beside the
+model; of a sequence also joint_centres.trc, positions.mot and motion.bvh. E_total is the area where
+body and silhouettes differ, over the silhouettes' area; 0 is a perfect match. Ctrl-C keeps the
+finished frames; --resume continues.
 
-[bold]A robot arm bolted to the world's origin, seen by two cameras:[/bold]
+[bold]A robot arm whose base is at the world's origin, seen by two cameras:[/bold]
 
     drake-pose estimate ../shared/data/arm_two_views --out results/arm \
       --model ../shared/data/arm_two_views/med7/med7.urdf
@@ -60,11 +62,11 @@ silhouette differ over the silhouette's area. Ctrl-C keeps the finished frames; 
 """)
 
 DEMO = _help("""
-Estimate a stored real picture: a man balancing on a beam, seen by one camera.
+Estimate the pose in a stored real mask: a man balancing on a beam, seen by one camera.
 
 Only the position of his right ankle is known. The search begins at that foot and finds all other
-joint angles, as Kameda, Minoh and Ikeda did for real people. The model is a man of average
-measures, not made from this man.
+joint angles, as in Kameda, Minoh and Ikeda's experiment with real people. The model is a man of
+average measures, not fitted to this man.
 
 [bold]Example:[/bold]
 
@@ -72,15 +74,15 @@ measures, not made from this man.
 """)
 
 CHECK = _help("""
-Say whether a model is fit for pose estimation, and if not, why.
+Check whether a model is fit for pose estimation, and if not, why.
 
-A fit model has visual geometry to be seen, and limits on every joint that could otherwise go on for
-ever. Shown are the segments of the pose tree: the link each one is, what it hangs on, its joints in
-the order of rotation with their limits, and its triangles. Exit status 1: not fit.
+A fit model has visual geometry, and limits on every prismatic joint that is searched. The table
+shows the pose tree in the order of the search: each link, its parent, the joints between them in
+the order of rotation with their limits, and the link's number of triangles. Exit status 1: not fit.
 
-Collision geometry, transmissions and plugins are not read. Joints that are written to follow others
-are named: they are searched by themselves. A file that still holds xacro macros is to be expanded
-first. Packages are looked for on the way up from the file and in ROS_PACKAGE_PATH.
+Collision geometry, transmissions and plugins are not read. Mimic joints and other couplings are
+named in a warning and not enforced. Expand xacro macros first. Packages are searched for in the
+folders above the model's file and in ROS_PACKAGE_PATH.
 
 [bold]Examples:[/bold]
 
@@ -91,10 +93,11 @@ first. Packages are looked for on the way up from the file and in ROS_PACKAGE_PA
 CALIBRATE = _help("""
 Calibrate one camera or several from pictures of a checkerboard or a ChArUco board.
 
-Every camera's lens is found from its own pictures, the cameras' places from instants at which two
-or more of them saw the board; at last everything is adjusted at once. Shown is the error of every
-camera. A picture that spoils the calibration is named, and refused unless told otherwise. The
-cameras written are free of distortion: take it out of the pictures with undistort.
+Intrinsics and distortion are found for each camera from its own pictures, extrinsics from instants
+at which two or more cameras saw the board; a bundle adjustment then refines all of them. The table
+shows the reprojection error of each camera. A picture that spoils the calibration is an error that
+names it; --drop-spoilt leaves such pictures out. The written cameras have no distortion: remove it
+from the pictures with undistort.
 
 The board's file, for 8 by 5 squares of 12 cm:
 
@@ -108,32 +111,36 @@ The board's file, for 8 by 5 squares of 12 cm:
 """)
 
 UNDISTORT = _help("""
-Take the distortion of the lenses out of pictures, as the cameras that calibrate wrote see them.
+Remove the lenses' distortion from pictures.
+
+The pictures written fit the cameras that calibrate wrote together with the lens file.
 
 [bold]Example:[/bold]
 
     drake-pose undistort RECORDING --lenses SCENE/cameras_lenses.yaml --out SCENE
 """)
 
-REPRODUCE = "Run a paper's experiment: its figures beside ours."
+REPRODUCE = "Run a paper's experiment and show its figures beside ours."
 
 KAMEDA = _help("""
-Kameda, Minoh and Ikeda, experiment A: random poses of a woman from one silhouette each.
+Kameda, Minoh and Ikeda, experiment A: random poses of a woman, one silhouette each.
 
-Every angle is drawn at random inside its limits, her silhouette is drawn (700 x 700 pixels,
-parallel projection, 2.26 pixels a centimetre), and her pose is searched for with no knowledge but
-the position of her head. The paper's figures stand beside ours.
+Every angle is drawn at random inside its limits, the silhouette is rendered (700 x 700 pixels,
+parallel projection, 2.26 pixels a centimetre), and the pose is searched given nothing but the
+position of the head. The table shows the paper's figures beside ours.
 
 [bold]Example:[/bold]
 
     drake-pose reproduce kameda --images 20
 
-With --angles continuous her angles are no multiples of 20 degrees, and poses are refined between
-the samples; every angle gets an interval, or is called free. --views N has her seen by N cameras,
---mismatch adds a body of other widths. The paper's method has no such angles.
+With --method wide, a beam search on the same grid runs beside the paper's method; branch and bound
+then proves its poses optimal, and all poses that look the same are collected. Both stop at a number
+of poses and at some 400 MB; the table says how often that was too little.
 
---method wide also proves each pose the best of the grid, and gathers all that look the same, in a
-minute and some 400 MB for each of the two at most; the table says how often that was too little.
+With --angles continuous the angles are no multiples of 20 degrees, and poses are refined between
+the samples; every angle gets a 95 % interval, or is called free. --views N uses N cameras,
+--mismatch adds a body whose widths and joints differ from the model's. The paper's method does not
+apply there.
 
     drake-pose reproduce kameda --angles continuous --views 2 --images 20
 """)
@@ -142,19 +149,19 @@ SHIMADA = _help("""
 Shimada, Shirai, Kuno and Miura: joint angles and segment lengths of a synthetic hand, one camera.
 
 A two-finger hand moves, turns and flexes for 55 frames; joints, fingertips and segment axes are
-seen with noise. A Kalman filter begins with wrong angles and wrong lengths and corrects both,
-inside the limits and couplings of the paper's table 1. Over all sequences: errors, and whether the
-filter's own deviations are honest.
+measured with noise. A Kalman filter starts from wrong angles and lengths and corrects both, its
+belief truncated by the limits and couplings of the paper's table 1. The table shows errors over
+all sequences, and whether they agree with the filter's covariance (NEES).
 
 [bold]Example:[/bold]
 
     drake-pose reproduce shimada --runs 20 --observed lines --out results/shimada
 
-[bold]Every truncation on the same sequences, side by side:[/bold]
+[bold]All truncations on the same sequences:[/bold]
 
     drake-pose reproduce shimada --runs 20 --truncation all
 
-[bold]One view, stared at for 5,000 frames: the flaw that the authors state:[/bold]
+[bold]One unchanging view for 5,000 frames, the limitation that the authors state:[/bold]
 
     drake-pose reproduce shimada --runs 10 --static 5000
 """)
@@ -162,11 +169,11 @@ filter's own deviations are honest.
 DATE = _help("""
 Date, Yoshimatsu, Arita and Taniguchi: a moving person before many calibrated cameras.
 
-A simulated person walks, reaches, leans, crouches, turns and crosses the arms; eight cameras on a
-circle and one at the face see it, 640 x 480 pixels, with noise. Beside each other: the paper's
-inverse kinematics alone, the paper's search for elbows and knees, and one fit to all silhouettes
-at once. A track is destroyed during each motion: frames until it is right again. Times are one
-core's; rendering does not count.
+A simulated person walks, reaches, leans, crouches, turns and crosses the arms, seen by eight
+cameras on a circle and one at the face (640 x 480 pixels, with noise). Compared are the paper's
+inverse kinematics alone, the paper's search for elbows and knees, and one fit to all silhouettes at
+once. The track is destroyed once during each motion, and the frames until it has recovered are
+counted. Times are those of one core, without rendering.
 
 [bold]Example:[/bold]
 
@@ -174,21 +181,21 @@ core's; rendering does not count.
 """)
 
 CAPTURE = _help("""
-Capture one moving person in a scene with several calibrated cameras, from masks alone.
+Capture the motion of one person before several calibrated cameras, from masks or live.
 
 Nothing need be known of the person: lengths and girths are fitted to the first frames. This is
-[bold]estimate[/bold] with the bundled person, and writes the same: report.html, which names bad
-cameras, poses.csv, joint_centres.csv, TRC, MOT and BVH files, overlays, and replay.html. A
-recording is captured as a whole: after Ctrl-C, --resume begins it again.
+[bold]estimate[/bold] with the bundled person as the model, and writes the same files: report.html,
+which also names faulty cameras, poses.csv, joint_centres.csv, TRC, MOT and BVH files, overlays and
+replay.html. A recording is captured as a whole: after Ctrl-C, --resume starts it again.
 
 [bold]Example:[/bold]
 
     drake-pose capture SCENE --out results/person
 
-A folder with [bold]sources.yaml[/bold] beside cameras.yaml is captured frame by frame as its
-pictures come: live cameras as fast as they are, videos and folders as fast as can be. A camera that
-stops is left out and taken back when it returns. Ctrl-C ends it and keeps everything but the
-pictures, so there are no overlays.
+If the folder has [bold]sources.yaml[/bold] beside cameras.yaml, frames are captured as they come:
+from live cameras in real time, from videos and folders as fast as possible. A camera that stops is
+left out until it returns. Ctrl-C ends the capture and keeps the result; pictures are not stored, so
+there are no overlays.
 
     front:
       kind: device             # or folder, video
@@ -204,8 +211,8 @@ pictures, so there are no overlays.
 EMPTY_ROOM = _help("""
 Take pictures of the empty room with the cameras of a sources.yaml, into their background folders.
 
-What differs from them is the person, so leave the room first, and take them anew when the light
-changes or a camera moves.
+Live capture finds the person as what differs from these pictures. Leave the room first, and take
+them again when the light changes or a camera moves.
 
 [bold]Example:[/bold]
 
@@ -213,38 +220,40 @@ changes or a camera moves.
 """)
 
 WALK = _help("""
-Walk through a garden in the browser, as an avatar that moves like the captured person.
+Walk through a garden in the browser as an avatar that moves like the captured person.
 
-The room of the capture is small, so where one stands in it is a command: facing right or left
-turns the view, standing ahead of or behind the first frame's place walks forward or backward.
-Plays a result of capture, a simulated person, the person before live cameras (who commands after
-standing still for a second), or none of these: then the arrow keys walk. A recording is played once
-a browser shows the page, and again at the press of its button.
+The person's place and direction are commands: facing right or left turns the view, standing ahead
+of or behind the place of the first frame walks forward or backward. The motion is that of a result
+of capture, of a simulated person (--simulate) or of the person before live cameras (--live;
+commands begin after standing still for a second). With none of these, the arrow keys walk. A
+recording starts when a browser shows the page, and again when its button is pressed.
 
-The page can be opened on this machine alone, by all its users, and only under its own address:
-other web pages that ask for it (a foreign Origin or Host) are refused. Through ssh, forward the
-same port: ssh -L 7000:localhost:7000, with --no-browser --wait.
+The page can be opened on this machine only, by all its users, and only under its own address:
+requests by other web pages (a foreign Origin or Host) are refused. Through ssh, forward the same
+port: ssh -L 7000:localhost:7000, with --port 7000 --no-browser --wait.
 
-[bold]Example:[/bold]
-
-    drake-pose walk --simulate
+[bold]Examples:[/bold]
 
     drake-pose walk results/person
+
+    drake-pose walk --simulate
 
     drake-pose walk --live STUDIO
 """)
 
 BATCH = _help("""
-Estimate many scenes, long ones in chunks of frames, by as many workers as there are.
+Estimate many scenes on several worker processes, long scenes in chunks of frames.
 
-The result is that of [bold]estimate[/bold], scene by scene, and the same however many work: chunks
-are cut by the job. In a sequence the first frame of each chunk is matched and the others are
-tracked; the recording of a person who is followed is not cut. A finished chunk is on the disk at
-once; a worker that dies costs the chunk it had, which another one does. A scene that fails is named
-and does not stop the others. Ctrl-C keeps the finished chunks; --resume computes what is missing.
+The result of each scene is that of [bold]estimate[/bold] and does not depend on the number of
+workers: the job file says how scenes are cut. In a sequence the first frame of each chunk is
+searched and the others are tracked; the recording of a person before several cameras is not cut.
+A finished chunk is on the disk at once; the chunk of a worker that dies is done by another one. A
+scene that fails is named and does not stop the others. Ctrl-C keeps the finished chunks; --resume
+continues.
 
-The job file, whose paths are relative to it; settings are those of estimate by their names in
-Python (EstimateSettings), and in defaults for all scenes; without a model it is the bundled person:
+The job file. Paths are relative to it; settings are the options of estimate by their names in
+Python (EstimateSettings), and those in defaults are for all scenes. A scene without a model is of a
+person, and the bundled one is used:
 
     chunk: 100
     defaults: {replay: false}
@@ -253,8 +262,8 @@ Python (EstimateSettings), and in defaults for all scenes; without a model it is
       tuesday: {scene: recordings/tuesday, model: arm.urdf, frames: "0:99"}
       walker: {scene: recordings/walker}
 
-Workers on this machine talk over its loopback address alone. Those of a Dask scheduler must have
-the same drake_pose, and find scenes, models and DIR under the same paths as this machine does.
+Workers on this machine communicate over its loopback address only. The workers of a Dask scheduler
+must have the same version of drake_pose, and find scenes, models and DIR under the same paths.
 
 [bold]Example:[/bold]
 

@@ -23,27 +23,30 @@ _OF_GRID = ("method", "outside_limit", "candidates", "interval", "edges", "out")
 
 def kameda(
     context: typer.Context,
-    images: Annotated[int, typer.Option(min=1, help="How many silhouettes are drawn.")] = 219,
-    seed: Annotated[int, typer.Option(min=0, help="Another seed draws other poses.")] = 0,
-    method: Annotated[str, typer.Option(help="How to search: paper or wide.")] = "paper",
+    images: Annotated[int, typer.Option(min=1, help="Number of silhouettes.")] = 219,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random poses.")] = 0,
+    method: Annotated[
+        str, typer.Option(help="paper: the paper's alone; wide: beam search beside it.")
+    ] = "paper",
     angles: Annotated[
         str,
         typer.Option(
-            help="lattice: multiples of 20 degrees, drawn and searched for as in the paper; "
-            "continuous: drawn anywhere, and refined between the samples."
+            help="lattice: true angles and samples are multiples of 20 degrees, as in the paper; "
+            "continuous: any true angles, and poses are refined between the samples."
         ),
     ] = "lattice",
     outside_limit: Annotated[
         float,
         typer.Option(
-            min=0.0, callback=finite, help=r"r \[pixel]; the paper's is 200.", metavar="R"
+            min=0.0,
+            callback=finite,
+            help=r"The paper's r: area of a segment that may lie outside \[pixel].",
+            metavar="R",
         ),
     ] = 200.0,
     candidates: Annotated[
         int,
-        typer.Option(
-            min=1, help="How many candidates a node keeps; the paper's is 5.", metavar="K"
-        ),
+        typer.Option(min=1, help="The paper's K: candidates kept for each segment.", metavar="K"),
     ] = 5,
     interval: Annotated[
         float,
@@ -51,17 +54,17 @@ def kameda(
             min=1.0,
             max=90.0,
             callback=finite,
-            help=r"Sampling interval \[deg]; the paper's is 20.",
+            help=r"Sampling interval \[deg].",
         ),
     ] = 20.0,
     views: Annotated[
-        int, typer.Option(min=1, help="With --angles continuous: so many cameras.")
+        int, typer.Option(min=1, help="With --angles continuous: number of cameras.")
     ] = 1,
     mismatch: Annotated[
         bool,
         typer.Option(
             "--mismatch",
-            help="With --angles continuous: beside it a body of other widths and joints than the "
+            help="With --angles continuous: also a body whose widths and joints differ from the "
             "model's.",
         ),
     ] = False,
@@ -69,12 +72,13 @@ def kameda(
         bool,
         typer.Option(
             "--edges",
-            help="With --method wide: what edges inside the silhouettes settle of what they leave "
-            "open (some seconds for each of these).",
+            help="With --method wide: resolve ambiguous silhouettes by the edges inside them (some "
+            "seconds for each).",
         ),
     ] = False,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for pictures; none without it.")
+        Path | None,
+        typer.Option("--out", "-o", help="Folder for pictures. Default: none are written."),
     ] = None,
     json: JsonOption = False,
 ) -> None:

@@ -24,19 +24,19 @@ if TYPE_CHECKING:
     from drake_pose.apps.live.scene import LiveScene
     from drake_pose.systems.person.live_capture import LiveEyes
 
-_PANEL = "Live cameras, videos and folders of pictures, by sources.yaml"
+_PANEL = "Live capture (sources.yaml)"
 
 SecondsOption = Annotated[
     float | None,
     typer.Option(
-        min=0.01, callback=finite, help="End after so many seconds.", rich_help_panel=_PANEL
+        min=0.01, callback=finite, help=r"Stop after this time \[s].", rich_help_panel=_PANEL
     ),
 ]
 ShapeOption = Annotated[
     Path | None,
     typer.Option(
         metavar="RESULT",
-        help="Take lengths and girths from an earlier capture of the same person.",
+        help="Take lengths and girths from this result of capture with the same person.",
         rich_help_panel=_PANEL,
     ),
 ]
@@ -44,7 +44,7 @@ FitShapeOption = Annotated[
     bool,
     typer.Option(
         "--fit-shape/--no-fit-shape",
-        help="Whether the first frames give lengths and girths; else they are the model's.",
+        help="Fit lengths and girths to the first frames; or keep the model's.",
         rich_help_panel=_PANEL,
     ),
 ]
@@ -53,8 +53,8 @@ ToleranceOption = Annotated[
     typer.Option(
         metavar="SECONDS",
         callback=finite,
-        help="How far apart pictures of one moment may be; half the time between two pictures if "
-        "not given, 0.9 of it for live cameras.",
+        help="Largest difference of time stamps of simultaneous pictures. Default: half the time "
+        "between two pictures of a camera, or 0.9 of it if cameras are live.",
         rich_help_panel=_PANEL,
     ),
 ]
@@ -97,8 +97,8 @@ def run_live_capture(
 
 
 def empty_room(
-    folder: Annotated[Path, typer.Argument(help="Holds cameras.yaml and sources.yaml.")],
-    pictures: Annotated[int, typer.Option(min=1, help="How many of each camera.")] = 30,
+    folder: Annotated[Path, typer.Argument(help="Folder with cameras.yaml and sources.yaml.")],
+    pictures: Annotated[int, typer.Option(min=1, help="Number of pictures of each camera.")] = 30,
 ) -> None:
     """See help_texts.EMPTY_ROOM."""
     with errors_as_messages():

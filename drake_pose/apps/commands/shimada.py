@@ -15,34 +15,34 @@ _ALL = "all"
 
 def shimada(
     runs: Annotated[
-        int, typer.Option(min=1, help="Sequences for each of r_13 = 35 and 40, other noise each.")
+        int, typer.Option(min=1, help="Number of sequences for each of r_13 = 35 and 40.")
     ] = 50,
-    seed: Annotated[int, typer.Option(min=0, help="Another seed draws other sequences.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random sequences.")] = 0,
     truncation: Annotated[
         str,
-        typer.Option(
-            help="sequential (the paper's), joint, clip, none; or all of them, side by side."
-        ),
+        typer.Option(help="sequential (the paper's), joint, clip, none; or all of these."),
     ] = "joint",
     observed: Annotated[
-        str, typer.Option(help="full: all points and lines; lines: knuckles hidden.")
+        str,
+        typer.Option(
+            help="What is measured. full: all points and lines; lines: the knuckles are hidden."
+        ),
     ] = "full",
     static: Annotated[
         int | None,
         typer.Option(
             min=1,
             metavar="FRAMES",
-            help="In place of it: stare at one view for so many frames, then see new ones.",
+            help="Another experiment: one unchanging view for this many frames, then new views.",
         ),
     ] = None,
     start: Annotated[
         str,
-        typer.Option(
-            help="With --static: guess (the view comes first) or learned (the sequence does)."
-        ),
+        typer.Option(help="With --static: guess (the view first) or learned (first the sequence)."),
     ] = "guess",
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for plots; none without it.")
+        Path | None,
+        typer.Option("--out", "-o", help="Folder for plots. Default: none are written."),
     ] = None,
     json: JsonOption = False,
 ) -> None:

@@ -31,42 +31,48 @@ if TYPE_CHECKING:
 
 def walk(
     result: Annotated[
-        Path | None, typer.Argument(help="Result folder of capture, to be played; else the keys.")
+        Path | None,
+        typer.Argument(
+            help="Result folder of capture that is played. Default: none, the arrow keys walk."
+        ),
     ] = None,
     simulate: Annotated[
         bool, typer.Option("--simulate", help="Play a simulated person's motion.")
     ] = False,
     live: Annotated[
         Path | None,
-        typer.Option(metavar="FOLDER", help="Be captured: a folder with sources.yaml."),
+        typer.Option(
+            metavar="FOLDER",
+            help="Walk as the person before live cameras: folder with sources.yaml.",
+        ),
     ] = None,
     shape: ShapeOption = None,
     workers: WatchersOption = 0,
     scheduler: SchedulerOption = None,
     model: Annotated[
-        Path | None, typer.Option(help="The model of the result, where it is not a bundled one.")
+        Path | None, typer.Option(help="The result's model, if it is not a bundled one.")
     ] = None,
     package: PackageOption = None,
     rate: Annotated[
         float | None,
         typer.Option(
             callback=finite,
-            help="The result's frames a second; what its summary says if not given.",
+            help="Frame rate of the result [Hz]. Default: that of its summary.json.",
         ),
     ] = None,
     seconds: Annotated[
         float | None,
-        typer.Option(min=0.01, callback=finite, help="End after so many seconds of the walk."),
+        typer.Option(min=0.01, callback=finite, help=r"Stop after this time of the walk \[s]."),
     ] = None,
     speed: Annotated[
         float,
         typer.Option(
-            min=0.0, callback=finite, help="Seconds walked a second; 0: as fast as can be."
+            min=0.0, callback=finite, help="Speed relative to real time; 0: as fast as possible."
         ),
     ] = 1.0,
     port: Annotated[
         int | None,
-        typer.Option(min=1024, max=65535, help="Where the page listens; a free port if not given."),
+        typer.Option(min=1024, max=65535, help="Port of the page. Default: a free one."),
     ] = None,
     browser: Annotated[
         bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")
@@ -75,9 +81,9 @@ def walk(
         bool | None,
         typer.Option(
             "--wait/--no-wait",
-            help="Play a result or --simulate once a browser shows the page, and again when the "
-            "page asks for it, until Ctrl-C or --seconds; --no-wait: at once, and once. "
-            "Default: as --browser.",
+            help="Start a result or --simulate when a browser shows the page, and again when its "
+            "button is pressed, until Ctrl-C or --seconds; or start at once and play once. "
+            "Default: --wait with --browser, else --no-wait.",
         ),
     ] = None,
     json: JsonOption = False,

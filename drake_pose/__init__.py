@@ -11,6 +11,8 @@ import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from drake_pose.version import VERSION
+
 if TYPE_CHECKING:
     from drake_pose.apps.estimate.scene import SceneEstimate, estimate_scene
     from drake_pose.apps.settings import EstimateSettings
@@ -18,7 +20,7 @@ if TYPE_CHECKING:
     from drake_pose.camera import load_cameras
     from drake_pose.silhouette import load_scene
 
-__version__ = "0.1.0"
+__version__ = VERSION
 
 _HOMES = {
     "EstimateSettings": "apps.settings",

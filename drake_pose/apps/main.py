@@ -7,7 +7,6 @@ from typing import Annotated
 
 import typer
 
-from drake_pose import __version__
 from drake_pose.apps.commands import help_texts
 from drake_pose.apps.commands.batch import batch
 from drake_pose.apps.commands.capture import capture
@@ -60,6 +59,7 @@ from drake_pose.apps.options import (
 )
 from drake_pose.apps.settings import EstimateSettings
 from drake_pose.errors import ModelError
+from drake_pose.version import VERSION
 
 app = typer.Typer(
     name="drake-pose",
@@ -82,7 +82,7 @@ def main() -> None:
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"drake-pose {__version__}")
+        typer.echo(f"drake-pose {VERSION}")
         raise typer.Exit()
 
 

@@ -9,6 +9,7 @@ from drake_pose.body.landmarks import (
     load_landmarks,
 )
 from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.body.report import (
     JointReport,
     ModelReport,
@@ -22,6 +23,7 @@ from drake_pose.body.tree.node_skin import ModelSkin
 from drake_pose.body.tree.pose_tree import PoseTree, PoseTreeNode
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.body.tree.skin_motion import NodeSkin
+from drake_pose.body.tree.tree_builder import build_pose_tree
 
 __all__ = [
     "ArticulatedModel",
@@ -32,11 +34,13 @@ __all__ = [
     "NodeLandmarks",
     "NodeReport",
     "NodeSkin",
+    "ParsedModel",
     "PoseTree",
     "PoseTreeNode",
     "RootRotation",
     "SkinBand",
     "TriangleMesh",
+    "build_pose_tree",
     "bundled_model",
     "describe_model",
     "landmark_positions",

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.body.model import ArticulatedModel
+from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.body.tree.link_graph import PlantKinematics, build_link_graph
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
@@ -76,7 +76,7 @@ def load_landmarks(model_path: Path | str) -> dict[str, Landmark]:
 
 
 def landmark_positions(
-    model: ArticulatedModel,
+    model: ParsedModel,
     landmarks: Mapping[str, Landmark],
     q: NDArray[np.float64],
     X_WB: NDArray[np.float64] | None = None,
@@ -140,7 +140,7 @@ def landmarks_of_nodes(tree: PoseTree, landmarks: Mapping[str, Landmark]) -> Nod
     )
 
 
-def _body(model: ArticulatedModel, name: str, link: str) -> int:
+def _body(model: ParsedModel, name: str, link: str) -> int:
     """The index of a landmark's link among the plant's bodies."""
     if link not in model.link_names:
         where = f"{landmarks_file(model.path)}: '{name}': {model.path.name}"

@@ -1,134 +1,43 @@
 """The articulated model: what a file says about links, joints, limits and looks, read once."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex
+from pydrake.multibody.tree import BodyIndex
 
 from drake_pose.body.files.parsing import ModelSource, limit_kinds
 from drake_pose.body.files.safety import check_in_child
-from drake_pose.body.limits import PositionKind, describe_positions
-from drake_pose.body.surfaces.mesh import TriangleMesh
-from drake_pose.body.surfaces.skin_file import SkinBand, load_skin
+from drake_pose.body.limits import describe_positions
+from drake_pose.body.parsed_model import ParsedModel, link_names
+from drake_pose.body.surfaces.skin_file import load_skin
 from drake_pose.body.surfaces.visual_geometry import body_mesh, make_drawable
-from drake_pose.errors import ModelError, UnknownNameError
-
-if TYPE_CHECKING:
-    from drake_pose.body.tree.pose_tree import PoseTree
-    from drake_pose.body.tree.root import RootRotation
+from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body.tree.root import RootRotation
+from drake_pose.body.tree.tree_builder import build_pose_tree
+from drake_pose.errors import ModelError
 
 
 @dataclass(frozen=True, eq=False)
-class ArticulatedModel:
-    """An articulated object as Drake understands it. Never changes.
+class ArticulatedModel(ParsedModel):
+    """An articulated object, from which pose trees are made. Never changes.
 
-    Attributes:
-        path: the model file.
-        name: the model's name (that of its first model instance).
-        plant: a finalized MultibodyPlant, to make contexts from; do not change it.
-        scene_graph: the SceneGraph the plant's geometry is registered with.
-        position_names: one unique name a position, in the plant's order: the joint's name, or
-            ``joint_suffix`` for joints of several positions.
-        position_kinds: "angle" [rad], "length" [m] or "quaternion" for each position.
-        lower, upper: (nq,) limits [rad or m], read-only; half a turn either side of the default
-            position for a joint that turns freely; infinite for the pose of a floating body, and
-            for slides without limits.
-        default_positions: (nq,) Drake's default positions moved inside the limits, read-only.
-        periodic: (nq,) bool, read-only: angles that look the same after a full turn.
-        turns_freely: (nq,) bool, read-only: angles without limits, or with limits more than four
-            turns apart, which mean none.
-        link_meshes: the visual geometry of each link that has some, in the link's frame.
-        skin: the bands of surface that bend with the joints, from the file beside the model's
-            (``load_skin``); usually none.
-        warnings: what is not read of the file or not enforced, which limits were not taken as they
-            are written, and what Drake remarked.
+    What it consists of is described at ``ParsedModel``.
     """
-
-    path: Path
-    name: str
-    plant: MultibodyPlant
-    scene_graph: SceneGraph
-    position_names: tuple[str, ...]
-    position_kinds: tuple[PositionKind, ...]
-    lower: NDArray[np.float64]
-    upper: NDArray[np.float64]
-    default_positions: NDArray[np.float64]
-    periodic: NDArray[np.bool_]
-    turns_freely: NDArray[np.bool_]
-    link_meshes: Mapping[str, TriangleMesh]
-    skin: tuple[SkinBand, ...]
-    warnings: tuple[str, ...]
-    _source: ModelSource = field(repr=False)
-
-    def add_to(
-        self,
-        plant: MultibodyPlant,
-        scene_graph: SceneGraph | None = None,
-        *,
-        prefix: str = "",
-    ) -> list[ModelInstanceIndex]:
-        """Add the same model to another plant, for example one of a diagram.
-
-        Mesh files that Drake would not draw are replaced as in this model. Add renderers to the
-        SceneGraph after this call: Drake's VTK renderer rejects an OBJ file without normals at the
-        moment it is parsed.
-
-        Args:
-            plant: a plant that is not finalized.
-            scene_graph: the SceneGraph it is or shall be registered with; None for no geometry.
-            prefix: put before the model's name, to tell several copies apart.
-
-        Returns:
-            The new model instances.
-
-        Raises:
-            ModelError: Drake refuses the model in that plant.
-        """
-        instances, _ = self._source.parse(plant, scene_graph, prefix)
-        if plant.geometry_source_is_registered():
-            make_drawable(plant, scene_graph, instances)
-        return instances
-
-    @property
-    def link_names(self) -> tuple[str, ...]:
-        """All links, seen or not, in the order of the plant's bodies; the first is the world."""
-        return link_names(self.plant)
-
-    def link_index(self, name: str) -> int:
-        """The index of a link among the plant's bodies.
-
-        Raises:
-            UnknownNameError: no link has that name.
-        """
-        if name not in self.link_names:
-            raise UnknownNameError("link", name, self.link_names, str(self.path))
-        return self.link_names.index(name)
-
-    def position_index(self, name: str) -> int:
-        """Where a position stands in q.
-
-        Raises:
-            UnknownNameError: no position has that name.
-        """
-        if name not in self.position_names:
-            raise UnknownNameError("joint", name, self.position_names, str(self.path))
-        return self.position_names.index(name)
 
     def pose_tree(
         self,
         root: str | None = None,
         *,
         root_position: Sequence[float] | NDArray[np.float64] | None = None,
-        root_rotation: "RootRotation | None" = None,
+        root_rotation: RootRotation | None = None,
         held: Mapping[str, float] | None = None,
-    ) -> "PoseTree":
+    ) -> PoseTree:
         """The tree in which poses are searched; see ``drake_pose.body.tree.pose_tree.PoseTree``.
 
         Args:
@@ -143,9 +52,7 @@ class ArticulatedModel:
             ModelError: the link has no geometry, or the file's joints allow no pose tree.
             SettingsError: a position or value that is not finite, or that is missing.
         """
-        from drake_pose.body.tree.tree_builder import build_pose_tree  # It imports this module.
-
-        return build_pose_tree(self, root, root_position, root_rotation, held or {})
+        return build_pose_tree(self, root, root_position, root_rotation, held)
 
 
 def load_model(
@@ -223,14 +130,4 @@ def read_model(
         skin=load_skin(path, link_names(plant)),
         warnings=tuple(limit_kinds([*warnings, *positions.warnings])),
         _source=source,
-    )
-
-
-def link_names(plant: MultibodyPlant) -> tuple[str, ...]:
-    """A unique name for each body, in the plant's order: ``instance::link`` where links repeat."""
-    bodies = [plant.get_body(BodyIndex(index)) for index in range(plant.num_bodies())]
-    plain = [body.name() for body in bodies]
-    return tuple(
-        body.name() if plain.count(body.name()) == 1 else body.scoped_name().get_full()
-        for body in bodies
     )

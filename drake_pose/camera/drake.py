@@ -7,7 +7,6 @@ Drake puts pixel centres at i + 0.5, drake_pose at i: principal points differ by
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 from pydrake.geometry import (
@@ -20,24 +19,47 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraInfo
 
+from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
 from drake_pose.errors import CameraError
-
-if TYPE_CHECKING:
-    from drake_pose.camera.models import ParallelCamera, PinholeCamera
 
 HALF_PIXEL = 0.5
 """What Drake's principal point has more than ours [pixel]."""
 
 _FARTHEST = 1000.0
+_PARALLEL_DEPTHS = (-2.0, 2.0)
 # Nearer, the rays are less parallel; farther, the renderer's 32 bit floats run out (measured: the
 # masks differ least from 30 to 100 km, labels of touching links suffer in proportion).
 _TELE_DISTANCE = 3.0e4
 
 
-def pinhole_to_drake(
+def camera_to_drake(
+    camera: Camera, *, renderer_name: str, depth_range: tuple[float, float] | None = None
+) -> tuple[ColorRenderCamera, DepthRenderCamera, RigidTransform]:
+    """Returns Drake's render cameras and the pose X_WC that the sensor must have.
+
+    Drake knows pinholes only: a parallel camera becomes a tele camera 30 km behind the middle of
+    the depth range.
+
+    Args:
+        camera: the camera.
+        renderer_name: the render engine's name in the scene graph.
+        depth_range: nearest and farthest visible depth [m]; left out, `near` to 1 km. Of a parallel
+            camera: nearest and farthest depth of the body in its frame (may be negative); keep it
+            tight, since the render engine's depth buffer has few bits; left out, -2 to 2 m.
+
+    Raises:
+        CameraError: when the principal point of a pinhole lies outside the picture (Drake refuses
+            it), or the depth range is not finite, positive and increasing.
+    """
+    if isinstance(camera, PinholeCamera):
+        return _pinhole_to_drake(camera, renderer_name, depth_range)
+    return _parallel_to_drake(camera, renderer_name, depth_range or _PARALLEL_DEPTHS)
+
+
+def _pinhole_to_drake(
     camera: PinholeCamera, renderer_name: str, depth_range: tuple[float, float] | None
 ) -> tuple[ColorRenderCamera, DepthRenderCamera, RigidTransform]:
-    """See PinholeCamera.to_drake."""
+    """See camera_to_drake."""
     near, far = (camera.near, max(_FARTHEST, 2.0 * camera.near))
     if depth_range is not None:
         near, far = depth_range
@@ -55,10 +77,10 @@ def pinhole_to_drake(
     return color, depth, _rigid_transform(camera.X_WC)
 
 
-def parallel_to_drake(
+def _parallel_to_drake(
     camera: ParallelCamera, renderer_name: str, depth_range: tuple[float, float]
 ) -> tuple[ColorRenderCamera, DepthRenderCamera, RigidTransform]:
-    """See ParallelCamera.to_drake."""
+    """See camera_to_drake."""
     nearest, farthest = depth_range
     middle, half = 0.5 * (nearest + farthest), 0.5 * (farthest - nearest)
     distance = max(_TELE_DISTANCE, 10.0 * half)
@@ -80,12 +102,17 @@ def parallel_to_drake(
     return color, depth, _rigid_transform(camera.X_WC) @ RigidTransform(p_CT)
 
 
-def pinhole_from_drake(
+def camera_from_drake(
     name: str, source: CameraInfo | RenderCameraCore, X_WC: np.ndarray | RigidTransform
 ) -> PinholeCamera:
-    """See PinholeCamera.from_drake."""
-    from drake_pose.camera.models import PinholeCamera
+    """Returns the camera of a Drake CameraInfo or RenderCameraCore.
 
+    Args:
+        name: the camera's name.
+        source: the intrinsics; a RenderCameraCore brings its near clipping plane and its sensor
+            offset X_BS too.
+        X_WC: the pose of the camera (with a RenderCameraCore: of its body B) in the world.
+    """
     pose = X_WC.GetAsMatrix4() if isinstance(X_WC, RigidTransform) else np.asarray(X_WC)
     if isinstance(source, CameraInfo):
         near, intrinsics = {}, source

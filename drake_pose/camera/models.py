@@ -4,16 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drake_pose.camera.checks import check_number, check_pose, check_side
-
-if TYPE_CHECKING:
-    from pydrake.geometry import ColorRenderCamera, DepthRenderCamera, RenderCameraCore
-    from pydrake.math import RigidTransform
-    from pydrake.systems.sensors import CameraInfo
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,38 +75,6 @@ class PinholeCamera:
         projection = [0.0, self.focal_x, self.focal_y, self.center_x, self.center_y, self.near]
         return np.array([*projection, self.width, self.height], dtype=np.float64)
 
-    def to_drake(
-        self, *, renderer_name: str, depth_range: tuple[float, float] | None = None
-    ) -> tuple[ColorRenderCamera, DepthRenderCamera, RigidTransform]:
-        """Returns Drake's render cameras and the pose X_WC that the sensor must have.
-
-        Args:
-            renderer_name: the render engine's name in the scene graph.
-            depth_range: nearest and farthest visible depth [m]; left out, `near` to 1 km.
-
-        Raises:
-            CameraError: when the principal point lies outside the picture (Drake refuses it).
-        """
-        from drake_pose.camera.drake import pinhole_to_drake
-
-        return pinhole_to_drake(self, renderer_name, depth_range)
-
-    @classmethod
-    def from_drake(
-        cls, name: str, source: CameraInfo | RenderCameraCore, X_WC: np.ndarray | RigidTransform
-    ) -> PinholeCamera:
-        """Returns the camera of a Drake CameraInfo or RenderCameraCore.
-
-        Args:
-            name: the camera's name.
-            source: the intrinsics; a RenderCameraCore brings its near clipping plane and its
-                sensor offset X_BS too.
-            X_WC: the pose of the camera (with a RenderCameraCore: of its body B) in the world.
-        """
-        from drake_pose.camera.drake import pinhole_from_drake
-
-        return pinhole_from_drake(name, source, X_WC)
-
 
 @dataclass(frozen=True, eq=False)
 class ParallelCamera:
@@ -166,23 +128,6 @@ class ParallelCamera:
         scale = self.pixels_per_metre
         projection = [1.0, scale, scale, self.center_x, self.center_y, 0.0]
         return np.array([*projection, self.width, self.height], dtype=np.float64)
-
-    def to_drake(
-        self, *, renderer_name: str, depth_range: tuple[float, float] = (-2.0, 2.0)
-    ) -> tuple[ColorRenderCamera, DepthRenderCamera, RigidTransform]:
-        """Returns a tele camera for Drake's renderer and the pose X_WC its sensor must have.
-
-        Drake knows pinholes only. The tele camera stands 30 km behind the middle of the depth
-        range.
-
-        Args:
-            renderer_name: the render engine's name in the scene graph.
-            depth_range: nearest and farthest depth of the body in this camera's frame [m] (may be
-                negative). Keep it tight: the render engine's depth buffer has few bits.
-        """
-        from drake_pose.camera.drake import parallel_to_drake
-
-        return parallel_to_drake(self, renderer_name, depth_range)
 
 
 Camera = PinholeCamera | ParallelCamera

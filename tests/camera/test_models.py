@@ -7,6 +7,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.sensors import CameraInfo
 
 from drake_pose.camera import Camera, ParallelCamera, PinholeCamera
+from drake_pose.camera.drake import camera_from_drake, camera_to_drake
 from drake_pose.errors import CameraError
 
 
@@ -135,15 +136,15 @@ def test_rounded_rotation_becomes_exact() -> None:
 
 def test_drake_and_back() -> None:
     camera = pinhole(near=0.05)
-    color, depth, X_WS = camera.to_drake(renderer_name="vtk")
+    color, depth, X_WS = camera_to_drake(camera, renderer_name="vtk")
     info = color.core().intrinsics()
     assert (info.center_x(), info.center_y()) == (300.5, 250.5)
     assert color.core().renderer_name() == depth.core().renderer_name() == "vtk"
     assert color.core().clipping().near() == 0.05
-    again = PinholeCamera.from_drake("again", color.core(), X_WS)
+    again = camera_from_drake("again", color.core(), X_WS)
     np.testing.assert_array_equal(again.kernel_parameters(), camera.kernel_parameters())
     np.testing.assert_allclose(again.X_WC, camera.X_WC, atol=1e-14)
-    plain = PinholeCamera.from_drake("plain", CameraInfo(100, 80, 1.0), np.eye(4))
+    plain = camera_from_drake("plain", CameraInfo(100, 80, 1.0), np.eye(4))
     assert (plain.center_x, plain.center_y) == (49.0, 39.0)
 
 
@@ -151,15 +152,15 @@ def test_sensor_offset_of_a_drake_core_is_kept() -> None:
     X_BS = RigidTransform(RollPitchYaw(0.1, 0.2, 0.3), np.array([0.1, 0.0, -0.2]))
     core = RenderCameraCore("vtk", CameraInfo(100, 80, 1.0), ClippingRange(0.3, 9.0), X_BS)
     X_WB = RigidTransform(X_WC)
-    camera = PinholeCamera.from_drake("c", core, X_WB)
+    camera = camera_from_drake("c", core, X_WB)
     np.testing.assert_allclose(camera.X_WC, (X_WB @ X_BS).GetAsMatrix4(), atol=1e-14)
     assert camera.near == 0.3
 
 
 def test_tele_camera_projects_as_the_parallel_one() -> None:
     for camera in (parallel(), parallel(center_x=-40.0, center_y=900.0)):
-        color, _, X_WS = camera.to_drake(renderer_name="vtk", depth_range=(-1.0, 3.0))
-        tele = PinholeCamera.from_drake("tele", color.core(), X_WS)
+        color, _, X_WS = camera_to_drake(camera, renderer_name="vtk", depth_range=(-1.0, 3.0))
+        tele = camera_from_drake("tele", color.core(), X_WS)
         p_C = np.random.default_rng(1).uniform([-1, -1, -1], [1, 1, 3], (50, 3))
         p_W = p_C @ X_WC[:3, :3].T + X_WC[:3, 3]
         # 2 m off the middle depth at 30 km: 7e-5 of at most 700 pixels from the picture's middle.
@@ -172,6 +173,6 @@ def test_tele_camera_projects_as_the_parallel_one() -> None:
 
 def test_drake_needs_the_principal_point_inside() -> None:
     with pytest.raises(CameraError, match=r"'cam'.*principal point"):
-        pinhole(center_x=-3.0).to_drake(renderer_name="vtk")
+        camera_to_drake(pinhole(center_x=-3.0), renderer_name="vtk")
     with pytest.raises(CameraError, match=r"'cam'.*depth range"):
-        pinhole().to_drake(renderer_name="vtk", depth_range=(2.0, 1.0))
+        camera_to_drake(pinhole(), renderer_name="vtk", depth_range=(2.0, 1.0))

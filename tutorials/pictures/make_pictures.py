@@ -16,6 +16,7 @@ from drake_pose.apps.demo import run_demo
 from drake_pose.apps.results.overlay import paint_agreement
 from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.camera import PinholeCamera
+from drake_pose.camera.drake import camera_to_drake
 from drake_pose.matching import PaperSearch, PaperSearchSettings, View
 from drake_pose.silhouette import LabelRenderer
 
@@ -51,7 +52,7 @@ def colour_image(model: ArticulatedModel, camera: PinholeCamera, q: np.ndarray) 
     poses = plant.get_geometry_pose_output_port().Eval(plant_context)
     scene_graph.get_source_pose_port(source).FixValue(context, poses)
     query = scene_graph.get_query_output_port().Eval(context)
-    colour_camera, _, X_WC = camera.to_drake(renderer_name="renderer")
+    colour_camera, _, X_WC = camera_to_drake(camera, renderer_name="renderer")
     image = query.RenderColorImage(colour_camera, scene_graph.world_frame_id(), X_WC)
     return image.data[:, :, :3].copy()
 

@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from drake_pose import __version__
 from drake_pose.apps.batch.job import SceneJob
 from drake_pose.apps.batch.tasks import Task
 from drake_pose.apps.results.folder import without_nan
 from drake_pose.errors import OutputError
+from drake_pose.version import VERSION
 
 BATCH = "batch.json"
 WAITING, FINISHED, FAILED = "waiting", "finished", "failed"
@@ -89,7 +89,7 @@ class BatchResult:
         return {
             "complete": all(one.state == FINISHED for one in self.scenes.values()),
             "seconds": self.seconds,
-            "version": __version__,
+            "version": VERSION,
             "scenes": {name: one.as_json() for name, one in self.scenes.items()},
         }
 

@@ -35,6 +35,7 @@ from drake_pose.apps.experiments.kameda.experiment import (
 from drake_pose.apps.experiments.kameda.table import experiment_table
 from drake_pose.body import TriangleMesh, bundled_model, load_model
 from drake_pose.camera import Camera, ParallelCamera, PinholeCamera
+from drake_pose.camera.drake import camera_to_drake
 from drake_pose.silhouette import (
     measure_agreement,
     outline_from_mesh,
@@ -133,7 +134,7 @@ def _label_images(
     scene_graph.RegisterGeometry(source, frame, instance)
     scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(RenderEngineVtkParams()))
     context = scene_graph.CreateDefaultContext()
-    color, _, X_WC = camera.to_drake(renderer_name=_RENDERER)
+    color, _, X_WC = camera_to_drake(camera, renderer_name=_RENDERER)
     poses = [
         RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), X[:3, 3]) for X in X_CN
     ]

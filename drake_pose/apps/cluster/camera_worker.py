@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 
 from drake_pose.camera.sources.files import load_background_pictures
-from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecification, open_source
+from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecification
+from drake_pose.camera.sources.opening import open_source
 from drake_pose.errors import DrakePoseError
 from drake_pose.multiview.person.silhouette_tracker import see_silhouette
 from drake_pose.multiview.person.view_packing import pack_view

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import drake_pose
+from drake_pose import version
 from drake_pose.apps.cluster.child_process import Child
 from drake_pose.errors import ClusterError
 
@@ -36,12 +36,12 @@ class WorkerFacts:
 def worker_facts(file: Path | None = None) -> WorkerFacts:
     """The facts of the process that is asked; ``file``: one that it should see."""
     digest = hashlib.sha256()
-    package = Path(drake_pose.__file__).parent
+    package = Path(version.__file__).parent
     for path in sorted(package.rglob("*.py")):
         digest.update(path.relative_to(package).as_posix().encode())
         digest.update(path.read_bytes())
     sees = file is None or file.is_file()
-    return WorkerFacts(drake_pose.__version__, digest.hexdigest(), sees)
+    return WorkerFacts(version.VERSION, digest.hexdigest(), sees)
 
 
 def worker_resources(dask_worker: Worker) -> tuple[str, ...]:

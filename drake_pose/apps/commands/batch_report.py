@@ -6,8 +6,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from drake_pose.apps.batch.state import FINISHED, BatchResult, SceneState
-from drake_pose.apps.commands.report import output_console, percent, progress_bar
+from drake_pose.apps.commands.report import output_console, progress_bar
 from drake_pose.apps.commands.terminal import warn
+from drake_pose.apps.texts import percent
 
 
 class BatchProgress:

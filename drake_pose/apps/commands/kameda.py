@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -16,6 +17,9 @@ from drake_pose.apps.commands.terminal import (
     usage_errors,
 )
 from drake_pose.apps.settings import EstimateSettings
+
+if TYPE_CHECKING:
+    from drake_pose.apps.experiments.kameda.continuous import ContinuousResult
 
 # What is about the grid of angles, which continuous ones have none of.
 _OF_GRID = ("method", "outside_limit", "candidates", "interval", "edges", "out")
@@ -102,9 +106,46 @@ def kameda(
             _run_on_grid(images, seed, method, interval, paper, edges, out, json)
         return
     with errors_as_messages():
-        from drake_pose.apps.experiments.kameda.continuous import print_continuous, run_beside
+        _print_continuous(_run_beside(images, seed, views, mismatch), json)
 
-        print_continuous(run_beside(images, seed, views, mismatch), json)
+
+def _run_beside(images: int, seed: int, views: int, mismatch: bool) -> dict[str, ContinuousResult]:
+    """Run the experiment, and with a mismatch a second time with another body; shows progress.
+
+    Args:
+        images, seed, views: as in ``run_continuous_experiment``.
+        mismatch: whether to run the second.
+
+    Returns:
+        The figures, by what was in the pictures.
+    """
+    from drake_pose.apps.commands.report import count_progress
+    from drake_pose.apps.experiments.kameda.continuous import (
+        continuous_search,
+        run_continuous_experiment,
+    )
+
+    search = continuous_search()
+    results = {}
+    for heading, other in {"the model itself": False, "another body": True}.items():
+        if mismatch or not other:
+            with count_progress(f"silhouettes of {heading}", images) as advance:
+                results[heading] = run_continuous_experiment(
+                    search, images, seed, views, other, advance
+                )
+    return results
+
+
+def _print_continuous(results: Mapping[str, ContinuousResult], json: bool) -> None:
+    """Print the figures of ``_run_beside`` as a table or as JSON."""
+    from drake_pose.apps.commands.report import output_console
+    from drake_pose.apps.experiments.kameda.continuous import continuous_table
+
+    if json:
+        first, *others = (result.as_json() for result in results.values())
+        print_json({**first, "another_body": others[0]} if others else first)
+    else:
+        output_console().print(continuous_table(results))
 
 
 def _run_on_grid(

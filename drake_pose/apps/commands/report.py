@@ -16,6 +16,7 @@ from rich.table import Table
 from drake_pose.apps.commands.terminal import warn
 from drake_pose.apps.results.folder import OVERLAY, POSES, REPLAY, REPORT
 from drake_pose.apps.results.summary import FrameRecord
+from drake_pose.apps.texts import percent
 
 if TYPE_CHECKING:
     from drake_pose.apps.estimate.scene import SceneEstimate
@@ -148,11 +149,6 @@ def print_demo(result: SceneEstimate) -> None:
         "The picture tells agreement (light grey), missing (blue) and excess (orange) apart. "
         "Kameda, Minoh and Ikeda report 22.3 % for six pictures of a woman, with a model of her."
     )
-
-
-def percent(share: float | None) -> str:
-    """Returns a share in percent, or a dash."""
-    return "-" if share is None else f"{100.0 * share:.2f} %"
 
 
 def position_text(kind: str, value: float) -> str:

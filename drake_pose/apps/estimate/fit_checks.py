@@ -12,10 +12,10 @@ from itertools import combinations
 
 import numpy as np
 
-from drake_pose.apps.commands.report import percent
 from drake_pose.apps.estimate.scene_checks import frame_ranges
 from drake_pose.apps.results.folder import PoseRow
 from drake_pose.apps.results.summary import FrameRecord
+from drake_pose.apps.texts import percent
 from drake_pose.body import ArticulatedModel
 from drake_pose.camera import Camera
 from drake_pose.matching import View

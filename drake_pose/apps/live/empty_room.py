@@ -12,8 +12,8 @@ from drake_pose.camera.sources.frame_source import (
     FrameSource,
     Picture,
     SourceSpecification,
-    open_source,
 )
+from drake_pose.camera.sources.opening import open_source
 from drake_pose.errors import OutputError, SceneError
 
 # How long it is waited for a camera [s].

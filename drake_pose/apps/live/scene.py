@@ -16,7 +16,8 @@ from drake_pose.camera.sources.files import (
     load_background_pictures,
     load_sources,
 )
-from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecification, open_source
+from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecification
+from drake_pose.camera.sources.opening import open_source
 from drake_pose.errors import DrakePoseError, SceneError
 from drake_pose.multiview.regions import Background, learn_background
 from drake_pose.systems.person.live_capture import LocalEyes

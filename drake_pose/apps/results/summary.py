@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from drake_pose import __version__
 from drake_pose.apps.settings import EstimateSettings
 from drake_pose.errors import OutputError
 from drake_pose.regular_files import digest, read_regular
 from drake_pose.silhouette import Scene
+from drake_pose.version import VERSION
 
 # A camera is suspicious where its pictures agree so much less than the others'.
 _SUSPICIOUS = 0.15
@@ -233,7 +233,7 @@ def _joint_errors(records: Mapping[str, FrameRecord]) -> dict[str, dict[str, flo
 
 
 def _versions() -> dict[str, str]:
-    versions = {"drake_pose": __version__, "python": platform.python_version()}
+    versions = {"drake_pose": VERSION, "python": platform.python_version()}
     for package in _PACKAGES:
         try:
             versions[package] = version(package)

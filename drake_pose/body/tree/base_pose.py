@@ -10,7 +10,7 @@ from pydrake.multibody.tree import Frame, JointIndex
 from scipy.optimize import least_squares
 
 from drake_pose.body.limits import nearest_turn, one_turn
-from drake_pose.body.model import ArticulatedModel
+from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.body.tree.joint_map import JointMap, inverse_transforms
 from drake_pose.body.tree.link_graph import JointEdge, LinkGraph, PlantKinematics
 from drake_pose.errors import ModelError
@@ -47,7 +47,7 @@ class BasePose:
     joint: int = -1
 
     def solve(
-        self, model: ArticulatedModel, q: NDArray[np.float64], X_WN: NDArray[np.float64]
+        self, model: ParsedModel, q: NDArray[np.float64], X_WN: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Complete q (nq,) and find X_WB (4, 4), given all node poses X_WN (n_nodes, 4, 4).
 
@@ -86,7 +86,7 @@ class BasePose:
         q[list(self.positions)] = solved[list(self.positions)]
 
     def _solve_joints(
-        self, model: ArticulatedModel, q: NDArray[np.float64], X_WA: NDArray[np.float64]
+        self, model: ParsedModel, q: NDArray[np.float64], X_WA: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Base positions (n,) that put the anchor at X_WA, inside their limits if possible."""
         index = list(self.positions)
@@ -152,7 +152,7 @@ def _chain_poses(maps: tuple[JointMap, ...], values: NDArray[Any]) -> NDArray[An
 
 
 def base_of_chain(
-    model: ArticulatedModel, graph: LinkGraph, chain: list[JointEdge], node: int
+    model: ParsedModel, graph: LinkGraph, chain: list[JointEdge], node: int
 ) -> BasePose:
     """How the joints from the world to a node can take up the node's pose.
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydrake.multibody.tree import BodyIndex, Joint, RigidBody
 
 from drake_pose.body.limits import FLOATING_TYPES
-from drake_pose.body.model import ArticulatedModel, link_names
+from drake_pose.body.parsed_model import ParsedModel, link_names
 from drake_pose.body.surfaces.mesh import TriangleMesh, join_meshes
 from drake_pose.body.tree.joint_map import JointMap, inverse_transforms
 from drake_pose.errors import ModelError
@@ -69,7 +69,7 @@ class LinkGraph:
 class PlantKinematics:
     """Poses of bodies in the plant's world, with a context of its own."""
 
-    def __init__(self, model: ArticulatedModel) -> None:
+    def __init__(self, model: ParsedModel) -> None:
         """Start at the model's default positions."""
         self.plant = model.plant
         self.context = model.plant.CreateDefaultContext()
@@ -90,7 +90,7 @@ class PlantKinematics:
         return np.asarray(X.GetAsMatrix4())
 
 
-def build_link_graph(model: ArticulatedModel, preferred_frame: str | None) -> LinkGraph:
+def build_link_graph(model: ParsedModel, preferred_frame: str | None) -> LinkGraph:
     """Walk the plant outwards from the world.
 
     Args:
@@ -137,7 +137,7 @@ def build_link_graph(model: ArticulatedModel, preferred_frame: str | None) -> Li
 
 
 def _make_group(
-    model: ArticulatedModel,
+    model: ParsedModel,
     kinematics: PlantKinematics,
     bodies: list[int],
     preferred_frame: str | None,

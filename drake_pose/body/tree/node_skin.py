@@ -5,7 +5,7 @@ from collections.abc import Collection
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.body.model import ArticulatedModel
+from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.body.surfaces.skin_file import SkinBand, skin_file
 from drake_pose.body.tree.joint_map import ChainStep, chain_transforms, inverse_transforms
@@ -15,7 +15,7 @@ from drake_pose.errors import ModelError
 
 
 def find_skin(
-    model: ArticulatedModel,
+    model: ParsedModel,
     graph: LinkGraph,
     parent: int,
     group: int,
@@ -43,7 +43,7 @@ def find_skin(
 
 
 def require_placed(
-    model: ArticulatedModel, graph: LinkGraph, pairs: Collection[tuple[int, int]]
+    model: ParsedModel, graph: LinkGraph, pairs: Collection[tuple[int, int]]
 ) -> None:
     """Refuse a model with a band that no node of the tree carries.
 
@@ -65,7 +65,7 @@ def require_placed(
             )
 
 
-def _pose_in_group(model: ArticulatedModel, graph: LinkGraph, link: str) -> NDArray[np.float64]:
+def _pose_in_group(model: ParsedModel, graph: LinkGraph, link: str) -> NDArray[np.float64]:
     """The pose (4, 4) of a link in the frame of its group."""
     kinematics = PlantKinematics(model)
     body = graph.groups[graph.group_of(link)].body
@@ -91,7 +91,7 @@ class ModelSkin:
         ModelError: a band does not join two neighbours.
     """
 
-    def __init__(self, model: ArticulatedModel) -> None:
+    def __init__(self, model: ParsedModel) -> None:
         self.bands: tuple[SkinBand, ...] = model.skin
         self._model = model
         self._kinematics = PlantKinematics(model)
@@ -120,7 +120,7 @@ class ModelSkin:
 
 
 def _chain(
-    model: ArticulatedModel, graph: LinkGraph, band: SkinBand
+    model: ParsedModel, graph: LinkGraph, band: SkinBand
 ) -> tuple[tuple[ChainStep, ...], tuple[int, ...]]:
     """The joints outwards from a band's parent to its child, and their positions."""
     inner, outer = graph.group_of(band.parent), graph.group_of(band.child)

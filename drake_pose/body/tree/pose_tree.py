@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.body.limits import one_turn, turns_around
-from drake_pose.body.model import ArticulatedModel
+from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.body.tree.base_pose import BasePose
 from drake_pose.body.tree.joint_map import ChainStep, chain_transforms
@@ -91,7 +91,7 @@ class PoseTree:
         root: name of the root node; "world" where the plant's own roots are kept.
     """
 
-    model: ArticulatedModel
+    model: ParsedModel
     nodes: tuple[PoseTreeNode, ...]
     leaves: tuple[int, ...]
     held: Mapping[int, float]

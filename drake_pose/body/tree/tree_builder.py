@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.body.model import ArticulatedModel
+from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.body.tree.base_pose import BasePose, base_of_chain, chain_pose
 from drake_pose.body.tree.joint_map import ChainStep
 from drake_pose.body.tree.link_graph import JointEdge, LinkGraph, PlantKinematics, build_link_graph
@@ -29,13 +29,14 @@ class Branch:
 
 
 def build_pose_tree(
-    model: ArticulatedModel,
-    root: str | None,
-    root_position: Sequence[float] | NDArray[np.float64] | None,
-    root_rotation: RootRotation | None,
-    held: Mapping[str, float],
+    model: ParsedModel,
+    root: str | None = None,
+    root_position: Sequence[float] | NDArray[np.float64] | None = None,
+    root_rotation: RootRotation | None = None,
+    held: Mapping[str, float] | None = None,
 ) -> PoseTree:
     """See ArticulatedModel.pose_tree."""
+    held = held or {}
     _check_root(model, root)
     held_values = {model.position_index(name): float(value) for name, value in held.items()}
     for name, value in held.items():
@@ -71,7 +72,7 @@ class RootPlan:
     own: bool
 
 
-def _check_root(model: ArticulatedModel, root: str | None) -> None:
+def _check_root(model: ParsedModel, root: str | None) -> None:
     """Only a link with geometry can be the root."""
     if root is None or root in model.link_meshes:
         return
@@ -93,7 +94,7 @@ def _checked_position(position: Sequence[float] | NDArray[np.float64]) -> NDArra
 
 
 def _choose_root(
-    model: ArticulatedModel, graph: LinkGraph, root: str | None, rotation: RootRotation | None
+    model: ParsedModel, graph: LinkGraph, root: str | None, rotation: RootRotation | None
 ) -> RootPlan:
     """Decide which group the tree starts from and whether it is turned by a RootRotation."""
     floating = _floating_tops(graph)
@@ -202,7 +203,7 @@ def _by_depth(graph: LinkGraph, branches: list[Branch]) -> list[Branch]:
 
 
 def _plant_rooted(
-    model: ArticulatedModel,
+    model: ParsedModel,
     graph: LinkGraph,
     position: NDArray[np.float64] | None,
     held: dict[int, float],
@@ -240,7 +241,7 @@ def _outermost(branches: list[Branch]) -> list[int]:
     return [index for index, branch in enumerate(branches) if branch.parent < 0]
 
 
-def _leading_translations(model: ArticulatedModel, chain: Chain) -> tuple[int, ...]:
+def _leading_translations(model: ParsedModel, chain: Chain) -> tuple[int, ...]:
     """The positions of three prismatic joints that begin a chain, or none."""
     leading = []
     for edge in chain[:3]:
@@ -250,7 +251,7 @@ def _leading_translations(model: ArticulatedModel, chain: Chain) -> tuple[int, .
 
 
 def _solve_translations(
-    model: ArticulatedModel, chain: Chain, translations: tuple[int, ...], p_WN: NDArray[np.float64]
+    model: ParsedModel, chain: Chain, translations: tuple[int, ...], p_WN: NDArray[np.float64]
 ) -> dict[int, float]:
     """Values of the leading translations that put the chain's end at p_WN for any rotation."""
     maps = tuple(edge.joint_map for edge in chain if edge.joint_map is not None)
@@ -274,7 +275,7 @@ def _solve_translations(
 
 
 def _turned_over(
-    model: ArticulatedModel,
+    model: ParsedModel,
     graph: LinkGraph,
     plan: RootPlan,
     position: NDArray[np.float64] | None,
@@ -321,7 +322,7 @@ def _chain_from_world(graph: LinkGraph, groups: set[int]) -> list[JointEdge]:
 
 
 def _with_world(
-    model: ArticulatedModel,
+    model: ParsedModel,
     graph: LinkGraph,
     branches: list[Branch],
     roots: dict[int, NodePlacement],
@@ -339,7 +340,7 @@ def _with_world(
 
 
 def _assemble(
-    model: ArticulatedModel,
+    model: ParsedModel,
     graph: LinkGraph,
     branches: list[Branch],
     roots: dict[int, NodePlacement],

@@ -4,12 +4,12 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from drake_pose.body.model import ArticulatedModel
+from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.errors import ModelError
 
 
 def placing_slides(
-    model: ArticulatedModel, objects: Sequence[Sequence[int]], held: Mapping[int, float]
+    model: ParsedModel, objects: Sequence[Sequence[int]], held: Mapping[int, float]
 ) -> dict[int, float]:
     """Slides without limits between the world and its only object, with their default values.
 
@@ -39,7 +39,7 @@ def placing_slides(
 
 
 def refuse_unlimited_slides(
-    model: ArticulatedModel, positions: Sequence[int], held: Mapping[int, float]
+    model: ParsedModel, positions: Sequence[int], held: Mapping[int, float]
 ) -> None:
     """All that is searched must have limits.
 
@@ -51,13 +51,13 @@ def refuse_unlimited_slides(
         raise ModelError(_faults(model, free))
 
 
-def _unlimited(model: ArticulatedModel, positions: Sequence[int]) -> list[int]:
+def _unlimited(model: ParsedModel, positions: Sequence[int]) -> list[int]:
     """Those that are lengths without a lower or without an upper limit."""
     limited = np.isfinite(model.lower) & np.isfinite(model.upper)
     return [i for i in positions if model.position_kinds[i] == "length" and not limited[i]]
 
 
-def _faults(model: ArticulatedModel, positions: Sequence[int]) -> str:
+def _faults(model: ParsedModel, positions: Sequence[int]) -> str:
     """Which joints lack limits, and what to do."""
     names = [model.position_names[position] for position in positions]
     many = len(names) > 1

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import abc
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -165,24 +164,3 @@ class FrameSource(abc.ABC):
             f"has {width} x {height} pixels (width x height), but the camera is calibrated for "
             f"{wanted.width} x {wanted.height}: give pictures of that size, or calibrate again"
         )
-
-
-def open_source(specification: SourceSpecification, clock: Clock = time.monotonic) -> FrameSource:
-    """Opens a source.
-
-    Args:
-        specification: where the pictures come from.
-        clock: gives the time stamps of a live camera's pictures [s].
-
-    Raises:
-        SceneError: a folder or video that cannot be read, is empty, or whose pictures are not of
-            the calibrated size. A live camera that cannot be opened is tried again and again.
-    """
-    from drake_pose.camera.sources.live import DeviceSource
-    from drake_pose.camera.sources.recorded import FolderSource, VideoSource
-
-    if specification.kind == "folder":
-        return FolderSource(specification)
-    if specification.kind == "video":
-        return VideoSource(specification)
-    return DeviceSource(specification, clock)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from drake_pose.body import ArticulatedModel
+from drake_pose.body import ParsedModel
 from drake_pose.camera import Camera
 from drake_pose.errors import MaskError, SettingsError
 from drake_pose.silhouette import LabelRenderer
@@ -88,7 +88,7 @@ class AxisObserver:
 
     def __init__(
         self,
-        model: ArticulatedModel,
+        model: ParsedModel,
         camera: Camera,
         axes: Mapping[str, Ends],
         origin: tuple[float, float] = (0.0, 0.0),

@@ -9,7 +9,7 @@ import numpy as np
 import yaml
 from pydrake.common.yaml import yaml_load_typed
 
-from drake_pose.body import ArticulatedModel
+from drake_pose.body import ParsedModel
 from drake_pose.errors import ModelError, SettingsError
 from drake_pose.filtering.truncation.inequalities import (
     Inequalities,
@@ -114,7 +114,7 @@ def couplings_file(model_file: Path) -> Path:
     return model_file.with_name(f"{model_file.name.split('.')[0]}.couplings.yaml")
 
 
-def model_inequalities(model: ArticulatedModel) -> Inequalities:
+def model_inequalities(model: ParsedModel) -> Inequalities:
     """All that is known of a model's positions: its limits, and its couplings file if there is one.
 
     Raises:

@@ -10,7 +10,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.solvers import Binding, MathematicalProgram
 from scipy.optimize import linprog
 
-from drake_pose.body import ArticulatedModel
+from drake_pose.body import ParsedModel
 from drake_pose.errors import SettingsError, UnknownNameError
 
 # Rows are scaled to unit length, so this is a length in the space of states.
@@ -176,7 +176,7 @@ def from_bounds(
     return stack(parts, names if columns is None else columns)
 
 
-def from_model(model: ArticulatedModel) -> Inequalities:
+def from_model(model: ParsedModel) -> Inequalities:
     """Every finite position limit of a model [rad or m]: (14), and with shape joints (16).
 
     A joint that turns freely has no limit to give, nor one whose limits meet after a full turn. A

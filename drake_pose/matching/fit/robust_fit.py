@@ -23,9 +23,9 @@ from drake_pose.errors import SettingsError
 from drake_pose.matching.fit.pose_jacobian import image_jacobian
 from drake_pose.matching.fit.robust_kernel import add_body_contour, add_silhouette_edge
 from drake_pose.matching.result import View
-from drake_pose.matching.starts.coarse_search import signed_distances
 from drake_pose.silhouette import Outline, TreeSurfaces, outline_from_mesh
 from drake_pose.silhouette.contours.contour_points import find_contour_points
+from drake_pose.silhouette.pictures.signed_distances import signed_distances
 
 # What refinement needs of a surface shows with so few triangles.
 _TRIANGLES = 400

@@ -13,7 +13,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from drake_pose.camera import ParallelCamera
@@ -27,6 +26,7 @@ from drake_pose.matching.starts.coarse_kernel import (
     score_samples,
     unite_pairs,
 )
+from drake_pose.silhouette.pictures.signed_distances import signed_distances
 
 _WORDS = 4
 _LEVELS = 10
@@ -251,19 +251,6 @@ class RoughSearch:
         # Any odd numbers will do; always the same, so that answers are.
         keys = np.random.default_rng(2718).integers(1, 2**62, cells.shape[1]) | 1
         return np.sort(np.unique((cells * keys).sum(axis=1), return_index=True)[1])
-
-
-def signed_distances(mask: np.ndarray) -> np.ndarray:
-    """(H, W) float32 distance from the edge of a mask, half way between pixels; positive outside.
-
-    Beyond the picture's edge nothing is known: it is no edge of the mask.
-    """
-    inside = np.asarray(mask, dtype=np.uint8)
-    if inside.all():
-        return np.full(mask.shape, -float(max(mask.shape)), dtype=np.float32)
-    within = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    beyond = cv2.distanceTransform(1 - inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return np.where(inside > 0, 0.5 - within, beyond - 0.5).astype(np.float32)
 
 
 def _mean_size(views: Sequence[View]) -> float:

@@ -13,7 +13,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.body import ArticulatedModel, PoseTree
+from drake_pose.body import ArticulatedModel, ParsedModel, PoseTree
 from drake_pose.errors import ModelError
 
 Array = NDArray[np.float64]
@@ -239,7 +239,7 @@ def _limb(tree: PoseTree, nodes: Mapping[str, int], X_WN: Array, name: str) -> L
 
 
 def _axes(
-    model: ArticulatedModel, positions: list[int] | tuple[int, ...], name: str
+    model: ParsedModel, positions: list[int] | tuple[int, ...], name: str
 ) -> NDArray[np.int64]:
     """The axes 0, 1, 2 that the positions' names end with."""
     letters = [model.position_names[i].rsplit("_", 1)[-1] for i in positions]

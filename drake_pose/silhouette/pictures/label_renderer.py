@@ -20,13 +20,14 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
 
 from drake_pose.body import ModelSkin
-from drake_pose.body.model import link_names
+from drake_pose.body.parsed_model import link_names
 from drake_pose.camera import Camera, ParallelCamera
+from drake_pose.camera.drake import camera_to_drake
 from drake_pose.silhouette.pictures.drake_skin import DeformableSkin
 from drake_pose.silhouette.pictures.label_images import EMPTY, label_data
 
 if TYPE_CHECKING:
-    from drake_pose.body import ArticulatedModel
+    from drake_pose.body import ParsedModel
 
 _RENDERER = "silhouette"
 _DEPTH_MARGIN = 0.01
@@ -45,7 +46,7 @@ class LabelRenderer:
             engine would give wrong images.
     """
 
-    def __init__(self, model: ArticulatedModel, camera: Camera) -> None:
+    def __init__(self, model: ParsedModel, camera: Camera) -> None:
         self.camera = camera
         self._thread = threading.get_ident()
         self._scene_graph = SceneGraph()
@@ -89,11 +90,10 @@ class LabelRenderer:
         p_B = self._skin.skin.vertices(np.asarray(q, dtype=np.float64))
         port = self._scene_graph.get_source_configuration_port(self._skin.source)
         port.FixValue(self._context, self._skin.configuration(p_B))
+        depths = None
         if isinstance(self.camera, ParallelCamera):
             depths = self._depths(poses, p_B, X_BW.inverse().GetAsMatrix4())
-            color, _, X_WC = self.camera.to_drake(renderer_name=_RENDERER, depth_range=depths)
-        else:
-            color, _, X_WC = self.camera.to_drake(renderer_name=_RENDERER)
+        color, _, X_WC = camera_to_drake(self.camera, renderer_name=_RENDERER, depth_range=depths)
         query = self._scene_graph.get_query_output_port().Eval(self._context)
         image = query.RenderLabelImage(color, self._world, X_BW @ X_WC)
         return label_data(image).copy()

@@ -13,7 +13,7 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
-from drake_pose.body import ArticulatedModel
+from drake_pose.body import ParsedModel
 
 
 class KnownPositions(LeafSystem):
@@ -72,7 +72,7 @@ def pose_plant(
 
 def add_avatar(
     builder: DiagramBuilder,
-    model: ArticulatedModel,
+    model: ParsedModel,
     positions: OutputPort,
     meshcat: Meshcat,
     prefix: str,

@@ -13,7 +13,7 @@ from pydrake.systems.framework import (
     OutputPort,
 )
 
-from drake_pose.body import ArticulatedModel, ModelSkin
+from drake_pose.body import ModelSkin, ParsedModel
 from drake_pose.silhouette.pictures.drake_skin import DeformableSkin
 
 MESHCAT_PERIOD = 1.0 / 64.0
@@ -125,7 +125,7 @@ class MeshcatSkin(LeafSystem):
 def add_skin(
     builder: DiagramBuilder,
     scene_graph: SceneGraph,
-    model: ArticulatedModel,
+    model: ParsedModel,
     positions: OutputPort,
     name: str,
     labels: Mapping[str, int] | None = None,
@@ -155,7 +155,7 @@ def add_skin(
 def add_meshcat_skin(
     builder: DiagramBuilder,
     meshcat: Meshcat,
-    model: ArticulatedModel,
+    model: ParsedModel,
     positions: OutputPort,
     name: str,
     colour: Rgba | None = None,

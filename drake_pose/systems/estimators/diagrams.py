@@ -25,8 +25,9 @@ from pydrake.systems.primitives import LogVectorOutput, TrajectorySource, Vector
 from pydrake.systems.sensors import RgbdSensor
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
-from drake_pose.body import ArticulatedModel
+from drake_pose.body import ParsedModel, build_pose_tree
 from drake_pose.camera import Camera, PinholeCamera
+from drake_pose.camera.drake import camera_to_drake
 from drake_pose.filtering.tracking.contour_tracker import TrackingSettings
 from drake_pose.matching import PoseSearch
 from drake_pose.silhouette import Scene
@@ -156,7 +157,7 @@ def build_simulated_matching(
 def add_simulated_cameras(
     builder: DiagramBuilder,
     scene_graph: SceneGraph,
-    model: ArticulatedModel,
+    model: ParsedModel,
     cameras: Sequence[Camera],
     true_positions: Trajectory | np.ndarray,
 ) -> tuple[OutputPort, list[OutputPort]]:
@@ -206,15 +207,15 @@ def _make_matcher(
 
 
 def _drake_camera(
-    camera: Camera, model: ArticulatedModel, true_positions: Trajectory
+    camera: Camera, model: ParsedModel, true_positions: Trajectory
 ) -> tuple[ColorRenderCamera, DepthRenderCamera, RigidTransform]:
     """Drake's cameras; a parallel one becomes a tele camera that is clipped about the body."""
     if isinstance(camera, PinholeCamera):
-        return camera.to_drake(renderer_name=_RENDERER)
+        return camera_to_drake(camera, renderer_name=_RENDERER)
     start, end = true_positions.start_time(), true_positions.end_time()
     # A constant has no end.
     times = np.linspace(start, end, 100) if np.isfinite([start, end]).all() else np.zeros(1)
-    tree = model.pose_tree()
+    tree = build_pose_tree(model)
     depths = []
     for time in times:
         values = tree.values_from_positions(true_positions.value(time).ravel())
@@ -225,13 +226,13 @@ def _drake_camera(
     # A body that moves fast may reach further between the times looked at.
     margin = 0.5 + 0.1 * float(np.ptp(everything))
     depth_range = (float(everything.min()) - margin, float(everything.max()) + margin)
-    return camera.to_drake(renderer_name=_RENDERER, depth_range=depth_range)
+    return camera_to_drake(camera, renderer_name=_RENDERER, depth_range=depth_range)
 
 
 def add_posed_body(
     builder: DiagramBuilder,
     scene_graph: SceneGraph,
-    model: ArticulatedModel,
+    model: ParsedModel,
     estimator: LeafSystem,
     name: str,
     colour: Rgba | None = None,

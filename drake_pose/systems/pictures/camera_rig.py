@@ -14,8 +14,9 @@ from pydrake.systems.primitives import PassThrough, TrajectorySource
 from pydrake.systems.sensors import RgbdSensor
 from pydrake.trajectories import Trajectory
 
-from drake_pose.body import ArticulatedModel
+from drake_pose.body import ParsedModel
 from drake_pose.camera import PinholeCamera
+from drake_pose.camera.drake import camera_to_drake
 from drake_pose.errors import CameraError, UnknownNameError
 from drake_pose.silhouette import label_image_to_mask
 from drake_pose.systems.bodies.posed_geometry import pose_plant
@@ -77,7 +78,7 @@ class CameraRig:
 
 
 def build_camera_rig(
-    model: ArticulatedModel,
+    model: ParsedModel,
     cameras: Mapping[str, PinholeCamera],
     true_positions: Trajectory | None = None,
     background: tuple[float, float, float] = (0.55, 0.58, 0.62),
@@ -139,8 +140,8 @@ def add_cameras(
     for name, camera in cameras.items():
         if not isinstance(camera, PinholeCamera):
             raise CameraError(f"camera '{name}': a rig's sensors are pinholes, not parallel")
-        color, depth, X_WC = camera.to_drake(
-            renderer_name=_RENDERER, depth_range=(camera.near, _FARTHEST)
+        color, depth, X_WC = camera_to_drake(
+            camera, renderer_name=_RENDERER, depth_range=(camera.near, _FARTHEST)
         )
         sensor = builder.AddNamedSystem(
             f"camera_{name}", RgbdSensor(scene_graph.world_frame_id(), X_WC, color, depth)

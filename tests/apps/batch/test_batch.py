@@ -18,7 +18,6 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-import drake_pose
 from drake_pose.apps.batch.batch import run_batch
 from drake_pose.apps.batch.job import SETTINGS, SceneJob, read_job
 from drake_pose.apps.batch.tasks import WORK, Outcome, Task, perform
@@ -245,7 +244,7 @@ def test_everything_listens_on_the_loopback_address(cluster):
 def test_workers_must_be_like_this_program(cluster, tmp_path, monkeypatch):
     require_fit_workers(cluster, tmp_path / "new")
     assert list((tmp_path / "new").iterdir()) == []
-    monkeypatch.setattr(drake_pose, "__version__", "99.0")
+    monkeypatch.setattr("drake_pose.version.VERSION", "99.0")
     with pytest.raises(ClusterError, match=r"here is 99\.0"):
         require_fit_workers(cluster, tmp_path)
 

@@ -89,10 +89,8 @@ def test_continuous_angles_mean_the_same_with_and_without_a_number_of_cameras(mo
         asked.append(arguments)
         return {}
 
-    monkeypatch.setattr("drake_pose.apps.experiments.kameda.continuous.run_beside", run)
-    monkeypatch.setattr(
-        "drake_pose.apps.experiments.kameda.continuous.print_continuous", lambda *_: None
-    )
+    monkeypatch.setattr("drake_pose.apps.commands.kameda._run_beside", run)
+    monkeypatch.setattr("drake_pose.apps.commands.kameda._print_continuous", lambda *_: None)
     for words in ([], ["--views", "1"]):
         arguments = ["reproduce", "kameda", "--angles", "continuous", "--images", "3", *words]
         done = CliRunner().invoke(app, arguments)

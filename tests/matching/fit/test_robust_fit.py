@@ -14,7 +14,6 @@ from drake_pose.matching.fit.robust_fit import (
     unlike,
 )
 from drake_pose.matching.fit.robust_kernel import add_body_contour, add_silhouette_edge
-from drake_pose.matching.starts.coarse_search import signed_distances
 from drake_pose.silhouette import TreeSurfaces
 from tests.matching.arms import arm_cameras, arm_tree, draw_pose, draw_view
 
@@ -128,17 +127,6 @@ def test_limits_and_held_values(kinematics: TreeKinematics) -> None:
     free = [0, 2, 3, 4]
     assert (found.values[free] <= kinematics.upper[free]).all()
     assert (found.values[free] >= kinematics.lower[free]).all()
-
-
-def test_signed_distances_are_those_to_the_nearest_pixel_of_the_other_kind() -> None:
-    mask = np.random.default_rng(4).random((14, 17)) < 0.6
-    found = signed_distances(mask)
-    inside, outside = np.argwhere(mask), np.argwhere(~mask)
-    for row, column in np.ndindex(mask.shape):
-        others = outside if mask[row, column] else inside
-        nearest = np.linalg.norm(others - [row, column], axis=1).min() - 0.5
-        expected = -nearest if mask[row, column] else nearest
-        assert found[row, column] == pytest.approx(expected, abs=1e-4)
 
 
 def test_unlike_keeps_the_best_of_those_alike() -> None:

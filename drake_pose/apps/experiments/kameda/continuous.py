@@ -10,8 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from rich.table import Table
 
-from drake_pose.apps.commands.report import count_progress, output_console
-from drake_pose.apps.commands.terminal import print_json
 from drake_pose.apps.experiments.kameda.experiment import draw_values, experiment_camera
 from drake_pose.body import PoseTree, bundled_model, load_model
 from drake_pose.camera import ParallelCamera
@@ -126,36 +124,6 @@ def continuous_table(results: Mapping[str, ContinuousResult]) -> Table:
         cells = ["-" if column[key] is None else form.format(column[key]) for column in figures]
         table.add_row(label, *cells)
     return table
-
-
-def print_continuous(results: Mapping[str, ContinuousResult], json: bool) -> None:
-    """Print the figures of ``run_beside`` as a table or as JSON."""
-    if json:
-        first, *others = (result.as_json() for result in results.values())
-        print_json({**first, "another_body": others[0]} if others else first)
-    else:
-        output_console().print(continuous_table(results))
-
-
-def run_beside(images: int, seed: int, views: int, mismatch: bool) -> dict[str, ContinuousResult]:
-    """Run the experiment, and with a mismatch a second time with another body; shows progress.
-
-    Args:
-        images, seed, views: as in ``run_continuous_experiment``.
-        mismatch: whether to run the second.
-
-    Returns:
-        The figures, by what was in the pictures.
-    """
-    search = continuous_search()
-    results = {}
-    for heading, other in {"the model itself": False, "another body": True}.items():
-        if mismatch or not other:
-            with count_progress(f"silhouettes of {heading}", images) as advance:
-                results[heading] = run_continuous_experiment(
-                    search, images, seed, views, other, advance
-                )
-    return results
 
 
 def continuous_search() -> ContinuousSearch:

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from drake_pose.apps.results.overlay import paint_agreement
-from drake_pose.body import ArticulatedModel
+from drake_pose.body import ParsedModel
 from drake_pose.matching import View
 from drake_pose.matching.pose_families import PoseFamily, PoseSet
 from drake_pose.silhouette import LabelRenderer
@@ -20,7 +20,7 @@ _BACKGROUND = (1.0, 1.0, 1.0)
 
 
 def save_families(
-    path: Path, model: ArticulatedModel, answer: PoseSet, views: Sequence[View], most: int = 6
+    path: Path, model: ParsedModel, answer: PoseSet, views: Sequence[View], most: int = 6
 ) -> Path:
     """Draw the families side by side, a column each.
 

@@ -1,0 +1,125 @@
+"""What a model file says of links, joints, limits and looks, as plain values and Drake's plant."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import SceneGraph
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex
+
+from drake_pose.body.files.parsing import ModelSource
+from drake_pose.body.limits import PositionKind
+from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.body.surfaces.skin_file import SkinBand
+from drake_pose.body.surfaces.visual_geometry import make_drawable
+from drake_pose.errors import UnknownNameError
+
+
+@dataclass(frozen=True, eq=False)
+class ParsedModel:
+    """What a model file says, as Drake understands it. Never changes.
+
+    Attributes:
+        path: the model file.
+        name: the model's name (that of its first model instance).
+        plant: a finalized MultibodyPlant, to make contexts from; do not change it.
+        scene_graph: the SceneGraph the plant's geometry is registered with.
+        position_names: one unique name a position, in the plant's order: the joint's name, or
+            ``joint_suffix`` for joints of several positions.
+        position_kinds: "angle" [rad], "length" [m] or "quaternion" for each position.
+        lower, upper: (nq,) limits [rad or m], read-only; half a turn either side of the default
+            position for a joint that turns freely; infinite for the pose of a floating body, and
+            for slides without limits.
+        default_positions: (nq,) Drake's default positions moved inside the limits, read-only.
+        periodic: (nq,) bool, read-only: angles that look the same after a full turn.
+        turns_freely: (nq,) bool, read-only: angles without limits, or with limits more than four
+            turns apart, which mean none.
+        link_meshes: the visual geometry of each link that has some, in the link's frame.
+        skin: the bands of surface that bend with the joints, from the file beside the model's
+            (``load_skin``); usually none.
+        warnings: what is not read of the file or not enforced, which limits were not taken as they
+            are written, and what Drake remarked.
+    """
+
+    path: Path
+    name: str
+    plant: MultibodyPlant
+    scene_graph: SceneGraph
+    position_names: tuple[str, ...]
+    position_kinds: tuple[PositionKind, ...]
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+    default_positions: NDArray[np.float64]
+    periodic: NDArray[np.bool_]
+    turns_freely: NDArray[np.bool_]
+    link_meshes: Mapping[str, TriangleMesh]
+    skin: tuple[SkinBand, ...]
+    warnings: tuple[str, ...]
+    _source: ModelSource = field(repr=False)
+
+    def add_to(
+        self,
+        plant: MultibodyPlant,
+        scene_graph: SceneGraph | None = None,
+        *,
+        prefix: str = "",
+    ) -> list[ModelInstanceIndex]:
+        """Add the same model to another plant, for example one of a diagram.
+
+        Mesh files that Drake would not draw are replaced as in this model. Add renderers to the
+        SceneGraph after this call: Drake's VTK renderer rejects an OBJ file without normals at the
+        moment it is parsed.
+
+        Args:
+            plant: a plant that is not finalized.
+            scene_graph: the SceneGraph it is or shall be registered with; None for no geometry.
+            prefix: put before the model's name, to tell several copies apart.
+
+        Returns:
+            The new model instances.
+
+        Raises:
+            ModelError: Drake refuses the model in that plant.
+        """
+        instances, _ = self._source.parse(plant, scene_graph, prefix)
+        if plant.geometry_source_is_registered():
+            make_drawable(plant, scene_graph, instances)
+        return instances
+
+    @property
+    def link_names(self) -> tuple[str, ...]:
+        """All links, seen or not, in the order of the plant's bodies; the first is the world."""
+        return link_names(self.plant)
+
+    def link_index(self, name: str) -> int:
+        """The index of a link among the plant's bodies.
+
+        Raises:
+            UnknownNameError: no link has that name.
+        """
+        if name not in self.link_names:
+            raise UnknownNameError("link", name, self.link_names, str(self.path))
+        return self.link_names.index(name)
+
+    def position_index(self, name: str) -> int:
+        """Where a position stands in q.
+
+        Raises:
+            UnknownNameError: no position has that name.
+        """
+        if name not in self.position_names:
+            raise UnknownNameError("joint", name, self.position_names, str(self.path))
+        return self.position_names.index(name)
+
+
+def link_names(plant: MultibodyPlant) -> tuple[str, ...]:
+    """A unique name for each body, in the plant's order: ``instance::link`` where links repeat."""
+    bodies = [plant.get_body(BodyIndex(index)) for index in range(plant.num_bodies())]
+    plain = [body.name() for body in bodies]
+    return tuple(
+        body.name() if plain.count(body.name()) == 1 else body.scoped_name().get_full()
+        for body in bodies
+    )

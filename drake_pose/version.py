@@ -1,0 +1,3 @@
+"""The version of drake_pose."""
+
+VERSION = "0.1.0"

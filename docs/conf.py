@@ -57,11 +57,8 @@ nitpick_ignore_regex = [
     # Drake's classes that are imported for type checkers alone.
     ("py:class", "ColorRenderCamera|DepthRenderCamera|RenderCameraCore|CameraInfo"),
     ("py:class", "RigidTransform|Diagram|OutputPort|Meshcat"),
-    # Type variables and names of types.
-    ("py:class", r"(.*\.)?(Item|Array|Mask|Picture|Turning|Motions|PackedBand)"),
-    # Named in signatures; nobody needs them outside of the library.
-    ("py:class", r"drake_pose\.body\.(files|tree)\..*"),
-    ("py:class", r".*\.(SampledTree|GridPoses|DeformableSkin|Task|Outcome)"),
+    # Names of types.
+    ("py:class", "Array|Turning|Motions|PackedBand"),
 ]
 
 # The packages that export names, and where each exported object is documented.
@@ -140,12 +137,25 @@ def _documenting(name: str, documented: Any) -> list[str]:
 def resolve_public(
     app: Sphinx, env: BuildEnvironment, node: pending_xref, content: nodes.Element
 ) -> nodes.Element | None:
-    """Finds a name under which its package exports it."""
-    target = PUBLIC.get(node.get("reftarget", ""))
-    if node.get("refdomain") != "py" or target is None:
+    """Finds a name where its package exports it; what is not exported exists, but has no entry."""
+    target = node.get("reftarget", "")
+    if node.get("refdomain") != "py":
         return None
+    if target not in PUBLIC:
+        return content if target.startswith("drake_pose.") and _exists(target) else None
     python = env.get_domain("py")
-    return python.resolve_xref(env, node["refdoc"], app.builder, "obj", target, node, content)
+    return python.resolve_xref(
+        env, node["refdoc"], app.builder, "obj", PUBLIC[target], node, content
+    )
+
+
+def _exists(target: str) -> bool:
+    """Whether there is such an object."""
+    module, _, name = target.rpartition(".")
+    try:
+        return hasattr(import_module(module), name)
+    except ImportError:
+        return False
 
 
 def prepare_docstring(

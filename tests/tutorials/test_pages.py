@@ -154,6 +154,10 @@ def test_the_folders_are_those_of_the_library() -> None:
     folders = {path.parent.name for path in (ROOT / "drake_pose").glob("*/__init__.py")}
     assert set(listed) == folders
     assert len(listed) == len(folders)
+    for package in folders:
+        (row,) = re.findall(rf"^\| `{package}` \|(.*)$", TEXTS["CONTRIBUTING.md"], re.MULTILINE)
+        inner = (ROOT / "drake_pose" / package).glob("*/**/__init__.py")
+        assert set(re.findall(r"`(\w+)`", row)) == {path.parent.name for path in inner}
 
 
 def test_every_package_has_an_api_page() -> None:

@@ -20,8 +20,9 @@ from drake_pose.camera import ParallelCamera
 from drake_pose.compiled import is_stored
 from drake_pose.matching import View, WholeSearch
 from drake_pose.matching.continuous.multi_start_settings import HALFWAY
-from drake_pose.matching.fit.robust_fit import RobustFit, few_triangles
-from drake_pose.matching.fit.robust_kernel import add_silhouette_edge
+from drake_pose.matching.fit.kernel import collect
+from drake_pose.matching.fit.surfaces import few_triangles
+from drake_pose.matching.fit.views_fit import ViewsFit
 
 _SIDE = 64
 
@@ -29,7 +30,7 @@ _SIDE = 64
 @contextmanager
 def compiling_ahead() -> Iterator[None]:
     """Lets a second process compile as long as the kernels are not stored and the block runs."""
-    if is_stored(add_silhouette_edge):
+    if is_stored(collect):
         yield
         return
     command = [sys.executable, "-m", "drake_pose.apps.estimate.compile_ahead"]
@@ -50,7 +51,7 @@ def main() -> None:
     view = View(camera, cv2.circle(mask, (_SIDE // 2, _SIDE // 2), _SIDE // 4, 1, -1) > 0)
     search = WholeSearch(tree)
     surfaces = search.sampled.surfaces
-    fit = RobustFit(TreeKinematics(tree), few_triangles(surfaces), [view])
+    fit = ViewsFit(TreeKinematics(tree), few_triangles(surfaces), [view])
     values = fit.kinematics.flatten(tree.default_values())
     fit.refine(values, HALFWAY)
     search.match([view])

@@ -16,11 +16,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_pose.errors import SettingsError
-from drake_pose.matching.fit.robust_fit import RobustFit, RobustPass, RobustPose
+from drake_pose.matching.fit.levenberg_marquardt import Round
+from drake_pose.matching.fit.views_fit import FittedPose, ViewsFit
 from drake_pose.matching.pose_families import JointEstimate, PoseFamily, PoseSet
 from drake_pose.matching.starts.self_motions import Flip, flips
 
-_LOOK = RobustPass((0.0125,), 2, 0.026)
+_LOOK = Round(0.0125, 0.026, 2)
 # The first and the longest step of a value that is moved, angle [rad] and length [m].
 _FIRST_STEPS, _LONGEST_STEPS = (0.05, 0.01), (0.35, 0.1)
 # Each step of a value that is moved is longer by this factor.
@@ -92,7 +93,7 @@ class RobustFamilies:
     """
 
     def __init__(
-        self, fit: RobustFit, settings: RobustFamilySettings, proceed: Callable[[], bool]
+        self, fit: ViewsFit, settings: RobustFamilySettings, proceed: Callable[[], bool]
     ) -> None:
         self._fit = fit
         self._kinematics = fit.kinematics
@@ -101,7 +102,7 @@ class RobustFamilies:
         self._tolerance = 0.0
         self._limit = math.inf
 
-    def find(self, poses: Sequence[RobustPose], J: Callable[[np.ndarray], float]) -> PoseSet:
+    def find(self, poses: Sequence[FittedPose], J: Callable[[np.ndarray], float]) -> PoseSet:
         """The poses that fit as well as the best.
 
         Args:
@@ -124,7 +125,7 @@ class RobustFamilies:
         return self._describe(families, J)
 
     def _cost(self, values: np.ndarray) -> float:
-        return self._fit.cost(values, _LOOK.scales[0], _LOOK.spacing)
+        return self._fit.cost(values, _LOOK)
 
     def _has_room(self, families: Sequence[_Family]) -> bool:
         return not families or (len(families) < self._settings.families and self._proceed())
@@ -142,7 +143,7 @@ class RobustFamilies:
         for flip in flips(self._kinematics, family.values):
             if not self._has_room(families):
                 return
-            look = self._fit.refine(flip.values, _LOOK)
+            look = self._fit.refine(flip.values, (_LOOK,))
             if look.cost <= self._limit and not self._is_in(families, look.values):
                 values = self._kinematics.nearest_turns(look.values)
                 families.append(self._flipped(family, flip, values))
@@ -166,7 +167,7 @@ class RobustFamilies:
         lower, upper = self._kinematics.reach(values)
         cost = self._cost(values)
         room = max(self._limit - cost, _LEAST_ROOM * self._tolerance)
-        H = self._fit.curvature(values, _LOOK.scales[0], _LOOK.spacing)
+        H = self._fit.curvature(values, _LOOK)
         free = np.flatnonzero(upper > lower)
         low, high = values.copy(), values.copy()
         covariance = np.linalg.inv(H[np.ix_(free, free)] + _LEAST_CURVATURE * np.eye(len(free)))
@@ -193,7 +194,7 @@ class RobustFamilies:
         while self._proceed():
             before, before_cost = values[index], cost
             trial = np.clip(values + step * along, lower, upper)
-            look = self._fit.refine(trial, _LOOK, held=(index,))
+            look = self._fit.refine(trial, (_LOOK,), held=(index,))
             values, cost = look.values, look.cost
             if cost > self._limit:
                 # Costs are parabolas in the rough.

@@ -2,7 +2,7 @@
 
 A body that is the object itself, in a pose of the grid, is found by the exact stages of the wide
 search, and J = 0 ends the search. Else poses that are right in the rough are found by places
-(``rough_search``), drawn to the silhouettes' edges by saturating costs (``robust_fit``), and about
+(``rough_search``), drawn to the silhouettes' edges by saturating costs (``fit``), and about
 the best of them other explanations are sought: a limb searched again, joints that turn against each
 other (``self_motions``).
 """
@@ -26,12 +26,13 @@ from drake_pose.matching.continuous.multi_start_settings import (
     IN_THE_END,
     WholeSearchSettings,
 )
-from drake_pose.matching.fit.robust_fit import (
-    RobustFit,
-    RobustPose,
-    few_triangles,
+from drake_pose.matching.fit.levenberg_marquardt import Round
+from drake_pose.matching.fit.surfaces import few_triangles
+from drake_pose.matching.fit.views_fit import (
+    FittedPose,
+    ViewsFit,
+    distinct,
     refine_best,
-    unlike,
 )
 from drake_pose.matching.grid.beam.search import WideSearch
 from drake_pose.matching.grid.families.examination import examine
@@ -117,7 +118,7 @@ class WholeSearch:
             kinematics = TreeKinematics(body.sampled.tree)
         limit = self.settings.wide.time_limit
         deadline = np.inf if limit is None else start + limit
-        fit = RobustFit(kinematics, self._outlines, views)
+        fit = ViewsFit(kinematics, self._outlines, views)
         run = _WholeRun(body, kinematics, fit, views, deadline)
         run.search(self.settings)
         return run
@@ -130,15 +131,15 @@ class _WholeRun:
         self,
         body: WideBody,
         kinematics: TreeKinematics,
-        fit: RobustFit,
+        fit: ViewsFit,
         views: Sequence[View],
         deadline: float,
     ) -> None:
         self.body = body
         self.kinematics = kinematics
         self.fit = fit
-        self.poses: list[RobustPose] = []
-        self.first: RobustPose | None = None
+        self.poses: list[FittedPose] = []
+        self.first: FittedPose | None = None
         self.stopped_by = "end"
         self._views = views
         self._deadline = deadline
@@ -166,7 +167,7 @@ class _WholeRun:
                     continue
                 done.append(pose.values)
                 found += self._others(rough, pose.values, settings)
-            pool = unlike([*pool, *found], settings.survivors, self.kinematics.turns_around)
+            pool = distinct([*pool, *found], settings.survivors, self.kinematics.turns_around)
         refined = refine_best(
             self.fit,
             [pose.values for pose in pool[: settings.answers]],
@@ -188,7 +189,7 @@ class _WholeRun:
 
     def _others(
         self, rough: RoughSearch, values: np.ndarray, settings: WholeSearchSettings
-    ) -> list[RobustPose]:
+    ) -> list[FittedPose]:
         """Other explanations near a pose, refined."""
         kinematics, interval = self.kinematics, settings.rough.interval
         flipped = [flip.values for flip in flips(kinematics, values)]
@@ -198,11 +199,11 @@ class _WholeRun:
             found = rough.find_again(X_WN, nodes)
             best = rough.choose_distinct(found, settings.tried, settings.apart)
             tried += self._values(best, values)
-        scale, spacing = HALFWAY.scales[0], FROM_AFAR.spacing
+        look = Round(HALFWAY[0].scale, FROM_AFAR[0].spacing)
         best_looks = []
         for group, count in ((flipped, settings.flipped), (tried, settings.tried)):
-            looks = [RobustPose(one, self.fit.cost(one, scale, spacing)) for one in group]
-            best_looks += unlike(looks, count, kinematics.turns_around, 0.5 * interval)
+            looks = [FittedPose(one, self.fit.cost(one, look)) for one in group]
+            best_looks += distinct(looks, count, kinematics.turns_around, 0.5 * interval)
         return [self.fit.refine(look.values, HALFWAY) for look in best_looks if self._proceed()]
 
     def _limbs(self) -> list[list[int]]:

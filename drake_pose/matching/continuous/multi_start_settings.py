@@ -5,14 +5,14 @@ from dataclasses import dataclass, field
 
 from drake_pose.errors import SettingsError
 from drake_pose.matching.continuous.equivalent_poses import RobustFamilySettings
-from drake_pose.matching.fit.robust_fit import RobustPass
+from drake_pose.matching.fit.levenberg_marquardt import Round
 from drake_pose.matching.grid.families.examination import ExaminationSettings
 from drake_pose.matching.grid.settings import WideSearchSettings
 from drake_pose.matching.starts.coarse_search import RoughSettings
 
-FROM_AFAR = RobustPass((0.1, 0.05), 3, 0.04)
-HALFWAY = RobustPass((0.05, 0.025), 4, 0.026)
-IN_THE_END = RobustPass((0.0125,), 6, 0.0125)
+FROM_AFAR = (Round(0.1, 0.04, 3), Round(0.05, 0.04, 3))
+HALFWAY = (Round(0.05, 0.026, 4), Round(0.025, 0.026, 4))
+IN_THE_END = (Round(0.0125, 0.0125, 6),)
 
 
 @dataclass(frozen=True)

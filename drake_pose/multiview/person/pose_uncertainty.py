@@ -20,13 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.camera import Camera
-from drake_pose.multiview.person.silhouette_edges import EdgePoints
-from drake_pose.multiview.person.silhouette_fit import (
-    Comparison,
-    Round,
-    SilhouetteFit,
-    affine_motions,
-)
+from drake_pose.matching.fit.contour_fit import Comparison, ContourFit
+from drake_pose.matching.fit.evidence import EdgePoints
+from drake_pose.matching.fit.levenberg_marquardt import Round
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -58,7 +54,7 @@ class PoseUncertainty:
 
 
 def pose_uncertainty(
-    fit: SilhouetteFit,
+    fit: ContourFit,
     cameras: Sequence[Camera],
     edges: Sequence[EdgePoints],
     values: Array,
@@ -83,9 +79,8 @@ def pose_uncertainty(
     free = np.flatnonzero(~held)
     compared = fit.compare(cameras, edges, values, step)
     A = np.tril(compared.A) + np.swapaxes(np.tril(compared.A, -1), -1, -2)
-    motions = affine_motions(compared.motions.twists)
     # (nodes, m, 12): what each value does to each node.
-    moves = np.where(compared.motions.moves[:, :, None], motions, 0.0)
+    moves = compared.placement.dense(len(values))
     apriori = _limits_information(fit)
     parts = _parts(fit, compared, A)
     between = _noise(A, parts.left, parts.alone)
@@ -110,7 +105,7 @@ def pose_uncertainty(
     return PoseUncertainty(covariance, H, noise, surface)
 
 
-def _limits_information(fit: SilhouetteFit) -> Array:
+def _limits_information(fit: ContourFit) -> Array:
     """(m,) what limits tell: as much as an even distribution between them has variance."""
     widest = np.where(fit.kinematics.is_angle, 2.0 * np.pi, _PLACE)
     span = np.minimum(fit.upper - fit.lower, widest)
@@ -121,7 +116,7 @@ def _noise(A: Array, b: Array, Q: Array) -> float:
     """The variance of the distances, 1 as the fit's noise says.
 
     Args:
-        A: (cameras, nodes, 12, 12) and b: (cameras, nodes, 12) as of `SilhouetteFit.compare`, where
+        A: (cameras, nodes, 12, 12) and b: (cameras, nodes, 12) as of `ContourFit.compare`, where
             everything fits best.
         Q: (nodes, 12, 12) covariance of the nodes' affine motions.
     """
@@ -148,12 +143,12 @@ class _Parts(NamedTuple):
     left: Array
 
 
-def _parts(fit: SilhouetteFit, compared: Comparison, A: Array) -> _Parts:
+def _parts(fit: ContourFit, compared: Comparison, A: Array) -> _Parts:
     """All parts, each free to shift, turn and stretch; A: (cameras, nodes, 12, 12), symmetric."""
     K = np.array(
         [
             _deformations(outline.vertices, X_WN)
-            for outline, X_WN in zip(fit.outlines, compared.motions.X_WN, strict=True)
+            for outline, X_WN in zip(fit.outlines, compared.placement.X_WN, strict=True)
         ]
     )
     whole, b = A.sum(axis=0), compared.b.sum(axis=0)

@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 
 from drake_pose.camera import Camera, ParallelCamera
 from drake_pose.errors import SettingsError
+from drake_pose.matching.fit.contour_fit import ContourFit, PoseFit, Prior
+from drake_pose.matching.fit.evidence import EdgePoints
+from drake_pose.matching.fit.kernel import COMPARED, FITTING
+from drake_pose.matching.fit.levenberg_marquardt import Round
 from drake_pose.multiview.person.body_plan import BodyPlan, PlannedLimb, crowding
 from drake_pose.multiview.person.limb_placement import score_places, worth_of_pixels
-from drake_pose.multiview.person.silhouette_edges import EdgePoints
-from drake_pose.multiview.person.silhouette_fit import PoseFit, Prior, Round, SilhouetteFit
 from drake_pose.multiview.rays import meeting_of_all
 
 Array = NDArray[np.float64]
@@ -179,7 +181,7 @@ class PersonSearch:
 
     def __init__(
         self,
-        fit: SilhouetteFit,
+        fit: ContourFit,
         plan: BodyPlan,
         settings: SearchSettings,
         information: Array,
@@ -292,7 +294,7 @@ class PersonSearch:
         The worst one is always among them: somewhere something does not fit.
         """
         settings = self.settings
-        lengths, fitting, _ = fitted.agreement.T
+        lengths, fitting = fitted.sums[:, [COMPARED, FITTING]].T
         shares = np.where(lengths > 0.0, fitting / np.maximum(lengths, 1e-9), 1.0)
         found = []
         for limb in self._plan.limbs.values():

@@ -1,8 +1,7 @@
 """A person's own lengths and girths, from the silhouettes of several frames at once.
 
 Lengths are the model's shape joints, girths how wide its parts are across their y axis. All frames
-share them, each frame has its own pose: the poses are eliminated from the normal equations (Schur's
-complement), so that a frame costs the same however many there are.
+share them, each frame has its own pose.
 """
 
 from __future__ import annotations
@@ -16,13 +15,20 @@ from numpy.typing import NDArray
 from drake_pose.body import PoseTree, TriangleMesh
 from drake_pose.camera import Camera
 from drake_pose.errors import ModelError
+from drake_pose.matching.fit.contour_fit import ContourFit, Noise
+from drake_pose.matching.fit.evidence import EdgePoints, Evidence, pack_evidence
+from drake_pose.matching.fit.frames_fit import FramesFit
+from drake_pose.matching.fit.levenberg_marquardt import Round
+from drake_pose.matching.fit.parameters import GIRTH_PREFIX, BodyParameters
+from drake_pose.matching.fit.unknowns import Unknowns, choose, join
 from drake_pose.multiview.person.pose_uncertainty import pose_uncertainty
-from drake_pose.multiview.person.silhouette_edges import EdgePoints
-from drake_pose.multiview.person.silhouette_fit import Noise, Round, SilhouetteFit
 from drake_pose.silhouette import Outline, outline_from_mesh
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+
+# The logarithm of a girth is no farther from the model's.
+_WIDEST = 0.5
 
 
 @dataclass(frozen=True)
@@ -89,7 +95,7 @@ def shape_values(tree: PoseTree) -> Mask:
 
 
 def fit_shape(
-    fit: SilhouetteFit,
+    fit: ContourFit,
     frames: Sequence[tuple[Sequence[Camera], Sequence[EdgePoints]]],
     poses: Array,
     settings: ShapeSettings | None = None,
@@ -110,40 +116,94 @@ def fit_shape(
     if not is_shape.any():
         raise ModelError(f"{fit.tree.model.path}: a person's shape needs a model with shape joints")
     parts, groups = shape_parts(fit.tree)
-    girths = np.zeros(len(parts))
-    shape = np.zeros(int(is_shape.sum()))
-    prior = _shape_prior(fit, is_shape, len(parts), settings)
-    poses, start = np.array(poses, dtype=np.float64), np.array(poses, dtype=np.float64)
-    worn = fit
-    for step in settings.rounds:
-        S, s = prior.copy(), prior @ np.concatenate([shape, girths])
-        backs = []
-        for k, (cameras, edges) in enumerate(frames):
-            poses[k, is_shape] = shape
-            H, g, _ = worn.equations(cameras, edges, poses[k], step, groups)
-            part, change, back = _eliminate(fit, H, g, poses[k], start[k], is_shape, settings)
-            S, s = S + part, s + change
-            backs.append(back)
-        x = np.linalg.solve(S, -s)
-        x *= min(1.0, 0.1 / float(np.abs(x).max()))
-        shape = np.clip(shape + x[: len(shape)], fit.lower[is_shape], fit.upper[is_shape])
-        girths = np.clip(girths + x[len(shape) :], -0.5, 0.5)
-        for k, (index, gain, offset) in enumerate(backs):
-            change = np.clip(offset - gain @ x, -0.35, 0.35)
-            poses[k, index] = np.clip(poses[k, index] + change, fit.lower[index], fit.upper[index])
-        outlines = widened(fit, np.exp(girths)[groups])
-        worn = SilhouetteFit(fit.tree, outlines, fit.noise)
+    body = BodyParameters(fit.kinematics, fit.outlines, groups, parts)
+    poses = np.array(poses, dtype=np.float64)
+    own = poses[:, ~is_shape]
+    unknowns = _unknowns(fit, body, is_shape, settings)
+    shape_count = int(is_shape.sum())
+    names = [name for name, wanted in zip(body.names, is_shape, strict=False) if wanted]
+    cameras, evidence = _of_all_cameras(frames)
+    found = FramesFit(body, cameras, unknowns, noise=fit.noise).fit(
+        evidence,
+        np.zeros((len(frames), 0)),
+        own,
+        np.zeros(shape_count + len(parts)),
+        settings.rounds,
+        shared_information=_sides_information(names, len(parts), settings),
+    )
+    shape, girths = found.shared[:shape_count], found.shared[shape_count:]
+    worn = ContourFit(fit.tree, widened(fit, np.exp(girths)[groups]), fit.noise)
     values = np.zeros(len(is_shape))
     values[is_shape] = shape
     poses[:, is_shape] = shape
+    poses[:, ~is_shape] = found.own
     widths = {part: float(np.exp(girth)) for part, girth in zip(parts, girths, strict=True)}
-    information = prior[: len(shape), : len(shape)] + _told(worn, frames, poses, is_shape, settings)
+    prior = np.eye(shape_count) / settings.length_deviation**2
+    prior += _sides_information(names, 0, settings)
+    information = prior + _told(worn, frames, poses, is_shape, settings)
     covariance = np.asarray(np.linalg.inv(information))
     return PersonShape(values, covariance, is_shape, widths, poses, worn.outlines)
 
 
+def _unknowns(
+    fit: ContourFit, body: BodyParameters, is_shape: Mask, settings: ShapeSettings
+) -> Unknowns:
+    """Each frame's pose, and the lengths and girths of all frames."""
+    of_values = np.array(body.names[: len(is_shape)])
+    return join(
+        choose(
+            body.names,
+            of_values[~is_shape].tolist(),
+            lower=fit.lower[~is_shape],
+            upper=fit.upper[~is_shape],
+            deviation=settings.pose_deviation,
+        ),
+        choose(
+            body.names,
+            of_values[is_shape].tolist(),
+            shared=True,
+            lower=fit.lower[is_shape],
+            upper=fit.upper[is_shape],
+            deviation=settings.length_deviation,
+        ),
+        choose(
+            body.names,
+            [name for name in body.names if name.startswith(GIRTH_PREFIX)],
+            shared=True,
+            lower=-_WIDEST,
+            upper=_WIDEST,
+            deviation=settings.girth_deviation,
+        ),
+    )
+
+
+def _of_all_cameras(
+    frames: Sequence[tuple[Sequence[Camera], Sequence[EdgePoints]]],
+) -> tuple[list[Camera], list[Evidence]]:
+    """All cameras that have a picture in some frame, and what each frame's say."""
+    known = {camera.name: camera for cameras, _ in frames for camera in cameras}
+    nothing = EdgePoints(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.full(2, np.nan))
+    evidence = []
+    for cameras, edges in frames:
+        seen = {camera.name: edge for camera, edge in zip(cameras, edges, strict=True)}
+        evidence.append(pack_evidence([seen.get(name, nothing) for name in known]))
+    return list(known.values()), evidence
+
+
+def _sides_information(names: Sequence[str], girths: int, settings: ShapeSettings) -> Array:
+    """The information about lengths, and after them girths: left and right are alike."""
+    information = np.zeros((len(names) + girths, len(names) + girths))
+    for k, name in enumerate(names):
+        other = name.replace("left_", "right_", 1)
+        if name.startswith("left_") and other in names:
+            row = np.zeros(len(information))
+            row[k], row[list(names).index(other)] = 1.0, -1.0
+            information += np.outer(row, row) / settings.side_deviation**2
+    return information
+
+
 def _told(
-    fit: SilhouetteFit,
+    fit: ContourFit,
     frames: Sequence[tuple[Sequence[Camera], Sequence[EdgePoints]]],
     poses: Array,
     is_shape: Mask,
@@ -164,7 +224,7 @@ def _told(
     return told
 
 
-def widened(fit: SilhouetteFit, girths: Array) -> tuple[Outline, ...]:
+def widened(fit: ContourFit, girths: Array) -> tuple[Outline, ...]:
     """The fit's surfaces, each node's as wide across its y axis as girths (nodes,) say."""
     wider = []
     for outline, girth in zip(fit.outlines, girths, strict=True):
@@ -181,49 +241,6 @@ def shape_parts(tree: PoseTree) -> tuple[list[str], list[int]]:
     ]
     parts = list(dict.fromkeys(names))
     return parts, [parts.index(name) for name in names]
-
-
-def _shape_prior(fit: SilhouetteFit, is_shape: Mask, girths: int, settings: ShapeSettings) -> Array:
-    """The information about lengths and girths before any picture."""
-    names = [name for name, wanted in zip(fit.kinematics.names, is_shape, strict=True) if wanted]
-    count = len(names)
-    prior = np.zeros((count + girths, count + girths))
-    prior[range(count), range(count)] = 1.0 / settings.length_deviation**2
-    for k in range(count, count + girths):
-        prior[k, k] = 1.0 / settings.girth_deviation**2
-    for k, name in enumerate(names):
-        other = name.replace("left_", "right_", 1)
-        if name.startswith("left_") and other in names:
-            row = np.zeros(len(prior))
-            row[k], row[names.index(other)] = 1.0, -1.0
-            prior += np.outer(row, row) / settings.side_deviation**2
-    return prior
-
-
-def _eliminate(
-    fit: SilhouetteFit,
-    H: Array,
-    g: Array,
-    pose: Array,
-    start: Array,
-    is_shape: Mask,
-    settings: ShapeSettings,
-) -> tuple[Array, Array, tuple[NDArray[np.intp], Array, Array]]:
-    """A frame's share of the shape's equations, and how its pose follows the shape."""
-    own = np.flatnonzero(~is_shape)
-    stuck = ((pose <= fit.lower) & (g[: len(pose)] > 0)) | (
-        (pose >= fit.upper) & (g[: len(pose)] < 0)
-    )
-    own = own[~stuck[own]]
-    shared = np.concatenate([np.flatnonzero(is_shape), np.arange(len(pose), len(H))])
-    information = 1.0 / settings.pose_deviation**2
-    pull = g[own] + information * (pose - start)[own]
-    block = H[np.ix_(own, own)] + information * np.eye(len(own))
-    gain = np.asarray(np.linalg.solve(block, H[np.ix_(own, shared)]))
-    offset = np.asarray(np.linalg.solve(block, -pull))
-    cross = H[np.ix_(shared, own)]
-    part = np.asarray(H[np.ix_(shared, shared)] - cross @ gain)
-    return part, np.asarray(g[shared] + cross @ offset), (own, gain, offset)
 
 
 def shape_noise() -> Noise:

@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 
 from drake_pose.camera import Camera
 from drake_pose.errors import SettingsError
+from drake_pose.matching.fit.contour_fit import ContourFit, PoseFit, Prior
+from drake_pose.matching.fit.evidence import EdgePoints, find_edge_points
+from drake_pose.matching.fit.levenberg_marquardt import Round
 from drake_pose.multiview.person.body_plan import BodyPlan
 from drake_pose.multiview.person.pose_uncertainty import PoseUncertainty, pose_uncertainty
 from drake_pose.multiview.person.search import PersonSearch, SearchSettings, Sight
-from drake_pose.multiview.person.silhouette_edges import EdgePoints, find_edge_points
-from drake_pose.multiview.person.silhouette_fit import PoseFit, Prior, Round, SilhouetteFit
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -120,7 +121,7 @@ class SilhouetteTracker:
 
     def __init__(
         self,
-        fit: SilhouetteFit,
+        fit: ContourFit,
         settings: TrackerSettings | None = None,
         held: Mask | None = None,
         rest: Array | None = None,

@@ -8,7 +8,7 @@ import zlib
 import cv2
 import numpy as np
 
-from drake_pose.multiview.person.silhouette_edges import EdgePoints
+from drake_pose.matching.fit.evidence import EdgePoints
 from drake_pose.multiview.person.silhouette_tracker import SilhouetteView
 
 # Height and width of the picture; the region's box: top, left, height, width; edge points; bytes

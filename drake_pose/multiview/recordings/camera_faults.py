@@ -13,17 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from drake_pose.camera import Camera
-from drake_pose.multiview.person.silhouette_edges import EdgePoints
-from drake_pose.multiview.person.silhouette_fit import (
-    PoseFit,
-    Prior,
-    Round,
-    SilhouetteFit,
-    affine_motions,
-)
+from drake_pose.matching.fit.contour_fit import ContourFit, Prior
+from drake_pose.matching.fit.evidence import EdgePoints, pack_evidence
+from drake_pose.matching.fit.frames_fit import FramesFit
+from drake_pose.matching.fit.levenberg_marquardt import Round, StepSettings
+from drake_pose.matching.fit.parameters import CAMERA_NAMES, CameraParameters
+from drake_pose.matching.fit.unknowns import choose
 from drake_pose.multiview.rays import viewing_rays
 from drake_pose.multiview.recordings.figures import pixels_per_metre
 
@@ -34,6 +31,7 @@ Mask = NDArray[np.bool_]
 _TURN, _SHIFT = 0.15, 0.3
 _POSE_ROUNDS = tuple(Round(scale, 0.05) for scale in (0.15, 0.12, 0.10, 0.08, 0.06, 0.05, 0.04))
 _CAMERA_ROUNDS = tuple(Round(scale, 0.05) for scale in (0.4, 0.3, 0.2, 0.15, 0.1, 0.07, 0.05, 0.05))
+_CAMERA_STEPS = StepSettings(longest=2.0, damping=1e-6, even_damping=1e-9)
 _TOLD_APART = Round(0.05, 0.05)
 _ANGLE_DEVIATION = 0.5
 # A camera is at fault where leaving it out lowers the others' misfit to so little of what it was,
@@ -82,7 +80,7 @@ class CameraMotion:
 
 
 def fit_without(
-    fit: SilhouetteFit,
+    fit: ContourFit,
     cameras: Mapping[str, Camera],
     frame: FrameView,
     left_out: str,
@@ -104,7 +102,7 @@ def fit_without(
 
 
 def camera_motion(
-    fit: SilhouetteFit, camera: Camera, edges: Sequence[EdgePoints], poses: Sequence[Array]
+    fit: ContourFit, camera: Camera, edges: Sequence[EdgePoints], poses: Sequence[Array]
 ) -> CameraMotion:
     """The motion of a camera that explains its silhouettes of given poses best.
 
@@ -140,7 +138,7 @@ def _way_to_regions(camera: Camera, edges: Sequence[EdgePoints], places: Array) 
 
 
 def _moved_camera(
-    fit: SilhouetteFit,
+    fit: ContourFit,
     camera: Camera,
     pairs: Sequence[tuple[EdgePoints, Array]],
     middle: Array,
@@ -150,35 +148,33 @@ def _moved_camera(
 
     Seen from the camera, the bodies (about middle (3,)) move, at first by a shift start (3,) [m].
     """
-    twists = np.zeros((6, 7))
-    twists[:3, :3] = np.eye(3)
-    twists[:3, 3:6] = -np.cross(np.eye(3), middle)
-    twists[3:, 3:6] = np.eye(3)
-    motions = affine_motions(twists)
-    reach = np.linalg.norm(camera.X_WC[:3, 3] - middle)
+    reach = float(np.linalg.norm(camera.X_WC[:3, 3] - middle))
+    names = [f"{camera.name}.{name}" for name in CAMERA_NAMES]
     # What the pictures see of a turn about the camera is the person's way about it.
-    information = 1.0 / np.array([_TURN] * 3 + [_SHIFT + _TURN * reach] * 3) ** 2
-    total = _rigid(np.concatenate([np.zeros(3), start]), middle)
-    for step in _CAMERA_ROUNDS:
-        moved = camera.with_pose(np.linalg.inv(total) @ camera.X_WC)
-        H, g = np.diag(information), -information * _twist_of(total, middle)
-        for edge, values in pairs:
-            found = fit.compare([moved], [edge], values, step)
-            lower = found.A.sum(axis=(0, 1))
-            A = np.tril(lower) + np.tril(lower, -1).T
-            H = H + motions @ A @ motions.T
-            g = g + motions @ found.b.sum(axis=(0, 1))
-        total = _rigid(np.asarray(np.linalg.solve(H, g)), middle) @ total
-    return camera.with_pose(np.linalg.inv(total) @ camera.X_WC)
+    deviations = np.array([_TURN] * 3 + [_SHIFT + _TURN * reach] * 3)
+    unknowns = choose([*fit.body.names, *names], names[:6], shared=True, deviation=deviations)
+    frames = FramesFit(
+        fit.body, [camera], unknowns, pivot=middle, noise=fit.noise, steps=_CAMERA_STEPS
+    )
+    found = frames.fit(
+        [pack_evidence([edge]) for edge, _ in pairs],
+        np.array([values for _, values in pairs]),
+        np.zeros((len(pairs), 0)),
+        np.concatenate([np.zeros(3), camera.X_CW[:3, :3] @ start]),
+        _CAMERA_ROUNDS,
+        expected=(np.zeros((len(pairs), 0)), np.zeros(6)),
+    )
+    X_CW = CameraParameters([camera], middle).place(np.append(found.shared, 0.0))[0][0]
+    return camera.with_pose(np.linalg.inv(X_CW))
 
 
-def share_of(fit: SilhouetteFit, camera: Camera, edge: EdgePoints, values: Array) -> float:
+def share_of(fit: ContourFit, camera: Camera, edge: EdgePoints, values: Array) -> float:
     """What share of the contours' lengths fits in one picture."""
-    return PoseFit(values, fit.compare([camera], [edge], values, _TOLD_APART).agreement).share
+    return fit.compare([camera], [edge], values, _TOLD_APART).share
 
 
 def _describe(
-    fit: SilhouetteFit,
+    fit: ContourFit,
     camera: Camera,
     moved: Camera,
     pairs: Sequence[tuple[EdgePoints, Array]],
@@ -208,24 +204,6 @@ def _describe(
     )
 
 
-def _rigid(twist: Array, middle: Array) -> Array:
-    """The motion (4, 4) of a turn about a middle (3,) and a shift (6,) [rad, m]."""
-    X = np.eye(4)
-    X[:3, :3] = Rotation.from_rotvec(twist[:3]).as_matrix()
-    X[:3, 3] = middle - X[:3, :3] @ middle + twist[3:]
-    return X
-
-
-def _twist_of(X: Array, middle: Array) -> Array:
-    """The inverse of _rigid."""
-    return np.concatenate(
-        [
-            Rotation.from_matrix(X[:3, :3]).as_rotvec(),
-            X[:3, 3] - middle + X[:3, :3] @ middle,
-        ]
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class CameraFault:
     """A camera that contradicts the others.
@@ -252,7 +230,7 @@ class CameraFault:
 
 
 def find_fault(
-    fit: SilhouetteFit,
+    fit: ContourFit,
     cameras: Mapping[str, Camera],
     frames: Sequence[FrameView],
     held: Mask | None = None,

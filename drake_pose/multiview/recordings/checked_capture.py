@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from drake_pose.body import PoseTree
 from drake_pose.camera import Camera
 from drake_pose.errors import CameraError, MaskError, SettingsError
+from drake_pose.matching.fit.contour_fit import ContourFit
+from drake_pose.matching.fit.evidence import EdgePoints, find_edge_points
 from drake_pose.multiview.person.shape import shape_noise, shape_values
-from drake_pose.multiview.person.silhouette_edges import EdgePoints, find_edge_points
-from drake_pose.multiview.person.silhouette_fit import SilhouetteFit
 from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker
 from drake_pose.multiview.recordings.camera_faults import (
     CameraFault,
@@ -199,7 +199,7 @@ class _Judge:
         self._cameras, self._recording = cameras, recording
         self._held = shape_values(tree)
         noise = None if captured.shape is None else shape_noise()
-        self._fit = SilhouetteFit(tree, captured.outlines, noise)
+        self._fit = ContourFit(tree, captured.outlines, noise)
         tracker = SilhouetteTracker(self._fit, held=self._held)
         poses = zip(recording.seen, captured.q, strict=True)
         self._values = {k: tracker.values(q) for k, q in poses if np.isfinite(q).all()}

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from drake_pose.body import PoseTree
 from drake_pose.errors import UnknownNameError
+from drake_pose.matching.fit.contour_fit import ContourFit
 from drake_pose.multiview.person.shape import (
     PersonShape,
     shape_noise,
@@ -17,7 +18,6 @@ from drake_pose.multiview.person.shape import (
     shape_values,
     widened,
 )
-from drake_pose.multiview.person.silhouette_fit import SilhouetteFit
 from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker
 from drake_pose.multiview.recordings.person_capture import PersonCaptureSettings
 from drake_pose.silhouette import Outline
@@ -58,7 +58,7 @@ def tracker_of_person(tree: PoseTree, shape: KnownShape | None) -> SilhouetteTra
         UnknownNameError: the shape has a length or a part that the model has not.
     """
     shape = shape or KnownShape({}, {})
-    fit = SilhouetteFit(tree, noise=shape_noise())
+    fit = ContourFit(tree, noise=shape_noise())
     held = shape_values(tree)
     rest = fit.kinematics.flatten(tree.default_values())
     names = list(fit.kinematics.names)
@@ -68,11 +68,11 @@ def tracker_of_person(tree: PoseTree, shape: KnownShape | None) -> SilhouetteTra
             raise UnknownNameError("length", name, known, str(tree.model.path))
         rest[names.index(name)] = length
     if shape.girths:
-        fit = SilhouetteFit(tree, _as_wide(fit, shape.girths), shape_noise())
+        fit = ContourFit(tree, _as_wide(fit, shape.girths), shape_noise())
     return SilhouetteTracker(fit, PersonCaptureSettings().tracker, held, rest)
 
 
-def _as_wide(fit: SilhouetteFit, girths: Mapping[str, float]) -> tuple[Outline, ...]:
+def _as_wide(fit: ContourFit, girths: Mapping[str, float]) -> tuple[Outline, ...]:
     """The fit's surfaces with the given girths by part."""
     parts, groups = shape_parts(fit.tree)
     for part in girths:

@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 from drake_pose.body import PoseTree
 from drake_pose.camera import Camera
 from drake_pose.errors import SettingsError
+from drake_pose.matching.fit.contour_fit import ContourFit
+from drake_pose.matching.fit.evidence import EdgePoints
+from drake_pose.matching.fit.levenberg_marquardt import Round
 from drake_pose.multiview.person.search import SearchSettings
 from drake_pose.multiview.person.shape import PersonShape, fit_shape, shape_noise, shape_values
-from drake_pose.multiview.person.silhouette_edges import EdgePoints
-from drake_pose.multiview.person.silhouette_fit import Round, SilhouetteFit
 from drake_pose.multiview.person.silhouette_tracker import (
     SilhouetteTracker,
     SilhouetteView,
@@ -177,7 +178,7 @@ def _measured(
     tree: PoseTree, recording: _Recording, count: int, settings: PersonCaptureSettings
 ) -> tuple[SilhouetteTracker, PersonShape | None, dict[int, TrackState]]:
     """What follows a person of the shape that the first frames give, the shape, and poses there."""
-    fit = SilhouetteFit(tree, noise=shape_noise())
+    fit = ContourFit(tree, noise=shape_noise())
     is_shape = shape_values(tree)
     tracker = SilhouetteTracker(fit, settings.tracker, is_shape)
     if not is_shape.any():
@@ -188,7 +189,7 @@ def _measured(
     poses = {int(k): one.values for k in wanted if (one := rough[int(k)]) is not None}
     used = list(poses)
     shape = fit_shape(fit, [recording.edges(k) for k in used], np.array(list(poses.values())))
-    worn = SilhouetteFit(tree, shape.outlines, shape_noise())
+    worn = ContourFit(tree, shape.outlines, shape_noise())
     tracker = SilhouetteTracker(worn, settings.tracker, is_shape, shape.values)
     states = {k: tracker.start(pose) for k, pose in zip(used, shape.poses, strict=True)}
     return tracker, shape, states

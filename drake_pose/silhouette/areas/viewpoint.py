@@ -9,10 +9,11 @@ from drake_pose.compiled import compiled
 
 @compiled
 def eye_in_node(X: np.ndarray, camera: np.ndarray) -> tuple[float, float, float, float]:
-    """Returns where a camera stands, or the way it looks, in a node's frame; 1 or 0 says which.
+    """Returns where a camera stands, or the way it looks, in a node's frame, times a last number.
 
-    The parallel camera looks along it, the pinhole stands there: opposite signs, which only turn
-    the winding number's sign.
+    That is 0 where it is the way that a parallel camera looks. A pinhole stands there: opposite
+    signs, which only turn the winding number's sign. The last number is 1 but where the pose X
+    (4, 4) has grown.
     """
     if camera[0] != 0.0:
         return X[2, 0], X[2, 1], X[2, 2], 0.0
@@ -21,5 +22,5 @@ def eye_in_node(X: np.ndarray, camera: np.ndarray) -> tuple[float, float, float,
         -(X[0, 0] * t0 + X[1, 0] * t1 + X[2, 0] * t2),
         -(X[0, 1] * t0 + X[1, 1] * t1 + X[2, 1] * t2),
         -(X[0, 2] * t0 + X[1, 2] * t1 + X[2, 2] * t2),
-        1.0,
+        X[0, 0] * X[0, 0] + X[1, 0] * X[1, 0] + X[2, 0] * X[2, 0],
     )

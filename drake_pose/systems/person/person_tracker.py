@@ -24,7 +24,7 @@ from pydrake.trajectories import Trajectory
 from drake_pose.body import ArticulatedModel
 from drake_pose.camera import Camera, PinholeCamera
 from drake_pose.errors import SettingsError
-from drake_pose.multiview.person.silhouette_fit import PoseFit, SilhouetteFit
+from drake_pose.matching.fit.contour_fit import ContourFit
 from drake_pose.multiview.person.silhouette_tracker import (
     SilhouetteTracker,
     SilhouetteView,
@@ -245,13 +245,13 @@ class PersonTracker(LeafSystem):
         clean = [(camera, view) for camera, view in pairs if camera.name not in sight.merged]
         if not 0 < len(clean) < len(pairs):
             return found
-        agreement = self._tracker.fit.compare(
+        compared = self._tracker.fit.compare(
             [camera for camera, _ in clean],
             [view.edge for _, view in clean],
             found.values,
             self._tracker.settings.rounds[-1],
-        ).agreement
-        return replace(found, share=PoseFit(found.values, agreement).share)
+        )
+        return replace(found, share=compared.share)
 
     def _calc_positions(self, context: Context, output: BasicVector) -> None:
         vector = context.get_discrete_state(self._state).value()
@@ -327,7 +327,7 @@ def build_person_capture(
         ModelError: the model has no landmarks of trunk, arms and legs.
     """
     builder = DiagramBuilder()
-    tracker = SilhouetteTracker(SilhouetteFit(model.pose_tree()))
+    tracker = SilhouetteTracker(ContourFit(model.pose_tree()))
     system = builder.AddNamedSystem(
         "person_tracker", PersonTracker(tracker, list(cameras.values()), period)
     )

@@ -15,7 +15,7 @@ from drake_pose.body.landmarks import landmark_positions, load_landmarks
 from drake_pose.camera import save_cameras
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.errors import ModelError, SceneError, SettingsError
-from drake_pose.multiview.person.silhouette_fit import SilhouetteFit
+from drake_pose.matching.fit.contour_fit import ContourFit
 from drake_pose.multiview.recordings.checked_capture import CheckedCapture
 from drake_pose.multiview.recordings.person_capture import PersonCapture
 from drake_pose.multiview.recordings.person_recording import ViewFaults
@@ -59,7 +59,7 @@ def known(recording: PersonScene, monkeypatch: pytest.MonkeyPatch) -> list[int]:
             q=q,
             shares=np.ones(count),
             shape=None,
-            outlines=SilhouetteFit(tree).outlines,
+            outlines=ContourFit(tree).outlines,
             tree=tree,
             deviations=np.full_like(q, 0.01),
         )

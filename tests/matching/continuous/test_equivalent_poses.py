@@ -10,19 +10,21 @@ from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.errors import SettingsError
 from drake_pose.matching import PoseSet, View
 from drake_pose.matching.continuous.equivalent_poses import RobustFamilies, RobustFamilySettings
-from drake_pose.matching.fit.robust_fit import RobustFit, RobustPass, few_triangles
+from drake_pose.matching.fit.levenberg_marquardt import Round
+from drake_pose.matching.fit.surfaces import few_triangles
+from drake_pose.matching.fit.views_fit import ViewsFit
 from drake_pose.matching.starts.self_motions import flips
 from drake_pose.silhouette import TreeSurfaces
 from tests.matching.arms import arm_cameras, arm_tree, damaged_views, draw_view, split
 
 TRUTH = np.array([0.6, 0.7, -0.7, 0.9, 0.3])
-FINE = RobustPass((0.025, 0.0125), 8, 0.0125)
+FINE = tuple(Round(scale, 0.0125, 8) for scale in (0.025, 0.0125))
 
 
 def find(
     kinematics: TreeKinematics, views: list[View], values: np.ndarray, **settings: object
 ) -> PoseSet:
-    fit = RobustFit(kinematics, few_triangles(TreeSurfaces(kinematics.tree)), views)
+    fit = ViewsFit(kinematics, few_triangles(TreeSurfaces(kinematics.tree)), views)
     families = RobustFamilies(fit, RobustFamilySettings(**settings), lambda: True)
     return families.find([fit.refine(values, FINE)], lambda values: float(values[0]))
 
@@ -89,7 +91,7 @@ def test_a_round_hand_may_turn_as_it_likes(tmp_path: Path) -> None:
 
 def test_time_that_is_up_leaves_the_intervals_of_the_curvature(kinematics: TreeKinematics) -> None:
     views = damaged_views(kinematics.tree, TRUTH, 1)
-    fit = RobustFit(kinematics, few_triangles(TreeSurfaces(kinematics.tree)), views)
+    fit = ViewsFit(kinematics, few_triangles(TreeSurfaces(kinematics.tree)), views)
     pose = fit.refine(TRUTH, FINE)
     before = fit.evaluations
     answer = RobustFamilies(fit, RobustFamilySettings(), lambda: False).find([pose], lambda _: 0.0)

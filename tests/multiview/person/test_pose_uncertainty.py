@@ -5,9 +5,10 @@ import pytest
 
 from drake_pose.body import TriangleMesh, bundled_model, load_model
 from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.matching.fit.contour_fit import ContourFit
+from drake_pose.matching.fit.evidence import find_edge_points
+from drake_pose.matching.fit.levenberg_marquardt import Round
 from drake_pose.multiview.person.pose_uncertainty import pose_uncertainty
-from drake_pose.multiview.person.silhouette_edges import find_edge_points
-from drake_pose.multiview.person.silhouette_fit import Round, SilhouetteFit
 from drake_pose.silhouette import draw_mask, outline_from_mesh
 
 STEP = Round(0.03, 0.05)
@@ -16,7 +17,7 @@ STEP = Round(0.03, 0.05)
 class World:
     def __init__(self):
         self.person = load_model(bundled_model("person"), check=False)
-        self.fit = SilhouetteFit(self.person.pose_tree())
+        self.fit = ContourFit(self.person.pose_tree())
         self.cameras = list(circle_of_cameras(6, size=(320, 240), face_camera=False).values())
         self.names = self.fit.kinematics.names
 
@@ -132,7 +133,7 @@ class TestUncertainty:
         edges = world.edges(values)
         modest = world.deviations(values, edges)
         noise = replace(world.fit.noise, deviation=2.0 * world.fit.noise.deviation)
-        other = SilhouetteFit(world.person.pose_tree(), noise=noise)
+        other = ContourFit(world.person.pose_tree(), noise=noise)
         found = pose_uncertainty(other, world.cameras, edges, values, STEP)
         bold = dict(zip(world.names, np.sqrt(np.diag(found.covariance)), strict=True))
         for name in world.names:

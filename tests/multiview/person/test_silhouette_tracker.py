@@ -6,9 +6,9 @@ import pytest
 from drake_pose.body import bundled_model, load_model
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.errors import ModelError, SettingsError
+from drake_pose.matching.fit.contour_fit import ContourFit
 from drake_pose.multiview.person.body_plan import crowding
 from drake_pose.multiview.person.search import SearchSettings, Sight
-from drake_pose.multiview.person.silhouette_fit import SilhouetteFit
 from drake_pose.multiview.person.silhouette_tracker import (
     SilhouetteTracker,
     TrackerSettings,
@@ -23,7 +23,7 @@ class World:
         ring = circle_of_cameras(5, size=(320, 240), face_camera=False)
         self.cameras = list(ring.values())
         self.renderers = [LabelRenderer(self.person, camera) for camera in self.cameras]
-        self.tracker = SilhouetteTracker(SilhouetteFit(self.person.pose_tree()))
+        self.tracker = SilhouetteTracker(ContourFit(self.person.pose_tree()))
 
     def pose(self, **degrees):
         q = np.zeros(len(self.person.position_names))
@@ -179,4 +179,4 @@ class TestPlan:
     def test_model_without_landmarks_is_refused(self):
         hand = load_model(bundled_model("two_finger_hand"), check=False)
         with pytest.raises(ModelError, match="landmarks"):
-            SilhouetteTracker(SilhouetteFit(hand.pose_tree()))
+            SilhouetteTracker(ContourFit(hand.pose_tree()))

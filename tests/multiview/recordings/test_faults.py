@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.camera import Camera
 from drake_pose.camera.rigs import circle_of_cameras
-from drake_pose.multiview.person.silhouette_edges import find_edge_points
-from drake_pose.multiview.person.silhouette_fit import SilhouetteFit
+from drake_pose.matching.fit.contour_fit import ContourFit
+from drake_pose.matching.fit.evidence import find_edge_points
 from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker, see_silhouette
 from drake_pose.multiview.recordings.camera_faults import (
     CameraFault,
@@ -33,7 +33,7 @@ Masks = list[dict[str, np.ndarray]]
 @dataclass(frozen=True)
 class Stage:
     person: ArticulatedModel
-    fit: SilhouetteFit
+    fit: ContourFit
     cameras: Mapping[str, Camera]
     poses: np.ndarray
     masks: Masks
@@ -63,7 +63,7 @@ def make_stage(count: int) -> Stage:
     person = load_model(bundled_model("person"), check=False)
     cameras = circle_of_cameras(count, size=(160, 120), face_camera=False)
     poses = np.array([stepping(person, 0.4 * k, -0.2 + 0.1 * k, 0.1) for k in range(4)])
-    fit = SilhouetteFit(person.pose_tree())
+    fit = ContourFit(person.pose_tree())
     return Stage(person, fit, cameras, poses, see(person, cameras, poses))
 
 

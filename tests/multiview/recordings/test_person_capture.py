@@ -7,9 +7,9 @@ from drake_pose.body import bundled_model, load_model
 from drake_pose.body.landmarks import landmark_positions, load_landmarks
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.errors import ModelError, SettingsError
+from drake_pose.matching.fit.contour_fit import ContourFit
+from drake_pose.matching.fit.evidence import find_edge_points
 from drake_pose.multiview.person.shape import fit_shape, shape_noise, shape_values, widened
-from drake_pose.multiview.person.silhouette_edges import find_edge_points
-from drake_pose.multiview.person.silhouette_fit import SilhouetteFit
 from drake_pose.multiview.recordings.person_capture import PersonCaptureSettings, capture_person
 from drake_pose.silhouette import LabelRenderer, draw_mask, load_scene
 
@@ -58,7 +58,7 @@ def stepping(person, phase):
 
 class TestShape:
     def test_lengths_are_found(self, person, cameras):
-        fit = SilhouetteFit(person.pose_tree(), noise=shape_noise())
+        fit = ContourFit(person.pose_tree(), noise=shape_noise())
         order = [person.position_index(name) for name in fit.kinematics.names]
         renderers = [LabelRenderer(person, camera) for camera in cameras.values()]
         frames, starts = [], []
@@ -82,7 +82,7 @@ class TestShape:
         assert 0.05 < off @ np.linalg.solve(shape.covariance, off) / len(off) < 2.0
 
     def test_girths_are_found(self, person, cameras):
-        fit = SilhouetteFit(person.pose_tree(), noise=shape_noise())
+        fit = ContourFit(person.pose_tree(), noise=shape_noise())
         order = [person.position_index(name) for name in fit.kinematics.names]
         factors = {"trunk": 1.1, "thigh": 1.2, "shin": 0.9}
         girths = np.ones(len(fit.outlines))
@@ -106,7 +106,7 @@ class TestShape:
         person = load_model(bundled_model("person"), check=False)
         assert not shape_values(person.pose_tree()).any()
         with pytest.raises(ModelError, match="shape joints"):
-            fit_shape(SilhouetteFit(person.pose_tree()), [], np.zeros((0, 23)))
+            fit_shape(ContourFit(person.pose_tree()), [], np.zeros((0, 23)))
 
 
 class TestCapture:

@@ -7,7 +7,7 @@ from pydrake.trajectories import PiecewisePolynomial
 from drake_pose.body import bundled_model, load_model
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.errors import SettingsError
-from drake_pose.multiview.person.silhouette_fit import SilhouetteFit
+from drake_pose.matching.fit.contour_fit import ContourFit
 from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker, see_silhouette
 from drake_pose.silhouette import LabelRenderer
 from drake_pose.systems.person.person_tracker import PersonTracker, build_person_capture
@@ -53,7 +53,7 @@ def test_moving_person_is_followed_and_shown(person, cameras):
 
 
 def test_without_pictures_nobody_is_found(person, cameras):
-    tracker = SilhouetteTracker(SilhouetteFit(person.pose_tree()))
+    tracker = SilhouetteTracker(ContourFit(person.pose_tree()))
     system = PersonTracker(tracker, list(cameras.values()), 0.1)
     simulator = Simulator(system)
     simulator.AdvanceTo(0.25)
@@ -67,7 +67,7 @@ def test_without_pictures_nobody_is_found(person, cameras):
 
 @pytest.mark.slow
 def test_person_is_lost_kept_in_mind_and_found_again(person, cameras):
-    tracker = SilhouetteTracker(SilhouetteFit(person.pose_tree()))
+    tracker = SilhouetteTracker(ContourFit(person.pose_tree()))
     system = PersonTracker(tracker, list(cameras.values()), 0.1)
     simulator = Simulator(system)
     context = simulator.get_context()
@@ -135,7 +135,7 @@ def both(person, cameras, alone):
 @pytest.fixture(scope="module")
 def watch(person, cameras):
     """What comes out for masks (T,), by port: (T, n)."""
-    tracker = SilhouetteTracker(SilhouetteFit(person.pose_tree()))
+    tracker = SilhouetteTracker(ContourFit(person.pose_tree()))
     names = ("estimated_positions", "others", "deviations", "seen")
 
     def watch(frames):
@@ -183,7 +183,7 @@ def test_deviations_tell_how_sure_each_position_is(watch, poses, alone):
 
 
 def test_arguments_are_checked(person, cameras):
-    tracker = SilhouetteTracker(SilhouetteFit(person.pose_tree()))
+    tracker = SilhouetteTracker(ContourFit(person.pose_tree()))
     with pytest.raises(SettingsError, match="two or more"):
         PersonTracker(tracker, list(cameras.values())[:1], 0.1)
     with pytest.raises(SettingsError, match="period"):

@@ -6,7 +6,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.analysis import Simulator
 
 from drake_pose.errors import SettingsError
-from drake_pose.multiview.person.silhouette_fit import SilhouetteFit
+from drake_pose.matching.fit.contour_fit import ContourFit
 from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker, see_silhouette
 from drake_pose.multiview.regions import person_region
 from drake_pose.systems.person.silhouette_capture import build_silhouette_capture
@@ -35,7 +35,7 @@ def backgrounds(studio, cameras):
 
 @pytest.fixture(scope="module")
 def tracker(studio):
-    return SilhouetteTracker(SilhouetteFit(studio.model.pose_tree()))
+    return SilhouetteTracker(ContourFit(studio.model.pose_tree()))
 
 
 @pytest.fixture(scope="module")

@@ -16,8 +16,8 @@ from pydrake.systems.sensors import ImageRgba8U
 from drake_pose.body import ArticulatedModel
 from drake_pose.camera import Camera
 from drake_pose.errors import SettingsError
+from drake_pose.matching.fit.contour_fit import ContourFit
 from drake_pose.multiview.date.capture import CaptureSetup
-from drake_pose.multiview.person.silhouette_fit import SilhouetteFit
 from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker, TrackState
 from drake_pose.multiview.regions import Background
 from drake_pose.systems.date.capture import PaperCapture, build_paper_capture
@@ -173,7 +173,7 @@ class SilhouetteTrack:
         backgrounds: Mapping[str, Background],
     ) -> SilhouetteTrack:
         """A track that knows nothing yet."""
-        tracker = SilhouetteTracker(SilhouetteFit(model.pose_tree()))
+        tracker = SilhouetteTracker(ContourFit(model.pose_tree()))
         capture = build_silhouette_capture(tracker, cameras, backgrounds, _PERIOD, _EDGE_POINTS)
         return SilhouetteTrack(capture, tracker)
 

@@ -1,12 +1,12 @@
-"""The inner loop of the silhouette method: two contours of one camera, compared both ways.
+"""The inner loop of the fit: a body's contour and a silhouette's edge, compared both ways.
 
-Every point of the body's contour is drawn to the nearest point of the region's edge that faces
-alike, and every point of the edge draws the nearest point of the body's contour. The cost of a
-distance r saturates (Geman and McClure): r^2 / (1 + r^2 / c^2), so that what has no counterpart
-costs something and pulls at nothing.
+Every point of the body's contour is drawn to the nearest point of the silhouette's edge that faces
+alike, and every point of the edge draws the nearest point of the contour. The cost of a distance r
+saturates (Geman and McClure 1987): c^2 r^2 / (r^2 + c^2), so that what has no counterpart costs
+something and pulls at nothing.
 
 How a distance changes is linear in the affine motion, 12 numbers, of the node that the point lies
-on. So the points of a node add up to a 12 x 12 matrix, however many parameters move it.
+on. So the points of a node add up to a 12 x 12 matrix, however many unknowns move it.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.compiled import compiled
+from drake_pose.matching.fit.evidence import Evidence
 from drake_pose.matching.fit.pose_jacobian import picture_rows
 from drake_pose.silhouette.areas.outline import PackedOutlines
 from drake_pose.silhouette.contours.contour_points import sample_contour
@@ -29,6 +30,9 @@ Mask = NDArray[np.bool_]
 # Contours correspond only where their normals point alike: at least this cosine.
 _ALIKE = 0.3
 
+COMPARED, FITTING, CLOSE, COST, SQUARES = range(5)
+"""The columns of compare_contours' sums."""
+
 
 @compiled
 def nearest_alike(
@@ -38,7 +42,7 @@ def nearest_alike(
 
     Args:
         uv, normals: (n, 2) points of the body's contour.
-        edge_uv, edge_normals: (k, 2) points of the region's edge, downwards (v ascends).
+        edge_uv, edge_normals: (k, 2) points of the silhouette's edge, downwards (v ascends).
         reach: farther points do not correspond [pixel].
 
     Returns:
@@ -74,29 +78,31 @@ def compare_contours(
     packed: PackedOutlines,
     X_WN: Array,
     cameras: tuple[Array, Array],
-    edges: tuple[Array, Array, Array, Indices],
+    edges: Evidence,
     weights: Array,
     reach: float,
     A: Array,
     b: Array,
-    agreement: Array,
+    sums: Array,
 ) -> None:
-    """Adds what each camera says of the nodes' affine motions, in world lengths.
+    """Adds what each camera says of the nodes' affine motions.
+
+    The cost is x^T A x - 2 b^T x and what it is now, for x the rows of a node's affine motion
+    (3, 4), which moves a point at p_W by M p_W + v.
 
     Args:
         packed: the nodes' surfaces.
         X_WN: (nodes, 4, 4).
         cameras: X_CW (c, 4, 4) and kernel parameters (c, 8).
-        edges: uv (k, 2), normals (k, 2), lengths (k,) of the regions' edges [pixel], camera after
-            camera, v ascending in each; starts (c + 1,).
-        weights: (c, 4) of each camera: metres a pixel, the cost's scale and the spacing of the
-            body's contour [pixel], weight of a pixel of contour.
+        edges: of their silhouettes.
+        weights: (c, 4) of each camera: units of length a pixel, the cost's scale and the spacing of
+            the body's contour [pixel], and what a pixel of contour is worth.
         reach: farther points do not correspond [scales].
-        A, b: (c, nodes, 12, 12), lower triangles, and (c, nodes, 12) added to: the cost is
-            x^T A x - 2 b^T x for x the rows of a node's affine motion (3, 4).
-        agreement: (nodes + 1, 3) added to: the length of each node's contour, and of all edges in
-            the last row, how much of it fits to within the scale, and how well: one minus the cost
-            in scales, summed along it [m].
+        A, b: (c, nodes, 12, 12), lower triangles, and (c, nodes, 12) added to.
+        sums: (c, nodes + 1, 5) added to, of each node's contour, and of all edges in the last row:
+            COMPARED, the length; FITTING, how much of it fits to within the scale; CLOSE, one minus
+            the cost in squares of the scale, summed along it [all in units of length]; COST, and
+            SQUARES of the distances, both as weighted in A and b.
     """
     uv, normals, lengths, starts = edges
     for c in range(len(weights)):
@@ -114,7 +120,7 @@ def compare_contours(
         contour = sample_contour(packed, segments, cameras[1][c], 0.0, weights[c, 2], True)
         edge = (uv[begin:end], normals[begin:end], lengths[begin:end])
         camera = (cameras[0][c], cameras[1][c])
-        _add_camera(contour, edge, X_WN, camera, weights[c], reach, A[c], b[c], agreement)
+        _add_camera(contour, edge, X_WN, camera, weights[c], reach, A[c], b[c], sums[c])
 
 
 @compiled
@@ -127,10 +133,10 @@ def _add_camera(
     reach: float,
     A: Array,
     b: Array,
-    agreement: Array,
+    sums: Array,
 ) -> None:
     """compare_contours for one camera; contour: the arrays of ContourPoints."""
-    metres, scale, _, worth = weights
+    unit, scale, _, worth = weights
     uv, normals, lengths, nodes, p_N, _ = contour
     edge_uv, edge_normals, edge_lengths = edge
     of_point, of_edge = nearest_alike(uv, normals, edge_uv, edge_normals, reach * scale)
@@ -140,9 +146,10 @@ def _add_camera(
         i = pair if pair < n else of_edge[pair - n]
         j = of_point[pair] if pair < n else pair - n
         length = lengths[i] if pair < n else edge_lengths[j]
-        counted = nodes[i] if pair < n else len(agreement) - 1
-        agreement[counted, 0] += length * metres
+        counted = nodes[i] if pair < n else len(sums) - 1
+        sums[counted, COMPARED] += length * unit
         if i < 0 or j < 0:
+            sums[counted, COST] += worth * length * scale * scale
             continue
         n0, n1 = normals[i, 0] + edge_normals[j, 0], normals[i, 1] + edge_normals[j, 1]
         size = math.sqrt(n0 * n0 + n1 * n1)
@@ -150,8 +157,9 @@ def _add_camera(
         r = (edge_uv[j, 0] - uv[i, 0]) * n0 + (edge_uv[j, 1] - uv[i, 1]) * n1
         t = (r / scale) ** 2
         if t < 1.0:
-            agreement[counted, 1] += length * metres
-        agreement[counted, 2] += length * metres / (1.0 + t)
+            sums[counted, FITTING] += length * unit
+        sums[counted, CLOSE] += length * unit / (1.0 + t)
+        sums[counted, COST] += worth * length * r * r / (1.0 + t)
         node = nodes[i]
         for k in range(3):
             p[k] = X_WN[node, k, 3]
@@ -163,6 +171,7 @@ def _add_camera(
             w[4 * k], w[4 * k + 1] = along * p[0], along * p[1]
             w[4 * k + 2], w[4 * k + 3] = along * p[2], along
         weight = worth * length / (1.0 + t) ** 2
+        sums[counted, SQUARES] += weight * r * r
         for k in range(12):
             share = weight * w[k]
             b[node, k] += share * r

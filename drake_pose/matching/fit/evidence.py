@@ -1,7 +1,8 @@
-"""The edge of the person's region as points with normals: all that the silhouette method needs."""
+"""What a fit needs of a silhouette: the points of its edge, with normals."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
@@ -18,13 +19,13 @@ _CHORD = 3
 
 
 class EdgePoints(NamedTuple):
-    """Points of a region's edge in one picture, from top to bottom.
+    """Points of a silhouette's edge in one picture, from top to bottom.
 
     Attributes:
         uv: (n, 2) [pixel].
-        normals: (n, 2) unit normals out of the region.
+        normals: (n, 2) unit normals out of the silhouette.
         lengths: (n,) the length of edge that each stands for [pixel].
-        middle: (2,) the region's middle [pixel]; nan where it is empty.
+        middle: (2,) the silhouette's middle [pixel]; nan where it is empty.
     """
 
     uv: Array
@@ -33,11 +34,37 @@ class EdgePoints(NamedTuple):
     middle: Array
 
 
+class Evidence(NamedTuple):
+    """The edges of one frame's silhouettes, camera after camera.
+
+    Attributes:
+        uv: (n, 2) [pixel], v ascending in each camera.
+        normals: (n, 2) unit normals out of the silhouettes.
+        lengths: (n,) the length of edge that each point stands for [pixel].
+        starts: (cameras + 1,) int64 where each camera's points begin.
+    """
+
+    uv: Array
+    normals: Array
+    lengths: Array
+    starts: NDArray[np.int64]
+
+
+def pack_evidence(edges: Sequence[EdgePoints]) -> Evidence:
+    """The edges of each camera's silhouette in one; one without points says nothing."""
+    return Evidence(
+        np.concatenate([np.zeros((0, 2)), *(edge.uv for edge in edges)]),
+        np.concatenate([np.zeros((0, 2)), *(edge.normals for edge in edges)]),
+        np.concatenate([np.zeros(0), *(edge.lengths for edge in edges)]),
+        np.cumsum([0, *(len(edge.uv) for edge in edges)]),
+    )
+
+
 def find_edge_points(region: Mask, spacing: float) -> EdgePoints:
-    """Points of a region's edge, holes included; the picture's border is no edge.
+    """Points of a silhouette's edge, holes included; the picture's border is no edge.
 
     Args:
-        region: (H, W).
+        region: (H, W) the silhouette.
         spacing: from point to point [pixel].
     """
     contours, _ = cv2.findContours(region.view(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)

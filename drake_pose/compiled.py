@@ -17,6 +17,7 @@ import functools
 import hashlib
 import logging
 import os
+import pickle
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -78,17 +79,29 @@ class _SharedCache(FunctionCache):
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Returns the stored kernel, or None: the caller compiles it then, and saves it."""
-        found = super().load_overload(sig, target_context)
+        found = self._load(sig, target_context)
         if found is not None or self._held is not None:
             return found
         self._held = _lock_file(Path(self.cache_path) / f"{self._impl.filename_base}.lock")
-        found = super().load_overload(sig, target_context)
+        found = self._load(sig, target_context)
         if found is not None:
             self._release()
         else:
             source = Path(self._py_func.__code__.co_filename)
             _announce(Path(self.cache_path), source.parent / "__pycache__")
         return found
+
+    def _load(self, sig: Any, target_context: Any) -> Any:
+        """The stored kernel, or None; what cannot be read any more is thrown away.
+
+        A stored kernel names the modules of its arguments' types, which another version of this
+        package may have moved.
+        """
+        try:
+            return super().load_overload(sig, target_context)
+        except (ImportError, AttributeError, EOFError, pickle.UnpicklingError):
+            self.flush()
+            return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Stores a kernel that was compiled."""

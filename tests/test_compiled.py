@@ -1,6 +1,7 @@
 """Kernels are compiled once for all processes, again when what they call changes, anywhere."""
 
 import os
+import pickle
 import subprocess
 import sys
 import textwrap
@@ -65,6 +66,19 @@ def test_compiled_once_and_again_when_what_it_calls_changes(package: Path) -> No
     write_callee(package, 20, 5)
     assert run(package)[0] == [28, 1]
     assert run(package) == ([28, 0], "")
+
+
+def test_stored_kernels_that_cannot_be_read_any_more(package: Path) -> None:
+    """As where a type of a kernel's arguments lives in another module than it did."""
+    run(package)
+    for index in package.glob("__pycache__/*.nbi"):
+        data = index.read_bytes()
+        first = pickle.loads(data)
+        rest = b"cdrake_pose.moved_away\nThing\n."
+        index.write_bytes(pickle.dumps(first) + rest)
+    values, _ = run(package)
+    assert values == [14, 1]
+    assert run(package)[0] == [14, 0]
 
 
 def test_processes_side_by_side_compile_once(package: Path) -> None:

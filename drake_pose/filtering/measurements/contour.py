@@ -10,15 +10,25 @@ from numpy.typing import NDArray
 
 from drake_pose.body import PoseTree
 from drake_pose.body.tree.link_graph import PlantKinematics
-from drake_pose.body.tree.tree_kinematics import Motions, TreeKinematics
+from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera import Camera
 from drake_pose.errors import SettingsError, UnknownNameError
-from drake_pose.filtering.measurements.contour_edges import find_edges
 from drake_pose.filtering.state import Belief, StateLayout
 from drake_pose.filtering.truncation.inequalities import Inequalities, from_bounds, say_if_unlimited
-from drake_pose.matching.fit.pose_jacobian import normal_jacobian
+from drake_pose.matching.fit.contour_fit import (
+    REACH,
+    Comparison,
+    Noise,
+    Views,
+    compare_views,
+    pack_views,
+    project,
+)
+from drake_pose.matching.fit.evidence import NO_EDGE, find_edge_points
+from drake_pose.matching.fit.kernel import COMPARED, FITTING, SQUARES, WEIGHT
+from drake_pose.matching.fit.levenberg_marquardt import Round
+from drake_pose.matching.fit.parameters import BodyParameters
 from drake_pose.silhouette import Outline, TreeSurfaces, draw_mask
-from drake_pose.silhouette.contours.contour_points import find_contour_points
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -28,7 +38,10 @@ ROOT_SHIFT = ("root_shift_x", "root_shift_y", "root_shift_z")
 
 # Geman and McClure's weight has half its influence at about this many deviations.
 _ROBUST_WIDTH = 2.5
-_MEDIAN_TO_DEVIATION = 1.4826
+# A pixel of contour has weight one.
+_PLAIN = Noise(deviation=1.0, correlation=0.5)
+# Directions about which so small a share of the most is told are not told about.
+_NOTHING = 1e-12
 
 
 @dataclass(frozen=True)
@@ -61,16 +74,15 @@ class ContourSettings:
 class ContourMeasurement:
     """What masks say of a pose near one state: an ``ObservationModel``, linear, made for one frame.
 
-    The distances of hundreds of contour points are rotated into as many numbers as the state has
-    elements, with noise 1, which lose nothing.
+    The distances of hundreds of contour points are summed to normal equations, and these are as
+    many numbers with noise 1 as there are directions of the state that they tell something about.
 
     Attributes:
         names: (k) of the numbers.
         y: (k,) what was measured, 0 at ``at``.
         H: (k, n) the slope.
         at: (n,) the state.
-        points: how many points of the contour were used.
-        share: their share of the contour that the model shows.
+        share: of the contour that the model shows, what has an edge beside it.
         distance: root mean square of their distances, robustly weighted [pixel].
     """
 
@@ -78,7 +90,6 @@ class ContourMeasurement:
     y: Array
     H: Array
     at: Array
-    points: int
     share: float
     distance: float
 
@@ -134,8 +145,8 @@ class ContourObservation:
         self.settings = settings or ContourSettings()
         self._kinematics = TreeKinematics(tree)
         self._surfaces = TreeSurfaces(tree)
-        # Points are found faster in outlines that are known already.
         self._outlines = tuple(self._surfaces.rigid)
+        self._body = BodyParameters(self._kinematics, self._outlines, surfaces=self._surfaces)
         free = self._kinematics.lower < self._kinematics.upper
         names = [n for n, is_free in zip(self._kinematics.names, free, strict=True) if is_free]
         moving = [name for name in names if name not in constant]
@@ -230,84 +241,91 @@ class ContourObservation:
 
     def draw(self, x: Array, camera: Camera) -> Mask:
         """(H, W) what a camera would see of the body at a state (n,)."""
-        motions = self._motions(x)
-        return draw_mask(self._outlines_at(x), camera.X_CW @ motions.X_WN, camera)
-
-    def measure(self, masks: Sequence[Mask | None], x: Array) -> ContourMeasurement | None:
-        """Compare the model's contour at a state with masks.
-
-        Args:
-            masks: (H, W) of each camera, in their order; None where there is no picture.
-            x: (n,).
-
-        Returns:
-            The measurement; None where no edge is near the contour in any mask.
-
-        Raises:
-            SettingsError: masks that do not fit the cameras.
-        """
-        if len(masks) != len(self.cameras):
-            raise SettingsError(f"{len(self.cameras)} masks expected, got {len(masks)}")
-        motions, outlines = self._motions(x), self._outlines_at(x)
-        rows, distances, lengths, shown = [], [], [], 0.0
-        for camera, mask in zip(self.cameras, masks, strict=True):
-            if mask is None:
-                continue
-            if mask.shape != (camera.height, camera.width):
-                raise SettingsError(
-                    f"camera '{camera.name}': mask of {mask.shape[1]} x {mask.shape[0]} pixels, "
-                    f"{camera.width} x {camera.height} expected"
-                )
-            X_CN = camera.X_CW @ motions.X_WN
-            points = find_contour_points(outlines, X_CN, camera, self.settings.spacing)
-            distance = find_edges(mask, points.uv, points.normals, self.settings.reach)
-            near = np.isfinite(distance)
-            shown += float(points.lengths.sum())
-            rows.append(normal_jacobian(points, motions, camera)[near])
-            distances.append(distance[near])
-            lengths.append(points.lengths[near])
-        if not rows or not sum(map(len, distances)):
-            return None
-        return self._compress(
-            x, np.vstack(rows), np.concatenate(distances), np.concatenate(lengths), shown
-        )
-
-    def _motions(self, x: Array) -> Motions:
-        values, shift = self._split(x)
-        motions = self._kinematics.motions(values, translation=True)
-        if not np.any(shift):
-            return motions
-        X_WN, twists = motions.X_WN.copy(), motions.twists.copy()
-        X_WN[motions.moves[:, -1], :3, 3] += shift
-        # Turns are about axes that have moved along.
-        twists[: len(values), 3:6] -= np.cross(twists[: len(values), :3], shift)
-        return Motions(X_WN, twists, motions.moves)
+        X_WN = self._body.place(self._theta(x)).X_WN
+        return draw_mask(self._outlines_at(x), camera.X_CW @ X_WN, camera)
 
     def _outlines_at(self, x: Array) -> tuple[Outline, ...]:
         if not self._surfaces.bends:
             return self._outlines
         return tuple(self._surfaces.at(self.node_values(x)))
 
-    def _compress(
-        self, x: Array, J: Array, distances: Array, lengths: Array, shown: float
-    ) -> ContourMeasurement:
-        """Weigh the points, and rotate them into as many numbers as there are elements."""
+    def look(self, masks: Sequence[Mask | None]) -> Views:
+        """What masks say: the points of their edges, found once for all measurements of a frame.
+
+        Args:
+            masks: (H, W) of each camera, in their order; None where there is no picture.
+
+        Raises:
+            SettingsError: masks that do not fit the cameras.
+        """
+        if len(masks) != len(self.cameras):
+            raise SettingsError(f"{len(self.cameras)} masks expected, got {len(masks)}")
+        edges = []
+        for camera, mask in zip(self.cameras, masks, strict=True):
+            if mask is not None and mask.shape != (camera.height, camera.width):
+                raise SettingsError(
+                    f"camera '{camera.name}': mask of {mask.shape[1]} x {mask.shape[0]} pixels, "
+                    f"{camera.width} x {camera.height} expected"
+                )
+            edges.append(
+                NO_EDGE if mask is None else find_edge_points(mask, 0.5 * self.settings.spacing)
+            )
+        return pack_views(self.cameras, edges)
+
+    def measure(
+        self, seen: Views, x: Array, distance: float | None = None
+    ) -> ContourMeasurement | None:
+        """Compare the model's contour at a state with the edges of masks.
+
+        Args:
+            seen: what the masks say.
+            x: (n,) the state.
+            distance: about how far they are apart [pixel], of the measurement before; None: this is
+                found out first.
+
+        Returns:
+            The measurement; None where no edge is near the contour in any mask.
+        """
+        if distance is None:
+            looked = self._compare(seen, x, self.settings.reach / REACH)
+            if looked is None:
+                return None
+            distance = looked[1]
+        scale = max(self.settings.deviation, distance)
+        found = self._compare(seen, x, _ROBUST_WIDTH * scale)
+        return None if found is None else self._compress(x, *found)
+
+    def _compare(self, seen: Views, x: Array, width: float) -> tuple[Comparison, float] | None:
+        """Contours compared with so wide a scale [pixel], and how far they are apart [pixel]."""
+        step = Round(width, self.settings.spacing)
+        compared = compare_views(self._body, seen, self._theta(x), step, _PLAIN, pixels=1.0)
+        squares, weight = compared.sums[:, :, [SQUARES, WEIGHT]].sum(axis=(0, 1))
+        return None if weight <= 0.0 else (compared, math.sqrt(squares / weight))
+
+    def _theta(self, x: Array) -> Array:
+        """All parameters of the body at a state (n,)."""
+        values, shift = self._split(x)
+        return np.concatenate([values, shift, [0.0]])
+
+    def _compress(self, x: Array, compared: Comparison, distance: float) -> ContourMeasurement:
+        """What the contours say as no more numbers than the state has elements, with noise 1."""
         settings = self.settings
-        scale = _MEDIAN_TO_DEVIATION * float(np.median(np.abs(distances)))
-        scale = max(settings.deviation, scale)
-        robust = 1.0 / (1.0 + (distances / (_ROBUST_WIDTH * scale)) ** 2) ** 2
-        weights = robust * lengths / (scale**2 * settings.correlation)
-        root = np.sqrt(weights)
-        Q, R = np.linalg.qr(root[:, None] * J[:, self._parameter_index])
-        H = np.zeros((len(R), len(self.layout)))
-        H[:, self._state_index] = R
-        mean_square = float(np.sum(weights * distances**2) / np.sum(weights))
+        H, g = project(compared, len(self._body.names))
+        index = self._parameter_index
+        scale = max(settings.deviation, distance)
+        # Both contours say the same: together they count as one.
+        worth = 0.5 / (scale**2 * settings.correlation)
+        size, turns = np.linalg.eigh(worth * H[np.ix_(index, index)])
+        told = size > _NOTHING * max(float(size[-1]), 1e-300)
+        root, turns = np.sqrt(size[told]), turns[:, told]
+        slope = np.zeros((len(root), len(self.layout)))
+        slope[:, self._state_index] = root[:, None] * turns.T
+        contour = compared.sums[:, :-1].sum(axis=(0, 1))
         return ContourMeasurement(
-            names=tuple(f"contour_{k}" for k in range(len(R))),
-            y=Q.T @ (root * distances),
-            H=H,
+            names=tuple(f"contour_{k}" for k in range(len(root))),
+            y=-worth * (turns.T @ g[index]) / root,
+            H=slope,
             at=x,
-            points=len(distances),
-            share=float(lengths.sum()) / shown,
-            distance=math.sqrt(mean_square),
+            share=float(contour[FITTING] / max(contour[COMPARED], 1e-9)),
+            distance=distance,
         )

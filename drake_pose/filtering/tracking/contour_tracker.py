@@ -167,14 +167,16 @@ class ContourTracker:
             observation = observation.with_root_position(root_position)
         prediction = track.state if first else self.filter.predict(track.state)
         state, measurement = prediction, None
+        seen = observation.look(masks)
         for _ in range(self.settings.rounds):
-            measurement = observation.measure(masks, state.best.mean)
+            distance = None if measurement is None else measurement.distance
+            measurement = observation.measure(seen, state.best.mean, distance)
             if measurement is None:
                 break
             state = self.filter.update(prediction, measurement.y, measurement)
         if measurement is None:
             return Track(state, None, track.lost or any(mask is not None for mask in masks))
-        last = observation.measure(masks, state.best.mean)
+        last = observation.measure(seen, state.best.mean, measurement.distance)
         return Track(state, last, last is None or self._is_lost(last))
 
     def _is_lost(self, measurement: ContourMeasurement) -> bool:

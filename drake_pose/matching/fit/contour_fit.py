@@ -37,7 +37,7 @@ Mask = NDArray[np.bool_]
 # Finer than this [pixel] silhouettes cannot tell.
 FINEST_SCALE, FINEST_SPACING = 1.5, 1.0
 # Distances beyond so many scales do not correspond.
-_REACH = 4.0
+REACH = 4.0
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Comparison(NamedTuple):
     """What each camera says of each node's affine motion x (12,): x^T A x - 2 b^T x.
 
     A: (cameras, nodes, 12, 12), lower triangles; b: (cameras, nodes, 12); sums: (cameras,
-    nodes + 1, 5) as of `compare_contours`; placement: of the body.
+    nodes + 1, 6) as of `compare_contours`; placement: of the body.
     """
 
     A: Array
@@ -100,7 +100,7 @@ class PoseFit:
 
     Args:
         values: (m,) of the pose tree [rad or m].
-        sums: (nodes + 1, 5) before the last step, of all cameras, as of `compare_contours`.
+        sums: (nodes + 1, 6) before the last step, of all cameras, as of `compare_contours`.
         cost: of the last comparison, all told.
         evaluations: how often contours were compared.
     """
@@ -123,7 +123,7 @@ class PoseFit:
 
 
 def fitting_share(sums: Array) -> float:
-    """Of both contours' lengths, what fits, 0 to 1; sums (..., 5) of `compare_contours`."""
+    """Of both contours' lengths, what fits, 0 to 1; sums (..., 6) of `compare_contours`."""
     total = sums.reshape(-1, sums.shape[-1]).sum(axis=0)
     return float(total[FITTING] / max(total[COMPARED], 1e-9))
 
@@ -210,7 +210,7 @@ class ContourFit:
         index = np.flatnonzero(np.ones(len(values), bool) if held is None else ~held)
         current = np.array(values, dtype=np.float64)
         current[index] = np.clip(values, self.lower, self.upper)[index]
-        sums = np.zeros((len(self.outlines) + 1, 5))
+        sums = np.zeros((len(self.outlines) + 1, 6))
 
         def evaluate(own: Array, _: Array, step: Round) -> Equations:
             nonlocal sums
@@ -278,14 +278,14 @@ def compare_views(
     )
     nodes = len(placement.X_WN)
     A, b = np.zeros((cameras, nodes, 12, 12)), np.zeros((cameras, nodes, 12))
-    sums = np.zeros((cameras, nodes + 1, 5))
+    sums = np.zeros((cameras, nodes + 1, 6))
     compare_contours(
         placement.packed,
         placement.X_WN,
         views.cameras,
         views.evidence,
         weights,
-        _REACH,
+        REACH,
         A,
         b,
         sums,

@@ -34,6 +34,10 @@ class EdgePoints(NamedTuple):
     middle: Array
 
 
+NO_EDGE = EdgePoints(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.full(2, np.nan))
+"""Of a picture in which nothing is seen, or of none."""
+
+
 class Evidence(NamedTuple):
     """The edges of one frame's silhouettes, camera after camera.
 
@@ -70,7 +74,7 @@ def find_edge_points(region: Mask, spacing: float) -> EdgePoints:
     contours, _ = cv2.findContours(region.view(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     chains = [chain.reshape(-1, 2) for chain in contours if len(chain) > 2 * _CHORD + 1]
     if not chains:
-        return EdgePoints(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.full(2, np.nan))
+        return NO_EDGE
     starts = np.cumsum([0, *(len(chain) for chain in chains)])
     moments = [cv2.moments(chain) for chain in chains]
     # Holes run the other way round, but OpenCV's moments are positive for them, too.

@@ -30,7 +30,7 @@ Mask = NDArray[np.bool_]
 # Contours correspond only where their normals point alike: at least this cosine.
 _ALIKE = 0.3
 
-COMPARED, FITTING, CLOSE, COST, SQUARES = range(5)
+COMPARED, FITTING, CLOSE, COST, SQUARES, WEIGHT = range(6)
 """The columns of compare_contours' sums."""
 
 
@@ -99,10 +99,10 @@ def compare_contours(
             the body's contour [pixel], and what a pixel of contour is worth.
         reach: farther points do not correspond [scales].
         A, b: (c, nodes, 12, 12), lower triangles, and (c, nodes, 12) added to.
-        sums: (c, nodes + 1, 5) added to, of each node's contour, and of all edges in the last row:
+        sums: (c, nodes + 1, 6) added to, of each node's contour, and of all edges in the last row:
             COMPARED, the length; FITTING, how much of it fits to within the scale; CLOSE, one minus
             the cost in squares of the scale, summed along it [all in units of length]; COST, and
-            SQUARES of the distances, both as weighted in A and b.
+            SQUARES of the distances, both as weighted in A and b; WEIGHT, of these.
     """
     uv, normals, lengths, starts = edges
     for c in range(len(weights)):
@@ -172,6 +172,7 @@ def _add_camera(
             w[4 * k + 2], w[4 * k + 3] = along * p[2], along
         weight = worth * length / (1.0 + t) ** 2
         sums[counted, SQUARES] += weight * r * r
+        sums[counted, WEIGHT] += weight
         for k in range(12):
             share = weight * w[k]
             b[node, k] += share * r

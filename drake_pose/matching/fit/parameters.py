@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera import Camera
-from drake_pose.silhouette import Outline
+from drake_pose.silhouette import Outline, TreeSurfaces
 from drake_pose.silhouette.areas.outline import PackedOutlines, pack
 
 Array = NDArray[np.float64]
@@ -72,6 +72,8 @@ class BodyParameters:
         groups: (nodes,) which girth each node has, or -1: how wide it is across its y axis. None:
             there are no girths.
         girth_names: of the girths.
+        surfaces: the pose tree's, where bands of skin shall bend with the values; the outlines are
+            these at rest then, and there are no girths.
     """
 
     def __init__(
@@ -80,7 +82,9 @@ class BodyParameters:
         outlines: Sequence[Outline],
         groups: Sequence[int] | None = None,
         girth_names: Sequence[str] = (),
+        surfaces: TreeSurfaces | None = None,
     ) -> None:
+        self._bending = surfaces if surfaces is not None and surfaces.bends else None
         self.kinematics, self.outlines = kinematics, tuple(outlines)
         self.groups = np.full(len(self.outlines), -1) if groups is None else np.array(groups)
         self.names = (
@@ -114,7 +118,7 @@ class BodyParameters:
         motions = kinematics.motions(theta[:count])
         if len(theta) == count:
             affine = affine_motions(motions.twists)
-            return Placement(self._packed, motions.X_WN, affine, *self._values_only)
+            return Placement(self._at(theta), motions.X_WN, affine, *self._values_only)
         shift, growth = theta[count : count + 3], float(np.exp(theta[count + 3]))
         X_WN, twists = motions.X_WN.copy(), np.zeros((count + 4, 7))
         twists[:count] = motions.twists
@@ -129,9 +133,17 @@ class BodyParameters:
         twists[-1, 3:6], twists[-1, 6] = -root - shift, 1.0
         girths = theta[count + 4 :]
         wide = np.where(self.groups >= 0, np.exp(np.append(girths, 0.0)[self.groups]), 1.0)
-        packed = self._packed if np.all(wide == 1.0) else _widened(self._packed, wide)
+        packed = self._at(theta[:count])
+        if np.any(wide != 1.0):
+            packed = _widened(packed, wide)
         affine = np.vstack([affine_motions(twists), [_widening(X) for X in X_WN]])
         return Placement(packed, X_WN, affine, *self._all)
+
+    def _at(self, values: Array) -> PackedOutlines:
+        """The surfaces at the tree's values (m,)."""
+        if self._bending is None:
+            return self._packed
+        return pack(tuple(self._bending.at(self.kinematics.split(values))))
 
 
 class CameraParameters:

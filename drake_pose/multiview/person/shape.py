@@ -16,7 +16,7 @@ from drake_pose.body import PoseTree, TriangleMesh
 from drake_pose.camera import Camera
 from drake_pose.errors import ModelError
 from drake_pose.matching.fit.contour_fit import ContourFit, Noise
-from drake_pose.matching.fit.evidence import EdgePoints, Evidence, pack_evidence
+from drake_pose.matching.fit.evidence import NO_EDGE, EdgePoints, Evidence, pack_evidence
 from drake_pose.matching.fit.frames_fit import FramesFit
 from drake_pose.matching.fit.levenberg_marquardt import Round
 from drake_pose.matching.fit.parameters import GIRTH_PREFIX, BodyParameters
@@ -182,11 +182,10 @@ def _of_all_cameras(
 ) -> tuple[list[Camera], list[Evidence]]:
     """All cameras that have a picture in some frame, and what each frame's say."""
     known = {camera.name: camera for cameras, _ in frames for camera in cameras}
-    nothing = EdgePoints(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.full(2, np.nan))
     evidence = []
     for cameras, edges in frames:
         seen = {camera.name: edge for camera, edge in zip(cameras, edges, strict=True)}
-        evidence.append(pack_evidence([seen.get(name, nothing) for name in known]))
+        evidence.append(pack_evidence([seen.get(name, NO_EDGE) for name in known]))
     return list(known.values()), evidence
 
 

@@ -34,6 +34,8 @@ _LEVELS = 10
 _CELLS = 40.0
 # A cover has so many rows and columns at most: 80 MB.
 _MOST_CELLS = 500
+# A cell is divided into so many parts along its side, where it has as many pixels.
+_PARTS = 4
 _LEAST_HYPOTHESES = 64
 # So many times the hypotheses kept are looked at for some that do not stand alike.
 _SPARE = 8
@@ -123,9 +125,9 @@ class RoughSearch:
         ]
         self._balls = [
             Balls(
-                body.p_PB[i],
-                body.ball_radii[i],
-                np.full(len(radii), body.surface_areas[i] / max(1, len(radii))),
+                _by_ball(body.p_PB[i]),
+                radii.astype(np.float32),
+                body.surface_areas[i] / max(1, len(radii)),
             )
             for i, radii in enumerate(body.ball_radii)
         ]
@@ -193,7 +195,7 @@ class RoughSearch:
 
     def _cover(self, node: int, X_WN: np.ndarray, masks: list[np.ndarray]) -> list[np.ndarray]:
         """What one hypothesis covers together with a node that has its place."""
-        still = self._balls[node]._replace(p_PB=self._p_NB[node][None])
+        still = self._balls[node]._replace(p_PB=_by_ball(self._p_NB[node][None]))
         one = np.zeros((1, 2), dtype=np.int64)
         return [
             unite_pairs(view, np.ascontiguousarray(view.X_CW @ X_WN[node])[None], still, mask, one)
@@ -253,6 +255,22 @@ class RoughSearch:
         return np.sort(np.unique((cells * keys).sum(axis=1), return_index=True)[1])
 
 
+def _distances_at(
+    mask: np.ndarray, origin: np.ndarray, side: float, rows: int, columns: int
+) -> np.ndarray:
+    """(rows, columns) signed distances in the middles of squares, from an origin (2,) on."""
+    places = [
+        np.clip(np.rint(first + side * (np.arange(count) + 0.5)), 0, size - 1).astype(int)
+        for first, count, size in zip(origin, (rows, columns), mask.shape, strict=True)
+    ]
+    return np.ascontiguousarray(signed_distances(mask)[np.ix_(*places)])
+
+
+def _by_ball(p_PB: np.ndarray) -> np.ndarray:
+    """(k, 3, n) float32 of centres (n, k, 3)."""
+    return np.ascontiguousarray(p_PB.transpose(1, 2, 0), dtype=np.float32)
+
+
 def _mean_size(views: Sequence[View]) -> float:
     """The root of the silhouettes' mean area [pixel]."""
     return math.sqrt(float(np.mean([np.count_nonzero(view.mask) for view in views])))
@@ -273,17 +291,21 @@ def _look_at(body: WideBody, views: Sequence[View], settings: RoughSettings) -> 
         end = np.minimum(points.max(axis=0) + reach, np.add(view.mask.shape, 1.0))
         cell = max(least_cell, float((end - origin).max()) / _MOST_CELLS)
         rows, columns = np.ceil((end - origin) / cell).astype(int)
+        parts = max(1, min(_PARTS, round(cell)))
         cover = np.zeros((_LEVELS, rows, columns, _WORDS), dtype=np.uint64)
         fill_cover(cover, points, origin, cell, radii)
         seen.append(
             RoughView(
                 camera=view.camera.kernel_parameters(),
                 X_CW=np.ascontiguousarray(view.camera.X_CW),
-                distances=signed_distances(view.mask),
                 origin=origin,
                 cell=cell,
                 radii=radii,
                 cover=cover,
+                parts=parts,
+                distances=_distances_at(
+                    view.mask, origin, cell / parts, parts * rows, parts * columns
+                ),
                 point_area=np.count_nonzero(view.mask) / len(points),
                 slack=slack,
             )

@@ -6,12 +6,18 @@ import numpy as np
 import pytest
 
 from drake_pose.body import PoseTree
+from drake_pose.camera import ParallelCamera
 from drake_pose.errors import SettingsError
 from drake_pose.matching import View
 from drake_pose.matching.grid.sampled_body import WideBody
 from drake_pose.matching.grid.settings import WideSearchSettings
-from drake_pose.matching.starts.coarse_kernel import fill_cover
-from drake_pose.matching.starts.coarse_search import RoughSearch, RoughSettings
+from drake_pose.matching.starts.coarse_kernel import fill_cover, score_samples, unite_pairs
+from drake_pose.matching.starts.coarse_search import (
+    RoughSearch,
+    RoughSettings,
+    _spread_points,
+)
+from drake_pose.silhouette.pictures.signed_distances import signed_distances
 from tests.matching.arms import arm_cameras, arm_tree, damaged_views, draw_pose, draw_view, split
 
 SETTINGS = RoughSettings()
@@ -90,6 +96,58 @@ def test_cover_holds_the_points_within_the_radius() -> None:
         expected = np.linalg.norm(points - middle, axis=1) <= radii[level]
         bits = [int(cover[level, i, j, p // 64]) >> (p % 64) & 1 for p in range(100)]
         np.testing.assert_array_equal(bits, expected)
+
+
+@pytest.mark.parametrize("parallel", [False, True])
+def test_scores_are_those_of_balls_looked_at_one_by_one(
+    tree: PoseTree, body: WideBody, parallel: bool
+) -> None:
+    """Against plain numpy: a ball's place, how far it leaves the mask, and the points within it."""
+    generator = np.random.default_rng(5)
+    camera = arm_cameras()[0]
+    values = draw_pose(tree, generator)
+    seen = draw_view(tree, values, camera)
+    if parallel:
+        middle = camera.center_x, camera.center_y
+        camera = ParallelCamera("", camera.width, camera.height, 130.0, *middle, camera.X_WC)
+    search = RoughSearch(body, [View(camera, seen.mask)], SETTINGS)
+    (view,) = search._views
+    distances, points = signed_distances(seen.mask), _spread_points(seen.mask)
+    n, node = 20, 3
+    radii, p_PB = body.ball_radii[node], body.p_PB[node]
+    X_WP = tree.node_poses(split(tree, values))[[node - 1] * n]
+    X_WP[:, :3, 3] += generator.uniform(-0.2, 0.2, (n, 3))
+    X_CP = np.ascontiguousarray(camera.X_CW @ X_WP)
+    scores = np.zeros((n, len(p_PB)))
+    masks = np.zeros((n, 4), dtype=np.uint64)
+    score_samples(view, X_CP, search._balls[node], masks, 0.8, scores)
+    area = body.surface_areas[node] / len(radii)
+    gaps = []
+    for h, sample in np.ndindex(scores.shape):
+        p_WB = p_PB[sample] @ X_WP[h, :3, :3].T + X_WP[h, :3, 3]
+        uv, depth = camera.project(p_WB)
+        pixels = np.full(len(uv), 130.0) if parallel else camera.focal_x / depth
+        size = np.array([camera.width, camera.height])
+        inside = ((uv > -0.5) & (uv < size - 0.5)).all(axis=1)
+        uv, pixels, r = uv[inside], pixels[inside], (pixels * radii)[inside]
+        column, row = np.rint(uv).astype(int).T
+        beyond = distances[row, column] + r - view.slack
+        cost = (pixels**2 * area * np.clip(beyond / (2.0 * r), 0.0, 1.0)).sum()
+        level = np.searchsorted(view.radii, r + view.slack, side="right") - 1
+        within = view.radii[np.maximum(level, 0)]
+        far = np.linalg.norm(points[:, None] - uv[:, ::-1], axis=2)
+        covered = (far <= within).any(axis=1).sum()
+        gaps.append(scores[h, sample] - (0.8 * cost - covered * view.point_area))
+    # The tables know places to a cell and distances to a quarter of one only.
+    assert np.abs(gaps).max() < 0.1 * seen.mask.sum()
+    assert np.abs(np.mean(gaps)) < 0.005 * seen.mask.sum()
+    pairs = np.column_stack([np.arange(n), np.full(n, 2)])
+    united = unite_pairs(view, X_CP, search._balls[node], masks, pairs)
+    again = np.zeros_like(scores)
+    score_samples(view, X_CP, search._balls[node], united, 0.8, again)
+    # What is covered already counts no more.
+    assert (again[:, 2] >= 0.0).all()
+    assert (again[:, 2] > scores[:, 2]).any()
 
 
 @pytest.mark.parametrize(

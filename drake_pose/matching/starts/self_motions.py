@@ -19,6 +19,8 @@ from drake_pose.body.tree.tree_kinematics import TreeKinematics
 _PARALLEL = 0.8
 # What a flip may move, as a share of the body's size.
 _STAYS = 1e-3
+# How far cosines are from where they are if all stays: wider than the above.
+_NEARLY = 0.02
 # Values nearer than this are the same [rad].
 _DIFFERENT = 1e-6
 
@@ -76,9 +78,10 @@ def flips(kinematics: TreeKinematics, values: np.ndarray, count: int = 16) -> li
     """
     untouched = np.zeros(len(values), dtype=np.bool_)
     known = [Flip(values, untouched, untouched)]
+    triples = _chained_triples(kinematics, kinematics.motions(values).moves)
     # One flip may leave the limits and the next return into them.
     for one in known:
-        for flip in _single_flips(kinematics, one):
+        for flip in _single_flips(kinematics, one, triples):
             if len(known) > count:
                 break
             gaps = [np.abs(_remainder(flip.values - other.values)).max() for other in known]
@@ -92,26 +95,52 @@ def flips(kinematics: TreeKinematics, values: np.ndarray, count: int = 16) -> li
     return found
 
 
-def _single_flips(kinematics: TreeKinematics, start: Flip) -> list[Flip]:
-    """One flip more, limits left aside."""
+def _single_flips(kinematics: TreeKinematics, start: Flip, triples: np.ndarray) -> list[Flip]:
+    """One flip more, limits left aside; triples (n, 3) of joints."""
     motions = kinematics.motions(start.values)
     size = float(np.ptp(motions.X_WN[:, :3, 3], axis=0).max()) + 1e-9
-    pairs = sorted(_chained_pairs(kinematics, motions.moves))
+    middles = start.values[triples[:, 1]]
+    mirrored = np.stack([-middles, math.pi - middles], axis=1)
+    possible = _may_stay(motions.twists[:, :3], triples, mirrored - middles[:, None])
     found = []
-    for first, middle in pairs:
-        for last in (one for other, one in pairs if other == middle):
-            for mirrored in (-start.values[middle], math.pi - start.values[middle]):
-                flipped = start.values.copy()
-                flipped[[first, last]] += math.pi
-                flipped[middle] = mirrored
-                node = kinematics.value_nodes[last]
-                gap = kinematics.poses(flipped)[node] - motions.X_WN[node]
-                if max(float(np.abs(gap[:3, :3]).max()), np.abs(gap[:3, 3]).max() / size) < _STAYS:
-                    changed, other_way = start.changed.copy(), start.mirrored.copy()
-                    changed[[first, middle, last]] = True
-                    other_way[middle] = not other_way[middle]
-                    found.append(Flip(flipped, changed, other_way))
+    for row, way in np.argwhere(possible):
+        first, middle, last = triples[row]
+        flipped = start.values.copy()
+        flipped[[first, last]] += math.pi
+        flipped[middle] = mirrored[row, way]
+        node = kinematics.value_nodes[last]
+        gap = kinematics.poses(flipped)[node] - motions.X_WN[node]
+        if max(float(np.abs(gap[:3, :3]).max()), np.abs(gap[:3, 3]).max() / size) < _STAYS:
+            changed, other_way = start.changed.copy(), start.mirrored.copy()
+            changed[[first, middle, last]] = True
+            other_way[middle] = not other_way[middle]
+            found.append(Flip(flipped, changed, other_way))
     return found
+
+
+def _may_stay(axes: np.ndarray, triples: np.ndarray, turns: np.ndarray) -> np.ndarray:
+    """Whether (n, 2) what hangs on the last joint can have its old direction.
+
+    Half turns about two axes make a turn about what is perpendicular to both, by twice the angle
+    between them, and the middle joint must undo it.
+
+    Args:
+        axes: (m, 3) of all joints as they stand.
+        triples: (n, 3) the first, middle and last joint.
+        turns: (n, 2) of the middle joint [rad].
+    """
+    first, middle, last = axes[triples].transpose(1, 0, 2)
+    across = np.abs(np.stack([first * middle, last * middle]).sum(axis=2)).max(axis=0) < _NEARLY
+    between = (first * last).sum(axis=1)
+    undone = np.abs(np.cos(turns) - (2.0 * between**2 - 1.0)[:, None]) < _NEARLY
+    return np.asarray(across[:, None] & undone)
+
+
+def _chained_triples(kinematics: TreeKinematics, moves: np.ndarray) -> np.ndarray:
+    """Triples (n, 3) of angles, each at most two movable angles behind the one before it."""
+    pairs = sorted(_chained_pairs(kinematics, moves))
+    triples = [(*pair, last) for pair in pairs for middle, last in pairs if middle == pair[1]]
+    return np.array(triples, dtype=np.int64).reshape(-1, 3)
 
 
 def _chained_pairs(kinematics: TreeKinematics, moves: np.ndarray) -> list[tuple[int, int]]:

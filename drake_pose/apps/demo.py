@@ -36,7 +36,7 @@ def demo_settings(scene: Path) -> EstimateSettings:
     """Returns the recipe of Kameda, Minoh and Ikeda (experiment B) for a person who stands.
 
     One camera; the root is a foot whose position is known. The foot may point anywhere, and be
-    tilted by 20 degrees. The search is the wide one, at continuous angles.
+    tilted by 20 degrees. The search is the multi-start search, at continuous angles.
     """
     return EstimateSettings(
         root=ROOT,

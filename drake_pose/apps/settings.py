@@ -10,7 +10,7 @@ from typing import Any, Literal
 from drake_pose.apps.options import Axis
 from drake_pose.errors import SettingsError
 
-METHODS = ("auto", "wide", "paper", "person")
+METHODS = ("auto", "beam", "paper", "person")
 ANGLES = ("continuous", "grid")
 # What a search for the pose heeds, and one who is followed by all silhouettes at once does not.
 _OF_THE_SEARCH = (
@@ -43,14 +43,14 @@ class EstimateSettings:
         run_limit: after so many runs of step 3 the search of a frame answers with what it has;
             ``paper`` alone.
         time_limit: after so many seconds the search of a frame answers with what it has; None: no
-            limit. Of the method ``wide`` alone.
+            limit. Of the method ``beam`` alone.
         hold: positions that are known, by name [deg or m].
-        method: ``wide``: many hypotheses side by side; ``paper``: the search as it was published;
+        method: ``beam``: many hypotheses side by side; ``paper``: the search as it was published;
             ``person``: one person is followed by the silhouettes of several cameras at once;
             ``auto``: ``person`` where model and scene allow it and no setting concerns a search,
-            else ``wide``.
+            else ``beam``.
         angles: ``continuous``: refined between the samples; ``grid``: multiples of the interval
-            alone, as always with the method ``paper``. Of the method ``wide`` alone.
+            alone, as always with the method ``paper``. Of the method ``beam`` alone.
         track: whether frames of a sequence are tracked; else every one is matched on its own.
         packages: folders of packages that the model's ``package://`` names mean, by name.
 
@@ -87,8 +87,8 @@ class EstimateSettings:
         for name in ("candidates", "run_limit"):
             if getattr(self, name) < 1:
                 raise SettingsError(f"{name} must be 1 or more, not {getattr(self, name)}")
-        if self.method in ("auto", "wide") and self.outside_limit is not None:
-            raise SettingsError("the wide search has no outside limit r; leave it out")
+        if self.method in ("auto", "beam") and self.outside_limit is not None:
+            raise SettingsError("the beam search has no outside limit r; leave it out")
         if self.method == "person" and self.search_settings:
             raise SettingsError(
                 f"the method person follows a person and searches no pose; leave "

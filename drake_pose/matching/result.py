@@ -135,7 +135,7 @@ class MatchResult:
 
     @property
     def explained(self) -> bool:
-        """Whether the pose explains the silhouettes at least in the rough (UNEXPLAINED)."""
+        """Whether the pose explains the silhouettes at least roughly (UNEXPLAINED)."""
         return bool(self.found and self.E_total < UNEXPLAINED)
 
 

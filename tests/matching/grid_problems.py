@@ -10,8 +10,8 @@ from drake_pose.body import PoseTree
 from drake_pose.camera import ParallelCamera
 from drake_pose.matching import View
 from drake_pose.matching.grid.families.search import samples_at
-from drake_pose.matching.grid.sampled_body import WideBody
-from drake_pose.matching.grid.settings import WideSearchSettings
+from drake_pose.matching.grid.sampled_body import SampledBody
+from drake_pose.matching.grid.settings import BeamSearchSettings
 from drake_pose.matching.scoring import SampledTree, Scoring
 from drake_pose.silhouette import Outline, draw_mask, outline_from_mesh
 
@@ -25,7 +25,7 @@ class GridProblem:
     choices: (poses, nodes) samples; Js: (poses,).
     """
 
-    body: WideBody
+    body: SampledBody
     views: list[View]
     choices: np.ndarray
     Js: np.ndarray
@@ -50,7 +50,7 @@ class ProblemMaker:
 
     def __init__(self, tree: PoseTree, interval: float) -> None:
         self.tree = tree
-        self.body = WideBody(tree, WideSearchSettings(interval=interval))
+        self.body = SampledBody(tree, BeamSearchSettings(interval=interval))
         values = self.body.sampled.values
         choices = itertools.product(*(range(len(grid)) for grid in values))
         self.choices = np.array(list(choices), dtype=np.int64)

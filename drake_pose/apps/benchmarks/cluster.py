@@ -110,7 +110,7 @@ def write_stills(folder: Path, count: int = _STILLS) -> SceneJob:
         for name, value, free in zip(model.position_names, rest, moves, strict=True)
         if not free
     }
-    settings = EstimateSettings(interval=20.0, hold=hold, method="wide", angles="grid")
+    settings = EstimateSettings(interval=20.0, hold=hold, method="beam", angles="grid")
     return SceneJob("stills", folder, model_path, settings, replay=False, chunk=_CHUNK)
 
 

@@ -69,7 +69,7 @@ def benchmark_commands(folder: Path) -> list[list[str]]:
     return [
         ["demo", "--out", str(folder / "demo")],
         [*kameda, "10"],
-        [*kameda, "10", "--method", "wide"],
+        [*kameda, "10", "--method", "beam"],
         [*kameda, "3", "--angles", "continuous"],
         [*kameda, "3", "--angles", "continuous", "--views", "4"],
         ["reproduce", "shimada", "--runs", "5"],

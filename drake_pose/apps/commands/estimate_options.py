@@ -148,7 +148,7 @@ TimeLimitOption = Annotated[
         metavar="SECONDS",
         min=0.0,
         help="Stop the search of a frame after this time and return the best pose so far. Method "
-        "wide only.",
+        "beam only.",
         rich_help_panel=_SEARCH,
     ),
 ]
@@ -156,9 +156,9 @@ MethodOption = Annotated[
     str,
     typer.Option(
         metavar="NAME",
-        help="wide: beam search and continuous fit; paper: Kameda, Minoh and Ikeda's search as "
+        help="beam: beam search and continuous fit; paper: Kameda, Minoh and Ikeda's search as "
         "published; person: one person, fitted to all cameras' silhouettes at once; auto: "
-        "person if model, cameras and options allow it, else wide.",
+        "person if model, cameras and options allow it, else beam.",
         rich_help_panel=_SEARCH,
     ),
 ]
@@ -167,7 +167,7 @@ AnglesOption = Annotated[
     typer.Option(
         metavar="KIND",
         help="continuous: poses are refined between the samples; grid: multiples of the sampling "
-        "interval only. Method wide only.",
+        "interval only. Method beam only.",
         rich_help_panel=_SEARCH,
     ),
 ]

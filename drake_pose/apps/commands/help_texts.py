@@ -133,7 +133,7 @@ position of the head. The table shows the paper's figures beside ours.
 
     drake-pose reproduce kameda --images 20
 
-With --method wide, a beam search on the same grid runs beside the paper's method; branch and bound
+With --method beam, a beam search on the same grid runs beside the paper's method; branch and bound
 then proves its poses optimal, and all poses that look the same are collected. Both stop at a number
 of poses and at some 400 MB; the table says how often that was too little.
 

@@ -30,15 +30,15 @@ def kameda(
     images: Annotated[int, typer.Option(min=1, help="Number of silhouettes.")] = 219,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random poses.")] = 0,
     method: Annotated[
-        str, typer.Option(help="paper: the paper's alone; wide: beam search beside it.")
+        str, typer.Option(help="paper: the paper's alone; beam: beam search beside it.")
     ] = "paper",
     angles: Annotated[
         str,
         typer.Option(
-            help="lattice: true angles and samples are multiples of 20 degrees, as in the paper; "
+            help="grid: true angles and samples are multiples of 20 degrees, as in the paper; "
             "continuous: any true angles, and poses are refined between the samples."
         ),
-    ] = "lattice",
+    ] = "grid",
     outside_limit: Annotated[
         float,
         typer.Option(
@@ -76,7 +76,7 @@ def kameda(
         bool,
         typer.Option(
             "--edges",
-            help="With --method wide: resolve ambiguous silhouettes by the edges inside them (some "
+            help="With --method beam: resolve ambiguous silhouettes by the edges inside them (some "
             "seconds for each).",
         ),
     ] = False,
@@ -89,18 +89,18 @@ def kameda(
     """See help_texts.KAMEDA."""
     with usage_errors():
         EstimateSettings(method=method)
-    if angles not in ("lattice", "continuous"):
-        raise typer.BadParameter("must be lattice or continuous", param_hint="--angles")
-    if edges and method != "wide":
-        raise typer.BadParameter("needs --method wide", param_hint="--edges")
+    if angles not in ("grid", "continuous"):
+        raise typer.BadParameter("must be grid or continuous", param_hint="--angles")
+    if edges and method != "beam":
+        raise typer.BadParameter("needs --method beam", param_hint="--edges")
     others = _OF_GRID if angles == "continuous" else ("views", "mismatch")
     for name in others:
         if str(getattr(context.get_parameter_source(name), "name", "")) == "COMMANDLINE":
-            needed = "lattice" if angles == "continuous" else "continuous"
+            needed = "grid" if angles == "continuous" else "continuous"
             raise typer.BadParameter(
                 f"needs --angles {needed}", param_hint=f"--{name.replace('_', '-')}"
             )
-    if angles == "lattice":
+    if angles == "grid":
         with errors_as_messages():
             paper = (outside_limit, candidates)
             _run_on_grid(images, seed, method, interval, paper, edges, out, json)
@@ -162,9 +162,9 @@ def _run_on_grid(
     from drake_pose.apps.commands.report import count_progress, output_console
     from drake_pose.apps.experiments.kameda.experiment import (
         PAPER_IMAGES,
+        beam_experiment_search,
         experiment_search,
         run_experiment,
-        wide_experiment_search,
     )
     from drake_pose.apps.experiments.kameda.inner_edges import edge_lines, settle_by_edges
     from drake_pose.apps.experiments.kameda.pictures import save_pictures
@@ -178,11 +178,11 @@ def _run_on_grid(
         search = experiment_search(*paper, interval)
         results = [run_experiment(search, paper_images, seed, advance)]
     beside: dict[str, object] = {}
-    if method == "wide":
+    if method == "beam":
         beside["paper_method"] = results[0].as_json()
-        with count_progress("silhouettes, wide search", images) as advance:
-            wide = wide_experiment_search(interval)
-            results.append(run_experiment(wide, images, seed, advance))
+        with count_progress("silhouettes, beam search", images) as advance:
+            beam = beam_experiment_search(interval)
+            results.append(run_experiment(beam, images, seed, advance))
     settled: dict[str, int] = {}
     if edges:
         with count_progress("silhouettes, edges", images) as advance:

@@ -18,7 +18,7 @@ from drake_pose.body import bundled_model, load_model
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera import ParallelCamera
 from drake_pose.compiled import is_stored
-from drake_pose.matching import View, WholeSearch
+from drake_pose.matching import MultiStartSearch, View
 from drake_pose.matching.continuous.multi_start_settings import HALFWAY
 from drake_pose.matching.fit.kernel import collect
 from drake_pose.matching.fit.surfaces import few_triangles
@@ -49,7 +49,7 @@ def main() -> None:
     camera = ParallelCamera("ahead", _SIDE, _SIDE, 300.0, 0.5 * _SIDE, 0.5 * _SIDE, np.eye(4))
     mask = np.zeros((_SIDE, _SIDE), dtype=np.uint8)
     view = View(camera, cv2.circle(mask, (_SIDE // 2, _SIDE // 2), _SIDE // 4, 1, -1) > 0)
-    search = WholeSearch(tree)
+    search = MultiStartSearch(tree)
     surfaces = search.sampled.surfaces
     fit = ViewsFit(TreeKinematics(tree), few_triangles(surfaces), [view])
     values = fit.kinematics.flatten(tree.default_values())

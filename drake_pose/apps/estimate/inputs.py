@@ -26,13 +26,13 @@ from drake_pose.body import ArticulatedModel, PoseTree, RootRotation, load_model
 from drake_pose.camera import Camera
 from drake_pose.errors import SceneError, SettingsError, UnknownNameError
 from drake_pose.matching import (
+    BeamSearchSettings,
     PaperSearch,
     PaperSearchSettings,
     PoseSearch,
-    WideSearchSettings,
 )
-from drake_pose.matching.continuous.multi_start import WholeSearch
-from drake_pose.matching.continuous.multi_start_settings import WholeSearchSettings
+from drake_pose.matching.continuous.multi_start import MultiStartSearch
+from drake_pose.matching.continuous.multi_start_settings import MultiStartSettings
 from drake_pose.matching.continuous.root_placement_search import RootPlacementSearch
 from drake_pose.matching.starts.root_placement import PlacementSettings, hub, turns_freely
 from drake_pose.silhouette import Scene, load_scene, require_visible
@@ -216,14 +216,14 @@ def _make_search(tree: PoseTree, settings: EstimateSettings, model: ArticulatedM
     interval = math.radians(settings.interval)
     intervals = _in_plant_units(model, settings.joint_intervals)
     if settings.method != "paper":
-        wide = WideSearchSettings(
+        beam = BeamSearchSettings(
             interval=interval,
             length_interval=settings.length_interval,
             intervals=intervals,
             time_limit=settings.time_limit,
         )
         continuous = settings.angles == "continuous"
-        return WholeSearch(tree, WholeSearchSettings(wide, continuous))
+        return MultiStartSearch(tree, MultiStartSettings(beam, continuous))
     paper = PaperSearchSettings(
         interval=interval,
         length_interval=settings.length_interval,
@@ -252,7 +252,7 @@ def _make_placement_search(
     if settings.method == "paper":
         raise SettingsError(
             "the paper's search must know where the root is and how large it looks; where the "
-            "scene has no cameras.yaml or the root position is unknown, use --method wide"
+            "scene has no cameras.yaml or the root position is unknown, use --method beam"
         )
     if settings.angles == "grid":
         raise SettingsError(
@@ -265,13 +265,13 @@ def _make_placement_search(
         held = _in_plant_units(model, settings.hold)
         rotation = RootRotation.free(interval_deg=_FREE_ROOT_INTERVAL)
         tree = model.pose_tree(hub(tree), root_position=first, root_rotation=rotation, held=held)
-    wide = WideSearchSettings(
+    beam = BeamSearchSettings(
         interval=math.radians(settings.interval),
         length_interval=settings.length_interval,
         intervals=_in_plant_units(model, settings.joint_intervals),
         time_limit=settings.time_limit,
     )
-    return RootPlacementSearch(tree, wide, PlacementSettings(scale_unknown=scale_unknown))
+    return RootPlacementSearch(tree, beam, PlacementSettings(scale_unknown=scale_unknown))
 
 
 def _check_pictures(

@@ -22,7 +22,7 @@ from drake_pose.apps.results.summary import FrameRecord, check_same_job, describ
 from drake_pose.apps.settings import EstimateSettings
 from drake_pose.camera import Camera, ParallelCamera
 from drake_pose.errors import SettingsError
-from drake_pose.matching import MatchResult, PoseSearch, View, WholeSearch
+from drake_pose.matching import MatchResult, MultiStartSearch, PoseSearch, View
 from drake_pose.matching.continuous.root_placement_search import PlacedMatch
 from drake_pose.matching.starts.root_placement import scale_camera
 from drake_pose.silhouette import LabelRenderer
@@ -76,7 +76,7 @@ def estimate_scene(
     search = inputs.search
     with_base = search is not None and _base_moves(search)
     result = ResultWriter(inputs, job, folder_path, recorded, with_base)
-    by_search = "paper" if settings.method == "paper" else "wide"
+    by_search = "paper" if settings.method == "paper" else "beam"
     result.more["method"] = "person" if search is None else by_search
     result.open()
     try:
@@ -145,7 +145,7 @@ class _Matching:
         """Warn of cameras that contradict each other; few frames are matched again for it."""
         scene, root_positions = self._inputs.scene, self._inputs.root_positions or {}
         search = self._search
-        if isinstance(search, WholeSearch):
+        if isinstance(search, MultiStartSearch):
             search = search.without_alternatives()
 
         def match(frame: str, views: Sequence[View]) -> float:

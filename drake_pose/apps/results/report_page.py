@@ -31,7 +31,7 @@ _STAYS = 1e-9
 _PICTURES = 6
 _PICTURE_SIZE = 300
 _METHODS = {
-    "wide": "searched by many hypotheses side by side",
+    "beam": "searched by many hypotheses side by side",
     "paper": "searched as published",
     "person": "one person followed by all silhouettes at once",
 }

@@ -57,7 +57,7 @@ class FrameRecord:
         outside_limit: r in each view [pixel].
         joint_errors: estimate minus truth by position [deg or m], where the truth is known.
         camera_scale: pixels a metre of a parallel camera whose scale was found.
-        explained: whether the pose explains the silhouettes at least in the rough.
+        explained: whether the pose explains the silhouettes at least roughly.
         joints: what is known of each value of the pose tree, by name.
         families: by name too, in each family of poses that look the same; the first of them.
         family_count: how many families there are; None where the search does not say.

@@ -197,7 +197,7 @@ class RobustFamilies:
             look = self._fit.refine(trial, (_LOOK,), held=(index,))
             values, cost = look.values, look.cost
             if cost > self._limit:
-                # Costs are parabolas in the rough.
+                # Costs are roughly parabolas.
                 a, b, c = (
                     math.sqrt(max(one - best, 0.0)) for one in (before_cost, self._limit, cost)
                 )

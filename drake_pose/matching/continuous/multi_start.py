@@ -1,7 +1,7 @@
-"""The whole search: from silhouettes, damaged and ill fitting ones too, to continuous positions.
+"""Multi-start search: from silhouettes, also damaged or ill fitting, to continuous positions.
 
-A body that is the object itself, in a pose of the grid, is found by the exact stages of the wide
-search, and J = 0 ends the search. Else poses that are right in the rough are found by places
+A body that is the object itself, in a pose of the grid, is found by the exact stages of the beam
+search, and J = 0 ends the search. Else poses that are roughly right are found by places
 (``rough_search``), drawn to the silhouettes' edges by saturating costs (``fit``), and about
 the best of them other explanations are sought: a limb searched again, joints that turn against each
 other (``self_motions``).
@@ -24,7 +24,7 @@ from drake_pose.matching.continuous.multi_start_settings import (
     FROM_AFAR,
     HALFWAY,
     IN_THE_END,
-    WholeSearchSettings,
+    MultiStartSettings,
 )
 from drake_pose.matching.fit.levenberg_marquardt import Round
 from drake_pose.matching.fit.surfaces import few_triangles
@@ -34,18 +34,18 @@ from drake_pose.matching.fit.views_fit import (
     distinct,
     refine_best,
 )
-from drake_pose.matching.grid.beam.search import WideSearch
+from drake_pose.matching.grid.beam.search import BeamSearch
 from drake_pose.matching.grid.families.examination import examine
-from drake_pose.matching.grid.sampled_body import WideBody
+from drake_pose.matching.grid.sampled_body import SampledBody
 from drake_pose.matching.pose_families import PoseSet
 from drake_pose.matching.result import MatchResult, View
 from drake_pose.matching.scoring import Scoring
-from drake_pose.matching.starts.coarse_search import RoughPoses, RoughSearch
+from drake_pose.matching.starts.coarse_search import CoarsePoses, CoarseSearch
 from drake_pose.matching.starts.self_motions import counter_turns, flips
 from drake_pose.silhouette import score_bodies
 
 
-class WholeSearch:
+class MultiStartSearch:
     """Matches silhouettes with a pose tree at continuous values.
 
     Args:
@@ -53,30 +53,30 @@ class WholeSearch:
         settings: the parameters.
     """
 
-    def __init__(self, tree: PoseTree, settings: WholeSearchSettings | None = None) -> None:
+    def __init__(self, tree: PoseTree, settings: MultiStartSettings | None = None) -> None:
         self.tree = tree
-        self.settings = settings or WholeSearchSettings()
-        wide = self.settings.wide
-        self._grid_search = WideSearch(tree, wide, self.settings.examination)
+        self.settings = settings or MultiStartSettings()
+        beam = self.settings.beam
+        self._grid_search = BeamSearch(tree, beam, self.settings.examination)
         self.sampled = self._grid_search.sampled
         if self.settings.continuous:
-            rough = self.settings.rough
-            self._body = WideBody(
+            coarse = self.settings.coarse
+            self._body = SampledBody(
                 tree,
                 replace(
-                    wide,
-                    interval=rough.interval,
-                    length_interval=rough.length_interval,
+                    beam,
+                    interval=coarse.interval,
+                    length_interval=coarse.length_interval,
                     intervals={},
                 ),
             )
             self._outlines = few_triangles(self.sampled.surfaces)
             self._kinematics = TreeKinematics(tree)
 
-    def without_alternatives(self) -> WholeSearch:
+    def without_alternatives(self) -> MultiStartSearch:
         """The same search where only E_total is wanted: one round, and no set of poses."""
         settings = replace(self.settings, rounds=0, families=None, examination=None)
-        return WholeSearch(self.tree, settings)
+        return MultiStartSearch(self.tree, settings)
 
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> MatchResult:
         """Estimate the pose that the views show.
@@ -111,25 +111,25 @@ class WholeSearch:
 
     def _run(
         self, views: Sequence[View], root_position: np.ndarray | None, start: float
-    ) -> _WholeRun:
+    ) -> _MultiStartRun:
         body, kinematics = self._body, self._kinematics
         if root_position is not None:
             body = body.with_root_position(root_position)
             kinematics = TreeKinematics(body.sampled.tree)
-        limit = self.settings.wide.time_limit
+        limit = self.settings.beam.time_limit
         deadline = np.inf if limit is None else start + limit
         fit = ViewsFit(kinematics, self._outlines, views)
-        run = _WholeRun(body, kinematics, fit, views, deadline)
+        run = _MultiStartRun(body, kinematics, fit, views, deadline)
         run.search(self.settings)
         return run
 
 
-class _WholeRun:
+class _MultiStartRun:
     """One match of a body, sampled roughly, with silhouettes, until a deadline."""
 
     def __init__(
         self,
-        body: WideBody,
+        body: SampledBody,
         kinematics: TreeKinematics,
         fit: ViewsFit,
         views: Sequence[View],
@@ -145,13 +145,13 @@ class _WholeRun:
         self._deadline = deadline
         self._families: RobustFamilies | None = None
 
-    def search(self, settings: WholeSearchSettings) -> None:
-        """Find rough poses, refine them, seek other explanations, and refine to the end."""
-        rough_settings = settings.rough
+    def search(self, settings: MultiStartSettings) -> None:
+        """Find coarse poses, refine them, seek other explanations, and refine to the end."""
+        coarse_settings = settings.coarse
         if not self._proceed():
-            rough_settings = replace(rough_settings, hypotheses=1)
-        rough = RoughSearch(self.body, self._views, rough_settings)
-        starts = rough.choose_distinct(rough.find(), settings.starts, settings.apart)
+            coarse_settings = replace(coarse_settings, hypotheses=1)
+        search = CoarseSearch(self.body, self._views, coarse_settings)
+        starts = search.choose_distinct(search.find(), settings.starts, settings.apart)
         pool = refine_best(
             self.fit,
             self._values(starts),
@@ -166,12 +166,12 @@ class _WholeRun:
                 if any(pose.values is values for values in done) or not self._proceed():
                     continue
                 done.append(pose.values)
-                found += self._others(rough, pose.values, settings)
+                found += self._others(search, pose.values, settings)
             pool = distinct([*pool, *found], settings.survivors, self.kinematics.turns_around)
         refined = refine_best(
             self.fit,
-            [pose.values for pose in pool[: settings.answers]],
-            [(IN_THE_END, settings.answers)],
+            [pose.values for pose in pool[: settings.finalists]],
+            [(IN_THE_END, settings.finalists)],
             self._proceed,
         )
         turned = [self.kinematics.nearest_turns(pose.values) for pose in refined]
@@ -188,16 +188,16 @@ class _WholeRun:
         return False
 
     def _others(
-        self, rough: RoughSearch, values: np.ndarray, settings: WholeSearchSettings
+        self, search: CoarseSearch, values: np.ndarray, settings: MultiStartSettings
     ) -> list[FittedPose]:
         """Other explanations near a pose, refined."""
-        kinematics, interval = self.kinematics, settings.rough.interval
+        kinematics, interval = self.kinematics, settings.coarse.interval
         flipped = [flip.values for flip in flips(kinematics, values)]
         tried = counter_turns(kinematics, values, interval)
         X_WN = kinematics.poses(values)
         for nodes in self._limbs():
-            found = rough.find_again(X_WN, nodes)
-            best = rough.choose_distinct(found, settings.tried, settings.apart)
+            found = search.find_again(X_WN, nodes)
+            best = search.choose_distinct(found, settings.tried, settings.apart)
             tried += self._values(best, values)
         look = Round(HALFWAY[0].scale, FROM_AFAR[0].spacing)
         best_looks = []
@@ -214,12 +214,12 @@ class _WholeRun:
             subtrees[i] = [i, *(j for child in nodes[i].children for j in subtrees[child])]
         return [tree for tree in subtrees if 2 * len(tree) <= len(nodes)]
 
-    def _values(self, rough: RoughPoses, values: np.ndarray | None = None) -> list[np.ndarray]:
-        """All values (m,) of rough poses; those of nodes not searched are taken from values."""
+    def _values(self, coarse: CoarsePoses, values: np.ndarray | None = None) -> list[np.ndarray]:
+        """All values (m,) of coarse poses; those of nodes not searched are taken from values."""
         grids = self.body.sampled.values
         base = np.zeros(len(self.kinematics.names)) if values is None else values
         found = []
-        for samples in rough.samples:
+        for samples in coarse.samples:
             parts = list(self.kinematics.split(base.copy()))
             for node, sample in enumerate(samples):
                 if sample >= 0:

@@ -1,4 +1,4 @@
-"""Settings of the whole search."""
+"""Settings of the multi-start search."""
 
 import math
 from dataclasses import dataclass, field
@@ -7,8 +7,8 @@ from drake_pose.errors import SettingsError
 from drake_pose.matching.continuous.equivalent_poses import RobustFamilySettings
 from drake_pose.matching.fit.levenberg_marquardt import Round
 from drake_pose.matching.grid.families.examination import ExaminationSettings
-from drake_pose.matching.grid.settings import WideSearchSettings
-from drake_pose.matching.starts.coarse_search import RoughSettings
+from drake_pose.matching.grid.settings import BeamSearchSettings
+from drake_pose.matching.starts.coarse_search import CoarseSettings
 
 FROM_AFAR = (Round(0.1, 0.04, 3), Round(0.05, 0.04, 3))
 HALFWAY = (Round(0.05, 0.026, 4), Round(0.025, 0.026, 4))
@@ -16,22 +16,22 @@ IN_THE_END = (Round(0.0125, 0.0125, 6),)
 
 
 @dataclass(frozen=True)
-class WholeSearchSettings:
-    """Parameters of the whole search.
+class MultiStartSettings:
+    """Parameters of the multi-start search.
 
     Args:
-        wide: of the search on the grid. Its time limit is that of the whole search.
+        beam: of the search on the grid. Its time limit is that of the multi-start search.
         continuous: False: nothing but the search on the grid is run.
-        rough: of the search for rough poses.
-        starts: so many rough poses are refined.
-        apart: rough poses differ where some part of the body is seen so far away, as a share of
+        coarse: of the search for coarse poses.
+        starts: how many coarse poses are refined.
+        apart: coarse poses differ where some part of the body is seen so far away, as a share of
             the root of the silhouettes' mean area.
-        survivors: so many of them are refined on.
-        answers: so many are refined to the end.
+        survivors: how many of them are refined further.
+        finalists: how many are refined to the end.
         rounds: how often other explanations are sought about the best poses.
-        sought_about: about so many of them.
-        tried: so many other explanations of each are refined.
-        flipped: so many more that flips of its joints make.
+        sought_about: about how many of them.
+        tried: how many other explanations of each are refined.
+        flipped: how many more, made by flips of its joints, are refined.
         families: of the answer as a set; None: only the best pose is wanted.
         examination: of an answer on the grid.
 
@@ -39,13 +39,13 @@ class WholeSearchSettings:
         SettingsError: if a value is out of its range.
     """
 
-    wide: WideSearchSettings = field(default_factory=WideSearchSettings)
+    beam: BeamSearchSettings = field(default_factory=BeamSearchSettings)
     continuous: bool = True
-    rough: RoughSettings = field(default_factory=RoughSettings)
+    coarse: CoarseSettings = field(default_factory=CoarseSettings)
     starts: int = 40
     apart: float = 0.13
     survivors: int = 12
-    answers: int = 4
+    finalists: int = 4
     rounds: int = 2
     sought_about: int = 3
     tried: int = 6
@@ -54,7 +54,7 @@ class WholeSearchSettings:
     examination: ExaminationSettings | None = field(default_factory=ExaminationSettings)
 
     def __post_init__(self) -> None:
-        for name in ("starts", "survivors", "answers", "sought_about", "tried", "flipped"):
+        for name in ("starts", "survivors", "finalists", "sought_about", "tried", "flipped"):
             if getattr(self, name) < 1:
                 raise SettingsError(f"{name} must be 1 or more, not {getattr(self, name)}")
         if self.rounds < 0:

@@ -1,10 +1,10 @@
-"""The wide search where nobody knows where the root is, nor the scale of a parallel camera.
+"""The beam search where nobody knows where the root is, nor the scale of a parallel camera.
 
 The root's samples are the product of its rotations and of positions all over the silhouettes. For
 every scale or depth a beam of hypotheses is grown of which no root position may keep more than its
 quota: what covers most at first is not what fits best at last. Whole poses compare fairly whatever
 their scale. The best are refined with the root free; where the roots of the best of these are, the
-wide search is run as with a known root; and in what comes of that what still fits badly is placed
+beam search is run as with a known root; and in what comes of that what still fits badly is placed
 anew.
 """
 
@@ -24,9 +24,9 @@ from drake_pose.matching.fit.refinement import COARSE_PASSES, FINE_PASSES, Pass,
 from drake_pose.matching.fit.refinement_body import RefinementBody
 from drake_pose.matching.fit.refinement_problem import RefinementProblem
 from drake_pose.matching.grid.beam.hypotheses import Beam, Hypotheses
-from drake_pose.matching.grid.beam.search import WideSearch
+from drake_pose.matching.grid.beam.search import BeamSearch
 from drake_pose.matching.grid.node_poses import Pictures, PoseStore, coarsen
-from drake_pose.matching.grid.settings import Stage, WideSearchSettings
+from drake_pose.matching.grid.settings import BeamSearchSettings, Stage
 from drake_pose.matching.result import MatchResult, View
 from drake_pose.matching.starts.escape import EscapeSettings, escape
 from drake_pose.matching.starts.part_placement import PartSearch
@@ -40,7 +40,7 @@ from drake_pose.matching.starts.root_placement import (
 )
 from drake_pose.silhouette import outline_from_mesh, prefix_sums, score_bodies
 
-# What may lie outside, as in the wide search's tolerant stages; the root is off by half a step.
+# What may lie outside, as in the beam search's tolerant stages; the root is off by half a step.
 _OUTSIDE_SHARE, _OUTSIDE_WEIGHT = 0.6, 2
 # The silhouettes are looked at with about so many pixels.
 _PIXELS = 1500
@@ -104,16 +104,16 @@ class RootPlacementSearch:
     def __init__(
         self,
         tree: PoseTree,
-        settings: WideSearchSettings | None = None,
+        settings: BeamSearchSettings | None = None,
         placement: PlacementSettings | None = None,
     ) -> None:
         if sum(node.parent < 0 for node in tree.nodes) != 1:
             raise SettingsError("a root position can be searched only of a tree with one root")
-        self.settings = settings or WideSearchSettings()
+        self.settings = settings or BeamSearchSettings()
         self.placement = placement or PlacementSettings()
         p_WR = tree.node_poses(tree.default_values())[0, :3, 3]
         self.tree = tree.with_root_position(p_WR)
-        self._grid = WideSearch(
+        self._grid = BeamSearch(
             self.tree,
             replace(self.settings, stages=_STAGES, research_hypotheses=0, time_limit=None),
         )
@@ -268,7 +268,7 @@ class RootPlacementSearch:
         return np.array(self._refined.motions(placed.parameters).X_WN[0, :3, 3])
 
     def _search_again(self, start: _Placed, moves: bool) -> list[_Placed]:
-        """Poses that the wide search finds with the root where it is, refined."""
+        """Poses that the beam search finds with the root where it is, refined."""
         p_WR = self._root_of(start)
         poses = self._grid.best_poses(start.views, p_WR, self.placement.again, _ALIKE)
         return [

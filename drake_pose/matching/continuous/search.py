@@ -1,4 +1,4 @@
-"""The continuous search: the wide search's best poses on grids, refined between their samples."""
+"""The continuous search: the beam search's best poses on grids, refined between their samples."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from drake_pose.matching.fit.refinement import (
 )
 from drake_pose.matching.fit.refinement_body import RefinementBody
 from drake_pose.matching.fit.refinement_problem import RefinementProblem
-from drake_pose.matching.grid.beam.search import WideSearch
-from drake_pose.matching.grid.settings import Stage, WideSearchSettings
+from drake_pose.matching.grid.beam.search import BeamSearch
+from drake_pose.matching.grid.settings import BeamSearchSettings, Stage
 from drake_pose.matching.result import MatchResult, View
 from drake_pose.matching.starts.escape import EscapeSettings, escape, reflect
 from drake_pose.matching.starts.part_placement import PartSearch
@@ -39,8 +39,8 @@ _FAIR = 4.0
 _AGREEING = 1.1
 
 
-def _grid(interval_deg: float, stage: Stage) -> WideSearchSettings:
-    return WideSearchSettings(
+def _grid(interval_deg: float, stage: Stage) -> BeamSearchSettings:
+    return BeamSearchSettings(
         interval=math.radians(interval_deg), stages=(stage,), research_hypotheses=0
     )
 
@@ -49,8 +49,8 @@ def _grid(interval_deg: float, stage: Stage) -> WideSearchSettings:
 _GRIDS = (
     _grid(20.0, Stage(60, 0.3, 5)),
     _grid(15.0, Stage(60, 1.0, 2)),
-    _grid(15.0, Stage(60, 1.0, 2, whole_limbs=True)),
-    _grid(15.0, Stage(60, 0.3, 5, whole_limbs=True)),
+    _grid(15.0, Stage(60, 1.0, 2, limb_by_limb=True)),
+    _grid(15.0, Stage(60, 0.3, 5, limb_by_limb=True)),
 )
 
 
@@ -83,16 +83,16 @@ class ContinuousSearchSettings:
     """Parameters of the continuous search.
 
     Args:
-        grids: of the wide searches that find where to start, at least one; the next one searches
+        grids: of the beam searches that find where to start, at least one; the next one searches
             only where none before has led to a good pose.
         starts: how many poses of each that do not look alike are refined.
-        alike: as in ``WideSearch.best_poses``.
+        alike: as in ``BeamSearch.best_poses``.
         escapes: of how many of these parts are placed anew, the best first.
         refinement: of the refinement.
         time_limit: the search answers with what it has after so many seconds; None: no limit.
     """
 
-    grids: tuple[WideSearchSettings, ...] = _GRIDS
+    grids: tuple[BeamSearchSettings, ...] = _GRIDS
     starts: int = 4
     alike: float = 0.5
     escapes: int = 1
@@ -314,7 +314,7 @@ class ContinuousSearch:
     def __init__(self, tree: PoseTree, settings: ContinuousSearchSettings | None = None) -> None:
         self.tree = tree
         self.settings = settings or ContinuousSearchSettings()
-        self._grids = [WideSearch(tree, grid) for grid in self.settings.grids]
+        self._grids = [BeamSearch(tree, grid) for grid in self.settings.grids]
         self.sampled = self._grids[0].sampled
         self._refiner = Refiner(tree, self.settings.refinement, self.sampled.values)
 

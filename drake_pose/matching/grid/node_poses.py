@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_pose.camera import Camera, ParallelCamera, PinholeCamera
-from drake_pose.matching.grid.sampled_body import WideBody
+from drake_pose.matching.grid.sampled_body import SampledBody
 from drake_pose.matching.result import View
 from drake_pose.silhouette.bits.bit_kernel import draw_bits
 from drake_pose.silhouette.bits.bit_view import WORD, BitView, make_bit_view
@@ -68,7 +68,7 @@ class Pictures:
         band: the width of the band [pixel]; 0: none.
     """
 
-    def __init__(self, body: WideBody, views: Sequence[View], band: int) -> None:
+    def __init__(self, body: SampledBody, views: Sequence[View], band: int) -> None:
         self.body = body
         self.views = tuple(views)
         self.has_bands = band > 0
@@ -119,7 +119,7 @@ class PoseStore:
         outside_share: the share of a node's mean projected area that may lie outside.
     """
 
-    def __init__(self, body: WideBody, pictures: Pictures, outside_share: float) -> None:
+    def __init__(self, body: SampledBody, pictures: Pictures, outside_share: float) -> None:
         self.body = body
         self.pictures = pictures
         self._outside_share = outside_share

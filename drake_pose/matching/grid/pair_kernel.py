@@ -1,4 +1,4 @@
-"""The inner loops of the wide search: pairs of a hypothesis and a pose of its next node.
+"""The inner loops of the beam search: pairs of a hypothesis and a pose of its next node.
 
 A hypothesis is a row of words, the pixels that its nodes cover. Its hash is the sum of half-word
 values times random numbers, modulo 2^64: because new pixels only add to it, the hash of a pair

@@ -1,4 +1,4 @@
-"""What the wide search knows of a sampled body before it sees a picture."""
+"""What the beam search knows of a sampled body before it sees a picture."""
 
 import copy
 
@@ -8,7 +8,7 @@ import numpy as np
 from drake_pose.body import PoseTree, TriangleMesh
 from drake_pose.camera import Camera, ParallelCamera
 from drake_pose.errors import SettingsError
-from drake_pose.matching.grid.settings import WideSearchSettings
+from drake_pose.matching.grid.settings import BeamSearchSettings
 from drake_pose.matching.scoring import SampledTree
 from drake_pose.matching.settings import PaperSearchSettings
 from drake_pose.silhouette import Outline, outline_from_mesh
@@ -26,7 +26,7 @@ _NEARER = 0.8
 _SPREADS = tuple(0.02 * 1.3**k for k in range(13))
 
 
-class WideBody:
+class SampledBody:
     """A sampled tree with what makes its nodes quick to draw and to reject; made once.
 
     Attributes:
@@ -48,7 +48,7 @@ class WideBody:
         SettingsError: if the order does not name every node once, parents before children.
     """
 
-    def __init__(self, tree: PoseTree, settings: WideSearchSettings) -> None:
+    def __init__(self, tree: PoseTree, settings: BeamSearchSettings) -> None:
         self.sampled = SampledTree(
             tree,
             PaperSearchSettings(
@@ -71,10 +71,10 @@ class WideBody:
         self.reach_balls = self._find_reaches()
         self._celled: dict[tuple[int, float, bool], CelledOutline] = {}
         given = named_order(tree, settings.node_order)
-        self.order = given or self._find_order(whole_limbs=False)
-        self.limb_order = given or self._find_order(whole_limbs=True)
+        self.order = given or self._find_order(limb_by_limb=False)
+        self.limb_order = given or self._find_order(limb_by_limb=True)
 
-    def with_root_position(self, root_position: np.ndarray) -> "WideBody":
+    def with_root_position(self, root_position: np.ndarray) -> "SampledBody":
         """The same with the root at another position (3,) [m]; all but the root is shared."""
         moved = copy.copy(self)
         moved.sampled = self.sampled.with_root_position(root_position)
@@ -164,14 +164,14 @@ class WideBody:
         farthest = float(np.linalg.norm(bands - ball[:3], axis=-1).max())
         return np.append(ball[:3], max(ball[3], farthest))
 
-    def _find_order(self, whole_limbs: bool) -> tuple[int, ...]:
+    def _find_order(self, limb_by_limb: bool) -> tuple[int, ...]:
         """Trunk first, then limb after limb, the larger before the smaller.
 
         The trunk is what a fork lies beyond. The nodes at the ends of the limbs come last: they
         are small and have many poses, most of which hang on what is not placed yet.
 
         Args:
-            whole_limbs: a limb's end comes with the limb.
+            limb_by_limb: a limb's end comes with the limb.
         """
         nodes = self.sampled.tree.nodes
         forks = [len(node.children) > 1 for node in nodes]
@@ -184,7 +184,7 @@ class WideBody:
             last = placed[-1] if placed else -1
 
             def rank(i: int, last: int = last) -> tuple[bool, bool, bool, float, int]:
-                is_end = not nodes[i].children and not whole_limbs
+                is_end = not nodes[i].children and not limb_by_limb
                 follows = not is_end and nodes[i].parent == last
                 return not forks[i], is_end, not follows, -sizes[i], i
 

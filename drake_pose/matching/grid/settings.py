@@ -1,4 +1,4 @@
-"""Settings of the wide search."""
+"""Settings of the beam search."""
 
 import math
 from collections.abc import Mapping
@@ -9,7 +9,7 @@ from drake_pose.errors import SettingsError
 
 @dataclass(frozen=True)
 class Stage:
-    """One pass of the wide search over all nodes.
+    """One pass of the beam search over all nodes.
 
     Args:
         hypotheses: how many are kept after each node.
@@ -18,14 +18,14 @@ class Stage:
         outside_weight: what a pixel outside counts in the ranking; a silhouette pixel newly
             covered counts one. J itself counts both alike, but what is outside stays outside,
             while what is not covered yet may be covered by a later node.
-        whole_limbs: place one limb after another, else the ends of all limbs last. What one order
+        limb_by_limb: place one limb after another, else the ends of all limbs last. What one order
             cannot find with few hypotheses, the other often can.
     """
 
     hypotheses: int
     outside_share: float = 0.0
     outside_weight: int = 1
-    whole_limbs: bool = False
+    limb_by_limb: bool = False
 
     def __post_init__(self) -> None:
         if self.hypotheses < 1:
@@ -39,9 +39,9 @@ class Stage:
 EXACT_STAGES = (
     Stage(40),
     Stage(160),
-    Stage(640, whole_limbs=True),
+    Stage(640, limb_by_limb=True),
     Stage(2000),
-    Stage(5000, whole_limbs=True),
+    Stage(5000, limb_by_limb=True),
 )
 """For a body that is the object itself: nothing lies outside. They end at once where it is not."""
 
@@ -50,8 +50,8 @@ TOLERANT_STAGES = (Stage(80, 0.3, 5), Stage(300, 1.0, 2))
 
 
 @dataclass(frozen=True)
-class WideSearchSettings:
-    """Parameters of the wide search.
+class BeamSearchSettings:
+    """Parameters of the beam search.
 
     Args:
         interval: sampling interval of every angle [rad].

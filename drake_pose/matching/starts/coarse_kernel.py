@@ -1,4 +1,4 @@
-"""The inner loops of the rough search: what balls inside a node cover of silhouettes, and leave.
+"""The inner loops of the coarse search: what balls inside a node cover of silhouettes, and leave.
 
 A node is a handful of balls that its picture surely covers. A ball outside the silhouette costs its
 share of the node's area, one that leaves it in part costs part of that; what it covers is looked up
@@ -15,8 +15,8 @@ from drake_pose.compiled import compiled
 from drake_pose.matching.grid.pair_kernel import count_bits
 
 
-class RoughView(NamedTuple):
-    """One silhouette as the rough search sees it.
+class CoarseView(NamedTuple):
+    """One silhouette as the coarse search sees it.
 
     camera: (8,) kernel parameters; X_CW: (4, 4); origin: (2,) first row and column of the cover
     [pixel]; cell: the side of the cover's cells [pixel]; radii: (levels,) [pixel], in equal steps;
@@ -69,7 +69,7 @@ class Balls(NamedTuple):
 def fill_cover(
     cover: np.ndarray, points: np.ndarray, origin: np.ndarray, cell: float, radii: np.ndarray
 ) -> None:
-    """Writes RoughView.cover of points (n, 2) row, column."""
+    """Writes CoarseView.cover of points (n, 2) row, column."""
     for level in range(cover.shape[0]):
         limit = radii[level] ** 2
         for i in range(cover.shape[1]):
@@ -95,7 +95,7 @@ def _make_room(count: int) -> Room:
 
 @compiled
 def _project_ball(
-    view: RoughView, X_CP: np.ndarray, p_PB: np.ndarray, first: int, room: Room
+    view: CoarseView, X_CP: np.ndarray, p_PB: np.ndarray, first: int, room: Room
 ) -> None:
     """Writes where a ball is seen at samples from the first on: room's columns, rows, scales.
 
@@ -131,7 +131,7 @@ def _project_ball(
 
 @compiled
 def _look_at_samples(
-    view: RoughView, X_CP: np.ndarray, balls: Balls, first: int, room: Room
+    view: CoarseView, X_CP: np.ndarray, balls: Balls, first: int, room: Room
 ) -> None:
     """Writes what a node costs and covers at samples from the first on: room's costs, covered."""
     zero, one, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)
@@ -170,7 +170,7 @@ def _look_at_samples(
 
 @compiled
 def score_samples(
-    view: RoughView,
+    view: CoarseView,
     X_CP: np.ndarray,
     balls: Balls,
     masks: np.ndarray,
@@ -200,7 +200,7 @@ def score_samples(
 
 @compiled
 def unite_pairs(
-    view: RoughView, X_CP: np.ndarray, balls: Balls, masks: np.ndarray, pairs: np.ndarray
+    view: CoarseView, X_CP: np.ndarray, balls: Balls, masks: np.ndarray, pairs: np.ndarray
 ) -> np.ndarray:
     """The points (m, 4) that pairs (m, 2) of a hypothesis and a sample cover in one view."""
     united = np.empty((pairs.shape[0], 4), dtype=np.uint64)

@@ -1,4 +1,4 @@
-"""The rough search: poses from which a continuous refinement has a chance.
+"""The coarse search: poses from which a continuous refinement has a chance.
 
 On a grid as coarse as is affordable, the pose nearest to the truth may show less of the silhouette
 than a wrong one: a thin limb half a step off leaves it altogether. So this search compares places,
@@ -17,11 +17,11 @@ import numpy as np
 
 from drake_pose.camera import ParallelCamera
 from drake_pose.errors import SettingsError
-from drake_pose.matching.grid.sampled_body import WideBody
+from drake_pose.matching.grid.sampled_body import SampledBody
 from drake_pose.matching.result import View
 from drake_pose.matching.starts.coarse_kernel import (
     Balls,
-    RoughView,
+    CoarseView,
     fill_cover,
     score_samples,
     unite_pairs,
@@ -44,8 +44,8 @@ _NEARER = 0.7
 
 
 @dataclass(frozen=True)
-class RoughSettings:
-    """Parameters of the rough search.
+class CoarseSettings:
+    """Parameters of the coarse search.
 
     Args:
         interval: sampling interval of every angle [rad].
@@ -80,7 +80,7 @@ class RoughSettings:
 
 
 @dataclass(frozen=True)
-class RoughPoses:
+class CoarsePoses:
     """Poses on the grid, best first.
 
     Args:
@@ -96,13 +96,13 @@ class RoughPoses:
     def __len__(self) -> int:
         return len(self.samples)
 
-    def only(self, chosen: np.ndarray) -> RoughPoses:
+    def only(self, chosen: np.ndarray) -> CoarsePoses:
         """Those at indices."""
-        return RoughPoses(self.samples[chosen], self.X_WN[chosen], self.costs[chosen])
+        return CoarsePoses(self.samples[chosen], self.X_WN[chosen], self.costs[chosen])
 
 
-class RoughSearch:
-    """Finds rough poses of one body in the silhouettes of one instant.
+class CoarseSearch:
+    """Finds coarse poses of one body in the silhouettes of one instant.
 
     Args:
         body: the body, sampled at the settings' intervals.
@@ -110,10 +110,10 @@ class RoughSearch:
         settings: the parameters.
     """
 
-    def __init__(self, body: WideBody, views: Sequence[View], settings: RoughSettings) -> None:
+    def __init__(self, body: SampledBody, views: Sequence[View], settings: CoarseSettings) -> None:
         self.body = body
         self._settings = settings
-        self._views = _look_at(body, views, settings)
+        self._views = _prepare_views(body, views, settings)
         self._size = _mean_size(views)
         self._nodes = body.sampled.tree.nodes
         self._reach = max(
@@ -132,13 +132,13 @@ class RoughSearch:
             for i, radii in enumerate(body.ball_radii)
         ]
 
-    def find(self) -> RoughPoses:
+    def find(self) -> CoarsePoses:
         """Search all nodes."""
         nodes = range(len(self._nodes))
         start = np.tile(np.eye(4), (len(self._nodes), 1, 1))
         return self._find(start, set(nodes), self._settings.hypotheses)
 
-    def find_again(self, X_WN: np.ndarray, again: Sequence[int]) -> RoughPoses:
+    def find_again(self, X_WN: np.ndarray, again: Sequence[int]) -> CoarsePoses:
         """Search some nodes of a pose again.
 
         Args:
@@ -147,9 +147,9 @@ class RoughSearch:
         """
         return self._find(X_WN, set(again), self._settings.again_hypotheses)
 
-    def _find(self, start: np.ndarray, wanted: set[int], hypotheses: int) -> RoughPoses:
+    def _find(self, start: np.ndarray, wanted: set[int], hypotheses: int) -> CoarsePoses:
         nodes = self._nodes
-        poses = RoughPoses(np.full((1, len(nodes)), -1), start[None].copy(), np.zeros(1))
+        poses = CoarsePoses(np.full((1, len(nodes)), -1), start[None].copy(), np.zeros(1))
         masks = [np.zeros((1, _WORDS), dtype=np.uint64) for _ in self._views]
         placed = set(range(len(nodes))) - wanted
         for node in placed:
@@ -160,7 +160,7 @@ class RoughSearch:
                 poses, masks = self._grow(node, poses, masks, placed, hypotheses)
         return poses
 
-    def choose_distinct(self, poses: RoughPoses, count: int, apart: float) -> RoughPoses:
+    def choose_distinct(self, poses: CoarsePoses, count: int, apart: float) -> CoarsePoses:
         """The best poses some ball of which lies apart from where it lies in any better one.
 
         Args:
@@ -187,7 +187,7 @@ class RoughSearch:
                 break
         return poses.only(np.array(chosen, dtype=np.int64))
 
-    def _parent_in(self, view: RoughView, node: int, X_WN: np.ndarray) -> np.ndarray:
+    def _parent_in(self, view: CoarseView, node: int, X_WN: np.ndarray) -> np.ndarray:
         """X_CP (n, 4, 4) of a node's parent at poses X_WN (n, nodes, 4, 4)."""
         parent = self._nodes[node].parent
         X_WP = np.tile(np.eye(4), (len(X_WN), 1, 1)) if parent < 0 else X_WN[:, parent]
@@ -205,11 +205,11 @@ class RoughSearch:
     def _grow(
         self,
         node: int,
-        poses: RoughPoses,
+        poses: CoarsePoses,
         masks: list[np.ndarray],
         placed: set[int],
         hypotheses: int,
-    ) -> tuple[RoughPoses, list[np.ndarray]]:
+    ) -> tuple[CoarsePoses, list[np.ndarray]]:
         """Place one more node in every hypothesis and keep the best."""
         settings, balls = self._settings, self._balls[node]
         X_PN = self.body.sampled.X_PN[node]
@@ -237,7 +237,7 @@ class RoughSearch:
             unite_pairs(view, X_CP, balls, mask, pairs)
             for view, X_CP, mask in zip(self._views, X_CPs, masks, strict=True)
         ]
-        return RoughPoses(samples, X_WN[kept], costs[best]), united
+        return CoarsePoses(samples, X_WN[kept], costs[best]), united
 
     def _unlike(self, X_WN: np.ndarray, placed: set[int]) -> np.ndarray:
         """Indices of the poses whose open nodes stand unlike those of any better pose."""
@@ -276,8 +276,10 @@ def _mean_size(views: Sequence[View]) -> float:
     return math.sqrt(float(np.mean([np.count_nonzero(view.mask) for view in views])))
 
 
-def _look_at(body: WideBody, views: Sequence[View], settings: RoughSettings) -> list[RoughView]:
-    """The silhouettes as the rough search sees them."""
+def _prepare_views(
+    body: SampledBody, views: Sequence[View], settings: CoarseSettings
+) -> list[CoarseView]:
+    """The silhouettes as the coarse search sees them."""
     size = _mean_size(views)
     slack, least_cell = settings.slack * size, max(1.0, size / _CELLS)
     largest = max(max((float(r.max(initial=0.0)) for r in body.ball_radii), default=0.0), 1e-6)
@@ -295,7 +297,7 @@ def _look_at(body: WideBody, views: Sequence[View], settings: RoughSettings) -> 
         cover = np.zeros((_LEVELS, rows, columns, _WORDS), dtype=np.uint64)
         fill_cover(cover, points, origin, cell, radii)
         seen.append(
-            RoughView(
+            CoarseView(
                 camera=view.camera.kernel_parameters(),
                 X_CW=np.ascontiguousarray(view.camera.X_CW),
                 origin=origin,
@@ -313,7 +315,7 @@ def _look_at(body: WideBody, views: Sequence[View], settings: RoughSettings) -> 
     return seen
 
 
-def _largest_scale(body: WideBody, view: View) -> float:
+def _largest_scale(body: SampledBody, view: View) -> float:
     """Pixels a metre at the nearest place where the body may be."""
     scale = float(view.camera.kernel_parameters()[1])
     if isinstance(view.camera, ParallelCamera):

@@ -20,7 +20,7 @@ from scipy.ndimage import distance_transform_edt
 from drake_pose.body import PoseTree
 from drake_pose.camera import Camera, ParallelCamera
 from drake_pose.errors import SettingsError
-from drake_pose.matching.grid.sampled_body import WideBody
+from drake_pose.matching.grid.sampled_body import SampledBody
 from drake_pose.matching.result import View
 from drake_pose.silhouette import score_bodies
 
@@ -92,7 +92,7 @@ class Layer:
 
 
 def find_layers(
-    body: WideBody, views: Sequence[View], settings: PlacementSettings, known: np.ndarray | None
+    body: SampledBody, views: Sequence[View], settings: PlacementSettings, known: np.ndarray | None
 ) -> list[Layer]:
     """Where the root can be, the likeliest scales and depths first.
 
@@ -179,7 +179,7 @@ def whereabouts(views: Sequence[View], p_WR: np.ndarray, settings: PlacementSett
     return np.array(here)
 
 
-def place_body(body: WideBody, positions: np.ndarray) -> WideBody:
+def place_body(body: SampledBody, positions: np.ndarray) -> SampledBody:
     """The body whose root is sampled at all combinations of positions (n, 3) and its rotations.
 
     Sample i of the root is rotation i % r at position i // r, of r rotations.
@@ -200,7 +200,7 @@ def place_body(body: WideBody, positions: np.ndarray) -> WideBody:
     return placed
 
 
-def _pixel_sizes(body: WideBody, view: View, settings: PlacementSettings) -> np.ndarray:
+def _pixel_sizes(body: SampledBody, view: View, settings: PlacementSettings) -> np.ndarray:
     """How many pixels a metre at the body may have (n,), the likeliest first."""
     area = float(view.mask.sum())
     low, middle, high = np.quantile(_random_areas(body, view.camera), [_RARE, 0.5, 1.0 - _RARE])
@@ -215,7 +215,7 @@ def _pixel_sizes(body: WideBody, view: View, settings: PlacementSettings) -> np.
     return np.asarray(likely * settings.ratio**steps)
 
 
-def _random_areas(body: WideBody, camera: Camera) -> np.ndarray:
+def _random_areas(body: SampledBody, camera: Camera) -> np.ndarray:
     """Areas of parallel projections of random poses of the grid, seen along the camera's axis."""
     generator = np.random.default_rng(1)
     sampled, nodes = body.sampled, body.sampled.tree.nodes

@@ -319,14 +319,14 @@ def test_job_file_gives_the_settings(tmp_path):
     entry = {
         "scene": "a", "model": "m.urdf", "cameras": ["left"], "frames": "0:9", "root": "base",
         "root_position": [1, 2, 3], "root_rotation": "y=-180:180", "interval": 5,
-        "hold": {"lift": 10}, "method": "wide", "truth": "t.csv", "replay": False,
+        "hold": {"lift": 10}, "method": "beam", "truth": "t.csv", "replay": False,
     }  # fmt: skip
     path = tmp_path / "jobs.yaml"
     path.write_text(yaml.safe_dump({"scenes": {"a": entry}}))
     (job,) = read_job(path, chunk=7)
     settings = EstimateSettings(
         cameras=("left",), frames=("0:9",), root="base", root_position=(1.0, 2.0, 3.0),
-        root_rotation={"y": (-180.0, 180.0)}, interval=5.0, hold={"lift": 10.0}, method="wide",
+        root_rotation={"y": (-180.0, 180.0)}, interval=5.0, hold={"lift": 10.0}, method="beam",
     )  # fmt: skip
     truth = tmp_path / "t.csv"
     assert job == SceneJob(

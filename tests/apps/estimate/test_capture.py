@@ -261,7 +261,7 @@ def test_resuming_with_more_frames_loses_none(
 @pytest.mark.parametrize(
     "settings",
     [
-        EstimateSettings(method="wide"),
+        EstimateSettings(method="beam"),
         EstimateSettings(cameras=("camera_0",)),
         EstimateSettings(hold={"left_forearm_x": -20.0}),
         EstimateSettings(root="left_foot", root_position=(0.0, 0.0, 0.0)),

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from drake_pose.apps.main import app
 from tests.apps.scenes import NAMES, TinyScene, camera, read_rows
 
-WIDE = ("--method", "wide", "--interval", "20", "--frame", "0", "--no-replay")
+BEAM = ("--method", "beam", "--interval", "20", "--frame", "0", "--no-replay")
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def bare_scene(own_scene: TinyScene) -> TinyScene:
 
 def run(runner: CliRunner, scene: TinyScene, out: Path, *more: str) -> tuple[np.ndarray, dict]:
     """The positions and the record of the first frame."""
-    given = [str(scene.folder), "--model", str(scene.model), "--out", str(out), *WIDE, *more]
+    given = [str(scene.folder), "--model", str(scene.model), "--out", str(out), *BEAM, *more]
     result = runner.invoke(app, ["estimate", *given])
     assert result.exit_code == 0, result.output
     (row,) = read_rows(out / "poses.csv")
@@ -59,8 +59,8 @@ def test_a_root_position_that_is_not_known(
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        (["--method", "paper"], "--method wide"),
-        (["--method", "wide", "--angles", "grid"], "angles are continuous"),
+        (["--method", "paper"], "--method beam"),
+        (["--method", "beam", "--angles", "grid"], "angles are continuous"),
     ],
 )
 def test_what_needs_a_known_root_is_refused(

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from drake_pose.apps.experiments.kameda.experiment import (
+    beam_experiment_search,
     draw_values,
     experiment_camera,
-    wide_experiment_search,
 )
 from drake_pose.apps.experiments.kameda.family_pictures import save_families
 from drake_pose.matching.grid.families.search import find_families, samples_at
@@ -18,10 +18,10 @@ from tests.matching.grid_problems import show_pose
 
 @pytest.mark.slow
 def test_a_column_for_each_family(tmp_path: Path) -> None:
-    search, camera = wide_experiment_search(), experiment_camera()
+    search, camera = beam_experiment_search(), experiment_camera()
     generator = np.random.default_rng(77)
     for _ in range(20):
-        values = draw_values(search, "lattice", generator)
+        values = draw_values(search, "grid", generator)
         view = show_pose(search.sampled, values, camera)
         samples = samples_at(search.sampled, values)
         assert samples is not None

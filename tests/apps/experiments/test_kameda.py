@@ -5,11 +5,11 @@ import pytest
 
 from drake_pose.apps.experiments.kameda.experiment import (
     PAPER,
+    beam_experiment_search,
     draw_values,
     experiment_camera,
     experiment_search,
     run_experiment,
-    wide_experiment_search,
 )
 from drake_pose.apps.experiments.kameda.pictures import save_pictures
 from drake_pose.apps.experiments.kameda.table import experiment_table
@@ -33,7 +33,7 @@ def test_the_camera_is_the_papers():
 
 def test_lattice_angles_are_multiples_of_20_degrees_inside_table_2():
     search = experiment_search()
-    values = draw_values(search, "lattice", np.random.default_rng(1))
+    values = draw_values(search, "grid", np.random.default_rng(1))
     for node, node_values in zip(search.tree.nodes, values, strict=True):
         model = search.tree.model
         for index, value in zip(node.positions, node_values, strict=True):
@@ -88,14 +88,14 @@ def test_nothing_outside_allowed_is_exact_far_more_often():
 
 @pytest.fixture(scope="module")
 def wide_result():
-    return run_experiment(wide_experiment_search(), images=12, seed=5)
+    return run_experiment(beam_experiment_search(), images=12, seed=5)
 
 
 def test_the_wide_search_matches_every_silhouette_exactly(wide_result):
     """Without being told r, in one run over poses that the paper's search mostly misses."""
     figures = wide_result.as_json()
     assert figures["exact"] == figures["proved"] == figures["truth_in_set"] == 12
-    assert figures["method"] == "wide"
+    assert figures["method"] == "beam"
 
 
 def test_the_truth_is_in_the_set(wide_result):
@@ -112,7 +112,7 @@ def test_three_columns_stand_side_by_side(result, wide_result):
         "figure",
         "paper",
         "the paper's method",
-        "wide search",
+        "beam search",
     ]
     assert table.row_count > experiment_table([result]).row_count
 

@@ -116,8 +116,8 @@ def test_the_command_prints_both_bodies():
         (["--views", "2"], "continuous"),
         (["--views", "1"], "continuous"),
         (["--views", "0", "--angles", "continuous"], "views"),
-        (["--angles", "continuous", "--method", "paper"], "lattice"),
-        (["--angles", "continuous", "--outside-limit", "200"], "lattice"),
+        (["--angles", "continuous", "--method", "paper"], "grid"),
+        (["--angles", "continuous", "--outside-limit", "200"], "grid"),
     ],
 )
 def test_wrong_options_are_refused(arguments, word):

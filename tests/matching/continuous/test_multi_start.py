@@ -1,4 +1,4 @@
-"""The whole search on arms drawn by the tests, clean and damaged, and on bad input."""
+"""The multi-start search on arms drawn by the tests, clean and damaged, and on bad input."""
 
 import cv2
 import numpy as np
@@ -7,9 +7,9 @@ import pytest
 from drake_pose.body import PoseTree
 from drake_pose.errors import SettingsError
 from drake_pose.matching import MatchResult, View
-from drake_pose.matching.continuous.multi_start import WholeSearch
-from drake_pose.matching.continuous.multi_start_settings import WholeSearchSettings
-from drake_pose.matching.grid.settings import WideSearchSettings
+from drake_pose.matching.continuous.multi_start import MultiStartSearch
+from drake_pose.matching.continuous.multi_start_settings import MultiStartSettings
+from drake_pose.matching.grid.settings import BeamSearchSettings
 from tests.matching.arms import arm_cameras, arm_tree, damaged_views, draw_pose, draw_view, split
 
 GRID = np.radians(20.0)
@@ -21,8 +21,8 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> PoseTree:
 
 
 @pytest.fixture(scope="module")
-def search(tree: PoseTree) -> WholeSearch:
-    return WholeSearch(tree, WholeSearchSettings(WideSearchSettings(interval=GRID)))
+def search(tree: PoseTree) -> MultiStartSearch:
+    return MultiStartSearch(tree, MultiStartSettings(BeamSearchSettings(interval=GRID)))
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,7 @@ def recount(tree: PoseTree, result: MatchResult, views: list[View]) -> int:
 
 
 def test_continuous_pose_is_found_and_said_to_be_known(
-    tree: PoseTree, search: WholeSearch, pose: np.ndarray
+    tree: PoseTree, search: MultiStartSearch, pose: np.ndarray
 ) -> None:
     views = clean_views(tree, pose)
     result = search.match(views)
@@ -75,7 +75,9 @@ def test_continuous_pose_is_found_and_said_to_be_known(
     assert sum(answer.determined) >= 4
 
 
-def test_a_pose_of_the_grid_ends_the_search_at_once(tree: PoseTree, search: WholeSearch) -> None:
+def test_a_pose_of_the_grid_ends_the_search_at_once(
+    tree: PoseTree, search: MultiStartSearch
+) -> None:
     grids = search.sampled.values
     generator = np.random.default_rng(5)
     values = np.concatenate([grid[generator.integers(len(grid))] for grid in grids])
@@ -86,14 +88,14 @@ def test_a_pose_of_the_grid_ends_the_search_at_once(tree: PoseTree, search: Whol
 
 
 def test_grid_alone(tree: PoseTree, pose: np.ndarray) -> None:
-    settings = WholeSearchSettings(WideSearchSettings(interval=GRID), continuous=False)
-    result = WholeSearch(tree, settings).match(clean_views(tree, pose))
+    settings = MultiStartSettings(BeamSearchSettings(interval=GRID), continuous=False)
+    result = MultiStartSearch(tree, settings).match(clean_views(tree, pose))
     steps = all_values(result) / GRID
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-6)
 
 
 @pytest.mark.slow
-def test_damaged_and_ill_fitting_arms(tree: PoseTree, search: WholeSearch) -> None:
+def test_damaged_and_ill_fitting_arms(tree: PoseTree, search: MultiStartSearch) -> None:
     places, held = [], []
     for seed in range(8):
         values = draw_pose(tree, np.random.default_rng(100 + seed))
@@ -111,7 +113,7 @@ def test_damaged_and_ill_fitting_arms(tree: PoseTree, search: WholeSearch) -> No
     assert np.mean(held) >= 0.85
 
 
-def test_the_same_every_time(tree: PoseTree, search: WholeSearch, pose: np.ndarray) -> None:
+def test_the_same_every_time(tree: PoseTree, search: MultiStartSearch, pose: np.ndarray) -> None:
     views = damaged_views(tree, pose, 3)
     first, again = search.match(views), search.match(views)
     np.testing.assert_array_equal(first.q, again.q)
@@ -122,16 +124,16 @@ def test_the_same_every_time(tree: PoseTree, search: WholeSearch, pose: np.ndarr
 
 
 def test_no_time_at_all(tree: PoseTree, pose: np.ndarray) -> None:
-    settings = WholeSearchSettings(WideSearchSettings(interval=GRID, time_limit=0.0))
+    settings = MultiStartSettings(BeamSearchSettings(interval=GRID, time_limit=0.0))
     views = clean_views(tree, pose)
-    result = WholeSearch(tree, settings).match(views)
+    result = MultiStartSearch(tree, settings).match(views)
     assert result.found
     assert result.stopped_by == "time_limit"
     assert result.J == recount(tree, result, views)
     assert result.seconds < 2.0
 
 
-def test_a_mask_that_no_pose_explains(search: WholeSearch) -> None:
+def test_a_mask_that_no_pose_explains(search: MultiStartSearch) -> None:
     views = []
     for camera in arm_cameras():
         mask = np.zeros((camera.height, camera.width), dtype=bool)
@@ -144,7 +146,7 @@ def test_a_mask_that_no_pose_explains(search: WholeSearch) -> None:
 
 
 @pytest.mark.parametrize("which", ["all", "one pixel"])
-def test_masks_without_a_shape(search: WholeSearch, which: str) -> None:
+def test_masks_without_a_shape(search: MultiStartSearch, which: str) -> None:
     (camera, _) = arm_cameras()
     mask = np.full((camera.height, camera.width), which == "all")
     mask[100, 150] = True
@@ -155,7 +157,7 @@ def test_masks_without_a_shape(search: WholeSearch, which: str) -> None:
 
 
 def test_body_cut_off_by_the_pictures_edge(
-    tree: PoseTree, search: WholeSearch, pose: np.ndarray
+    tree: PoseTree, search: MultiStartSearch, pose: np.ndarray
 ) -> None:
     """What would lie outside the picture does not count against a pose."""
     views = []
@@ -174,7 +176,9 @@ def test_body_cut_off_by_the_pictures_edge(
     assert worst_place(tree, result, pose) < 0.02
 
 
-def test_other_things_in_the_picture(tree: PoseTree, search: WholeSearch, pose: np.ndarray) -> None:
+def test_other_things_in_the_picture(
+    tree: PoseTree, search: MultiStartSearch, pose: np.ndarray
+) -> None:
     views = clean_views(tree, pose)
     for view, center in zip(views, ((40, 60), (280, 200)), strict=True):
         blob = np.zeros(view.mask.shape, np.uint8)
@@ -187,7 +191,7 @@ def test_other_things_in_the_picture(tree: PoseTree, search: WholeSearch, pose: 
     assert blobs - 0.03 < result.E_total < blobs + 0.05
 
 
-def test_salt_noise(tree: PoseTree, search: WholeSearch, pose: np.ndarray) -> None:
+def test_salt_noise(tree: PoseTree, search: MultiStartSearch, pose: np.ndarray) -> None:
     generator = np.random.default_rng(8)
     views = clean_views(tree, pose)
     for view in views:
@@ -198,7 +202,7 @@ def test_salt_noise(tree: PoseTree, search: WholeSearch, pose: np.ndarray) -> No
     assert result.J == recount(tree, result, views)
 
 
-def test_no_view(search: WholeSearch) -> None:
+def test_no_view(search: MultiStartSearch) -> None:
     with pytest.raises(SettingsError, match="at least one view"):
         search.match([])
 
@@ -206,4 +210,4 @@ def test_no_view(search: WholeSearch) -> None:
 @pytest.mark.parametrize("name", ["starts", "survivors", "answers", "sought_about", "tried"])
 def test_settings_out_of_range(name: str) -> None:
     with pytest.raises(SettingsError, match=name):
-        WholeSearchSettings(**{name: 0})
+        MultiStartSettings(**{name: 0})

@@ -1,4 +1,4 @@
-"""The wide search against brute force over whole grids, and what it promises of its answers."""
+"""The beam search against brute force over whole grids, and what it promises of its answers."""
 
 import itertools
 import math
@@ -16,8 +16,8 @@ from drake_pose.body import PoseTree, RootRotation
 from drake_pose.camera import ParallelCamera
 from drake_pose.errors import SettingsError
 from drake_pose.matching import View
-from drake_pose.matching.grid.beam.search import WideSearch
-from drake_pose.matching.grid.settings import Stage, WideSearchSettings
+from drake_pose.matching.grid.beam.search import BeamSearch
+from drake_pose.matching.grid.settings import BeamSearchSettings, Stage
 from drake_pose.matching.scoring import SampledTree, Scoring
 from drake_pose.matching.settings import PaperSearchSettings
 from drake_pose.silhouette import TreeSurfaces, draw_mask
@@ -57,8 +57,8 @@ def random_values(tree: PoseTree, generator: np.random.Generator) -> list[np.nda
     return [generator.uniform(lower, upper) for lower, upper in bounds]
 
 
-def search(tree: PoseTree, **settings: object) -> WideSearch:
-    return WideSearch(tree, WideSearchSettings(interval=INTERVAL, **settings))
+def search(tree: PoseTree, **settings: object) -> BeamSearch:
+    return BeamSearch(tree, BeamSearchSettings(interval=INTERVAL, **settings))
 
 
 def cameras(count: int) -> list[ParallelCamera]:
@@ -137,7 +137,7 @@ def test_a_sliding_joint_and_a_fixed_one(tmp_path: Path) -> None:
         joint("swing", "revolute", "rail", "arm", (-1.0, 1.0), y=12.0),
     )
     tree = model.pose_tree()
-    matcher = WideSearch(tree, WideSearchSettings(interval=0.25, length_interval=0.05))
+    matcher = BeamSearch(tree, BeamSearchSettings(interval=0.25, length_interval=0.05))
     camera = front_camera(90, shift=0.137)
     view = picture(tree, camera, [np.array([0.15]), np.array([-0.5])])
     result = matcher.match([view])
@@ -237,7 +237,7 @@ def test_the_order_of_nodes_can_be_given_and_is_checked(tmp_path: Path) -> None:
 )
 def test_settings_out_of_range_are_refused(settings: dict[str, object]) -> None:
     with pytest.raises(SettingsError):
-        WideSearchSettings(**settings)
+        BeamSearchSettings(**settings)
 
 
 def test_a_stage_out_of_range_is_refused() -> None:
@@ -254,11 +254,11 @@ def test_no_view_is_refused(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_experiment_a_is_matched_exactly() -> None:
     paper, camera = experiment_search(), experiment_camera()
-    matcher = WideSearch(paper.tree)
+    matcher = BeamSearch(paper.tree)
     generator = np.random.default_rng(2024)
     results = []
     for _ in range(25):
-        values = draw_values(paper, "lattice", generator)
+        values = draw_values(paper, "grid", generator)
         results.append(matcher.match([picture(paper.tree, camera, values)]))
     assert sum(result.stopped_by == "exact" for result in results) >= 24
     assert np.mean([result.E_total for result in results]) < 1e-3

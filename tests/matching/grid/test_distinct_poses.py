@@ -9,7 +9,7 @@ import pytest
 
 from drake_pose.body import PoseTree
 from drake_pose.errors import SettingsError
-from drake_pose.matching import View, WideSearch, WideSearchSettings
+from drake_pose.matching import BeamSearch, BeamSearchSettings, View
 from drake_pose.matching.grid.beam.distinct_poses import GridPoses
 from drake_pose.matching.scoring import SampledTree, Scoring
 from drake_pose.matching.settings import PaperSearchSettings
@@ -41,8 +41,8 @@ def random_values(tree: PoseTree, seed: int) -> list[np.ndarray]:
     return [generator.uniform(lower, upper) for lower, upper in bounds]
 
 
-def settings(**more: object) -> WideSearchSettings:
-    return WideSearchSettings(interval=INTERVAL, **more)
+def settings(**more: object) -> BeamSearchSettings:
+    return BeamSearchSettings(interval=INTERVAL, **more)
 
 
 def look_alike(tree: PoseTree, views: list[View], poses: GridPoses, i: int, j: int) -> bool:
@@ -72,7 +72,7 @@ def test_the_list_begins_with_the_best_and_no_two_look_alike(
     tree: PoseTree, angles: list[float]
 ) -> None:
     views = [picture(tree, random_values(tree, 1), angle) for angle in angles]
-    search = WideSearch(tree, settings())
+    search = BeamSearch(tree, settings())
     poses = search.best_poses(views, count=12, alike=ALIKE)
     assert len(poses) == 12
     assert poses.J[0] == search.match(views).J
@@ -83,7 +83,7 @@ def test_the_list_begins_with_the_best_and_no_two_look_alike(
 
 def test_what_is_told_of_a_pose_belongs_together(tree: PoseTree) -> None:
     views = [picture(tree, random_values(tree, 2))]
-    search = WideSearch(tree, settings())
+    search = BeamSearch(tree, settings())
     poses = search.best_poses(views, count=5)
     scoring = Scoring(SampledTree(tree, PaperSearchSettings()), views)
     for i in range(len(poses)):
@@ -98,7 +98,7 @@ def test_what_is_told_of_a_pose_belongs_together(tree: PoseTree) -> None:
 
 def test_all_poses_of_the_grid_differ_if_that_is_wanted(tree: PoseTree) -> None:
     views = [picture(tree, random_values(tree, 3))]
-    search = WideSearch(tree, settings())
+    search = BeamSearch(tree, settings())
     choices = list(itertools.product(*(range(len(grid)) for grid in search.sampled.values)))
     X_WN = [
         tree.node_poses([grid[t] for grid, t in zip(search.sampled.values, choice, strict=True)])
@@ -111,7 +111,7 @@ def test_all_poses_of_the_grid_differ_if_that_is_wanted(tree: PoseTree) -> None:
 
 
 def test_alternatives_to_an_exact_pose_are_listed_too(tree: PoseTree) -> None:
-    search = WideSearch(tree, settings())
+    search = BeamSearch(tree, settings())
     view = picture(tree, [grid[1] for grid in search.sampled.values])
     poses = search.best_poses([view], count=6)
     assert poses.J[0] == 0.0
@@ -120,7 +120,7 @@ def test_alternatives_to_an_exact_pose_are_listed_too(tree: PoseTree) -> None:
 
 def test_a_limit_leaves_a_list_that_may_be_short(tree: PoseTree) -> None:
     view = picture(tree, random_values(tree, 4))
-    poses = WideSearch(tree, settings(time_limit=0.0)).best_poses([view])
+    poses = BeamSearch(tree, settings(time_limit=0.0)).best_poses([view])
     assert len(poses) == len(poses.node_values) >= 1
 
 
@@ -128,4 +128,4 @@ def test_a_limit_leaves_a_list_that_may_be_short(tree: PoseTree) -> None:
 def test_settings_out_of_range_are_refused(tree: PoseTree, count: int, alike: float) -> None:
     view = picture(tree, random_values(tree, 4))
     with pytest.raises(SettingsError):
-        WideSearch(tree, settings()).best_poses([view], count=count, alike=alike)
+        BeamSearch(tree, settings()).best_poses([view], count=count, alike=alike)

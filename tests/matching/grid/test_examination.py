@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drake_pose.errors import SettingsError
-from drake_pose.matching import ExaminationSettings, WideSearch, WideSearchSettings
+from drake_pose.matching import BeamSearch, BeamSearchSettings, ExaminationSettings
 from drake_pose.matching.grid.families.examination import examine
 from drake_pose.matching.grid.families.search import samples_at
 from tests.matching.bodies import swinging_chain
@@ -20,8 +20,8 @@ def maker(tmp_path_factory: pytest.TempPathFactory) -> ProblemMaker:
     return ProblemMaker(swinging_chain(tmp_path_factory.mktemp("chain"), 3).pose_tree(), INTERVAL)
 
 
-def search_of(maker: ProblemMaker, examination: ExaminationSettings | None) -> WideSearch:
-    return WideSearch(maker.tree, WideSearchSettings(interval=INTERVAL), examination)
+def search_of(maker: ProblemMaker, examination: ExaminationSettings | None) -> BeamSearch:
+    return BeamSearch(maker.tree, BeamSearchSettings(interval=INTERVAL), examination)
 
 
 def test_what_is_proved_is_the_best_of_the_grid(maker: ProblemMaker) -> None:

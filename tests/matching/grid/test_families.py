@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from drake_pose.apps.experiments.kameda.experiment import (
+    beam_experiment_search,
     draw_values,
     experiment_camera,
-    wide_experiment_search,
 )
 from drake_pose.errors import SettingsError
 from drake_pose.matching import View
@@ -139,7 +139,7 @@ def test_a_limit_still_leaves_the_best_pose_and_is_reported(
     settings = FamilySettings(tolerance=60.0, **limits)
     answer = find_families(problem.body, problem.views, samples, J, settings)
     assert not answer.complete
-    assert answer.lattice.contains(samples)
+    assert answer.graph.contains(samples)
     assert answer.families[0].J == J
 
 
@@ -209,11 +209,11 @@ def test_a_pose_off_the_grid_has_no_samples(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_experiment_a_the_truth_is_in_the_set_and_all_members_look_alike() -> None:
-    search, camera = wide_experiment_search(), experiment_camera()
+    search, camera = beam_experiment_search(), experiment_camera()
     generator = np.random.default_rng(26)
     sizes, complete = [], []
     for _ in range(12):
-        values = draw_values(search, "lattice", generator)
+        values = draw_values(search, "grid", generator)
         view = show_pose(search.sampled, values, camera)
         true_samples = samples_at(search.sampled, values)
         assert true_samples is not None
@@ -222,7 +222,7 @@ def test_experiment_a_the_truth_is_in_the_set_and_all_members_look_alike() -> No
         assert samples is not None
         answer = find_families(search.body, [view], samples, found.J)
         assert answer.contains(values)
-        members = answer.lattice.draw(10, generator)
+        members = answer.graph.draw(10, generator)
         scoring = Scoring(search.sampled, [view])
         assert scoring.J(poses_at(scoring, members), members).max() == 0.0
         flat = np.concatenate(values)

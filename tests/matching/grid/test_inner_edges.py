@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from drake_pose.apps.experiments.kameda.experiment import (
+    beam_experiment_search,
     draw_values,
     experiment_camera,
-    wide_experiment_search,
 )
 from drake_pose.errors import SettingsError
 from drake_pose.matching.grid.families.inner_edges import (
@@ -19,8 +19,8 @@ from drake_pose.matching.grid.families.inner_edges import (
     rank_families,
 )
 from drake_pose.matching.grid.families.search import find_families, samples_at
-from drake_pose.matching.grid.sampled_body import WideBody
-from drake_pose.matching.grid.settings import WideSearchSettings
+from drake_pose.matching.grid.sampled_body import SampledBody
+from drake_pose.matching.grid.settings import BeamSearchSettings
 from drake_pose.silhouette import LabelRenderer
 from tests.matching.bodies import box_link, front_camera, joint, load_body
 from tests.matching.grid_problems import show_pose
@@ -89,7 +89,7 @@ def test_a_hand_before_the_trunk_is_found_by_its_edges(tmp_path: Path, most: int
         '<origin xyz="0.1 0 0"/><axis xyz="1 0 0"/>'
         '<limit lower="-3" upper="3" effort="1" velocity="1"/></joint>',
     )
-    body = WideBody(model.pose_tree(), WideSearchSettings(interval=0.4))
+    body = SampledBody(model.pose_tree(), BeamSearchSettings(interval=0.4))
     tree, camera = body.sampled.tree, front_camera(80, shift=0.137)
     values = [np.zeros(1), np.array([1.2])]
     view = show_pose(body.sampled, values, camera)
@@ -112,12 +112,12 @@ def test_a_hand_before_the_trunk_is_found_by_its_edges(tmp_path: Path, most: int
 
 @pytest.mark.slow
 def test_experiment_a_edges_never_speak_against_the_truth() -> None:
-    search, camera = wide_experiment_search(), experiment_camera()
+    search, camera = beam_experiment_search(), experiment_camera()
     generator = np.random.default_rng(77)
     renderer = LabelRenderer(search.tree.model, camera)
     before, after = 0.0, 0
     for _ in range(12):
-        values = draw_values(search, "lattice", generator)
+        values = draw_values(search, "grid", generator)
         view = show_pose(search.sampled, values, camera)
         samples = samples_at(search.sampled, values)
         assert samples is not None

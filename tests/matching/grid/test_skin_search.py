@@ -7,9 +7,9 @@ import pytest
 
 from drake_pose.body import ArticulatedModel, RootRotation
 from drake_pose.camera import ParallelCamera
-from drake_pose.matching import PaperSearch, PaperSearchSettings, View, WideSearch
+from drake_pose.matching import BeamSearch, PaperSearch, PaperSearchSettings, View
 from drake_pose.matching.grid.beam.limb_search import poses_at
-from drake_pose.matching.grid.settings import WideSearchSettings
+from drake_pose.matching.grid.settings import BeamSearchSettings
 from drake_pose.matching.scoring import SampledTree, Scoring
 from drake_pose.silhouette import TreeSurfaces, draw_mask
 from tests.body.skins import load_limb
@@ -77,7 +77,7 @@ def test_the_papers_search_is_that_of_plain_pictures(limb: ArticulatedModel, see
 @pytest.mark.parametrize("seed", range(3))
 def test_the_wide_search_finds_the_minimum(limb: ArticulatedModel, seed: int) -> None:
     tree = limb.pose_tree()
-    search = WideSearch(tree, WideSearchSettings(interval=INTERVAL))
+    search = BeamSearch(tree, BeamSearchSettings(interval=INTERVAL))
     sampled = search.sampled
     rng = np.random.default_rng(10 + seed)
     target = [v[t] for v, t in zip(sampled.values, random_samples(sampled, rng), strict=True)]
@@ -112,7 +112,7 @@ def test_a_turned_over_tree_gives_the_same_J(limb: ArticulatedModel, root: str) 
 
 def test_grid_poses_are_judged_with_their_skin(limb: ArticulatedModel) -> None:
     tree = limb.pose_tree()
-    search = WideSearch(tree, WideSearchSettings(interval=INTERVAL))
+    search = BeamSearch(tree, BeamSearchSettings(interval=INTERVAL))
     rng = np.random.default_rng(4)
     target = random_samples(search.sampled, rng)
     view = view_of(tree, [v[t] for v, t in zip(search.sampled.values, target, strict=True)])

@@ -1,4 +1,4 @@
-"""The rough search: what is right in the rough is among the few that are refined."""
+"""The coarse search: what is roughly right is among the few that are refined."""
 
 from dataclasses import replace
 
@@ -9,18 +9,18 @@ from drake_pose.body import PoseTree
 from drake_pose.camera import ParallelCamera
 from drake_pose.errors import SettingsError
 from drake_pose.matching import View
-from drake_pose.matching.grid.sampled_body import WideBody
-from drake_pose.matching.grid.settings import WideSearchSettings
+from drake_pose.matching.grid.sampled_body import SampledBody
+from drake_pose.matching.grid.settings import BeamSearchSettings
 from drake_pose.matching.starts.coarse_kernel import fill_cover, score_samples, unite_pairs
 from drake_pose.matching.starts.coarse_search import (
-    RoughSearch,
-    RoughSettings,
+    CoarseSearch,
+    CoarseSettings,
     _spread_points,
 )
 from drake_pose.silhouette.pictures.signed_distances import signed_distances
 from tests.matching.arms import arm_cameras, arm_tree, damaged_views, draw_pose, draw_view, split
 
-SETTINGS = RoughSettings()
+SETTINGS = CoarseSettings()
 
 
 @pytest.fixture(scope="module")
@@ -29,8 +29,8 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> PoseTree:
 
 
 @pytest.fixture(scope="module")
-def body(tree: PoseTree) -> WideBody:
-    return WideBody(tree, WideSearchSettings(interval=SETTINGS.interval))
+def body(tree: PoseTree) -> SampledBody:
+    return SampledBody(tree, BeamSearchSettings(interval=SETTINGS.interval))
 
 
 def nearest(tree: PoseTree, X_WN: np.ndarray, values: np.ndarray) -> float:
@@ -40,11 +40,11 @@ def nearest(tree: PoseTree, X_WN: np.ndarray, values: np.ndarray) -> float:
 
 
 @pytest.mark.slow
-def test_the_pose_is_among_the_few(tree: PoseTree, body: WideBody) -> None:
+def test_the_pose_is_among_the_few(tree: PoseTree, body: SampledBody) -> None:
     found = []
     for seed in range(10):
         values = draw_pose(tree, np.random.default_rng(40 + seed))
-        search = RoughSearch(body, damaged_views(tree, values, seed), SETTINGS)
+        search = CoarseSearch(body, damaged_views(tree, values, seed), SETTINGS)
         poses = search.choose_distinct(search.find(), 40, 0.13)
         assert 1 <= len(poses) <= 40
         assert (np.diff(poses.costs) >= 0.0).all()
@@ -53,20 +53,20 @@ def test_the_pose_is_among_the_few(tree: PoseTree, body: WideBody) -> None:
     assert np.mean(np.array(found) < 0.15) >= 0.9
 
 
-def test_poses_are_those_of_their_samples(tree: PoseTree, body: WideBody) -> None:
+def test_poses_are_those_of_their_samples(tree: PoseTree, body: SampledBody) -> None:
     views = [draw_view(tree, draw_pose(tree, np.random.default_rng(1)), arm_cameras()[0])]
-    poses = RoughSearch(body, views, SETTINGS).find()
+    poses = CoarseSearch(body, views, SETTINGS).find()
     for samples, X_WN in zip(poses.samples[:20], poses.X_WN[:20], strict=True):
         values = [grid[t] for grid, t in zip(body.sampled.values, samples, strict=True)]
         np.testing.assert_allclose(X_WN, tree.node_poses(values), atol=1e-9)
 
 
-def test_a_limb_searched_again_leaves_the_rest(tree: PoseTree, body: WideBody) -> None:
+def test_a_limb_searched_again_leaves_the_rest(tree: PoseTree, body: SampledBody) -> None:
     values = draw_pose(tree, np.random.default_rng(2))
     views = [draw_view(tree, values, camera) for camera in arm_cameras()]
     X_WN = tree.node_poses(split(tree, values))
     hand = len(tree.nodes) - 1
-    poses = RoughSearch(body, views, SETTINGS).find_again(X_WN, [hand])
+    poses = CoarseSearch(body, views, SETTINGS).find_again(X_WN, [hand])
     np.testing.assert_array_equal(poses.X_WN[:, :hand], np.tile(X_WN[:hand], (len(poses), 1, 1, 1)))
     assert (poses.samples[:, :hand] == -1).all()
     best = body.sampled.values[hand][poses.samples[0, hand], 0]
@@ -75,12 +75,12 @@ def test_a_limb_searched_again_leaves_the_rest(tree: PoseTree, body: WideBody) -
 
 @pytest.mark.parametrize("longer", [1e3, 1e9])
 def test_a_lens_that_is_far_too_long_does_not_fill_the_memory(
-    tree: PoseTree, body: WideBody, longer: float
+    tree: PoseTree, body: SampledBody, longer: float
 ) -> None:
     view = draw_view(tree, draw_pose(tree, np.random.default_rng(3)), arm_cameras()[0])
     focal = longer * arm_cameras()[0].focal_x
     wrong = View(replace(arm_cameras()[0], focal_x=focal, focal_y=focal), view.mask)
-    search = RoughSearch(body, [wrong], SETTINGS)
+    search = CoarseSearch(body, [wrong], SETTINGS)
     assert sum(view.cover.nbytes for view in search._views) < 1e8
     assert len(search.find()) >= 1
 
@@ -100,7 +100,7 @@ def test_cover_holds_the_points_within_the_radius() -> None:
 
 @pytest.mark.parametrize("parallel", [False, True])
 def test_scores_are_those_of_balls_looked_at_one_by_one(
-    tree: PoseTree, body: WideBody, parallel: bool
+    tree: PoseTree, body: SampledBody, parallel: bool
 ) -> None:
     """Against plain numpy: a ball's place, how far it leaves the mask, and the points within it."""
     generator = np.random.default_rng(5)
@@ -110,7 +110,7 @@ def test_scores_are_those_of_balls_looked_at_one_by_one(
     if parallel:
         middle = camera.center_x, camera.center_y
         camera = ParallelCamera("", camera.width, camera.height, 130.0, *middle, camera.X_WC)
-    search = RoughSearch(body, [View(camera, seen.mask)], SETTINGS)
+    search = CoarseSearch(body, [View(camera, seen.mask)], SETTINGS)
     (view,) = search._views
     distances, points = signed_distances(seen.mask), _spread_points(seen.mask)
     n, node = 20, 3
@@ -155,4 +155,4 @@ def test_scores_are_those_of_balls_looked_at_one_by_one(
 )
 def test_settings_out_of_range(name: str, value: float) -> None:
     with pytest.raises(SettingsError, match=name):
-        RoughSettings(**{name: value})
+        CoarseSettings(**{name: value})

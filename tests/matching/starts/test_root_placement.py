@@ -6,13 +6,13 @@ import pytest
 from drake_pose.body import RootRotation
 from drake_pose.camera import ParallelCamera, PinholeCamera
 from drake_pose.errors import SettingsError
-from drake_pose.matching import View, WideSearchSettings
+from drake_pose.matching import BeamSearchSettings, View
 from drake_pose.matching.continuous.root_placement_search import RootPlacementSearch
 from drake_pose.matching.starts.root_placement import PlacementSettings, find_layers, whereabouts
 from drake_pose.silhouette import draw_mask
 from tests.matching.bodies import box_link, front_camera, joint, load_body
 
-SETTINGS = WideSearchSettings(interval=math.radians(30.0))
+SETTINGS = BeamSearchSettings(interval=math.radians(30.0))
 
 
 @pytest.fixture(scope="module")
@@ -156,7 +156,7 @@ def test_a_known_position_is_kept(body):
 def test_no_time_gives_an_answer_all_the_same(body):
     camera = front_camera(160)
     mask = picture(body, camera, (0.0, 0.13, 0.31))
-    settings = WideSearchSettings(interval=SETTINGS.interval, time_limit=0.0)
+    settings = BeamSearchSettings(interval=SETTINGS.interval, time_limit=0.0)
     result = RootPlacementSearch(body.pose_tree(), settings).match([View(camera, mask)])
     assert result.found
     assert result.stopped_by == "time_limit"

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from drake_pose.matching import (
+    BeamSearch,
     ContinuousSearch,
     ExaminationSettings,
-    WholeSearch,
-    WideSearch,
+    MultiStartSearch,
 )
 from drake_pose.matching.grid.families.joint_estimates import _joined
 from tests.matching.turning import crane, views_of
@@ -20,7 +20,7 @@ def model(tmp_path_factory):
     return crane(tmp_path_factory.mktemp("crane"))
 
 
-@pytest.mark.parametrize("make", [ContinuousSearch, WholeSearch])
+@pytest.mark.parametrize("make", [ContinuousSearch, MultiStartSearch])
 @pytest.mark.parametrize("truth", [(178.0, 331.5), (-181.0, -28.5), (-100.0, 190.0)])
 def test_drakes_pictures_are_answered_in_the_turn_about_the_default(model, make, truth):
     """The limits of the second joint hold the truth in two turns."""
@@ -46,7 +46,7 @@ def test_drakes_pictures_are_answered_in_the_turn_about_the_default(model, make,
 
 def test_directions_on_both_sides_of_half_a_turn_are_one_family(model):
     """A pose on the grid at 180 degrees, with room for its neighbours at 160 and -160."""
-    search = WideSearch(model.pose_tree(), None, ExaminationSettings(tolerance=400.0))
+    search = BeamSearch(model.pose_tree(), None, ExaminationSettings(tolerance=400.0))
     result = search.match(views_of(model, np.radians([180.0, 0.0])))
     np.testing.assert_allclose(np.degrees(np.abs(result.q)), [180.0, 0.0], atol=1e-6)
     first = result.pose_set.families[0].joints[0]

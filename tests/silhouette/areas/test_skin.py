@@ -105,7 +105,7 @@ def test_many_poses_at_once_are_scored_as_one_by_one(tmp_path: Path) -> None:
 
 
 def test_bits_have_the_band_of_their_sample(tmp_path: Path) -> None:
-    """The wide search's pictures are the kernel's, for each of many samples of a node."""
+    """The beam search's pictures are the kernel's, for each of many samples of a node."""
     model = load_limb(tmp_path)
     tree = model.pose_tree()
     surfaces = TreeSurfaces(tree)

@@ -17,7 +17,7 @@ from drake_pose.camera import ParallelCamera
 from drake_pose.errors import SettingsError
 from drake_pose.filtering import ContourObservation, model_inequalities
 from drake_pose.filtering.measurements.axes import AxisObservation
-from drake_pose.matching import WideSearch, WideSearchSettings
+from drake_pose.matching import BeamSearch, BeamSearchSettings
 from drake_pose.silhouette import LabelRenderer
 from drake_pose.silhouette.pictures.label_images import EMPTY
 from drake_pose.systems import AxisSensor, StateMatcher, add_hand_tracking, build_hand_tracking
@@ -66,7 +66,7 @@ def search(hand):
         root_rotation=RootRotation.fixed(rotation),
         held=SHAPE,
     )
-    return CountingSearch(WideSearch(tree, WideSearchSettings(interval=math.radians(10))))
+    return CountingSearch(BeamSearch(tree, BeamSearchSettings(interval=math.radians(10))))
 
 
 def true_angles(count=FRAMES, phase=0.0):
@@ -256,7 +256,7 @@ def test_bad_arguments_are_named(hand, camera, search):
     observation = AxisObservation(body, camera, SEGMENTS)
     with pytest.raises(SettingsError, match="transition"):
         AxisSensor(observation, np.eye(3), camera)
-    other = WideSearch(hand.pose_tree(root_position=(0.0, 0.0, 0.0), held=SHAPE))
+    other = BeamSearch(hand.pose_tree(root_position=(0.0, 0.0, 0.0), held=SHAPE))
     with pytest.raises(SettingsError, match="one pose tree"):
         StateMatcher(other, observation, camera)
 

@@ -11,11 +11,11 @@ from pydrake.trajectories import PiecewisePolynomial
 from drake_pose.camera import PinholeCamera, save_cameras
 from drake_pose.errors import SettingsError
 from drake_pose.matching import (
+    BeamSearch,
+    BeamSearchSettings,
     ExaminationSettings,
     PaperSearch,
     PaperSearchSettings,
-    WideSearch,
-    WideSearchSettings,
 )
 from drake_pose.silhouette import LabelRenderer, load_scene, mask_to_label_image, write_mask
 from drake_pose.systems import (
@@ -209,7 +209,7 @@ def test_what_the_answer_is_worth_comes_out(tmp_path):
         box_link("lever", 8, 30),
     )
     camera = front_camera(160, shift=0.1234)
-    search = WideSearch(model.pose_tree(), WideSearchSettings(interval=0.25), ExaminationSettings())
+    search = BeamSearch(model.pose_tree(), BeamSearchSettings(interval=0.25), ExaminationSettings())
     matcher = SilhouetteMatcher(search, [camera], PERIOD, family_limit=3)
     context = matcher.CreateDefaultContext()
 

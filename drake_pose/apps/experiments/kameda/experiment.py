@@ -11,14 +11,14 @@ from drake_pose.body import PoseTree, bundled_model, load_model
 from drake_pose.camera import ParallelCamera
 from drake_pose.errors import SettingsError
 from drake_pose.matching import (
+    BeamSearch,
+    BeamSearchSettings,
     ExaminationSettings,
     MatchResult,
     PaperSearch,
     PaperSearchSettings,
     PoseSearch,
     View,
-    WideSearch,
-    WideSearchSettings,
 )
 from drake_pose.matching.grid.families.examination import examine
 from drake_pose.matching.grid.families.search import GridPoseSet
@@ -117,8 +117,8 @@ class ExperimentResult:
             "stopped_by_run_limit": sum(t.result.stopped_by == "run_limit" for t in self.trials),
             "leaving_the_picture": sum(not trial.inside for trial in self.trials),
             "seed": self.seed,
-            "angles": "lattice",
-            "method": "paper" if isinstance(self.search, PaperSearch) else "wide",
+            "angles": "grid",
+            "method": "paper" if isinstance(self.search, PaperSearch) else "beam",
         }
         return figures | self._set_figures()
 
@@ -172,10 +172,10 @@ def experiment_search(
     return PaperSearch(_experiment_tree(), settings)
 
 
-def wide_experiment_search(interval_deg: float = 20.0) -> WideSearch:
-    """The wide search for the same body, which is told no r."""
-    settings = WideSearchSettings(interval=math.radians(interval_deg))
-    return WideSearch(_experiment_tree(), settings)
+def beam_experiment_search(interval_deg: float = 20.0) -> BeamSearch:
+    """The beam search for the same body, which needs no threshold r."""
+    settings = BeamSearchSettings(interval=math.radians(interval_deg))
+    return BeamSearch(_experiment_tree(), settings)
 
 
 def _experiment_tree() -> PoseTree:
@@ -189,7 +189,7 @@ def draw_values(
 
     Args:
         search: gives the pose tree and its sampling grid.
-        angles: "lattice": from the grid, as the paper; "continuous": anywhere inside the limits.
+        angles: "grid": from the grid, as the paper; "continuous": anywhere inside the limits.
         generator: the source of chance.
 
     Returns:
@@ -220,7 +220,7 @@ def run_experiment(
     """Draw silhouettes of poses of the grid, as the paper's experiment A does, and match them.
 
     Args:
-        search: the search, of ``experiment_search`` or ``wide_experiment_search``.
+        search: the search, of ``experiment_search`` or ``beam_experiment_search``.
         images: how many; the paper's 219 if not given.
         seed: of the random angles.
         progress: called with the number of images done after each.
@@ -234,7 +234,7 @@ def run_experiment(
     generator = np.random.default_rng(seed)
     trials = []
     for done in range(1, images + 1):
-        values = draw_values(search, "lattice", generator)
+        values = draw_values(search, "grid", generator)
         trials.append(_match_one(search, camera, values))
         if progress is not None:
             progress(done)
@@ -265,10 +265,10 @@ def _match_one(search: PoseSearch, camera: ParallelCamera, values: list[np.ndarr
         for found, true in zip(result.node_values, values, strict=True)
     )
     trial = Trial(tuple(values), inside, result, bool(equal), seconds)
-    return _examined(trial, search, view) if isinstance(search, WideSearch) else trial
+    return _examined(trial, search, view) if isinstance(search, BeamSearch) else trial
 
 
-def _examined(trial: Trial, search: WideSearch, view: View) -> Trial:
+def _examined(trial: Trial, search: BeamSearch, view: View) -> Trial:
     """The trial with proof and families, which the seconds of the search leave out."""
     start = time.process_time()
     result = examine(search.body, [view], trial.result, _EXAMINATION)

@@ -29,7 +29,7 @@ _ROWS = {
     "examination_median_seconds": ("seconds for proof and set, median", "{:.3f}"),
 }
 _OF_RUNS = ("improved", "mean_runs", "mean_runs_without_worst_seven", "min_runs")
-_METHODS = {"paper": "the paper's method", "wide": "wide search"}
+_METHODS = {"paper": "the paper's method", "beam": "beam search"}
 
 
 def experiment_table(results: Sequence[ExperimentResult]) -> Table:
@@ -44,7 +44,7 @@ def experiment_table(results: Sequence[ExperimentResult]) -> Table:
     table.add_column("paper", justify="right")
     for result in results:
         figures = dict(result.as_json())
-        if figures["method"] == "wide":
+        if figures["method"] == "beam":
             # Its runs are other steps than the paper's.
             figures = {key: value for key, value in figures.items() if key not in _OF_RUNS}
         table.add_column(_METHODS[str(result.as_json()["method"])], justify="right")

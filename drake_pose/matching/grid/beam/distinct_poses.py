@@ -71,7 +71,7 @@ class Gathering:
             scoring: gives J.
             pictures: with bands; in them poses are compared.
             count: at most so many.
-            alike: as in WideSearch.best_poses.
+            alike: as in BeamSearch.best_poses.
         """
         nodes = len(scoring.sampled.values)
         samples = self._different_samples(nodes)

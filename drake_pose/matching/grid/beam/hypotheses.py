@@ -1,4 +1,4 @@
-"""Hypotheses and how they grow by one node: the beam of the wide search."""
+"""Hypotheses and how they grow by one node: the beam of the beam search."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

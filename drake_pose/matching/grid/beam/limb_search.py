@@ -103,8 +103,8 @@ def turn_single_nodes(
             break
         tried = np.repeat(current[None], len(scoring.sampled.values[node]), axis=0)
         tried[:, node] = np.arange(len(tried))
-        rough = _rough_J(scoring, pictures, tried, node)
-        tried = tried[np.argsort(rough, kind="stable")[:_JUDGED]]
+        approximate = _J_by_bits(scoring, pictures, tried, node)
+        tried = tried[np.argsort(approximate, kind="stable")[:_JUDGED]]
         Js = scoring.J(poses_at(scoring, tried), tried)
         best = int(np.argmin(Js))
         unchanged += 1
@@ -115,7 +115,7 @@ def turn_single_nodes(
     return current
 
 
-def _rough_J(scoring: Scoring, pictures: Pictures, samples: np.ndarray, node: int) -> np.ndarray:
+def _J_by_bits(scoring: Scoring, pictures: Pictures, samples: np.ndarray, node: int) -> np.ndarray:
     """J (n,) as the pictures show it of samples (n, nodes) that differ in one node's alone.
 
     Beyond the bands areas are added up, not united.

@@ -1,4 +1,4 @@
-"""The wide search: many hypotheses at once, ranked by what the whole objective will be.
+"""The beam search: many hypotheses at once, ranked by what the whole objective will be.
 
 Like Kameda's search it places one node after another, each at the samples of its grid, and scores
 what a node covers newly (5). Unlike it, it keeps many hypotheses instead of one with K
@@ -23,14 +23,14 @@ from drake_pose.matching.grid.beam.limb_search import (
 )
 from drake_pose.matching.grid.families.examination import ExaminationSettings, examine
 from drake_pose.matching.grid.node_poses import Pictures, PoseStore, coarsen
-from drake_pose.matching.grid.sampled_body import WideBody
-from drake_pose.matching.grid.settings import Stage, WideSearchSettings
+from drake_pose.matching.grid.sampled_body import SampledBody
+from drake_pose.matching.grid.settings import BeamSearchSettings, Stage
 from drake_pose.matching.result import MatchResult, View
 from drake_pose.matching.scoring import Scoring
 
 
-class WideSearch:
-    """Matches silhouettes with a pose tree by the wide search.
+class BeamSearch:
+    """Matches silhouettes with a pose tree by the beam search.
 
     Grids and tables are made once; :meth:`match` may then be called for any number of pictures.
 
@@ -44,13 +44,13 @@ class WideSearch:
     def __init__(
         self,
         tree: PoseTree,
-        settings: WideSearchSettings | None = None,
+        settings: BeamSearchSettings | None = None,
         examination: ExaminationSettings | None = None,
     ) -> None:
         self.tree = tree
-        self.settings = settings or WideSearchSettings()
+        self.settings = settings or BeamSearchSettings()
         self.examination = examination
-        self.body = WideBody(tree, self.settings)
+        self.body = SampledBody(tree, self.settings)
         self.sampled = self.body.sampled
 
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> MatchResult:
@@ -161,9 +161,9 @@ class _Run:
 
     def __init__(
         self,
-        body: WideBody,
+        body: SampledBody,
         views: Sequence[View],
-        settings: WideSearchSettings,
+        settings: BeamSearchSettings,
         gathering: Gathering | None,
     ) -> None:
         limit = settings.time_limit
@@ -234,7 +234,7 @@ class _Run:
     def _run_stage(self, beam: Beam, stage: Stage) -> bool:
         """Returns whether the stage lost no hypothesis."""
         exact = stage.outside_share == 0.0
-        order = self.body.limb_order if stage.whole_limbs else self.body.order
+        order = self.body.limb_order if stage.limb_by_limb else self.body.order
         last, complete = beam.run(
             beam.start(), order, stage.hypotheses, stage.outside_weight, exact, self.proceed
         )

@@ -1,4 +1,4 @@
-"""The poses of nodes for a lattice search, drawn in full detail and within its limits."""
+"""The poses of nodes for a branch and bound, drawn in full detail and within its limits."""
 
 import time
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ import numpy as np
 
 from drake_pose.camera import Camera
 from drake_pose.matching.grid.node_poses import Pictures, PoseStore
-from drake_pose.matching.grid.sampled_body import WideBody
+from drake_pose.matching.grid.sampled_body import SampledBody
 from drake_pose.matching.result import View
 from drake_pose.silhouette.contours.direction_cells import CelledOutline
 
@@ -22,8 +22,8 @@ _REACHES_TOGETHER = 20_000
 
 
 @dataclass(frozen=True)
-class LatticeLimits:
-    """How much a lattice search may look at.
+class BoundLimits:
+    """How much a branch and bound may look at.
 
     Args:
         states: so many partial poses are kept after each node.
@@ -42,14 +42,14 @@ class LatticeLimits:
     deadline: float = np.inf
 
 
-class DetailedBody(WideBody):
+class DetailedBody(SampledBody):
     """A body whose surfaces are never simplified, so that areas are those of the definition."""
 
-    def __init__(self, body: WideBody) -> None:
+    def __init__(self, body: SampledBody) -> None:
         self.__dict__.update(body.__dict__)
 
     def celled_outline(self, node: int, camera: Camera, coarse: bool) -> CelledOutline:
-        """As WideBody's, never coarse."""
+        """As SampledBody's, never coarse."""
         return super().celled_outline(node, camera, False)
 
 
@@ -61,7 +61,7 @@ class BoundedPoses(PoseStore):
     """The poses of all nodes that leave no more than a limit outside [pixel]."""
 
     def __init__(
-        self, body: WideBody, pictures: Pictures, outside_limit: float, limits: LatticeLimits
+        self, body: SampledBody, pictures: Pictures, outside_limit: float, limits: BoundLimits
     ) -> None:
         super().__init__(body, pictures, np.inf)
         self._outside_limit = outside_limit
@@ -105,7 +105,7 @@ class BoundedPoses(PoseStore):
         return super().reach_rows(node, parents)
 
 
-def make_pictures(body: WideBody, views: Sequence[View], J_limit: float) -> Pictures:
+def make_pictures(body: SampledBody, views: Sequence[View], J_limit: float) -> Pictures:
     """The silhouettes with bands so wide that nothing within the limit lies beyond, if possible."""
     if J_limit < 1.0:
         return Pictures(body, views, 0)

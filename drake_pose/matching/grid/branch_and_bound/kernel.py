@@ -1,4 +1,4 @@
-"""The inner loops of the lattice search: partial poses told apart, and bounds on their objective.
+"""The inner loops of the branch and bound: partial poses told apart, and bounds on their objective.
 
 What matters of a partial pose for all that is still to come is what it covers, what it leaves
 outside, and the poses of the nodes that have children to come. Partial poses equal in this are one

@@ -1,9 +1,9 @@
-"""Very many poses in little room: a lattice of partial poses.
+"""Very many poses in little room: a graph of partial poses.
 
 The nodes are placed one after another, layer by layer. A state of a layer stands for all partial
 poses that are equal in all that matters later; an edge places the next node at one of its samples.
 Every path from the one first state to a last one is a pose. From one state a sample leads to one
-state at most, so whether a pose is in the lattice takes one look a node.
+state at most, so whether a pose is in the graph takes one look a node.
 """
 
 from collections.abc import Sequence
@@ -39,7 +39,7 @@ def make_layer(node: int, origins: np.ndarray, samples: np.ndarray, ends: np.nda
     return Layer(node, origins[order], samples[order], ends[order])
 
 
-class PoseLattice:
+class PartialPoseGraph:
     """A set of poses of the grid.
 
     Attributes:
@@ -102,7 +102,7 @@ class PoseLattice:
             seen[layer.node] = np.unique(layer.samples)
         return seen
 
-    def restricted(self, allowed: Sequence[np.ndarray | None]) -> "PoseLattice":
+    def restricted(self, allowed: Sequence[np.ndarray | None]) -> "PartialPoseGraph":
         """Those poses that take allowed samples alone.
 
         Args:
@@ -112,15 +112,15 @@ class PoseLattice:
         for layer in self.layers:
             rule = allowed[layer.node]
             layers.append(layer if rule is None else layer.chosen(rule[layer.samples]))
-        return PoseLattice(layers, self.Js)
+        return PartialPoseGraph(layers, self.Js)
 
-    def up_to(self, J: float) -> "PoseLattice":
+    def up_to(self, J: float) -> "PartialPoseGraph":
         """Those poses whose objective is no greater."""
         kept = self.Js <= J
         numbers = np.cumsum(kept) - 1
         last = self.layers[-1].chosen(kept[self.layers[-1].ends])
         last = Layer(last.node, last.origins, last.samples, numbers[last.ends])
-        return PoseLattice([*self.layers[:-1], last], self.Js[kept])
+        return PartialPoseGraph([*self.layers[:-1], last], self.Js[kept])
 
     def draw(self, count: int, generator: np.random.Generator) -> np.ndarray:
         """Draw poses at random, each as likely as any other: samples (count, nodes).
@@ -129,7 +129,7 @@ class PoseLattice:
             ValueError: if there is none to draw.
         """
         if not self.size:
-            raise ValueError("a pose was to be drawn from an empty lattice")
+            raise ValueError("a pose was to be drawn from an empty set")
         drawn = np.empty((count, len(self.layers)), dtype=np.int64)
         for row in drawn:
             state = 0
@@ -159,7 +159,7 @@ class PoseLattice:
             ValueError: if there is none.
         """
         if not self.size:
-            raise ValueError("a pose was asked of an empty lattice")
+            raise ValueError("a pose was asked of an empty set")
         samples = np.empty(len(self.layers), dtype=np.int64)
         best = self.Js == self.Js.min()
         state = int(np.argmax(np.where(best, self.ways[-1], -1.0)))
@@ -197,8 +197,8 @@ def _prune(layers: list[Layer], Js: np.ndarray) -> tuple[list[Layer], np.ndarray
     return pruned, Js
 
 
-def single_pose(samples: np.ndarray, J: float) -> PoseLattice:
+def single_pose(samples: np.ndarray, J: float) -> PartialPoseGraph:
     """The set of one pose, samples (nodes,), with objective J."""
     zero = np.zeros(1, dtype=np.int64)
     layers = [Layer(node, zero, np.array([t]), zero) for node, t in enumerate(samples)]
-    return PoseLattice(layers, np.array([J]))
+    return PartialPoseGraph(layers, np.array([J]))

@@ -1,6 +1,6 @@
 """Proof that no pose of the grid has a smaller objective: branch and bound over the whole grid.
 
-The lattice search drops a partial pose only if no completion can be within a limit. So a complete
+The branch and bound drops a partial pose only if no completion can be within a limit. So a complete
 search without a find proves that the objective is greater than the limit everywhere, and one with
 a find proves the best of it the best of all. The limit is raised step by step from 0 to just below
 the best objective known: a bound is so proved even where time does not suffice for the whole.
@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drake_pose.matching.grid.branch_and_bound.full_detail import LatticeLimits
-from drake_pose.matching.grid.branch_and_bound.search import search_lattice
-from drake_pose.matching.grid.sampled_body import WideBody
+from drake_pose.matching.grid.branch_and_bound.full_detail import BoundLimits
+from drake_pose.matching.grid.branch_and_bound.search import branch_and_bound
+from drake_pose.matching.grid.sampled_body import SampledBody
 from drake_pose.matching.result import View
 
 _FIRST_LIMIT = 8.0
@@ -42,15 +42,15 @@ class Proof:
 
 
 def prove_optimal(
-    body: WideBody,
+    body: SampledBody,
     views: Sequence[View],
     samples: np.ndarray,
     J: float,
     time_limit: float | None = None,
     states: int = 20_000,
     pairs: int = 1_000_000,
-    poses: int = LatticeLimits.poses,
-    memory: int = LatticeLimits.memory,
+    poses: int = BoundLimits.poses,
+    memory: int = BoundLimits.memory,
 ) -> Proof:
     """Prove a pose the best of the grid, or find the best.
 
@@ -62,17 +62,17 @@ def prove_optimal(
         time_limit: it answers with what it has after so many seconds; None: no limit.
         states: so many partial poses are kept after each node; more end the proof.
         pairs: the same of pairs of a partial pose and a pose of the next node.
-        poses, memory: as in LatticeLimits, the latter in bytes.
+        poses, memory: as in BoundLimits, the latter in bytes.
     """
     deadline = np.inf if time_limit is None else time.perf_counter() + time_limit
-    limits = LatticeLimits(states, pairs, poses, memory, deadline)
+    limits = BoundLimits(states, pairs, poses, memory, deadline)
     best, bound, visited, J_limit, spent = samples, 0.0, 0, 0.0, False
     while bound < J:
         J_limit = min(J_limit, J - 1.0)
-        found = search_lattice(body, views, J_limit, limits)
+        found = branch_and_bound(body, views, J_limit, limits)
         visited += found.states
-        if found.lattice.best_J < J:
-            J, best = found.lattice.best_J, found.lattice.central()
+        if found.graph.best_J < J:
+            J, best = found.graph.best_J, found.graph.central()
         bound = max(bound, min(J, found.lower_bound))
         if not found.complete:
             spent = found.limited

@@ -13,8 +13,8 @@ import numpy as np
 
 from drake_pose.matching.grid.branch_and_bound.full_detail import (
     BoundedPoses,
+    BoundLimits,
     DetailedBody,
-    LatticeLimits,
     LimitReached,
     make_pictures,
 )
@@ -27,36 +27,36 @@ from drake_pose.matching.grid.branch_and_bound.kernel import (
 )
 from drake_pose.matching.grid.branch_and_bound.partial_pose_graph import (
     Layer,
-    PoseLattice,
+    PartialPoseGraph,
     make_layer,
 )
 from drake_pose.matching.grid.branch_and_bound.reachable_area import SubtreeReaches
 from drake_pose.matching.grid.pair_kernel import Reaches
-from drake_pose.matching.grid.sampled_body import WideBody
+from drake_pose.matching.grid.sampled_body import SampledBody
 from drake_pose.matching.result import View
 
 # What lies outside counts so much where partial poses must be ranked: it stays outside, while what
 # is not covered yet may be covered by a later node.
 _OUTSIDE_WEIGHT = 2
-# More pairs than these are worth a look at what later nodes can really cover: roughly, or closely.
+# More pairs than these are worth a look at what later nodes can really cover: quickly, or closely.
 _FEW_PAIRS, _MANY_PAIRS = 300, 2000
-# So many poses of a node are tried for a rough and for a close look.
-_ROUGH_TRIES, _CLOSE_TRIES = 5000, 100_000
+# So many poses of a node are tried for a quick and for a close look.
+_QUICK_TRIES, _CLOSE_TRIES = 5000, 100_000
 
 
 @dataclass(frozen=True)
-class FoundLattice:
-    """What a lattice search found.
+class PosesWithin:
+    """What a branch and bound found.
 
     Attributes:
-        lattice: the poses; every one is within the limit.
+        graph: the poses; every one is within the limit.
         complete: whether it holds all poses within the limit.
         limited: whether a limit of the search left some out.
-        lower_bound: no pose of the grid that is not in the lattice has a smaller objective [pixel].
+        lower_bound: no pose of the grid that is not in the graph has a smaller objective [pixel].
         states: how many partial poses were looked at.
     """
 
-    lattice: PoseLattice
+    graph: PartialPoseGraph
     complete: bool
     limited: bool
     lower_bound: float
@@ -90,13 +90,13 @@ class _States:
         )  # fmt: skip
 
 
-def search_lattice(
-    body: WideBody,
+def branch_and_bound(
+    body: SampledBody,
     views: Sequence[View],
     J_limit: float,
-    limits: LatticeLimits | None = None,
+    limits: BoundLimits | None = None,
     kept_samples: np.ndarray | None = None,
-) -> FoundLattice:
+) -> PosesWithin:
     """Find all poses of the grid whose objective is no greater than a limit.
 
     Args:
@@ -110,18 +110,18 @@ def search_lattice(
         The poses; not all if a limit was reached, or if an area beyond the bands around the
         silhouettes is counted twice.
     """
-    return _LatticeSearch(body, views, J_limit, limits or LatticeLimits(), kept_samples).run()
+    return _BranchAndBound(body, views, J_limit, limits or BoundLimits(), kept_samples).run()
 
 
-class _LatticeSearch:
-    """One search; arguments as search_lattice."""
+class _BranchAndBound:
+    """One search; arguments as branch_and_bound."""
 
     def __init__(
         self,
-        body: WideBody,
+        body: SampledBody,
         views: Sequence[View],
         J_limit: float,
-        limits: LatticeLimits,
+        limits: BoundLimits,
         kept_samples: np.ndarray | None,
     ) -> None:
         self.body = body
@@ -131,7 +131,7 @@ class _LatticeSearch:
         self.kept_samples = kept_samples
         self.pictures = make_pictures(body, views, J_limit)
         self.store = BoundedPoses(DetailedBody(body), self.pictures, J_limit, limits)
-        self.rough = SubtreeReaches(self.store, _ROUGH_TRIES)
+        self.quick = SubtreeReaches(self.store, _QUICK_TRIES)
         self.close = SubtreeReaches(self.store, _CLOSE_TRIES)
         words = int(self.pictures.part_starts[-1])
         # Any odd numbers will do; always the same, so that answers are.
@@ -145,7 +145,7 @@ class _LatticeSearch:
         # The state that the pose to be kept is in; -1: none.
         self._kept_state = -1 if kept_samples is None else 0
 
-    def run(self) -> FoundLattice:
+    def run(self) -> PosesWithin:
         """Place all nodes."""
         words = int(self.pictures.part_starts[-1])
         zero = np.zeros(1, dtype=np.int64)
@@ -167,25 +167,25 @@ class _LatticeSearch:
                 return self._stop(states)
         return self._finish(states)
 
-    def _stop(self, states: _States) -> FoundLattice:
+    def _stop(self, states: _States) -> PosesWithin:
         """The answer when a limit ends the search."""
         bound = min(self._lower_bound, float(states.lows.min()) if len(states) else np.inf)
         nothing = np.zeros(0, dtype=np.int64)
         layers = [Layer(i, nothing, nothing, nothing) for i in range(len(self.nodes))]
-        return FoundLattice(PoseLattice(layers, np.zeros(0)), False, True, bound, self._visited)
+        return PosesWithin(PartialPoseGraph(layers, np.zeros(0)), False, True, bound, self._visited)
 
-    def _finish(self, states: _States) -> FoundLattice:
+    def _finish(self, states: _States) -> PosesWithin:
         """The answer when all nodes are placed: lows are then the objectives.
 
         What lies beyond the bands twice makes them uncertain.
         """
         highs = states.lows + states.far[:, 1] - states.far[:, 0]
-        lattice = PoseLattice(self._layers, highs).up_to(self.J_limit)
+        graph = PartialPoseGraph(self._layers, highs).up_to(self.J_limit)
         sure = bool(np.all(highs <= self.J_limit))
         if not sure:
             self._drop(states.lows[highs > self.J_limit])
         bound = min(self._lower_bound, float(np.floor(self.J_limit)) + 1.0)
-        return FoundLattice(lattice, self._complete, self._limited, bound, self._visited)
+        return PosesWithin(graph, self._complete, self._limited, bound, self._visited)
 
     def _drop(self, lows: np.ndarray) -> None:
         """Note that states with these bounds were dropped though they might lead to poses."""
@@ -210,7 +210,7 @@ class _LatticeSearch:
         states = self._fit_pairs(states, node)
         if min(totals) <= _FEW_PAIRS:
             return states, node, self._pairs(states, node)
-        best = self._sift(states, waiting, self.rough)
+        best = self._sift(states, waiting, self.quick)
         if best is not None and len(best[1]) > _MANY_PAIRS:
             best = self._sift(states, waiting, self.close)
         if best is None:

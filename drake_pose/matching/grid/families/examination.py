@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drake_pose.errors import SettingsError
-from drake_pose.matching.grid.branch_and_bound.full_detail import LatticeLimits
+from drake_pose.matching.grid.branch_and_bound.full_detail import BoundLimits
 from drake_pose.matching.grid.branch_and_bound.proof import prove_optimal
 from drake_pose.matching.grid.families.search import FamilySettings, find_families, samples_at
-from drake_pose.matching.grid.sampled_body import WideBody
+from drake_pose.matching.grid.sampled_body import SampledBody
 from drake_pose.matching.result import MatchResult, View
 
 
@@ -44,7 +44,7 @@ class ExaminationSettings:
     family_time_limit: float | None = None
     proof_poses: int = 25_000
     family_poses: int = 50_000
-    memory: int = LatticeLimits.memory
+    memory: int = BoundLimits.memory
     families: int = 32
     tolerance: float | None = None
 
@@ -69,7 +69,7 @@ class ExaminationSettings:
 
 
 def examine(
-    body: WideBody,
+    body: SampledBody,
     views: Sequence[View],
     result: MatchResult,
     settings: ExaminationSettings,

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from drake_pose.errors import SettingsError
-from drake_pose.matching.grid.branch_and_bound.partial_pose_graph import PoseLattice
+from drake_pose.matching.grid.branch_and_bound.partial_pose_graph import PartialPoseGraph
 from drake_pose.matching.grid.families.joint_estimates import estimate_joints
 from drake_pose.matching.grid.families.search import GridPoseSet
 from drake_pose.matching.pose_families import JointEstimate, PoseSet
@@ -176,7 +176,7 @@ def choose_by_edges(
 
     exhaustive = answer.size <= most
     random = np.random.default_rng(0)
-    members = _members(answer.lattice, most, random)
+    members = _members(answer.graph, most, random)
     agreements = [judge(samples) for samples in members]
     if not exhaustive:
         _turn_subtrees(answer, members[int(np.argmax(agreements))], judge, most, random)
@@ -215,7 +215,7 @@ def _turn_subtrees(
             None if node in subtree else np.arange(len(grid)) == samples[node]
             for node, grid in enumerate(answer.sampled.values)
         ]
-        members = _members(answer.lattice.restricted(allowed), most, random)
+        members = _members(answer.graph.restricted(allowed), most, random)
         agreements = [judge(member) for member in members]
         unchanged += 1
         if max(agreements) > best:
@@ -225,11 +225,11 @@ def _turn_subtrees(
             return
 
 
-def _members(lattice: PoseLattice, most: int, random: np.random.Generator) -> np.ndarray:
-    """All poses (n, nodes) of a lattice, or so many of them drawn at random."""
-    if lattice.size <= most:
-        return lattice.members()
-    return lattice.draw(most, random)
+def _members(graph: PartialPoseGraph, most: int, random: np.random.Generator) -> np.ndarray:
+    """All poses (n, nodes) of a graph, or so many of them drawn at random."""
+    if graph.size <= most:
+        return graph.members()
+    return graph.draw(most, random)
 
 
 def _mean_agreement(

@@ -7,12 +7,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drake_pose.errors import SettingsError
-from drake_pose.matching.grid.branch_and_bound.full_detail import LatticeLimits
-from drake_pose.matching.grid.branch_and_bound.partial_pose_graph import PoseLattice, single_pose
-from drake_pose.matching.grid.branch_and_bound.search import search_lattice
+from drake_pose.matching.grid.branch_and_bound.full_detail import BoundLimits
+from drake_pose.matching.grid.branch_and_bound.partial_pose_graph import (
+    PartialPoseGraph,
+    single_pose,
+)
+from drake_pose.matching.grid.branch_and_bound.search import branch_and_bound
 from drake_pose.matching.grid.families.joint_estimates import estimate_joints
-from drake_pose.matching.grid.families.split import LatticeFamily, cluster_samples, split_lattice
-from drake_pose.matching.grid.sampled_body import WideBody
+from drake_pose.matching.grid.families.split import (
+    GraphFamily,
+    cluster_samples,
+    split_into_families,
+)
+from drake_pose.matching.grid.sampled_body import SampledBody
 from drake_pose.matching.pose_families import PoseFamily, PoseSet
 from drake_pose.matching.result import View
 from drake_pose.matching.scoring import SampledTree
@@ -32,7 +39,7 @@ class FamilySettings:
         pairs: so many pairs of a partial pose and a pose of the next node are looked at.
         poses: after so many poses of nodes are drawn it answers with what it has.
         time_limit: it answers with what it has after so many seconds; None: no limit.
-        memory: as in LatticeLimits [byte].
+        memory: as in BoundLimits [byte].
 
     Raises:
         SettingsError: if a value is out of its range.
@@ -45,7 +52,7 @@ class FamilySettings:
     pairs: int = 1_000_000
     poses: int = 100_000
     time_limit: float | None = None
-    memory: int = LatticeLimits.memory
+    memory: int = BoundLimits.memory
 
     def __post_init__(self) -> None:
         if self.tolerance is not None and not self.tolerance >= 0.0:
@@ -64,33 +71,33 @@ class GridPoseSet(PoseSet):
     """A set of poses of the grid that tells of any pose whether it is in it.
 
     Args:
-        lattice: the poses.
+        graph: the poses.
         sampled: the sampled tree.
         budget_spent: whether a limit on time or room left poses out.
     """
 
-    lattice: PoseLattice
+    graph: PartialPoseGraph
     sampled: SampledTree
     budget_spent: bool
 
     @property
     def size(self) -> float:
         """How many poses there are."""
-        return self.lattice.size
+        return self.graph.size
 
     def contains(self, node_values: Sequence[np.ndarray]) -> bool:
         """Whether a pose of the grid, the values of each node, is in the set."""
         samples = samples_at(self.sampled, node_values)
-        return samples is not None and self.lattice.contains(samples)
+        return samples is not None and self.graph.contains(samples)
 
     def draw(self, count: int, generator: np.random.Generator) -> list[list[np.ndarray]]:
         """Draw members at random, each as likely as any other: for each the nodes' values."""
-        drawn = self.lattice.draw(count, generator)
+        drawn = self.graph.draw(count, generator)
         return [_values_at(self.sampled, samples) for samples in drawn]
 
 
 def find_families(
-    body: WideBody,
+    body: SampledBody,
     views: Sequence[View],
     samples: np.ndarray,
     J: float,
@@ -116,17 +123,15 @@ def find_families(
     deadline = np.inf
     if settings.time_limit is not None:
         deadline = time.perf_counter() + settings.time_limit
-    limits = LatticeLimits(
-        settings.states, settings.pairs, settings.poses, settings.memory, deadline
-    )
-    found = search_lattice(body, views, J + tolerance, limits, samples)
-    lattice = found.lattice
-    if lattice.best_J < J:
-        lattice = lattice.up_to(lattice.best_J + tolerance)
+    limits = BoundLimits(settings.states, settings.pairs, settings.poses, settings.memory, deadline)
+    found = branch_and_bound(body, views, J + tolerance, limits, samples)
+    graph = found.graph
+    if graph.best_J < J:
+        graph = graph.up_to(graph.best_J + tolerance)
     complete = found.complete
-    if lattice.size == 0.0:
-        lattice, complete = single_pose(samples, J), False
-    described = _describe(body.sampled, lattice, samples, tolerance, complete, settings.families)
+    if graph.size == 0.0:
+        graph, complete = single_pose(samples, J), False
+    described = _describe(body.sampled, graph, samples, tolerance, complete, settings.families)
     return replace(described, budget_spent=found.limited)
 
 
@@ -155,32 +160,32 @@ def contour_length(views: Sequence[View]) -> int:
 
 def _describe(
     sampled: SampledTree,
-    lattice: PoseLattice,
+    graph: PartialPoseGraph,
     samples: np.ndarray,
     tolerance: float,
     complete: bool,
     most: int,
 ) -> GridPoseSet:
-    """The set that a lattice holds; ``samples`` stands for its own family if it is a best one."""
+    """The set that a graph holds; ``samples`` stands for its own family if it is a best one."""
     labels = [
-        cluster_samples(sampled, node, seen) for node, seen in enumerate(lattice.samples_seen())
+        cluster_samples(sampled, node, seen) for node, seen in enumerate(graph.samples_seen())
     ]
-    families = split_lattice(lattice, labels)
+    families = split_into_families(graph, labels)
     described = []
     for family in families[:most]:
-        own = lattice.restricted(
+        own = graph.restricted(
             [label == cluster for label, cluster in zip(labels, family.clusters, strict=True)]
         )
         described.append(_describe_family(sampled, own, family, samples, complete))
     return GridPoseSet(
         families=tuple(described),
         joints=estimate_joints(
-            sampled, lattice.samples_seen(), described[0].node_values, complete=complete
+            sampled, graph.samples_seen(), described[0].node_values, complete=complete
         ),
         tolerance=tolerance,
         complete=complete,
         family_count=len(families),
-        lattice=lattice,
+        graph=graph,
         sampled=sampled,
         budget_spent=False,
     )
@@ -188,12 +193,12 @@ def _describe(
 
 def _describe_family(
     sampled: SampledTree,
-    lattice: PoseLattice,
-    family: LatticeFamily,
+    graph: PartialPoseGraph,
+    family: GraphFamily,
     samples: np.ndarray,
     complete: bool,
 ) -> PoseFamily:
-    central = samples if lattice.objective(samples) == family.J else lattice.central()
+    central = samples if graph.objective(samples) == family.J else graph.central()
     values = _values_at(sampled, central)
     q, X_WB = sampled.tree.positions_from(values)
     return PoseFamily(
@@ -201,7 +206,7 @@ def _describe_family(
         X_WB=X_WB,
         node_values=tuple(values),
         J=family.J,
-        joints=estimate_joints(sampled, lattice.samples_seen(), values, complete=complete),
+        joints=estimate_joints(sampled, graph.samples_seen(), values, complete=complete),
         size=family.size,
     )
 

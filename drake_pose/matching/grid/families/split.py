@@ -1,4 +1,4 @@
-"""Which poses of a lattice belong together.
+"""Which poses of a graph belong together.
 
 Two samples of a node are neighbours if no value differs by more than a step of the grid, or if they
 place the node alike. The samples of a node that occur fall into clusters of neighbours of
@@ -12,7 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from drake_pose.matching.grid.branch_and_bound.partial_pose_graph import Layer, PoseLattice
+from drake_pose.matching.grid.branch_and_bound.partial_pose_graph import Layer, PartialPoseGraph
 from drake_pose.matching.grid.families.joint_estimates import grid_steps
 from drake_pose.matching.scoring import SampledTree
 
@@ -23,8 +23,8 @@ _MOST_PAIRS = 200_000
 
 
 @dataclass(frozen=True)
-class LatticeFamily:
-    """One family of a lattice.
+class GraphFamily:
+    """One family of a graph.
 
     Attributes:
         clusters: (nodes,) int64 the cluster of each node.
@@ -63,17 +63,17 @@ def cluster_samples(sampled: SampledTree, node: int, samples: np.ndarray) -> np.
     return labels
 
 
-def split_lattice(lattice: PoseLattice, labels: list[np.ndarray]) -> list[LatticeFamily]:
-    """The families of a lattice, best first, of equals the larger first.
+def split_into_families(graph: PartialPoseGraph, labels: list[np.ndarray]) -> list[GraphFamily]:
+    """The families of a graph, best first, of equals the larger first.
 
     Args:
-        lattice: the poses.
+        graph: the poses.
         labels: for each node the clusters of its samples, as of cluster_samples.
     """
     states, families = np.zeros(1, dtype=np.int64), np.zeros(1, dtype=np.int64)
     sizes: np.ndarray = np.ones(1)
     clusters = np.zeros((1, len(labels)), dtype=np.int64)
-    for layer in lattice.layers:
+    for layer in graph.layers:
         found = labels[layer.node][layer.samples]
         several = found.max(initial=0) > 0 and len(states) < _MOST_PAIRS
         ends, codes, weights = _bundle(layer, found if several else np.zeros_like(found))
@@ -90,7 +90,7 @@ def split_lattice(lattice: PoseLattice, labels: list[np.ndarray]) -> list[Lattic
         merged, places = np.unique(keys, axis=0, return_inverse=True)
         sizes = np.bincount(places.ravel(), sizes[source] * weights[edge], minlength=len(merged))
         states, families = merged[:, 0], merged[:, 1]
-    return _collect(lattice, states, families, sizes, clusters)
+    return _collect(graph, states, families, sizes, clusters)
 
 
 def _bundle(
@@ -103,16 +103,16 @@ def _bundle(
 
 
 def _collect(
-    lattice: PoseLattice,
+    graph: PartialPoseGraph,
     states: np.ndarray,
     families: np.ndarray,
     sizes: np.ndarray,
     clusters: np.ndarray,
-) -> list[LatticeFamily]:
+) -> list[GraphFamily]:
     """The families from pairs of a last state and a family."""
     found = []
     for family in np.unique(families):
         own = families == family
-        J = float(lattice.Js[states[own]].min())
-        found.append(LatticeFamily(clusters[family], float(sizes[own].sum()), J))
+        J = float(graph.Js[states[own]].min())
+        found.append(GraphFamily(clusters[family], float(sizes[own].sum()), J))
     return sorted(found, key=lambda family: (family.J, -family.size))

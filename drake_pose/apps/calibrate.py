@@ -17,7 +17,7 @@ from drake_pose.camera.calibration.board import load_board
 from drake_pose.camera.calibration.calibrate import Calibration, CalibrationSettings, calibrate
 from drake_pose.camera.calibration.lens import COEFFICIENTS, Lens, save_lenses
 from drake_pose.camera.calibration.pictures import (
-    BoardSightings,
+    BoardDetections,
     Picture,
     find_boards,
     find_pictures,
@@ -37,7 +37,7 @@ class CalibrationReport:
     """
 
     calibration: Calibration
-    seen: BoardSightings
+    seen: BoardDetections
     files: tuple[Path, ...] = ()
 
     @property
@@ -45,7 +45,7 @@ class CalibrationReport:
         """What the user should look at, a line each."""
         unreadable = self.seen.unreadable or {}
         lines = [reason for reason in unreadable.values()]
-        for camera in self.seen.sightings:
+        for camera in self.seen.detections:
             blank = [frame for name, frame in self.seen.not_found if name == camera]
             if blank:
                 lines.append(f"camera '{camera}': no board found in {_listed(blank)}")

@@ -1,7 +1,7 @@
 """Belief within limits: a Kalman filter whose estimates respect linear inequalities."""
 
 from drake_pose.filtering.kalman.hypotheses import Hypothesis, Rejection
-from drake_pose.filtering.kalman.repeated_views import Stare, View
+from drake_pose.filtering.kalman.repeated_views import RepeatedView, View
 from drake_pose.filtering.kalman.truncated_filter import (
     FilterSettings,
     FilterState,
@@ -64,7 +64,7 @@ __all__ = [
     "MatchAndTrack",
     "ObservationModel",
     "Rejection",
-    "Stare",
+    "RepeatedView",
     "StateLayout",
     "Track",
     "TrackingSettings",

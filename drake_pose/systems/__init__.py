@@ -22,10 +22,15 @@ from drake_pose.systems.estimators.mask_player import MaskPlayer
 from drake_pose.systems.estimators.silhouette_matcher import STATISTICS, SilhouetteMatcher
 from drake_pose.systems.estimators.silhouette_tracker import TRACK, SilhouetteTracker
 from drake_pose.systems.estimators.truncated_ekf import TruncatedEkf
-from drake_pose.systems.person.live_capture import EyePorts, LiveEyes, LocalEyes, build_live_capture
+from drake_pose.systems.person.live_capture import (
+    LiveSensors,
+    LocalSensors,
+    SensorPorts,
+    build_live_capture,
+)
 from drake_pose.systems.person.person_tracker import PersonTracker, build_person_capture
 from drake_pose.systems.person.silhouette_capture import SilhouetteCapture, build_silhouette_capture
-from drake_pose.systems.person.silhouette_sensor import SilhouetteEye
+from drake_pose.systems.person.silhouette_sensor import SilhouetteSensor
 from drake_pose.systems.pictures.picture_capture import CameraCount, PictureCapture
 from drake_pose.systems.walk.walk import Walker, WalkKeys, WalkView, build_walk
 
@@ -35,13 +40,12 @@ __all__ = [
     "AxisSensor",
     "BodyBelief",
     "CameraCount",
-    "EyePorts",
     "FaceDirectionFinder",
     "FeatureFinder",
     "HandTracking",
     "HorizontalImage",
-    "LiveEyes",
-    "LocalEyes",
+    "LiveSensors",
+    "LocalSensors",
     "MaskPlayer",
     "MatchingDiagram",
     "MeshcatSkin",
@@ -50,9 +54,10 @@ __all__ = [
     "PersonTracker",
     "PictureCapture",
     "PoseRecogniser",
+    "SensorPorts",
     "SilhouetteCapture",
-    "SilhouetteEye",
     "SilhouetteMatcher",
+    "SilhouetteSensor",
     "SilhouetteTracker",
     "SkinPoser",
     "StateMatcher",

@@ -85,12 +85,12 @@ def test_undistorted_pictures_fit_the_written_cameras(taken, report, tmp_path):
     for (name, frame), path in list(written.items())[::3]:
         if frame not in poses:
             continue
-        sighting = CHECKERBOARD.find(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
-        if sighting is None:
+        detection = CHECKERBOARD.find(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+        if detection is None:
             continue  # Cut off by the undistorted picture's edge.
         X_0B = X_0W @ poses[frame]
         uv, _ = straight[name].project(CHECKERBOARD.points @ X_0B[:3, :3].T + X_0B[:3, 3])
-        difference = sighting.uv - uv
+        difference = detection.uv - uv
         # The shape must fit; how far off the whole lies is the poses' error.
         assert np.abs(difference - difference.mean(axis=0)).max() < 1.5
         checked += 1

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from drake_pose.camera.calibration.board import Board, Sighting
-from drake_pose.camera.calibration.pictures import BoardSightings
+from drake_pose.camera.calibration.board import Board, Detection
+from drake_pose.camera.calibration.pictures import BoardDetections
 
 CHECKERBOARD = Board("checkerboard", 8, 5, 0.12)
 CHARUCO = Board("charuco", 8, 5, 0.12, marker_length=0.09, dictionary="4X4_50")
@@ -128,9 +128,9 @@ def sightings_of(cameras, board, poses, generator, noise=0.1):
             uv = camera.project(p_W)
             if facing(X_WB, camera) and inside(uv, camera):
                 uv = uv + generator.normal(0, noise, uv.shape)
-                found[name][frame] = Sighting(np.arange(len(uv)), uv)
+                found[name][frame] = Detection(np.arange(len(uv)), uv)
     sizes = {name: (camera.width, camera.height) for name, camera in cameras.items()}
-    return BoardSightings(board, sizes, found)
+    return BoardDetections(board, sizes, found)
 
 
 def drawn_board(board):

@@ -41,7 +41,7 @@ OnProgress = Callable[[int, int, str], None]
 """Called with the number of frames done, that of all frames, and what went wrong just now or ""."""
 
 
-class Crew(Protocol):
+class WorkerPool(Protocol):
     """Who does the tasks."""
 
     @property
@@ -60,7 +60,7 @@ class Crew(Protocol):
 
 
 class OwnProcess:
-    """A crew of one: this process, which does a task when it is waited for."""
+    """A pool of one worker: this process, which does a task when it is waited for."""
 
     size = 1
 
@@ -80,7 +80,7 @@ class OwnProcess:
 def run_batch(
     jobs: Sequence[SceneJob],
     out: Path,
-    crew: Crew | None = None,
+    pool: WorkerPool | None = None,
     resume: bool = False,
     on_progress: OnProgress | None = None,
 ) -> BatchResult:
@@ -91,7 +91,7 @@ def run_batch(
     Args:
         jobs: the scenes.
         out: the batch's folder, empty or not there.
-        crew: who works; this process where None.
+        pool: who works; this process where None.
         resume: go on with what is in ``out``, and try failed scenes again.
         on_progress: hears how far it is.
 
@@ -108,7 +108,7 @@ def run_batch(
     try:
         batch.write()
         batch.plan()
-        batch.run(OwnProcess() if crew is None else crew)
+        batch.run(OwnProcess() if pool is None else pool)
     finally:
         batch.write()
     return batch.result()
@@ -143,14 +143,14 @@ class _Batch:
                 self._waiting.append(whole)
         self._report("")
 
-    def run(self, crew: Crew) -> None:
+    def run(self, pool: WorkerPool) -> None:
         """Does what is missing."""
         running = 0
         while self._waiting or running:
-            while self._waiting and running < crew.size:
-                crew.start(self._waiting.popleft())
+            while self._waiting and running < pool.size:
+                pool.start(self._waiting.popleft())
                 running += 1
-            self._note(*crew.next())
+            self._note(*pool.next())
             running -= 1
             if time.monotonic() - self._written > _SUMMARY_PERIOD:
                 self.write()

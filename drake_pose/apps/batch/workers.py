@@ -1,4 +1,4 @@
-"""The workers of a cluster as the crew of a batch."""
+"""The workers of a cluster as the pool of a batch."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 
-class ClusterCrew:
+class ClusterPool:
     """The workers of a cluster, as a batch needs them.
 
     At most one task a thread is under way, so that none waits at a worker that may die.

@@ -23,8 +23,8 @@ from rich.table import Table
 
 from drake_pose.apps.batch.batch import run_batch
 from drake_pose.apps.batch.job import SceneJob
-from drake_pose.apps.batch.workers import ClusterCrew
-from drake_pose.apps.cluster.remote_views import ClusterEyes
+from drake_pose.apps.batch.workers import ClusterPool
+from drake_pose.apps.cluster.remote_views import ClusterSensors
 from drake_pose.apps.cluster.scheduler import open_cluster
 from drake_pose.apps.experiments.date.motion import make_motion
 from drake_pose.apps.experiments.kameda.experiment import experiment_camera
@@ -37,7 +37,7 @@ from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.multiview.date.skeleton import load_skeleton
 from drake_pose.multiview.recordings.known_shape import tracker_of_person
 from drake_pose.silhouette import LabelRenderer, write_mask
-from drake_pose.systems.person.live_capture import LiveEyes, build_live_capture
+from drake_pose.systems.person.live_capture import LiveSensors, build_live_capture
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
 
 if TYPE_CHECKING:
@@ -151,9 +151,9 @@ def write_studio(folder: Path, frames: int = _FRAMES) -> LiveScene:
 def measure_batch(job: SceneJob, out: Path, workers: int, client: Client | None) -> BatchFigures:
     """Times a batch; what the workers need to start is not counted."""
     if client is not None:
-        run_batch(warm_up_jobs(job, workers), out / "warm_up", ClusterCrew(client))
+        run_batch(warm_up_jobs(job, workers), out / "warm_up", ClusterPool(client))
     begin, processor = time.perf_counter(), time.process_time()
-    result = run_batch([job], out / "out", None if client is None else ClusterCrew(client))
+    result = run_batch([job], out / "out", None if client is None else ClusterPool(client))
     seconds, processor = time.perf_counter() - begin, time.process_time() - processor
     frames = result.scenes[job.name].frame_count
     size = sum(path.stat().st_size for path in (out / "out").rglob("*") if path.is_file())
@@ -168,9 +168,9 @@ def warm_up_jobs(job: SceneJob, count: int) -> list[SceneJob]:
 
 def measure_live(scene: LiveScene, workers: int, client: Client | None) -> LiveFigures:
     """Captures a recording as fast as can be."""
-    eyes: LiveEyes = scene.open_eyes() if client is None else ClusterEyes(client, scene)
+    sensors: LiveSensors = scene.open_sensors() if client is None else ClusterSensors(client, scene)
     tracker = tracker_of_person(load_model(bundled_model("person"), check=False).pose_tree(), None)
-    diagram = build_live_capture(tracker, scene.cameras, eyes)
+    diagram = build_live_capture(tracker, scene.cameras, sensors)
     times: list[tuple[float, float]] = []
 
     def note(_: LiveFrame) -> None:
@@ -178,17 +178,17 @@ def measure_live(scene: LiveScene, workers: int, client: Client | None) -> LiveF
 
     try:
         run_live(
-            diagram, eyes, None, lambda _: None, monitor=FrameWatch(diagram, scene.cameras, note)
+            diagram, sensors, None, lambda _: None, monitor=FrameWatch(diagram, scene.cameras, note)
         )
     finally:
-        eyes.close()
+        sensors.close()
     # In the first frame the person is searched, not followed.
     walls, processors = np.diff(times, axis=0).T
     seconds, centre = float(walls.sum()), float(np.median(processors))
     figures = LiveFigures(workers, len(scene.cameras), len(walls), seconds, centre)
-    if not isinstance(eyes, ClusterEyes):
+    if not isinstance(sensors, ClusterSensors):
         return figures
-    groups = eyes.watchers.groups
+    groups = sensors.watchers.groups
     views = sum(group.views for group in groups)
     return replace(
         figures,

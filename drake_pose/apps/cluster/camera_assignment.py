@@ -12,7 +12,7 @@ from drake_pose.errors import ClusterError
 
 
 @dataclass(frozen=True)
-class CameraPlace:
+class CameraAssignment:
     """Cameras that one worker looks through. hosts: where; empty: anywhere."""
 
     specifications: tuple[SourceSpecification, ...]
@@ -23,9 +23,9 @@ class CameraPlace:
         return not self.hosts or host_of(address) in self.hosts
 
 
-def place_cameras(
+def assign_cameras(
     specifications: Sequence[SourceSpecification], workers: Mapping[str, Collection[str]]
-) -> list[CameraPlace]:
+) -> list[CameraAssignment]:
     """Shares cameras out among workers.
 
     Recordings and cameras in a network can be opened anywhere. A camera that hangs on a machine
@@ -55,18 +55,18 @@ def place_cameras(
                 f'which: start a worker there with --resources "{one.camera}=1"'
             )
         bound.setdefault(homes, []).append(one)
-    places = []
+    assignments = []
     for homes, group in bound.items():
-        places += _split(group, sum(host_of(address) in homes for address in workers), homes)
-    return places + _split(free, len(workers), frozenset())
+        assignments += _split(group, sum(host_of(address) in homes for address in workers), homes)
+    return assignments + _split(free, len(workers), frozenset())
 
 
 def _split(
     group: Sequence[SourceSpecification], count: int, hosts: frozenset[str]
-) -> list[CameraPlace]:
+) -> list[CameraAssignment]:
     """Neighbours stay together."""
     parts = np.array_split(np.arange(len(group)), max(1, min(count, len(group))))
-    return [CameraPlace(tuple(group[k] for k in part), hosts) for part in parts if len(part)]
+    return [CameraAssignment(tuple(group[k] for k in part), hosts) for part in parts if len(part)]
 
 
 def host_of(address: str) -> str:

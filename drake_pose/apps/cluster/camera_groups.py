@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drake_pose.apps.cluster import camera_worker
-from drake_pose.apps.cluster.camera_assignment import CameraPlace, place_cameras
-from drake_pose.apps.cluster.camera_worker import WatchAnswer, WatchRequest
+from drake_pose.apps.cluster.camera_assignment import CameraAssignment, assign_cameras
+from drake_pose.apps.cluster.camera_worker import WatchReply, WatchRequest
 from drake_pose.apps.cluster.worker import worker_resources
 from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecification, TimedPicture
 from drake_pose.errors import ClusterError, DrakePoseError
@@ -35,7 +35,7 @@ _OPENING = 120.0
 _ALIVE_PERIOD = 0.25
 # A worker that does not answer for so long is said to be silent [s].
 _SILENCE = 3.0
-_NAP = 0.0005
+_POLL_PAUSE = 0.0005
 
 
 class Watchers:
@@ -70,8 +70,8 @@ class Watchers:
         self._addresses: tuple[str, ...] = ()
         self._warm: dict[str, Future] = {}
         self._looked = -np.inf
-        places = place_cameras(specifications, client.run(worker_resources))
-        self.groups = [WatchedGroup(self, place, spacings) for place in places]
+        assignments = assign_cameras(specifications, client.run(worker_resources))
+        self.groups = [WatchedGroup(self, assignment, spacings) for assignment in assignments]
         try:
             for group in self.groups:
                 group.prepare()
@@ -95,7 +95,7 @@ class Watchers:
 
     def free_address(self, group: WatchedGroup) -> str | None:
         """The worker with the fewest groups; None where none can look through the cameras."""
-        loads = dict.fromkeys(filter(group.place.allows, self.addresses()), 0)
+        loads = dict.fromkeys(filter(group.assignment.allows, self.addresses()), 0)
         for other in self.groups:
             if other is not group and other.address in loads:
                 loads[other.address] += 1
@@ -124,7 +124,7 @@ class WatchedGroup:
     """Cameras that one worker watches.
 
     Attributes:
-        place: the cameras, and where they can be looked through.
+        assignment: the cameras, and where they can be looked through.
         address: of the worker.
         specifications: by camera, of the cameras' sources.
         queues: by camera, what came and was not read yet.
@@ -135,18 +135,18 @@ class WatchedGroup:
 
     Args:
         watchers: all of them.
-        place: the cameras, and where they can be looked through.
+        assignment: the cameras, and where they can be looked through.
         spacings: from edge point to edge point, by camera [pixel].
     """
 
     def __init__(
         self,
         watchers: Watchers,
-        place: CameraPlace,
+        assignment: CameraAssignment,
         spacings: Mapping[str, float],
     ) -> None:
-        self.place = place
-        self.specifications = {one.camera: one for one in place.specifications}
+        self.assignment = assignment
+        self.specifications = {one.camera: one for one in assignment.specifications}
         self.address = ""
         self.queues: dict[str, deque[TimedPicture]] = {
             name: deque() for name in self.specifications
@@ -183,7 +183,7 @@ class WatchedGroup:
         while self._future is not None:
             if time.monotonic() - begin > _OPENING:
                 raise ClusterError(f"the worker of camera {self.names} does not get ready")
-            time.sleep(_NAP)
+            time.sleep(_POLL_PAUSE)
             if self._future.done():
                 future, self._future = self._future, None
                 self._take(future.result())
@@ -210,7 +210,7 @@ class WatchedGroup:
             self._watchers.pump()
             # The next time nobody waits, until it answers.
             self._given_up = time.monotonic() - begin > _PATIENCE
-            time.sleep(_NAP)
+            time.sleep(_POLL_PAUSE)
 
     def close(self) -> None:
         """Lets go of the sources."""
@@ -237,19 +237,19 @@ class WatchedGroup:
         )
         self._asked = time.monotonic()
         self._future = self._client.submit(
-            camera_worker.look, request, workers=[self.address], pure=False
+            camera_worker.poll, request, workers=[self.address], pure=False
         )
 
     def _note(self, future: Future) -> None:
-        """Takes an answer; it may have died with its worker."""
+        """Takes a reply; it may have died with its worker."""
         error = future.exception() if future.status == "error" else None
         if future.status != "finished":
             self._lose(f"failed ({error})" if isinstance(error, DrakePoseError) else "was lost")
             return
         with suppress(asyncio.TimeoutError, asyncio.CancelledError, futures.CancelledError):
-            answer = future.result(timeout=_ALIVE_PERIOD)
+            reply = future.result(timeout=_ALIVE_PERIOD)
             self._future = None
-            self._take(answer)
+            self._take(reply)
 
     def _lose(self, how: str) -> None:
         self._report_silence(how)
@@ -282,22 +282,22 @@ class WatchedGroup:
             camera_worker.close, self._key, workers=[self.address], pure=False
         )
 
-    def _take(self, answer: WatchAnswer) -> None:
+    def _take(self, reply: WatchReply) -> None:
         if self._silent:
             self._watchers.reports.append(f"a worker goes on with camera {self.names}")
         self._silent = self._given_up = False
-        for name, views in answer.views.items():
+        for name, views in reply.views.items():
             for one in views:
                 packed = np.frombuffer(one.packed, dtype=np.uint8)
                 self.queues[name].append(TimedPicture(one.time, one.frame, packed))
                 self._after[name] = one.time
                 self.view_bytes += len(one.packed)
             self.views += len(views)
-        self.ended.update(answer.ended)
-        self.rates.update(answer.rates)
-        self.dropped.update(answer.dropped)
-        self.seconds += answer.seconds
-        self._watchers.reports.extend(answer.problems)
+        self.ended.update(reply.ended)
+        self.rates.update(reply.rates)
+        self.dropped.update(reply.dropped)
+        self.seconds += reply.seconds
+        self._watchers.reports.extend(reply.problems)
 
 
 class WatchedSource(FrameSource):

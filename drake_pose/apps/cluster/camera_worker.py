@@ -1,6 +1,6 @@
 """What a worker does for live capture: it opens some cameras' sources and says what they see.
 
-The sources stay open from one look to the next. Pictures do not leave the machine; what leaves it
+The sources stay open from one poll to the next. Pictures do not leave the machine; what leaves it
 is a few kilobytes a camera.
 """
 
@@ -25,8 +25,8 @@ from drake_pose.multiview.regions import Background, learn_background, person_re
 
 # Cameras for which nobody asks are let go after this time [s].
 _IDLE = 30.0
-# Between two looks whether a live camera has a new picture [s].
-_NAP = 0.002
+# Between two checks whether a live camera has a new picture [s].
+_POLL_PAUSE = 0.002
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class PackedView:
 
 
 @dataclass(frozen=True, eq=False)
-class WatchAnswer:
+class WatchReply:
     """What a worker saw.
 
     Args:
@@ -102,7 +102,7 @@ class _Watch:
             self.close()
             raise
 
-    def look(self, request: WatchRequest) -> WatchAnswer:
+    def poll(self, request: WatchRequest) -> WatchReply:
         """What the cameras see now, or next."""
         self.used = time.monotonic()
         seconds = 0.0
@@ -116,12 +116,12 @@ class _Watch:
             live = any(one.specification.live for one in self._sources.values())
             if not live or any(views.values()) or time.monotonic() > end:
                 break
-            time.sleep(_NAP)
+            time.sleep(_POLL_PAUSE)
         self.used = time.monotonic()
         problems = [text for one in self._sources.values() for text in one.problems]
         for source in self._sources.values():
             source.problems.clear()
-        return WatchAnswer(
+        return WatchReply(
             views={name: tuple(seen) for name, seen in views.items()},
             ended=tuple(name for name, source in self._sources.items() if source.ended),
             problems=tuple(problems),
@@ -167,7 +167,7 @@ _watches_lock = threading.Lock()
 
 
 def warm() -> None:
-    """Brings all to memory that a look needs, so that the first one is as fast as the others."""
+    """Brings all to memory that a poll needs, so that the first one is as fast as the others."""
     # A worker is one core.
     cv2.setNumThreads(1)
     region = np.zeros((64, 64), dtype=np.bool_)
@@ -175,7 +175,7 @@ def warm() -> None:
     pack_view(see_silhouette(region, 4.0))
 
 
-def look(request: WatchRequest) -> WatchAnswer:
+def poll(request: WatchRequest) -> WatchReply:
     """Opens the cameras' sources if they are not open yet, and says what they see.
 
     Raises:
@@ -189,7 +189,7 @@ def look(request: WatchRequest) -> WatchAnswer:
                 target=_close_when_idle, args=(request.key, watch), daemon=True
             ).start()
     with watch.lock:
-        return watch.look(request)
+        return watch.poll(request)
 
 
 def close(key: str) -> None:

@@ -1,4 +1,4 @@
-"""The eyes of a live capture on workers: each opens the sources of its cameras itself."""
+"""The sensors of a live capture on workers: each opens the sources of its cameras itself."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_pose.apps.cluster.camera_groups import WatchedSource, Watchers
 from drake_pose.apps.live.scene import LiveScene
 from drake_pose.camera.sources.frame_source import Clock
-from drake_pose.systems.person.live_capture import EyePorts
-from drake_pose.systems.person.remote_sensors import RemoteEyes
+from drake_pose.systems.person.live_capture import SensorPorts
+from drake_pose.systems.person.remote_sensors import RemoteSensors
 from drake_pose.systems.person.silhouette_sensor import edge_spacing
 from drake_pose.systems.pictures.picture_capture import CameraCount
 
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from distributed import Client
 
 
-def opener(client: Client, tolerance: float | None = None) -> Callable[[LiveScene], ClusterEyes]:
-    """What opens the eyes of a scene on the workers of a cluster."""
-    return lambda scene: ClusterEyes(client, scene, tolerance=tolerance)
+def opener(client: Client, tolerance: float | None = None) -> Callable[[LiveScene], ClusterSensors]:
+    """What opens the sensors of a scene on the workers of a cluster."""
+    return lambda scene: ClusterSensors(client, scene, tolerance=tolerance)
 
 
-class ClusterEyes:
-    """Eyes on the workers of a cluster, one worker for each group of cameras; see LiveEyes.
+class ClusterSensors:
+    """Sensors on the workers of a cluster, one worker for each group of cameras; see LiveSensors.
 
     Pictures stay where they are: a worker says in a few kilobytes what its cameras see. A worker
     that dies costs the others nothing; another one, or itself when it was started again, goes on
@@ -68,7 +68,7 @@ class ClusterEyes:
             for name, one in group.specifications.items()
         }
         ordered = {one.camera: sources[one.camera] for one in specifications}
-        self.capture = RemoteEyes(
+        self.capture = RemoteSensors(
             ordered, scene.cameras, live=live, tolerance=tolerance, clock=clock
         )
         if self.capture.live:
@@ -80,15 +80,15 @@ class ClusterEyes:
         """How many moments were not shown, as newer ones had come."""
         return self.capture.skipped
 
-    def add(self, builder: DiagramBuilder) -> EyePorts:
+    def add(self, builder: DiagramBuilder) -> SensorPorts:
         """Adds the systems that see to a diagram under construction."""
-        builder.AddNamedSystem("remote_eyes", self.capture)
+        builder.AddNamedSystem("remote_sensors", self.capture)
         silhouettes = {
             name: self.capture.GetOutputPort(f"silhouette_{name}")
             for group in self.watchers.groups
             for name in group.specifications
         }
-        return EyePorts(silhouettes, self.capture.GetOutputPort("time"))
+        return SensorPorts(silhouettes, self.capture.GetOutputPort("time"))
 
     def take_reports(self) -> list[str]:
         """What the user should know and was not told yet."""

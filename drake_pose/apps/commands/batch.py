@@ -36,14 +36,14 @@ def batch(
     with errors_as_messages(out):
         from drake_pose.apps.batch.batch import run_batch
         from drake_pose.apps.batch.job import read_job
-        from drake_pose.apps.batch.workers import ClusterCrew
+        from drake_pose.apps.batch.workers import ClusterPool
         from drake_pose.apps.commands.batch_report import BatchProgress, print_batch
 
         read = read_job(jobs, chunk)
         with workers_of(workers, scheduler, out.absolute().parent) as client:
-            crew = None if client is None else ClusterCrew(client)
+            pool = None if client is None else ClusterPool(client)
             with BatchProgress() as progress:
-                result = run_batch(read, out, crew, resume, progress)
+                result = run_batch(read, out, pool, resume, progress)
         if json:
             print_json(result.as_json())
         else:

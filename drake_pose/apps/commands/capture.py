@@ -70,15 +70,15 @@ def capture(
                 f"{scene} has a sources.yaml"
             )
         with errors_as_messages(), workers_of(workers, scheduler) as client:
-            open_eyes = None
+            open_sensors = None
             if client is not None:
                 from drake_pose.apps.cluster.remote_views import opener
 
                 # Workers may have another working folder.
-                scene, open_eyes = scene.absolute(), opener(client, tolerance)
+                scene, open_sensors = scene.absolute(), opener(client, tolerance)
             run_live_capture(
                 scene, out, model, seconds=seconds, shape=shape, fit_shape=fit_shape,
-                tolerance=tolerance, replay=replay, json=json, open_eyes=open_eyes,
+                tolerance=tolerance, replay=replay, json=json, open_sensors=open_sensors,
                 packages=packages,
             )  # fmt: skip
         return

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from drake_pose.apps.live.capture import LiveResult
     from drake_pose.apps.live.scene import LiveScene
-    from drake_pose.systems.person.live_capture import LiveEyes
+    from drake_pose.systems.person.live_capture import LiveSensors
 
 _PANEL = "Live capture (sources.yaml)"
 
@@ -71,7 +71,7 @@ def run_live_capture(
     tolerance: float | None = None,
     replay: bool = True,
     json: bool = False,
-    open_eyes: Callable[[LiveScene], LiveEyes] | None = None,
+    open_sensors: Callable[[LiveScene], LiveSensors] | None = None,
     packages: Mapping[str, Path] | None = None,
 ) -> None:
     """Captures as the pictures come, tells what happens, and prints what came out."""
@@ -84,15 +84,19 @@ def run_live_capture(
         settings = LiveSettings(seconds, shape, fit_shape, replay, packages or {})
         scene = load_live_scene(folder)
 
-        def eyes() -> LiveEyes:
-            return scene.open_eyes(tolerance=tolerance) if open_eyes is None else open_eyes(scene)
+        def sensors() -> LiveSensors:
+            return (
+                scene.open_sensors(tolerance=tolerance)
+                if open_sensors is None
+                else open_sensors(scene)
+            )
 
         with FrameProgress() as progress:
 
             def show(count: int, found: bool) -> None:
                 progress.show_stage("frames", count, None)
 
-            result = capture_live(scene, out, model, settings, eyes, warn, show)
+            result = capture_live(scene, out, model, settings, sensors, warn, show)
         _print_result(result, json)
 
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
 
     from drake_pose.apps.live.scene import LiveScene
-    from drake_pose.systems.person.live_capture import LiveEyes
+    from drake_pose.systems.person.live_capture import LiveSensors
 
 
 def walk(
@@ -158,17 +158,17 @@ def _walk_live(
     def report(text: str) -> None:
         say(f"drake-pose: {text}")
 
-    open_eyes = None if client is None else _opener(client, scene)
+    open_sensors = None if client is None else _opener(client, scene)
     walked = walk_live(
-        scene, page, model, shape, seconds, open_eyes, _say_command, report, packages
+        scene, page, model, shape, seconds, open_sensors, _say_command, report, packages
     )
     for text in walked["warnings"]:
         warn(text)
     return walked
 
 
-def _opener(client: Client, scene: LiveScene) -> Callable[[], LiveEyes]:
-    """What opens the eyes on the workers."""
+def _opener(client: Client, scene: LiveScene) -> Callable[[], LiveSensors]:
+    """What opens the sensors on the workers."""
     from drake_pose.apps.cluster.remote_views import opener
 
     # A recording cannot be skipped from afar as fast as its moments pass, so that it is waited for.

@@ -30,11 +30,11 @@ from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker
 from drake_pose.multiview.recordings.known_shape import KnownShape, tracker_of_person
 from drake_pose.multiview.recordings.other_persons import keep_person
 from drake_pose.silhouette import Scene, draw_mask
-from drake_pose.systems.person.live_capture import LiveEyes, build_live_capture
+from drake_pose.systems.person.live_capture import LiveSensors, build_live_capture
 from drake_pose.systems.person.person_tracker import place_of_person
 from drake_pose.systems.pictures.picture_capture import CameraCount
 
-OpenEyes = Callable[[], LiveEyes]
+OpenSensors = Callable[[], LiveSensors]
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def capture_live(
     out: Path,
     model_path: Path | None = None,
     settings: LiveSettings | None = None,
-    open_eyes: OpenEyes | None = None,
+    open_sensors: OpenSensors | None = None,
     on_report: Callable[[str], None] = lambda _: None,
     on_frame: Callable[[int, bool], None] = lambda _, __: None,
 ) -> LiveResult:
@@ -97,7 +97,7 @@ def capture_live(
         model_path: a person with landmarks.yaml beside it; the bundled one with shape joints where
             not given.
         settings: how.
-        open_eyes: opens the eyes; those of the scene in this process where not given. Called once
+        open_sensors: opens the sensors; where not given the scene's, in this process. Called once
             more for the frames that give the person's shape.
         on_report: hears at once of cameras that stop and return, and of bad pictures.
         on_frame: hears of each frame: how many there are, and whether a person was found.
@@ -107,17 +107,17 @@ def capture_live(
         OutputError: the result cannot be written.
     """
     settings = settings or LiveSettings()
-    opener: OpenEyes = open_eyes or (lambda: scene.open_eyes())
+    opener: OpenSensors = open_sensors or (lambda: scene.open_sensors())
     model = load_model(model_path or bundled_person(), package_paths=settings.packages)
     # A folder that cannot be written is refused before a camera is opened.
     require_empty(out)
     shape = _shape(scene, model, settings, opener, on_report)
     tracker = tracker_of_person(model.pose_tree(), shape)
     told: list[str] = []
-    eyes = opener()
+    sensors = opener()
     try:
-        diagram = build_live_capture(tracker, scene.cameras, eyes, with_deviations=True)
-        result = _Result(scene, model, tracker, out, eyes.period, settings.packages)
+        diagram = build_live_capture(tracker, scene.cameras, sensors, with_deviations=True)
+        result = _Result(scene, model, tracker, out, sensors.period, settings.packages)
         result.writer.more["method"] = "person"
         if shape is not None:
             result.writer.more |= {"lengths_m": shape.lengths, "girths": shape.girths}
@@ -134,12 +134,12 @@ def capture_live(
                 on_report(text)
 
             watch = FrameWatch(diagram, scene.cameras, note)
-            interrupted = run_live(diagram, eyes, settings.seconds, report, monitor=watch)
-            result.finish(eyes, settings.replay)
+            interrupted = run_live(diagram, sensors, settings.seconds, report, monitor=watch)
+            result.finish(sensors, settings.replay)
         finally:
             result.writer.close()
     finally:
-        eyes.close()
+        sensors.close()
     estimate = result.writer.result()
     troubles = tuple(text for text in estimate.warnings if text not in told)
     return LiveResult(estimate, interrupted, troubles)
@@ -149,7 +149,7 @@ def _shape(
     scene: LiveScene,
     model: ArticulatedModel,
     settings: LiveSettings,
-    open_eyes: OpenEyes,
+    open_sensors: OpenSensors,
     on_report: Callable[[str], None],
 ) -> KnownShape | None:
     """The person's lengths and girths; None: the model's."""
@@ -157,13 +157,13 @@ def _shape(
         return shape_of_result(settings.shape)
     if not settings.fit_shape:
         return None
-    eyes = open_eyes()
+    sensors = open_sensors()
     try:
         # What is wrong with recorded pictures is said when they are captured.
-        report = on_report if eyes.live else lambda _: None
-        return fit_first_frames(scene, eyes, model.pose_tree(), report)
+        report = on_report if sensors.live else lambda _: None
+        return fit_first_frames(scene, sensors, model.pose_tree(), report)
     finally:
-        eyes.close()
+        sensors.close()
 
 
 class _Result:
@@ -216,19 +216,19 @@ class _Result:
         self.writer.finish_frame(row, record)
         return row.found
 
-    def finish(self, eyes: LiveEyes, replay: bool) -> None:
+    def finish(self, sensors: LiveSensors, replay: bool) -> None:
         """Writes what is made of all frames."""
         writer = self.writer
         # A moment that no camera saw, or nobody had time for, is a frame without a pose.
         frames = tuple(f"{k:06d}" for k in range(self._last + 1))
         scene = replace(writer.inputs.scene, frames=frames, masks=self._seen)
         writer.inputs = replace(writer.inputs, scene=scene, frames=tuple(self._times))
-        counts = eyes.counts()
+        counts = sensors.counts()
         writer.more["sources"] = {
             name: _describe_camera(self._scene, name, count) for name, count in counts.items()
         }
-        writer.more["skipped_moments"] = eyes.skipped
-        writer.warn(camera_troubles(counts, eyes.skipped))
+        writer.more["skipped_moments"] = sensors.skipped
+        writer.warn(camera_troubles(counts, sensors.skipped))
         if writer.rows:
             writer.finish(replay)
             _write_times(writer, self._times)

@@ -19,7 +19,7 @@ from drake_pose.apps.live.walk import CommandLog, stride_positions
 from drake_pose.body import load_model
 from drake_pose.errors import SettingsError
 from drake_pose.multiview.recordings.known_shape import tracker_of_person
-from drake_pose.systems.person.live_capture import LiveEyes, add_person_tracker
+from drake_pose.systems.person.live_capture import LiveSensors, add_person_tracker
 from drake_pose.systems.walk.walk import build_walk
 
 SETTLE = 1.0
@@ -32,7 +32,7 @@ def walk_live(
     model_path: Path | None = None,
     shape: Path | None = None,
     seconds: float | None = None,
-    open_eyes: Callable[[], LiveEyes] | None = None,
+    open_sensors: Callable[[], LiveSensors] | None = None,
     on_command: Callable[[str], None] = lambda _: None,
     on_report: Callable[[str], None] = lambda _: None,
     packages: Mapping[str, Path] | None = None,
@@ -48,7 +48,7 @@ def walk_live(
         shape: a result of capture with the same person, whose lengths and girths are taken; the
             model's where not given.
         seconds: how long; without end, or until the recordings end, where not given.
-        open_eyes: opens the eyes; those of the scene in this process where not given.
+        open_sensors: opens the sensors; those of the scene in this process where not given.
         on_command: called when the command changes, with its words, "" for none.
         on_report: hears at once of cameras that stop and return, of bad pictures, and of a person
             who is found or lost.
@@ -67,7 +67,7 @@ def walk_live(
     model = load_model(model_path or bundled_person(), package_paths=packages)
     known = None if shape is None else shape_of_result(shape)
     tracker = tracker_of_person(model.pose_tree(), known)
-    opened: LiveEyes = scene.open_eyes(live=True) if open_eyes is None else open_eyes()
+    opened: LiveSensors = scene.open_sensors(live=True) if open_sensors is None else open_sensors()
     try:
 
         def add(builder: DiagramBuilder) -> OutputPort:

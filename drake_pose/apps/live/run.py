@@ -13,7 +13,7 @@ from pydrake.systems.analysis import Simulator, SimulatorStatus
 from pydrake.systems.framework import Context, Diagram
 
 from drake_pose.multiview.person.silhouette_tracker import SilhouetteView
-from drake_pose.systems.person.live_capture import LiveEyes
+from drake_pose.systems.person.live_capture import LiveSensors
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -48,7 +48,7 @@ class LiveFrame:
 
 def run_live(
     diagram: Diagram,
-    eyes: LiveEyes,
+    sensors: LiveSensors,
     seconds: float | None,
     on_report: Callable[[str], None],
     until: Callable[[], bool] = lambda: False,
@@ -58,8 +58,8 @@ def run_live(
     """Runs a diagram until its recordings end, its time is up, or Ctrl-C.
 
     Args:
-        diagram: with the eyes in it.
-        eyes: the eyes.
+        diagram: with the sensors in it.
+        sensors: the sensors.
         seconds: how long; None: without end.
         on_report: hears what the user should know of cameras and pictures.
         until: asked after every period whether it is enough.
@@ -72,14 +72,14 @@ def run_live(
     simulator = Simulator(diagram)
     if monitor is not None:
         simulator.set_monitor(monitor)
-    is_paced = eyes.live or is_shown
+    is_paced = sensors.live or is_shown
     if is_paced:
         simulator.set_target_realtime_rate(1.0)
     context = simulator.get_context()
     begin = start = time.monotonic()
 
     def elapsed() -> float:
-        return time.monotonic() - start if eyes.live else context.get_time()
+        return time.monotonic() - start if sensors.live else context.get_time()
 
     end = math.inf if seconds is None else seconds
     reached = SimulatorStatus.ReturnReason.kReachedTerminationCondition
@@ -87,8 +87,8 @@ def run_live(
         simulator.Initialize()
         begin = start = time.monotonic()
         while elapsed() < end and not until():
-            status = simulator.AdvanceTo(context.get_time() + eyes.period)
-            for report in eyes.take_reports():
+            status = simulator.AdvanceTo(context.get_time() + sensors.period)
+            for report in sensors.take_reports():
                 on_report(report)
             if status.reason() == reached:
                 break

@@ -20,7 +20,7 @@ from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecificat
 from drake_pose.camera.sources.opening import open_source
 from drake_pose.errors import DrakePoseError, SceneError
 from drake_pose.multiview.regions import Background, learn_background
-from drake_pose.systems.person.live_capture import LocalEyes
+from drake_pose.systems.person.live_capture import LocalSensors
 from drake_pose.systems.pictures.picture_capture import PictureCapture
 
 
@@ -40,8 +40,10 @@ class LiveScene:
     specifications: Mapping[str, SourceSpecification]
     backgrounds: Mapping[str, Background]
 
-    def open_eyes(self, live: bool | None = None, tolerance: float | None = None) -> LocalEyes:
-        """Opens the sources, and the eyes that see with them.
+    def open_sensors(
+        self, live: bool | None = None, tolerance: float | None = None
+    ) -> LocalSensors:
+        """Opens the sources, and the sensors that see with them.
 
         Args:
             live: whether the computer's clock decides; where not given, if a camera is live.
@@ -60,7 +62,7 @@ class LiveScene:
             for source in opened.values():
                 source.close()
             raise
-        return LocalEyes(capture, self.cameras, self.backgrounds)
+        return LocalSensors(capture, self.cameras, self.backgrounds)
 
 
 def hush_opencv() -> None:

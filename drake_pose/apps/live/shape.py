@@ -16,7 +16,7 @@ from drake_pose.multiview.person.shape import shape_values
 from drake_pose.multiview.recordings.known_shape import KnownShape
 from drake_pose.multiview.recordings.person_capture import capture_person
 from drake_pose.multiview.recordings.person_recording import PersonRecording
-from drake_pose.systems.person.live_capture import LiveEyes
+from drake_pose.systems.person.live_capture import LiveSensors
 from drake_pose.systems.person.silhouette_sensor import shows_somebody
 
 _FRAMES = 40
@@ -44,7 +44,7 @@ def shape_of_result(result: Path) -> KnownShape:
 
 def fit_first_frames(
     scene: LiveScene,
-    eyes: LiveEyes,
+    sensors: LiveSensors,
     tree: PoseTree,
     on_report: Callable[[str], None],
     count: int = _FRAMES,
@@ -53,7 +53,7 @@ def fit_first_frames(
 
     Args:
         scene: the cameras.
-        eyes: are used up.
+        sensors: are used up.
         tree: of a model with the landmarks of a person.
         on_report: hears of cameras that stop, and of bad pictures.
         count: by how many frames at most.
@@ -68,7 +68,7 @@ def fit_first_frames(
         return None
     frames: list[dict[str, Mask]] = []
     builder = DiagramBuilder()
-    ports = eyes.add(builder)
+    ports = sensors.add(builder)
     for name, port in ports.silhouettes.items():
         builder.ExportOutput(port, name)
     builder.ExportOutput(ports.time, "time")
@@ -85,8 +85,8 @@ def fit_first_frames(
         if len(seen) >= 2:
             frames.append(seen)
 
-    waited = _PATIENCE if eyes.live else None
-    if run_live(diagram, eyes, waited, on_report, lambda: len(frames) >= count, look):
+    waited = _PATIENCE if sensors.live else None
+    if run_live(diagram, sensors, waited, on_report, lambda: len(frames) >= count, look):
         raise KeyboardInterrupt
     # Whoever else is in view is cut out.
     alone = PersonRecording(scene.cameras, lambda k: frames[k], len(frames), True)

@@ -45,7 +45,7 @@ _SIMULATED_FRAMES = 1200
 # How often it is looked whether the walk has ended [s].
 _LOOK = 0.5
 # Between two looks at browser and button [s].
-_NAP = 0.05
+_POLL_PAUSE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,7 +273,7 @@ def wait_for_browser(page: Meshcat, patience: float = math.inf) -> None:
     """Waits until a browser shows a page, for so long at most [s]."""
     end = time.monotonic() + patience
     while page.GetNumActiveConnections() == 0 and time.monotonic() < end:
-        time.sleep(_NAP)
+        time.sleep(_POLL_PAUSE)
 
 
 def wait_for_replay(page: Meshcat) -> bool:
@@ -281,7 +281,7 @@ def wait_for_replay(page: Meshcat) -> bool:
     page.AddButton(REPLAY, _REPLAY_KEY)
     try:
         while page.GetButtonClicks(REPLAY) == 0:
-            time.sleep(_NAP)
+            time.sleep(_POLL_PAUSE)
     except KeyboardInterrupt:
         return False
     finally:

@@ -34,7 +34,7 @@ _FEWEST_CORNERS = 8
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
+class Detection:
     """The corners of a board that were found in a picture.
 
     Args:
@@ -100,7 +100,7 @@ class Board:
         """Whether the board turned by 180 degrees looks like the board."""
         return self.kind == "checkerboard" and (self.columns + self.rows) % 2 == 0
 
-    def find(self, picture: NDArray[np.uint8]) -> Sighting | None:
+    def find(self, picture: NDArray[np.uint8]) -> Detection | None:
         """Finds the board in a picture.
 
         Args:
@@ -116,7 +116,7 @@ class Board:
             return self._find_charuco(grey)
         return self._find_checkerboard(grey)
 
-    def _find_checkerboard(self, grey: NDArray[np.uint8]) -> Sighting | None:
+    def _find_checkerboard(self, grey: NDArray[np.uint8]) -> Detection | None:
         size = (self.columns - 1, self.rows - 1)
         found, pixels = cv2.findChessboardCorners(
             grey, size, flags=cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
@@ -137,9 +137,9 @@ class Board:
         if not self.looks_the_same_turned and _top_left_is_white(grey, grid):
             grid = grid[::-1, ::-1]
         uv = np.ascontiguousarray(grid.reshape(-1, 2))
-        return Sighting(np.arange(len(uv)), uv)
+        return Detection(np.arange(len(uv)), uv)
 
-    def _find_charuco(self, grey: NDArray[np.uint8]) -> Sighting | None:
+    def _find_charuco(self, grey: NDArray[np.uint8]) -> Detection | None:
         detector = cv2.aruco.CharucoDetector(self.opencv_charuco_board())
         pixels, identities, _, _ = detector.detectBoard(grey)
         if identities is None or len(identities) < _FEWEST_CORNERS:
@@ -151,7 +151,7 @@ class Board:
         row, column = np.divmod(corners, self.columns - 1)
         if min(len(np.unique(row)), len(np.unique(column))) < 2:
             return None
-        return Sighting(corners, uv)
+        return Detection(corners, uv)
 
     def opencv_charuco_board(self) -> Any:
         """OpenCV's object of a ChArUco board, with which it can be drawn and printed."""

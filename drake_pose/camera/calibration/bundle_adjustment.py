@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_array
 
-from drake_pose.camera.calibration.initial_poses import Sightings
+from drake_pose.camera.calibration.initial_poses import Detections
 from drake_pose.camera.calibration.intrinsics import inverse_pose, pose_matrix, pose_vector
 from drake_pose.camera.calibration.lens import COEFFICIENTS, Lens
 
@@ -45,20 +45,22 @@ class Rig:
     X_RC: Mapping[str, Array]
     X_RB: Mapping[str, Array]
 
-    def errors(self, points: Array, sightings: Sightings) -> dict[tuple[str, str], float]:
+    def errors(self, points: Array, detections: Detections) -> dict[tuple[str, str], float]:
         """Root mean square corner distance [pixel] of each (camera, frame)."""
         found = {}
-        for name, seen in sightings.items():
+        for name, seen in detections.items():
             X_CR = inverse_pose(self.X_RC[name])
-            for frame, sighting in seen.items():
+            for frame, detection in seen.items():
                 X_CB = X_CR @ self.X_RB[frame]
-                p_C = points[sighting.corners] @ X_CB[:3, :3].T + X_CB[:3, 3]
-                difference = self.lenses[name].project(p_C) - sighting.uv
+                p_C = points[detection.corners] @ X_CB[:3, :3].T + X_CB[:3, 3]
+                difference = self.lenses[name].project(p_C) - detection.uv
                 found[name, frame] = float(np.sqrt(np.mean(np.sum(difference**2, axis=1))))
         return found
 
 
-def adjust_rig(points: Array, sightings: Sightings, start: Rig, model: str, *, robust: bool) -> Rig:
+def adjust_rig(
+    points: Array, detections: Detections, start: Rig, model: str, *, robust: bool
+) -> Rig:
     """Moves lenses and poses until the corners are met best.
 
     The first camera's pose is held. The Jacobian is analytic (OpenCV's projectPoints and
@@ -66,13 +68,13 @@ def adjust_rig(points: Array, sightings: Sightings, start: Rig, model: str, *, r
 
     Args:
         points: (n, 3) the board's corners in its frame [m].
-        sightings: by camera, then by frame.
+        detections: by camera, then by frame.
         start: where to start.
         model: which distortion coefficients are free, one of LENS_MODELS.
         robust: corners far off count little, so that a spoilt picture stands out instead of
             spoiling the others. The start must be good for most.
     """
-    problem = _Problem(points, sightings, start, model)
+    problem = _Problem(points, detections, start, model)
     x = problem.start
     residuals = problem.residuals(x)
     scale = None
@@ -131,11 +133,11 @@ def _weigh(residuals: Array, scale: float | None) -> tuple[Array, float]:
 class _Problem:
     """Unknowns in a row: every camera's lens, every camera's pose but the first, the boards'."""
 
-    def __init__(self, points: Array, sightings: Sightings, start: Rig, model: str) -> None:
+    def __init__(self, points: Array, detections: Detections, start: Rig, model: str) -> None:
         self.points = points
-        self.cameras = list(sightings)
+        self.cameras = list(detections)
         self.frames = list(start.X_RB)
-        self.sightings = sightings
+        self.detections = detections
         self.first = start
         self.coefficients = _FREE_COEFFICIENTS[model]
         self.lens_size = 4 + self.coefficients
@@ -218,14 +220,14 @@ class _Problem:
             )
             distortion = np.zeros(len(COEFFICIENTS))
             distortion[: self.coefficients] = numbers[4:]
-            for frame, sighting in self.sightings[name].items():
+            for frame, detection in self.detections[name].items():
                 k = places[frame]
                 board = self._board(x, k)
                 composed = cv2.composeRT(board[:3], board[3:], pose[:3], pose[3:])
                 uv, full = cv2.projectPoints(
-                    self.points[sighting.corners], composed[0], composed[1], matrix, distortion
+                    self.points[detection.corners], composed[0], composed[1], matrix, distortion
                 )
-                residuals = (np.reshape(uv, (-1, 2)) - sighting.uv).ravel()
+                residuals = (np.reshape(uv, (-1, 2)) - detection.uv).ravel()
                 blocks = []
                 if with_jacobian:
                     chain = [np.asarray(d, dtype=np.float64) for d in composed[2:]]

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.camera.calibration.board import Sighting
+from drake_pose.camera.calibration.board import Detection
 from drake_pose.camera.calibration.bundle_adjustment import Rig, adjust_rig
 from drake_pose.camera.calibration.initial_poses import (
     board_poses,
@@ -27,7 +27,7 @@ from drake_pose.camera.calibration.intrinsics import (
 )
 from drake_pose.camera.calibration.lens import Lens
 from drake_pose.camera.calibration.mirrored_pictures import find_mirrored
-from drake_pose.camera.calibration.pictures import BoardSightings, Picture
+from drake_pose.camera.calibration.pictures import BoardDetections, Picture
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import CameraError, UnknownNameError
 
@@ -94,7 +94,7 @@ class Calibration:
     world: str
 
 
-def calibrate(seen: BoardSightings, settings: CalibrationSettings | None = None) -> Calibration:
+def calibrate(seen: BoardDetections, settings: CalibrationSettings | None = None) -> Calibration:
     """Calibrates the cameras that saw a board.
 
     Args:
@@ -108,17 +108,17 @@ def calibrate(seen: BoardSightings, settings: CalibrationSettings | None = None)
         UnknownNameError: when the settings name a camera or frame that is not there.
     """
     settings = settings or CalibrationSettings()
-    sightings, left_out = _chosen(seen, settings)
-    _check_board(seen, sightings)
+    detections, left_out = _chosen(seen, settings)
+    _check_board(seen, detections)
     points = seen.board.points
     lenses = {}
-    for name in sightings:
-        lenses[name], spoilt = _lens_without_spoilt(name, points, sightings, seen, settings)
+    for name in detections:
+        lenses[name], spoilt = _lens_without_spoilt(name, points, detections, seen, settings)
         left_out |= spoilt
-    rig, spoilt = _adjusted_rig(points, sightings, lenses, settings)
+    rig, spoilt = _adjusted_rig(points, detections, lenses, settings)
     left_out |= spoilt
-    errors = rig.errors(points, sightings)
-    camera_errors = _camera_errors(errors, sightings)
+    errors = rig.errors(points, detections)
+    camera_errors = _camera_errors(errors, detections)
     worst = max(camera_errors, key=lambda name: camera_errors[name])
     if camera_errors[worst] > settings.largest_error:
         raise CameraError(
@@ -127,44 +127,44 @@ def calibrate(seen: BoardSightings, settings: CalibrationSettings | None = None)
             "camera or its lens (focus, zoom) moved? Leave it out, or allow a larger error"
         )
     X_WR, world = _world(rig, settings.world)
-    cameras = {n: rig.lenses[n].camera(n, X_WR @ rig.X_RC[n]) for n in sightings}
+    cameras = {n: rig.lenses[n].camera(n, X_WR @ rig.X_RC[n]) for n in detections}
     X_WB = {frame: X_WR @ X for frame, X in rig.X_RB.items()}
     return Calibration(cameras, rig.lenses, X_WB, errors, camera_errors, left_out, world)
 
 
 def _chosen(
-    seen: BoardSightings, settings: CalibrationSettings
-) -> tuple[dict[str, dict[str, Sighting]], dict[Picture, str]]:
-    """The sightings to use, in dictionaries of our own, and what was left out on request."""
+    seen: BoardDetections, settings: CalibrationSettings
+) -> tuple[dict[str, dict[str, Detection]], dict[Picture, str]]:
+    """The detections to use, in dictionaries of our own, and what was left out on request."""
     unwanted = set(settings.leave_out)
-    known = {*seen.sightings} | {
-        f"{camera}/{frame}" for camera, frames in seen.sightings.items() for frame in frames
+    known = {*seen.detections} | {
+        f"{camera}/{frame}" for camera, frames in seen.detections.items() for frame in frames
     }
     known |= {f"{camera}/{frame}" for camera, frame in seen.not_found}
     for name in sorted(unwanted - known):
         raise UnknownNameError("camera or picture", name, sorted(known), "the calibration")
     left_out: dict[Picture, str] = {}
-    sightings: dict[str, dict[str, Sighting]] = {}
-    for camera, frames in seen.sightings.items():
+    detections: dict[str, dict[str, Detection]] = {}
+    for camera, frames in seen.detections.items():
         if camera in unwanted:
             left_out |= {(camera, frame): "the camera was left out" for frame in frames}
             continue
-        sightings[camera] = {f: s for f, s in frames.items() if f"{camera}/{f}" not in unwanted}
-        asked = {f for f in frames if f not in sightings[camera]}
+        detections[camera] = {f: s for f, s in frames.items() if f"{camera}/{f}" not in unwanted}
+        asked = {f for f in frames if f not in detections[camera]}
         left_out |= {(camera, frame): "left out on request" for frame in sorted(asked)}
-    if not sightings:
+    if not detections:
         raise CameraError("no camera is left to be calibrated")
-    return sightings, left_out
+    return detections, left_out
 
 
-def _check_board(seen: BoardSightings, sightings: Mapping[str, Mapping[str, Sighting]]) -> None:
+def _check_board(seen: BoardDetections, detections: Mapping[str, Mapping[str, Detection]]) -> None:
     for camera in seen.mirrored:
-        if camera in sightings:
+        if camera in detections:
             raise CameraError(
                 f"camera '{camera}': its pictures are mirrored: the board is found in them only "
                 "when left and right are exchanged; switch mirroring off"
             )
-    if len(sightings) > 1 and seen.board.looks_the_same_turned:
+    if len(detections) > 1 and seen.board.looks_the_same_turned:
         raise CameraError(
             f"a checkerboard of {seen.board.columns} x {seen.board.rows} squares looks the same "
             "when it is turned by 180 degrees, so several cameras cannot agree on its corners: "
@@ -175,21 +175,21 @@ def _check_board(seen: BoardSightings, sightings: Mapping[str, Mapping[str, Sigh
 def _lens_without_spoilt(
     name: str,
     points: Array,
-    sightings: dict[str, dict[str, Sighting]],
-    seen: BoardSightings,
+    detections: dict[str, dict[str, Detection]],
+    seen: BoardDetections,
     settings: CalibrationSettings,
 ) -> tuple[LensEstimate, dict[Picture, str]]:
-    """A camera's lens; spoilt pictures are taken out of `sightings` or refused."""
+    """A camera's lens; spoilt pictures are taken out of `detections` or refused."""
     spoilt: dict[Picture, str] = {}
     while True:
-        estimate = estimate_lens(name, points, sightings[name], seen.sizes[name], settings.lens)
+        estimate = estimate_lens(name, points, detections[name], seen.sizes[name], settings.lens)
         worst = max(estimate.errors, key=lambda frame: estimate.errors[frame])
         # One spoilt picture also harms the others' errors: the worst goes first, then look again.
         if estimate.errors[worst] <= _limit(list(estimate.errors.values()), settings):
             break
         reason = f"its corners are {estimate.errors[worst]:.2f} pixel off the camera's own lens"
         spoilt[name, worst] = reason
-        del sightings[name][worst]
+        del detections[name][worst]
     _refuse(spoilt, settings)
     if not estimate.focal_deviation < _LARGEST_FOCAL_DEVIATION:
         raise CameraError(
@@ -204,38 +204,38 @@ _LARGEST_FOCAL_DEVIATION = 0.05
 
 def _adjusted_rig(
     points: Array,
-    sightings: dict[str, dict[str, Sighting]],
+    detections: dict[str, dict[str, Detection]],
     lenses: Mapping[str, LensEstimate],
     settings: CalibrationSettings,
 ) -> tuple[Rig, dict[Picture, str]]:
-    """Everything at once; spoilt pictures are taken out of `sightings` or refused."""
-    X_RC = chain_cameras(points, sightings, lenses)
+    """Everything at once; spoilt pictures are taken out of `detections` or refused."""
+    X_RC = chain_cameras(points, detections, lenses)
     start = Rig(
         {name: estimate.lens for name, estimate in lenses.items()},
         X_RC,
-        board_poses(points, sightings, lenses, X_RC),
+        board_poses(points, detections, lenses, X_RC),
     )
-    original = {name: dict(frames) for name, frames in sightings.items()}
+    original = {name: dict(frames) for name, frames in detections.items()}
     spoilt: dict[Picture, str] = {}
-    while len(sightings) > 1:
-        start = adjust_rig(points, sightings, start, settings.lens, robust=True)
-        worst = _disagreeing(start.errors(points, sightings), sightings, settings)
+    while len(detections) > 1:
+        start = adjust_rig(points, detections, start, settings.lens, robust=True)
+        worst = _disagreeing(start.errors(points, detections), detections, settings)
         if not worst:
             break
         spoilt |= worst
         _require_true_cameras(points, spoilt, original, lenses)
         for camera, frame in worst:
-            del sightings[camera][frame]
-        frames = {frame for frames in sightings.values() for frame in frames}
+            del detections[camera][frame]
+        frames = {frame for frames in detections.values() for frame in frames}
         start = Rig(start.lenses, start.X_RC, {f: X for f, X in start.X_RB.items() if f in frames})
     _refuse(spoilt, settings)
-    require_shared_pictures(sightings)
-    return adjust_rig(points, sightings, start, settings.lens, robust=False), spoilt
+    require_shared_pictures(detections)
+    return adjust_rig(points, detections, start, settings.lens, robust=False), spoilt
 
 
 def _disagreeing(
     errors: Mapping[Picture, float],
-    sightings: Mapping[str, Mapping[str, Sighting]],
+    detections: Mapping[str, Mapping[str, Detection]],
     settings: CalibrationSettings,
 ) -> dict[Picture, str]:
     """At each instant the picture that contradicts the other cameras' most, if one does.
@@ -246,7 +246,7 @@ def _disagreeing(
     limit = _limit(list(errors.values()), settings)
     spoilt: dict[Picture, str] = {}
     for frame in {frame for _, frame in errors}:
-        seers = [name for name in sightings if frame in sightings[name]]
+        seers = [name for name in detections if frame in detections[name]]
         worst = max(seers, key=lambda name: errors[name, frame])
         if errors[worst, frame] <= limit:
             continue
@@ -267,22 +267,22 @@ def _disagreeing(
 def _require_true_cameras(
     points: Array,
     spoilt: Mapping[Picture, str],
-    sightings: Mapping[str, Mapping[str, Sighting]],
+    detections: Mapping[str, Mapping[str, Detection]],
     lenses: Mapping[str, LensEstimate],
 ) -> None:
     """Refuses a camera most of whose shared pictures contradict the others, and says why."""
-    for name, frames in sightings.items():
+    for name, frames in detections.items():
         shared = [
             frame
             for frame in frames
-            if any(frame in others for camera, others in sightings.items() if camera != name)
+            if any(frame in others for camera, others in detections.items() if camera != name)
         ]
         bad = sum((name, frame) in spoilt for frame in shared)
         if 2 * bad <= len(shared) or _blamed_more(name, bad, spoilt):
             continue
         # Of two cameras nobody can say which is wrong.
-        who = " or ".join(f"camera '{n}'" for n in (sightings if len(sightings) == 2 else [name]))
-        if find_mirrored(points, sightings, lenses, name):
+        who = " or ".join(f"camera '{n}'" for n in (detections if len(detections) == 2 else [name]))
+        if find_mirrored(points, detections, lenses, name):
             raise CameraError(
                 f"{who}: its pictures are mirrored: they agree with the other cameras only when "
                 "left and right are exchanged; switch mirroring off"
@@ -324,12 +324,12 @@ def _refuse(spoilt: Mapping[Picture, str], settings: CalibrationSettings) -> Non
 
 
 def _camera_errors(
-    errors: Mapping[Picture, float], sightings: Mapping[str, Mapping[str, Sighting]]
+    errors: Mapping[Picture, float], detections: Mapping[str, Mapping[str, Detection]]
 ) -> dict[str, float]:
     """Root mean square distance over all corners of each camera [pixel]."""
     found = {}
-    for name, frames in sightings.items():
-        counts = np.array([len(sighting.corners) for sighting in frames.values()])
+    for name, frames in detections.items():
+        counts = np.array([len(detection.corners) for detection in frames.values()])
         squares = np.array([errors[name, frame] ** 2 for frame in frames])
         found[name] = float(np.sqrt(np.sum(counts * squares) / np.sum(counts)))
     return found

@@ -10,29 +10,35 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
-from drake_pose.camera.calibration.board import Sighting
+from drake_pose.camera.calibration.board import Detection
 from drake_pose.camera.calibration.intrinsics import LensEstimate, inverse_pose
 from drake_pose.errors import CameraError
 
 Array = NDArray[np.float64]
-Sightings = Mapping[str, Mapping[str, Sighting]]
-"""Sightings by camera, then by frame."""
+Detections = Mapping[str, Mapping[str, Detection]]
+"""Detections by camera, then by frame."""
 
 
-def picture_error(points: Array, sighting: Sighting, estimate: LensEstimate, X_CB: Array) -> float:
+def picture_error(
+    points: Array, detection: Detection, estimate: LensEstimate, X_CB: Array
+) -> float:
     """Root mean square distance of a picture's corners from where a board's pose puts them [pixel].
 
     Infinite where the board would be behind the camera.
     """
-    p_C = points[sighting.corners] @ X_CB[:3, :3].T + X_CB[:3, 3]
+    p_C = points[detection.corners] @ X_CB[:3, :3].T + X_CB[:3, 3]
     if p_C[:, 2].min() <= 0.0:
         return float("inf")
-    difference = estimate.lens.project(p_C) - sighting.uv
+    difference = estimate.lens.project(p_C) - detection.uv
     return float(np.sqrt(np.mean(np.sum(difference**2, axis=1))))
 
 
 def pair_pose(
-    points: Array, sightings: Sightings, lenses: Mapping[str, LensEstimate], first: str, second: str
+    points: Array,
+    detections: Detections,
+    lenses: Mapping[str, LensEstimate],
+    first: str,
+    second: str,
 ) -> tuple[Array, float] | None:
     """The second camera's pose in the first's frame (4, 4), from the instants both saw the board.
 
@@ -42,7 +48,7 @@ def pair_pose(
     Returns:
         The pose and the median error [pixel]; None where the cameras share no picture.
     """
-    shared = [frame for frame in sightings[first] if frame in sightings[second]]
+    shared = [frame for frame in detections[first] if frame in detections[second]]
     if not shared:
         return None
     best, best_error = np.eye(4), np.inf
@@ -50,7 +56,7 @@ def pair_pose(
     for proposer in shared:
         X_AB = a.X_CB[proposer] @ inverse_pose(b.X_CB[proposer])
         errors = [
-            picture_error(points, sightings[first][frame], a, X_AB @ b.X_CB[frame])
+            picture_error(points, detections[first][frame], a, X_AB @ b.X_CB[frame])
             for frame in shared
         ]
         # A proposer explains itself: it has no say where others can be asked.
@@ -62,22 +68,22 @@ def pair_pose(
 
 
 def chain_cameras(
-    points: Array, sightings: Sightings, lenses: Mapping[str, LensEstimate]
+    points: Array, detections: Detections, lenses: Mapping[str, LensEstimate]
 ) -> dict[str, Array]:
     """Poses (4, 4) of all cameras in the first one's frame, by the most trustworthy pairs.
 
     Raises:
         CameraError: when the cameras fall into groups that share no picture.
     """
-    require_shared_pictures(sightings)
-    names = list(sightings)
+    require_shared_pictures(detections)
+    names = list(detections)
     pairs: dict[tuple[int, int], Array] = {}
     costs = []
     for i, j in combinations(range(len(names)), 2):
-        found = pair_pose(points, sightings, lenses, names[i], names[j])
+        found = pair_pose(points, detections, lenses, names[i], names[j])
         if found is None:
             continue
-        shared = sum(frame in sightings[names[j]] for frame in sightings[names[i]])
+        shared = sum(frame in detections[names[j]] for frame in detections[names[i]])
         pairs[i, j], pairs[j, i] = found[0], inverse_pose(found[0])
         # More shared instants and a smaller error make a better link; both stay positive.
         costs.append((i, j, (1.0 + min(found[1], 1e6)) / shared))
@@ -93,23 +99,26 @@ def chain_cameras(
 
 
 def board_poses(
-    points: Array, sightings: Sightings, lenses: Mapping[str, LensEstimate], poses: dict[str, Array]
+    points: Array,
+    detections: Detections,
+    lenses: Mapping[str, LensEstimate],
+    poses: dict[str, Array],
 ) -> dict[str, Array]:
     """The board's pose (4, 4) in the cameras' common frame at each instant.
 
     Every camera that saw the board proposes one; the one with the smallest median error wins.
     """
-    frames = list(dict.fromkeys(frame for seen in sightings.values() for frame in seen))
+    frames = list(dict.fromkeys(frame for seen in detections.values() for frame in seen))
     found = {}
     for frame in frames:
-        seers = [name for name in sightings if frame in sightings[name]]
+        seers = [name for name in detections if frame in detections[name]]
         proposals = [poses[name] @ lenses[name].X_CB[frame] for name in seers]
         errors = [
             np.median(
                 [
                     picture_error(
                         points,
-                        sightings[name][frame],
+                        detections[name][frame],
                         lenses[name],
                         inverse_pose(poses[name]) @ proposal,
                     )
@@ -122,17 +131,17 @@ def board_poses(
     return found
 
 
-def require_shared_pictures(sightings: Sightings) -> None:
+def require_shared_pictures(detections: Detections) -> None:
     """Checks that instants which several cameras saw tie all cameras together.
 
     Raises:
         CameraError: when the cameras fall into groups that share no picture.
     """
-    names = list(sightings)
+    names = list(detections)
     shared = [
         (i, j)
         for i, j in combinations(range(len(names)), 2)
-        if set(sightings[names[i]]) & set(sightings[names[j]])
+        if set(detections[names[i]]) & set(detections[names[j]])
     ]
     rows, columns = np.array(shared, dtype=int).reshape(-1, 2).T
     graph = coo_array((np.ones(len(shared)), (rows, columns)), shape=(len(names), len(names)))

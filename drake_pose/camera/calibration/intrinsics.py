@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.camera.calibration.board import Sighting
+from drake_pose.camera.calibration.board import Detection
 from drake_pose.camera.calibration.lens import COEFFICIENTS, Lens
 from drake_pose.errors import CameraError
 
@@ -41,7 +41,7 @@ class LensEstimate:
 def estimate_lens(
     name: str,
     points: Array,
-    sightings: Mapping[str, Sighting],
+    detections: Mapping[str, Detection],
     size: tuple[int, int],
     model: str = "standard",
 ) -> LensEstimate:
@@ -50,22 +50,22 @@ def estimate_lens(
     Args:
         name: the camera's name, for messages.
         points: (n, 3) the board's corners in its frame B [m].
-        sightings: the board in the camera's pictures, by frame.
+        detections: the board in the camera's pictures, by frame.
         size: the pictures' width and height [pixel].
         model: one of LENS_MODELS.
 
     Raises:
         CameraError: when there are fewer than three pictures of the board, or OpenCV finds no lens.
     """
-    if len(sightings) < FEWEST_PICTURES:
-        found = ", ".join(f"'{frame}'" for frame in sightings) or "none"
+    if len(detections) < FEWEST_PICTURES:
+        found = ", ".join(f"'{frame}'" for frame in detections) or "none"
         raise CameraError(
-            f"camera '{name}': the board was found in {len(sightings)} pictures ({found}), but at "
+            f"camera '{name}': the board was found in {len(detections)} pictures ({found}), but at "
             f"least {FEWEST_PICTURES} are needed, better 15, with the board tilted"
         )
-    frames = list(sightings)
-    objects = [points[sightings[frame].corners].astype(np.float32) for frame in frames]
-    images = [sightings[frame].uv.astype(np.float32) for frame in frames]
+    frames = list(detections)
+    objects = [points[detections[frame].corners].astype(np.float32) for frame in frames]
+    images = [detections[frame].uv.astype(np.float32) for frame in frames]
     try:
         _, matrix, distortion, turns, shifts, deviations, _, errors = cv2.calibrateCameraExtended(
             objects, images, size, np.eye(3), np.zeros(5), flags=lens_flags(model)

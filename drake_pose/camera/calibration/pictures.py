@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.camera.calibration.board import Board, Sighting
+from drake_pose.camera.calibration.board import Board, Detection
 from drake_pose.camera.checks import LARGEST_SIDE
 from drake_pose.errors import CameraError
 from drake_pose.regular_files import read_regular
@@ -22,13 +22,13 @@ Picture = tuple[str, str]
 
 
 @dataclass(frozen=True, eq=False)
-class BoardSightings:
+class BoardDetections:
     """What a set of calibration pictures shows.
 
     Args:
         board: the board.
         sizes: width and height of each camera's pictures [pixel].
-        sightings: by camera, then by frame: where the board's corners are.
+        detections: by camera, then by frame: where the board's corners are.
         not_found: pictures in which the board was not found.
         unreadable: pictures that could not be read, with the reason.
         mirrored: cameras in whose pictures the board is found when they are turned left to right.
@@ -36,7 +36,7 @@ class BoardSightings:
 
     board: Board
     sizes: Mapping[str, tuple[int, int]]
-    sightings: Mapping[str, Mapping[str, Sighting]]
+    detections: Mapping[str, Mapping[str, Detection]]
     not_found: tuple[Picture, ...] = ()
     unreadable: Mapping[Picture, str] | None = None
     mirrored: tuple[str, ...] = ()
@@ -75,7 +75,7 @@ def find_boards(
     files: Mapping[str, Mapping[str, Path]],
     board: Board,
     on_picture: Callable[[str, str], None] | None = None,
-) -> BoardSightings:
+) -> BoardDetections:
     """Searches pictures for the board; a bad picture is noted and harms no other.
 
     Args:
@@ -87,12 +87,12 @@ def find_boards(
         CameraError: when a camera's pictures differ in size, or none of them can be read.
     """
     sizes: dict[str, tuple[int, int]] = {}
-    sightings: dict[str, dict[str, Sighting]] = {}
+    detections: dict[str, dict[str, Detection]] = {}
     not_found: list[Picture] = []
     unreadable: dict[Picture, str] = {}
     mirrored = []
     for camera, frames in files.items():
-        seen: dict[str, Sighting] = {}
+        seen: dict[str, Detection] = {}
         turned_around = 0
         for frame, path in frames.items():
             if on_picture is not None:
@@ -108,9 +108,9 @@ def find_boards(
                     f"{path}: {size[0]} x {size[1]} pixels (width x height), but camera "
                     f"'{camera}' began with {sizes[camera][0]} x {sizes[camera][1]}"
                 )
-            sighting = board.find(grey)
-            if sighting is not None:
-                seen[frame] = sighting
+            detection = board.find(grey)
+            if detection is not None:
+                seen[frame] = detection
                 continue
             not_found.append((camera, frame))
             if not seen and board.kind == "charuco":
@@ -119,8 +119,8 @@ def find_boards(
             raise CameraError(f"camera '{camera}': none of its pictures can be read")
         if not seen and turned_around:
             mirrored.append(camera)
-        sightings[camera] = seen
-    return BoardSightings(board, sizes, sightings, tuple(not_found), unreadable, tuple(mirrored))
+        detections[camera] = seen
+    return BoardDetections(board, sizes, detections, tuple(not_found), unreadable, tuple(mirrored))
 
 
 def read_picture(path: Path, *, grey: bool = False) -> NDArray[np.uint8]:

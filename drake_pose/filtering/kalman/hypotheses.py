@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.filtering.kalman.repeated_views import Stare
+from drake_pose.filtering.kalman.repeated_views import RepeatedView
 from drake_pose.filtering.state import Belief
 
 Array = NDArray[np.float64]
@@ -26,7 +26,7 @@ class Hypothesis:
         active: names of the rows that cut its belief in the last step.
         sites: of the last truncation, where the next one begins; see ``Truncated``.
         tangent: (n,) where the first frame of the present view was linearised.
-        stare: what is believed within a view that lasts; None in its first frame.
+        repeated: what is believed within a view that lasts; None in its first frame.
     """
 
     belief: Belief
@@ -37,7 +37,7 @@ class Hypothesis:
     active: tuple[str, ...] = ()
     sites: Array = field(default_factory=lambda: np.zeros((0, 2)))
     tangent: Array = field(default_factory=lambda: np.zeros(0))
-    stare: Stare | None = None
+    repeated: RepeatedView | None = None
 
     @property
     def weight(self) -> float:

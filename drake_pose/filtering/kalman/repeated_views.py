@@ -93,7 +93,7 @@ def measure_curvature(model: ObservationModel, belief: Belief) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Stare:
+class RepeatedView:
     """What is believed within a view: the state, and beside it the tangent's offsets.
 
     Attributes:
@@ -109,7 +109,7 @@ class Stare:
         n = len(self.tangent)
         return Belief(self.belief.mean[:n].copy(), self.belief.covariance[:n, :n].copy())
 
-    def moved(self, A: Array, U: Array) -> "Stare":
+    def moved(self, A: Array, U: Array) -> "RepeatedView":
         """One step at constant velocity; the offsets stay as they are."""
         n, P = len(self.tangent), self.belief.covariance.copy()
         mean = np.r_[A @ self.belief.mean[:n], self.belief.mean[n:]]
@@ -117,10 +117,12 @@ class Stare:
         P[:n, :n] = 0.5 * (P[:n, :n] + P[:n, :n].T)
         P[:n, n:] = A @ P[:n, n:]
         P[n:, :n] = P[:n, n:].T
-        return Stare(self.tangent, Belief(mean, P))
+        return RepeatedView(self.tangent, Belief(mean, P))
 
 
-def begin_stare(model: ObservationModel, free: Belief, seen: Belief, tangent: Array) -> Stare:
+def begin_repeated_view(
+    model: ObservationModel, free: Belief, seen: Belief, tangent: Array
+) -> RepeatedView:
     """A view's second frame: nothing is known yet of the offsets but how large they may be.
 
     Args:
@@ -134,7 +136,7 @@ def begin_stare(model: ObservationModel, free: Belief, seen: Belief, tangent: Ar
     P = np.zeros((n + m, n + m))
     P[:n, :n] = free.covariance
     P[n:, n:] = np.diag(curvature)
-    return Stare(tangent, Belief(np.r_[free.mean, np.zeros(m)], P))
+    return RepeatedView(tangent, Belief(np.r_[free.mean, np.zeros(m)], P))
 
 
 class AnchoredObservation:

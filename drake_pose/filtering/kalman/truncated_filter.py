@@ -20,7 +20,7 @@ from drake_pose.filtering.kalman.limited_update import LimitedUpdate, limited_up
 from drake_pose.filtering.kalman.repeated_views import (
     AnchoredObservation,
     View,
-    begin_stare,
+    begin_repeated_view,
     next_view,
 )
 from drake_pose.filtering.kalman.update import ObservationModel, check_measurement, update
@@ -177,9 +177,9 @@ class TruncatedFilter:
         """One step at constant velocity: (6), for every hypothesis."""
         moved = []
         for h in state.hypotheses:
-            stare = h.stare.moved(self._A, self._U) if h.stare else None
-            free = stare.state() if stare else self._move(h.free)
-            moved.append(replace(h, belief=self._move(h.belief), free=free, stare=stare))
+            repeated = h.repeated.moved(self._A, self._U) if h.repeated else None
+            free = repeated.state() if repeated else self._move(h.free)
+            moved.append(replace(h, belief=self._move(h.belief), free=free, repeated=repeated))
         return replace(state, hypotheses=tuple(moved), rejections=())
 
     def update(
@@ -222,7 +222,7 @@ class TruncatedFilter:
         self, hypothesis: Hypothesis, y: Array, model: ObservationModel, step: int
     ) -> list[Branch]:
         """A hypothesis updated at its prediction, and at each mirrored one."""
-        hypothesis = replace(hypothesis, stare=None)
+        hypothesis = replace(hypothesis, repeated=None)
         found = [(hypothesis, self._update(hypothesis, y, model, hypothesis.belief.mean))]
         if self.settings.hypothesis_cap == 1:
             return found
@@ -249,14 +249,16 @@ class TruncatedFilter:
 
     def _repeat(self, hypothesis: Hypothesis, y: Array, model: ObservationModel) -> Branch:
         """A hypothesis updated by a further frame of the same view."""
-        stare = hypothesis.stare
-        if stare is None:
-            stare = begin_stare(model, hypothesis.free, hypothesis.belief, hypothesis.tangent)
-        updated = update(stare.belief, y, AnchoredObservation(model, stare.tangent))
-        stare = replace(stare, belief=updated.belief)
-        updated = replace(updated, belief=stare.state())
+        repeated = hypothesis.repeated
+        if repeated is None:
+            repeated = begin_repeated_view(
+                model, hypothesis.free, hypothesis.belief, hypothesis.tangent
+            )
+        updated = update(repeated.belief, y, AnchoredObservation(model, repeated.tangent))
+        repeated = replace(repeated, belief=updated.belief)
+        updated = replace(updated, belief=repeated.state())
         truncated = self._truncate(updated.belief, hypothesis.sites)
-        return replace(hypothesis, stare=stare), LimitedUpdate(updated, truncated)
+        return replace(hypothesis, repeated=repeated), LimitedUpdate(updated, truncated)
 
     def _reject(
         self, branches: Sequence[Branch], step: int
@@ -302,7 +304,7 @@ class TruncatedFilter:
             log_evidence=evidence,
             active=active,
             sites=result.sites,
-            tangent=hypothesis.tangent if hypothesis.stare else belief.mean,
+            tangent=hypothesis.tangent if hypothesis.repeated else belief.mean,
         )
 
     def _truncate(self, belief: Belief, sites: Array) -> Truncated:

@@ -42,7 +42,7 @@ def worth_of_pixels(
     return found
 
 
-def score_places(
+def score_limb_placements(
     samples: Array, weights: Array, cameras: Sequence[Camera], worth: Sequence[Worth]
 ) -> Array:
     """How well limb poses fill what is unexplained.
@@ -66,7 +66,7 @@ def score_places(
 
 @compiled
 def _score(samples: Array, weights: Array, camera: Array, X_CW: Array, worth: Worth) -> Array:
-    """score_places for one camera."""
+    """score_limb_placements for one camera."""
     height, width = worth.shape
     scores, p = np.zeros(samples.shape[0]), np.empty(3)
     for n in range(samples.shape[0]):

@@ -1,4 +1,4 @@
-"""Where a lost limb or a lost person is: rough guesses all over, the best of them fitted.
+"""Where a lost limb or a lost person is: coarse guesses all over, the best of them fitted.
 
 Guesses are judged in small pictures of a few cameras; only what is promising is fitted to all.
 """
@@ -20,7 +20,7 @@ from drake_pose.matching.fit.evidence import EdgePoints
 from drake_pose.matching.fit.kernel import COMPARED, FITTING
 from drake_pose.matching.fit.levenberg_marquardt import Round
 from drake_pose.multiview.person.body_plan import BodyPlan, PlannedLimb, crowding
-from drake_pose.multiview.person.limb_placement import score_places, worth_of_pixels
+from drake_pose.multiview.person.limb_placement import score_limb_placements, worth_of_pixels
 from drake_pose.multiview.rays import meeting_of_all
 
 Array = NDArray[np.float64]
@@ -45,7 +45,7 @@ class SearchSettings:
     """How a lost limb or person is searched.
 
     Args:
-        rounds: the steps of a fit from a rough guess.
+        rounds: the steps of a fit from a coarse guess.
         limb_fits: a limb is searched again where less of its own contour fits.
         limb_gain: or where elsewhere so much more of it would lie in unexplained pixels.
         limb_shows: or where it shows less contour than this share of its length in each camera.
@@ -98,8 +98,8 @@ class SearchSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
-    """What all cameras say in a frame, and small pictures of a few, for rough judgement.
+class FrameViews:
+    """What all cameras say in a frame, and small pictures of a few, for coarse judgement.
 
     Args:
         cameras: all that have a picture.
@@ -133,7 +133,7 @@ class Sight:
         )
 
     @cached_property
-    def rough(self) -> tuple[list[Camera], list[EdgePoints]]:
+    def coarse(self) -> tuple[list[Camera], list[EdgePoints]]:
         """The judges' cameras and every other point of their edges."""
         edges = [self.edges[k] for k in self.judges]
         return [self.cameras[k] for k in self.judges], [
@@ -191,49 +191,49 @@ class PersonSearch:
         self.settings = settings
         self._fit, self._plan = fit, plan
         self._information, self._held, self._rest = information, held, rest
-        self._rough_rounds = [
+        self._coarse_rounds = [
             replace(one, spacing=_ROUGHER * one.spacing) for one in settings.rounds[:_JUDGED]
         ]
 
     def mended(
-        self, fitted: PoseFit, sight: Sight, enough: float = math.inf, first: int = 0,
+        self, fitted: PoseFit, frame_views: FrameViews, enough: float = math.inf, first: int = 0,
         limbs: int | None = None,
     ) -> PoseFit:  # fmt: skip
         """A fit whose doubtful limbs were searched again, where that is better.
 
         Args:
             fitted: the fit.
-            sight: the frame.
+            frame_views: the frame.
             enough: where so much of the contours fits, the search ends.
             first: the doubtful limb to begin with; the worst is 0.
             limbs: how many limbs are searched; None: all that are doubtful.
         """
-        best = _better(fitted, self._refine(fitted.values, sight))
+        best = _better(fitted, self._refine(fitted.values, frame_views))
         if best.share >= enough:
             return best
-        doubtful = self._doubtful(best, sight)
+        doubtful = self._doubtful(best, frame_views)
         begin = first % len(doubtful)
         chosen = (doubtful[begin:] + doubtful[:begin])[:limbs]
-        return self._searched(best, chosen, sight, enough)
+        return self._searched(best, chosen, frame_views, enough)
 
     def _searched(
-        self, best: PoseFit, limbs: Iterable[PlannedLimb], sight: Sight, enough: float
+        self, best: PoseFit, limbs: Iterable[PlannedLimb], frame_views: FrameViews, enough: float
     ) -> PoseFit:
         """A fit whose limbs were searched again, until enough of the contours fits."""
         for limb in limbs:
-            guesses = self._placed(best.values, limb, sight)
+            guesses = self._placed(best.values, limb, frame_views)
             for pose in (limb.poses[0], *self._stretched(best.values, limb)):
                 guesses.append(best.values.copy())
                 guesses[-1][limb.values] = pose
             for values in guesses:
-                best = _better(best, self._refine(values, sight))
+                best = _better(best, self._refine(values, frame_views))
             if best.share >= enough:
                 break
         return best
 
     def found(
         self,
-        sight: Sight,
+        frame_views: FrameViews,
         turns: Sequence[int],
         known: Array | None = None,
         enough: float = math.inf,
@@ -241,7 +241,7 @@ class PersonSearch:
         """The best of fresh starts with some headings.
 
         Args:
-            sight: the frame.
+            frame_views: the frame.
             turns: which of the headings; where not all, only the best start's limbs are searched.
             known: (m,) where held values are taken from; None: the person at rest.
             enough: where so much of the contours fits, no more limbs are searched.
@@ -249,46 +249,50 @@ class PersonSearch:
         Returns:
             None where fewer than two cameras see a person.
         """
-        middle = sight.middle()
+        middle = frame_views.middle()
         if middle is None:
             return None
-        guesses = [self._guess(sight, turn, middle, known) for turn in turns]
+        guesses = [self._guess(frame_views, turn, middle, known) for turn in turns]
         guesses.sort(key=lambda one: -one.closeness)
         promising = guesses[: math.ceil(self.settings.fitted * len(guesses))]
-        found = [self._refine(one.values, sight) for one in promising]
+        found = [self._refine(one.values, frame_views) for one in promising]
         found.sort(key=lambda one: -one.closeness)
         if len(turns) < self.settings.headings:
-            return self.mended(found[0], sight, enough, limbs=self.settings.limbs_a_frame)
-        mended = [self.mended(one, sight) for one in found[: self.settings.mended]]
+            return self.mended(found[0], frame_views, enough, limbs=self.settings.limbs_a_frame)
+        mended = [self.mended(one, frame_views) for one in found[: self.settings.mended]]
         best = max(mended, key=lambda one: one.closeness)
-        return self._searched(best, self._plan.limbs.values(), sight, math.inf)
+        return self._searched(best, self._plan.limbs.values(), frame_views, math.inf)
 
-    def _guess(self, sight: Sight, turn: int, middle: Array, known: Array | None) -> PoseFit:
+    def _guess(
+        self, frame_views: FrameViews, turn: int, middle: Array, known: Array | None
+    ) -> PoseFit:
         """A person turned somewhere, the trunk fitted roughly, then each limb placed."""
         values = self._rest.copy() if known is None else np.where(self._held, known, self._rest)
         if self._plan.heading is not None:
             values[self._plan.heading] = 2.0 * np.pi * turn / self.settings.headings
-        values = self._judged(self._stand_at(values, middle), sight).values
+        values = self._judged(self._stand_at(values, middle), frame_views).values
         placed = np.ones(len(self._fit.outlines), dtype=np.bool_)
         for limb in self._plan.limbs.values():
             placed[limb.nodes] = False
         for limb in self._plan.limbs.values():
-            values = self._placed(values, limb, sight, placed, 1)[0]
+            values = self._placed(values, limb, frame_views, placed, 1)[0]
             placed[limb.nodes] = True
-        return self._judged(values, sight)
+        return self._judged(values, frame_views)
 
-    def _judged(self, values: Array, sight: Sight) -> PoseFit:
+    def _judged(self, values: Array, frame_views: FrameViews) -> PoseFit:
         """A few steps of a fit to a few cameras."""
         prior = Prior(values, 0.1 * self._information)
-        return self._fit.fit(*sight.rough, values, self._rough_rounds, prior, self._held)
+        return self._fit.fit(*frame_views.coarse, values, self._coarse_rounds, prior, self._held)
 
-    def _refine(self, values: Array, sight: Sight) -> PoseFit:
-        """A fit from a rough guess, which is trusted little."""
+    def _refine(self, values: Array, frame_views: FrameViews) -> PoseFit:
+        """A fit from a coarse guess, which is trusted little."""
         prior = Prior(values, 0.1 * self._information)
         rounds = self.settings.rounds
-        return self._fit.fit(sight.cameras, sight.edges, values, rounds, prior, self._held)
+        return self._fit.fit(
+            frame_views.cameras, frame_views.edges, values, rounds, prior, self._held
+        )
 
-    def _doubtful(self, fitted: PoseFit, sight: Sight) -> list[PlannedLimb]:
+    def _doubtful(self, fitted: PoseFit, frame_views: FrameViews) -> list[PlannedLimb]:
         """The limbs that fit badly, hardly show, or would fill much more of the regions elsewhere.
 
         The worst one is always among them: somewhere something does not fit.
@@ -299,8 +303,8 @@ class PersonSearch:
         found = []
         for limb in self._plan.limbs.values():
             share = shares[limb.nodes].min()
-            shown = lengths[limb.nodes].sum() / (limb.length * len(sight.cameras))
-            scores, now = self._scores(fitted.values, limb, sight)
+            shown = lengths[limb.nodes].sum() / (limb.length * len(frame_views.cameras))
+            scores, now = self._scores(fitted.values, limb, frame_views)
             gain = float(scores.max() - now)
             doubtful = (
                 share < settings.limb_fits
@@ -312,31 +316,31 @@ class PersonSearch:
         return [limb for k, (good, _, limb) in enumerate(found) if k == 0 or not good]
 
     def _scores(
-        self, values: Array, limb: PlannedLimb, sight: Sight, placed: Mask | None = None
+        self, values: Array, limb: PlannedLimb, frame_views: FrameViews, placed: Mask | None = None
     ) -> tuple[Array, float]:
         """How much each pose of a limb would fill, and how much the limb fills where it is."""
         X_WN = self._fit.kinematics.poses(values)
         others = np.ones(len(X_WN), dtype=np.bool_) if placed is None else placed.copy()
         others[limb.nodes] = False
         outlines = [self._fit.outlines[node] for node in np.flatnonzero(others)]
-        cameras, regions = sight.small
+        cameras, regions = frame_views.small
         worth = worth_of_pixels(cameras, regions, outlines, X_WN[others])
         X_WT = X_WN[self._plan.trunk]
         places = limb.samples_T @ X_WT[:3, :3].T + X_WT[:3, 3]
         here = self._plan.samples(limb, X_WN)[None]
-        now = score_places(here, crowding(here), cameras, worth)[0]
-        return score_places(places, limb.weights, cameras, worth), float(now)
+        now = score_limb_placements(here, crowding(here), cameras, worth)[0]
+        return score_limb_placements(places, limb.weights, cameras, worth), float(now)
 
     def _placed(
         self,
         values: Array,
         limb: PlannedLimb,
-        sight: Sight,
+        frame_views: FrameViews,
         placed: Mask | None = None,
         count: int = 2,
     ) -> list[Array]:
         """Values (m,) with a limb where it fills most, in a few ways that are not alike."""
-        scores, _ = self._scores(values, limb, sight, placed)
+        scores, _ = self._scores(values, limb, frame_views, placed)
         found: list[Array] = []
         tips: list[Array] = []
         for index in np.argsort(-scores):

@@ -20,7 +20,7 @@ from drake_pose.matching.fit.evidence import EdgePoints, find_edge_points
 from drake_pose.matching.fit.levenberg_marquardt import Round
 from drake_pose.multiview.person.body_plan import BodyPlan
 from drake_pose.multiview.person.pose_uncertainty import PoseUncertainty, pose_uncertainty
-from drake_pose.multiview.person.search import PersonSearch, SearchSettings, Sight
+from drake_pose.multiview.person.search import FrameViews, PersonSearch, SearchSettings
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -213,21 +213,27 @@ class SilhouetteTracker:
         Returns:
             None where nothing is known yet and fewer than two cameras see a person.
         """
-        sight = Sight(cameras, [view.region for view in views], [view.edge for view in views])
+        frame_views = FrameViews(
+            cameras, [view.region for view in views], [view.edge for view in views]
+        )
         if last is None:
-            found = self._search.found(sight, range(self.settings.search.headings))
+            found = self._search.found(frame_views, range(self.settings.search.headings))
             still = np.zeros(len(self._held))
             if found is None:
                 return None
             return TrackState(found.values, still, found.share, _USUAL)
-        fitted = self._fitted(last, sight)
+        fitted = self._fitted(last, frame_views)
         settings, search = self.settings, self.settings.search
         enough = last.usual - settings.retry_below
         lost = fitted.share < settings.lost_below * last.usual
         due = fitted.share < enough and _is_due(last.troubled)
         if due and not lost:
             fitted = self._search.mended(
-                fitted, sight, enough, last.troubled * search.limbs_a_frame, search.limbs_a_frame
+                fitted,
+                frame_views,
+                enough,
+                last.troubled * search.limbs_a_frame,
+                search.limbs_a_frame,
             )
         doubted = last.troubled < 0
         state = TrackState(
@@ -238,9 +244,11 @@ class SilhouetteTracker:
             last.troubled + 1 if doubted or fitted.share < enough else 0,
         )
         hopeless = due and fitted.share < enough and last.troubled > 0
-        return self._restarted(state, last, sight) if lost or doubted or hopeless else state
+        return self._restarted(state, last, frame_views) if lost or doubted or hopeless else state
 
-    def _restarted(self, state: TrackState, last: TrackState, sight: Sight) -> TrackState:
+    def _restarted(
+        self, state: TrackState, last: TrackState, frame_views: FrameViews
+    ) -> TrackState:
         """A state, or the person found anew with some headings, where that fits better.
 
         The first heading that fits need not be the right one: people look alike from behind. So the
@@ -248,19 +256,19 @@ class SilhouetteTracker:
         """
         search = self.settings.search
         turns = search.turns(last.troubled)
-        found = self._search.found(sight, turns, last.values, last.usual)
+        found = self._search.found(frame_views, turns, last.values, last.usual)
         if found is None or found.share <= state.share:
             return state
         left = last.troubled + 1 if last.troubled < 0 else 1 - search.cycle
         still = np.zeros(len(found.values))
         return replace(state, values=found.values, step=still, share=found.share, troubled=left)
 
-    def _fitted(self, last: TrackState, sight: Sight) -> PoseFit:
+    def _fitted(self, last: TrackState, frame_views: FrameViews) -> PoseFit:
         """The frame fitted from where the last ones point to."""
         expected = last.values + self.settings.carry * last.step
         return self.fit.fit(
-            sight.cameras,
-            sight.edges,
+            frame_views.cameras,
+            frame_views.edges,
             expected,
             self.settings.rounds,
             Prior(expected, self._information),

@@ -79,7 +79,7 @@ class PersonRecording:
             _sort(cameras, own, one, present)
             for own, one, present in zip(figures, followed, persons, strict=True)
         ]
-        self._eyes = [
+        self._seeing = [
             {name for k, (name, all_) in enumerate(own.items()) if len(all_) > len(whose.others[k])}
             for own, whose in zip(figures, self._sorted, strict=True)
         ]
@@ -94,7 +94,9 @@ class PersonRecording:
 
     def cameras_at(self, frame: int) -> set[str]:
         """The cameras that see the person and are not left out."""
-        return {name for name in self._eyes[frame] if frame < self._left_out.get(name, self._count)}
+        return {
+            name for name in self._seeing[frame] if frame < self._left_out.get(name, self._count)
+        }
 
     def leave_out(self, name: str, first: int) -> None:
         """Leaves a camera out from a frame on."""
@@ -102,7 +104,7 @@ class PersonRecording:
 
     def read(self, frame: int, with_all: bool = False) -> dict[str, Mask]:
         """The masks of a frame by camera, those of cameras that were left out if wanted."""
-        wanted = self._eyes[frame] if with_all else self.cameras_at(frame)
+        wanted = self._seeing[frame] if with_all else self.cameras_at(frame)
         others = dict(zip(self._names[frame], self._sorted[frame].others, strict=True))
         return {
             name: cut_figures(mask, others[name]) if others[name] else mask
@@ -119,7 +121,7 @@ class PersonRecording:
         for frame in range(self._count):
             for k, name in enumerate(self._names[frame]):
                 whose = self._sorted[frame]
-                if name not in self._eyes[frame] and frame in seen:
+                if name not in self._seeing[frame] and frame in seen:
                     blind.setdefault(name, []).append(frame)
                 if whose.others[k] or whose.merged[k]:
                     others.setdefault(name, []).append(frame)

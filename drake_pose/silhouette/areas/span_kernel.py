@@ -23,7 +23,7 @@ import numpy as np
 
 from drake_pose.compiled import compiled
 from drake_pose.silhouette.areas.outline import PackedOutlines
-from drake_pose.silhouette.areas.viewpoint import eye_in_node
+from drake_pose.silhouette.areas.viewpoint import viewpoint_in_node
 
 # Crossings are kept as 8 * pixel + weight + 4; a weight is a whole number from -2 to 2.
 _SHIFT = 3
@@ -142,7 +142,7 @@ def _find_facings(
     packed: PackedOutlines, node: int, X_CN: np.ndarray, camera: np.ndarray, work: _Work
 ) -> None:
     """Writes which side of each triangle the camera sees: +1, 0 or -1; 0 after the last."""
-    e0, e1, e2, share = eye_in_node(X_CN[node], camera)
+    e0, e1, e2, share = viewpoint_in_node(X_CN[node], camera)
     begin, end = packed.starts[node, 1], packed.starts[node + 1, 1]
     n0, n1 = packed.planes[0, begin:end], packed.planes[1, begin:end]
     n2, offset = packed.planes[2, begin:end], packed.planes[3, begin:end]

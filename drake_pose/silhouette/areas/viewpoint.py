@@ -8,7 +8,7 @@ from drake_pose.compiled import compiled
 
 
 @compiled
-def eye_in_node(X: np.ndarray, camera: np.ndarray) -> tuple[float, float, float, float]:
+def viewpoint_in_node(X: np.ndarray, camera: np.ndarray) -> tuple[float, float, float, float]:
     """Returns where a camera stands, or the way it looks, in a node's frame, times a last number.
 
     That is 0 where it is the way that a parallel camera looks. A pinhole stands there: opposite

@@ -142,24 +142,29 @@ def move_surface(
 
 @compiled(inline="always")
 def _facing(
-    planes: np.ndarray, t: int, eye_x: float, eye_y: float, eye_z: float, near: float
+    planes: np.ndarray,
+    t: int,
+    viewpoint_x: float,
+    viewpoint_y: float,
+    viewpoint_z: float,
+    near: float,
 ) -> int:
-    """Which side of a plane an eye sees: a point (near = 1) or a direction (near = 0)."""
-    side = planes[t, 0] * eye_x + planes[t, 1] * eye_y + planes[t, 2] * eye_z
+    """Which side of a plane an viewpoint sees: a point (near = 1) or a direction (near = 0)."""
+    side = planes[t, 0] * viewpoint_x + planes[t, 1] * viewpoint_y + planes[t, 2] * viewpoint_z
     side -= planes[t, 3] * near
     return int(side > 0.0) - int(side < 0.0)
 
 
 @compiled
-def _find_eye(X: np.ndarray, camera: np.ndarray, eye: np.ndarray) -> None:
+def _find_viewpoint(X: np.ndarray, camera: np.ndarray, viewpoint: np.ndarray) -> None:
     """Writes where the camera is in a surface's frame, as _facing takes it."""
     if camera[0] == 1.0:
-        eye[0], eye[1], eye[2], eye[3] = X[2, 0], X[2, 1], X[2, 2], 0.0
+        viewpoint[0], viewpoint[1], viewpoint[2], viewpoint[3] = X[2, 0], X[2, 1], X[2, 2], 0.0
         return
     size = X[0, 0] ** 2 + X[1, 0] ** 2 + X[2, 0] ** 2
     for k in range(3):
-        eye[k] = -(X[0, k] * X[0, 3] + X[1, k] * X[1, 3] + X[2, k] * X[2, 3]) / size
-    eye[3] = 1.0
+        viewpoint[k] = -(X[0, k] * X[0, 3] + X[1, k] * X[1, 3] + X[2, k] * X[2, 3]) / size
+    viewpoint[3] = 1.0
 
 
 @compiled
@@ -179,22 +184,22 @@ def find_body_segments(
     capacity, count = 2048, 0
     ends, depths = np.empty((capacity, 4)), np.empty((capacity, 2))
     labels = np.empty((capacity, 4), dtype=np.int64)
-    eye, uvz = np.empty(4), np.empty((2, 3))
+    viewpoint, uvz = np.empty(4), np.empty((2, 3))
     points, planes, edges, cell_edges = body.points, body.planes, body.edges, body.cell_edges
     for surface in range(X_CN.shape[0]):
         begin, end = body.edge_starts[surface], body.edge_starts[surface + 1]
         if not wanted[surface] or begin == end:
             continue
         X = X_CN[surface]
-        _find_eye(X, camera, eye)
-        away = eye[:3] - eye[3] * body.balls[surface, :3]
+        _find_viewpoint(X, camera, viewpoint)
+        away = viewpoint[:3] - viewpoint[3] * body.balls[surface, :3]
         distance = np.sqrt(away[0] ** 2 + away[1] ** 2 + away[2] ** 2)
         in_cell = camera[0] == 1.0 or body.balls[surface, 3] <= body.reaches[surface] * distance
         in_cell = in_cell and body.reaches[surface] >= 0.0
         if in_cell:
             cell = find_cell(away[0], away[1], away[2])
             begin, end = body.cell_starts[surface, cell], body.cell_starts[surface, cell + 1]
-        ex, ey, ez, near = eye[0], eye[1], eye[2], eye[3]
+        ex, ey, ez, near = viewpoint[0], viewpoint[1], viewpoint[2], viewpoint[3]
         for index in range(begin, end):
             e = cell_edges[index] if in_cell else index
             weight = _facing(planes, edges[e, 2], ex, ey, ez, near)

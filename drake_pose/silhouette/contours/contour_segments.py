@@ -8,7 +8,7 @@ import numpy as np
 
 from drake_pose.compiled import compiled, with_room
 from drake_pose.silhouette.areas.outline import PackedOutlines
-from drake_pose.silhouette.areas.viewpoint import eye_in_node
+from drake_pose.silhouette.areas.viewpoint import viewpoint_in_node
 
 # Slits and overlaps narrower than this [pixel] are rounding where surfaces touch.
 _SLIT = 1e-6
@@ -61,7 +61,7 @@ def _find_facings(
     facings: np.ndarray,
 ) -> None:
     """Writes which side of each triangle is seen: +1, 0 or -1; 0 after the last and too near."""
-    e0, e1, e2, share = eye_in_node(X, camera)
+    e0, e1, e2, share = viewpoint_in_node(X, camera)
     begin, end = packed.starts[node, 1], packed.starts[node + 1, 1]
     for i in range(end - begin):
         t = begin + i

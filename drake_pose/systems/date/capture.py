@@ -63,7 +63,7 @@ def build_paper_capture(
     """
     wiring = _Wiring(setup, source)
     estimator = wiring.add("pose", PaperPoseEstimator(setup, period))
-    wiring.add_eyes()
+    wiring.add_images()
     wiring.watch(estimator)
     wiring.add_recognition(estimator)
     wiring.add_features(estimator)
@@ -86,7 +86,7 @@ class _Wiring:
         self.setup, self.source = setup, source
         self.builder = DiagramBuilder()
         self.stages: dict[str, tuple[OutputPort, ...]] = {}
-        self._eyes: dict[str, HorizontalImage] = {}
+        self._images: dict[str, HorizontalImage] = {}
         self._inputs: set[str] = set()
         if source is not None:
             self.builder.AddNamedSystem("source", source)
@@ -100,24 +100,24 @@ class _Wiring:
     def export(self, port: OutputPort, name: str | None = None) -> None:
         self.builder.ExportOutput(port, name or port.get_name())
 
-    def add_eyes(self) -> None:
+    def add_images(self) -> None:
         """One HorizontalImage a camera, the face camera's last."""
         face = self.setup.face_camera
         for camera in [*self.setup.cameras.values(), *([] if face is None else [face])]:
-            self._eyes[camera.name] = self._add_eye(camera)
+            self._images[camera.name] = self._add_image(camera)
         for stage, name in (("region", "region"), ("skin", "person_view")):
-            self.stages[stage] = tuple(eye.GetOutputPort(name) for eye in self._eyes.values())
-        for name, eye in self._eyes.items():
-            self.export(eye.GetOutputPort("person_view"), f"person_view_{name}")
+            self.stages[stage] = tuple(image.GetOutputPort(name) for image in self._images.values())
+        for name, image in self._images.items():
+            self.export(image.GetOutputPort("person_view"), f"person_view_{name}")
 
-    def _add_eye(self, camera: Camera) -> HorizontalImage:
+    def _add_image(self, camera: Camera) -> HorizontalImage:
         name, background = camera.name, self.setup.backgrounds.get(camera.name)
-        eye = HorizontalImage(camera, background, self.setup.settings.skin)
-        self.add(f"horizontal_image_{name}", eye)
-        self._connect_image("color_image", name, eye)
+        image = HorizontalImage(camera, background, self.setup.settings.skin)
+        self.add(f"horizontal_image_{name}", image)
+        self._connect_image("color_image", name, image)
         if background is None:
-            self._connect_image("label_image", name, eye)
-        return eye
+            self._connect_image("label_image", name, image)
+        return image
 
     def _connect_image(self, kind: str, camera: str, system: LeafSystem) -> None:
         """Connects a camera's image of a kind to a system's input of that name."""
@@ -143,7 +143,7 @@ class _Wiring:
     def watch(self, system: LeafSystem) -> None:
         """Connects what the cameras on the circle saw."""
         for name in self.setup.cameras:
-            view = self._eyes[name].GetOutputPort("person_view")
+            view = self._images[name].GetOutputPort("person_view")
             self.builder.Connect(view, system.GetInputPort(f"person_view_{name}"))
 
     def add_recognition(self, estimator: PaperPoseEstimator) -> None:
@@ -181,7 +181,7 @@ class _Wiring:
         finder = FaceDirectionFinder(camera, faces, self.setup.settings.farthest_face)
         self.add("face", finder)
         self._connect_image("color_image", camera.name, finder)
-        view = self._eyes[camera.name].GetOutputPort("person_view")
+        view = self._images[camera.name].GetOutputPort("person_view")
         self.builder.Connect(view, finder.GetInputPort("person_view"))
         self._finish("face", finder, "face_direction", estimator)
         self.export(finder.GetOutputPort("face_direction"))

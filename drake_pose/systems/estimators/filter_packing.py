@@ -5,7 +5,14 @@ from numpy.typing import NDArray
 from pydrake.systems.framework import Context, LeafSystem
 
 from drake_pose.errors import SettingsError
-from drake_pose.filtering import Belief, FilterState, Hypothesis, Stare, TruncatedFilter, View
+from drake_pose.filtering import (
+    Belief,
+    FilterState,
+    Hypothesis,
+    RepeatedView,
+    TruncatedFilter,
+    View,
+)
 
 Array = NDArray[np.float64]
 
@@ -41,16 +48,16 @@ class FilterPacking:
         self._sites = belief_filter.site_count
         n, z = self.n, self.n + measured
         self.belief_width = 4 + 2 * (n + n * n) + 2 * self._sites + n
-        self._stare_width = 1 + z + z * z if belief_filter.novelty > 0 else 0
+        self._repeated_width = 1 + z + z * z if belief_filter.novelty > 0 else 0
 
     def pack(self, state: FilterState) -> tuple[Array, Array, Array]:
-        """Beliefs (cap x belief_width), stares (cap x width), view (1 + m), each flat.
+        """Beliefs (cap x belief_width), repeated_views (cap x width), view (1 + m), each flat.
 
         A belief's row begins with: alive, log weight, log evidence, step of birth, mean.
         """
         beliefs = np.zeros((self.cap, self.belief_width))
-        stares = np.zeros((self.cap, self._stare_width))
-        for row, stared, h in zip(beliefs, stares, state.hypotheses, strict=False):
+        repeated_views = np.zeros((self.cap, self._repeated_width))
+        for row, repeated_row, h in zip(beliefs, repeated_views, state.hypotheses, strict=False):
             sites = np.zeros((self._sites, 2))
             sites[: len(h.sites)] = h.sites
             row[:] = np.concatenate(
@@ -64,30 +71,38 @@ class FilterPacking:
                     h.tangent,
                 ]
             )
-            if h.stare is not None:
-                belief = h.stare.belief
-                stared[:] = np.concatenate([[1.0], belief.mean, belief.covariance.ravel()])
+            if h.repeated is not None:
+                belief = h.repeated.belief
+                repeated_row[:] = np.concatenate([[1.0], belief.mean, belief.covariance.ravel()])
         view = np.zeros(1 + self.m)
         if state.view is not None and self._filter.novelty > 0:
             view[0], view[1:] = state.view.count, state.view.reference
-        return beliefs.ravel(), stares.ravel(), view
+        return beliefs.ravel(), repeated_views.ravel(), view
 
     def unpack(
-        self, beliefs: Array, stares: Array, view: Array, step: int, distance: float, count: int
+        self,
+        beliefs: Array,
+        repeated_views: Array,
+        view: Array,
+        step: int,
+        distance: float,
+        count: int,
     ) -> FilterState:
         """The state that was packed."""
         n, z = self.n, self.n + self.m
         ends = np.cumsum([4, n, n * n, n, n * n, 2 * self._sites])
         hypotheses = []
         rows = beliefs.reshape(self.cap, -1)
-        for row, stared in zip(rows, stares.reshape(self.cap, -1), strict=True):
+        for row, repeated_row in zip(rows, repeated_views.reshape(self.cap, -1), strict=True):
             if row[0] == 0:
                 continue
             head, mean, P, free_mean, free_P, sites, tangent = np.split(row.copy(), ends)
-            stare = None
-            if stared.size and stared[0] > 0:
-                joint = Belief(stared[1 : 1 + z].copy(), stared[1 + z :].reshape(z, z).copy())
-                stare = Stare(tangent, joint)
+            repeated = None
+            if repeated_row.size and repeated_row[0] > 0:
+                joint = Belief(
+                    repeated_row[1 : 1 + z].copy(), repeated_row[1 + z :].reshape(z, z).copy()
+                )
+                repeated = RepeatedView(tangent, joint)
             hypotheses.append(
                 Hypothesis(
                     belief=Belief(mean, P.reshape(n, n)),
@@ -97,7 +112,7 @@ class FilterPacking:
                     born=int(head[3]),
                     sites=sites.reshape(-1, 2),
                     tangent=tangent,
-                    stare=stare,
+                    repeated=repeated,
                 )
             )
         seen = View(view[1:].copy(), int(view[0])) if view[0] > 0 else None

@@ -137,11 +137,13 @@ class TruncatedEkf(LeafSystem):
     def filter_state(self, context: Context) -> FilterState:
         """The filter's state in a context, without its rejections."""
         step, _, distance, count = context.get_discrete_state(self._record).value()[:4]
-        beliefs, stares, view = (
+        beliefs, repeated_views, view = (
             np.array(context.get_discrete_state(index).value())
             for index in (self._belief, self._stare, self._view)
         )
-        return self._packing.unpack(beliefs, stares, view, int(step), float(distance), int(count))
+        return self._packing.unpack(
+            beliefs, repeated_views, view, int(step), float(distance), int(count)
+        )
 
     def _rows(self, context: Context) -> Array:
         return np.array(context.get_discrete_state(self._belief).value()).reshape(self._cap, -1)

@@ -1,4 +1,4 @@
-"""A person captured live: cameras' pictures in, poses out, the eyes here or elsewhere."""
+"""A person captured live: cameras' pictures in, poses out, the sensors here or elsewhere."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from drake_pose.multiview.recordings.person_capture import EDGE_POINTS
 from drake_pose.multiview.regions import Background
 from drake_pose.systems.bodies.posed_geometry import add_avatar
 from drake_pose.systems.person.person_tracker import PersonTracker
-from drake_pose.systems.person.silhouette_sensor import SilhouetteEye
+from drake_pose.systems.person.silhouette_sensor import SilhouetteSensor
 from drake_pose.systems.pictures.picture_capture import CameraCount, PictureCapture
 
 
-class EyePorts(NamedTuple):
-    """What the eyes of all cameras give, wherever they are.
+class SensorPorts(NamedTuple):
+    """What the sensors of all cameras give, wherever they are.
 
     Attributes:
         silhouettes: by camera, the port of a SilhouetteView or None.
@@ -30,8 +30,8 @@ class EyePorts(NamedTuple):
     time: OutputPort
 
 
-class LiveEyes(Protocol):
-    """The eyes of all cameras: here, as LocalEyes, or on other machines.
+class LiveSensors(Protocol):
+    """The sensors of all cameras: here, as LocalSensors, or on other machines.
 
     Attributes:
         period: time between two looks at the cameras [s].
@@ -45,7 +45,7 @@ class LiveEyes(Protocol):
     def skipped(self) -> int:
         """How many moments were not shown, as newer ones had come."""
 
-    def add(self, builder: DiagramBuilder) -> EyePorts:
+    def add(self, builder: DiagramBuilder) -> SensorPorts:
         """Adds the systems that see to a diagram under construction."""
 
     def take_reports(self) -> list[str]:
@@ -58,8 +58,8 @@ class LiveEyes(Protocol):
         """Lets go of files, cameras and workers."""
 
 
-class LocalEyes:
-    """Eyes in this process: a PictureCapture, and a SilhouetteEye for each camera; see LiveEyes.
+class LocalSensors:
+    """Sensors in this process: a PictureCapture, and a SilhouetteSensor each; see LiveSensors.
 
     Args:
         capture: gives the pictures.
@@ -85,18 +85,18 @@ class LocalEyes:
         """How many moments were not shown, as newer ones had come."""
         return self.capture.skipped
 
-    def add(self, builder: DiagramBuilder) -> EyePorts:
+    def add(self, builder: DiagramBuilder) -> SensorPorts:
         """Adds the systems that see to a diagram under construction."""
         builder.AddNamedSystem("picture_capture", self.capture)
         silhouettes = {}
         for name, camera in self._cameras.items():
             background = self._backgrounds.get(name)
-            eye = SilhouetteEye(camera, background, self._edge_points)
-            builder.AddNamedSystem(f"eye_{name}", eye)
+            sensor = SilhouetteSensor(camera, background, self._edge_points)
+            builder.AddNamedSystem(f"sensor_{name}", sensor)
             port = f"{'label' if background is None else 'color'}_image_{name}"
-            builder.Connect(self.capture.GetOutputPort(port), eye.get_input_port())
-            silhouettes[name] = eye.GetOutputPort("silhouette")
-        return EyePorts(silhouettes, self.capture.GetOutputPort("time"))
+            builder.Connect(self.capture.GetOutputPort(port), sensor.get_input_port())
+            silhouettes[name] = sensor.GetOutputPort("silhouette")
+        return SensorPorts(silhouettes, self.capture.GetOutputPort("time"))
 
     def take_reports(self) -> list[str]:
         """What the user should know and was not told yet."""
@@ -115,18 +115,18 @@ def add_person_tracker(
     builder: DiagramBuilder,
     tracker: SilhouetteTracker,
     cameras: Mapping[str, Camera],
-    eyes: EyePorts,
+    sensors: SensorPorts,
     period: float,
     with_deviations: bool = False,
 ) -> PersonTracker:
-    """Add what follows a person with eyes.
+    """Add what follows a person with sensors.
 
     Args:
         builder: the diagram under construction.
         tracker: made for the person's pose tree.
         cameras: two calibrated cameras or more.
-        eyes: what LiveEyes.add gave.
-        period: time between two looks at the eyes [s].
+        sensors: what LiveSensors.add gave.
+        period: time between two looks at the sensors [s].
         with_deviations: whether the positions' standard deviations are an output.
 
     Raises:
@@ -134,16 +134,16 @@ def add_person_tracker(
     """
     system = PersonTracker(tracker, list(cameras.values()), period, with_deviations)
     builder.AddNamedSystem("person_tracker", system)
-    for name, port in eyes.silhouettes.items():
+    for name, port in sensors.silhouettes.items():
         builder.Connect(port, system.GetInputPort(f"silhouette_{name}"))
-    builder.Connect(eyes.time, system.GetInputPort("time"))
+    builder.Connect(sensors.time, system.GetInputPort("time"))
     return system
 
 
 def build_live_capture(
     tracker: SilhouetteTracker,
     cameras: Mapping[str, Camera],
-    eyes: LiveEyes,
+    sensors: LiveSensors,
     meshcat: Meshcat | None = None,
     with_deviations: bool = False,
 ) -> Diagram:
@@ -156,7 +156,7 @@ def build_live_capture(
     Args:
         tracker: made for the person's pose tree.
         cameras: two calibrated cameras or more.
-        eyes: those of the cameras, here or elsewhere.
+        sensors: those of the cameras, here or elsewhere.
         meshcat: where the avatar is shown; None: nowhere.
         with_deviations: whether the positions' standard deviations are an output.
 
@@ -164,8 +164,8 @@ def build_live_capture(
         SettingsError: fewer than two cameras, or a period that is not positive.
     """
     builder = DiagramBuilder()
-    ports = eyes.add(builder)
-    system = add_person_tracker(builder, tracker, cameras, ports, eyes.period, with_deviations)
+    ports = sensors.add(builder)
+    system = add_person_tracker(builder, tracker, cameras, ports, sensors.period, with_deviations)
     for name, port in ports.silhouettes.items():
         builder.ExportOutput(port, f"silhouette_{name}")
     for index in range(system.num_output_ports()):
@@ -174,5 +174,5 @@ def build_live_capture(
     if meshcat is not None:
         positions = system.GetOutputPort("last_positions")
         model = tracker.fit.tree.model
-        add_avatar(builder, model, positions, meshcat, "avatar", eyes.period)
+        add_avatar(builder, model, positions, meshcat, "avatar", sensors.period)
     return builder.Build()

@@ -32,7 +32,11 @@ from drake_pose.multiview.person.silhouette_tracker import (
 )
 from drake_pose.multiview.recordings.other_persons import keep_views
 from drake_pose.systems.bodies.posed_geometry import add_avatar
-from drake_pose.systems.person.silhouette_sensor import SilhouetteEye, edge_spacing, shows_somebody
+from drake_pose.systems.person.silhouette_sensor import (
+    SilhouetteSensor,
+    edge_spacing,
+    shows_somebody,
+)
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
 
 # Before the values in the state: whether the person is known, the share that fits, the usual share,
@@ -66,7 +70,7 @@ class PersonTracker(LeafSystem):
         - others
         - deviations
 
-    ``silhouette_<camera>`` is a SilhouetteView, as SilhouetteEye gives it, or None: then the
+    ``silhouette_<camera>`` is a SilhouetteView, as SilhouetteSensor gives it, or None: then the
     others go on without the camera, as they do where the port is not connected. ``time`` is the
     pictures' time stamp [s]: while it stays the same, or is nan, there is nothing new; where it is
     not connected, every period brings new pictures.
@@ -164,10 +168,10 @@ class PersonTracker(LeafSystem):
             time = float(self._time.Eval(context)[0])
             if np.isnan(time) or time == before:
                 return EventStatus.Succeeded()
-        sight = self._sight(context)
+        frame_views = self._frame_views(context)
         elapsed = 0.0 if np.isnan(before) else time - before
         last = _unpack(vector, elapsed)
-        found, kept = self._followed(last, sight, vector[_OTHERS] > 0)
+        found, kept = self._followed(last, frame_views, vector[_OTHERS] > 0)
         seers = {*kept.merged} | {
             camera.name
             for camera, view in zip(kept.cameras, kept.views, strict=True)
@@ -195,7 +199,7 @@ class PersonTracker(LeafSystem):
             discrete_state.set_value(self._deviations, deviations)
         return EventStatus.Succeeded()
 
-    def _sight(self, context: Context) -> _Sight:
+    def _frame_views(self, context: Context) -> _FrameViews:
         """What those cameras say that have a picture."""
         cameras, views = [], []
         for camera, port in zip(self._cameras, self._silhouettes, strict=True):
@@ -203,46 +207,46 @@ class PersonTracker(LeafSystem):
             if view is not None:
                 cameras.append(camera)
                 views.append(view)
-        return _Sight(cameras, views)
+        return _FrameViews(cameras, views)
 
     def _followed(
-        self, last: TrackState | None, sight: _Sight, is_watching: bool
-    ) -> tuple[TrackState | None, _Sight]:
+        self, last: TrackState | None, frame_views: _FrameViews, is_watching: bool
+    ) -> tuple[TrackState | None, _FrameViews]:
         """The next state, and what the cameras say of the person alone."""
         is_sorted = last is None or last.troubled != 0 or is_watching
         if is_sorted:
-            sight = self._alone(sight, last)
-        found = self._follow_one(last, sight)
+            frame_views = self._alone(frame_views, last)
+        found = self._follow_one(last, frame_views)
         if not is_sorted and (found is None or found.troubled != 0):
-            alone = self._alone(sight, last)
+            alone = self._alone(frame_views, last)
             if alone.others:
                 return self._follow_one(last, alone), alone
-        return found, sight
+        return found, frame_views
 
-    def _follow_one(self, last: TrackState | None, sight: _Sight) -> TrackState | None:
+    def _follow_one(self, last: TrackState | None, frame_views: _FrameViews) -> TrackState | None:
         """The next state; None where fewer than two cameras see anybody."""
-        if sum(shows_somebody(view) for view in sight.views) < 2:
+        if sum(shows_somebody(view) for view in frame_views.views) < 2:
             return None
-        return self._tracker.follow(last, sight.cameras, sight.views)
+        return self._tracker.follow(last, frame_views.cameras, frame_views.views)
 
-    def _alone(self, sight: _Sight, last: TrackState | None) -> _Sight:
+    def _alone(self, frame_views: _FrameViews, last: TrackState | None) -> _FrameViews:
         """What cameras say without other persons than the one who was seen last."""
         place = None if last is None else place_of_person(self._tracker, last.values)
-        views, cut, merged = keep_views(sight.cameras, sight.views, edge_spacing, place)
+        views, cut, merged = keep_views(frame_views.cameras, frame_views.views, edge_spacing, place)
         seers = [
             (camera, view)
-            for camera, view in zip(sight.cameras, views, strict=True)
+            for camera, view in zip(frame_views.cameras, views, strict=True)
             if camera.name not in merged
         ]
         if merged and sum(shows_somebody(view) for _, view in seers) >= _ENOUGH:
             cameras, views = [camera for camera, _ in seers], [view for _, view in seers]
-            return _Sight(cameras, views, True, merged)
-        return _Sight(sight.cameras, views, bool(cut or merged), merged)
+            return _FrameViews(cameras, views, True, merged)
+        return _FrameViews(frame_views.cameras, views, bool(cut or merged), merged)
 
-    def _judged(self, found: TrackState, sight: _Sight) -> TrackState:
+    def _judged(self, found: TrackState, frame_views: _FrameViews) -> TrackState:
         """A state whose share is that of the cameras in which nobody else's contours are."""
-        pairs = list(zip(sight.cameras, sight.views, strict=True))
-        clean = [(camera, view) for camera, view in pairs if camera.name not in sight.merged]
+        pairs = list(zip(frame_views.cameras, frame_views.views, strict=True))
+        clean = [(camera, view) for camera, view in pairs if camera.name not in frame_views.merged]
         if not 0 < len(clean) < len(pairs):
             return found
         compared = self._tracker.fit.compare(
@@ -267,7 +271,7 @@ class PersonTracker(LeafSystem):
         output.SetFromVector(vector[_SCALARS - 2 : _SCALARS - 1])
 
 
-class _Sight(NamedTuple):
+class _FrameViews(NamedTuple):
     """What cameras say at a moment.
 
     Attributes:
@@ -335,9 +339,11 @@ def build_person_capture(
         "camera_rig", build_camera_rig(model, cameras, true_positions).diagram
     )
     for name, camera in cameras.items():
-        eye = builder.AddNamedSystem(f"eye_{name}", SilhouetteEye(camera))
-        builder.Connect(rig.GetOutputPort(f"label_image_{name}"), eye.get_input_port())
-        builder.Connect(eye.GetOutputPort("silhouette"), system.GetInputPort(f"silhouette_{name}"))
+        sensor = builder.AddNamedSystem(f"sensor_{name}", SilhouetteSensor(camera))
+        builder.Connect(rig.GetOutputPort(f"label_image_{name}"), sensor.get_input_port())
+        builder.Connect(
+            sensor.GetOutputPort("silhouette"), system.GetInputPort(f"silhouette_{name}")
+        )
     for name in ("estimated_positions", "share"):
         builder.ExportOutput(system.GetOutputPort(name), name)
     if meshcat is not None:

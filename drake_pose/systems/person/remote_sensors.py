@@ -14,19 +14,19 @@ from drake_pose.multiview.person.view_packing import unpack_view
 from drake_pose.systems.pictures.picture_capture import PictureCapture
 
 
-class RemoteEyes(PictureCapture):
+class RemoteSensors(PictureCapture):
     """Gives the synchronised views of cameras whose pictures stay on other machines.
 
     .. pydrake_system::
 
-        name: RemoteEyes
+        name: RemoteSensors
         output_ports:
         - silhouette_<camera>
         - time
         - fresh
 
     As PictureCapture, but its sources deliver packed views (bytes (n,) of pack_view) in place of
-    pictures, and its outputs are what SilhouetteEye gives: a SilhouetteView, or None where the
+    pictures, and its outputs are what SilhouetteSensor gives: a SilhouetteView, or None where the
     camera gave no picture at that moment.
     """
 

@@ -13,7 +13,7 @@ from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker
 from drake_pose.multiview.recordings.person_capture import EDGE_POINTS
 from drake_pose.multiview.regions import Background
 from drake_pose.systems.person.person_tracker import PersonTracker
-from drake_pose.systems.person.silhouette_sensor import SilhouetteEye
+from drake_pose.systems.person.silhouette_sensor import SilhouetteSensor
 from drake_pose.systems.staged_diagram import StagedDiagram
 
 
@@ -35,7 +35,7 @@ def build_silhouette_capture(
     period: float = 1.0 / 30.0,
     edge_points: float = EDGE_POINTS,
 ) -> SilhouetteCapture:
-    """Wire the cameras' images to their eyes, and these to what follows the person.
+    """Wire the cameras' images to their sensors, and these to what follows the person.
 
     The diagram's inputs are ``color_image_<camera>``, its outputs those of PersonTracker, and its
     stages ``region`` and ``edge``.
@@ -60,10 +60,10 @@ def build_silhouette_capture(
             raise SettingsError(
                 f"camera '{name}' has no background: give one for each of {', '.join(cameras)}"
             )
-        eye = SilhouetteEye(camera, backgrounds[name], edge_points)
-        builder.AddNamedSystem(f"eye_{name}", eye)
-        builder.ExportInput(eye.get_input_port(), f"color_image_{name}")
-        region, silhouette = eye.GetOutputPort("region"), eye.GetOutputPort("silhouette")
+        sensor = SilhouetteSensor(camera, backgrounds[name], edge_points)
+        builder.AddNamedSystem(f"sensor_{name}", sensor)
+        builder.ExportInput(sensor.get_input_port(), f"color_image_{name}")
+        region, silhouette = sensor.GetOutputPort("region"), sensor.GetOutputPort("silhouette")
         builder.Connect(silhouette, person.GetInputPort(f"silhouette_{name}"))
         stages["region"].append(region)
         stages["edge"].append(silhouette)

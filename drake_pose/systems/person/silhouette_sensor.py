@@ -31,12 +31,12 @@ def shows_somebody(view: SilhouetteView | None) -> bool:
     return bool(view.edge.lengths.sum() >= _LEAST_EDGE * view.region.shape[0])
 
 
-class SilhouetteEye(LeafSystem):
+class SilhouetteSensor(LeafSystem):
     """What one camera's picture says of the person.
 
     .. pydrake_system::
 
-        name: SilhouetteEye
+        name: SilhouetteSensor
         input_ports:
         - label_image
         output_ports:

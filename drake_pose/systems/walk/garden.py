@@ -36,7 +36,7 @@ _BALLS = ((2.5, -2.5, (0.95, 0.75, 0.10)), (-3.5, -1.5, (0.45, 0.20, 0.60)))
 
 
 @dataclass(frozen=True)
-class PlaceObject:
+class GardenObject:
     """An object of the place.
 
     Args:
@@ -54,19 +54,19 @@ class PlaceObject:
     radius: float = 0.0
 
 
-def place_objects() -> tuple[PlaceObject, ...]:
+def garden_objects() -> tuple[GardenObject, ...]:
     """All objects: lawn, paths, walls, gates over the path, trees, balls, a fountain."""
     return (*_ground(), *_walls(), *_gates(), *_trees(), *_things())
 
 
-def place_obstacles() -> NDArray[np.float64]:
+def garden_obstacles() -> NDArray[np.float64]:
     """(n, 3) x, y and radius of what one cannot walk through [m]."""
-    return np.array([(*one.position[:2], one.radius) for one in place_objects() if one.radius])
+    return np.array([(*one.position[:2], one.radius) for one in garden_objects() if one.radius])
 
 
-def draw_place(meshcat: Meshcat, path: str = "place") -> None:
+def draw_garden(meshcat: Meshcat, path: str = "place") -> None:
     """Draw the place, under a path of Meshcat's tree, below a sky."""
-    for one in place_objects():
+    for one in garden_objects():
         here = f"{path}/{one.name}"
         meshcat.SetObject(here, one.shape, Rgba(*one.colour))
         meshcat.SetTransform(here, RigidTransform(one.position))
@@ -105,54 +105,54 @@ def walker_transform(pose: NDArray[np.float64], rest: NDArray[np.float64]) -> Ri
     return X_PF.multiply(RigidTransform([-rest[3], -rest[4], 0.0]))
 
 
-def _ground() -> list[PlaceObject]:
+def _ground() -> list[GardenObject]:
     side = 2.0 * HALF_SIZE
     return [
-        PlaceObject("lawn", Box(side, side, 0.1), (0.0, 0.0, -0.05), _LAWN),
-        PlaceObject("path_x", Box(side, 1.8, 0.02), (0.0, 0.0, 0.0), _PATH),
-        PlaceObject("path_y", Box(1.8, side, 0.02), (0.0, 0.0, 0.001), _PATH),
+        GardenObject("lawn", Box(side, side, 0.1), (0.0, 0.0, -0.05), _LAWN),
+        GardenObject("path_x", Box(side, 1.8, 0.02), (0.0, 0.0, 0.0), _PATH),
+        GardenObject("path_y", Box(1.8, side, 0.02), (0.0, 0.0, 0.001), _PATH),
     ]
 
 
-def _walls() -> list[PlaceObject]:
+def _walls() -> list[GardenObject]:
     side, z = 2.0 * HALF_SIZE, 0.5 * _WALL_HEIGHT
     long, deep = Box(side, 0.3, _WALL_HEIGHT), Box(0.3, side, _WALL_HEIGHT)
     return [
-        PlaceObject("wall_left", long, (0.0, HALF_SIZE, z), _STONE),
-        PlaceObject("wall_right", long, (0.0, -HALF_SIZE, z), _STONE),
-        PlaceObject("wall_ahead", deep, (HALF_SIZE, 0.0, z), _STONE),
-        PlaceObject("wall_behind", deep, (-HALF_SIZE, 0.0, z), _STONE),
+        GardenObject("wall_left", long, (0.0, HALF_SIZE, z), _STONE),
+        GardenObject("wall_right", long, (0.0, -HALF_SIZE, z), _STONE),
+        GardenObject("wall_ahead", deep, (HALF_SIZE, 0.0, z), _STONE),
+        GardenObject("wall_behind", deep, (-HALF_SIZE, 0.0, z), _STONE),
     ]
 
 
-def _gates() -> list[PlaceObject]:
+def _gates() -> list[GardenObject]:
     found = []
     for index, x in enumerate(_GATES):
         for side, y in (("left", 1.3), ("right", -1.3)):
             name = f"gate_{index}_{side}"
-            found.append(PlaceObject(name, Cylinder(0.15, 2.8), (x, y, 1.4), _GATE, 0.15))
-        found.append(PlaceObject(f"gate_{index}_top", Box(0.3, 3.4, 0.25), (x, 0.0, 2.9), _GATE))
+            found.append(GardenObject(name, Cylinder(0.15, 2.8), (x, y, 1.4), _GATE, 0.15))
+        found.append(GardenObject(f"gate_{index}_top", Box(0.3, 3.4, 0.25), (x, 0.0, 2.9), _GATE))
     return found
 
 
-def _trees() -> list[PlaceObject]:
+def _trees() -> list[GardenObject]:
     found = []
     for index, (x, y) in enumerate(_TREES):
-        found.append(PlaceObject(f"trunk_{index}", Cylinder(0.18, 2.0), (x, y, 1.0), _BARK, 0.18))
+        found.append(GardenObject(f"trunk_{index}", Cylinder(0.18, 2.0), (x, y, 1.0), _BARK, 0.18))
         crown = Ellipsoid(1.1, 1.1, 1.4)
-        found.append(PlaceObject(f"crown_{index}", crown, (x, y, 2.9), _LEAVES))
+        found.append(GardenObject(f"crown_{index}", crown, (x, y, 2.9), _LEAVES))
     return found
 
 
-def _things() -> list[PlaceObject]:
+def _things() -> list[GardenObject]:
     balls = [
-        PlaceObject(f"ball_{index}", Sphere(0.5), (x, y, 0.5), colour, 0.5)
+        GardenObject(f"ball_{index}", Sphere(0.5), (x, y, 0.5), colour, 0.5)
         for index, (x, y, colour) in enumerate(_BALLS)
     ]
     x, y = -6.0, 3.0
     fountain = [
-        PlaceObject("basin", Cylinder(1.3, 0.45), (x, y, 0.225), _STONE, 1.3),
-        PlaceObject("water", Cylinder(1.15, 0.02), (x, y, 0.46), _WATER),
-        PlaceObject("spout", Cylinder(0.12, 1.3), (x, y, 0.65), _STONE),
+        GardenObject("basin", Cylinder(1.3, 0.45), (x, y, 0.225), _STONE, 1.3),
+        GardenObject("water", Cylinder(1.15, 0.02), (x, y, 0.46), _WATER),
+        GardenObject("spout", Cylinder(0.12, 1.3), (x, y, 0.65), _STONE),
     ]
     return balls + fountain

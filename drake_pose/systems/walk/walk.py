@@ -34,9 +34,9 @@ from drake_pose.systems.bodies.posed_geometry import add_avatar
 from drake_pose.systems.walk.garden import (
     HALF_SIZE,
     START,
-    draw_place,
+    draw_garden,
+    garden_obstacles,
     look_over_shoulder,
-    place_obstacles,
     walker_transform,
 )
 
@@ -109,7 +109,7 @@ class Walker(LeafSystem):
         self._plant, self._period = model.plant, period
         self._plant_context = model.plant.CreateDefaultContext()
         self._settings = settings or WalkSettings()
-        self._obstacles = place_obstacles()
+        self._obstacles = garden_obstacles()
         self._positions = self.DeclareVectorInputPort("positions", len(standing))
         self._keys = self.DeclareVectorInputPort("keys", 2)
         starts = {
@@ -300,7 +300,7 @@ def build_walk(
         settings: thresholds and speeds.
         settle: how long the person must stand still at first [s]; 0: the first pose is the rest.
     """
-    draw_place(meshcat)
+    draw_garden(meshcat)
     builder = DiagramBuilder()
     keys = builder.AddNamedSystem("keys", WalkKeys(meshcat, stride, period))
     walker = builder.AddNamedSystem("walker", Walker(model, stride[-1], period, settings, settle))

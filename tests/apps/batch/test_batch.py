@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 from drake_pose.apps.batch.batch import run_batch
 from drake_pose.apps.batch.job import SETTINGS, SceneJob, read_job
 from drake_pose.apps.batch.tasks import WORK, Outcome, Task, perform
-from drake_pose.apps.batch.workers import ClusterCrew
+from drake_pose.apps.batch.workers import ClusterPool
 from drake_pose.apps.cluster.scheduler import open_cluster, require_fit_workers
 from drake_pose.apps.estimate.scene import estimate_scene
 from drake_pose.apps.main import app
@@ -80,7 +80,7 @@ def same_results(one: Path, other: Path) -> bool:
     return all(rows(one / name) == rows(other / name) for name in ("stills", "motion"))
 
 
-class OneAtATime(ClusterCrew):
+class OneAtATime(ClusterPool):
     """As if there were one worker."""
 
     size = 1
@@ -88,8 +88,8 @@ class OneAtATime(ClusterCrew):
 
 @pytest.mark.slow
 def test_results_do_not_depend_on_who_works(jobs, alone, cluster, scenes, tmp_path):
-    for name, crew in (("one", OneAtATime(cluster)), ("two", ClusterCrew(cluster))):
-        result = run_batch(jobs, tmp_path / name, crew)
+    for name, pool in (("one", OneAtATime(cluster)), ("two", ClusterPool(cluster))):
+        result = run_batch(jobs, tmp_path / name, pool)
         assert not result.failed
         assert same_results(alone, tmp_path / name)
     # Three chunks and two, and each scene put together.
@@ -185,7 +185,7 @@ def test_poisoned_chunk_is_given_up_and_the_rest_is_kept(
     out = tmp_path / "out"
     heard = []
     result = run_batch(
-        jobs, out, ClusterCrew(cluster, die_on_second_chunk),
+        jobs, out, ClusterPool(cluster, die_on_second_chunk),
         on_progress=lambda done, total, message: heard.append((done, total, message)),
     )  # fmt: skip
     assert result.failed == ("stills",)
@@ -220,7 +220,7 @@ def test_killed_worker_loses_and_repeats_nothing(jobs, alone, cluster, tmp_path)
         if done and victims:
             os.kill(victims.pop(), signal.SIGKILL)
 
-    result = run_batch(jobs, out, ClusterCrew(cluster, slow), on_progress=kill)
+    result = run_batch(jobs, out, ClusterPool(cluster, slow), on_progress=kill)
     assert not victims
     assert not result.failed
     assert same_results(alone, out)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from drake_pose.apps.cluster.camera_assignment import place_cameras
-from drake_pose.apps.cluster.remote_views import ClusterEyes
+from drake_pose.apps.cluster.camera_assignment import assign_cameras
+from drake_pose.apps.cluster.remote_views import ClusterSensors
 from drake_pose.apps.cluster.scheduler import open_cluster
 from drake_pose.apps.live.run import FrameWatch, run_live
 from drake_pose.apps.live.scene import load_live_scene
@@ -48,11 +48,11 @@ def cluster():
 
 
 class Capture:
-    """Runs eyes to the end, and keeps what came out."""
+    """Runs sensors to the end, and keeps what came out."""
 
-    def __init__(self, scene, person, eyes, on_frame=lambda count: None):
+    def __init__(self, scene, person, sensors, on_frame=lambda count: None):
         tracker = tracker_of_person(person.pose_tree(), None)
-        diagram = build_live_capture(tracker, scene.cameras, eyes)
+        diagram = build_live_capture(tracker, scene.cameras, sensors)
         self.frames, self.reports = [], []
 
         def note(frame):
@@ -61,10 +61,10 @@ class Capture:
 
         watch = FrameWatch(diagram, scene.cameras, note)
         try:
-            run_live(diagram, eyes, 60.0, self.reports.append, monitor=watch)
-            self.used = {name: count.used for name, count in eyes.counts().items()}
+            run_live(diagram, sensors, 60.0, self.reports.append, monitor=watch)
+            self.used = {name: count.used for name, count in sensors.counts().items()}
         finally:
-            eyes.close()
+            sensors.close()
 
     @property
     def text(self):
@@ -84,18 +84,18 @@ class Capture:
 @pytest.fixture(scope="module")
 def here(scene, person):
     """What this process sees by itself."""
-    return Capture(scene, person, scene.open_eyes())
+    return Capture(scene, person, scene.open_sensors())
 
 
 @pytest.mark.slow
 def test_workers_see_what_this_process_sees(scene, person, cluster, here):
-    eyes = ClusterEyes(cluster, scene)
-    groups = eyes.watchers.groups
+    sensors = ClusterSensors(cluster, scene)
+    groups = sensors.watchers.groups
     assert [list(group.specifications) for group in groups] == [
         ["camera_0", "camera_1"], ["camera_2", "camera_3"],
     ]  # fmt: skip
     assert groups[0].address != groups[1].address
-    there = Capture(scene, person, eyes)
+    there = Capture(scene, person, sensors)
     assert len(there.frames) == FRAMES
     assert there.same_as(here)
     assert not set(GAP) & set(there.times("camera_1"))
@@ -110,14 +110,14 @@ def test_workers_see_what_this_process_sees(scene, person, cluster, here):
 
 @pytest.mark.slow
 def test_recording_loses_nothing_with_its_worker(scene, person, cluster, here):
-    eyes = ClusterEyes(cluster, scene)
-    victim = cluster.run(os.getpid)[eyes.watchers.groups[0].address]
+    sensors = ClusterSensors(cluster, scene)
+    victim = cluster.run(os.getpid)[sensors.watchers.groups[0].address]
 
     def kill(count):
         if count == 4:
             os.kill(victim, signal.SIGKILL)
 
-    there = Capture(scene, person, eyes, kill)
+    there = Capture(scene, person, sensors, kill)
     assert there.same_as(here)
     assert "the worker of camera 'camera_0', 'camera_1' was lost" in there.text
     assert "a worker goes on with camera 'camera_0', 'camera_1'" in there.text
@@ -129,14 +129,14 @@ def test_live_capture_goes_on_without_a_worker_that_stops(scene, person, cluster
     monkeypatch.setattr("drake_pose.apps.cluster.camera_groups._SILENCE", 0.3)
     ticks = itertools.count()
     # A clock that waits for the slowest machine that runs this test.
-    eyes = ClusterEyes(cluster, scene, live=True, clock=lambda: next(ticks) / RATE_HZ)
-    victim = cluster.run(os.getpid)[eyes.watchers.groups[1].address]
+    sensors = ClusterSensors(cluster, scene, live=True, clock=lambda: next(ticks) / RATE_HZ)
+    victim = cluster.run(os.getpid)[sensors.watchers.groups[1].address]
 
     def stop(count):
         if count in (4, 14):
             os.kill(victim, signal.SIGSTOP if count == 4 else signal.SIGCONT)
 
-    there = Capture(scene, person, eyes, stop)
+    there = Capture(scene, person, sensors, stop)
     assert "the worker of camera 'camera_2', 'camera_3' does not answer" in there.text
     assert "a worker goes on with camera 'camera_2', 'camera_3'" in there.text
     assert "camera 'camera_3' stopped at" in there.text
@@ -155,7 +155,7 @@ def test_source_that_cannot_be_opened_is_named(scene, cluster, tmp_path, person)
     broken = load_live_scene(tmp_path)
     (tmp_path / "masks" / "camera_1" / "0000.png").unlink()
     with pytest.raises(SceneError, match="camera_1"):
-        ClusterEyes(cluster, broken)
+        ClusterSensors(cluster, broken)
 
 
 def device(name, location):
@@ -165,17 +165,17 @@ def device(name, location):
 def test_a_camera_is_looked_through_where_it_hangs():
     cameras = [device("left", "0"), device("right", "0"), device("door", "rtsp://10.0.0.9/live")]
     here = {"tcp://10.0.0.1:7001": (), "tcp://10.0.0.1:7002": ()}
-    assert [len(place.specifications) for place in place_cameras(cameras, here)] == [2, 1]
+    assert [len(place.specifications) for place in assign_cameras(cameras, here)] == [2, 1]
     two = {"tcp://10.0.0.1:7001": ("left",), "tcp://10.0.0.2:7001": ("right",)}
-    places = place_cameras(cameras, two)
+    places = assign_cameras(cameras, two)
     found = {place.specifications[0].camera: place.hosts for place in places}
     assert found == {"left": {"10.0.0.1"}, "right": {"10.0.0.2"}, "door": set()}
     assert places[0].allows("tcp://10.0.0.1:7009")
     assert not places[0].allows("tcp://10.0.0.2:7001")
     with pytest.raises(ClusterError, match=r"camera 'left' hangs on one of 10\.0\.0\.1, 10"):
-        place_cameras(cameras, dict.fromkeys(two, ()))
+        assign_cameras(cameras, dict.fromkeys(two, ()))
     with pytest.raises(ClusterError, match="no workers"):
-        place_cameras(cameras, {})
+        assign_cameras(cameras, {})
 
 
 @pytest.mark.slow

@@ -43,7 +43,7 @@ def test_person_before_the_cameras_walks_is_lost_and_found_again(studio, person)
         open_page(),
         person.path,
         # The simulation's time, so that a busy computer skips nothing.
-        open_eyes=lambda: scene.open_eyes(live=False),
+        open_sensors=lambda: scene.open_sensors(live=False),
         on_command=commands.append,
         on_report=reports.append,
     )
@@ -98,13 +98,13 @@ def test_a_slow_computer_does_not_make_up_for_lost_time(studio, monkeypatch):
     clock = {"now": 0.0}
     monkeypatch.setattr("drake_pose.apps.live.run.time.monotonic", lambda: clock["now"])
     scene = load_live_scene(studio)
-    eyes = scene.open_eyes(live=False)
+    sensors = scene.open_sensors(live=False)
     from pydrake.systems.framework import DiagramBuilder
 
     builder = DiagramBuilder()
-    eyes.add(builder)
+    sensors.add(builder)
     diagram = builder.Build()
-    eyes.live = True
+    sensors.live = True
     times = []
 
     def work(context):
@@ -112,6 +112,6 @@ def test_a_slow_computer_does_not_make_up_for_lost_time(studio, monkeypatch):
             times.append(context.get_time())
             clock["now"] += 1.0
 
-    run_live(diagram, eyes, 10.0, lambda _: None, monitor=work)
+    run_live(diagram, sensors, 10.0, lambda _: None, monitor=work)
     # Ten seconds of the clock, one a period: the simulation's time does not run after it.
     assert len(times) == pytest.approx(10, abs=1)

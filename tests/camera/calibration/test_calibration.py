@@ -1,4 +1,4 @@
-"""Calibration of known cameras, from sightings and pictures made by formulas of our own."""
+"""Calibration of known cameras, from detections and pictures made by formulas of our own."""
 
 import dataclasses
 
@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from drake_pose.camera.calibration.board import Board, Sighting, load_board
+from drake_pose.camera.calibration.board import Board, Detection, load_board
 from drake_pose.camera.calibration.calibrate import CalibrationSettings, calibrate
 from drake_pose.camera.calibration.lens import load_lenses, save_lenses
 from drake_pose.errors import CameraError, UnknownNameError
@@ -41,17 +41,17 @@ def rig(count=6, pictures=36, noise=0.1, seed=0, board=CHECKERBOARD):
 
 
 def changed(seen, camera, frame, change):
-    """The sightings with one picture's corners changed."""
-    sightings = {name: dict(frames) for name, frames in seen.sightings.items()}
-    old = sightings[camera][frame]
-    sightings[camera][frame] = Sighting(old.corners, change(old.uv))
-    return dataclasses.replace(seen, sightings=sightings)
+    """The detections with one picture's corners changed."""
+    detections = {name: dict(frames) for name, frames in seen.detections.items()}
+    old = detections[camera][frame]
+    detections[camera][frame] = Detection(old.corners, change(old.uv))
+    return dataclasses.replace(seen, detections=detections)
 
 
 def shared_frame(seen, camera, seers):
     """A frame that so many cameras saw, this one among them."""
-    for frame in seen.sightings[camera]:
-        if sum(frame in frames for frames in seen.sightings.values()) == seers:
+    for frame in seen.detections[camera]:
+        if sum(frame in frames for frames in seen.detections.values()) == seers:
             return frame
     raise AssertionError(f"{camera} has no frame that {seers} cameras saw")
 
@@ -116,7 +116,7 @@ class TestKnownCameras:
 class TestSpoiltPictures:
     def test_picture_that_contradicts_its_own_lens_is_named(self):
         _, _, seen = rig()
-        frame = list(seen.sightings["c2"])[3]
+        frame = list(seen.detections["c2"])[3]
         bent = changed(seen, "c2", frame, lambda uv: uv + 8 * np.sin(uv[:, ::-1] / 30))
         with pytest.raises(
             CameraError, match=f"camera 'c2', picture '{frame}'.*leave out c2/{frame}"
@@ -126,8 +126,8 @@ class TestSpoiltPictures:
     def test_picture_of_another_instant_is_named_where_a_third_camera_tells(self):
         _, _, seen = rig(5, 30)
         frame = shared_frame(seen, "c1", 3)
-        other = next(f for f in seen.sightings["c1"] if f != frame)
-        late = changed(seen, "c1", frame, lambda _: seen.sightings["c1"][other].uv)
+        other = next(f for f in seen.detections["c1"] if f != frame)
+        late = changed(seen, "c1", frame, lambda _: seen.detections["c1"][other].uv)
         with pytest.raises(CameraError, match=f"camera 'c1', picture '{frame}'.*same instant"):
             calibrate(late)
         found = calibrate(late, CalibrationSettings(drop_spoilt=True))
@@ -142,17 +142,17 @@ class TestSpoiltPictures:
     def test_two_cameras_that_disagree_are_both_named(self):
         _, _, seen = rig(4, 20)
         frame = shared_frame(seen, "c3", 2)
-        other = next(f for f in seen.sightings["c3"] if f != frame)
-        late = changed(seen, "c3", frame, lambda _: seen.sightings["c3"][other].uv)
+        other = next(f for f in seen.detections["c3"] if f != frame)
+        late = changed(seen, "c3", frame, lambda _: seen.detections["c3"][other].uv)
         found = calibrate(late, CalibrationSettings(drop_spoilt=True))
-        pair = {name for name, frames in seen.sightings.items() if frame in frames}
+        pair = {name for name, frames in seen.detections.items() if frame in frames}
         assert set(found.left_out) == {(name, frame) for name in pair}
         with pytest.raises(CameraError, match="no third camera tells"):
             calibrate(late)
 
     def test_calibration_goes_on_as_well_without_the_spoilt_picture(self):
         cameras, _, seen = rig(6, 48)
-        frame = list(seen.sightings["c2"])[3]
+        frame = list(seen.detections["c2"])[3]
         bent = changed(seen, "c2", frame, lambda uv: uv + 8 * np.sin(uv[:, ::-1] / 30))
         found = calibrate(bent, CalibrationSettings(drop_spoilt=True))
         clean = calibrate(seen, CalibrationSettings(leave_out=[f"c2/{frame}"]))
@@ -169,9 +169,9 @@ class TestSpoiltPictures:
 class TestCamerasThatDoNotFit:
     def test_camera_that_shares_no_picture_is_named(self):
         _, _, seen = rig()
-        sightings = {name: dict(frames) for name, frames in seen.sightings.items()}
-        sightings["c4"] = {f"alone_{frame}": s for frame, s in sightings["c4"].items()}
-        apart = dataclasses.replace(seen, sightings=sightings)
+        detections = {name: dict(frames) for name, frames in seen.detections.items()}
+        detections["c4"] = {f"alone_{frame}": s for frame, s in detections["c4"].items()}
+        apart = dataclasses.replace(seen, detections=detections)
         with pytest.raises(CameraError, match="camera 'c4' shares no picture"):
             calibrate(apart)
         found = calibrate(apart, CalibrationSettings(leave_out=["c4"]))
@@ -179,9 +179,9 @@ class TestCamerasThatDoNotFit:
 
     def test_camera_with_too_few_pictures_is_named(self):
         _, _, seen = rig()
-        sightings = {**seen.sightings, "c1": dict(list(seen.sightings["c1"].items())[:2])}
+        detections = {**seen.detections, "c1": dict(list(seen.detections["c1"].items())[:2])}
         with pytest.raises(CameraError, match="camera 'c1': the board was found in 2 pictures"):
-            calibrate(dataclasses.replace(seen, sightings=sightings))
+            calibrate(dataclasses.replace(seen, detections=detections))
 
     @pytest.mark.parametrize("board", [CHECKERBOARD, Board("checkerboard", 7, 6, 0.12)])
     def test_mirrored_checkerboard_pictures_are_recognised(self, board):
@@ -198,12 +198,12 @@ class TestCamerasThatDoNotFit:
             (rows - 1 - row) * columns + column if even else row * columns + columns - 1 - column
         )
         mirrored = {}
-        for frame, s in seen.sightings["c3"].items():
+        for frame, s in seen.detections["c3"].items():
             uv = np.column_stack([640 - 1 - s.uv[:, 0], s.uv[:, 1]])
-            mirrored[frame] = Sighting(s.corners, uv[turned])
-        sightings = {**seen.sightings, "c3": mirrored}
+            mirrored[frame] = Detection(s.corners, uv[turned])
+        detections = {**seen.detections, "c3": mirrored}
         with pytest.raises(CameraError, match="camera 'c3': its pictures are mirrored"):
-            calibrate(dataclasses.replace(seen, sightings=sightings))
+            calibrate(dataclasses.replace(seen, detections=detections))
 
     def test_camera_that_was_moved_meanwhile_is_named(self):
         generator = np.random.default_rng(6)
@@ -216,20 +216,21 @@ class TestCamerasThatDoNotFit:
         moved["c2"] = dataclasses.replace(cameras["c2"], X_WC=cameras["c2"].X_WC @ shift)
         late = sightings_of(moved, CHECKERBOARD, poses, generator)
         both = {
-            frame: (late if frame >= "0022" else seen).sightings["c2"].get(frame) for frame in poses
+            frame: (late if frame >= "0022" else seen).detections["c2"].get(frame)
+            for frame in poses
         }
-        sightings = {**seen.sightings, "c2": {f: s for f, s in both.items() if s is not None}}
+        detections = {**seen.detections, "c2": {f: s for f, s in both.items() if s is not None}}
         with pytest.raises(CameraError, match=r"Camera 'c2' takes part in all.*was it moved"):
-            calibrate(dataclasses.replace(seen, sightings=sightings))
+            calibrate(dataclasses.replace(seen, detections=detections))
 
     def test_camera_with_pictures_of_other_instants_is_named(self):
         _, _, seen = rig(5, 30)
-        frames = list(seen.sightings["c2"])
-        old = list(seen.sightings["c2"].values())
+        frames = list(seen.detections["c2"])
+        old = list(seen.detections["c2"].values())
         shuffled = dict(zip(frames, old[1:] + old[:1], strict=True))
-        sightings = {**seen.sightings, "c2": shuffled}
+        detections = {**seen.detections, "c2": shuffled}
         with pytest.raises(CameraError, match="camera 'c2' contradicts the others"):
-            calibrate(dataclasses.replace(seen, sightings=sightings))
+            calibrate(dataclasses.replace(seen, detections=detections))
 
     def test_pictures_too_much_alike_are_refused(self):
         cameras, poses, _ = rig(1, 4)
@@ -272,11 +273,11 @@ class TestPictures:
                 uv = camera.project(board.points @ X_WB[:3, :3].T + X_WB[:3, 3])
                 if not (facing(X_WB, camera, 0.6) and inside(uv, camera)):
                     continue
-                sighting = board.find(photograph(camera, board, X_WB, generator))
-                if sighting is None:
+                detection = board.find(photograph(camera, board, X_WB, generator))
+                if detection is None:
                     assert board.kind == "charuco"  # Small markers may escape.
                     continue
-                errors.append(np.linalg.norm(sighting.uv - uv[sighting.corners], axis=1))
+                errors.append(np.linalg.norm(detection.uv - uv[detection.corners], axis=1))
         assert len(errors) >= 4
         everything = np.concatenate(errors)
         assert np.sqrt(np.mean(everything**2)) < 0.4

@@ -8,8 +8,8 @@ from drake_pose.filtering import Belief, FilterSettings, update
 from drake_pose.filtering.hand.observation import HAND_STATE
 from drake_pose.filtering.kalman.repeated_views import (
     AnchoredObservation,
-    Stare,
-    begin_stare,
+    RepeatedView,
+    begin_repeated_view,
     measure_curvature,
     next_view,
 )
@@ -88,16 +88,18 @@ def test_the_curvature_is_the_mean_square_of_what_the_tangent_leaves_out():
 def test_a_thousand_frames_tell_the_sum_of_state_and_offset_and_no_more():
     """Against the closed form: prior, offset and mean noise as one normal distribution."""
     prior = Belief(np.zeros(1), np.array([[0.09]]))
-    stare = begin_stare(Parabola(), prior, prior, np.zeros(1))
-    anchored = AnchoredObservation(Parabola(), stare.tangent)
+    repeated = begin_repeated_view(Parabola(), prior, prior, np.zeros(1))
+    anchored = AnchoredObservation(Parabola(), repeated.tangent)
     C = measure_curvature(Parabola(), prior)[0]
     frames, y = 1000, 0.4
     for _ in range(frames):
-        stare = Stare(stare.tangent, update(stare.belief, np.array([y]), anchored).belief)
+        repeated = RepeatedView(
+            repeated.tangent, update(repeated.belief, np.array([y]), anchored).belief
+        )
     noise = Parabola.variances[0] / frames + C
-    assert stare.state().covariance[0, 0] == pytest.approx(1 / (1 / 0.09 + 1 / noise), rel=1e-6)
-    assert stare.state().mean[0] == pytest.approx(y * 0.09 / (0.09 + noise), rel=1e-6)
-    total = np.ones(2) @ stare.belief.covariance @ np.ones(2)
+    assert repeated.state().covariance[0, 0] == pytest.approx(1 / (1 / 0.09 + 1 / noise), rel=1e-6)
+    assert repeated.state().mean[0] == pytest.approx(y * 0.09 / (0.09 + noise), rel=1e-6)
+    total = np.ones(2) @ repeated.belief.covariance @ np.ones(2)
     assert total == pytest.approx(Parabola.variances[0] / frames, rel=1e-2)
 
 
@@ -117,13 +119,13 @@ def test_the_anchored_jacobian_against_differences(hand):
 def test_offsets_stay_while_the_state_moves(hand):
     f, observation, sequence = hand
     guess = f.start(sequence.guess).best
-    stare = begin_stare(observation, guess, guess, guess.mean)
+    repeated = begin_repeated_view(observation, guess, guess, guess.mean)
     A, U = HAND_STATE.transition(), f.predict(f.start(sequence.guess)).hypotheses[0].free.covariance
-    moved = stare.moved(A, U)
+    moved = repeated.moved(A, U)
     n = len(HAND_STATE)
     np.testing.assert_allclose(moved.state().mean, A @ guess.mean)
     np.testing.assert_allclose(moved.state().covariance, A @ guess.covariance @ A.T + U)
-    np.testing.assert_allclose(moved.belief.mean[n:], stare.belief.mean[n:])
+    np.testing.assert_allclose(moved.belief.mean[n:], repeated.belief.mean[n:])
     np.testing.assert_array_equal(moved.belief.covariance, moved.belief.covariance.T)
 
 

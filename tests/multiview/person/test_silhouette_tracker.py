@@ -8,7 +8,7 @@ from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.errors import ModelError, SettingsError
 from drake_pose.matching.fit.contour_fit import ContourFit
 from drake_pose.multiview.person.body_plan import crowding
-from drake_pose.multiview.person.search import SearchSettings, Sight
+from drake_pose.multiview.person.search import FrameViews, SearchSettings
 from drake_pose.multiview.person.silhouette_tracker import (
     SilhouetteTracker,
     TrackerSettings,
@@ -133,9 +133,9 @@ class TestTracker:
 
     def test_small_pictures_show_the_same_places(self, world):
         views = world.views(world.pose(**WALKING))
-        sight = Sight(world.cameras, [v.region for v in views], [v.edge for v in views])
+        frame_views = FrameViews(world.cameras, [v.region for v in views], [v.edge for v in views])
         points = np.array([[0.1, 0.2, 1.0], [-0.1, 0.0, 0.4]])
-        for k, small, region in zip(sight.judges, *sight.small, strict=True):
+        for k, small, region in zip(frame_views.judges, *frame_views.small, strict=True):
             assert region.shape == (small.height, small.width)
             stride = world.cameras[k].height / small.height
             uv, _ = world.cameras[k].project(points)

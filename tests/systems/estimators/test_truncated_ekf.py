@@ -97,7 +97,7 @@ def test_a_view_that_lasts_is_kept_in_the_context(sequence):
     assert kept.view.count == 12
     np.testing.assert_allclose(kept.best.covariance, state.best.covariance)
     np.testing.assert_allclose(
-        kept.hypotheses[0].stare.belief.mean, state.hypotheses[0].stare.belief.mean
+        kept.hypotheses[0].repeated.belief.mean, state.hypotheses[0].repeated.belief.mean
     )
 
 

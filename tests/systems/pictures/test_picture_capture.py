@@ -11,7 +11,11 @@ from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.multiview.person.silhouette_tracker import see_silhouette
 from drake_pose.multiview.regions import learn_background, person_region
 from drake_pose.silhouette import label_image_to_mask, mask_to_label_image
-from drake_pose.systems.person.silhouette_sensor import SilhouetteEye, edge_spacing, shows_somebody
+from drake_pose.systems.person.silhouette_sensor import (
+    SilhouetteSensor,
+    edge_spacing,
+    shows_somebody,
+)
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
 from drake_pose.systems.pictures.picture_capture import PictureCapture
 
@@ -204,13 +208,13 @@ class TestEye:
     @pytest.mark.parametrize("kind", ["label", "color"])
     def test_drakes_sensors_connect(self, rig, kind):
         rig, camera, q, background = rig
-        eye = SilhouetteEye(camera, background if kind == "color" else None)
+        sensor = SilhouetteSensor(camera, background if kind == "color" else None)
         context = rig.diagram.CreateDefaultContext()
         rig.set_positions(context, q)
         image = rig.diagram.GetOutputPort(f"{kind}_image_camera_0").Eval(context)
-        own = eye.CreateDefaultContext()
-        eye.get_input_port().FixValue(own, image)
-        found = eye.GetOutputPort("silhouette").Eval(own)
+        own = sensor.CreateDefaultContext()
+        sensor.get_input_port().FixValue(own, image)
+        found = sensor.GetOutputPort("silhouette").Eval(own)
         if kind == "label":
             region = rig.mask(context, "camera_0")
         else:
@@ -222,22 +226,22 @@ class TestEye:
 
     def test_nothing_shown_is_none(self, rig):
         _, camera, _, background = rig
-        for eye, image in (
-            (SilhouetteEye(camera), ImageLabel16I()),
-            (SilhouetteEye(camera, background), ImageRgba8U()),
+        for sensor, image in (
+            (SilhouetteSensor(camera), ImageLabel16I()),
+            (SilhouetteSensor(camera, background), ImageRgba8U()),
         ):
-            context = eye.CreateDefaultContext()
-            assert eye.GetOutputPort("silhouette").Eval(context) is None
-            eye.get_input_port().FixValue(context, image)
-            assert eye.GetOutputPort("silhouette").Eval(context) is None
+            context = sensor.CreateDefaultContext()
+            assert sensor.GetOutputPort("silhouette").Eval(context) is None
+            sensor.get_input_port().FixValue(context, image)
+            assert sensor.GetOutputPort("silhouette").Eval(context) is None
 
     def test_nobody_shown_is_an_empty_region(self, rig):
         _, camera, _, _ = rig
-        eye = SilhouetteEye(camera)
-        context = eye.CreateDefaultContext()
+        sensor = SilhouetteSensor(camera)
+        context = sensor.CreateDefaultContext()
         empty = np.zeros((camera.height, camera.width), dtype=bool)
-        eye.get_input_port().FixValue(context, mask_to_label_image(empty))
-        found = eye.GetOutputPort("silhouette").Eval(context)
+        sensor.get_input_port().FixValue(context, mask_to_label_image(empty))
+        found = sensor.GetOutputPort("silhouette").Eval(context)
         assert not found.region.any()
         assert len(found.edge.uv) == 0
         assert not shows_somebody(found)
@@ -251,13 +255,13 @@ class TestEye:
 def test_rgba_alpha_is_ignored():
     camera = CAMERAS["camera_0"]
     picture = np.full((*SIZE[::-1], 3), 90, np.uint8)
-    eye = SilhouetteEye(camera, learn_background([picture]))
+    sensor = SilhouetteSensor(camera, learn_background([picture]))
     image = ImageRgba8U(*SIZE)
     cv2.cvtColor(picture, cv2.COLOR_RGB2RGBA, dst=image.mutable_data)
     image.mutable_data[10:20, 10:20, :3] = 250
     image.mutable_data[:, :, 3] = 7
-    context = eye.CreateDefaultContext()
-    eye.get_input_port().FixValue(context, image)
-    region = eye.GetOutputPort("silhouette").Eval(context).region
+    context = sensor.CreateDefaultContext()
+    sensor.get_input_port().FixValue(context, image)
+    region = sensor.GetOutputPort("silhouette").Eval(context).region
     assert region[12:18, 12:18].all()
     assert not region[:8].any()

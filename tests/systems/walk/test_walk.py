@@ -12,8 +12,8 @@ from drake_pose.multiview.date.walk_commands import WalkSettings
 from drake_pose.systems.walk.garden import (
     HALF_SIZE,
     START,
-    place_objects,
-    place_obstacles,
+    garden_objects,
+    garden_obstacles,
     walker_transform,
 )
 from drake_pose.systems.walk.walk import KEYS, Walker, build_walk
@@ -136,9 +136,9 @@ def test_who_stands_at_rest_is_where_the_walker_is():
 
 
 def test_place_lies_within_its_walls_and_the_start_is_free():
-    names = [one.name for one in place_objects()]
+    names = [one.name for one in garden_objects()]
     assert len(set(names)) == len(names)
-    obstacles = place_obstacles()
+    obstacles = garden_obstacles()
     assert np.abs(obstacles[:, :2]).max() < HALF_SIZE
     distance = np.linalg.norm(obstacles[:, :2] - START[:2], axis=1) - obstacles[:, 2]
     assert distance.min() > 2 * SETTINGS.body_radius

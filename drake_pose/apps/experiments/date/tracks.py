@@ -152,7 +152,7 @@ class SilhouetteTrack:
     Args:
         capture: the diagram.
         tracker: what it follows with.
-        eyes: another track of the same diagram, whose silhouettes of each frame are used, too, as
+        shared: another track of the same diagram, whose silhouettes of each frame are used, too, as
             it stepped before; None: the images are looked at.
     """
 
@@ -160,10 +160,10 @@ class SilhouetteTrack:
         self,
         capture: SilhouetteCapture,
         tracker: SilhouetteTracker,
-        eyes: SilhouetteTrack | None = None,
+        shared: SilhouetteTrack | None = None,
     ) -> None:
         self.milliseconds: list[Mapping[str, float]] = []
-        self._capture, self._tracker, self._eyes = capture, tracker, eyes
+        self._capture, self._tracker, self._shared = capture, tracker, shared
         self._run = _Run(capture)
 
     @staticmethod
@@ -188,11 +188,11 @@ class SilhouetteTrack:
             SettingsError: nobody was seen in the first frame.
         """
         self._run.begin_frame()
-        if self._eyes is None:
+        if self._shared is None:
             self._run.fix(images)
             laps = self._run.finish_frame(self._capture.stages)
         else:
-            self._borrow_silhouettes(self._eyes, images)
+            self._borrow_silhouettes(self._shared, images)
             laps = self._run.finish_frame(())
         self.milliseconds.append(laps)
         return self._tracker.positions(self._state().values)
@@ -210,11 +210,11 @@ class SilhouetteTrack:
         track._set_state(replace(state, values=values, step=np.zeros(len(values))))
         return track
 
-    def _borrow_silhouettes(self, eyes: SilhouetteTrack, names: Iterable[str]) -> None:
+    def _borrow_silhouettes(self, shared: SilhouetteTrack, names: Iterable[str]) -> None:
         """What a fixed input is given comes before what the diagram connects it to."""
         person = self._capture.person
         own = person.GetMyMutableContextFromRoot(self._run.context)
-        other = person.GetMyContextFromRoot(eyes._run.context)
+        other = person.GetMyContextFromRoot(shared._run.context)
         for name in names:
             port = person.GetInputPort(f"silhouette_{name}")
             port.FixValue(own, AbstractValue.Make(port.Eval(other)))

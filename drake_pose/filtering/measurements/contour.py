@@ -28,6 +28,7 @@ from drake_pose.matching.fit.evidence import NO_EDGE, find_edge_points
 from drake_pose.matching.fit.kernel import COMPARED, FITTING, SQUARES, WEIGHT
 from drake_pose.matching.fit.levenberg_marquardt import Round
 from drake_pose.matching.fit.parameters import BodyParameters
+from drake_pose.matching.fit.surfaces import MANY, few_triangles
 from drake_pose.silhouette import Outline, TreeSurfaces, draw_mask
 
 Array = NDArray[np.float64]
@@ -146,7 +147,10 @@ class ContourObservation:
         self._kinematics = TreeKinematics(tree)
         self._surfaces = TreeSurfaces(tree)
         self._outlines = tuple(self._surfaces.rigid)
-        self._body = BodyParameters(self._kinematics, self._outlines, surfaces=self._surfaces)
+        # Skin, which bends, keeps all of its triangles.
+        bends = self._surfaces.bends
+        compared = self._outlines if bends else few_triangles(self._surfaces, MANY)
+        self._body = BodyParameters(self._kinematics, compared, surfaces=self._surfaces)
         free = self._kinematics.lower < self._kinematics.upper
         names = [n for n, is_free in zip(self._kinematics.names, free, strict=True) if is_free]
         moving = [name for name in names if name not in constant]
@@ -280,19 +284,16 @@ class ContourObservation:
         Args:
             seen: what the masks say.
             x: (n,) the state.
-            distance: about how far they are apart [pixel], of the measurement before; None: this is
-                found out first.
+            distance: about how far they are apart [pixel], of the measurement before; None: as far
+                as is looked.
 
         Returns:
             The measurement; None where no edge is near the contour in any mask.
         """
-        if distance is None:
-            looked = self._compare(seen, x, self.settings.reach / REACH)
-            if looked is None:
-                return None
-            distance = looked[1]
-        scale = max(self.settings.deviation, distance)
-        found = self._compare(seen, x, _ROBUST_WIDTH * scale)
+        width = self.settings.reach / REACH
+        if distance is not None:
+            width = min(width, _ROBUST_WIDTH * max(self.settings.deviation, distance))
+        found = self._compare(seen, x, width)
         return None if found is None else self._compress(x, *found)
 
     def _compare(self, seen: Views, x: Array, width: float) -> tuple[Comparison, float] | None:

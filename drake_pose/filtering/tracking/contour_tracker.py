@@ -22,6 +22,9 @@ from drake_pose.filtering.state import Belief
 
 Array = NDArray[np.float64]
 
+# A frame's pose that changes by less is settled [rad, m].
+_STANDSTILL = 1e-3
+
 
 @dataclass(frozen=True)
 class TrackingSettings:
@@ -167,13 +170,17 @@ class ContourTracker:
             observation = observation.with_root_position(root_position)
         prediction = track.state if first else self.filter.predict(track.state)
         state, measurement = prediction, None
-        seen = observation.look(masks)
-        for _ in range(self.settings.rounds):
+        seen, moving = observation.look(masks), len(observation.layout.moving)
+        for k in range(self.settings.rounds):
+            before = state.best.mean
             distance = None if measurement is None else measurement.distance
             measurement = observation.measure(seen, state.best.mean, distance)
             if measurement is None:
                 break
             state = self.filter.update(prediction, measurement.y, measurement)
+            if k > 0 and np.abs((state.best.mean - before)[:moving]).max() < _STANDSTILL:
+                # The contour is compared where the state is.
+                return Track(state, measurement, self._is_lost(measurement))
         if measurement is None:
             return Track(state, None, track.lost or any(mask is not None for mask in masks))
         last = observation.measure(seen, state.best.mean, measurement.distance)

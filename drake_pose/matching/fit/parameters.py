@@ -92,6 +92,7 @@ class BodyParameters:
             *ROOT_NAMES,
             *(f"{GIRTH_PREFIX}{name}" for name in girth_names),
         )
+        self._has_girths = bool(np.any(self.groups >= 0))
         self._packed = pack(self.outlines)
         tree = kinematics.tree
         values = kinematics.flatten(tree.default_values())
@@ -126,17 +127,21 @@ class BodyParameters:
         X_WN[self._rooted, :3, :3] *= growth
         X_WN[self._rooted, :3, 3] = root + shift + growth * (X_WN[self._rooted, :3, 3] - root)
         omega, v = motions.twists[:, :3], motions.twists[:, 3:6]
+        turned = omega @ _cross_matrix((1.0 - growth) * root + shift).T
+        twists[:count, 3:6] = growth * v + turned
         # What moves the root moves the point about which the body has grown.
-        held = (1.0 - growth) * (np.cross(omega, root) + v) * self._of_root[:, None]
-        twists[:count, 3:6] = growth * v + np.cross(omega, (growth - 1.0) * root - shift) + held
+        held = (1.0 - growth) * (omega @ _cross_matrix(root) + v)
+        twists[:count, 3:6] += held * self._of_root[:, None]
         twists[count : count + 3, 3:6] = np.eye(3)
         twists[-1, 3:6], twists[-1, 6] = -root - shift, 1.0
-        girths = theta[count + 4 :]
-        wide = np.where(self.groups >= 0, np.exp(np.append(girths, 0.0)[self.groups]), 1.0)
         packed = self._at(theta[:count])
-        if np.any(wide != 1.0):
+        if self._has_girths:
+            girths = np.append(theta[count + 4 :], 0.0)
+            wide = np.where(self.groups >= 0, np.exp(girths[self.groups]), 1.0)
             packed = _widened(packed, wide)
-        affine = np.vstack([affine_motions(twists), [_widening(X) for X in X_WN]])
+        affine = affine_motions(twists)
+        if self._has_girths:
+            affine = np.vstack([affine, [_widening(X) for X in X_WN]])
         return Placement(packed, X_WN, affine, *self._all)
 
     def _at(self, values: Array) -> PackedOutlines:

@@ -23,8 +23,10 @@ def pinhole(name, turn_deg, side=260, focal=330.0, distance=2.9, height=0.9):
 def descend(observation, masks, x, steps=8):
     """Gauss and Newton's steps from a state."""
     moving, seen = len(observation.layout.moving), observation.look(masks)
+    distance = None
     for _ in range(steps):
-        measured = observation.measure(seen, x)
+        measured = observation.measure(seen, x, distance)
+        distance = measured.distance
         H = measured.H[:, :moving]
         step = np.linalg.solve(H.T @ H + 1e-3 * np.eye(moving), H.T @ measured.y)
         x = x.copy()

@@ -95,6 +95,7 @@ VALUE_TYPES = {"camera/drake.py", "silhouette/pictures/label_images.py"}
 FOR_ALL = {"compiled", "errors", "regular_files", "version", "yaml_files"}
 
 MOST_FILES = 20
+MOST_LINES = 60
 
 FILES = sorted(PACKAGE.rglob("*.py"))
 MODULES = {
@@ -170,6 +171,20 @@ def test_every_folder_of_a_room_is_known():
 def test_no_folder_is_too_full():
     counts = {str(folder): len(list(folder.glob("*.py"))) for folder in {p.parent for p in FILES}}
     assert {folder: count for folder, count in counts.items() if count > MOST_FILES + 1} == {}
+
+
+def test_no_function_is_too_long():
+    # A kernel cannot be parted at will: what it calls must be compiled with it.
+    too_long = {}
+    for path in [*FILES, *sorted((PACKAGE.parent / "urdf").rglob("*.py"))]:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                continue
+            count = node.end_lineno - node.lineno + 1
+            is_kernel = any("compiled" in ast.unparse(one) for one in node.decorator_list)
+            if count > MOST_LINES and not is_kernel:
+                too_long[f"{path.relative_to(PACKAGE.parent)}: {node.name}"] = count
+    assert too_long == {}
 
 
 @pytest.mark.parametrize("path", FILES, ids=[str(p.relative_to(PACKAGE)) for p in FILES])

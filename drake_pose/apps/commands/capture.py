@@ -33,14 +33,16 @@ from drake_pose.apps.commands.terminal import errors_as_messages, usage_errors
 from drake_pose.apps.options import parse_packages
 from drake_pose.apps.settings import EstimateSettings
 
+PersonOption = Annotated[
+    Path | None,
+    typer.Option(help="A person with landmarks.yaml beside it. Default: the bundled one."),
+]
+
 
 def capture(
     scene: SceneArgument,
     out: OutOption,
-    model: Annotated[
-        Path | None,
-        typer.Option(help="A person with landmarks.yaml beside it. Default: the bundled one."),
-    ] = None,
+    model: PersonOption = None,
     package: PackageOption = None,
     camera: CameraOption = None,
     frame: FrameOption = None,
@@ -89,12 +91,9 @@ def capture(
 
         model = model or bundled_person()
     settings = EstimateSettings(
-        cameras=tuple(camera or ()),
-        frames=tuple(frame or ()),
-        method="person",
-        track=track,
+        cameras=tuple(camera or ()), frames=tuple(frame or ()), method="person", track=track,
         packages=packages,
-    )
+    )  # fmt: skip
     run_estimate(
         scene, model, out, settings, truth=truth, resume=resume, overlay=overlay, replay=replay,
         json=json,

@@ -25,65 +25,73 @@ if TYPE_CHECKING:
 _OF_GRID = ("method", "outside_limit", "candidates", "interval", "edges", "out")
 
 
+ImagesOption = Annotated[int, typer.Option(min=1, help="Number of silhouettes.")]
+SeedOption = Annotated[int, typer.Option(min=0, help="Seed of the random poses.")]
+MethodOption = Annotated[
+    str, typer.Option(help="paper: the paper's alone; beam: beam search beside it.")
+]
+AnglesOption = Annotated[
+    str,
+    typer.Option(
+        help="grid: true angles and samples are multiples of 20 degrees, as in the paper; "
+        "continuous: any true angles, and poses are refined between the samples."
+    ),
+]
+OutsideLimitOption = Annotated[
+    float,
+    typer.Option(
+        min=0.0,
+        callback=finite,
+        help=r"The paper's r: area of a segment that may lie outside \[pixel].",
+        metavar="R",
+    ),
+]
+CandidatesOption = Annotated[
+    int,
+    typer.Option(min=1, help="The paper's K: candidates kept for each segment.", metavar="K"),
+]
+IntervalOption = Annotated[
+    float,
+    typer.Option(min=1.0, max=90.0, callback=finite, help=r"Sampling interval \[deg]."),
+]
+ViewsOption = Annotated[
+    int, typer.Option(min=1, help="With --angles continuous: number of cameras.")
+]
+MismatchOption = Annotated[
+    bool,
+    typer.Option(
+        "--mismatch",
+        help="With --angles continuous: also a body whose widths and joints differ from the "
+        "model's.",
+    ),
+]
+EdgesOption = Annotated[
+    bool,
+    typer.Option(
+        "--edges",
+        help="With --method beam: resolve ambiguous silhouettes by the edges inside them (some "
+        "seconds for each).",
+    ),
+]
+PicturesOption = Annotated[
+    Path | None,
+    typer.Option("--out", "-o", help="Folder for pictures. Default: none are written."),
+]
+
+
 def kameda(
     context: typer.Context,
-    images: Annotated[int, typer.Option(min=1, help="Number of silhouettes.")] = 219,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the random poses.")] = 0,
-    method: Annotated[
-        str, typer.Option(help="paper: the paper's alone; beam: beam search beside it.")
-    ] = "paper",
-    angles: Annotated[
-        str,
-        typer.Option(
-            help="grid: true angles and samples are multiples of 20 degrees, as in the paper; "
-            "continuous: any true angles, and poses are refined between the samples."
-        ),
-    ] = "grid",
-    outside_limit: Annotated[
-        float,
-        typer.Option(
-            min=0.0,
-            callback=finite,
-            help=r"The paper's r: area of a segment that may lie outside \[pixel].",
-            metavar="R",
-        ),
-    ] = 200.0,
-    candidates: Annotated[
-        int,
-        typer.Option(min=1, help="The paper's K: candidates kept for each segment.", metavar="K"),
-    ] = 5,
-    interval: Annotated[
-        float,
-        typer.Option(
-            min=1.0,
-            max=90.0,
-            callback=finite,
-            help=r"Sampling interval \[deg].",
-        ),
-    ] = 20.0,
-    views: Annotated[
-        int, typer.Option(min=1, help="With --angles continuous: number of cameras.")
-    ] = 1,
-    mismatch: Annotated[
-        bool,
-        typer.Option(
-            "--mismatch",
-            help="With --angles continuous: also a body whose widths and joints differ from the "
-            "model's.",
-        ),
-    ] = False,
-    edges: Annotated[
-        bool,
-        typer.Option(
-            "--edges",
-            help="With --method beam: resolve ambiguous silhouettes by the edges inside them (some "
-            "seconds for each).",
-        ),
-    ] = False,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", help="Folder for pictures. Default: none are written."),
-    ] = None,
+    images: ImagesOption = 219,
+    seed: SeedOption = 0,
+    method: MethodOption = "paper",
+    angles: AnglesOption = "grid",
+    outside_limit: OutsideLimitOption = 200.0,
+    candidates: CandidatesOption = 5,
+    interval: IntervalOption = 20.0,
+    views: ViewsOption = 1,
+    mismatch: MismatchOption = False,
+    edges: EdgesOption = False,
+    out: PicturesOption = None,
     json: JsonOption = False,
 ) -> None:
     """See help_texts.KAMEDA."""

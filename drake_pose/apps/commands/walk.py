@@ -29,63 +29,75 @@ if TYPE_CHECKING:
     from drake_pose.systems.person.live_capture import LiveSensors
 
 
+ResultArgument = Annotated[
+    Path | None,
+    typer.Argument(
+        help="Result folder of capture that is played. Default: none, the arrow keys walk."
+    ),
+]
+SimulateOption = Annotated[
+    bool, typer.Option("--simulate", help="Play a simulated person's motion.")
+]
+LiveOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FOLDER",
+        help="Walk as the person before live cameras: folder with sources.yaml.",
+    ),
+]
+ResultModelOption = Annotated[
+    Path | None, typer.Option(help="The result's model, if it is not a bundled one.")
+]
+RateOption = Annotated[
+    float | None,
+    typer.Option(
+        callback=finite,
+        help="Frame rate of the result [Hz]. Default: that of its summary.json.",
+    ),
+]
+WalkSecondsOption = Annotated[
+    float | None,
+    typer.Option(min=0.01, callback=finite, help=r"Stop after this time of the walk \[s]."),
+]
+SpeedOption = Annotated[
+    float,
+    typer.Option(
+        min=0.0, callback=finite, help="Speed relative to real time; 0: as fast as possible."
+    ),
+]
+PortOption = Annotated[
+    int | None,
+    typer.Option(min=1024, max=65535, help="Port of the page. Default: a free one."),
+]
+BrowserOption = Annotated[
+    bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")
+]
+WaitOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--wait/--no-wait",
+        help="Start a result or --simulate when a browser shows the page, and again when its "
+        "button is pressed, until Ctrl-C or --seconds; or start at once and play once. "
+        "Default: --wait with --browser, else --no-wait.",
+    ),
+]
+
+
 def walk(
-    result: Annotated[
-        Path | None,
-        typer.Argument(
-            help="Result folder of capture that is played. Default: none, the arrow keys walk."
-        ),
-    ] = None,
-    simulate: Annotated[
-        bool, typer.Option("--simulate", help="Play a simulated person's motion.")
-    ] = False,
-    live: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="Walk as the person before live cameras: folder with sources.yaml.",
-        ),
-    ] = None,
+    result: ResultArgument = None,
+    simulate: SimulateOption = False,
+    live: LiveOption = None,
     shape: ShapeOption = None,
     workers: WatchersOption = 0,
     scheduler: SchedulerOption = None,
-    model: Annotated[
-        Path | None, typer.Option(help="The result's model, if it is not a bundled one.")
-    ] = None,
+    model: ResultModelOption = None,
     package: PackageOption = None,
-    rate: Annotated[
-        float | None,
-        typer.Option(
-            callback=finite,
-            help="Frame rate of the result [Hz]. Default: that of its summary.json.",
-        ),
-    ] = None,
-    seconds: Annotated[
-        float | None,
-        typer.Option(min=0.01, callback=finite, help=r"Stop after this time of the walk \[s]."),
-    ] = None,
-    speed: Annotated[
-        float,
-        typer.Option(
-            min=0.0, callback=finite, help="Speed relative to real time; 0: as fast as possible."
-        ),
-    ] = 1.0,
-    port: Annotated[
-        int | None,
-        typer.Option(min=1024, max=65535, help="Port of the page. Default: a free one."),
-    ] = None,
-    browser: Annotated[
-        bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")
-    ] = True,
-    wait: Annotated[
-        bool | None,
-        typer.Option(
-            "--wait/--no-wait",
-            help="Start a result or --simulate when a browser shows the page, and again when its "
-            "button is pressed, until Ctrl-C or --seconds; or start at once and play once. "
-            "Default: --wait with --browser, else --no-wait.",
-        ),
-    ] = None,
+    rate: RateOption = None,
+    seconds: WalkSecondsOption = None,
+    speed: SpeedOption = 1.0,
+    port: PortOption = None,
+    browser: BrowserOption = True,
+    wait: WaitOption = None,
     json: JsonOption = False,
 ) -> None:
     """See help_texts.WALK."""
@@ -95,14 +107,11 @@ def walk(
         raise typer.BadParameter("give --workers or --scheduler, not both")
     if live is None and (workers or scheduler is not None or shape is not None):
         raise typer.BadParameter("--shape, --workers and --scheduler are for --live")
-    if result is None and rate is not None:
-        raise typer.BadParameter("--rate is for a result")
     if result is None and live is None and model is not None:
         raise typer.BadParameter("--model is for a result or --live")
-    if rate is not None and rate <= 0.0:
-        raise typer.BadParameter("must be above 0", param_hint="--rate")
     if package and model is None:
         raise typer.BadParameter("--package is for --model")
+    _check_rate(rate, result)
     with usage_errors():
         packages = parse_packages(package or ())
     with errors_as_messages():
@@ -115,14 +124,22 @@ def walk(
             return
         if result is not None:
             player = walking.recorded_player(result, model, rate, packages)
-        elif simulate:
-            player = walking.simulated_player()
         else:
-            player = walking.key_player()
+            player = walking.simulated_player() if simulate else walking.key_player()
         waits = player.q is not None and (browser if wait is None else wait)
         page = _open_page(port, browser, waits)
         again = _asker(page) if waits and seconds is None else None
         _print(walking.walk(player, page, seconds, speed, _say_command, again), json)
+
+
+def _check_rate(rate: float | None, result: Path | None) -> None:
+    """Refuses a rate that cannot be, or that is the rate of nothing."""
+    if rate is None:
+        return
+    if result is None:
+        raise typer.BadParameter("--rate is for a result")
+    if rate <= 0.0:
+        raise typer.BadParameter("must be above 0", param_hint="--rate")
 
 
 def _asker(page: Meshcat) -> Callable[[], bool]:

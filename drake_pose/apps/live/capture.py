@@ -106,8 +106,7 @@ def capture_live(
         SceneError, ModelError, SettingsError: what was given cannot be captured.
         OutputError: the result cannot be written.
     """
-    settings = settings or LiveSettings()
-    opener: OpenSensors = open_sensors or (lambda: scene.open_sensors())
+    settings, opener = settings or LiveSettings(), open_sensors or (lambda: scene.open_sensors())
     model = load_model(model_path or bundled_person(), package_paths=settings.packages)
     # A folder that cannot be written is refused before a camera is opened.
     require_empty(out)
@@ -118,10 +117,7 @@ def capture_live(
     try:
         diagram = build_live_capture(tracker, scene.cameras, sensors, with_deviations=True)
         result = _Result(scene, model, tracker, out, sensors.period, settings.packages)
-        result.writer.more["method"] = "person"
-        if shape is not None:
-            result.writer.more |= {"lengths_m": shape.lengths, "girths": shape.girths}
-        result.writer.open()
+        result.open(shape)
         try:
 
             def note(frame: LiveFrame) -> None:
@@ -141,8 +137,7 @@ def capture_live(
     finally:
         sensors.close()
     estimate = result.writer.result()
-    troubles = tuple(text for text in estimate.warnings if text not in told)
-    return LiveResult(estimate, interrupted, troubles)
+    return LiveResult(estimate, interrupted, tuple(t for t in estimate.warnings if t not in told))
 
 
 def _shape(
@@ -215,6 +210,13 @@ class _Result:
         )
         self.writer.finish_frame(row, record)
         return row.found
+
+    def open(self, shape: KnownShape | None) -> None:
+        """Opens the files; shape: the person's lengths and girths, None: the model's."""
+        self.writer.more["method"] = "person"
+        if shape is not None:
+            self.writer.more |= {"lengths_m": shape.lengths, "girths": shape.girths}
+        self.writer.open()
 
     def finish(self, sensors: LiveSensors, replay: bool) -> None:
         """Writes what is made of all frames."""

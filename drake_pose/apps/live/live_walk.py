@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pydrake.geometry import Meshcat
-from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
 from drake_pose.apps.estimate.capture import bundled_person
 from drake_pose.apps.live.capture import camera_troubles
@@ -77,33 +77,49 @@ def walk_live(
 
         stride = stride_positions(model)
         diagram = build_walk(model, meshcat, add, stride, opened.period, settle=SETTLE)
-        command, pose = (diagram.GetOutputPort(name) for name in ("command", "walker_pose"))
-        person = diagram.GetSubsystemByName("person_tracker")
-        positions = person.GetOutputPort("estimated_positions")
-        log = CommandLog(on_command)
-        presence = _Presence(on_report)
-        last = [0.0, *pose.Eval(diagram.CreateDefaultContext())]
-
-        def watch(context: Context) -> None:
-            log.add(context.get_time(), command.Eval(context))
-            found = positions.Eval(person.GetMyContextFromRoot(context))
-            presence.add(math.isfinite(found[0]))
-            last[:] = [context.get_time(), *pose.Eval(context)]
-
-        run_live(diagram, opened, seconds, on_report, monitor=watch, is_shown=True)
+        walked = _Walked(diagram, on_command, on_report)
+        run_live(diagram, opened, seconds, on_report, monitor=walked.watch, is_shown=True)
         warnings = camera_troubles(opened.counts(), 0)
     finally:
         opened.close()
-    time, x, y, heading = (float(value) for value in last)
-    return {
-        "seconds": time,
-        "x": x,
-        "y": y,
-        "heading_deg": math.degrees(heading),
-        "commands": log.seconds,
-        "found_share": presence.share,
-        "warnings": warnings,
-    }
+    return {**walked.as_json(), "warnings": warnings}
+
+
+class _Walked:
+    """What is noted of a walk, period by period."""
+
+    def __init__(
+        self,
+        diagram: Diagram,
+        on_command: Callable[[str], None],
+        on_report: Callable[[str], None],
+    ) -> None:
+        self._command = diagram.GetOutputPort("command")
+        self._pose = diagram.GetOutputPort("walker_pose")
+        self._person = diagram.GetSubsystemByName("person_tracker")
+        self._positions = self._person.GetOutputPort("estimated_positions")
+        self._log = CommandLog(on_command)
+        self._presence = _Presence(on_report)
+        self._last = [0.0, *self._pose.Eval(diagram.CreateDefaultContext())]
+
+    def watch(self, context: Context) -> None:
+        """Notes a period."""
+        self._log.add(context.get_time(), self._command.Eval(context))
+        found = self._positions.Eval(self._person.GetMyContextFromRoot(context))
+        self._presence.add(math.isfinite(found[0]))
+        self._last = [context.get_time(), *self._pose.Eval(context)]
+
+    def as_json(self) -> dict[str, Any]:
+        """How long the walk was, where it ended, and what was commanded."""
+        time, x, y, heading = (float(value) for value in self._last)
+        return {
+            "seconds": time,
+            "x": x,
+            "y": y,
+            "heading_deg": math.degrees(heading),
+            "commands": self._log.seconds,
+            "found_share": self._presence.share,
+        }
 
 
 class _Presence:

@@ -202,6 +202,16 @@ def truncate_joint(
         apply_sites(q, factor, joint.whole, sites, -1, -1.0)
     elif start is not None:
         sites[:] = start
+    q, factor, log_probability = _settle(q, factor, joint, sites, tolerance, sweep_limit)
+    active = (c <= SKIP_ABOVE) & (sites[joint.group, 0] > 0)
+    covariance_after = covariance_from(factor, definite)
+    return Truncated(q, covariance_after, c, active, log_probability, sites)
+
+
+def _settle(
+    q: Array, factor: Array, joint: JointRows, sites: Array, tolerance: float, sweep_limit: int
+) -> tuple[Array, Array, float]:
+    """Expectation propagation from sites (S, 2), which are moved: mean, factor, log probability."""
     base = lower_or_root(outer_product(factor[joint.used]))
     free = q, factor
     for limit in (sweep_limit, _PATIENCE * sweep_limit):
@@ -220,9 +230,7 @@ def truncate_joint(
         # Rows thousands of deviations away, almost parallel, settle slowly.
         if sweeps < limit or is_inside(q, joint.inequalities.phi, joint.inequalities.b):
             break
-    active = (c <= SKIP_ABOVE) & (sites[joint.group, 0] > 0)
-    covariance_after = covariance_from(factor, definite)
-    return Truncated(q, covariance_after, c, active, log_probability, sites)
+    return q, factor, log_probability
 
 
 def clip(mean: ArrayLike, covariance: ArrayLike, inequalities: Inequalities) -> Truncated:

@@ -41,6 +41,16 @@ class Hypotheses:
     def __len__(self) -> int:
         return len(self.poses)
 
+    def chosen(self, kept: np.ndarray) -> "Hypotheses":
+        """Some of them, by their indices."""
+        return Hypotheses(
+            self.masks[kept],
+            self.poses[kept],
+            self.hashes[kept],
+            self.covered[kept],
+            self.outside[kept],
+        )
+
 
 class Beam:
     """Grows hypotheses node by node.
@@ -107,12 +117,7 @@ class Beam:
             lost because there were too many.
         """
         store, pictures = self.store, self.store.pictures
-        parents = self._parents(hypotheses, node)
-        hidden = np.zeros(len(hypotheses), dtype=np.bool_)
-        if not self.nodes[node].children and not pictures.has_bands:
-            rows = store.reach_rows(node, parents)[parents]
-            hidden = find_hidden(hypotheses.masks, rows, store.reach_runs, store.reach_words)
-        groups = store.groups(node, parents, hidden)
+        groups = self._groups(hypotheses, node)
         stored = store.nodes[node]
         pairs, gains, losses = score_pairs(
             hypotheses.masks,
@@ -149,14 +154,22 @@ class Beam:
         lost = seen < len(pairs)
         if len(poses) == 0:
             return None, lost
-        kept: slice | np.ndarray = slice(None)
-        if not exact:
-            costs = outside_weight * (outside[chosen] + left) - covered[chosen]
-            kept = np.argsort(costs, kind="stable")[:width]
-            lost = lost or len(kept) < len(poses)
-        chosen = chosen[kept]
-        made = Hypotheses(masks[kept], poses[kept], hashes[kept], covered[chosen], outside[chosen])
-        return made, lost
+        made = Hypotheses(masks, poses, hashes, covered[chosen], outside[chosen])
+        if exact:
+            return made, lost
+        costs = outside_weight * (made.outside + left) - made.covered
+        kept = np.argsort(costs, kind="stable")[:width]
+        return made.chosen(kept), lost or len(kept) < len(poses)
+
+    def _groups(self, hypotheses: Hypotheses, node: int) -> np.ndarray:
+        """Where the poses of a node begin and end (B, 2) that each hypothesis may take."""
+        store = self.store
+        parents = self._parents(hypotheses, node)
+        hidden = np.zeros(len(hypotheses), dtype=np.bool_)
+        if not self.nodes[node].children and not store.pictures.has_bands:
+            rows = store.reach_rows(node, parents)[parents]
+            hidden = find_hidden(hypotheses.masks, rows, store.reach_runs, store.reach_words)
+        return store.groups(node, parents, hidden)
 
     def _parents(self, hypotheses: Hypotheses, node: int) -> np.ndarray:
         """The poses (B,) of a node's parent; 0 for a root."""

@@ -44,8 +44,9 @@ MAY_KNOW_INSIDE = {
         "kameda": set(),
         "grid": set(),
         "fit": set(),
-        "starts": {"fit", "grid"},
-        "continuous": {"starts", "fit", "grid"},
+        "raster_fit": {"fit"},
+        "starts": {"raster_fit", "fit", "grid"},
+        "continuous": {"starts", "raster_fit", "fit", "grid"},
     },
     "matching/grid": {
         ".": set(),

@@ -18,10 +18,10 @@ from scipy.special import ndtri
 
 from drake_pose.body import PoseTree
 from drake_pose.errors import SettingsError
-from drake_pose.matching.fit.refinement import FINE_PASSES, descend
-from drake_pose.matching.fit.refinement_body import Freedom
-from drake_pose.matching.fit.refinement_problem import RefinementProblem
 from drake_pose.matching.pose_families import JointEstimate, PoseFamily, PoseSet
+from drake_pose.matching.raster_fit.body import Freedom
+from drake_pose.matching.raster_fit.passes import FINE_PASSES, descend
+from drake_pose.matching.raster_fit.problem import RefinementProblem
 from drake_pose.matching.starts.escape import OTHER_PASSES
 from drake_pose.matching.starts.part_placement import PartSearch
 

@@ -20,13 +20,13 @@ import numpy as np
 from drake_pose.body import PoseTree
 from drake_pose.camera import ParallelCamera
 from drake_pose.errors import SettingsError
-from drake_pose.matching.fit.refinement import COARSE_PASSES, FINE_PASSES, Pass, descend
-from drake_pose.matching.fit.refinement_body import RefinementBody
-from drake_pose.matching.fit.refinement_problem import RefinementProblem
 from drake_pose.matching.grid.beam.hypotheses import Beam, Hypotheses
 from drake_pose.matching.grid.beam.search import BeamSearch
 from drake_pose.matching.grid.node_poses import Pictures, PoseStore, coarsen
 from drake_pose.matching.grid.settings import BeamSearchSettings, Stage
+from drake_pose.matching.raster_fit.body import RefinementBody
+from drake_pose.matching.raster_fit.passes import COARSE_PASSES, FINE_PASSES, Pass, descend
+from drake_pose.matching.raster_fit.problem import RefinementProblem
 from drake_pose.matching.result import MatchResult, View
 from drake_pose.matching.starts.escape import EscapeSettings, escape
 from drake_pose.matching.starts.part_placement import PartSearch

@@ -18,17 +18,17 @@ from drake_pose.matching.continuous.intervals import (
     find_intervals,
     pose_set,
 )
-from drake_pose.matching.fit.refinement import (
+from drake_pose.matching.grid.beam.search import BeamSearch
+from drake_pose.matching.grid.settings import BeamSearchSettings, Stage
+from drake_pose.matching.raster_fit.body import RefinementBody
+from drake_pose.matching.raster_fit.passes import (
     COARSE_PASSES,
     FINE_PASSES,
     LAST_PASSES,
     Pass,
     descend,
 )
-from drake_pose.matching.fit.refinement_body import RefinementBody
-from drake_pose.matching.fit.refinement_problem import RefinementProblem
-from drake_pose.matching.grid.beam.search import BeamSearch
-from drake_pose.matching.grid.settings import BeamSearchSettings, Stage
+from drake_pose.matching.raster_fit.problem import RefinementProblem
 from drake_pose.matching.result import MatchResult, View
 from drake_pose.matching.starts.escape import EscapeSettings, escape, reflect
 from drake_pose.matching.starts.part_placement import PartSearch

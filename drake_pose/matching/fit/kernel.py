@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from drake_pose.compiled import compiled
 from drake_pose.matching.fit.evidence import Evidence
-from drake_pose.matching.fit.pose_jacobian import picture_rows
+from drake_pose.matching.fit.point_motion import picture_rows
 from drake_pose.silhouette.areas.outline import PackedOutlines
 from drake_pose.silhouette.contours.contour_points import sample_contour
 from drake_pose.silhouette.contours.contour_segments import find_segments

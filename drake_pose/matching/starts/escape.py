@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_pose.errors import SettingsError
-from drake_pose.matching.fit.refinement import Pass, descend
-from drake_pose.matching.fit.refinement_problem import RefinementProblem
+from drake_pose.matching.raster_fit.passes import Pass, descend
+from drake_pose.matching.raster_fit.problem import RefinementProblem
 from drake_pose.matching.starts.part_placement import PartSearch
 
 # So many placements of a part, the best after the first pass, are refined on.

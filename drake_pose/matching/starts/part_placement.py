@@ -16,9 +16,9 @@ import fast_simplification
 import numpy as np
 
 from drake_pose.body import PoseTree, TriangleMesh
-from drake_pose.matching.fit.refinement_body import RefinementBody
-from drake_pose.matching.fit.refinement_lines import Border, clear_spans
-from drake_pose.matching.fit.refinement_problem import RefinementProblem
+from drake_pose.matching.raster_fit.body import RefinementBody
+from drake_pose.matching.raster_fit.lines import Border, clear_spans
+from drake_pose.matching.raster_fit.problem import RefinementProblem
 from drake_pose.matching.result import View
 from drake_pose.matching.starts.depth_reflections import Reflection, find_reflections
 from drake_pose.silhouette import Outline, outline_from_mesh

@@ -1,7 +1,7 @@
 """Refinement of a pose to a local optimum of the silhouettes' difference.
 
 Levenberg and Marquardt's method on the distances between the body's contour and the silhouette's
-border (see ``refinement_kernel``), with limits: a parameter that would leave its limits is held
+border (see ``kernel``), with limits: a parameter that would leave its limits is held
 there for the step. Passes look at few lines of the raster first and let far distances count, then
 at all lines and near distances only.
 """
@@ -16,9 +16,9 @@ import numpy as np
 
 from drake_pose.compiled import compiled
 from drake_pose.errors import SettingsError
-from drake_pose.matching.fit.refinement_body import Freedom
-from drake_pose.matching.fit.refinement_lines import Border
-from drake_pose.matching.fit.refinement_problem import RefinementProblem
+from drake_pose.matching.raster_fit.body import Freedom
+from drake_pose.matching.raster_fit.lines import Border
+from drake_pose.matching.raster_fit.problem import RefinementProblem
 
 _AT_LIMIT = 1e-9
 # Steps smaller than this [rad or m] end a pass.

@@ -1,6 +1,6 @@
 """Normal equations of the distances between a body's contour and a silhouette's border.
 
-What ``refinement_lines`` finds on each line of the raster is summed here with how fast the contour
+What ``lines`` finds on each line of the raster is summed here with how fast the contour
 moves with the parameters.
 """
 
@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_pose.compiled import compiled
-from drake_pose.matching.fit.pose_jacobian import picture_rows, speed_along
-from drake_pose.matching.fit.refinement_lines import Border, compare_line, pixels_apart
+from drake_pose.matching.fit.point_motion import picture_rows, speed_along
+from drake_pose.matching.raster_fit.lines import Border, compare_line, pixels_apart
 from drake_pose.silhouette.contours.contour_body import ContourBody, find_body_segments
 from drake_pose.silhouette.contours.contour_segments import (
     Segments,

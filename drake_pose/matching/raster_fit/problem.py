@@ -8,19 +8,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_pose.errors import SettingsError
-from drake_pose.matching.fit.refinement_body import Freedom, RefinementBody
-from drake_pose.matching.fit.refinement_kernel import (
+from drake_pose.matching.raster_fit.body import Freedom, RefinementBody
+from drake_pose.matching.raster_fit.kernel import (
     Movements,
     add_normal_equations,
     count_apart,
     find_contour_border,
 )
-from drake_pose.matching.fit.refinement_lines import (
+from drake_pose.matching.raster_fit.lines import (
     Border,
     add_apart_near,
     find_border,
 )
-from drake_pose.matching.fit.refinement_placing import place_surfaces
+from drake_pose.matching.raster_fit.placing import place_surfaces
 from drake_pose.matching.result import View
 from drake_pose.silhouette.contours.contour_body import ContourBody, contour_body
 

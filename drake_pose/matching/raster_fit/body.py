@@ -10,7 +10,7 @@ import numpy as np
 from drake_pose.body import PoseTree
 from drake_pose.body.tree.tree_kinematics import Motions, TreeKinematics
 from drake_pose.errors import SettingsError
-from drake_pose.matching.fit.refinement_placing import Surfaces, pack_bands, place_nodes
+from drake_pose.matching.raster_fit.placing import Surfaces, pack_bands, place_nodes
 from drake_pose.silhouette import Outline, TreeSurfaces
 from drake_pose.silhouette.areas.outline import edge_records
 

@@ -1,40 +1,33 @@
 """What the scripts beside the bundled bodies share: their command line."""
 
 import argparse
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from body_generator.measures import Build, Measures
 from body_generator.model import write_body
+from body_generator.persons import Person
 from body_generator.skin import body_bands, write_skin
 
 
-def run(
-    folder: Path,
-    measures: Mapping[str, float],
-    mass: float,
-    *,
-    skin: bool = False,
-    **build: Any,
-) -> None:
+def run(folder: Path, person: Person, *, skin: bool = False) -> None:
     """Read the command line and write a body.
 
     Args:
         folder: the script's own folder, where the body is written unless told otherwise.
-        measures: the published measures [m].
-        mass: the whole mass at the published stature [kg].
+        person: whose body.
         skin: whether bands of skin are written, too.
-        build: the other fields of ``Build``.
     """
-    parser = argparse.ArgumentParser(description=f"Write {build['name']}.urdf and its meshes.")
-    parser.add_argument("--stature", type=float, default=measures["stature"], help="in metres")
+    name = person.build["name"]
+    parser = argparse.ArgumentParser(description=f"Write {name}.urdf and its meshes.")
+    parser.add_argument(
+        "--stature", type=float, default=person.measures["stature"], help="in metres"
+    )
     parser.add_argument("--out", type=Path, default=folder, help="folder to write into")
     options = parser.parse_args()
-    published = Measures(**measures)
-    scaled_mass = mass * (options.stature / published.stature) ** 3
-    scaled, scaled_build = published.scaled_to(options.stature), Build(mass=scaled_mass, **build)
-    write_body(options.out, scaled, scaled_build)
+    published = Measures(**person.measures)
+    scaled = published.scaled_to(options.stature)
+    mass = person.mass * (options.stature / published.stature) ** 3
+    build = Build(mass=mass, mass_shares=person.mass_shares, **person.build)
+    write_body(options.out, scaled, build)
     if skin:
-        bands = body_bands(scaled, scaled_build)
-        write_skin(options.out, scaled_build.name, f"make_{scaled_build.name}.py", bands)
+        write_skin(options.out, name, f"make_{name}.py", body_bands(scaled, build))

@@ -106,19 +106,15 @@ def average_figure(
 ) -> "Figure":
     """Return the person half-way between the bundled woman and man, in other proportions."""
     from body_generator.measures import Build, Measures
-    from man import make_man
+    from body_generator.persons import MAN, WOMAN
     from person.person_shapes import Figure, Proportions
-    from woman import make_woman
 
-    mean = {
-        name: 0.5 * (value + make_man.MEASURES[name]) for name, value in make_woman.MEASURES.items()
-    }
+    mean = {name: 0.5 * (value + MAN.measures[name]) for name, value in WOMAN.measures.items()}
     shares = {
-        name: 0.5 * (share + make_man.MASS_SHARES[name])
-        for name, share in make_woman.MASS_SHARES.items()
+        name: 0.5 * (share + MAN.mass_shares[name]) for name, share in WOMAN.mass_shares.items()
     }
     measures = Measures(**mean)
-    mass = 0.5 * (make_woman.MASS + make_man.MASS)
+    mass = 0.5 * (WOMAN.mass + MAN.mass)
     if stature is not None:
         mass *= (stature / measures.stature) ** 3
         measures = measures.scaled_to(stature)

@@ -22,7 +22,7 @@ def read_regular(path: Path, limit: int = -1) -> bytes:
 
     Args:
         path: the file; a link to one is as good.
-        limit: at most so many bytes of it are read; all where negative.
+        limit: at most this many bytes of it are read; all where negative.
 
     Raises:
         OSError: it cannot be read, or is no regular file; strerror says which.

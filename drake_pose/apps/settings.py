@@ -40,9 +40,9 @@ class EstimateSettings:
         outside_limit: the paper's r, the area of a segment that may lie outside the silhouette
             [pixel]; None: found automatically. Of the method ``paper`` alone.
         candidates: the paper's K, how many candidates of a segment are kept; ``paper`` alone.
-        run_limit: after so many runs of step 3 the search of a frame answers with what it has;
+        run_limit: after this many runs of step 3 the search of a frame returns its best pose;
             ``paper`` alone.
-        time_limit: after so many seconds the search of a frame answers with what it has; None: no
+        time_limit: after this time [s] the search of a frame returns its best pose; None: no
             limit. Of the method ``beam`` alone.
         hold: positions that are known, by name [deg or m].
         method: ``beam``: many hypotheses side by side; ``paper``: the search as it was published;

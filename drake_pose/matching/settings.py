@@ -22,7 +22,7 @@ class PaperSearchSettings:
         candidate_limit: K, how many of a node's candidates are kept; the paper's is 5.
         run_limit: the search stops after this many runs of step 3 and answers with the best pose
             that it has; the paper knows no such limit.
-        leaf_combination_limit: up to so many combinations of the leaves' candidates are tried one
+        leaf_combination_limit: up to this many combinations of the leaves' candidates are tried one
             by one (section 5.2.1); beyond, each leaf's candidates are tried in turn until no
             change of one leaf is an improvement.
 

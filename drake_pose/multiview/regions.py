@@ -18,7 +18,7 @@ Picture = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
 _LEAST_DEVIATION = 3.0
-# Opening leaves squares of so many pixels.
+# Opening leaves squares of this many pixels.
 _STEP = 3
 _SQUARE = np.ones((_STEP, _STEP), np.uint8)
 # Around the middles of these squares: to their borders, as far as closing looks, and one to spare.

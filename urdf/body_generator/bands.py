@@ -41,7 +41,7 @@ class Band:
     through: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def scaled(self, scale: float) -> "Band":
-        """Return the band of a body so many times as large."""
+        """Return the band of a body this many times as large."""
         x, y, z = self.through
         return replace(
             self,

@@ -32,7 +32,7 @@ from drake_pose.apps.batch.tasks import (
 from drake_pose.apps.results.folder import require_empty
 from drake_pose.errors import DrakePoseError
 
-# A scene of which so many chunks have failed is given up.
+# A scene of which this many chunks have failed is given up.
 _HOPELESS = 3
 # Whatever ends the batch writes its summary; this is for one that is killed [s].
 _SUMMARY_PERIOD = 2.0

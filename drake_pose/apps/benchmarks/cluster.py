@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 _STILLS, _CHUNK = 8, 2
 _CAMERAS, _SIZE, _RATE_HZ = 8, (640, 480), 30.0
-# So many frames of Date's motions, which take twelve seconds in all.
+# How many frames of Date's motions, which take twelve seconds in all.
 _FRAMES, _MOTION_FRAMES = 60, 360
 _FAR_AWAY = -9.0
 _GIGA = 1e9
@@ -161,7 +161,7 @@ def measure_batch(job: SceneJob, out: Path, workers: int, client: Client | None)
 
 
 def warm_up_jobs(job: SceneJob, count: int) -> list[SceneJob]:
-    """So many jobs of one frame each: whatever is loaded or compiled once is not timed."""
+    """This many jobs of one frame each: whatever is loaded or compiled once is not timed."""
     settings = replace(job.settings, frames=("0000",))
     return [replace(job, name=f"warm_up_{k}", settings=settings) for k in range(count)]
 

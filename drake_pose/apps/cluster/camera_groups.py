@@ -23,17 +23,17 @@ from drake_pose.errors import ClusterError, DrakePoseError
 if TYPE_CHECKING:
     from distributed import Client, Future
 
-# So many pictures of each camera are asked for at once, and asked for again when fewer wait here.
+# How many pictures of each camera are asked for at once, and asked for again when fewer wait here.
 _COUNT = 4
-# So long a worker waits for a live camera's picture before it says that there is none [s].
+# How long a worker waits for a live camera's picture before it says that there is none [s].
 _LIVE_PATIENCE = 0.1
-# So long a recording waits for a worker, which may be started again meanwhile [s].
+# How long a recording waits for a worker, which may be started again meanwhile [s].
 _PATIENCE = 10.0
-# So long opening the sources may take, with all that a worker must import for it [s].
+# How long opening the sources may take, with all that a worker must import for it [s].
 _OPENING = 120.0
 # How often it is looked whether a worker that does not answer is still there [s].
 _ALIVE_PERIOD = 0.25
-# A worker that does not answer for so long is said to be silent [s].
+# A worker that does not answer for this long is said to be silent [s].
 _SILENCE = 3.0
 _POLL_PAUSE = 0.0005
 

@@ -39,8 +39,8 @@ class WatchRequest:
         spacings: from edge point to edge point, by camera [pixel].
         after: by camera, the time stamp up to which nobody wants a picture any more [s]: they came
             already, or would come too late.
-        count: so many pictures of each camera at most.
-        patience: so long at most until a live camera gives a picture [s].
+        count: how many pictures of each camera at most.
+        patience: how long at most until a live camera gives a picture [s].
     """
 
     key: str

@@ -25,7 +25,7 @@ from typing import Any, BinaryIO
 
 from drake_pose.errors import ClusterError
 
-# So much of what a child said last is looked at [byte].
+# How much of what a child said last is looked at [byte].
 _TAIL = 4096
 
 

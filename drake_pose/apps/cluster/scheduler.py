@@ -26,7 +26,7 @@ _TIMEOUT = 5.0
 _GRACE = 0.5
 
 TRIES = 3
-"""A task that has killed its process or its worker so often is given up."""
+"""A task that has killed its process or its worker this often is given up."""
 
 # Nothing but this machine can talk to an embedded cluster, and it says nothing of its own.
 _LOOPBACK = "127.0.0.1"
@@ -58,7 +58,7 @@ def open_cluster(workers: int | None = None, scheduler: str | None = None) -> It
     """Workers, for as long as the context lasts.
 
     Args:
-        workers: so many processes on this machine, of one thread each, that talk over its loopback
+        workers: how many processes on this machine, of one thread each, that talk over its loopback
             address alone; None: one for each core.
         scheduler: address of a Dask scheduler whose workers are used instead.
 

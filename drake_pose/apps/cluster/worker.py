@@ -54,7 +54,7 @@ def call_in_child(payload: bytes, tries: int) -> bytes:
 
     Args:
         payload: the pickled pair of a function and its argument.
-        tries: so many children may die of it.
+        tries: how many children may die of it.
 
     Returns:
         The pickled result.

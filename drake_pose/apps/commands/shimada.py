@@ -82,7 +82,7 @@ def shimada(
 def _run_static(
     runs: int, seed: int, truncation: str, observed: str, frames: int, start: str
 ) -> StaticResult:
-    """One unchanging view for so many frames."""
+    """One unchanging view for this many frames."""
     from drake_pose.apps.commands.report import count_progress
     from drake_pose.apps.experiments.shimada.static_view import MARKS, run_static_experiment
 

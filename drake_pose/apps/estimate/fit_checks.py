@@ -30,7 +30,7 @@ _DOUBTFUL = 0.12
 # Cameras contradict each other where each alone leaves less than this share of what all together
 # leave; and what is put right leaves as little.
 _LEFT = 0.5
-# So many frames are compared, and so many pairs of cameras exchanged.
+# How many frames are compared, and how many pairs of cameras exchanged.
 _FRAMES, _PAIRS = 2, 3
 # A joint stands at a limit if it is so near to it, as a share of its range.
 _AT_LIMIT = 1e-3

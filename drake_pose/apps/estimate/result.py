@@ -36,7 +36,7 @@ from drake_pose.apps.results.summary import FrameRecord, camera_warnings, mask_d
 from drake_pose.errors import OutputError
 
 # Whatever ends the job writes the summary; this is for a job that is killed [s]. It takes a while
-# where the recording is long: so many times as long is spent on frames.
+# where the recording is long: this many times as long is spent on frames.
 _SUMMARY_PERIOD = 2.0
 _SUMMARY_SHARE = 20.0
 USUAL_RATE_HZ = 30.0

@@ -63,7 +63,7 @@ def take_empty_room(folder: Path, count: int, patience: float = _PATIENCE) -> di
 def _take(
     specifications: dict[str, SourceSpecification], count: int, patience: float
 ) -> dict[str, list[Picture]]:
-    """So many pictures of each camera."""
+    """This many pictures of each camera."""
     pictures: dict[str, list[Picture]] = {name: [] for name in specifications}
     sources: dict[str, FrameSource] = {}
     try:

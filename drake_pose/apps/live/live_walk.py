@@ -23,7 +23,7 @@ from drake_pose.systems.person.live_capture import LiveSensors, add_person_track
 from drake_pose.systems.walk.walk import build_walk
 
 SETTLE = 1.0
-"""Whoever comes before the cameras commands after standing still for so long [s]."""
+"""Whoever comes before the cameras commands after standing still for this long [s]."""
 
 
 def walk_live(

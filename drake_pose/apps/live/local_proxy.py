@@ -22,7 +22,7 @@ PORTS = range(7000, 8000)
 _NAMES = ("localhost", "127.0.0.1")
 _END = b"\r\n\r\n"
 _CHUNK = 1 << 16
-# A server that was told that no more will come may still answer for so long [s].
+# A server that was told that no more will come may still answer for this long [s].
 _PATIENCE = 5.0
 
 

@@ -270,7 +270,7 @@ def show(page: Meshcat, patience: float = 10.0) -> bool:
 
 
 def wait_for_browser(page: Meshcat, patience: float = math.inf) -> None:
-    """Waits until a browser shows a page, for so long at most [s]."""
+    """Waits until a browser shows a page, for this long at most [s]."""
     end = time.monotonic() + patience
     while page.GetNumActiveConnections() == 0 and time.monotonic() < end:
         time.sleep(_POLL_PAUSE)

@@ -18,7 +18,7 @@ JOINT_COLUMNS = ("frame", "joint", "determined", "low", "high", "families")
 FAMILY_COLUMNS = ("frame", "family", "joint", "value", "determined", "low", "high")
 """A row for each frame, family and joint; family 1 holds the answer [deg or m]."""
 
-# Of a normal distribution, 95 % lie within so many standard deviations.
+# Of a normal distribution, 95 % lie within this many standard deviations.
 _NORMAL_95 = 1.96
 
 

@@ -17,7 +17,7 @@ WIDTH, HEIGHT = 640, 150
 _LEFT, _RIGHT, _TOP, _BOTTOM = 46, 8, 8, 20
 _GRID_LEFT, _GRID_ROW = 130, 18
 
-# More points than this are thinned: the highest and lowest of so many neighbours stay.
+# More points than this are thinned: the highest and lowest of this many neighbours stay.
 _POINTS = 600
 # Limits are in the picture where the curve takes up this share of them; else it is enlarged.
 _SHARE = 0.2

@@ -21,7 +21,7 @@ from drake_pose.version import VERSION
 
 # A camera is suspicious where its pictures agree so much less than the others'.
 _SUSPICIOUS = 0.15
-# Of a mask's digest so many digits are kept.
+# Of a mask's digest this many digits are kept.
 _DIGITS = 16
 _PACKAGES = ("drake", "numpy", "numba", "opencv-python-headless")
 

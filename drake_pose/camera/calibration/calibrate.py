@@ -44,7 +44,7 @@ class CalibrationSettings:
         lens: "none" (no distortion), "standard" (k1, k2, p1, p2) or "full" (k3 too).
         drop_spoilt: go on without the pictures that spoil the calibration instead of refusing.
         leave_out: cameras ("left"), or pictures ("left/0007"), not to be used.
-        spoilt_factor: a picture is spoilt whose error is so many times its camera's median, ...
+        spoilt_factor: a picture is spoilt whose error is this many times its camera's median, ...
         spoilt_pixels: ... and above this [pixel].
         largest_error: a calibration whose camera has a larger error is refused [pixel].
 

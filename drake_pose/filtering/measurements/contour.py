@@ -53,7 +53,7 @@ class ContourSettings:
         spacing: of the contour's points [pixel].
         deviation: how far a mask's edge is from the body's own contour at least [pixel]; where
             the mask and the model agree less than that, their disagreement is taken.
-        correlation: so much of a contour [pixel] errs together: its points count as one.
+        correlation: how much of a contour [pixel] errs together: its points count as one.
         reach: how far from the model's contour the mask's edge is looked for [pixel].
 
     Raises:

@@ -26,7 +26,7 @@ class AxisSettings:
 
     Args:
         edge_deviation: how far a segment's edge in the image is from where it belongs [pixel].
-        correlation: so much of an edge [pixel] errs together.
+        correlation: how much of an edge [pixel] errs together.
         smallest_share: a segment of whose area less than this is seen, in the picture or at the
             rough pose, is occluded: it is left out.
         reach: pixels of a bare mask further than this from all segments of the rough pose belong

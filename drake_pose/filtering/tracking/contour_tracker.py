@@ -41,7 +41,7 @@ class TrackingSettings:
         lost_distance: the track is lost when the contour and the masks' edge are further apart
             than this [pixel].
         lost_share: and when a smaller share of the contour than this has an edge beside it.
-        lost_growth: and when E_total is so many times what it was after the last match ...
+        lost_growth: and when E_total is this many times what it was after the last match ...
         lost_margin: ... and larger than that by this.
         root_moves: whether the root may be elsewhere than where the tree holds it.
 

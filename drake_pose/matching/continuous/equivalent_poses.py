@@ -47,7 +47,7 @@ class RobustFamilySettings:
         widest_angle, widest_length: a value is free whose interval is wider than this on either
             side.
         moved_angle, moved_length: a value that the curvature lets go so far is moved step by step.
-        families: at most so many are told apart.
+        families: at most this many are told apart.
 
     Raises:
         SettingsError: if a value is out of its range.

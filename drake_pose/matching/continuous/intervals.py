@@ -29,8 +29,8 @@ from drake_pose.matching.starts.part_placement import PartSearch
 _PIXEL_VARIANCE = 1.0 / 12.0
 # Wrong pixels of a refined true pose, as a share of its contour's length; found on drawn bodies.
 _PIXEL_SHARE = 0.02
-# Other poses that have, after the first pass, more than so many times the tolerance above what they
-# may have are left.
+# Other poses are left that are, after the first pass, more than this many times the tolerance above
+# what they may have.
 _HOPEFUL = 4.0
 
 

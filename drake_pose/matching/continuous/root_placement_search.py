@@ -42,11 +42,11 @@ from drake_pose.silhouette import outline_from_mesh, prefix_sums, score_bodies
 
 # What may lie outside, as in the beam search's tolerant stages; the root is off by half a step.
 _OUTSIDE_SHARE, _OUTSIDE_WEIGHT = 0.6, 2
-# The silhouettes are looked at with about so many pixels.
+# The silhouettes are looked at with about this many pixels.
 _PIXELS = 1500
-# So many times the width are kept of the root alone.
+# How many times the width are kept of the root alone.
 _ROOT_FACTOR = 8
-# So many times the width are grown, before the quota.
+# How many times the width are grown, before the quota.
 _SPARE = 8
 # The search about a root that has been found, and which of its poses differ (best_poses).
 _STAGES, _ALIKE = (Stage(60, 1.0, 2),), 0.5
@@ -63,7 +63,7 @@ class PlacedMatch(MatchResult):
     Args:
         root_position: (3,) the root's origin in the world [m]; of a parallel camera's single
             picture the part along its axis is arbitrary.
-        scale: a parallel camera has so many times the pixels a metre that it was given with, and
+        scale: a parallel camera has this many times the pixels a metre that it was given with, and
             the body its own size; 1 where the scale was known.
     """
 

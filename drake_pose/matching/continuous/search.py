@@ -33,9 +33,9 @@ from drake_pose.matching.result import MatchResult, View
 from drake_pose.matching.starts.escape import EscapeSettings, escape, reflect
 from drake_pose.matching.starts.part_placement import PartSearch
 
-# No other start is searched on where one has led to so many times what is enough.
+# No other start is searched on where one has led to this many times what is enough.
 _FAIR = 4.0
-# Rounds agree where the worse one's J is no more than so many times the better one's.
+# Rounds agree where the worse one's J is no more than this many times the better one's.
 _AGREEING = 1.1
 
 
@@ -89,7 +89,7 @@ class ContinuousSearchSettings:
         alike: as in ``BeamSearch.best_poses``.
         escapes: of how many of these parts are placed anew, the best first.
         refinement: of the refinement.
-        time_limit: the search answers with what it has after so many seconds; None: no limit.
+        time_limit: the search returns its best pose so far after this time [s]; None: no limit.
     """
 
     grids: tuple[BeamSearchSettings, ...] = _GRIDS

@@ -16,7 +16,7 @@ _ONE, _ALL = 1, 2
 
 
 def coarsen(view: View, pixels: int) -> View:
-    """The view at the whole fraction of its size that shows about so many silhouette pixels.
+    """The view at the whole fraction of its size that shows about this many silhouette pixels.
 
     A pixel is in the silhouette if at least half of those that it replaces are.
     """
@@ -31,7 +31,7 @@ def coarsen(view: View, pixels: int) -> View:
 
 
 def _coarse_camera(camera: Camera, factor: int, width: int, height: int) -> Camera:
-    """The camera with pixels so many times as large, in a picture of the given size."""
+    """The camera with pixels this many times as large, in a picture of the given size."""
     # Pixel centres are at integers.
     center_x = (camera.center_x + 0.5) / factor - 0.5
     center_y = (camera.center_y + 0.5) / factor - 0.5

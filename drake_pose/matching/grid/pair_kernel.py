@@ -49,7 +49,7 @@ def score_pairs(
         runs: (n, K, 3) int64 of each pose, for each part of a mask, the first word, the number of
             words and where they begin in words.
         words: (m,) uint64.
-        silhouettes: so many parts come first that are silhouettes; the others are bands.
+        silhouettes: how many parts come first that are silhouettes; the others are bands.
         drop_hidden: keep only the first pose of a hypothesis that adds nothing at all.
 
     Returns:
@@ -244,7 +244,7 @@ def grow_hypotheses(
         node: the node that the poses are of.
         open_nodes: nodes that have children to come, this one perhaps among them.
         keys: (2 W,) uint64 random odd numbers.
-        width: at most so many are made.
+        width: at most this many are made.
         everything, reaches: as in count_unreachable.
         exact: nothing may lie outside, and nothing be left that is out of reach.
 

@@ -64,11 +64,11 @@ class BeamSearchSettings:
         band: how far around the silhouette the union of what lies outside is told from its sum
             [pixel].
         coarse_pixels: stages that let something lie outside see the silhouettes no finer than with
-            about so many pixels; the best pose is then judged in full.
+            about this many pixels; the best pose is then judged in full.
         research_hypotheses: how many hypotheses are kept when single limbs and pairs of limbs of
             the winner are searched again; 0: they are not.
-        time_limit: the search answers with what it has after so many seconds; None: no limit.
-        hypothesis_limit: the same after so many hypotheses; None: no limit.
+        time_limit: the search returns its best pose so far after this time [s]; None: no limit.
+        hypothesis_limit: the same after this many hypotheses; None: no limit.
 
     Raises:
         SettingsError: if a value is out of its range.

@@ -36,7 +36,7 @@ def best_leaf_combination(
         leaves: the leaf nodes.
         candidates: for each leaf the samples (n,) and poses (n, 4, 4) of its candidates.
         adopted: for each leaf the candidate in use.
-        limit: up to so many combinations are all tried; beyond, one leaf after another.
+        limit: up to this many combinations are all tried; beyond, one leaf after another.
 
     Returns:
         The candidate of each leaf, and by how much its J is below that of ``adopted`` [pixel].

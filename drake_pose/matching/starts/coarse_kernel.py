@@ -21,8 +21,8 @@ class CoarseView(NamedTuple):
     camera: (8,) kernel parameters; X_CW: (4, 4); origin: (2,) first row and column of the cover
     [pixel]; cell: the side of the cover's cells [pixel]; radii: (levels,) [pixel], in equal steps;
     cover: (levels, rows, columns, 4) uint64 the points of the silhouette within a radius of each
-    cell's middle; parts: so many distances are known along a cell's side; distances: (parts * rows,
-    parts * columns) float32 signed distance of each part's middle from the silhouette's edge,
+    cell's middle; parts: how many distances are known along a cell's side; distances: (parts *
+    rows, parts * columns) float32 signed distance of each part's middle from the silhouette's edge,
     positive outside [pixel]; point_area: what a point stands for [pixel]; slack: distances up to
     this do not count [pixel].
     """
@@ -83,7 +83,7 @@ def fill_cover(
 
 @compiled
 def _make_room(count: int) -> Room:
-    """Room for so many samples."""
+    """Room for this many samples."""
     return Room(
         np.empty(count, dtype=np.float32),
         np.empty(count, dtype=np.float32),

@@ -30,14 +30,14 @@ from drake_pose.silhouette.pictures.signed_distances import signed_distances
 
 _WORDS = 4
 _LEVELS = 10
-# So many cells of a cover are as wide as the root of the silhouettes' area.
+# How many cells of a cover are as wide as the root of the silhouettes' area.
 _CELLS = 40.0
-# A cover has so many rows and columns at most: 80 MB.
+# A cover has this many rows and columns at most: 80 MB.
 _MOST_CELLS = 500
-# A cell is divided into so many parts along its side, where it has as many pixels.
+# A cell is divided into this many parts along its side, where it has as many pixels.
 _PARTS = 4
 _LEAST_HYPOTHESES = 64
-# So many times the hypotheses kept are looked at for some that do not stand alike.
+# How many times the hypotheses kept are looked at for some that do not stand alike.
 _SPARE = 8
 # Nodes come nearer to a camera than the root by this factor at most.
 _NEARER = 0.7
@@ -50,7 +50,7 @@ class CoarseSettings:
     Args:
         interval: sampling interval of every angle [rad].
         length_interval: sampling interval of every prismatic position [m].
-        hypotheses: at most so many are kept after each node.
+        hypotheses: at most this many are kept after each node.
         again_hypotheses: the same where a limb of a pose is searched again.
         evaluations: fewer are kept where a node's samples times the hypotheses exceed this.
         slack: distances that do not count, as a share of the root of the silhouette's area.
@@ -165,7 +165,7 @@ class CoarseSearch:
 
         Args:
             poses: of find.
-            count: at most so many.
+            count: at most this many.
             apart: in some view it is seen so far away, as a share of the root of the silhouette's
                 area.
         """

@@ -12,7 +12,7 @@ from drake_pose.matching.raster_fit.passes import Pass, descend
 from drake_pose.matching.raster_fit.problem import RefinementProblem
 from drake_pose.matching.starts.part_placement import PartSearch
 
-# So many placements of a part, the best after the first pass, are refined on.
+# How many placements of a part, the best after the first pass, are refined on.
 _PURSUED = 2
 _PART_PASSES = (Pass(4, 4, 30.0, 100.0), Pass(4, 3, 6.0, 50.0))
 _WHOLE_PASSES = (Pass(3, 3, 6.0, 50.0),)

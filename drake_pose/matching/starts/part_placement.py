@@ -27,9 +27,9 @@ from drake_pose.silhouette.areas.prefix_sums import sum_rows
 from drake_pose.silhouette.areas.span_kernel import score
 
 _TRIANGLES = 200
-# Every so many rows and columns are looked at.
+# Which rows and columns are looked at: one in this many.
 _COARSENESS = 2
-# Hypotheses kept for the first, second, ... node of a part, and so many times more are scored
+# Hypotheses kept for the first, second, ... node of a part, and this many times more are scored
 # with what the part itself hides taken into account.
 _WIDTHS = (40, 12, 8)
 _SPARE = 4
@@ -127,7 +127,7 @@ class PartSearch:
             problem: the silhouettes.
             parameters: (m + 4,) the pose.
             part: the part.
-            count: at most so many.
+            count: at most this many.
             still: of ``RefinementProblem.still`` for all nodes but the part's; None: made here.
 
         Returns:

@@ -38,16 +38,16 @@ class PlacementSettings:
 
     Args:
         scale_unknown: the camera is parallel and its pixels_per_metre is not known.
-        positions_across: so many positions are tried across the silhouette.
+        positions_across: how many positions are tried across the silhouette.
         ratio: of two scales or depths tried one after the other.
         cut_off: where the silhouette touches the picture's edge the body may be larger by this
             factor than it looks, and the root that share of the silhouette's extent, less one,
             beyond the edge.
-        hypotheses: so many are kept, shared among the scales or depths.
+        hypotheses: how many are kept, shared among the scales or depths.
         quota: the share of them that may have the root at one position.
         starts: how many poses are refined from far.
-        finalists: at so many of the places where they then have their roots, the poses are searched
-            again; so many of all poses are refined to the end.
+        finalists: at how many of the root positions reached the poses are searched again; and how
+            many of all poses are refined to the end.
         again: how many poses are refined of those found by each of these searches.
 
     Raises:
@@ -155,7 +155,7 @@ def turns_freely(tree: PoseTree) -> bool:
 
 
 def scale_camera(camera: ParallelCamera, scale: float) -> ParallelCamera:
-    """The camera with so many times its pixels a metre."""
+    """The camera with this many times its pixels a metre."""
     return dataclasses.replace(camera, pixels_per_metre=scale * camera.pixels_per_metre)
 
 

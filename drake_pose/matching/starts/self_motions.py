@@ -74,7 +74,7 @@ def flips(kinematics: TreeKinematics, values: np.ndarray, count: int = 16) -> li
     Args:
         kinematics: the pose tree's.
         values: (m,) to begin with; not among those returned.
-        count: at most so many poses are looked at; those outside the limits are left out.
+        count: at most this many poses are looked at; those outside the limits are left out.
     """
     untouched = np.zeros(len(values), dtype=np.bool_)
     known = [Flip(values, untouched, untouched)]

@@ -26,7 +26,7 @@ PERSON_LANDMARKS = frozenset({*_TRUNK, *(name for limb in _LIMBS.values() for na
 """The anatomical joint centres that a model of a person has in its landmarks.yaml."""
 
 _POSES = 2048
-# One in so many of them is stretched.
+# One in this many of them is stretched.
 _STRETCHED = 8
 # Points of a limb that are nearer to each other fill the same space [m].
 _APART = 0.08

@@ -29,7 +29,7 @@ Mask = NDArray[np.bool_]
 
 # How far parts' surfaces may be off the model's [m].
 _SURFACES = 0.0005 * np.sqrt(2.0) ** np.arange(13)
-# The fit's own noise counts as much as so many distances.
+# The fit's own noise counts as much as this many distances.
 _ASSUMED = 4.0
 # A person is somewhere in a place as large [m].
 _PLACE = 10.0

@@ -28,11 +28,11 @@ Mask = NDArray[np.bool_]
 
 # Limbs whose tips are farther apart are not alike [m].
 _UNALIKE = 0.25
-# So much of its length a nearly stretched limb reaches.
+# How much of its length a nearly stretched limb reaches.
 _NEARLY = 0.9
 # Tips that are nearer are about in the same place [m].
 _NEAR = 0.15
-# Guesses are judged by so many cameras, in pictures with about so many rows.
+# Guesses are judged by this many cameras, in pictures with about this many rows.
 _JUDGES = 5
 _ROWS = 120
 # How much of a fit tells which guess is promising.
@@ -50,10 +50,10 @@ class SearchSettings:
         limb_gain: or where elsewhere so much more of it would lie in unexplained pixels.
         limb_shows: or where it shows less contour than this share of its length in each camera.
         headings: into how many directions a lost person is turned.
-        headings_a_frame: so many of them in each frame of a sequence.
-        limbs_a_frame: so many doubtful limbs are searched again in each frame of a sequence.
+        headings_a_frame: how many of them in each frame of a sequence.
+        limbs_a_frame: how many doubtful limbs are searched again in each frame of a sequence.
         fitted: the share of the fresh starts, the most promising ones, that is fitted.
-        mended: where nothing is known yet, so many of these have all doubtful limbs searched again.
+        mended: where nothing is known yet, for how many of these all doubtful limbs are searched.
     """
 
     rounds: tuple[Round, ...] = (
@@ -204,7 +204,7 @@ class PersonSearch:
         Args:
             fitted: the fit.
             frame_views: the frame.
-            enough: where so much of the contours fits, the search ends.
+            enough: where this much of the contours fits, the search ends.
             first: the doubtful limb to begin with; the worst is 0.
             limbs: how many limbs are searched; None: all that are doubtful.
         """
@@ -244,7 +244,7 @@ class PersonSearch:
             frame_views: the frame.
             turns: which of the headings; where not all, only the best start's limbs are searched.
             known: (m,) where held values are taken from; None: the person at rest.
-            enough: where so much of the contours fits, no more limbs are searched.
+            enough: where this much of the contours fits, no more limbs are searched.
 
         Returns:
             None where fewer than two cameras see a person.

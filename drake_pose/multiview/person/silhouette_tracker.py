@@ -85,7 +85,7 @@ class TrackState:
         share: of the contours, what fits.
         usual: the share that can be expected.
         troubled: for how many frames too little has fitted; below 0: the person was found anew, and
-            in so many frames all directions will have been tried.
+            in this many frames all directions will have been tried.
     """
 
     values: Array
@@ -96,7 +96,7 @@ class TrackState:
 
 
 def see_silhouette(region: Mask, spacing: float) -> SilhouetteView:
-    """One camera's share: the edge of the person's region, a point every so many pixels."""
+    """One camera's share: the edge of the person's region, points this many pixels apart."""
     return SilhouetteView(region, find_edge_points(region, spacing))
 
 
@@ -277,5 +277,5 @@ class SilhouetteTracker:
 
 
 def _is_due(troubled: int) -> bool:
-    """Whether to search again after so many troubled frames: 0 to 3, then every eighth time."""
+    """Whether to search again after this many troubled frames: 0 to 3, then every eighth time."""
     return 0 <= troubled < 4 or troubled % 8 == 0

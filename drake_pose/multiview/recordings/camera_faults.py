@@ -27,7 +27,7 @@ from drake_pose.multiview.recordings.figures import pixels_per_metre
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# A camera that was pushed has turned and shifted by about so much [rad, m].
+# A camera that was pushed has turned and shifted by about this much [rad, m].
 _TURN, _SHIFT = 0.15, 0.3
 _POSE_ROUNDS = tuple(Round(scale, 0.05) for scale in (0.15, 0.12, 0.10, 0.08, 0.06, 0.05, 0.04))
 _CAMERA_ROUNDS = tuple(Round(scale, 0.05) for scale in (0.4, 0.3, 0.2, 0.15, 0.1, 0.07, 0.05, 0.05))

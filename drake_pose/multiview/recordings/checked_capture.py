@@ -42,9 +42,9 @@ from drake_pose.multiview.recordings.rig_faults import RigFault, find_rig_fault
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# Cameras are compared in so many frames.
+# Cameras are compared in this many frames.
 _COMPARED = 10
-# And carved out of their silhouettes in so many.
+# And carved out of their silhouettes in this many.
 _CARVED = 3
 # Pictures of which less fits than this share of the others' do not agree.
 _AGREES = 0.7
@@ -52,7 +52,7 @@ _AGREES = 0.7
 _SMALLEST, _TALLEST = 0.1, 3.0
 # In more of the masks nobody fills the whole picture; it is the background that does.
 _INVERTED = 0.5
-# A person is followed by so many cameras or more after one was left out.
+# A person is followed by this many cameras or more after one was left out.
 _LEAST_LEFT = 3
 
 
@@ -181,7 +181,7 @@ def _capture_seen(
 
 
 def _spread_over(frames: Sequence[int], count: int) -> list[int]:
-    """So many frames of all, evenly."""
+    """This many frames of all, evenly."""
     picked = np.linspace(0, len(frames) - 1, min(count, len(frames)))
     return [frames[int(k)] for k in picked]
 

@@ -21,7 +21,7 @@ Mask = NDArray[np.bool_]
 _RASTER = 240
 # A figure of less than this share of the picture's largest is a speck, or a part of another.
 _SPECK = 0.05
-# Nobody is as small as so many pixels, or this share of the picture.
+# Nobody is as small as this many pixels, or this share of the picture.
 _LEAST_PIXELS, _LEAST_SHARE = 16.0, 2e-4
 # Middles of one person's silhouettes lie no farther apart, other persons stand farther off [m].
 _WITHIN = 0.35
@@ -30,7 +30,7 @@ _APART = 0.5
 _FITS, _COVERS, _MISSES = 1.0, 0.4, -1.0
 # Another person's silhouettes are no smaller than this share of the first's.
 _LEAST_AREA = 0.25
-# So many of the best places are looked at more closely.
+# How many of the best places are looked at more closely.
 _LOOKED_AT = 8
 
 

@@ -59,7 +59,7 @@ class PersonCaptureSettings:
         tracker: how the person is followed.
         is_sequence: whether frames follow each other; else each is found afresh.
         starts: in how many of the frames a sequence is begun, for the best to be taken.
-        shape_span: the shape is fitted to frames among so many first ones.
+        shape_span: the shape is fitted to frames among this many first ones.
         shape_frames: how many of them.
     """
 

@@ -28,7 +28,7 @@ from drake_pose.multiview.recordings.person_capture import ReadFrame
 
 Mask = NDArray[np.bool_]
 
-# In so many frames, or somewhat more, the person is measured.
+# In this many frames, or somewhat more, the person is measured.
 _MEASURED = 20
 
 

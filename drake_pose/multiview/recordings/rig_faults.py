@@ -21,9 +21,9 @@ from drake_pose.multiview.recordings.hull import HullView, coherence, hull_grid
 
 Mask = NDArray[np.bool_]
 
-# Silhouettes of a sound rig are filled but for so much.
+# Silhouettes of a sound rig are filled but for this much.
 _UNFILLED = 0.01
-# What happened leaves no more than so much, and this share of what was unfilled.
+# What happened leaves no more than this much, and this share of what was unfilled.
 _LEFT, _EXPLAINED = 0.03, 0.35
 # Where more is unfilled and nothing explains it, the rig is not sound.
 _CONTRADICTING = 0.3

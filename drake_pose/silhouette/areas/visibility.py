@@ -12,7 +12,7 @@ from drake_pose.errors import CameraError
 from drake_pose.silhouette.areas.outline import Outline
 from drake_pose.silhouette.areas.scoring import draw_mask
 
-# A body that is as large as so many pictures is not what they show.
+# A body that is as large as this many pictures is not what they show.
 _LARGER = 10.0
 
 

@@ -49,7 +49,7 @@ class _Scratch(NamedTuple):
 
 @compiled
 def _make_scratch(edges: int) -> _Scratch:
-    """Returns room for a surface of so many edges."""
+    """Returns room for a surface of this many edges."""
     return _Scratch(
         np.empty(edges + 1, dtype=np.int32),
         np.empty(edges + 1, dtype=np.int32),

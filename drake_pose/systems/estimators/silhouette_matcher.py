@@ -68,7 +68,7 @@ class SilhouetteMatcher(LeafSystem):
         period: time between two matches [s].
         offset: time of the first match [s].
         labels: the labels that belong to the body; None: all that are not reserved.
-        family_limit: so many families are given out at most.
+        family_limit: how many families are given out at most.
 
     Raises:
         SettingsError: if there is no camera, two cameras share a name, the period is not positive,

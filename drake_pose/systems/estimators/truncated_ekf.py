@@ -60,7 +60,7 @@ class TruncatedEkf(LeafSystem):
         start: the belief before the first measurement.
         period: time between two updates [s]; one step of the filter's prediction.
         offset: time of the first update [s].
-        patience: so many unlikely measurements in a row make a loss.
+        patience: how many unlikely measurements in a row make a loss.
 
     Raises:
         SettingsError: a start that does not fit, a period or patience that is not positive; and,

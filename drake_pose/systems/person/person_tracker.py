@@ -44,11 +44,11 @@ from drake_pose.systems.pictures.camera_rig import build_camera_rig
 # stamp, and the time since the frame before.
 _SCALARS = 8
 _OTHERS = 5
-# Who was seen beside the person is looked for in so many more frames; to look takes long.
+# Who was seen beside the person is looked for in this many more frames; to look takes long.
 _REMEMBERED = 15
-# Cameras in which the person and another are one figure are left out where so many others remain.
+# Cameras in which the person and another are one figure are left out where this many others remain.
 _ENOUGH = 3
-# After a pause a motion is expected to go on for no more than so many frames.
+# After a pause a motion is expected to go on for no more than this many frames.
 _LONGEST_PAUSE = 3.0
 
 

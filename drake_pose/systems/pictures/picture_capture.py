@@ -30,7 +30,7 @@ from drake_pose.systems.pictures.colour_images import fill_colour_image
 USUAL_RATE_HZ = 30.0
 """Pictures a second where no source says."""
 
-# A recorded source is read so many pictures ahead of its slowest neighbour.
+# A recorded source is read this many pictures ahead of its slowest neighbour.
 _AHEAD = 8
 # Half a millionth of a period keeps what is due at a tick in spite of rounding.
 _ROUNDING = 5e-7

@@ -54,7 +54,7 @@ class Studio:
 
     @staticmethod
     def build(cameras: int, size: tuple[int, int], generator: np.random.Generator) -> Studio:
-        """A studio of so many cameras, the face camera among them, pictures of one size [pixel]."""
+        """A studio of this many cameras, face camera included, pictures of one size [pixel]."""
         model = load_model(bundled_model("person"), check=False)
         placed = circle_of_cameras(cameras - 1, size=size)
         rig = build_camera_rig(model, placed)

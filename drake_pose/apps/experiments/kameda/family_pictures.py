@@ -33,7 +33,7 @@ def save_families(
         model: the model.
         answer: the families.
         views: the silhouettes.
-        most: so many families are drawn, the best first.
+        most: how many families are drawn, the best first.
 
     Returns:
         The file written.

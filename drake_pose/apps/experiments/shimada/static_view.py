@@ -20,7 +20,7 @@ from drake_pose.filtering.hand.observation import HAND_STATE, LENGTHS, MEASURED,
 Array = NDArray[np.float64]
 
 MARKS = (55, 500, 2000, 5000)
-"""After so many static frames the belief is compared with the truth."""
+"""After this many static frames the belief is compared with the truth."""
 
 STARTS = ("guess", "learned")
 """The static view comes first, or after the moving sequence."""

@@ -12,7 +12,7 @@ from drake_pose.matching.grid.node_poses import Pictures
 from drake_pose.matching.grid.pair_kernel import count_bits
 from drake_pose.matching.scoring import Scoring
 
-# So many times the poses asked for are looked at in one go, and scored in full.
+# How many times the poses asked for are looked at in one go, and scored in full.
 _LOOKED_AT = 8
 _SCORED = 2
 
@@ -70,7 +70,7 @@ class Gathering:
         Args:
             scoring: gives J.
             pictures: with bands; in them poses are compared.
-            count: at most so many.
+            count: at most this many.
             alike: as in BeamSearch.best_poses.
         """
         nodes = len(scoring.sampled.values)

@@ -16,7 +16,7 @@ from drake_pose.matching.grid.pair_kernel import (
     unite_masks,
 )
 
-# So many times the width are looked at until enough are found that are not alike.
+# How many times the width are looked at until enough are found that are not alike.
 _SPARE = 4
 
 

@@ -12,7 +12,7 @@ from drake_pose.matching.scoring import Scoring
 
 # What is placed last need not spare the silhouette for what comes after it.
 _OUTSIDE_WEIGHT = 2
-# So many of a node's samples are judged in full.
+# How many of a node's samples are judged in full.
 _JUDGED = 4
 
 

@@ -116,7 +116,7 @@ class BeamSearch:
         Args:
             views: one or several silhouettes of the same instant.
             root_position: as in match.
-            count: at most so many.
+            count: at most this many.
             alike: two poses look alike if each node's pictures in both have so much of their union
                 in common in all views, or it is hidden in both, covering nothing that other nodes
                 do not cover. Above 1: all poses of the grid differ.
@@ -221,7 +221,7 @@ class _Run:
         return self._pictures[exact]
 
     def proceed(self, made: int) -> bool:
-        """Whether the limits allow to go on, after one more node with so many hypotheses."""
+        """Whether the limits allow to go on, after one more node with this many hypotheses."""
         self.runs += 1
         self.hypotheses += made
         limit = self.settings.hypothesis_limit

@@ -12,10 +12,10 @@ from drake_pose.matching.grid.sampled_body import SampledBody
 from drake_pose.matching.result import View
 from drake_pose.silhouette.contours.direction_cells import CelledOutline
 
-# Masks of more words than these get narrower bands, but none narrower than so many pixels.
+# Masks of more words than these get narrower bands, but none narrower than this many pixels.
 _WORDS = 2000
 _LEAST_BAND = 8
-# So many poses of a node are tried before the limits are looked at again.
+# How many poses of a node are tried before the limits are looked at again.
 _TRIED_TOGETHER = 100_000
 # The same of the discs that hold what can be reached.
 _REACHES_TOGETHER = 20_000
@@ -26,9 +26,9 @@ class BoundLimits:
     """How much a branch and bound may look at.
 
     Args:
-        states: so many partial poses are kept after each node.
-        pairs: so many pairs of a partial pose and a pose of the next node are looked at.
-        poses: after so many poses of nodes are drawn it stops.
+        states: how many partial poses are kept after each node.
+        pairs: how many pairs of a partial pose and a pose of the next node are looked at.
+        poses: after this many poses of nodes are drawn it stops.
         memory: it stops before drawn poses and what they reach take more than this, and keeps fewer
             partial poses where all would take more than a quarter of it [byte]. What it needs for a
             moment comes on top, about as much again.

@@ -37,7 +37,7 @@ def tell_apart(
             nodes, -1 where not placed; hashes: (B,) uint64 of the masks.
         far: (B, 2) int64 greatest and summed area beyond the bands of any node [pixel].
         pairs: (p, 2) int32 state and pose.
-        runs, words: as in wide_kernel.score_pairs.
+        runs, words: as in pair_kernel.score_pairs.
         pose_far: (n,) int32 area of each pose beyond the bands.
         node: the node that the poses are of.
         open_nodes: nodes that have children to come, this one perhaps among them.
@@ -166,7 +166,7 @@ def unite_groups(
 
     Args:
         groups: (n, 2) int64 where the poses of each union begin and end.
-        runs, words: as in wide_kernel.score_pairs; so many parts come first that are silhouettes.
+        runs, words: as in pair_kernel.score_pairs; this many parts come first that are silhouettes.
         child_rows: (children, poses) int64 the row of the table for each child and pose.
         table: (r, w) uint64 unions; rows: (n,) int64 the rows to write, which are zero.
     """
@@ -198,7 +198,7 @@ def sift_pairs(
 
     Args:
         rests: (B, w) uint64 what no other node can cover, for each state.
-        room: (B,) int64 so many pixels of it may stay uncovered.
+        room: (B,) int64 this many pixels of it may stay uncovered.
         pairs: (p, 2) int32 state and pose.
         runs, words, silhouettes, child_rows, table: as in unite_groups.
 

@@ -59,8 +59,8 @@ def prove_optimal(
         views: the silhouettes.
         samples: (nodes,) the samples of the best pose known.
         J: its objective [pixel].
-        time_limit: it answers with what it has after so many seconds; None: no limit.
-        states: so many partial poses are kept after each node; more end the proof.
+        time_limit: it returns what it has after this time [s]; None: no limit.
+        states: how many partial poses are kept after each node; more end the proof.
         pairs: the same of pairs of a partial pose and a pose of the next node.
         poses, memory: as in BoundLimits, the latter in bytes.
     """

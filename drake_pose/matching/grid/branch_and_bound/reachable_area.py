@@ -14,7 +14,7 @@ class SubtreeReaches:
 
     Args:
         store: the poses; what is missing is drawn within its limits, in which the table counts.
-        tries: so many poses of a node are tried at a time; where there are more, a disc that holds
+        tries: how many poses of a node are tried at a time; where there are more, a disc that holds
             all that they can cover will do.
     """
 
@@ -83,7 +83,7 @@ class SubtreeReaches:
         return rows
 
     def _new_rows(self, count: int) -> np.ndarray:
-        """So many rows of zeros."""
+        """This many rows of zeros."""
         rows = np.arange(self._used, self._used + count)
         self._used += count
         if self._used > len(self.table):

@@ -40,7 +40,7 @@ from drake_pose.matching.result import View
 _OUTSIDE_WEIGHT = 2
 # More pairs than these are worth a look at what later nodes can really cover: quickly, or closely.
 _FEW_PAIRS, _MANY_PAIRS = 300, 2000
-# So many poses of a node are tried for a quick and for a close look.
+# How many poses of a node are tried for a quick and for a close look.
 _QUICK_TRIES, _CLOSE_TRIES = 5000, 100_000
 
 

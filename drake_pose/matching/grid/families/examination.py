@@ -24,16 +24,16 @@ class ExaminationSettings:
     """Parameters of an examination.
 
     Args:
-        proof_time_limit: the proof ends after so many seconds, proved or not; None: no limit, 0: it
+        proof_time_limit: the proof ends after this time [s], proved or not; None: no limit, 0: it
             is not tried. An answer with J = 0 needs none.
         family_time_limit: the same of the search for all poses as good; it then answers with those
             it has, and no joint is called determined.
-        proof_poses: each step of the proof ends after so many poses of nodes are drawn, which takes
-            nearly all its time: about a second by default. Unlike a limit on time, the answer is
-            that of any machine.
+        proof_poses: each step of the proof ends after this many poses of nodes are drawn, which
+            takes nearly all its time: about a second by default. Unlike a limit on time, it gives
+            the same result on every machine.
         family_poses: the same of the search for all poses as good: about two seconds.
         memory: of each of the two, for what it keeps; it ends as if its time were over [byte].
-        families: so many families are described at most.
+        families: how many families are described at most.
         tolerance: as in ``FamilySettings``.
 
     Raises:

@@ -160,8 +160,8 @@ def choose_by_edges(
         answer: the set.
         edges: of each camera.
         renders: one for each camera.
-        most: a set of more poses is judged by so many random ones; from the best of them, one node
-            and all that hangs on it is then turned in as many ways while that helps.
+        most: a set of more poses is judged by this many random ones; from the best of them, one
+            node and all that hangs on it is then turned in as many ways while that helps.
         alike: poses whose agreement is no more below the best one's count as equally good.
     """
     tree = answer.sampled.tree
@@ -226,7 +226,7 @@ def _turn_subtrees(
 
 
 def _members(graph: PartialPoseGraph, most: int, random: np.random.Generator) -> np.ndarray:
-    """All poses (n, nodes) of a graph, or so many of them drawn at random."""
+    """All poses (n, nodes) of a graph, or this many of them drawn at random."""
     if graph.size <= most:
         return graph.members()
     return graph.draw(most, random)
@@ -256,7 +256,7 @@ def _window(shape: tuple[int, ...], mask: np.ndarray) -> tuple[int, int, int, in
 
 
 def _interior(mask: np.ndarray, rim: int) -> np.ndarray:
-    """Pixels of a mask (H, W) bool that are farther than so many pixels from its edge."""
+    """Pixels of a mask (H, W) bool that are farther than this many pixels from its edge."""
     if rim == 0:
         return mask
     padded = np.pad(mask.astype(np.uint8), 1)

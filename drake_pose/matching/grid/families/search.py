@@ -34,11 +34,11 @@ class FamilySettings:
             this [pixel]; None: not at all where the best is exact, else ``contour_share`` of the
             length of the silhouettes' contours.
         contour_share: the share of the contours' pixels that noise may turn.
-        families: so many are described at most.
-        states: so many partial poses are kept after each node.
-        pairs: so many pairs of a partial pose and a pose of the next node are looked at.
-        poses: after so many poses of nodes are drawn it answers with what it has.
-        time_limit: it answers with what it has after so many seconds; None: no limit.
+        families: how many are described at most.
+        states: how many partial poses are kept after each node.
+        pairs: how many pairs of a partial pose and a pose of the next node are looked at.
+        poses: after this many poses of nodes are drawn it returns what it has.
+        time_limit: it returns what it has after this time [s]; None: no limit.
         memory: as in BoundLimits [byte].
 
     Raises:

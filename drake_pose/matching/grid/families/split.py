@@ -18,7 +18,7 @@ from drake_pose.matching.scoring import SampledTree
 
 _NEIGHBOUR = 1.01
 _ALIKE = 1e-6
-# Beyond so many pairs of a state and a family, later nodes are not told apart any more.
+# Beyond this many pairs of a state and a family, later nodes are not told apart any more.
 _MOST_PAIRS = 200_000
 
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from drake_pose.apps.commands.estimate_options import JsonOption
+from drake_pose.apps.commands.estimate_options import JsonOption, PicturesOption
 from drake_pose.apps.commands.terminal import errors_as_messages, print_json
 
 
@@ -28,10 +27,7 @@ def date(
             help="silhouette: the paper's method and a fit to all silhouettes; paper: the former."
         ),
     ] = "silhouette",
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", help="Folder for pictures. Default: none are written."),
-    ] = None,
+    out: PicturesOption = None,
     json: JsonOption = False,
 ) -> None:
     """See help_texts.DATE."""

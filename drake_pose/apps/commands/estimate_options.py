@@ -198,6 +198,10 @@ OverlayOption = Annotated[
         rich_help_panel=RESULT_PANEL,
     ),
 ]
+PicturesOption = Annotated[
+    Path | None,
+    typer.Option("--out", "-o", help="Folder for pictures. Default: none are written."),
+]
 JsonOption = Annotated[
     bool,
     typer.Option("--json", help="Print the result as JSON.", rich_help_panel=RESULT_PANEL),

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from drake_pose.apps.commands.estimate_options import JsonOption
+from drake_pose.apps.commands.estimate_options import JsonOption, PicturesOption
 from drake_pose.apps.commands.terminal import (
     errors_as_messages,
     finite,
@@ -72,10 +72,6 @@ EdgesOption = Annotated[
         help="With --method beam: resolve ambiguous silhouettes by the edges inside them (some "
         "seconds for each).",
     ),
-]
-PicturesOption = Annotated[
-    Path | None,
-    typer.Option("--out", "-o", help="Folder for pictures. Default: none are written."),
 ]
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from drake_pose.apps.commands.estimate_options import JsonOption
+from drake_pose.apps.commands.estimate_options import JsonOption, PicturesOption
 from drake_pose.apps.commands.terminal import errors_as_messages, print_json
 
 if TYPE_CHECKING:
@@ -42,10 +42,6 @@ StartOption = Annotated[
     str,
     typer.Option(help="With --static: guess (the view first) or learned (first the sequence)."),
 ]
-PlotsOption = Annotated[
-    Path | None,
-    typer.Option("--out", "-o", help="Folder for plots. Default: none are written."),
-]
 
 
 def shimada(
@@ -55,7 +51,7 @@ def shimada(
     observed: ObservedOption = "full",
     static: StaticOption = None,
     start: StartOption = "guess",
-    out: PlotsOption = None,
+    out: PicturesOption = None,
     json: JsonOption = False,
 ) -> None:
     """See help_texts.SHIMADA."""

@@ -33,6 +33,7 @@ from drake_pose.matching.starts.part_placement import PartSearch
 from drake_pose.matching.starts.root_placement import (
     Layer,
     PlacementSettings,
+    choose_root_samples,
     find_layers,
     place_body,
     scale_camera,
@@ -46,6 +47,8 @@ _OUTSIDE_SHARE, _OUTSIDE_WEIGHT = 0.6, 2
 _PIXELS = 1500
 # How many times the width are kept of the root alone.
 _ROOT_FACTOR = 8
+# How many times a position's quota of the root's rotations are grown at it.
+_ROOT_SPARE = 2
 # How many times the width are grown, before the quota.
 _SPARE = 8
 # The search about a root that has been found, and which of its poses differ (best_poses).
@@ -170,12 +173,13 @@ class RootPlacementSearch:
         """The best whole poses of a scale or depth, of each root placement the best."""
         if len(layer.positions) == 0:
             return []
-        body = place_body(self.body, layer.positions)
-        pictures = Pictures(
-            body, [coarsen(view, _PIXELS) for view in layer.views], self.settings.band
-        )
+        views = [coarsen(view, _PIXELS) for view in layer.views]
+        turns = _ROOT_SPARE * _ROOT_FACTOR * self._quota(width)
+        chosen = choose_root_samples(self.body, views, layer.positions, turns, _OUTSIDE_WEIGHT)
+        body = place_body(self.body, layer.positions, chosen)
+        pictures = Pictures(body, views, self.settings.band)
         store = PoseStore(body, pictures, outside_share)
-        last = self._grow(Beam(store), width)
+        last = self._grow(Beam(store), width, chosen // len(self.sampled.X_PN[0]))
         if last is None:
             return []
         # As many pixels as in the silhouettes themselves.
@@ -195,9 +199,18 @@ class RootPlacementSearch:
                 break
         return list(found.values())
 
-    def _grow(self, beam: Beam, width: int) -> Hypotheses | None:
-        """Whole poses, no root position having more than its quota at any time."""
-        quota = math.ceil(self.placement.quota * width)
+    def _quota(self, width: int) -> int:
+        return math.ceil(self.placement.quota * width)
+
+    def _grow(self, beam: Beam, width: int, places: np.ndarray) -> Hypotheses | None:
+        """Whole poses, no root position having more than its quota at any time.
+
+        Args:
+            beam: grows them.
+            width: how many.
+            places: the position of each of the root's samples.
+        """
+        quota = self._quota(width)
         hypotheses: Hypotheses | None = beam.start()
         for place, node in enumerate(self.body.order):
             if hypotheses is None:
@@ -208,10 +221,8 @@ class RootPlacementSearch:
             hypotheses = None
             if grown is not None:
                 roots = beam.store.nodes[0].samples[grown.poses[:, 0]]
-                positions = roots // len(self.sampled.X_PN[0])
-                hypotheses = _choose(
-                    grown, _within_quota(positions, factor * quota)[: factor * width]
-                )
+                kept = _within_quota(places[roots], factor * quota)[: factor * width]
+                hypotheses = _choose(grown, kept)
         return hypotheses
 
     def _improve(self, starts: Sequence[_Placed], moves: bool, deadline: float) -> _Placed:

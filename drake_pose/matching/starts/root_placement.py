@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -23,6 +24,8 @@ from drake_pose.errors import SettingsError
 from drake_pose.matching.grid.sampled_body import SampledBody
 from drake_pose.matching.result import View
 from drake_pose.silhouette import score_bodies
+from drake_pose.silhouette.bits.bit_kernel import draw_bits
+from drake_pose.silhouette.bits.bit_view import WORD, make_bit_view
 
 # The picture in which random poses are measured [pixel], and how many.
 _SIDE, _POSES = 240, 100
@@ -30,6 +33,8 @@ _SIDE, _POSES = 240, 100
 _RARE = 0.03
 # Half the cube in space that the root is looked for in [the silhouette's extent].
 _HALF_CUBE = 0.75
+# The root is drawn no farther than this from its origin [pixel].
+_FARTHEST = 60
 
 
 @dataclass(frozen=True)
@@ -179,25 +184,114 @@ def whereabouts(views: Sequence[View], p_WR: np.ndarray, settings: PlacementSett
     return np.array(here)
 
 
-def place_body(body: SampledBody, positions: np.ndarray) -> SampledBody:
-    """The body whose root is sampled at all combinations of positions (n, 3) and its rotations.
+def place_body(body: SampledBody, positions: np.ndarray, chosen: np.ndarray) -> SampledBody:
+    """The body whose root is sampled at combinations of positions (n, 3) and its rotations.
 
-    Sample i of the root is rotation i % r at position i // r, of r rotations.
+    Args:
+        body: the body.
+        positions: (n, 3) of the root's origin in the world [m].
+        chosen: (m,) the samples that it has: i is rotation i % r at position i // r, of r.
     """
     placed, sampled = copy.copy(body), copy.copy(body.sampled)
     X_WR = sampled.X_PN[0]
-    shifts = positions - X_WR[0, :3, 3]
-    X = np.repeat(X_WR[None], len(shifts), axis=0)
-    X[:, :, :3, 3] += shifts[:, None]
-    sampled.X_PN = [X.reshape(-1, 4, 4), *sampled.X_PN[1:]]
-    sampled.values = [np.tile(sampled.values[0], (len(shifts), 1)), *sampled.values[1:]]
+    places, turns = np.divmod(chosen, len(X_WR))
+    shifts = positions[places] - X_WR[0, :3, 3]
+    X = X_WR[turns]
+    X[:, :3, 3] += shifts
+    sampled.X_PN = [X, *sampled.X_PN[1:]]
+    sampled.values = [sampled.values[0][turns], *sampled.values[1:]]
     band = sampled.bands[0]
     if band is not None:
-        sampled.bands = [np.tile(band, (len(shifts), 1, 1)), *sampled.bands[1:]]
+        sampled.bands = [band[turns], *sampled.bands[1:]]
     placed.sampled = sampled
-    balls = body.p_PB[0][None] + shifts[:, None, None]
-    placed.p_PB = [np.ascontiguousarray(balls.reshape(-1, *balls.shape[2:])), *body.p_PB[1:]]
+    placed.p_PB = [np.ascontiguousarray(body.p_PB[0][turns] + shifts[:, None]), *body.p_PB[1:]]
     return placed
+
+
+def choose_root_samples(
+    body: SampledBody, views: Sequence[View], positions: np.ndarray, count: int, outside_weight: float
+) -> np.ndarray:
+    """At every position the rotations of the root whose pictures fit best.
+
+    In one view the root looks nearly alike wherever it is in the picture: it is drawn once for
+    each rotation and moved by whole pixels. In several views all rotations are taken.
+
+    Args:
+        body: the body.
+        views: the silhouettes.
+        positions: (n, 3) of the root's origin in the world [m], of one depth.
+        count: so many rotations at each.
+        outside_weight: what a pixel outside counts; one covered counts one.
+
+    Returns:
+        (m,) the samples of ``place_body``, increasing.
+    """
+    rotations = len(body.sampled.X_PN[0])
+    if len(views) > 1 or count >= rotations:
+        return np.arange(len(positions) * rotations)
+    (view,) = views
+    places = np.atleast_2d(view.camera.project(positions)[0])
+    middle = int(np.argmin(np.abs(places - places.mean(axis=0)).sum(axis=1)))
+    pictures = _draw_root(body, view.camera, positions[middle], places[middle])
+    side = pictures.shape[1]
+    # Beyond the picture's edge nothing counts.
+    worth = np.pad(outside_weight - (1.0 + outside_weight) * view.mask, side).astype(np.float32)
+    corners = np.rint(places).astype(np.int64) - side // 2 + side
+    corners = np.clip(corners, 0, np.array(worth.shape)[::-1] - side)
+    windows = np.lib.stride_tricks.sliding_window_view(worth, (side, side))
+    seen = windows[corners[:, 1], corners[:, 0]].reshape(len(places), -1)
+    costs = seen @ pictures.reshape(rotations, -1).T
+    best = np.argpartition(costs, count - 1, axis=1)[:, :count]
+    return np.sort((best + rotations * np.arange(len(places))[:, None]).ravel())
+
+
+def _draw_root(body: SampledBody, camera: Camera, p_WR: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Pictures (r, side, side) float32 of the root at its rotations, its place in the middle.
+
+    Args:
+        body: the body.
+        camera: the camera.
+        p_WR: (3,) where the root's origin is [m].
+        place: (2,) where that is seen [pixel].
+    """
+    rotations = len(body.sampled.X_PN[0])
+    ball = body.sampled.outlines[0].ball
+    depth = float(_in_camera(camera, p_WR)[2])
+    scale = float(camera.kernel_parameters()[1])
+    reach = float(np.linalg.norm(ball[:3]) + ball[3])
+    if not isinstance(camera, ParallelCamera):
+        scale /= max(depth - reach, 0.2 * depth)
+    half = min(_FARTHEST, math.ceil(scale * reach) + 1)
+    side = 2 * half + 1
+    inner = side - 2
+    window = dataclasses.replace(
+        camera,
+        width=side,
+        height=side,
+        center_x=camera.center_x - float(place[0]) + half,
+        center_y=camera.center_y - float(place[1]) + half,
+    )
+    everywhere = np.zeros((side, side), dtype=np.bool_)
+    everywhere[1:-1, 1:-1] = True
+    placed = place_body(body, p_WR[None], np.arange(rotations))
+    pairs = np.column_stack([np.zeros(rotations), np.arange(rotations)]).astype(np.int32)
+    _, _, runs, words = draw_bits(
+        placed.celled_outline(0, camera, coarse=True),
+        make_bit_view(everywhere, window.kernel_parameters(), camera.X_CW, 0),
+        np.eye(4)[None],
+        placed.sampled.X_PN[0],
+        pairs,
+        np.inf,
+        np.zeros(1, dtype=np.bool_),
+    )
+    bits = np.zeros((rotations, -(-(inner**2) // WORD) * WORD // 8), dtype=np.uint8)
+    data = words.view(np.uint8).reshape(-1, 8)
+    for row, (first, length, start) in zip(bits.reshape(rotations, -1, 8), runs[:, 0], strict=True):
+        row[first : first + length] = data[start : start + length]
+    pixels = np.unpackbits(bits, axis=1, count=inner**2, bitorder="little")
+    pictures = np.zeros((rotations, side, side), dtype=np.float32)
+    pictures[:, 1:-1, 1:-1] = pixels.reshape(rotations, inner, inner)
+    return pictures
 
 
 def _pixel_sizes(body: SampledBody, view: View, settings: PlacementSettings) -> np.ndarray:

@@ -3,12 +3,18 @@ import math
 import numpy as np
 import pytest
 
-from drake_pose.body import RootRotation
+from drake_pose.body import RootRotation, bundled_model, load_model
 from drake_pose.camera import ParallelCamera, PinholeCamera
 from drake_pose.errors import SettingsError
 from drake_pose.matching import BeamSearchSettings, View
 from drake_pose.matching.continuous.root_placement_search import RootPlacementSearch
-from drake_pose.matching.starts.root_placement import PlacementSettings, find_layers, whereabouts
+from drake_pose.matching.grid.sampled_body import SampledBody
+from drake_pose.matching.starts.root_placement import (
+    PlacementSettings,
+    choose_root_samples,
+    find_layers,
+    whereabouts,
+)
 from drake_pose.silhouette import draw_mask
 from tests.matching.bodies import box_link, front_camera, joint, load_body
 
@@ -193,3 +199,37 @@ def test_whereabouts_count_the_steps_that_are_tried():
     # The camera stands at x = 5; a tenth of the silhouette's extent is 10 pixels.
     assert near - far == pytest.approx([0.0, 0.0, 1.0])
     assert np.abs(aside - near) == pytest.approx([2.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("parallel", [True, False])
+def test_the_roots_best_rotations_are_chosen(parallel):
+    """Against drawing every rotation at every position."""
+    tree = load_model(bundled_model("hand")).pose_tree(
+        "palm", root_position=np.zeros(3), root_rotation=RootRotation.free(interval_deg=60.0)
+    )
+    body = SampledBody(tree, BeamSearchSettings(interval=math.radians(60.0)))
+    X_WC = np.array([[0.0, 0.0, -1.0, 0.5], [1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0]])
+    X_WC = np.vstack([X_WC, [0.0, 0.0, 0.0, 1.0]])
+    if parallel:
+        camera = ParallelCamera("c", 60, 50, 260.0, 29.5, 24.5, X_WC)
+    else:
+        camera = PinholeCamera("c", 60, 50, 130.0, 130.0, 29.5, 24.5, X_WC)
+    X_WR, outline = body.sampled.X_PN[0], body.sampled.outlines[0]
+    positions = np.array([[0.0, 0.0, 0.0], [0.0, 0.02, -0.015], [0.0, -0.05, 0.06]])
+
+    def drawn(position, rotation):
+        X_WN = X_WR[rotation].copy()
+        X_WN[:3, 3] += position - X_WR[0, :3, 3]
+        return draw_mask([outline], (camera.X_CW @ X_WN)[None], camera)
+
+    mask = drawn(np.array([0.0, 0.003, 0.002]), 11)
+    chosen = choose_root_samples(body, [View(camera, mask)], positions, 30, 2)
+    places, rotations = np.divmod(chosen, len(X_WR))
+    assert (np.bincount(places) == 30).all()
+    for k, position in enumerate(positions):
+        masks = [drawn(position, rotation) for rotation in range(len(X_WR))]
+        costs = [2.0 * (one & ~mask).sum() - (one & mask).sum() for one in masks]
+        best = np.argsort(costs)[:10]
+        # A whole pixel's shift is all that the pictures may be off by.
+        missing = set(best) - set(rotations[places == k])
+        assert len(missing) <= 1

@@ -209,7 +209,11 @@ def place_body(body: SampledBody, positions: np.ndarray, chosen: np.ndarray) -> 
 
 
 def choose_root_samples(
-    body: SampledBody, views: Sequence[View], positions: np.ndarray, count: int, outside_weight: float
+    body: SampledBody,
+    views: Sequence[View],
+    positions: np.ndarray,
+    count: int,
+    outside_weight: float,
 ) -> np.ndarray:
     """At every position the rotations of the root whose pictures fit best.
 
@@ -245,7 +249,9 @@ def choose_root_samples(
     return np.sort((best + rotations * np.arange(len(places))[:, None]).ravel())
 
 
-def _draw_root(body: SampledBody, camera: Camera, p_WR: np.ndarray, place: np.ndarray) -> np.ndarray:
+def _draw_root(
+    body: SampledBody, camera: Camera, p_WR: np.ndarray, place: np.ndarray
+) -> np.ndarray:
     """Pictures (r, side, side) float32 of the root at its rotations, its place in the middle.
 
     Args:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_pose.body.tree.joint_map import ChainStep
-from drake_pose.compiled import compiled, copy_into
+from drake_pose.compiled import compiled
 
 
 class PackedBand(NamedTuple):
@@ -59,35 +59,53 @@ def pack_band(
 
 
 @compiled
-def _apply_joint(
-    band: PackedBand, step: int, basis: np.ndarray, X: np.ndarray, scratch: np.ndarray
+def _find_joint(
+    band: PackedBand, step: int, values: np.ndarray, share: float, scratch: np.ndarray
 ) -> None:
-    """Multiplies X (3, 4) by one joint's transform, whose basis functions (k, 4) are given."""
-    size, begin = band.sizes[step], band.coefficient_starts[step]
-    joint, product = scratch[0], scratch[1]
-    joint[:] = 0.0
+    """Writes one joint's transform (3, 4) at a share of its values into scratch[0]."""
+    size, begin, coefficients = band.sizes[step], band.coefficient_starts[step], band.coefficients
+    if size == 1:
+        # Nearly every joint; four terms without a search for what is 0 in them.
+        value = share * values[0]
+        cosine, sine = np.cos(value), np.sin(value)
+        for i in range(3):
+            for j in range(4):
+                k = 4 * i + j
+                scratch[0, i, j] = (
+                    coefficients[begin, k]
+                    + cosine * coefficients[begin + 1, k]
+                    + sine * coefficients[begin + 2, k]
+                    + value * coefficients[begin + 3, k]
+                )
+        return
+    scratch[1, 0, 0] = 1.0
+    for k in range(size):
+        value = share * values[k]
+        scratch[1, k, 0] = 1.0
+        scratch[1, k, 1], scratch[1, k, 2], scratch[1, k, 3] = np.cos(value), np.sin(value), value
+    for i in range(3):
+        for j in range(4):
+            scratch[0, i, j] = 0.0
     for row in range(4**size):
-        factor, rest = basis[0, 0], row
+        factor, rest = scratch[1, 0, 0], row
         for k in range(size - 1, -1, -1):
-            factor = factor * basis[k, rest % 4]
+            factor = factor * scratch[1, k, rest % 4]
             rest //= 4
         if factor != 0.0:
             for i in range(3):
                 for j in range(4):
-                    joint[i, j] += factor * band.coefficients[begin + row, 4 * i + j]
+                    scratch[0, i, j] += factor * coefficients[begin + row, 4 * i + j]
+
+
+@compiled
+def _invert(X: np.ndarray) -> None:
+    """Inverts a rigid transform (3, 4) in its place."""
+    x, y, z = X[0, 3], X[1, 3], X[2, 3]
+    X[0, 1], X[1, 0] = X[1, 0], X[0, 1]
+    X[0, 2], X[2, 0] = X[2, 0], X[0, 2]
+    X[1, 2], X[2, 1] = X[2, 1], X[1, 2]
     for i in range(3):
-        for j in range(4):
-            total = X[i, 3] * (1.0 if j == 3 else 0.0)
-            for k in range(3):
-                if not band.inverted[step]:
-                    total += X[i, k] * joint[k, j]
-                elif j < 3:
-                    total += X[i, k] * joint[j, k]
-                else:
-                    for m in range(3):
-                        total -= X[i, k] * joint[m, k] * joint[m, 3]
-            product[i, j] = total
-    copy_into(X, product)
+        X[i, 3] = -(X[i, 0] * x + X[i, 1] * y + X[i, 2] * z)
 
 
 @compiled
@@ -95,23 +113,31 @@ def _find_transform(
     band: PackedBand, values: np.ndarray, share: float, X: np.ndarray, scratch: np.ndarray
 ) -> None:
     """Writes X_PN (3, 4) with the joints gone only a share of their way to values (k,)."""
-    X[:] = 0.0
-    for i in range(3):
-        X[i, i] = 1.0
-    basis, first = scratch[2], 0
+    first = 0
     for step in range(band.sizes.shape[0]):
-        for k in range(band.sizes[step]):
-            value = share * values[first + k]
-            basis[k, 0] = 1.0
-            basis[k, 1], basis[k, 2], basis[k, 3] = np.cos(value), np.sin(value), value
-        _apply_joint(band, step, basis, X, scratch)
+        _find_joint(band, step, values[first:], share, scratch)
+        if band.inverted[step]:
+            _invert(scratch[0])
+        for i in range(3):
+            if step == 0:
+                for j in range(4):
+                    X[i, j] = scratch[0, i, j]
+                continue
+            x, y, z = X[i, 0], X[i, 1], X[i, 2]
+            for j in range(4):
+                X[i, j] = (
+                    x * scratch[0, 0, j]
+                    + y * scratch[0, 1, j]
+                    + z * scratch[0, 2, j]
+                    + (X[i, 3] if j == 3 else 0.0)
+                )
         first += band.sizes[step]
 
 
 @compiled
 def place_band(band: PackedBand, values: np.ndarray, placed: np.ndarray) -> None:
     """Writes the vertices (n, v, 3) in the node's frame at values (n, k), both real or complex."""
-    scratch = np.empty((3, 3, 4), dtype=values.dtype)
+    scratch = np.empty((2, 3, 4), dtype=values.dtype)
     X_whole = np.empty((3, 4), dtype=values.dtype)
     X_part = np.empty((band.levels.shape[0], 3, 4), dtype=values.dtype)
     x = np.empty(3, dtype=values.dtype)

@@ -132,12 +132,12 @@ def move_surface(
     copy_into(points, vertices)
     for t in range(triangles.shape[0]):
         a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
-        planes[t, 3] = 0.0
-        for i in range(3):
-            j, k = (i + 1) % 3, (i + 2) % 3
-            planes[t, i] = (vertices[b, j] - vertices[a, j]) * (vertices[c, k] - vertices[a, k])
-            planes[t, i] -= (vertices[b, k] - vertices[a, k]) * (vertices[c, j] - vertices[a, j])
-            planes[t, 3] += planes[t, i] * vertices[a, i]
+        x, y, z = vertices[a, 0], vertices[a, 1], vertices[a, 2]
+        bx, by, bz = vertices[b, 0] - x, vertices[b, 1] - y, vertices[b, 2] - z
+        cx, cy, cz = vertices[c, 0] - x, vertices[c, 1] - y, vertices[c, 2] - z
+        n0, n1, n2 = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
+        planes[t, 0], planes[t, 1], planes[t, 2] = n0, n1, n2
+        planes[t, 3] = n0 * x + n1 * y + n2 * z
 
 
 @compiled(inline="always")

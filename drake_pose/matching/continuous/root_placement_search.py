@@ -28,7 +28,7 @@ from drake_pose.matching.raster_fit.body import RefinementBody
 from drake_pose.matching.raster_fit.passes import COARSE_PASSES, FINE_PASSES, Pass, descend
 from drake_pose.matching.raster_fit.problem import RefinementProblem
 from drake_pose.matching.result import MatchResult, View
-from drake_pose.matching.starts.escape import EscapeSettings, escape
+from drake_pose.matching.starts.neighbourhood import NeighbourhoodSearch
 from drake_pose.matching.starts.part_placement import PartSearch
 from drake_pose.matching.starts.root_placement import (
     Layer,
@@ -296,9 +296,8 @@ class RootPlacementSearch:
         near = self._settle(start, FINE_PASSES[:2], moves)
         problem = RefinementProblem(self._refined, near.views, near.parameters)
         enough = _ENOUGH * problem.area
-        parameters, J = escape(
-            problem, self._parts, near.parameters, enough, EscapeSettings(), deadline
-        )
+        about = NeighbourhoodSearch(problem, self._parts)
+        parameters, J = about.improve(near.parameters, enough, deadline)
         better = replace(near, parameters=parameters, J=float(J))
         end = self._settle(better, FINE_PASSES, moves)
         return min(start, near, better, end, key=lambda one: one.J)

@@ -30,13 +30,15 @@ from drake_pose.matching.raster_fit.passes import (
 )
 from drake_pose.matching.raster_fit.problem import RefinementProblem
 from drake_pose.matching.result import MatchResult, View
-from drake_pose.matching.starts.escape import EscapeSettings, escape, reflect
+from drake_pose.matching.starts.neighbourhood import NeighbourhoodSearch, NeighbourhoodSettings
 from drake_pose.matching.starts.part_placement import PartSearch
 
 # No other start is searched on where one has led to this many times what is enough.
-_FAIR = 4.0
+_FAIR = 6.0
 # Rounds agree where the worse one's J is no more than this many times the better one's.
 _AGREEING = 1.1
+# How often another pose found may take the best one's place.
+_BETTER = 3
 
 
 def _grid(interval_deg: float, stage: Stage) -> BeamSearchSettings:
@@ -69,7 +71,7 @@ class RefinementSettings:
 
     passes: tuple[Pass, ...] = COARSE_PASSES + FINE_PASSES
     extra: tuple[int, ...] = ()
-    escape: EscapeSettings | None = field(default_factory=EscapeSettings)
+    escape: NeighbourhoodSettings | None = field(default_factory=NeighbourhoodSettings)
     enough: float = 0.03
     intervals: IntervalSettings | None = field(default_factory=IntervalSettings)
 
@@ -125,12 +127,13 @@ class RefinedMatch(MatchResult):
 
 
 class _Reached(NamedTuple):
-    """Where descents led: parameters, the first J, the number of steps, what stopped them."""
+    """Where descents led: parameters and J, the first J, the steps, what was found about them."""
 
     parameters: np.ndarray
+    J: float
     first_J: float
     steps: int
-    stopped_by: str
+    about: NeighbourhoodSearch
 
 
 class Refiner:
@@ -187,7 +190,7 @@ class Refiner:
         reached = self._descend_all(problem, poses, escapes, deadline)
         rounds = iter(others)
         fair = _FAIR * self.settings.enough * problem.border_length
-        while problem.J(reached.parameters) > fair and time.perf_counter() < deadline:
+        while reached.J > fair and time.perf_counter() < deadline:
             more = next(rounds, None)
             if more is None:
                 break
@@ -195,20 +198,24 @@ class Refiner:
             if not poses:
                 continue
             again = self._descend_all(problem, poses, escapes, deadline)
-            least, most = sorted(problem.J(one.parameters) for one in (reached, again))
-            reached = min((reached, again), key=lambda one: problem.J(one.parameters))
-            if most <= _AGREEING * least:
+            reached, worse = sorted((reached, again), key=lambda one: one.J)
+            if worse.J <= _AGREEING * reached.J:
                 break
-        reached = self._descend_last(problem, reached, deadline)
-        reached = reached._replace(parameters=self.body.nearest_turns(reached.parameters))
+        in_time = time.perf_counter() <= deadline
+        if in_time:
+            reached = self._descend_last(problem, reached, deadline)
+        nearest = self.body.nearest_turns(reached.parameters)
+        reached = reached._replace(parameters=nearest)
         middle = time.perf_counter()
         intervals, settings = None, self.settings
         if settings.intervals is not None:
+            reached, found = self._find_others(problem, reached, settings.intervals)
             intervals = find_intervals(
-                problem, self._parts, reached.parameters, settings.intervals, settings.extra
+                problem, found, reached.parameters, settings.intervals, settings.extra
             )
         end = time.perf_counter()
-        return self._answer(problem, reached, intervals, middle - begin, end - middle)
+        stopped_by = "end" if in_time else "time_limit"
+        return self._answer(problem, reached, intervals, (middle - begin, end - middle), stopped_by)
 
     def _descend_all(
         self,
@@ -231,48 +238,62 @@ class Refiner:
             steps += count
         coarse.sort(key=lambda entry: entry[:2])
         enough = settings.enough * problem.border_length
-        first_J, best = float(coarse[0][0]), coarse[0][2]
-        least = first_J
+        about = NeighbourhoodSearch(problem, self._parts, settings.escape)
+        best = _Reached(coarse[0][2], coarse[0][0], coarse[0][0], 0, about)
         for index, (_, _, parameters) in enumerate(coarse[:escapes]):
-            if index > 0 and (least <= _FAIR * enough or time.perf_counter() > deadline):
+            if index > 0 and (best.J <= _FAIR * enough or time.perf_counter() > deadline):
                 break
-            parameters, _, count = descend(problem, parameters, freedom, FINE_PASSES[:2])
+            parameters, _, count = descend(problem, parameters, freedom, FINE_PASSES)
             steps += count
+            about = NeighbourhoodSearch(problem, self._parts, settings.escape)
             if settings.escape is not None:
-                parameters, _ = escape(
-                    problem, self._parts, parameters, enough, settings.escape, deadline
-                )
-            parameters, _, count = descend(problem, parameters, freedom, FINE_PASSES[1:])
-            steps += count
-            J = problem.J(parameters)
-            if settings.escape is not None and enough < J and time.perf_counter() < deadline:
-                reflected, _ = reflect(problem, self._parts, parameters)
-                reflected, _, count = descend(problem, reflected, freedom, FINE_PASSES[1:])
-                steps += count
-                if problem.J(reflected) < J:
-                    parameters, J = reflected, problem.J(reflected)
-            if J < least:
-                best, least = parameters, float(J)
-        return _Reached(best, first_J, steps, "end")
+                parameters, _ = about.improve(parameters, enough, deadline)
+            J = float(problem.J(parameters))
+            if J < best.J:
+                best = best._replace(parameters=parameters, J=J, about=about)
+        return best._replace(steps=steps)
 
     def _descend_last(
         self, problem: RefinementProblem, reached: _Reached, deadline: float
     ) -> _Reached:
-        """What was reached, as near its optimum as there is time."""
-        if time.perf_counter() > deadline:
-            return reached._replace(stopped_by="time_limit")
+        """What was reached, improved all over, as near its optimum as there is time."""
+        parameters = reached.parameters
+        if self.settings.escape is not None:
+            parameters, _ = reached.about.improve(parameters, 0.0, deadline, everywhere=True)
+        return self._end(problem, reached, parameters)
+
+    def _end(
+        self, problem: RefinementProblem, reached: _Reached, parameters: np.ndarray
+    ) -> _Reached:
+        """What was reached from there, if it is better."""
         freedom = self.body.freedom(None, self.settings.extra)
-        last, _, steps = descend(problem, reached.parameters, freedom, LAST_PASSES)
-        best = min((reached.parameters, last), key=problem.J)
-        return reached._replace(parameters=best, steps=reached.steps + steps)
+        last, _, steps = descend(problem, parameters, freedom, LAST_PASSES)
+        steps += reached.steps
+        best = min((reached.parameters, parameters, last), key=problem.J)
+        return reached._replace(parameters=best, J=float(problem.J(best)), steps=steps)
+
+    def _find_others(
+        self, problem: RefinementProblem, reached: _Reached, settings: IntervalSettings
+    ) -> tuple[_Reached, list[np.ndarray]]:
+        """The best of all poses found, and the others that are as good."""
+        others: list[np.ndarray] = []
+        for _ in range(_BETTER):
+            limit = reached.J + settings.tolerance * problem.border_length
+            others = reached.about.others(reached.parameters, limit, settings.same)
+            if not others or problem.J(others[0]) >= reached.J:
+                break
+            reached = self._end(problem, reached, others[0])
+            nearest = self.body.nearest_turns(reached.parameters)
+            reached = reached._replace(parameters=nearest)
+        return reached, others
 
     def _answer(
         self,
         problem: RefinementProblem,
         reached: _Reached,
         intervals: Intervals | None,
-        seconds: float,
-        interval_seconds: float,
+        seconds: tuple[float, float],
+        stopped_by: str,
     ) -> RefinedMatch:
         """The result."""
         parameters = reached.parameters
@@ -281,7 +302,7 @@ class Refiner:
             tree = tree.with_root_position(self.body.poses(parameters)[0, :3, 3])
         node_values = self.body.node_values(parameters)
         q, X_WB = tree.positions_from(node_values)
-        J = float(problem.J(parameters))
+        J = reached.J
         return RefinedMatch(
             found=True,
             q=q,
@@ -293,13 +314,13 @@ class Refiner:
             runs=reached.steps,
             outside_limit=(),
             untried={},
-            stopped_by=reached.stopped_by,
-            seconds=seconds,
+            stopped_by=stopped_by,
+            seconds=seconds[0],
             pose_set=None if intervals is None else pose_set(problem, tree, intervals),
             shift=parameters[-4:-1],
             growth=float(np.exp(parameters[-1])),
             covariance=np.zeros((0, 0)) if intervals is None else intervals.covariance,
-            interval_seconds=interval_seconds,
+            interval_seconds=seconds[1],
         )
 
 

@@ -159,6 +159,7 @@ def add_normal_equations(
     stride: int,
     offset: int,
     scale: float,
+    slack: float,
     H: np.ndarray,
     g: np.ndarray,
 ) -> tuple[float, float, float]:
@@ -172,6 +173,7 @@ def add_normal_equations(
         X_CW, camera: the camera's pose and parameters.
         stride, offset: every so many rows and columns are looked at, from this one on.
         scale: residuals beyond it lose weight [pixel].
+        slack: distances up to this hardly count [pixel]; 0: all do.
         H: (c, c) symmetric, added to.
         g: (c,) added to.
 
@@ -217,7 +219,17 @@ def add_normal_equations(
             if first == end:
                 continue
             compare_line(
-                places, slopes, count, border_places, first, end, extent, scale, weights, residuals
+                places,
+                slopes,
+                count,
+                border_places,
+                first,
+                end,
+                extent,
+                scale,
+                slack,
+                weights,
+                residuals,
             )
             for k in range(count):
                 s = chosen[k]

@@ -17,6 +17,8 @@ import numpy as np
 from drake_pose.compiled import compiled
 
 _FAR = 1e9
+# What distances within the slack weigh: enough to choose among the poses that all bounds allow.
+_WITHIN = 0.03
 
 
 class Border(NamedTuple):
@@ -112,6 +114,7 @@ def compare_line(
     end: int,
     extent: float,
     scale: float,
+    slack: float,
     weights: np.ndarray,
     residuals: np.ndarray,
 ) -> None:
@@ -123,6 +126,7 @@ def compare_line(
         border: the silhouette's crossings; this line's are those from ``first`` to ``end``.
         extent: the picture's end [pixel].
         scale: residuals beyond it lose weight (Geman and McClure 1987) [pixel].
+        slack: distances up to this hardly count [pixel]; 0: all do.
         weights, residuals: written.
     """
     for k in range(count):
@@ -130,10 +134,7 @@ def compare_line(
         if -0.5 <= places[k] <= extent:
             distance = _nearest(places[k], border, first + k % 2, end)
             if distance < _FAR:
-                residual = distance * slopes[k]
-                weight = 0.5 * slopes[k] / (1.0 + (residual / scale) ** 2)
-                weights[k] = weight
-                residuals[k] = weight * residual
+                _add_distance(distance, slopes[k], scale, slack, k, weights, residuals)
     for m in range(first, end):
         best, nearest = _FAR, -1
         for k in range((m - first) % 2, count, 2):
@@ -141,10 +142,31 @@ def compare_line(
             if abs(distance) < abs(best):
                 best, nearest = distance, k
         if nearest >= 0 and -0.5 <= places[nearest] <= extent:
-            residual = best * slopes[nearest]
-            weight = 0.5 * slopes[nearest] / (1.0 + (residual / scale) ** 2)
-            weights[nearest] += weight
-            residuals[nearest] += weight * residual
+            _add_distance(best, slopes[nearest], scale, slack, nearest, weights, residuals)
+
+
+@compiled(inline="always")
+def _add_distance(
+    distance: float,
+    slope: float,
+    scale: float,
+    slack: float,
+    k: int,
+    weights: np.ndarray,
+    residuals: np.ndarray,
+) -> None:
+    """Adds one distance along a line to a crossing's weight and weighted residual."""
+    residual = distance * slope
+    weight = 0.5 * slope / (1.0 + (residual / scale) ** 2)
+    if slack > 0.0:
+        beyond = abs(distance) - slack
+        if beyond > 0.0:
+            hinge = math.copysign(beyond, distance) * slope
+            residuals[k] += weight * hinge
+            weights[k] += weight
+        weight *= _WITHIN
+    weights[k] += weight
+    residuals[k] += weight * residual
 
 
 @compiled

@@ -152,6 +152,7 @@ class RefinementProblem:
         offset: int,
         scale: float,
         still: Sequence[Border] | None = None,
+        slack: float = 0.0,
     ) -> Equations:
         """The normal equations at a pose.
 
@@ -160,6 +161,7 @@ class RefinementProblem:
             freedom: which of them may change.
             stride, offset, scale: as in ``add_normal_equations``.
             still: the border in each view of what does not move; None: made here.
+            slack: as in ``add_normal_equations``.
         """
         X_WS, twists = self._placed(parameters)
         movements = Movements(
@@ -177,6 +179,6 @@ class RefinementProblem:
         for sight, border in zip(self._sights, borders, strict=True):
             sums += add_normal_equations(
                 sight.body, border, sight.border, movements, sight.X_CW, sight.camera,
-                stride, offset, scale, H, g,
+                stride, offset, scale, slack, H, g,
             )  # fmt: skip
         return Equations(H, g, *sums.tolist())

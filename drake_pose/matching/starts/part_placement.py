@@ -8,6 +8,7 @@ what looks best is refined.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -27,8 +28,8 @@ from drake_pose.silhouette.areas.prefix_sums import sum_rows
 from drake_pose.silhouette.areas.span_kernel import score
 
 _TRIANGLES = 200
-# Which rows and columns are looked at: one in this many.
-_COARSENESS = 2
+# One row and column in so many is looked at that silhouettes have about this many pixels.
+_COARSE_PIXELS = 3000
 # Hypotheses kept for the first, second, ... node of a part, and this many times more are scored
 # with what the part itself hides taken into account.
 _WIDTHS = (40, 12, 8)
@@ -38,6 +39,8 @@ _ALIKE = 0.35
 _LONGEST_PART = 3
 # Steps of Gauss and Newton's method that bring nodes to given places.
 _MOVES = 12
+# Steps smaller than this end it [rad or m].
+_STANDSTILL = 2e-3
 
 
 @dataclass(frozen=True)
@@ -270,19 +273,22 @@ class PartSearch:
         """The parameters with nodes' middles moved towards places (k, 3) by their own values."""
         body = self.body
         columns = np.concatenate([self._columns[node] for node in nodes])
+        lower, upper = body.lower[columns], body.upper[columns]
         moved = parameters.copy()
         for _ in range(_MOVES):
             motions = body.motions(moved)
             p_W = self._middles(motions.X_WN, nodes)
-            twists = motions.twists[columns]
-            J = np.cross(twists[:, None, :3], p_W[None]) + twists[:, None, 3:6]
+            J = _velocities(motions.twists[columns], p_W)
             J *= motions.moves[list(nodes)][:, columns].T[:, :, None]
             A = J.reshape(len(columns), -1).T
             step = np.linalg.solve(
                 A.T @ A + 1e-4 * np.eye(len(columns)), A.T @ (wanted - p_W).ravel()
             )
-            moved[columns] += np.clip(step, -0.5, 0.5)
-            moved[columns] = np.clip(moved[columns], body.lower[columns], body.upper[columns])
+            before = moved[columns]
+            after = np.clip(before + np.clip(step, -0.5, 0.5), lower, upper)
+            moved[columns] = after
+            if np.abs(after - before).max() < _STANDSTILL:
+                break
         return moved
 
     def _hold(self, parameters: np.ndarray, X_WN: np.ndarray, node: int) -> np.ndarray:
@@ -297,12 +303,27 @@ class PartSearch:
             motions = self.body.motions(held)
             X = motions.X_WN[node]
             p_W = p_N @ X[:3, :3].T + X[:3, 3]
-            twists = motions.twists[columns]
-            J = np.cross(twists[:, None, :3], p_W[None]) + twists[:, None, 3:6]
-            A = J.reshape(len(columns), -1).T
+            A = _velocities(motions.twists[columns], p_W).reshape(len(columns), -1).T
             step = np.linalg.lstsq(A, (wanted - p_W).ravel(), rcond=1e-6)[0]
-            held[columns] = np.clip(held[columns] + np.clip(step, -1.0, 1.0), lower, upper)
+            before = held[columns]
+            held[columns] = np.clip(before + np.clip(step, -1.0, 1.0), lower, upper)
+            if np.abs(held[columns] - before).max() < _STANDSTILL:
+                break
         return held
+
+
+def _velocities(twists: np.ndarray, p_W: np.ndarray) -> np.ndarray:
+    """How points (n, 3) move with twists (k, 7): (k, n, 3); quicker than ``np.cross``."""
+    w, v = twists[:, :3, None], twists[:, 3:6, None]
+    x, y, z = p_W.T
+    return np.stack(
+        [
+            w[:, 1] * z - w[:, 2] * y + v[:, 0],
+            w[:, 2] * x - w[:, 0] * z + v[:, 1],
+            w[:, 0] * y - w[:, 1] * x + v[:, 2],
+        ],
+        axis=-1,
+    )
 
 
 def _find_regions(problem: RefinementProblem, still: Sequence[Border]) -> list[_Regions]:
@@ -313,13 +334,15 @@ def _find_regions(problem: RefinementProblem, still: Sequence[Border]) -> list[_
         still: the border of all that is not of the part in each view.
     """
     regions = []
+    pixels = problem.area / (_COARSE_PIXELS * len(problem.views))
+    step = max(1, round(math.sqrt(pixels)))
     for view, border in zip(problem.views, still, strict=True):
-        mask = np.ascontiguousarray(view.mask[::_COARSENESS, ::_COARSENESS])
+        mask = np.ascontiguousarray(view.mask[::step, ::step])
         camera = view.camera.kernel_parameters()
-        camera[1:5] /= _COARSENESS
+        camera[1:5] /= step
         camera[6:] = mask.shape[1], mask.shape[0]
         free = np.ones(mask.shape, dtype=np.bool_)
-        clear_spans(border, _COARSENESS, free)
+        clear_spans(border, step, free)
         sets = np.empty((2, mask.shape[0], mask.shape[1] + 1), dtype=np.int32)
         for index, region in enumerate((mask & free, ~mask & free)):
             sum_rows(region.view(np.uint8), sets[index], 0, len(mask))

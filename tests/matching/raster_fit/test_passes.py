@@ -17,6 +17,7 @@ from drake_pose.matching.raster_fit.body import RefinementBody
 from drake_pose.matching.raster_fit.passes import (
     COARSE_PASSES,
     FINE_PASSES,
+    LAST_PASSES,
     Pass,
     descend,
     limited_step,
@@ -24,7 +25,7 @@ from drake_pose.matching.raster_fit.passes import (
 from drake_pose.matching.raster_fit.problem import RefinementProblem
 from drake_pose.matching.result import View
 from drake_pose.matching.starts.depth_reflections import find_reflections
-from drake_pose.matching.starts.escape import EscapeSettings, escape
+from drake_pose.matching.starts.neighbourhood import NeighbourhoodSearch, NeighbourhoodSettings
 from drake_pose.matching.starts.part_placement import PartSearch, find_parts
 from drake_pose.silhouette import TreeSurfaces, draw_mask
 
@@ -179,13 +180,56 @@ def test_a_part_in_the_wrong_place_is_found_again(body, search):
     wrong[shoulder] = np.clip(wrong[shoulder] - 1.2, body.lower[shoulder], body.upper[shoulder])
     wrong[elbow] = np.clip(wrong[elbow] + 0.5, body.lower[elbow], body.upper[elbow])
     before = problem.J(wrong)
-    found, J = escape(problem, search, wrong, 0.0, EscapeSettings())
+    found, J = NeighbourhoodSearch(problem, search).improve(wrong, 0.0)
     assert J == problem.J(found)
     assert J < 0.25 * before
-    again, _ = escape(problem, search, wrong, 0.0, EscapeSettings())
+    again, _ = NeighbourhoodSearch(problem, search).improve(wrong, 0.0)
     np.testing.assert_array_equal(found, again)
-    unchanged, _ = escape(problem, search, wrong, 0.0, EscapeSettings(rounds=0))
+    never = NeighbourhoodSettings(rounds=0)
+    unchanged, _ = NeighbourhoodSearch(problem, search, never).improve(wrong, 0.0)
     np.testing.assert_array_equal(unchanged, wrong)
+    once, _ = NeighbourhoodSearch(problem, search).improve(wrong, 0.0, tries=0)
+    np.testing.assert_array_equal(once, wrong)
+
+
+@pytest.mark.slow
+def test_others_are_as_good_and_differ(body, search):
+    """From a part mirrored in depth, which one camera hardly tells from the true one."""
+    camera = camera_of("parallel")
+    for seed in (41, 42, 43):
+        true = random_pose(body, seed, share=0.5)
+        problem = problem_of(body, true, [camera])
+        part = next(part for part in search.parts if len(part.nodes) == 2)
+        mirrored = search.mirror(true, part, problem.views[0])
+        start, _, _ = descend(problem, mirrored, body.freedom(), FINE_PASSES)
+        about = NeighbourhoodSearch(problem, search)
+        best, J = about.improve(start, 0.0, everywhere=True)
+        assert J == problem.J(best) <= problem.J(start)
+        limit = J + 0.03 * problem.border_length
+        for other in about.others(best, limit, 0.1):
+            assert problem.J(other) <= limit
+            assert np.abs(other - best).max() > 0.1
+
+
+def test_pixels_that_are_right_pull_little(body):
+    """Refined to the end fewer pixels are wrong, and the pose is nearer, than by least squares."""
+    camera = camera_of("parallel")
+    shares, errors = [], []
+    for seed in (51, 52, 53, 54):
+        true = random_pose(body, seed, share=0.5)
+        problem = problem_of(body, true, [camera])
+        start = true + 0.02 * np.random.default_rng(seed).normal(size=len(true))
+        start[-4:] = 0.0
+        start = np.clip(start, body.lower, body.upper)
+        freedom = body.freedom()
+        squares, _, _ = descend(problem, start, freedom, FINE_PASSES)
+        last, _, _ = descend(problem, squares, freedom, LAST_PASSES)
+        shares.append(problem.J(last) / problem.J(squares))
+        columns = freedom.columns
+        off = [np.median(np.abs(pose - true)[columns]) for pose in (last, squares)]
+        errors.append(off[0] / off[1])
+    assert np.median(shares) < 0.8
+    assert np.median(errors) < 0.9
 
 
 def test_parts_are_ends_of_limbs_and_nodes_of_the_trunk(body):
@@ -252,8 +296,12 @@ def test_intervals_hold_the_truth_and_say_what_is_free(body, search):
     for seed in (21, 22, 23):
         true = random_pose(body, seed)
         problem = problem_of(body, true, cameras)
-        refined, _, _ = descend(problem, true, body.freedom(), FINE_PASSES)
-        intervals = find_intervals(problem, search, refined, IntervalSettings())
+        refined, _, _ = descend(problem, true, body.freedom(), FINE_PASSES + LAST_PASSES)
+        about = NeighbourhoodSearch(problem, search)
+        about.improve(refined, 0.0, everywhere=True)
+        others = about.others(refined, 2.0 * problem.J(refined) + 40.0, 0.1)
+        others = [pose for pose in others if problem.J(pose) <= problem.J(refined) + 20.0]
+        intervals = find_intervals(problem, others, refined, IntervalSettings())
         assert len(intervals.joints) == len(true) - 4
         np.testing.assert_array_equal(intervals.families[0].members[0], refined)
         for pose in intervals.alternatives:
@@ -280,6 +328,8 @@ def test_a_body_of_other_size_and_place(body):
 def test_bad_settings_are_refused(body):
     with pytest.raises(SettingsError, match="iteration"):
         Pass(0, 1, 1.0, 1.0)
+    with pytest.raises(SettingsError, match="slack"):
+        Pass(1, 1, 1.0, 1.0, slack=0.6)
     with pytest.raises(SettingsError, match="scale"):
         Pass(1, 1, 0.0, 1.0)
     with pytest.raises(SettingsError, match="confidence"):
@@ -287,7 +337,7 @@ def test_bad_settings_are_refused(body):
     with pytest.raises(SettingsError, match="noise_factor"):
         IntervalSettings(noise_factor=0.0)
     with pytest.raises(SettingsError, match="proposals"):
-        EscapeSettings(proposals=0)
+        NeighbourhoodSettings(proposals=0)
     with pytest.raises(SettingsError, match="extra"):
         body.freedom(None, (4,))
     with pytest.raises(SettingsError, match="view"):

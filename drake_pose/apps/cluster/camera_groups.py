@@ -8,17 +8,23 @@ import uuid
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent import futures
+from concurrent.futures import Future as OpeningFuture
 from contextlib import suppress
+from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drake_pose.apps.cluster import camera_worker
-from drake_pose.apps.cluster.camera_assignment import CameraAssignment, assign_cameras
+from drake_pose.apps.cluster.camera_assignment import CameraAssignment, assign_cameras, host_of
 from drake_pose.apps.cluster.camera_worker import WatchReply, WatchRequest
+from drake_pose.apps.cluster.edge_server import POLLS
+from drake_pose.apps.cluster.lines import LineReply, hang_up, open_line
+from drake_pose.apps.cluster.remote_keeper import RemoteKeeper
 from drake_pose.apps.cluster.worker import worker_resources
 from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecification, TimedPicture
 from drake_pose.errors import ClusterError, DrakePoseError
+from drake_pose.matching.fit.camera_sums import EdgeKeeper
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -69,7 +75,7 @@ class Watchers:
         self.overdue: Callable[[str], float] = lambda _: -np.inf
         self._addresses: tuple[str, ...] = ()
         self._warm: dict[str, Future] = {}
-        self._looked = -np.inf
+        self._looked = self._pumped = -np.inf
         assignments = assign_cameras(specifications, client.run(worker_resources))
         self.groups = [WatchedGroup(self, assignment, spacings) for assignment in assignments]
         try:
@@ -111,6 +117,11 @@ class Watchers:
 
     def pump(self) -> None:
         """Takes what came, and asks for more."""
+        now = time.monotonic()
+        if now - self._pumped < _POLL_PAUSE:
+            # Every camera calls, a hundred of them at once.
+            return
+        self._pumped = now
         for group in self.groups:
             group.pump()
 
@@ -131,6 +142,7 @@ class WatchedGroup:
         ended: the cameras that will give nothing any more.
         rates: by camera, pictures a second, where known.
         dropped: by camera, pictures that could not be used.
+        keeper: asks the worker for sums over its cameras.
         views, view_bytes, seconds: how many views came, of how many bytes, and the work for them.
 
     Args:
@@ -157,8 +169,13 @@ class WatchedGroup:
         self.views, self.view_bytes, self.seconds = 0, 0, 0.0
         self._watchers, self._spacings = watchers, spacings
         self._key = uuid.uuid4().hex
+        self.keeper = RemoteKeeper(
+            self.specifications, self._key.encode(), lambda text: watchers.reports.append(text)
+        )
         self._after = dict.fromkeys(self.specifications, -np.inf)
-        self._future: Future | None = None
+        self._future: Future | LineReply | None = None
+        self._line: OpeningFuture[Connection] | None = None
+        self._listening = "", 0
         self._asked = 0.0
         self._silent = self._given_up = False
 
@@ -202,6 +219,11 @@ class WatchedGroup:
             self._note(self._future)
         elif time.monotonic() - self._asked > _SILENCE:
             self._report_silence("does not answer")
+            if isinstance(self._future, LineReply) and time.monotonic() - self._asked > _PATIENCE:
+                # The line may be dead and the worker alive: Dask finds out.
+                self._future.cancel()
+                self._hang_up()
+                self._future = None
 
     def await_camera(self, camera: str) -> None:
         """Waits until there is something of a camera, or nothing is to be expected."""
@@ -214,6 +236,8 @@ class WatchedGroup:
 
     def close(self) -> None:
         """Lets go of the sources."""
+        self.keeper.close()
+        self._hang_up()
         if self._future is not None:
             self._future.cancel()
             self._future = None
@@ -236,11 +260,36 @@ class WatchedGroup:
             _LIVE_PATIENCE,
         )
         self._asked = time.monotonic()
+        connection = self._line_to_worker() if count else None
+        if connection is not None:
+            self._future = LineReply(connection, request)
+            return
         self._future = self._client.submit(
             camera_worker.poll, request, workers=[self.address], pure=False
         )
 
-    def _note(self, future: Future) -> None:
+    def _line_to_worker(self) -> Connection | None:
+        """The connection beside Dask, where there is one by now: Dask costs milliseconds a task."""
+        if self._line is None or not self._line.done() or self._line.exception() is not None:
+            return None
+        return self._line.result()
+
+    def _move_to(self, address: tuple[str, int]) -> None:
+        """Connects to where the worker listens; port 0: nowhere."""
+        self.keeper.move_to(*address)
+        if address == self._listening:
+            return
+        self._hang_up()
+        self._listening = address
+        if address[1]:
+            self._line = open_line(address, self._key.encode(), [POLLS])
+
+    def _hang_up(self) -> None:
+        line, self._line, self._listening = self._line, None, ("", 0)
+        if line is not None:
+            hang_up(line)
+
+    def _note(self, future: Future | LineReply) -> None:
         """Takes a reply; it may have died with its worker."""
         error = future.exception() if future.status == "error" else None
         if future.status != "finished":
@@ -253,6 +302,7 @@ class WatchedGroup:
 
     def _lose(self, how: str) -> None:
         self._report_silence(how)
+        self._hang_up()
         self._future, self.address = None, ""
 
     def _report_silence(self, how: str) -> None:
@@ -275,6 +325,7 @@ class WatchedGroup:
         elif self.address in taken and free not in taken and self._watchers.is_warm(free):
             fire_and_forget(self._close_watch())
             self._watchers.reports.append(f"camera {self.names} moves to a worker of its own")
+            self._hang_up()
             self.address = free
 
     def _close_watch(self) -> Future:
@@ -286,6 +337,7 @@ class WatchedGroup:
         if self._silent:
             self._watchers.reports.append(f"a worker goes on with camera {self.names}")
         self._silent = self._given_up = False
+        self._move_to((host_of(self.address), reply.port))
         for name, views in reply.views.items():
             for one in views:
                 packed = np.frombuffer(one.packed, dtype=np.uint8)
@@ -325,6 +377,11 @@ class WatchedSource(FrameSource):
     def rate_hz(self) -> float | None:
         """As the source says where it is open."""
         return self._group.rates[self.specification.camera]
+
+    @property
+    def keeper(self) -> EdgeKeeper:
+        """Who has the edges of the camera's pictures."""
+        return self._group.keeper
 
     def close(self) -> None:
         """Nothing is held open here."""

@@ -7,19 +7,23 @@ is a few kilobytes a camera.
 from __future__ import annotations
 
 import os
+import pickle
 import threading
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
+from drake_pose.apps.cluster.camera_assignment import host_of
+from drake_pose.apps.cluster.edge_server import EdgeServer, EdgeStore
 from drake_pose.camera.sources.files import load_background_pictures
 from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecification
 from drake_pose.camera.sources.opening import open_source
 from drake_pose.errors import DrakePoseError
-from drake_pose.multiview.person.silhouette_tracker import see_silhouette
+from drake_pose.multiview.person.silhouette_view import see_silhouette
 from drake_pose.multiview.person.view_packing import pack_view
 from drake_pose.multiview.regions import Background, learn_background, person_region
 
@@ -71,7 +75,8 @@ class WatchReply:
         dropped: by camera, pictures that could not be used since the sources were opened.
         rates: by camera, pictures a second, where known.
         process: the worker's process.
-        seconds: of its processor's time [s].
+        seconds: of its processor's time, for views and sums [s].
+        port: where it answers with sums, at the address where Dask reaches it; 0: it does not.
     """
 
     views: Mapping[str, tuple[PackedView, ...]]
@@ -81,6 +86,7 @@ class WatchReply:
     rates: Mapping[str, float | None]
     process: int
     seconds: float
+    port: int = 0
 
 
 class _Watch:
@@ -91,6 +97,8 @@ class _Watch:
         self.used = time.monotonic()
         self._sources: dict[str, FrameSource] = {}
         self._backgrounds: dict[str, Background] = {}
+        self._store = EdgeStore(one.camera for one in request.specifications)
+        self._server: EdgeServer | None = None
         warm()
         try:
             for one in request.specifications:
@@ -98,6 +106,7 @@ class _Watch:
                     self._backgrounds[one.camera] = learn_background(load_background_pictures(one))
                 # Machines share no other clock than that of the day.
                 self._sources[one.camera] = open_source(one, time.time)
+            self._server = _open_server(request.key, self._store)
         except DrakePoseError:
             self.close()
             raise
@@ -128,7 +137,8 @@ class _Watch:
             dropped={name: source.dropped for name, source in self._sources.items()},
             rates={name: source.rate_hz for name, source in self._sources.items()},
             process=os.getpid(),
-            seconds=seconds,
+            seconds=seconds + (self._server.take_seconds() if self._server else 0.0),
+            port=self._server.port if self._server else 0,
         )
 
     @property
@@ -154,12 +164,34 @@ class _Watch:
                 picture = np.asarray(one.picture, dtype=np.uint8)
                 region = person_region(picture, self._backgrounds[name])
             view = see_silhouette(region, request.spacings[name])
+            self._store.put(name, one.time, view.edge)
             views.append(PackedView(one.time, one.frame, pack_view(view)))
 
     def close(self) -> None:
         """Lets go of the sources."""
+        if self._server is not None:
+            self._server.close()
         for source in self._sources.values():
             source.close()
+
+
+def _open_server(key: str, store: EdgeStore) -> EdgeServer | None:
+    """Answers with sums where the worker listens to Dask; None where that cannot be.
+
+    The connection is not encrypted: where Dask's are, there is none.
+    """
+    from distributed import get_worker
+
+    try:
+        address = get_worker().address
+    except ValueError:
+        # Not called by a worker.
+        return None
+    if not address.startswith("tcp://"):
+        return None
+    with suppress(OSError):
+        return EdgeServer(host_of(address), key.encode(), store, _poll_pickled)
+    return None
 
 
 _watches: dict[str, _Watch] = {}
@@ -190,6 +222,14 @@ def poll(request: WatchRequest) -> WatchReply:
             ).start()
     with watch.lock:
         return watch.poll(request)
+
+
+def _poll_pickled(data: bytes) -> bytes:
+    """As poll, of a request that came by a connection of its own."""
+    try:
+        return pickle.dumps(poll(pickle.loads(data)))
+    except DrakePoseError as error:
+        return pickle.dumps(error)
 
 
 def close(key: str) -> None:

@@ -28,9 +28,9 @@ def opener(client: Client, tolerance: float | None = None) -> Callable[[LiveScen
 class ClusterSensors:
     """Sensors on the workers of a cluster, one worker for each group of cameras; see LiveSensors.
 
-    Pictures stay where they are: a worker says in a few kilobytes what its cameras see. A worker
-    that dies costs the others nothing; another one, or itself when it was started again, goes on
-    with its cameras.
+    Pictures stay where they are: a worker says in a few kilobytes what its cameras see, and adds up
+    what they say of a pose, as often as a fit asks. A worker that dies costs the others nothing;
+    another one, or itself when it was started again, goes on with its cameras.
 
     Attributes:
         watchers: the workers.
@@ -68,8 +68,9 @@ class ClusterSensors:
             for name, one in group.specifications.items()
         }
         ordered = {one.camera: sources[one.camera] for one in specifications}
+        keepers = {name: one.keeper for name, one in sources.items()}
         self.capture = RemoteSensors(
-            ordered, scene.cameras, live=live, tolerance=tolerance, clock=clock
+            ordered, scene.cameras, keepers=keepers, live=live, tolerance=tolerance, clock=clock
         )
         if self.capture.live:
             self.watchers.overdue = self.capture.overdue

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydrake.systems.analysis import Simulator, SimulatorStatus
 from pydrake.systems.framework import Context, Diagram
 
-from drake_pose.multiview.person.silhouette_tracker import SilhouetteView
+from drake_pose.multiview.person.silhouette_view import SilhouetteView
 from drake_pose.systems.person.live_capture import LiveSensors
 
 Array = NDArray[np.float64]

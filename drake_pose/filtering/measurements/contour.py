@@ -15,11 +15,10 @@ from drake_pose.camera import Camera
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.filtering.state import Belief, StateLayout
 from drake_pose.filtering.truncation.inequalities import Inequalities, from_bounds, say_if_unlimited
+from drake_pose.matching.fit.camera_sums import REACH, Views
 from drake_pose.matching.fit.contour_fit import (
-    REACH,
     Comparison,
     Noise,
-    Views,
     compare_views,
     pack_views,
     project,

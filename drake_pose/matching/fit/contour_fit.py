@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from drake_pose.body import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera import Camera
-from drake_pose.matching.fit.evidence import EdgePoints, Evidence, pack_evidence
-from drake_pose.matching.fit.kernel import (
-    CLOSE,
-    COMPARED,
-    COST,
-    FITTING,
-    collect,
-    compare_contours,
+from drake_pose.matching.fit.camera_sums import (
+    AddUp,
+    CameraSum,
+    Views,
+    add_cameras,
+    compare_placed,
 )
+from drake_pose.matching.fit.evidence import EdgePoints, pack_evidence
+from drake_pose.matching.fit.kernel import CLOSE, COMPARED, COST, FITTING, collect
 from drake_pose.matching.fit.levenberg_marquardt import (
     Equations,
     Round,
@@ -36,8 +36,6 @@ Mask = NDArray[np.bool_]
 
 # Finer than this [pixel] silhouettes cannot tell.
 FINEST_SCALE, FINEST_SPACING = 1.5, 1.0
-# Distances beyond so many scales do not correspond.
-REACH = 4.0
 
 
 @dataclass(frozen=True)
@@ -66,16 +64,6 @@ class Prior:
     information: Array
 
 
-class Views(NamedTuple):
-    """What all cameras say of one frame, as the kernel takes it.
-
-    cameras: X_CW (c, 4, 4) and kernel parameters (c, 8); evidence: their silhouettes' edges.
-    """
-
-    cameras: tuple[Array, Array]
-    evidence: Evidence
-
-
 class Comparison(NamedTuple):
     """What each camera says of each node's affine motion x (12,): x^T A x - 2 b^T x.
 
@@ -87,6 +75,11 @@ class Comparison(NamedTuple):
     b: Array
     sums: Array
     placement: Placement
+
+    @property
+    def total(self) -> CameraSum:
+        """What all cameras say together."""
+        return add_cameras(self.A, self.b, self.sums)
 
     @property
     def share(self) -> float:
@@ -130,12 +123,14 @@ def fitting_share(sums: Array) -> float:
 
 def pack_views(cameras: Sequence[Camera], edges: Sequence[EdgePoints]) -> Views:
     """Cameras and the edges of their silhouettes; without points where nothing is seen."""
-    return Views(
-        (
-            np.array([camera.X_CW for camera in cameras]).reshape(-1, 4, 4),
-            np.array([camera.kernel_parameters() for camera in cameras]).reshape(-1, 8),
-        ),
-        pack_evidence(edges),
+    return Views(pack_cameras(cameras), pack_evidence(edges))
+
+
+def pack_cameras(cameras: Sequence[Camera]) -> tuple[Array, Array]:
+    """X_CW (c, 4, 4) and kernel parameters (c, 8) of cameras."""
+    return (
+        np.array([camera.X_CW for camera in cameras]).reshape(-1, 4, 4),
+        np.array([camera.kernel_parameters() for camera in cameras]).reshape(-1, 8),
     )
 
 
@@ -207,6 +202,21 @@ class ContourFit:
         held: Mask | None = None,
     ) -> PoseFit:
         """As fit, of views that are packed."""
+
+        def add_up(placement: Placement, step: Round) -> CameraSum:
+            return add_cameras(*self.compare_placed(views, placement, step))
+
+        return self.fit_sums(add_up, values, rounds, prior, held)
+
+    def fit_sums(
+        self,
+        add_up: AddUp,
+        values: Array,
+        rounds: Sequence[Round],
+        prior: Prior | None = None,
+        held: Mask | None = None,
+    ) -> PoseFit:
+        """As fit, of cameras whose edges may be elsewhere: add_up says what all of them say."""
         index = np.flatnonzero(np.ones(len(values), bool) if held is None else ~held)
         current = np.array(values, dtype=np.float64)
         current[index] = np.clip(values, self.lower, self.upper)[index]
@@ -216,9 +226,10 @@ class ContourFit:
             nonlocal sums
             theta = current.copy()
             theta[index] = own[0]
-            compared = self.compare_views(views, theta, step)
-            H, g = project(compared, len(theta))
-            sums = compared.sums.sum(axis=0)
+            placement = self.body.place(theta)
+            total = add_up(placement, step)
+            H, g = normal_equations(total, placement, len(theta))
+            sums = total.sums
             cost = float(sums[:, COST].sum())
             if prior is not None:
                 off = theta - prior.mean
@@ -242,6 +253,17 @@ class ContourFit:
         """The contours at values (m,), or at all parameters, compared with all cameras' edges."""
         return compare_views(self.body, views, theta, step, self.noise, self._pixels)
 
+    def compare_placed(
+        self, views: Views, placement: Placement, step: Round
+    ) -> tuple[Array, Array, Array]:
+        """A, b and sums of each camera, as of `compare_contours`, where the body stands."""
+        weights = self.weights(views.cameras, placement, step)
+        return compare_placed(placement.packed, placement.X_WN, views, weights)
+
+    def weights(self, cameras: tuple[Array, Array], placement: Placement, step: Round) -> Array:
+        """(c, 4) of cameras, as `compare_contours` takes them."""
+        return camera_weights(cameras, placement, step, self.noise, self._pixels)
+
 
 def compare_views(
     body: BodyParameters,
@@ -262,12 +284,23 @@ def compare_views(
         pixels: of the unit of length; None: the metre's at the root.
     """
     placement = body.place(theta)
-    cameras = len(views.cameras[0])
+    weights = camera_weights(views.cameras, placement, step, noise, pixels)
+    return Comparison(*compare_placed(placement.packed, placement.X_WN, views, weights), placement)
+
+
+def camera_weights(
+    cameras: tuple[Array, Array],
+    placement: Placement,
+    step: Round,
+    noise: Noise,
+    pixels: float | None = None,
+) -> Array:
+    """(c, 4) of cameras, as `compare_contours` takes them; arguments as of compare_views."""
     if pixels is None:
-        size = pixels_per_metre(views.cameras, placement.X_WN[0, :3, 3])
+        size = pixels_per_metre(cameras, placement.X_WN[0, :3, 3])
     else:
-        size = np.full(cameras, pixels)
-    weights = np.column_stack(
+        size = np.full(len(cameras[0]), pixels)
+    return np.column_stack(
         [
             1.0 / size,
             np.maximum(FINEST_SCALE, step.scale * size),
@@ -276,21 +309,6 @@ def compare_views(
             0.5 / (size * noise.correlation * (size * noise.deviation) ** 2),
         ]
     )
-    nodes = len(placement.X_WN)
-    A, b = np.zeros((cameras, nodes, 12, 12)), np.zeros((cameras, nodes, 12))
-    sums = np.zeros((cameras, nodes + 1, 6))
-    compare_contours(
-        placement.packed,
-        placement.X_WN,
-        views.cameras,
-        views.evidence,
-        weights,
-        REACH,
-        A,
-        b,
-        sums,
-    )
-    return Comparison(A, b, sums, placement)
 
 
 def project(
@@ -306,15 +324,7 @@ def project(
     """
     placement = compared.placement
     if camera_motions is None:
-        return collect(
-            compared.A.sum(axis=0),
-            compared.b.sum(axis=0),
-            placement.motions,
-            placement.starts,
-            placement.owners,
-            placement.parameters,
-            size,
-        )
+        return normal_equations(compared.total, placement, size)
     cameras, count = camera_motions.shape[:2]
     nodes, moved = len(placement.X_WN), len(placement.motions)
     total = size + cameras * count
@@ -332,6 +342,19 @@ def project(
         H += part[0]
         g += part[1]
     return H, g
+
+
+def normal_equations(total: CameraSum, placement: Placement, size: int) -> tuple[Array, Array]:
+    """As project, of what cameras that stay say together."""
+    return collect(
+        total.A,
+        total.b,
+        placement.motions,
+        placement.starts,
+        placement.owners,
+        placement.parameters,
+        size,
+    )
 
 
 def pixels_per_metre(cameras: tuple[Array, Array], place: Array) -> Array:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from drake_pose.camera import Camera
 from drake_pose.errors import SettingsError
-from drake_pose.matching.fit.contour_fit import Noise, Views, compare_views, project
+from drake_pose.matching.fit.camera_sums import Views
+from drake_pose.matching.fit.contour_fit import Noise, compare_views, project
 from drake_pose.matching.fit.evidence import Evidence
 from drake_pose.matching.fit.kernel import COMPARED, COST, FITTING
 from drake_pose.matching.fit.levenberg_marquardt import (

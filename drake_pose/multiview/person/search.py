@@ -8,20 +8,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.camera import Camera, ParallelCamera
 from drake_pose.errors import SettingsError
 from drake_pose.matching.fit.contour_fit import ContourFit, PoseFit, Prior
-from drake_pose.matching.fit.evidence import EdgePoints
 from drake_pose.matching.fit.kernel import COMPARED, FITTING
 from drake_pose.matching.fit.levenberg_marquardt import Round
 from drake_pose.multiview.person.body_plan import BodyPlan, PlannedLimb, crowding
+from drake_pose.multiview.person.frame_views import FrameViews
 from drake_pose.multiview.person.limb_placement import score_limb_placements, worth_of_pixels
-from drake_pose.multiview.rays import meeting_of_all
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -32,9 +29,6 @@ _UNALIKE = 0.25
 _NEARLY = 0.9
 # Tips that are nearer are about in the same place [m].
 _NEAR = 0.15
-# Guesses are judged by this many cameras, in pictures with about this many rows.
-_JUDGES = 5
-_ROWS = 120
 # How much of a fit tells which guess is promising.
 _JUDGED = 3
 _ROUGHER = 1.5
@@ -95,73 +89,6 @@ class SearchSettings:
         # Bits in reverse order make neighbours late.
         order = sorted(range(self.cycle), key=lambda k: f"{k:032b}"[::-1])
         return list(range(order[frame % self.cycle], self.headings, self.cycle))
-
-
-@dataclass(frozen=True, eq=False)
-class FrameViews:
-    """What all cameras say in a frame, and small pictures of a few, for coarse judgement.
-
-    Args:
-        cameras: all that have a picture.
-        regions: (H, W) the person in each.
-        edges: their edges.
-    """
-
-    cameras: Sequence[Camera]
-    regions: Sequence[Mask]
-    edges: Sequence[EdgePoints]
-
-    @cached_property
-    def seers(self) -> list[int]:
-        """Which cameras see somebody."""
-        return [k for k, edge in enumerate(self.edges) if len(edge.uv)]
-
-    @cached_property
-    def judges(self) -> list[int]:
-        """Which of them judge guesses; a few, as far as possible all around."""
-        count = min(_JUDGES, len(self.seers))
-        chosen = np.linspace(0, len(self.seers), count, endpoint=False).astype(int)
-        return [self.seers[k] for k in chosen]
-
-    @cached_property
-    def small(self) -> tuple[list[Camera], list[Mask]]:
-        """The judges' cameras and regions with fewer pixels."""
-        strides = [max(1, self.regions[k].shape[0] // _ROWS) for k in self.judges]
-        return (
-            [_coarser(self.cameras[k], n) for k, n in zip(self.judges, strides, strict=True)],
-            [self.regions[k][::n, ::n] for k, n in zip(self.judges, strides, strict=True)],
-        )
-
-    @cached_property
-    def coarse(self) -> tuple[list[Camera], list[EdgePoints]]:
-        """The judges' cameras and every other point of their edges."""
-        edges = [self.edges[k] for k in self.judges]
-        return [self.cameras[k] for k in self.judges], [
-            EdgePoints(edge.uv[::2], edge.normals[::2], 2.0 * edge.lengths[::2], edge.middle)
-            for edge in edges
-        ]
-
-    def middle(self) -> Array | None:
-        """(3,) where somebody is [m]; None where fewer than two cameras see one."""
-        if len(self.seers) < 2:
-            return None
-        return meeting_of_all(
-            [self.cameras[k] for k in self.seers], [self.edges[k].middle for k in self.seers]
-        )
-
-
-def _coarser(camera: Camera, stride: int) -> Camera:
-    """The camera of every so manieth pixel of every so manieth row."""
-    smaller = replace(
-        camera,
-        width=-(-camera.width // stride),
-        height=-(-camera.height // stride),
-        center_x=camera.center_x / stride,
-        center_y=camera.center_y / stride,
-    )
-    if isinstance(smaller, ParallelCamera):
-        return replace(smaller, pixels_per_metre=smaller.pixels_per_metre / stride)
-    return replace(smaller, focal_x=smaller.focal_x / stride, focal_y=smaller.focal_y / stride)
 
 
 class PersonSearch:
@@ -288,9 +215,8 @@ class PersonSearch:
         """A fit from a coarse guess, which is trusted little."""
         prior = Prior(values, 0.1 * self._information)
         rounds = self.settings.rounds
-        return self._fit.fit(
-            frame_views.cameras, frame_views.edges, values, rounds, prior, self._held
-        )
+        add_up = frame_views.add_up(self._fit)
+        return self._fit.fit_sums(add_up, values, rounds, prior, self._held)
 
     def _doubtful(self, fitted: PoseFit, frame_views: FrameViews) -> list[PlannedLimb]:
         """The limbs that fit badly, hardly show, or would fill much more of the regions elsewhere.

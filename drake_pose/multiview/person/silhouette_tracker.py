@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from drake_pose.camera import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.matching.fit.contour_fit import ContourFit, PoseFit, Prior
-from drake_pose.matching.fit.evidence import EdgePoints, find_edge_points
 from drake_pose.matching.fit.levenberg_marquardt import Round
 from drake_pose.multiview.person.body_plan import BodyPlan
+from drake_pose.multiview.person.frame_views import FrameViews
 from drake_pose.multiview.person.pose_uncertainty import PoseUncertainty, pose_uncertainty
-from drake_pose.multiview.person.search import FrameViews, PersonSearch, SearchSettings
+from drake_pose.multiview.person.search import PersonSearch, SearchSettings
+from drake_pose.multiview.person.silhouette_view import SilhouetteView
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -63,19 +64,6 @@ class TrackerSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class SilhouetteView:
-    """What one camera says.
-
-    Args:
-        region: (H, W) the person.
-        edge: points of the region's edge.
-    """
-
-    region: Mask
-    edge: EdgePoints
-
-
-@dataclass(frozen=True, eq=False)
 class TrackState:
     """What the next frame is told of this one.
 
@@ -93,11 +81,6 @@ class TrackState:
     share: float
     usual: float
     troubled: int = 0
-
-
-def see_silhouette(region: Mask, spacing: float) -> SilhouetteView:
-    """One camera's share: the edge of the person's region, points this many pixels apart."""
-    return SilhouetteView(region, find_edge_points(region, spacing))
 
 
 class SilhouetteTracker:
@@ -213,9 +196,7 @@ class SilhouetteTracker:
         Returns:
             None where nothing is known yet and fewer than two cameras see a person.
         """
-        frame_views = FrameViews(
-            cameras, [view.region for view in views], [view.edge for view in views]
-        )
+        frame_views = FrameViews(cameras, views)
         if last is None:
             found = self._search.found(frame_views, range(self.settings.search.headings))
             still = np.zeros(len(self._held))
@@ -266,9 +247,8 @@ class SilhouetteTracker:
     def _fitted(self, last: TrackState, frame_views: FrameViews) -> PoseFit:
         """The frame fitted from where the last ones point to."""
         expected = last.values + self.settings.carry * last.step
-        return self.fit.fit(
-            frame_views.cameras,
-            frame_views.edges,
+        return self.fit.fit_sums(
+            frame_views.add_up(self.fit),
             expected,
             self.settings.rounds,
             Prior(expected, self._information),

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.camera import Camera
-from drake_pose.multiview.person.silhouette_tracker import SilhouetteView, see_silhouette
+from drake_pose.multiview.person.silhouette_view import SilhouetteView, see_silhouette
 from drake_pose.multiview.rays import meeting_of_all
 from drake_pose.multiview.recordings.figures import (
     Figure,

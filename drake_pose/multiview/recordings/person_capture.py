@@ -23,11 +23,10 @@ from drake_pose.multiview.person.search import SearchSettings
 from drake_pose.multiview.person.shape import PersonShape, fit_shape, shape_noise, shape_values
 from drake_pose.multiview.person.silhouette_tracker import (
     SilhouetteTracker,
-    SilhouetteView,
     TrackerSettings,
     TrackState,
-    see_silhouette,
 )
+from drake_pose.multiview.person.silhouette_view import SilhouetteView, see_silhouette
 from drake_pose.silhouette import Outline
 
 Array = NDArray[np.float64]

@@ -24,12 +24,10 @@ from pydrake.trajectories import Trajectory
 from drake_pose.body import ArticulatedModel
 from drake_pose.camera import Camera, PinholeCamera
 from drake_pose.errors import SettingsError
-from drake_pose.matching.fit.contour_fit import ContourFit
-from drake_pose.multiview.person.silhouette_tracker import (
-    SilhouetteTracker,
-    SilhouetteView,
-    TrackState,
-)
+from drake_pose.matching.fit.contour_fit import ContourFit, fitting_share
+from drake_pose.multiview.person.frame_views import FrameViews
+from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker, TrackState
+from drake_pose.multiview.person.silhouette_view import SilhouetteView
 from drake_pose.multiview.recordings.other_persons import keep_views
 from drake_pose.systems.bodies.posed_geometry import add_avatar
 from drake_pose.systems.person.silhouette_sensor import (
@@ -249,13 +247,10 @@ class PersonTracker(LeafSystem):
         clean = [(camera, view) for camera, view in pairs if camera.name not in frame_views.merged]
         if not 0 < len(clean) < len(pairs):
             return found
-        compared = self._tracker.fit.compare(
-            [camera for camera, _ in clean],
-            [view.edge for _, view in clean],
-            found.values,
-            self._tracker.settings.rounds[-1],
-        )
-        return replace(found, share=compared.share)
+        fit = self._tracker.fit
+        add_up = FrameViews([c for c, _ in clean], [view for _, view in clean]).add_up(fit)
+        total = add_up(fit.body.place(found.values), self._tracker.settings.rounds[-1])
+        return replace(found, share=fitting_share(total.sums))
 
     def _calc_positions(self, context: Context, output: BasicVector) -> None:
         vector = context.get_discrete_state(self._state).value()

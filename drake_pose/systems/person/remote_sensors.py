@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -10,6 +11,8 @@ from pydrake.systems.framework import Context, DependencyTicket
 
 from drake_pose.camera import Camera
 from drake_pose.camera.sources.frame_source import FrameSource
+from drake_pose.matching.fit.camera_sums import EdgeKeeper
+from drake_pose.multiview.person.silhouette_view import KeptEdge
 from drake_pose.multiview.person.view_packing import unpack_view
 from drake_pose.systems.pictures.picture_capture import PictureCapture
 
@@ -28,7 +31,25 @@ class RemoteSensors(PictureCapture):
     As PictureCapture, but its sources deliver packed views (bytes (n,) of pack_view) in place of
     pictures, and its outputs are what SilhouetteSensor gives: a SilhouetteView, or None where the
     camera gave no picture at that moment.
+
+    Args:
+        sources: where each camera's packed views come from, opened.
+        cameras: the calibrated cameras.
+        keepers: by camera, who has the edges of its pictures and compares contours with them; the
+            process itself does where nobody has.
+        others: the further arguments of PictureCapture.
     """
+
+    def __init__(
+        self,
+        sources: Mapping[str, FrameSource],
+        cameras: Mapping[str, Camera],
+        *,
+        keepers: Mapping[str, EdgeKeeper] | None = None,
+        **others: Any,
+    ) -> None:
+        super().__init__(sources, cameras, **others)
+        self._keepers = dict(keepers or {})
 
     def _declare_outputs(
         self, cameras: Mapping[str, Camera], ticket: set[DependencyTicket]
@@ -51,7 +72,12 @@ class RemoteSensors(PictureCapture):
 
     def _calc_silhouette(self, name: str) -> Callable[[Context, AbstractValue], None]:
         def calc(context: Context, output: AbstractValue) -> None:
-            packed = self._picture(name)
-            output.set_value(None if packed is None else unpack_view(packed.tobytes()))
+            one = None if self.moment is None else self.moment.items.get(name)
+            if one is None:
+                output.set_value(None)
+                return
+            keeper = self._keepers.get(name)
+            kept = None if keeper is None else KeptEdge(keeper, name, one.time)
+            output.set_value(unpack_view(one.picture.tobytes(), kept))
 
         return calc

@@ -9,7 +9,7 @@ from pydrake.systems.framework import Context, LeafSystem
 from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 
 from drake_pose.camera import Camera
-from drake_pose.multiview.person.silhouette_tracker import SilhouetteView, see_silhouette
+from drake_pose.multiview.person.silhouette_view import SilhouetteView, see_silhouette
 from drake_pose.multiview.recordings.person_capture import EDGE_POINTS
 from drake_pose.multiview.regions import Background, person_region
 from drake_pose.silhouette import label_image_to_mask
@@ -28,7 +28,7 @@ def shows_somebody(view: SilhouetteView | None) -> bool:
     """Whether a view has more to show than a speck: to search a person in specks takes seconds."""
     if view is None:
         return False
-    return bool(view.edge.lengths.sum() >= _LEAST_EDGE * view.region.shape[0])
+    return bool(view.edge_length >= _LEAST_EDGE * view.height)
 
 
 class SilhouetteSensor(LeafSystem):

@@ -8,12 +8,10 @@ from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.errors import ModelError, SettingsError
 from drake_pose.matching.fit.contour_fit import ContourFit
 from drake_pose.multiview.person.body_plan import crowding
-from drake_pose.multiview.person.search import FrameViews, SearchSettings
-from drake_pose.multiview.person.silhouette_tracker import (
-    SilhouetteTracker,
-    TrackerSettings,
-    see_silhouette,
-)
+from drake_pose.multiview.person.frame_views import FrameViews
+from drake_pose.multiview.person.search import SearchSettings
+from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker, TrackerSettings
+from drake_pose.multiview.person.silhouette_view import see_silhouette
 from drake_pose.silhouette import LabelRenderer
 
 
@@ -133,7 +131,7 @@ class TestTracker:
 
     def test_small_pictures_show_the_same_places(self, world):
         views = world.views(world.pose(**WALKING))
-        frame_views = FrameViews(world.cameras, [v.region for v in views], [v.edge for v in views])
+        frame_views = FrameViews(world.cameras, views)
         points = np.array([[0.1, 0.2, 1.0], [-0.1, 0.0, 0.4]])
         for k, small, region in zip(frame_views.judges, *frame_views.small, strict=True):
             assert region.shape == (small.height, small.width)

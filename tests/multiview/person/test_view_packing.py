@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from drake_pose.multiview.person.silhouette_tracker import see_silhouette
+from drake_pose.multiview.person.silhouette_view import see_silhouette
 from drake_pose.multiview.person.view_packing import pack_view, unpack_view
 
 
@@ -17,6 +17,7 @@ def test_nothing_is_lost_on_the_way(cut):
     region[3, 5] = True
     view = see_silhouette(region, 6.0)
     there = unpack_view(pack_view(view))
+    assert (there.height, there.edge_length) == (view.height, view.edge_length)
     np.testing.assert_array_equal(there.region, region)
     for name in ("uv", "normals", "lengths", "middle"):
         sent, got = getattr(view.edge, name), getattr(there.edge, name)

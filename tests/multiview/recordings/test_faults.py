@@ -12,7 +12,8 @@ from drake_pose.camera import Camera
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.matching.fit.contour_fit import ContourFit
 from drake_pose.matching.fit.evidence import find_edge_points
-from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker, see_silhouette
+from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker
+from drake_pose.multiview.person.silhouette_view import see_silhouette
 from drake_pose.multiview.recordings.camera_faults import (
     CameraFault,
     FrameView,

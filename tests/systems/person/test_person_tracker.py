@@ -8,7 +8,8 @@ from drake_pose.body import bundled_model, load_model
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.errors import SettingsError
 from drake_pose.matching.fit.contour_fit import ContourFit
-from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker, see_silhouette
+from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker
+from drake_pose.multiview.person.silhouette_view import see_silhouette
 from drake_pose.silhouette import LabelRenderer
 from drake_pose.systems.person.person_tracker import PersonTracker, build_person_capture
 from drake_pose.systems.person.silhouette_sensor import edge_spacing

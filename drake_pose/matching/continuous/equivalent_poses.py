@@ -1,10 +1,14 @@
 """What damaged silhouettes leave open: poses that fit as well as the best, in families.
 
-Where the body fits badly and masks are damaged, the misfit itself is the only measure of the noise:
-the larger the share of the silhouettes' edges that the best pose leaves unexplained, the larger the
-cost of poses that count as good. What well determined values may do within that follows from the
-cost's curvature; a weakly determined value is moved step by step, the others following, until the
-cost or a limit ends it. Other optima that fit, and flipped joints, make further families.
+Two questions are put to the silhouettes. How far a pose may be off that is right: its covariance,
+where parts, masks and cameras err together (``fit.covariance``), as 95 % intervals; a value that
+may go far is moved step by step, the others following, until what does not fit any more is
+significant. Whether another pose fits as well: other optima that were found, and flipped joints,
+make families of their own unless they are significantly worse. That is Vuong's test of models that
+are not nested (1989): the costs of both poses are compared piece by piece of the pictures, and how
+their differences scatter from piece to piece tells how large the difference of the whole may be by
+chance. What no pose explains, such as a part that is missing in a mask, costs all of them alike and
+says nothing.
 """
 
 from __future__ import annotations
@@ -16,22 +20,27 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_pose.errors import SettingsError
+from drake_pose.matching.fit.covariance import ErrorSizes, estimate_sizes, values_covariance
 from drake_pose.matching.fit.levenberg_marquardt import Round
 from drake_pose.matching.fit.views_fit import FittedPose, ViewsFit
 from drake_pose.matching.pose_families import JointEstimate, PoseFamily, PoseSet
 from drake_pose.matching.starts.self_motions import Flip, flips
 
 _LOOK = Round(0.0125, 0.026, 2)
-# The first and the longest step of a value that is moved, angle [rad] and length [m].
-_FIRST_STEPS, _LONGEST_STEPS = (0.05, 0.01), (0.35, 0.1)
+# What follows a value that is moved.
+_FOLLOW = (Round(0.025, 0.026, 2), Round(0.0125, 0.026, 2))
+# Distances that count less in the fit tell of errors, too.
+_FINE = Round(0.025, 0.0125)
+# The longest step of a value that is moved, angle [rad] and length [m].
+_LONGEST_STEPS = 0.5, 0.1
 # Each step of a value that is moved is longer by this factor.
 _GROWTH = 1.6
-# A value without any effect has this curvature, so that equations can be solved [pixel/rad^2].
-_LEAST_CURVATURE = 1e-2
-# A pose that is hardly good enough may still do so much of what the best may.
-_LEAST_ROOM = 0.5
-# Up to this share of the edges left unexplained, the tolerance is a share of the best cost.
-_SMALL_MISFIT = 0.5
+# The first step is this share of what the covariance allows.
+_FIRST_STEP = 0.5
+# Of a normal distribution, 95 % lie within so many standard deviations.
+_NORMAL_95 = 1.96
+# A fit of which most does not fit can be wrong altogether: no robust estimate outlives that.
+_BREAKDOWN = 0.5
 _ROUNDING = 1e-9
 
 
@@ -40,20 +49,18 @@ class RobustFamilySettings:
     """Parameters of the answer as a set; angles in rad, lengths in m.
 
     Args:
-        tolerance: how much more cost is as good as the best: this times the square of the best
-            cost, both as shares of the length of the silhouettes' edges; of a best cost below a
-            half, half of this times it. Found on drawn arms with damaged masks and links too thick
-            or thin.
+        significance: poses are as good as the best whose cost is larger by no more than so many
+            standard deviations of the difference.
         widest_angle, widest_length: a value is free whose interval is wider than this on either
             side.
-        moved_angle, moved_length: a value that the curvature lets go so far is moved step by step.
+        moved_angle, moved_length: a value that the covariance lets go so far is moved step by step.
         families: at most this many are told apart.
 
     Raises:
         SettingsError: if a value is out of its range.
     """
 
-    tolerance: float = 0.6
+    significance: float = 1.96
     widest_angle: float = math.radians(10.0)
     widest_length: float = 0.02
     moved_angle: float = math.radians(3.0)
@@ -61,7 +68,13 @@ class RobustFamilySettings:
     families: int = 8
 
     def __post_init__(self) -> None:
-        for name in ("tolerance", "widest_angle", "widest_length", "moved_angle", "moved_length"):
+        for name in (
+            "significance",
+            "widest_angle",
+            "widest_length",
+            "moved_angle",
+            "moved_length",
+        ):
             if not getattr(self, name) > 0.0:
                 raise SettingsError(f"{name} must be positive, not {getattr(self, name)}")
         if self.families < 1:
@@ -77,10 +90,9 @@ class _Family:
     high: np.ndarray
     size: int = 1
 
-    def holds(self, values: np.ndarray) -> bool:
-        """Whether values (m,), of angles in the turn nearest to the family's, are in it."""
-        inside = (values >= self.low - _ROUNDING) & (values <= self.high + _ROUNDING)
-        return bool(inside.all())
+    def outside(self, values: np.ndarray) -> np.ndarray:
+        """Which values (m,), of angles in the turn nearest to the family's, are not in it."""
+        return np.asarray((values < self.low - _ROUNDING) | (values > self.high + _ROUNDING))
 
 
 class RobustFamilies:
@@ -99,8 +111,10 @@ class RobustFamilies:
         self._kinematics = fit.kinematics
         self._settings = settings
         self._proceed = proceed
+        self._pieces = np.zeros(0)
         self._tolerance = 0.0
-        self._limit = math.inf
+        self._sizes: ErrorSizes | None = None
+        self._broken = False
 
     def find(self, poses: Sequence[FittedPose], J: Callable[[np.ndarray], float]) -> PoseSet:
         """The poses that fit as well as the best.
@@ -109,12 +123,12 @@ class RobustFamilies:
             poses: refined, best first; the first is the answer.
             J: the objective (1) at values (m,) [pixel].
         """
-        costs = [self._cost(pose.values) for pose in poses]
-        best = min(costs)
-        misfit = max(best / self._fit.edge_length, _SMALL_MISFIT)
-        self._tolerance = self._settings.tolerance * best * misfit
-        self._limit = best + self._tolerance
-        good = [pose.values for pose, cost in zip(poses, costs, strict=True) if cost <= self._limit]
+        pieces = [self._fit.piece_costs(pose.values, _LOOK) for pose in poses]
+        self._pieces = min(pieces, key=lambda one: float(one.sum()))
+        self._broken = float(self._pieces.sum()) > _BREAKDOWN * 2.0 * self._fit.edge_length
+        good = [
+            pose.values for pose, one in zip(poses, pieces, strict=True) if self._is_as_good(one)
+        ]
         families: list[_Family] = []
         for values in good or [poses[0].values]:
             if self._is_in(families, values) or not self._has_room(families):
@@ -124,19 +138,40 @@ class RobustFamilies:
             self._add_flipped(families, whole)
         return self._describe(families, J)
 
-    def _cost(self, values: np.ndarray) -> float:
-        return self._fit.cost(values, _LOOK)
+    def _excess(self, pieces: np.ndarray) -> float:
+        """By how many standard deviations costs by pieces are above the best pose's."""
+        more = pieces - self._pieces
+        return float(more.sum() / max(math.sqrt(float((more**2).sum())), _ROUNDING))
+
+    def _is_as_good(self, pieces: np.ndarray) -> bool:
+        """Whether costs by pieces are not significantly above the best pose's."""
+        as_good = self._excess(pieces) <= self._settings.significance
+        if as_good:
+            self._tolerance = max(self._tolerance, float((pieces - self._pieces).sum()))
+        return as_good
 
     def _has_room(self, families: Sequence[_Family]) -> bool:
         return not families or (len(families) < self._settings.families and self._proceed())
 
     def _is_in(self, families: list[_Family], values: np.ndarray) -> bool:
-        """Whether some family holds a pose; it is counted there."""
+        """Whether some family holds a pose; it is counted there.
+
+        What is free in a family may be anything: that widens it.
+        """
         for i, family in enumerate(families):
-            if family.holds(self._kinematics.nearest_turns(values, family.values)):
-                families[i] = _Family(family.values, family.low, family.high, family.size + 1)
+            near = self._kinematics.nearest_turns(values, family.values)
+            if not np.any(family.outside(near) & (family.high - family.low <= self._widest())):
+                low, high = np.minimum(family.low, near), np.maximum(family.high, near)
+                families[i] = _Family(family.values, low, high, family.size + 1)
                 return True
         return False
+
+    def _widest(self) -> np.ndarray:
+        """(m,) how wide the intervals of determined values are at most."""
+        settings = self._settings
+        return 2.0 * np.where(
+            self._kinematics.is_angle, settings.widest_angle, settings.widest_length
+        )
 
     def _add_flipped(self, families: list[_Family], family: _Family) -> None:
         """Add what flips make of a family, as far as it fits."""
@@ -144,7 +179,9 @@ class RobustFamilies:
             if not self._has_room(families):
                 return
             look = self._fit.refine(flip.values, (_LOOK,))
-            if look.cost <= self._limit and not self._is_in(families, look.values):
+            if not self._is_as_good(self._fit.piece_costs(look.values, _LOOK)):
+                continue
+            if not self._is_in(families, look.values):
                 values = self._kinematics.nearest_turns(look.values)
                 families.append(self._flipped(family, flip, values))
 
@@ -164,49 +201,58 @@ class RobustFamilies:
 
     def _spread(self, values: np.ndarray) -> _Family:
         """What the values (m,) may be about a pose."""
-        lower, upper = self._kinematics.reach(values)
-        cost = self._cost(values)
-        room = max(self._limit - cost, _LEAST_ROOM * self._tolerance)
-        H = self._fit.curvature(values, _LOOK)
+        kinematics = self._kinematics
+        lower, upper = kinematics.reach(values)
         free = np.flatnonzero(upper > lower)
+        seen = self._fit.distances(values, _FINE)
+        if self._sizes is None:
+            self._sizes = estimate_sizes(seen, kinematics.is_angle)
+        covariance = values_covariance(seen, self._sizes, free, kinematics.is_angle)
         low, high = values.copy(), values.copy()
-        covariance = np.linalg.inv(H[np.ix_(free, free)] + _LEAST_CURVATURE * np.eye(len(free)))
-        widths = np.sqrt(2.0 * room * np.diag(covariance))
-        for column, (index, width) in enumerate(zip(free, widths, strict=True)):
-            angle = bool(self._kinematics.is_angle[index])
-            moved = self._settings.moved_angle if angle else self._settings.moved_length
-            if width <= moved or not self._proceed():
-                low[index], high[index] = values[index] - width, values[index] + width
-                continue
+        widths = _NORMAL_95 * np.sqrt(np.diag(covariance))
+        low[free], high[free] = values[free] - widths, values[free] + widths
+        angles = kinematics.is_angle[free]
+        wide = widths > np.where(angles, self._settings.moved_angle, self._settings.moved_length)
+        found = [values]
+        for column in np.flatnonzero(wide):
             along = np.zeros(len(values))
             along[free] = covariance[:, column] / covariance[column, column]
-            low[index] = self._move(values, int(index), -along, cost)
-            high[index] = self._move(values, int(index), along, cost)
+            for way in (-along, along):
+                found += self._move(values, int(free[column]), way, float(widths[column]))
+        # Poses found while one value was moved show what others may be, too.
+        moved = free[wide]
+        low[moved] = np.minimum(low[moved], np.min(found, axis=0)[moved])
+        high[moved] = np.maximum(high[moved], np.max(found, axis=0)[moved])
         return _Family(values, np.maximum(low, lower), np.minimum(high, upper))
 
-    def _move(self, values: np.ndarray, index: int, along: np.ndarray, cost: float) -> float:
-        """How far a value can go, the others following along (m,), from a pose of some cost."""
-        kind = 0 if self._kinematics.is_angle[index] else 1
+    def _move(
+        self, values: np.ndarray, index: int, along: np.ndarray, width: float
+    ) -> list[np.ndarray]:
+        """Poses (m,) that fit as well, with a value farther and farther away.
+
+        Args:
+            values: (m,) where it begins.
+            index: of the value.
+            along: (m,) how the others follow it.
+            width: how far it may go in any case.
+        """
+        longest = _LONGEST_STEPS[0 if self._kinematics.is_angle[index] else 1]
         lower, upper = self._kinematics.lower.copy(), self._kinematics.upper.copy()
         # Beyond half a turn the values come back from the other side.
         lower[index], upper[index] = (ends[index] for ends in self._kinematics.reach(values))
-        step, best = _FIRST_STEPS[kind], cost
-        while self._proceed():
-            before, before_cost = values[index], cost
-            trial = np.clip(values + step * along, lower, upper)
-            look = self._fit.refine(trial, (_LOOK,), held=(index,))
-            values, cost = look.values, look.cost
-            if cost > self._limit:
-                # Costs are roughly parabolas.
-                a, b, c = (
-                    math.sqrt(max(one - best, 0.0)) for one in (before_cost, self._limit, cost)
-                )
-                return float(before + (values[index] - before) * (b - a) / max(c - a, _ROUNDING))
-            best = min(best, cost)
-            if not lower[index] < values[index] < upper[index]:
-                break
-            step = min(_GROWTH * step, _LONGEST_STEPS[kind])
-        return float(values[index])
+        step, most = _FIRST_STEP * width, self._settings.significance
+        found, excess = [values], 0.0
+        while lower[index] < found[-1][index] < upper[index] and self._proceed():
+            trial = np.clip(found[-1] + min(step, longest) * along, lower, upper)
+            looked = self._fit.refine(trial, _FOLLOW, held=(index,)).values
+            before, excess = excess, self._excess(self._fit.piece_costs(looked, _LOOK))
+            if excess > most:
+                # Costs are parabolas in the rough, and their differences scatter as values differ.
+                share = (most - before) / (excess - before)
+                return [*found, found[-1] + share * (looked - found[-1])]
+            found.append(looked)
+            step *= _GROWTH
+        return found
 
     def _describe(self, families: Sequence[_Family], J: Callable[[np.ndarray], float]) -> PoseSet:
         kinematics = self._kinematics
@@ -225,7 +271,7 @@ class RobustFamilies:
 
     def _joints(self, families: Sequence[_Family]) -> tuple[JointEstimate, ...]:
         """Each value over some families."""
-        kinematics, settings = self._kinematics, self._settings
+        kinematics, widest = self._kinematics, self._widest()
         # All in the turns nearest to the first one.
         seen = np.array(
             [kinematics.nearest_turns(family.values, families[0].values) for family in families]
@@ -236,8 +282,7 @@ class RobustFamilies:
         high = np.minimum(np.max([one.high for one in families] + turns, axis=0), upper)
         estimates = []
         for i, name in enumerate(kinematics.names):
-            widest = settings.widest_angle if kinematics.is_angle[i] else settings.widest_length
-            determined = bool(high[i] - low[i] <= 2.0 * widest)
+            determined = not self._broken and bool(high[i] - low[i] <= widest[i])
             estimates.append(
                 JointEstimate(
                     name,

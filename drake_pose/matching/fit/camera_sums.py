@@ -85,13 +85,20 @@ class EdgeKeeper(Protocol):
 
 
 def compare_placed(
-    packed: PackedOutlines, X_WN: Array, views: Views, weights: Array
+    packed: PackedOutlines,
+    X_WN: Array,
+    views: Views,
+    weights: Array,
+    pieces: Array | None = None,
+    side: float = 1.0,
 ) -> tuple[Array, Array, Array]:
-    """A, b and sums of each camera, as of `compare_contours`; weights: (c, 4) as there."""
+    """A, b and sums of each camera, as of `compare_contours`; the other arguments as there."""
     cameras, nodes = len(weights), len(X_WN)
+    pieces = np.zeros((cameras, 0, 0)) if pieces is None else pieces
     A, b = np.zeros((cameras, nodes, 12, 12)), np.zeros((cameras, nodes, 12))
     sums = np.zeros((cameras, nodes + 1, _SUMS))
-    compare_contours(packed, X_WN, views.cameras, views.evidence, weights, REACH, A, b, sums)
+    outputs = (A, b, sums, pieces, side)
+    compare_contours(packed, X_WN, views.cameras, views.evidence, weights, REACH, *outputs)
     return A, b, sums
 
 

@@ -36,6 +36,8 @@ Mask = NDArray[np.bool_]
 
 # Finer than this [pixel] silhouettes cannot tell.
 FINEST_SCALE, FINEST_SPACING = 1.5, 1.0
+# So many squares of a picture's rows and columns are told apart.
+_SQUARES = 64
 
 
 @dataclass(frozen=True)
@@ -259,6 +261,14 @@ class ContourFit:
         """A, b and sums of each camera, as of `compare_contours`, where the body stands."""
         weights = self.weights(views.cameras, placement, step)
         return compare_placed(placement.packed, placement.X_WN, views, weights)
+
+    def piece_costs(self, views: Views, theta: Array, step: Round, side: float) -> Array:
+        """(cameras, k, k) the cost at values (m,) by squares of the pictures of a side [pixel]."""
+        placement = self.body.place(theta)
+        weights = self.weights(views.cameras, placement, step)
+        pieces = np.zeros((len(weights), _SQUARES, _SQUARES))
+        compare_placed(placement.packed, placement.X_WN, views, weights, pieces, side)
+        return pieces
 
     def weights(self, cameras: tuple[Array, Array], placement: Placement, step: Round) -> Array:
         """(c, 4) of cameras, as `compare_contours` takes them."""

@@ -84,6 +84,8 @@ def compare_contours(
     A: Array,
     b: Array,
     sums: Array,
+    pieces: Array,
+    side: float,
 ) -> None:
     """Adds what each camera says of the nodes' affine motions.
 
@@ -103,6 +105,9 @@ def compare_contours(
             COMPARED, the length; FITTING, how much of it fits to within the scale; CLOSE, one minus
             the cost in squares of the scale, summed along it [all in units of length]; COST, and
             SQUARES of the distances, both as weighted in A and b; WEIGHT, of these.
+        pieces: (c, k, k) the COST by squares of the picture added to; beyond k squares they are
+            counted from 0 again. (c, 0, 0): it is not asked for.
+        side: of the squares [pixel].
     """
     uv, normals, lengths, starts = edges
     for c in range(len(weights)):
@@ -120,7 +125,8 @@ def compare_contours(
         contour = sample_contour(packed, segments, cameras[1][c], 0.0, weights[c, 2], True)
         edge = (uv[begin:end], normals[begin:end], lengths[begin:end])
         camera = (cameras[0][c], cameras[1][c])
-        _add_camera(contour, edge, X_WN, camera, weights[c], reach, A[c], b[c], sums[c])
+        add = (A[c], b[c], sums[c], pieces[c])
+        _add_camera(contour, edge, X_WN, camera, weights[c], reach, add, side)
 
 
 @compiled
@@ -131,11 +137,11 @@ def _add_camera(
     camera: tuple[Array, Array],
     weights: Array,
     reach: float,
-    A: Array,
-    b: Array,
-    sums: Array,
+    add: tuple[Array, Array, Array, Array],
+    side: float,
 ) -> None:
-    """compare_contours for one camera; contour: the arrays of ContourPoints."""
+    """compare_contours for one camera; contour: the arrays of ContourPoints; add: its outputs."""
+    A, b, sums, pieces = add
     unit, scale, _, worth = weights
     uv, normals, lengths, nodes, p_N, _ = contour
     edge_uv, edge_normals, edge_lengths = edge
@@ -148,8 +154,11 @@ def _add_camera(
         length = lengths[i] if pair < n else edge_lengths[j]
         counted = nodes[i] if pair < n else len(sums) - 1
         sums[counted, COMPARED] += length * unit
+        u, v = (uv[i, 0], uv[i, 1]) if pair < n else (edge_uv[j, 0], edge_uv[j, 1])
         if i < 0 or j < 0:
-            sums[counted, COST] += worth * length * scale * scale
+            cost = worth * length * scale * scale
+            sums[counted, COST] += cost
+            _add_piece(pieces, u / side, v / side, cost)
             continue
         n0, n1 = normals[i, 0] + edge_normals[j, 0], normals[i, 1] + edge_normals[j, 1]
         size = math.sqrt(n0 * n0 + n1 * n1)
@@ -159,7 +168,9 @@ def _add_camera(
         if t < 1.0:
             sums[counted, FITTING] += length * unit
         sums[counted, CLOSE] += length * unit / (1.0 + t)
-        sums[counted, COST] += worth * length * r * r / (1.0 + t)
+        cost = worth * length * r * r / (1.0 + t)
+        sums[counted, COST] += cost
+        _add_piece(pieces, u / side, v / side, cost)
         node = nodes[i]
         for k in range(3):
             p[k] = X_WN[node, k, 3]
@@ -178,6 +189,14 @@ def _add_camera(
             b[node, k] += share * r
             for c in range(k + 1):
                 A[node, k, c] += share * w[c]
+
+
+@compiled
+def _add_piece(pieces: Array, column: float, row: float, cost: float) -> None:
+    """Adds a cost to the square of a picture that it arises in."""
+    size = len(pieces)
+    if size > 0:
+        pieces[math.floor(row) % size, math.floor(column) % size] += cost
 
 
 @compiled

@@ -19,8 +19,8 @@ from drake_pose.matching.fit.contour_fit import (
     ContourFit,
     Noise,
     pack_views,
-    project,
 )
+from drake_pose.matching.fit.covariance import Distances, distances
 from drake_pose.matching.fit.evidence import find_edge_points
 from drake_pose.matching.fit.kernel import COST
 from drake_pose.matching.fit.levenberg_marquardt import Round, StepSettings
@@ -30,6 +30,10 @@ from drake_pose.silhouette import Outline
 _STEPS = StepSettings(longest=0.3, damping=1e-2, even_damping=1e-3)
 # From one point of a silhouette's edge to the next, as a share of its size.
 _EDGE_SPACING = 1.0 / 80.0
+# Errors of masks and cameras are about a pixel, or this share of the silhouettes' size.
+_ERROR_UNIT = 1.0 / 200.0
+# What is missing or too much is about as large, as a share of the silhouettes' size.
+_PIECE = 0.2
 
 
 @dataclass(frozen=True)
@@ -82,11 +86,18 @@ class ViewsFit:
         sums = self._fit.compare_views(self._views, values, step).sums
         return float(sums[..., COST].sum()) / self._scale(step) ** 2
 
-    def curvature(self, values: np.ndarray, step: Round) -> np.ndarray:
-        """(m, m) second derivatives of the cost where all that is near fits [pixel/rad^2]."""
+    def distances(self, values: np.ndarray, step: Round) -> Distances:
+        """What is left of the contours' distances at values (m,)."""
         self.evaluations += 1
         compared = self._fit.compare_views(self._views, values, step)
-        return 2.0 * project(compared, len(values))[0] / self._scale(step) ** 2
+        unit = max(1.0, _ERROR_UNIT * self.size)
+        return distances(self._fit, self._views, compared, unit)
+
+    def piece_costs(self, values: np.ndarray, step: Round) -> np.ndarray:
+        """What does not fit at values (m,), by pieces of the pictures that err on their own."""
+        self.evaluations += 1
+        side = max(1.0, _PIECE * self.size)
+        return self._fit.piece_costs(self._views, values, step, side) / self._scale(step) ** 2
 
     def refine(
         self, values: np.ndarray, rounds: Sequence[Round], held: Sequence[int] = ()

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from drake_pose.camera import Camera
 from drake_pose.matching.fit.contour_fit import Comparison, ContourFit
+from drake_pose.matching.fit.covariance import surface_deformations
 from drake_pose.matching.fit.evidence import EdgePoints
 from drake_pose.matching.fit.levenberg_marquardt import Round
 
@@ -147,7 +148,7 @@ def _parts(fit: ContourFit, compared: Comparison, A: Array) -> _Parts:
     """All parts, each free to shift, turn and stretch; A: (cameras, nodes, 12, 12), symmetric."""
     K = np.array(
         [
-            _deformations(outline.vertices, X_WN)
+            surface_deformations(outline.vertices, X_WN)
             for outline, X_WN in zip(fit.outlines, compared.placement.X_WN, strict=True)
         ]
     )
@@ -157,21 +158,6 @@ def _parts(fit: ContourFit, compared: Comparison, A: Array) -> _Parts:
     alone = (K / (information + _SURFACES[-1] ** -2)[:, None]) @ np.swapaxes(K, 1, 2)
     left = compared.b - np.einsum("cnij,njk,nk->cni", A, alone, b)
     return _Parts(whole, b, K, information, alone, left)
-
-
-def _deformations(vertices: Array, X_WN: Array) -> Array:
-    """(12, 12) affine motions, in columns, that each move a part's surface by about one metre."""
-    R = X_WN[:3, :3]
-    middle = vertices.mean(axis=0)
-    sizes = np.maximum(np.sqrt(((vertices - middle) ** 2).mean(axis=0)), 1e-3)
-    K = np.zeros((12, 12))
-    for i in range(3):
-        K[[3, 7, 11], i] = R[:, i]
-        for j in range(3):
-            M = np.outer(R[:, i], R[:, j]) / sizes[j]
-            v = -M @ (X_WN[:3, 3] + R @ middle)
-            K[:, 3 + 3 * i + j] = np.column_stack([M, v]).ravel()
-    return K
 
 
 def _with_surfaces(

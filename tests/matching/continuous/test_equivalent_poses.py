@@ -36,7 +36,7 @@ def kinematics(tmp_path_factory: pytest.TempPathFactory) -> TreeKinematics:
 
 def test_intervals_hold_the_truth_and_widen_with_the_damage(kinematics: TreeKinematics) -> None:
     tree = kinematics.tree
-    clean = [draw_view(tree, TRUTH, camera) for camera in arm_cameras()]
+    clean = [draw_view(tree, TRUTH, camera) for camera in arm_cameras(640, 480)]
     widths = []
     for views in (clean, damaged_views(tree, TRUTH, 1)):
         answer = find(kinematics, views, TRUTH)
@@ -47,16 +47,17 @@ def test_intervals_hold_the_truth_and_widen_with_the_damage(kinematics: TreeKine
         for joint, value in zip(family.joints, family.q, strict=True):
             assert joint.holds(value)
     assert np.all(np.array(widths[0]) < np.radians(10.0))
-    assert np.median(np.array(widths[1]) / widths[0]) > 1.2
+    # A pixel of error in every camera is assumed where nothing is damaged, too.
+    assert np.median(np.array(widths[1]) / widths[0]) > 1.03
 
 
 def test_flips_are_families_of_their_own(kinematics: TreeKinematics) -> None:
-    """With a tolerance of everything, all that flips make is as good; nothing is determined."""
+    """Where nothing is significant, all that flips make is as good; nothing is determined."""
     tree = kinematics.tree
     views = [draw_view(tree, TRUTH, camera) for camera in arm_cameras()]
-    answer = find(kinematics, views, TRUTH, tolerance=1e6, families=5)
+    answer = find(kinematics, views, TRUTH, significance=1e6, families=5)
     assert not any(answer.determined)
-    answer = find(kinematics, damaged_views(tree, TRUTH, 1), TRUTH, tolerance=0.6)
+    answer = find(kinematics, damaged_views(tree, TRUTH, 1), TRUTH)
     flipped = [flip.values for flip in flips(kinematics, answer.families[0].q)]
     for family in answer.families[1:]:
         gaps = [np.abs(family.q - values).max() for values in flipped]
@@ -102,7 +103,7 @@ def test_time_that_is_up_leaves_the_intervals_of_the_curvature(kinematics: TreeK
 
 @pytest.mark.parametrize(
     "name",
-    ["tolerance", "widest_angle", "widest_length", "moved_angle", "moved_length", "families"],
+    ["significance", "widest_angle", "widest_length", "moved_angle", "moved_length", "families"],
 )
 def test_settings_out_of_range(name: str) -> None:
     with pytest.raises(SettingsError, match=name):

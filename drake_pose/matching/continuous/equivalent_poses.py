@@ -18,6 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import stdtrit
 
 from drake_pose.errors import SettingsError
 from drake_pose.matching.fit.covariance import ErrorSizes, estimate_sizes, values_covariance
@@ -37,8 +38,10 @@ _LONGEST_STEPS = 0.5, 0.1
 _GROWTH = 1.6
 # The first step is this share of what the covariance allows.
 _FIRST_STEP = 0.5
-# Of a normal distribution, 95 % lie within so many standard deviations.
-_NORMAL_95 = 1.96
+# As often shall a value lie below the upper end of its interval, and above the lower one.
+_ONE_SIDED = 0.975
+# How large errors are is told by the motions of each camera.
+_CAMERA_MOTIONS = 6
 # A fit of which most does not fit can be wrong altogether: no robust estimate outlives that.
 _BREAKDOWN = 0.5
 _ROUNDING = 1e-9
@@ -209,7 +212,8 @@ class RobustFamilies:
             self._sizes = estimate_sizes(seen, kinematics.is_angle)
         covariance = values_covariance(seen, self._sizes, free, kinematics.is_angle)
         low, high = values.copy(), values.copy()
-        widths = _NORMAL_95 * np.sqrt(np.diag(covariance))
+        freedom = _CAMERA_MOTIONS * self._fit.camera_count
+        widths = stdtrit(freedom, _ONE_SIDED) * np.sqrt(np.diag(covariance))
         low[free], high[free] = values[free] - widths, values[free] + widths
         angles = kinematics.is_angle[free]
         wide = widths > np.where(angles, self._settings.moved_angle, self._settings.moved_length)

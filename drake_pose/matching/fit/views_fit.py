@@ -55,6 +55,7 @@ class ViewsFit:
     Attributes:
         kinematics: the pose tree's.
         size: the root of the silhouettes' mean area [pixel], the unit of length of all rounds.
+        camera_count: how many cameras see it.
         edge_length: the length of the silhouettes' edges [pixel].
         evaluations: how often contours were compared.
 
@@ -78,6 +79,7 @@ class ViewsFit:
             [find_edge_points(view.mask, spacing) for view in views],
         )
         self.edge_length = max(1.0, float(self._views.evidence.lengths.sum()))
+        self.camera_count = len(views)
         self.evaluations = 0
 
     def cost(self, values: np.ndarray, step: Round) -> float:

@@ -2,7 +2,8 @@
 
 Run as ``python -m drake_pose.apps.benchmarks.cluster``. A batch of stills and a live capture of a
 simulated person are done by this process, one worker and two; bytes are counted, milliseconds are
-the processor's own, so that a busy machine changes little but the frames a second.
+the processor's own, so that a busy machine changes little but the frames a second. What a hundred
+cameras cost the process in the middle is measured with simulated views.
 """
 
 from __future__ import annotations
@@ -24,6 +25,12 @@ from rich.table import Table
 from drake_pose.apps.batch.batch import run_batch
 from drake_pose.apps.batch.job import SceneJob
 from drake_pose.apps.batch.workers import ClusterPool
+from drake_pose.apps.benchmarks.centre import (
+    CentreFigures,
+    SimulatedViews,
+    measure_centre,
+    measure_polls,
+)
 from drake_pose.apps.cluster.remote_views import ClusterSensors
 from drake_pose.apps.cluster.scheduler import open_cluster
 from drake_pose.apps.experiments.date.motion import make_motion
@@ -48,6 +55,8 @@ _CAMERAS, _SIZE, _RATE_HZ = 8, (640, 480), 30.0
 # How many frames of Date's motions, which take twelve seconds in all.
 _FRAMES, _MOTION_FRAMES = 60, 360
 _FAR_AWAY = -9.0
+# The centre is measured with so many cameras, ten a worker; and with fewer, four a worker.
+_CENTRE, _GROUPS, _FEW, _LEAST_GROUP = 100, 10, 40, 4
 _GIGA = 1e9
 
 
@@ -233,29 +242,61 @@ def live_table(found: list[LiveFigures]) -> Table:
     return table
 
 
-def needs_table(batch: BatchFigures, few: LiveFigures, many: LiveFigures) -> Table:
+def measure_centres(views: SimulatedViews) -> list[CentreFigures]:
+    """What following a person by simulated views costs the centre: alone, then with groups."""
+    few = views.fewer(_FEW)
+    return [
+        *(measure_centre(few, groups) for groups in (0, _FEW // _LEAST_GROUP)),
+        *(measure_centre(views, groups) for groups in (0, _CENTRE // _LEAST_GROUP, _GROUPS)),
+    ]
+
+
+def centre_table(found: list[CentreFigures]) -> Table:
+    """What following costs the centre, and how far its answer is from that of one process."""
+    table = Table(title="The process in the middle, which follows by workers' sums")
+    for heading in ("cameras", "a worker", "centre, a frame", "off one process"):
+        table.add_column(heading, justify="right")
+    for one in found:
+        alone = next(own for own in found if own.cameras == one.cameras and not own.groups)
+        table.add_row(
+            str(one.cameras),
+            f"{one.cameras // one.groups}" if one.groups else "none",
+            f"{1e3 * one.seconds:.1f} ms",
+            f"{np.abs(one.q - alone.q).max():.0e}" if one.groups else "",
+        )
+    return table
+
+
+def needs_table(
+    batch: BatchFigures, live: LiveFigures, centre: CentreFigures, polls: float
+) -> Table:
     """What 100 cameras at 30 Hz and ten million frames would need.
 
     Args:
         batch: this process's.
-        few, many: the same capture by two workers with fewer and with more cameras.
+        live: a capture by two workers.
+        centre: following by 100 cameras in groups.
+        polls: what asking all workers once for their views costs the centre [s].
     """
-    slope = (many.centre_seconds - few.centre_seconds) / (many.cameras - few.cameras)
-    hundred = many.centre_seconds + slope * (100 - many.cameras)
-    per_second = 100 * _RATE_HZ
+    hundred = centre.seconds + polls
+    per_second = centre.cameras * _RATE_HZ
+    # A sum goes and comes once for each worker and round.
+    sums = centre.groups * _RATE_HZ * centre.sum_bytes
     table = Table(title="What more would need")
     table.add_column("for")
     table.add_column("needs")
     picture = 3 * _SIZE[0] * _SIZE[1]
     rows = (
-        ("one view", f"{1e3 * many.view_seconds:.2f} ms, {many.view_bytes:.0f} bytes "
+        ("one view", f"{1e3 * live.view_seconds:.2f} ms, {live.view_bytes:.0f} bytes "
                      f"(its picture: {picture})"),
-        ("100 cameras at 30 Hz: workers", f"{per_second * many.view_seconds:.1f} cores"),
+        ("100 cameras at 30 Hz: workers", f"{per_second * live.view_seconds:.1f} cores"),
         ("100 cameras at 30 Hz: network",
-         f"{8e-6 * per_second * many.view_bytes:.0f} Mbit/s (pictures: "
-         f"{8e-6 * per_second * picture:.0f})"),
+         f"{8e-6 * per_second * live.view_bytes:.0f} Mbit/s of views, {8e-6 * sums:.0f} of sums "
+         f"(pictures: {8e-6 * per_second * picture:.0f})"),
         ("100 cameras at 30 Hz: centre",
-         f"{1e3 * hundred:.1f} ms a frame = {_RATE_HZ * hundred:.1f} cores, of which it can use 1"),
+         f"{1e3 * hundred:.1f} ms a frame = {_RATE_HZ * hundred:.2f} cores, of which it can use 1: "
+         f"{1e3 * centre.seconds:.1f} to follow, {1e3 * polls:.1f} for the views of "
+         f"{centre.groups} workers"),
         ("ten million stills", f"{1e7 * batch.processor_seconds / batch.frames / 3600:.0f} core "
                                f"hours, {1e7 * batch.bytes_a_frame / _GIGA:.0f} GB"),
     )  # fmt: skip
@@ -292,8 +333,10 @@ def main() -> None:
         console.print(batch_table(batch))
         live = [measure_live(scene, workers, client) for workers, client in clients.items()]
         console.print(live_table(live))
-        few = measure_live(fewer_cameras(scene, 4), 2, clients[2])
-        console.print(needs_table(batch[0], few, live[2]))
+    centres = measure_centres(SimulatedViews(_CENTRE))
+    console.print(centre_table(centres))
+    polls = measure_polls(_GROUPS, _CENTRE, live[2].view_bytes)
+    console.print(needs_table(batch[0], live[2], centres[-1], polls))
 
 
 if __name__ == "__main__":

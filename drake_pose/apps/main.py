@@ -38,6 +38,7 @@ from drake_pose.apps.commands.estimate_options import (
     TimeLimitOption,
     TrackOption,
     TruthOption,
+    UnseenOption,
 )
 from drake_pose.apps.commands.kameda import kameda
 from drake_pose.apps.commands.live import empty_room
@@ -107,6 +108,7 @@ def estimate(
     camera: CameraOption = None,
     frame: FrameOption = None,
     hold: HoldOption = None,
+    unseen: UnseenOption = None,
     truth: TruthOption = None,
     root: RootOption = None,
     root_position: RootPositionOption = None,
@@ -142,6 +144,7 @@ def estimate(
             run_limit=run_limit,
             time_limit=time_limit,
             hold=parse_assignments(hold or (), "--hold"),
+            unseen=tuple(unseen or ()),
             method=method,
             angles=angles,
             track=track,

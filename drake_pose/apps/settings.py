@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
@@ -15,7 +15,7 @@ ANGLES = ("continuous", "grid")
 # What a search for the pose heeds, and one who is followed by all silhouettes at once does not.
 _OF_THE_SEARCH = (
     "root", "root_position", "root_rotation", "interval", "length_interval", "joint_intervals",
-    "outside_limit", "candidates", "run_limit", "time_limit", "hold", "angles",
+    "outside_limit", "candidates", "run_limit", "time_limit", "hold", "unseen", "angles",
 )  # fmt: skip
 RootTurns = Literal["fixed", "free"] | Mapping[Axis, tuple[float, float]]
 
@@ -45,6 +45,8 @@ class EstimateSettings:
         time_limit: after this time [s] the search of a frame returns its best pose; None: no
             limit. Of the method ``beam`` alone.
         hold: positions that are known, by name [deg or m].
+        unseen: links that are not in the pictures, such as the forearm of a hand cut off at the
+            wrist; their joints are held.
         method: ``beam``: many hypotheses side by side; ``paper``: the search as it was published;
             ``person``: one person is followed by the silhouettes of several cameras at once;
             ``auto``: ``person`` where model and scene allow it and no setting concerns a search,
@@ -72,6 +74,7 @@ class EstimateSettings:
     run_limit: int = 10_000
     time_limit: float | None = None
     hold: Mapping[str, float] = field(default_factory=dict)
+    unseen: Sequence[str] = ()
     method: str = "auto"
     angles: str = "continuous"
     track: bool = True

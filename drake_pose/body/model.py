@@ -1,7 +1,7 @@
 """The articulated model: what a file says about links, joints, limits and looks, read once."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -9,13 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import BodyIndex
+from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex
 
 from drake_pose.body.files.parsing import ModelSource, limit_kinds
 from drake_pose.body.files.safety import check_in_child
+from drake_pose.body.files.urdf_shape import Factors, stretched, without_visuals
 from drake_pose.body.limits import describe_positions
 from drake_pose.body.parsed_model import ParsedModel, link_names
-from drake_pose.body.surfaces.skin_file import load_skin
+from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.body.surfaces.skin_file import SkinBand, load_skin
 from drake_pose.body.surfaces.visual_geometry import body_mesh, make_drawable
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.root import RootRotation
@@ -54,6 +56,68 @@ class ArticulatedModel(ParsedModel):
         """
         return build_pose_tree(self, root, root_position, root_rotation, held)
 
+    def without(self, links: Collection[str]) -> "ArticulatedModel":
+        """The same without the looks of some links, and the skin between them and others.
+
+        Raises:
+            UnknownNameError: no link has that name.
+            ModelError: the file is no URDF, or nothing would be seen.
+        """
+        for name in links:
+            self.link_index(name)
+        skin = [band for band in self.skin if not {band.parent, band.child} & set(links)]
+        return self._changed(without_visuals(self._urdf_text(), links), skin)
+
+    def stretched(self, factors: Factors) -> "ArticulatedModel":
+        """The same with some links longer or wider; positions mean what they did.
+
+        Args:
+            factors: for links by name, so many times (3,) their size along their frame's axes.
+
+        Raises:
+            UnknownNameError: no link has that name.
+            ModelError: the file is no URDF.
+        """
+        for name in factors:
+            self.link_index(name)
+        # A band grows with the link in whose frame it is.
+        skin = [
+            replace(
+                band,
+                mesh=TriangleMesh(
+                    band.mesh.vertices * factors.get(band.child, (1.0, 1.0, 1.0)),
+                    band.mesh.triangles,
+                ),
+            )
+            for band in self.skin
+        ]
+        return self._changed(stretched(self._urdf_text(), factors), skin)
+
+    @property
+    def changes_shape(self) -> bool:
+        """Whether ``without`` and ``stretched`` can change it: whether it is a URDF."""
+        return self._source.kind == "urdf"
+
+    def _urdf_text(self) -> str:
+        """What Drake reads in the file's place."""
+        if not self.changes_shape:
+            raise ModelError(f"{self.path}: only the shape of a URDF model can be changed")
+        return self._source.text
+
+    def _changed(self, text: str, skin: Sequence[SkinBand]) -> "ArticulatedModel":
+        """The same read from another text."""
+        source = replace(self._source, text=text)
+        plant, scene_graph, _, _ = _parse(self.path, source)
+        plant.Finalize()
+        return replace(
+            self,
+            plant=plant,
+            scene_graph=scene_graph,
+            link_meshes=MappingProxyType(_seen_meshes(self.path, plant, scene_graph)),
+            skin=tuple(skin),
+            _source=source,
+        )
+
 
 def load_model(
     path: Path | str,
@@ -91,29 +155,14 @@ def read_model(
 ) -> ArticulatedModel:
     """As load_model, in this process and without the check."""
     source = ModelSource.open(path, packages)
-    plant = MultibodyPlant(time_step=0.0)
-    scene_graph = SceneGraph()
-    plant.RegisterAsSourceForSceneGraph(scene_graph)
-    instances, warnings = source.parse(plant, scene_graph)
-    if not instances:
-        raise ModelError(f"{path} holds no model")
+    plant, scene_graph, instances, warnings = _parse(path, source)
     try:
-        make_drawable(plant, scene_graph, instances)
         plant.Finalize()
         positions = describe_positions(plant, {**source.limits, **limits}, str(path))
-        meshes = {
-            name: body_mesh(plant, scene_graph, plant.get_body(BodyIndex(index)))
-            for index, name in enumerate(link_names(plant))
-        }
     # Drake ends the process, which Python sees as SystemExit, at some values.
     except (ModelError, RuntimeError, SystemExit) as error:
         raise ModelError(f"{path}: {error}") from error
-    meshes = {name: mesh for name, mesh in meshes.items() if not mesh.is_empty}
-    if not meshes:
-        raise ModelError(
-            f"{path} has no visual geometry: nothing would be seen; give its links <visual> "
-            "elements (MJCF: geoms of a group below 3)"
-        )
+    meshes = _seen_meshes(path, plant, scene_graph)
     return ArticulatedModel(
         path=path,
         name=plant.GetModelInstanceName(instances[0]),
@@ -131,3 +180,42 @@ def read_model(
         warnings=tuple(limit_kinds([*warnings, *positions.warnings])),
         _source=source,
     )
+
+
+def _parse(
+    path: Path, source: ModelSource
+) -> tuple[MultibodyPlant, SceneGraph, list[ModelInstanceIndex], list[str]]:
+    """A plant of a model that is not finalized, its SceneGraph, instances, and warnings."""
+    plant = MultibodyPlant(time_step=0.0)
+    scene_graph = SceneGraph()
+    plant.RegisterAsSourceForSceneGraph(scene_graph)
+    instances, warnings = source.parse(plant, scene_graph)
+    if not instances:
+        raise ModelError(f"{path} holds no model")
+    try:
+        make_drawable(plant, scene_graph, instances)
+    # Drake ends the process, which Python sees as SystemExit, at some values.
+    except (ModelError, RuntimeError, SystemExit) as error:
+        raise ModelError(f"{path}: {error}") from error
+    return plant, scene_graph, instances, warnings
+
+
+def _seen_meshes(
+    path: Path, plant: MultibodyPlant, scene_graph: SceneGraph
+) -> dict[str, TriangleMesh]:
+    """The visual geometry of each link that has some."""
+    try:
+        meshes = {
+            name: body_mesh(plant, scene_graph, plant.get_body(BodyIndex(index)))
+            for index, name in enumerate(link_names(plant))
+        }
+    # Drake ends the process, which Python sees as SystemExit, at some values.
+    except (ModelError, RuntimeError, SystemExit) as error:
+        raise ModelError(f"{path}: {error}") from error
+    meshes = {name: mesh for name, mesh in meshes.items() if not mesh.is_empty}
+    if not meshes:
+        raise ModelError(
+            f"{path} has no visual geometry: nothing would be seen; give its links <visual> "
+            "elements (MJCF: geoms of a group below 3)"
+        )
+    return meshes

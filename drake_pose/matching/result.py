@@ -139,6 +139,21 @@ class MatchResult:
         return bool(self.found and self.E_total < UNEXPLAINED)
 
 
+@dataclass(frozen=True)
+class PlacedMatch(MatchResult):
+    """The pose that a search found with a root position or a scale that was not known.
+
+    Args:
+        root_position: (3,) the root's origin in the world [m]; of a parallel camera's single
+            picture the part along its axis is arbitrary.
+        scale: a parallel camera has so many times the pixels a metre that it was given with, and
+            the body its own size; 1 where the scale was known.
+    """
+
+    root_position: np.ndarray | None = None
+    scale: float = 1.0
+
+
 def _turned_positions(q: np.ndarray, tree: PoseTree, turns: Sequence[np.ndarray]) -> np.ndarray:
     turned = np.array(q)
     for node, added in zip(tree.nodes, turns, strict=True):

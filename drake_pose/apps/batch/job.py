@@ -203,6 +203,7 @@ SETTINGS: dict[str, Callable[[Any, str, Path], Any]] = {
     "run_limit": _whole,
     "time_limit": _number,
     "hold": _numbers,
+    "unseen": _texts,
     "method": _text,
     "angles": _text,
     "track": _yes_or_no,

@@ -62,6 +62,15 @@ HoldOption = Annotated[
         rich_help_panel=_MATCHED,
     ),
 ]
+UnseenOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="LINK",
+        help="This link is not in the pictures, as the forearm of a hand cut off; repeat for "
+        "several. Its joints are held. URDF models alone.",
+        rich_help_panel=_MATCHED,
+    ),
+]
 TruthOption = Annotated[
     Path | None,
     typer.Option(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -88,6 +88,8 @@ def read_inputs(
     cameras = select_cameras(scene, settings.cameras)
     frames = select_seen_frames(scene, cameras, settings.frames)
     model = load_model(model_path, package_paths=settings.packages)
+    if settings.unseen:
+        model, settings = leave_out_links(model, settings)
     truth = _read_truth(scene_path, truth_path, model)
     if follows_person(scene, cameras, model, settings):
         texts = (*texts_of(*checked.warnings, *check_upright(cameras)), *model.warnings)
@@ -104,14 +106,40 @@ def read_inputs(
         position = root_positions[frames[0]]
     else:
         position = np.array(settings.root_position)
+    search: PoseSearch
     if anywhere or scene.scale_unknown:
-        search = _make_placement_search(model, settings, position, scene.scale_unknown)
+        search = make_placement_search(model, settings, position, scene.scale_unknown)
     else:
         search = _make_search(_make_tree(model, settings, position), settings, model)
     read = _check_pictures(scene, cameras, frames, search)
     of_model = model_warnings(model, search.tree, settings.hold)
     texts = (*texts_of(*checked.warnings, *read.warnings), *of_model)
     return Inputs(read.scene, model, cameras, frames, search, root_positions, truth, texts)
+
+
+def leave_out_links(
+    model: ArticulatedModel, settings: EstimateSettings
+) -> tuple[ArticulatedModel, EstimateSettings]:
+    """The model without the links that are not in the pictures, their joints held.
+
+    Raises:
+        ModelError: the model is no URDF, or nothing would be seen.
+        UnknownNameError: there is no such link.
+    """
+    whole = model.pose_tree()
+    centre = model.pose_tree(
+        hub(whole), root_position=np.zeros(3), root_rotation=RootRotation.free()
+    )
+    names = [
+        name for node in centre.nodes if node.name in settings.unseen for name in node.value_names
+    ]
+    kinds = dict(zip(model.position_names, model.position_kinds, strict=True))
+    held = {
+        name: math.degrees(value) if kinds[name] == "angle" else value
+        for name in names
+        for value in [float(model.default_positions[model.position_index(name)])]
+    }
+    return model.without(settings.unseen), replace(settings, hold={**held, **settings.hold})
 
 
 def select_cameras(scene: Scene, wanted: Sequence[str]) -> tuple[Camera, ...]:
@@ -235,12 +263,12 @@ def _make_search(tree: PoseTree, settings: EstimateSettings, model: ArticulatedM
     return PaperSearch(tree, paper)
 
 
-def _make_placement_search(
+def make_placement_search(
     model: ArticulatedModel,
     settings: EstimateSettings,
     position: np.ndarray | None,
     scale_unknown: bool,
-) -> PoseSearch:
+) -> RootPlacementSearch:
     """The search for a root that can be anywhere.
 
     Where the model's own joints turn its root in all ways, the tree begins at the node with the

@@ -43,7 +43,7 @@ USUAL_RATE_HZ = 30.0
 """Frames a second of a sequence that does not say."""
 
 # What a method says of a whole recording, in summary.json.
-_OF_THE_METHOD = ("lengths_m", "girths")
+_OF_THE_METHOD = ("lengths_m", "girths", "unseen", "proportions", "body_fit_seconds")
 
 OnFrame = Callable[[int, int, str, "FrameRecord | None"], None]
 """Called with the number of finished frames, that of all frames, and a finished frame's name and

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
+from drake_pose.apps.estimate.body_fit import fit_body
 from drake_pose.apps.estimate.fit_checks import find_contradiction
 from drake_pose.apps.estimate.inputs import Inputs, read_inputs
 from drake_pose.apps.estimate.mask_agreement import compare_masks
@@ -22,8 +23,7 @@ from drake_pose.apps.results.summary import FrameRecord, check_same_job, describ
 from drake_pose.apps.settings import EstimateSettings
 from drake_pose.camera import Camera, ParallelCamera
 from drake_pose.errors import SettingsError
-from drake_pose.matching import MatchResult, MultiStartSearch, PoseSearch, View
-from drake_pose.matching.continuous.root_placement_search import PlacedMatch
+from drake_pose.matching import MatchResult, MultiStartSearch, PlacedMatch, PoseSearch, View
 from drake_pose.matching.starts.root_placement import scale_camera
 from drake_pose.silhouette import LabelRenderer
 from drake_pose.systems.estimators.diagrams import build_recorded_matching
@@ -66,18 +66,18 @@ def estimate_scene(
     Raises:
         DrakePoseError: names the file, camera, frame, link or joint at fault.
     """
-    settings = settings or EstimateSettings()
-    folder_path = None if out is None else Path(out)
+    settings, folder_path = settings or EstimateSettings(), None if out is None else Path(out)
     recorded = _recorded_summary(folder_path, resume)
     inputs = read_inputs(Path(scene), Path(model), settings, None if truth is None else Path(truth))
     job = describe_job(Path(scene), Path(model), settings)
     if recorded is not None and folder_path is not None:
         check_same_job(job, recorded, folder_path)
+    inputs, of_body = fit_body(inputs, settings, on_stage)
     search = inputs.search
     with_base = search is not None and _base_moves(search)
     result = ResultWriter(inputs, job, folder_path, recorded, with_base)
     by_search = "paper" if settings.method == "paper" else "beam"
-    result.more["method"] = "person" if search is None else by_search
+    result.more = result.more | {"method": "person" if search is None else by_search} | of_body
     result.open()
     try:
         if search is not None:
@@ -208,11 +208,12 @@ class _Matching:
     def _renderer(self, camera: Camera, match: MatchResult) -> LabelRenderer:
         """Draws the body in a camera, whose scale may have been found."""
         scale = match.scale if isinstance(match, PlacedMatch) else 1.0
-        if scale != 1.0 and isinstance(camera, ParallelCamera):
-            return LabelRenderer(self._inputs.model, scale_camera(camera, scale))
         if camera.name not in self._renderers:
             self._renderers[camera.name] = LabelRenderer(self._inputs.model, camera)
-        return self._renderers[camera.name]
+        renderer = self._renderers[camera.name]
+        if isinstance(camera, ParallelCamera):
+            renderer.camera = scale_camera(camera, scale)
+        return renderer
 
     def _camera_scale(self, frame: str, match: MatchResult) -> float | None:
         """Pixels a metre of the frame's camera, where they were not known."""

@@ -1,5 +1,6 @@
 """The plant's base: which base positions, or which pose of the plant, put the root where it is."""
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -35,6 +36,7 @@ class BasePose:
         body: the plant's body of that node.
         positions: the base positions in q that are solved for.
         maps: for "joints", the base joints from the world outwards.
+        chain: for "joints", their positions in q; those that are not solved for are held.
         joint: for "floating", the joint's index.
     """
 
@@ -44,6 +46,7 @@ class BasePose:
     body: int = 0
     positions: tuple[int, ...] = ()
     maps: tuple[JointMap, ...] = ()
+    chain: tuple[int, ...] = ()
     joint: int = -1
 
     def solve(
@@ -95,11 +98,18 @@ class BasePose:
         middle = np.mean(one_turn(lower, upper, model.default_positions[index]), axis=0)
         turns = np.array([model.position_kinds[i] == "angle" for i in index])
 
+        solved = np.isin(self.chain, index)
+
+        def completed(values: NDArray[np.float64]) -> NDArray[np.float64]:
+            every = q[list(self.chain)]
+            every[solved] = values
+            return every
+
         def residual(values: NDArray[np.float64]) -> NDArray[np.float64]:
-            return (chain_pose(self.maps, values) - X_WA)[:3].reshape(12)
+            return (chain_pose(self.maps, completed(values)) - X_WA)[:3].reshape(12)
 
         def jacobian(values: NDArray[np.float64]) -> NDArray[np.float64]:
-            return chain_jacobian(self.maps, values)
+            return chain_jacobian(self.maps, completed(values))[:, solved]
 
         random = np.random.default_rng(0)
         starts = [q[index]] + [
@@ -152,7 +162,11 @@ def _chain_poses(maps: tuple[JointMap, ...], values: NDArray[Any]) -> NDArray[An
 
 
 def base_of_chain(
-    model: ParsedModel, graph: LinkGraph, chain: list[JointEdge], node: int
+    model: ParsedModel,
+    graph: LinkGraph,
+    chain: list[JointEdge],
+    node: int,
+    held: Collection[int] = (),
 ) -> BasePose:
     """How the joints from the world to a node can take up the node's pose.
 
@@ -161,6 +175,7 @@ def base_of_chain(
         graph: its links and joints.
         chain: the edges from the world outwards to the anchor group.
         node: the tree's node of the anchor group.
+        held: positions that stay as they are, if the others suffice.
     """
     body = graph.groups[chain[-1].outer].body if chain else graph.groups[0].body
     floating = [edge for edge in chain if edge.joint_map is None]
@@ -172,8 +187,16 @@ def base_of_chain(
     positions = tuple(position for edge in chain for position in edge.positions)
     maps = tuple(edge.joint_map for edge in chain if edge.joint_map is not None)
     values = model.default_positions[list(positions)] + 0.1
-    if len(positions) <= 12 and np.linalg.matrix_rank(chain_jacobian(maps, values), tol=1e-5) >= 6:
-        return BasePose("joints", node=node, body=body, positions=positions, maps=maps)
+    if len(positions) <= 12:
+        slopes = chain_jacobian(maps, values)
+        for solved in (~np.isin(positions, list(held)), np.ones(len(positions), dtype=np.bool_)):
+            if np.linalg.matrix_rank(slopes[:, solved], tol=1e-5) >= 6:
+                taken = tuple(
+                    p for p, is_solved in zip(positions, solved, strict=True) if is_solved
+                )
+                return BasePose(
+                    "joints", node=node, body=body, positions=taken, maps=maps, chain=positions
+                )
     return BasePose("placed", node=node, body=body)
 
 

@@ -110,6 +110,12 @@ class PoseTree:
         """How the values of each node place it."""
         return self._placements
 
+    @property
+    def turns_root_freely(self) -> bool:
+        """Whether the first root is turned by a rotation vector, in all ways."""
+        rotation = self._placements[0].rotation
+        return rotation is not None and rotation.kind == "free"
+
     def with_root_position(self, root_position: NDArray[np.float64]) -> "PoseTree":
         """The same tree with the root's origin at another known position (3,) [m].
 
@@ -288,13 +294,40 @@ class PoseTree:
         Raises:
             ModelError: the base joints cannot be solved for.
         """
+        return self._base.solve(self.model, self._completed(values), self.node_poses(values))
+
+    def positions_with_root_at(
+        self,
+        values: Sequence[NDArray[np.float64]],
+        root_position: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """As positions_from of the tree whose root's origin is at (3,) [m], which is not built.
+
+        Raises:
+            SettingsError: a tree that cannot be moved.
+            ModelError: the base joints cannot be solved for.
+        """
+        if self._base.kind == "constant":
+            return self.with_root_position(root_position).positions_from(values)
+        X_WN = self.node_poses(values)
+        shift = root_position - X_WN[0, :3, 3]
+        for index in range(len(self.nodes)):
+            top = index
+            while self.nodes[top].parent >= 0:
+                top = self.nodes[top].parent
+            if top == 0:
+                X_WN[index, :3, 3] += shift
+        return self._base.solve(self.model, self._completed(values), X_WN)
+
+    def _completed(self, values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+        """The plant's positions (nq,) as far as the values and what is held tell them."""
         q = np.array(self.model.default_positions)
         for index, value in self.held.items():
             q[index] = value
         for node, node_values in zip(self.nodes, values, strict=True):
             if node.positions:
                 q[list(node.positions)] = node_values
-        return self._base.solve(self.model, q, self.node_poses(values))
+        return q
 
     def values_from_positions(
         self, q: NDArray[np.float64], X_WB: NDArray[np.float64] | None = None

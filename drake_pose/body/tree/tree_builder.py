@@ -299,7 +299,7 @@ def _turned_over(
         base = BasePose("world_node", node=groups.index(0), body=graph.groups[0].body)
     else:
         chain = _chain_from_world(graph, set(groups))
-        base = base_of_chain(model, graph, chain, groups.index(chain[-1].outer))
+        base = base_of_chain(model, graph, chain, groups.index(chain[-1].outer), held)
         if any(edge.joint_map is None for edge in chain):
             branches, roots = _with_world(model, graph, branches, roots)
     taken = [model.position_names[index] for index in base.positions if index in held]

@@ -11,10 +11,16 @@ from numpy.typing import NDArray
 from drake_pose.body import PoseTree
 from drake_pose.body.tree.link_graph import PlantKinematics
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.camera import Camera
+from drake_pose.camera import Camera, ParallelCamera
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.filtering.state import Belief, StateLayout
-from drake_pose.filtering.truncation.inequalities import Inequalities, from_bounds, say_if_unlimited
+from drake_pose.filtering.truncation.couplings import couplings_file, load_couplings
+from drake_pose.filtering.truncation.inequalities import (
+    Inequalities,
+    from_bounds,
+    say_if_unlimited,
+    stack,
+)
 from drake_pose.matching.fit.camera_sums import REACH, Views
 from drake_pose.matching.fit.contour_fit import (
     Comparison,
@@ -27,8 +33,11 @@ from drake_pose.matching.fit.evidence import NO_EDGE, find_edge_points
 from drake_pose.matching.fit.kernel import COMPARED, FITTING, SQUARES, WEIGHT
 from drake_pose.matching.fit.levenberg_marquardt import Round
 from drake_pose.matching.fit.parameters import BodyParameters
-from drake_pose.matching.fit.surfaces import MANY, few_triangles
-from drake_pose.silhouette import Outline, TreeSurfaces, draw_mask
+from drake_pose.matching.fit.surfaces import MANY, few_rigid_triangles
+from drake_pose.matching.starts.root_placement import slide_root
+from drake_pose.silhouette import TreeSurfaces
+from drake_pose.silhouette.areas.bending import PackedSurfaces
+from drake_pose.silhouette.areas.scoring import draw_packed
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -36,10 +45,17 @@ Mask = NDArray[np.bool_]
 ROOT_SHIFT = ("root_shift_x", "root_shift_y", "root_shift_z")
 """Where the root is in the world, beside where its tree holds it [m]."""
 
+GROWTH = "log_growth"
+"""The logarithm of how much larger the body is seen than a parallel camera's scale says."""
+
+_ROOT = (*ROOT_SHIFT, GROWTH)
+
 # Geman and McClure's weight has half its influence at about this many deviations.
 _ROBUST_WIDTH = 2.5
 # A pixel of contour has weight one.
 _PLAIN = Noise(deviation=1.0, correlation=0.5)
+# So many triangles show a rigid part beside bands of skin to a fraction of a pixel.
+_WITH_SKIN = 160
 # Directions about which so small a share of the most is told are not told about.
 _NOTHING = 1e-12
 
@@ -119,15 +135,19 @@ class ContourObservation:
         tree: the body's pose tree.
         cameras: the calibrated cameras.
         moves: whether the root may be elsewhere than where the tree holds it.
+        grows: whether the scale of the one parallel camera is unknown.
         constant: names of values that never change, such as shape joints.
         settings: how the contour is measured.
+        rest: each measurement also says, with so much weight, that joints are about the middle of
+            their limits, as evenly spread as these are wide; 0: nothing is said.
 
     Attributes:
-        layout: the state: the tree's values that are free to move, then ROOT_SHIFT, their rates,
-            and the constants.
+        layout: the state: the tree's values that are free to move, then ROOT_SHIFT and GROWTH,
+            their rates, and the constants.
 
     Raises:
-        SettingsError: no camera; or the tree has no value to estimate.
+        SettingsError: no camera; the tree has no value to estimate; or a scale is unknown and there
+            is not one parallel camera.
         UnknownNameError: a constant is no value of the tree.
     """
 
@@ -136,54 +156,84 @@ class ContourObservation:
         tree: PoseTree,
         cameras: Sequence[Camera],
         moves: bool = False,
+        grows: bool = False,
         constant: Sequence[str] = (),
         settings: ContourSettings | None = None,
+        rest: float = 0.0,
     ) -> None:
         if not cameras:
             raise SettingsError("a contour needs one camera or more")
+        if grows and (len(cameras) != 1 or not isinstance(cameras[0], ParallelCamera)):
+            raise SettingsError("a scale can be tracked only in one parallel camera's masks")
         self.tree, self.cameras = tree, tuple(cameras)
         self.settings = settings or ContourSettings()
         self._kinematics = TreeKinematics(tree)
-        self._surfaces = TreeSurfaces(tree)
-        self._outlines = tuple(self._surfaces.rigid)
-        # Skin, which bends, keeps all of its triangles.
-        bends = self._surfaces.bends
-        compared = self._outlines if bends else few_triangles(self._surfaces, MANY)
-        self._body = BodyParameters(self._kinematics, compared, surfaces=self._surfaces)
+        surfaces = TreeSurfaces(tree)
+        self._whole = PackedSurfaces(surfaces)
+        # Few triangles are compared; what is drawn has all of them.
+        compared = few_rigid_triangles(surfaces, _WITH_SKIN if surfaces.bends else MANY)
+        self._body = BodyParameters(self._kinematics, compared.rigid, surfaces=compared)
         free = self._kinematics.lower < self._kinematics.upper
         names = [n for n, is_free in zip(self._kinematics.names, free, strict=True) if is_free]
         moving = [name for name in names if name not in constant]
         for name in constant:
             if name not in names:
                 raise UnknownNameError("value", name, names, f"the tree of {tree.model.path}")
-        self.layout = StateLayout((*moving, *(ROOT_SHIFT if moves else ())), tuple(constant))
+        root = (*(ROOT_SHIFT if moves else ()), *((GROWTH,) if grows else ()))
+        self.layout = StateLayout((*moving, *root), tuple(constant))
         if not len(self.layout):
             raise SettingsError(f"{tree.model.path}: all values of its tree are held")
         self._moves = moves
-        known = [*self._kinematics.names, *ROOT_SHIFT]
+        known = [*self._kinematics.names, *_ROOT]
         seen = [*self.layout.moving, *self.layout.constant]
         self._state_index = self.layout.indices(seen)
         self._parameter_index = np.array([known.index(name) for name in seen], dtype=np.intp)
         self._values = self._kinematics.flatten(tree.default_values())
         self._known_shift = np.zeros(3)
+        self._middles = self._find_middles()
+        self._rest = self._middles[0], rest * self._middles[1]
+
+    def _find_middles(self) -> tuple[Array, Array]:
+        """For each value of the state the middle of its limits, and one over their variance."""
+        kinematics = self._kinematics
+        lower, upper = kinematics.lower, kinematics.upper
+        limited = kinematics.is_angle & ~kinematics.turns_around & (lower < upper)
+        if self.tree.placements[0].rotation is not None:
+            # How the root is turned is no joint's.
+            limited &= kinematics.value_nodes > 0
+        middle, information = np.zeros((2, len(lower) + len(_ROOT)))
+        at = np.flatnonzero(limited)
+        middle[at] = 0.5 * (lower[at] + upper[at])
+        information[at] = 12.0 / (upper[at] - lower[at]) ** 2
+        return middle[self._parameter_index], information[self._parameter_index]
 
     def is_angle(self, name: str) -> bool:
         """Whether an element is an angle [rad], else it is a length [m]."""
-        if name in ROOT_SHIFT:
+        if name in _ROOT:
             return False
         return bool(self._kinematics.is_angle[self._kinematics.names.index(name)])
 
     def inequalities(self) -> Inequalities:
-        """The limits of all values; angles that can take every direction have none."""
-        lower = np.r_[self._kinematics.lower, np.full(3, -np.inf)]
-        upper = np.r_[self._kinematics.upper, np.full(3, np.inf)]
-        turns = np.r_[self._kinematics.is_angle, np.zeros(3, dtype=bool)]
+        """The limits of all values, and the couplings of the model's file if it has one.
+
+        Angles that can take every direction have no limits.
+
+        Raises:
+            ModelError: the couplings file cannot be read.
+        """
+        lower = np.r_[self._kinematics.lower, np.full(len(_ROOT), -np.inf)]
+        upper = np.r_[self._kinematics.upper, np.full(len(_ROOT), np.inf)]
+        turns = np.r_[self._kinematics.is_angle, np.zeros(len(_ROOT), dtype=bool)]
         free = turns & (upper - lower >= 2 * np.pi - 1e-9)
         lower[free], upper[free] = -np.inf, np.inf
         index = self._parameter_index
         names = [*self.layout.moving, *self.layout.constant]
-        rows = from_bounds(names, lower[index], upper[index])
-        return say_if_unlimited(rows, str(self.tree.model.path))
+        model = self.tree.model
+        parts = [from_bounds(names, lower[index], upper[index])]
+        file = couplings_file(model.path)
+        if file.is_file():
+            parts.append(load_couplings(file, model.position_names).only_of(names))
+        return say_if_unlimited(stack(parts, names), str(model.path))
 
     def with_root_position(self, root_position: Array) -> "ContourObservation":
         """The same with the root at another known position (3,) in the world [m]."""
@@ -203,54 +253,102 @@ class ContourObservation:
         return self._kinematics.split(self._kinematics.within_limits(self._split(x)[0]))
 
     def _split(self, x: Array) -> tuple[Array, Array]:
-        """The tree's values (m,) and the root's shift (3,) of a state (n,)."""
-        parameters = np.r_[self._values, np.zeros(3)]
+        """The tree's values (m,), and the root's shift and growth (4,), of a state (n,)."""
+        parameters = np.r_[self._values, np.zeros(len(_ROOT))]
         parameters[self._parameter_index] = x[self._state_index]
         count = len(self._values)
-        return parameters[:count], parameters[count:] + self._known_shift
+        parameters[count : count + 3] += self._known_shift
+        return parameters[:count], parameters[count:]
+
+    def scale(self, x: Array) -> float:
+        """So many times the pixels a metre that it was given with the camera has."""
+        return math.exp(self._split(x)[1][3])
+
+    def root_position(self, x: Array) -> Array:
+        """(3,) where the root is in the world, the body in its own size [m]."""
+        values, root = self._split(x)
+        p_WR = self._root(values) + root[:3]
+        return p_WR if root[3] == 0.0 else slide_root(self._parallel(), p_WR, math.exp(-root[3]))
+
+    def _parallel(self) -> ParallelCamera:
+        """The camera whose scale is unknown."""
+        camera = self.cameras[0]
+        assert isinstance(camera, ParallelCamera)
+        return camera
 
     def positions(self, x: Array) -> tuple[Array, Array]:
-        """The plant's q (nq,) and X_WB (4, 4) of a state (n,).
+        """The plant's q (nq,) and X_WB (4, 4) of a state (n,), the body in its own size.
 
         Raises:
             ModelError: the base joints cannot hold the root where it is.
         """
-        values, shift = self._split(x)
-        tree = self.tree
-        if np.any(shift):
-            tree = tree.with_root_position(self._root(values) + shift)
-        return tree.positions_from(self.node_values(x))
+        values = self.node_values(x)
+        if np.any(self._split(x)[1]):
+            return self.tree.positions_with_root_at(values, self.root_position(x))
+        return self.tree.positions_from(values)
 
-    def state(self, q: Array, X_WB: Array | None = None) -> Array:
-        """(n,) a state at rest at the plant's positions q (nq,)."""
+    def state(self, q: Array, X_WB: Array | None = None, scale: float = 1.0) -> Array:
+        """(n,) a state at rest.
+
+        Args:
+            q: (nq,) the plant's positions.
+            X_WB: (4, 4) where the plant's world is; None: where the world is.
+            scale: so many times the pixels a metre that it was given with the camera has.
+        """
         values = self._kinematics.flatten(self.tree.values_from_positions(q, X_WB))
-        shift = np.zeros(3)
+        root = np.append(np.zeros(3), math.log(scale))
         if self._moves:
             model = self.tree.model
-            p_BR = PlantKinematics(model).pose_at(model.link_index(self.tree.root), q)[:, 3]
-            p_WR = p_BR if X_WB is None else X_WB @ p_BR
-            shift = p_WR[:3] - self._root(values) - self._known_shift
+            p_BR = PlantKinematics(model).pose_at(model.link_index(self.tree.nodes[0].name), q)[
+                :, 3
+            ]
+            p_WR = p_BR[:3] if X_WB is None else (X_WB @ p_BR)[:3]
+            if scale != 1.0:
+                p_WR = slide_root(self._parallel(), p_WR, scale)
+            root[:3] = p_WR - self._root(values) - self._known_shift
         x = np.zeros(len(self.layout))
-        x[self._state_index] = np.r_[values, shift][self._parameter_index]
+        x[self._state_index] = np.r_[values, root][self._parameter_index]
         return x
+
+    def turned(self, x: Array, rotation: Array) -> Array:
+        """(n,) the state whose root is turned about its origin by (3, 3) in the world.
+
+        Raises:
+            SettingsError: the tree's root does not turn freely.
+        """
+        placed = self.tree.placements[0]
+        if placed.rotation is None or not self.tree.turns_root_freely:
+            raise SettingsError("only a pose tree whose root turns freely can be turned")
+        values = self._split(x)[0]
+        R_WR = rotation @ self._kinematics.poses(values)[0, :3, :3]
+        other = x.copy()
+        changed = values.copy()
+        changed[:3] = placed.rotation.values_from(placed.X_PA[:3, :3].T @ R_WR)
+        count = len(values)
+        inside = self._parameter_index < count
+        other[self._state_index[inside]] = changed[self._parameter_index[inside]]
+        return other
+
+    def strain(self, x: Array) -> float:
+        """How far joints are from the middle of their limits, in all [deviations^2].
+
+        The deviation is that of positions spread evenly between the limits.
+        """
+        middle, spread = self._middles
+        return float(np.sum(spread * (x[self._state_index] - middle) ** 2))
 
     def continued(self, x: Array, last: Array) -> Array:
         """The same pose (n,), angles that turn around in the turns nearest to the last state's."""
         values = self._split(x)[0]
         turns = self._kinematics.nearest_turns(values, self._split(last)[0]) - values
         turned = x.copy()
-        turned[self._state_index] += np.r_[turns, np.zeros(3)][self._parameter_index]
+        turned[self._state_index] += np.r_[turns, np.zeros(len(_ROOT))][self._parameter_index]
         return turned
 
     def draw(self, x: Array, camera: Camera) -> Mask:
         """(H, W) what a camera would see of the body at a state (n,)."""
-        X_WN = self._body.place(self._theta(x)).X_WN
-        return draw_mask(self._outlines_at(x), camera.X_CW @ X_WN, camera)
-
-    def _outlines_at(self, x: Array) -> tuple[Outline, ...]:
-        if not self._surfaces.bends:
-            return self._outlines
-        return tuple(self._surfaces.at(self.node_values(x)))
+        X_WN = self._body.place(self.parameters(x)).X_WN
+        return draw_packed(self._whole.at(self.node_values(x)), camera.X_CW @ X_WN, camera)
 
     def look(self, masks: Sequence[Mask | None]) -> Views:
         """What masks say: the points of their edges, found once for all measurements of a frame.
@@ -298,14 +396,25 @@ class ContourObservation:
     def _compare(self, seen: Views, x: Array, width: float) -> tuple[Comparison, float] | None:
         """Contours compared with so wide a scale [pixel], and how far they are apart [pixel]."""
         step = Round(width, self.settings.spacing)
-        compared = compare_views(self._body, seen, self._theta(x), step, _PLAIN, pixels=1.0)
+        compared = compare_views(self._body, seen, self.parameters(x), step, _PLAIN, pixels=1.0)
         squares, weight = compared.sums[:, :, [SQUARES, WEIGHT]].sum(axis=(0, 1))
         return None if weight <= 0.0 else (compared, math.sqrt(squares / weight))
 
-    def _theta(self, x: Array) -> Array:
-        """All parameters of the body at a state (n,)."""
-        values, shift = self._split(x)
-        return np.concatenate([values, shift, [0.0]])
+    def parameters(self, x: Array) -> Array:
+        """The tree's values, the root's shift and the logarithm of growth (m + 4,) of a state."""
+        return np.concatenate(self._split(x))
+
+    def state_of(self, parameters: Array) -> Array:
+        """(n,) a state at rest of parameters (m + 4,): the inverse of ``parameters``."""
+        held = parameters.copy()
+        held[len(self._values) : len(self._values) + 3] -= self._known_shift
+        x = np.zeros(len(self.layout))
+        x[self._state_index] = held[self._parameter_index]
+        return x
+
+    def node_poses(self, x: Array) -> Array:
+        """X_WN (nodes, 4, 4) at a state (n,), scaled by its growth."""
+        return self._body.place(self.parameters(x)).X_WN
 
     def _compress(self, x: Array, compared: Comparison, distance: float) -> ContourMeasurement:
         """What the contours say as no more numbers than the state has elements, with noise 1."""
@@ -315,7 +424,10 @@ class ContourObservation:
         scale = max(settings.deviation, distance)
         # Both contours say the same: together they count as one.
         worth = 0.5 / (scale**2 * settings.correlation)
-        size, turns = np.linalg.eigh(worth * H[np.ix_(index, index)])
+        middle, information = self._rest
+        slopes = worth * g[index] + information * (x[self._state_index] - middle)
+        curvature = worth * H[np.ix_(index, index)] + np.diag(information)
+        size, turns = np.linalg.eigh(curvature)
         told = size > _NOTHING * max(float(size[-1]), 1e-300)
         root, turns = np.sqrt(size[told]), turns[:, told]
         slope = np.zeros((len(root), len(self.layout)))
@@ -323,7 +435,7 @@ class ContourObservation:
         contour = compared.sums[:, :-1].sum(axis=(0, 1))
         return ContourMeasurement(
             names=tuple(f"contour_{k}" for k in range(len(root))),
-            y=-worth * (turns.T @ g[index]) / root,
+            y=-(turns.T @ slopes) / root,
             H=slope,
             at=x,
             share=float(contour[FITTING] / max(contour[COMPARED], 1e-9)),

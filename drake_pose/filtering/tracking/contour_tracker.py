@@ -14,6 +14,7 @@ from drake_pose.filtering.kalman.truncated_filter import (
     TruncatedFilter,
 )
 from drake_pose.filtering.measurements.contour import (
+    GROWTH,
     ContourMeasurement,
     ContourObservation,
     Mask,
@@ -33,9 +34,11 @@ class TrackingSettings:
     Args:
         angle_acceleration: standard deviation of every joint's acceleration [rad/s^2].
         length_acceleration: of the root's, and of joints that slide [m/s^2].
+        growth_acceleration: of the logarithm of a scale that is unknown [1/s^2].
         memory: time in which a rate that is not seen fades [s]: a hidden limb comes to rest.
         start_angle: standard deviation of the angles at the start [rad].
         start_length: of the root's position and other lengths at the start [m].
+        start_growth: of the logarithm of a scale that is unknown at the start.
         constant_length: of what never changes, such as lengths of segments, at the start [m].
         rounds: how often the contour is compared anew in each frame.
         lost_distance: the track is lost when the contour and the masks' edge are further apart
@@ -44,6 +47,10 @@ class TrackingSettings:
         lost_growth: and when E_total is this many times what it was after the last match ...
         lost_margin: ... and larger than that by this.
         root_moves: whether the root may be elsewhere than where the tree holds it.
+        scale_unknown: whether the scale of the one parallel camera is unknown, and may drift.
+        rest_time: in about this time joints that are not seen come to the middle of their limits
+            [s]; it also tells which way they bend where the picture is the same for both. None:
+            they stay where they are.
 
     Raises:
         SettingsError: a number that is not positive.
@@ -51,9 +58,11 @@ class TrackingSettings:
 
     angle_acceleration: float = 15.0
     length_acceleration: float = 5.0
+    growth_acceleration: float = 0.1
     memory: float = 0.15
     start_angle: float = 0.2
     start_length: float = 0.03
+    start_growth: float = 0.1
     constant_length: float = 0.03
     rounds: int = 4
     lost_distance: float = 12.0
@@ -61,10 +70,12 @@ class TrackingSettings:
     lost_growth: float = 1.5
     lost_margin: float = 0.1
     root_moves: bool = False
+    scale_unknown: bool = False
+    rest_time: float | None = None
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not isinstance(value, bool) and not 0 < value < math.inf:
+            if value is not None and not isinstance(value, bool) and not 0 < value < math.inf:
                 raise SettingsError(f"{name} must be positive, not {value}")
 
 
@@ -108,11 +119,7 @@ class ContourTracker:
             raise SettingsError(f"the tracker's period must be positive, not {period}")
         self.observation, self.settings = observation, settings or TrackingSettings()
         layout = observation.layout
-        scale = {
-            name: period**2
-            * self._pick(name, self.settings.angle_acceleration, self.settings.length_acceleration)
-            for name in layout.moving
-        }
+        scale = {name: period**2 * self._acceleration(name) for name in layout.moving}
         self.filter = TruncatedFilter(
             layout,
             _Nothing(len(layout)),
@@ -124,8 +131,19 @@ class ContourTracker:
         )
         self._period = period
 
-    def _pick(self, name: str, angle: float, length: float) -> float:
-        return angle if self.observation.is_angle(name) else length
+    def _acceleration(self, name: str) -> float:
+        """Of what moves [rad/s^2, m/s^2 or 1/s^2]."""
+        if name == GROWTH:
+            return self.settings.growth_acceleration
+        angle = self.observation.is_angle(name)
+        return self.settings.angle_acceleration if angle else self.settings.length_acceleration
+
+    def _start_deviation(self, name: str) -> float:
+        """Of what moves at the start [rad, m or 1]."""
+        if name == GROWTH:
+            return self.settings.start_growth
+        angle = self.observation.is_angle(name)
+        return self.settings.start_angle if angle else self.settings.start_length
 
     def start(self, x: Array) -> Track:
         """Begin at a state (n,), for example the matcher's, as sure of it as the settings say."""
@@ -136,12 +154,9 @@ class ContourTracker:
             if name in layout.constant:
                 deviations[index] = settings.constant_length
             elif name in layout.moving:
-                deviations[index] = self._pick(name, settings.start_angle, settings.start_length)
+                deviations[index] = self._start_deviation(name)
             else:
-                moving = name.removeprefix("rate_")
-                acceleration = self._pick(
-                    moving, settings.angle_acceleration, settings.length_acceleration
-                )
+                acceleration = self._acceleration(name.removeprefix("rate_"))
                 # What a limb picks up while its rate is remembered.
                 deviations[index] = acceleration * settings.memory * self._period
         return Track(self.filter.start(Belief(x, np.diag(deviations**2))), None, False)

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.body import PoseTree
 from drake_pose.camera import Camera
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.tracking.contour_tracker import ContourTracker, Track, TrackingSettings
 from drake_pose.matching import MatchResult, PoseSearch
-from drake_pose.matching.result import UNEXPLAINED, View
+from drake_pose.matching.result import UNEXPLAINED, PlacedMatch, View
 
 Array = NDArray[np.float64]
 
@@ -32,6 +33,27 @@ class Followed:
     track: Track | None = None
     reference: float = 0.0
     matches: int = 0
+
+
+def make_tracker(
+    tree: PoseTree, cameras: Sequence[Camera], period: float, settings: TrackingSettings
+) -> ContourTracker:
+    """The tracker of a pose tree's contour.
+
+    Args:
+        tree: the body's pose tree.
+        cameras: the cameras.
+        period: time between two frames [s].
+        settings: how the body may move, and what is unknown.
+
+    Raises:
+        SettingsError: no camera, a period that is not positive, or a tree without free values.
+    """
+    rest = 0.0 if settings.rest_time is None else period / settings.rest_time
+    observation = ContourObservation(
+        tree, cameras, settings.root_moves, settings.scale_unknown, rest=rest
+    )
+    return ContourTracker(observation, period, settings)
 
 
 class MatchAndTrack:
@@ -59,8 +81,7 @@ class MatchAndTrack:
     ) -> None:
         self.settings = settings or TrackingSettings()
         self._search = search
-        observation = ContourObservation(search.tree, cameras, self.settings.root_moves)
-        self.tracker = ContourTracker(observation, period, self.settings)
+        self.tracker = make_tracker(search.tree, cameras, period, self.settings)
 
     def next(
         self, last: Followed, views: Sequence[View], root_position: Array | None = None
@@ -86,7 +107,8 @@ class MatchAndTrack:
         found = [] if tracked is None else [tracked]
         if matched.found:
             observation = self._observation(root_position)
-            x = observation.state(matched.q, matched.X_WB)
+            scale = matched.scale if isinstance(matched, PlacedMatch) else 1.0
+            x = observation.state(matched.q, matched.X_WB, scale)
             if last.track is not None:
                 # A search does not know how often an angle has turned round.
                 x = observation.continued(x, last.track.state.best.mean)
@@ -135,7 +157,7 @@ class MatchAndTrack:
             J += int(np.count_nonzero(observation.draw(x, view.camera) != view.mask))
             area += int(np.count_nonzero(view.mask))
         E_total = J / area
-        return MatchResult(
+        return PlacedMatch(
             found=True,
             q=q,
             X_WB=X_WB,
@@ -148,4 +170,6 @@ class MatchAndTrack:
             untried={},
             stopped_by=TRACKED,
             seconds=time.perf_counter() - begin,
+            root_position=observation.root_position(x),
+            scale=observation.scale(x),
         )

@@ -27,7 +27,7 @@ from drake_pose.matching.grid.settings import BeamSearchSettings, Stage
 from drake_pose.matching.raster_fit.body import RefinementBody
 from drake_pose.matching.raster_fit.passes import COARSE_PASSES, FINE_PASSES, Pass, descend
 from drake_pose.matching.raster_fit.problem import RefinementProblem
-from drake_pose.matching.result import MatchResult, View
+from drake_pose.matching.result import PlacedMatch, View
 from drake_pose.matching.starts.neighbourhood import NeighbourhoodSearch
 from drake_pose.matching.starts.part_placement import PartSearch
 from drake_pose.matching.starts.root_placement import (
@@ -37,6 +37,7 @@ from drake_pose.matching.starts.root_placement import (
     find_layers,
     place_body,
     scale_camera,
+    slide_root,
     whereabouts,
 )
 from drake_pose.silhouette import outline_from_mesh, prefix_sums, score_bodies
@@ -57,21 +58,6 @@ _STAGES, _ALIKE = (Stage(60, 1.0, 2),), 0.5
 _ENOUGH = 0.004
 # Parameters of the refinement after the tree's values.
 _TRANSLATION, _GROWTH = (0, 1, 2), (3,)
-
-
-@dataclass(frozen=True)
-class PlacedMatch(MatchResult):
-    """The pose that a search found with a root position or a scale that was not known.
-
-    Args:
-        root_position: (3,) the root's origin in the world [m]; of a parallel camera's single
-            picture the part along its axis is arbitrary.
-        scale: a parallel camera has this many times the pixels a metre that it was given with, and
-            the body its own size; 1 where the scale was known.
-    """
-
-    root_position: np.ndarray | None = None
-    scale: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,9 +249,7 @@ class RootPlacementSearch:
         growth, camera = math.exp(parameters[-1]), start.views[0].camera
         if growth == 1.0 or not isinstance(camera, ParallelCamera):
             return refined
-        p_C = camera.X_CW[:3, :3] @ self._root_of(refined) + camera.X_CW[:3, 3]
-        p_C[:2] /= growth
-        p_WR = camera.X_WC[:3, :3] @ p_C + camera.X_WC[:3, 3]
+        p_WR = slide_root(camera, self._root_of(refined), 1.0 / growth)
         values = self._refined.node_values(parameters)
         return _Placed(
             (View(scale_camera(camera, growth), start.views[0].mask),),

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera import Camera
 from drake_pose.silhouette import Outline, TreeSurfaces
+from drake_pose.silhouette.areas.bending import PackedSurfaces
 from drake_pose.silhouette.areas.outline import PackedOutlines, pack
 
 Array = NDArray[np.float64]
@@ -84,7 +85,8 @@ class BodyParameters:
         girth_names: Sequence[str] = (),
         surfaces: TreeSurfaces | None = None,
     ) -> None:
-        self._bending = surfaces if surfaces is not None and surfaces.bends else None
+        bends = surfaces is not None and surfaces.bends
+        self._bending = PackedSurfaces(surfaces) if surfaces is not None and bends else None
         self.kinematics, self.outlines = kinematics, tuple(outlines)
         self.groups = np.full(len(self.outlines), -1) if groups is None else np.array(groups)
         self.names = (
@@ -148,7 +150,7 @@ class BodyParameters:
         """The surfaces at the tree's values (m,)."""
         if self._bending is None:
             return self._packed
-        return pack(tuple(self._bending.at(self.kinematics.split(values))))
+        return self._bending.at(self.kinematics.split(values))
 
 
 class CameraParameters:

@@ -12,17 +12,25 @@ MANY, FEW, VERY_FEW = 2500, 400, 80
 """Triangles a node: where a pixel counts, for a still, and for a person in real time."""
 
 
+def few_rigid_triangles(surfaces: TreeSurfaces, count: int) -> TreeSurfaces:
+    """The surfaces with few triangles in each rigid part; bands of skin stay and bend."""
+    return surfaces.with_rigid([_simplified(rigid, count) for rigid in surfaces.rigid])
+
+
 def few_triangles(surfaces: TreeSurfaces, count: int = FEW) -> tuple[Outline, ...]:
     """The nodes' surfaces, skin at rest, with few triangles (Garland and Heckbert's metric)."""
     outlines = []
     for node, rigid in enumerate(surfaces.rigid):
         bending = surfaces.bending[node]
-        whole = rigid if bending is None else bending.rest
-        if len(whole.triangles) > count:
-            points, triangles = fast_simplification.simplify(
-                whole.vertices, whole.triangles, target_count=count
-            )
-            mesh = TriangleMesh(np.asarray(points, dtype=np.float64), triangles)
-            whole = outline_from_mesh(mesh)
-        outlines.append(whole)
+        outlines.append(_simplified(rigid if bending is None else bending.rest, count))
     return tuple(outlines)
+
+
+def _simplified(outline: Outline, count: int) -> Outline:
+    """A surface with at most about so many triangles."""
+    if len(outline.triangles) <= count:
+        return outline
+    points, triangles = fast_simplification.simplify(
+        outline.vertices, outline.triangles, target_count=count
+    )
+    return outline_from_mesh(TriangleMesh(np.asarray(points, dtype=np.float64), triangles))

@@ -155,6 +155,8 @@ def turns_freely(tree: PoseTree) -> bool:
     kinds = [tree.model.position_kinds[position] for position in tree.nodes[0].positions]
     lower, upper = tree.value_bounds(0)
     ranges = np.sort((upper - lower)[[kind == "angle" for kind in kinds]])
+    # Joints that are held do not turn it.
+    ranges = ranges[ranges > 0.0]
     wanted = np.array([np.pi, 2.0 * np.pi, 2.0 * np.pi])
     return len(ranges) == 3 and bool(np.all(ranges >= wanted - 1e-6))
 
@@ -162,6 +164,17 @@ def turns_freely(tree: PoseTree) -> bool:
 def scale_camera(camera: ParallelCamera, scale: float) -> ParallelCamera:
     """The camera with this many times its pixels a metre."""
     return dataclasses.replace(camera, pixels_per_metre=scale * camera.pixels_per_metre)
+
+
+def slide_root(camera: ParallelCamera, p_WR: np.ndarray, factor: float) -> np.ndarray:
+    """(3,) where a root at (3,) [m] comes to lie that is moved across a parallel camera's axis.
+
+    Seen by a camera of so many times the scale, it keeps its place if it comes so many times
+    nearer to the axis: a body and its root's place grow alike, or the camera's scale does.
+    """
+    p_CR = _in_camera(camera, p_WR)
+    p_CR[:2] *= factor
+    return np.asarray(camera.X_WC[:3, :3] @ p_CR + camera.X_WC[:3, 3])
 
 
 def whereabouts(views: Sequence[View], p_WR: np.ndarray, settings: PlacementSettings) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -9,8 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drake_pose.camera import Camera
-from drake_pose.silhouette.areas.bending_kernel import score_bent
-from drake_pose.silhouette.areas.outline import Outline, edge_records, outline_from_mesh
+from drake_pose.silhouette.areas.bending_kernel import bend, score_bent
+from drake_pose.silhouette.areas.outline import (
+    Outline,
+    PackedOutlines,
+    edge_records,
+    outline_from_mesh,
+    pack,
+)
 from drake_pose.silhouette.areas.scoring import check_body, check_prefixes
 
 if TYPE_CHECKING:
@@ -68,6 +75,7 @@ class TreeSurfaces:
     Attributes:
         rigid: the rigid part of each node, in the node's frame.
         bending: for each node its rigid part and its band; None for a node without one.
+        skins: for each node its band's motion; None for a node without one.
 
     Args:
         tree: the pose tree.
@@ -75,11 +83,22 @@ class TreeSurfaces:
 
     def __init__(self, tree: PoseTree) -> None:
         self._nodes = tree.nodes
+        self.skins = [node.skin for node in tree.nodes]
         self.rigid = [outline_from_mesh(node.mesh) for node in tree.nodes]
         self.bending = [
             None if node.skin is None else BendingOutline(rigid, node.skin.mesh)
             for node, rigid in zip(tree.nodes, self.rigid, strict=True)
         ]
+
+    def with_rigid(self, rigid: Sequence[Outline]) -> TreeSurfaces:
+        """The same bands beside other rigid parts."""
+        other = copy.copy(self)
+        other.rigid = list(rigid)
+        other.bending = [
+            None if skin is None else BendingOutline(outline, skin.mesh)
+            for skin, outline in zip(self.skins, other.rigid, strict=True)
+        ]
+        return other
 
     @property
     def bends(self) -> bool:
@@ -100,6 +119,37 @@ class TreeSurfaces:
     def at(self, values: Sequence[np.ndarray]) -> list[Outline]:
         """All nodes' whole surfaces, each in its node's frame, at each node's values (k_i,)."""
         return [self.node_at(node, part) for node, part in enumerate(values)]
+
+
+class PackedSurfaces:
+    """A pose tree's surfaces as the kernels take them, at any values, at little cost.
+
+    Args:
+        surfaces: the surfaces; their rigid parts may have fewer triangles than the tree's.
+    """
+
+    def __init__(self, surfaces: TreeSurfaces) -> None:
+        outlines = [surfaces.whole(node) for node in range(len(surfaces.rigid))]
+        self._rest = pack(tuple(o.rest if isinstance(o, BendingOutline) else o for o in outlines))
+        self._bands = []
+        for node, bending in enumerate(surfaces.bending):
+            skin = surfaces.skins[node]
+            if bending is not None and skin is not None:
+                rigid = bending.rigid
+                first = len(rigid.vertices), len(rigid.triangles)
+                self._bands.append((np.array([node, *first, 0], dtype=np.int64), skin))
+
+    def at(self, values: Sequence[np.ndarray]) -> PackedOutlines:
+        """All nodes' surfaces at each node's values (k_i,) [rad or m]."""
+        rest = self._rest
+        if not self._bands:
+            return rest
+        own = rest._replace(
+            points=rest.points.copy(), planes=rest.planes.copy(), balls=rest.balls.copy()
+        )
+        for part, skin in self._bands:
+            bend(own, part, skin.vertices(values[part[0]][None])[0])
+        return own
 
 
 def score_bending(

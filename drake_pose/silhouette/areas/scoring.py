@@ -61,8 +61,14 @@ def score_bodies(
 def draw_mask(outlines: Sequence[Outline], X_CN: np.ndarray, camera: Camera) -> np.ndarray:
     """Returns the mask (H, W) bool of a body at poses X_CN (nodes, 4, 4) in the camera."""
     packed, poses = check_body(outlines, np.asarray(X_CN)[None])
+    return draw_packed(packed, poses[0], camera)
+
+
+def draw_packed(packed: PackedOutlines, X_CN: np.ndarray, camera: Camera) -> np.ndarray:
+    """As draw_mask, for surfaces that are packed, as ``PackedSurfaces`` gives them."""
+    poses = np.ascontiguousarray(X_CN[:, :3], dtype=np.float64)
     mask = np.zeros((camera.height, camera.width), dtype=np.uint8)
-    paint(packed, poses[0], camera.kernel_parameters(), mask, 1)
+    paint(packed, poses, camera.kernel_parameters(), mask, 1)
     return mask.view(np.bool_)
 
 

@@ -1,0 +1,77 @@
+"""Changes of a URDF model's shape, made in its cured text: parts not drawn, parts stretched."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Collection, Mapping, Sequence
+
+import numpy as np
+
+from drake_pose.body.files.xml_files import xml_text
+
+Factors = Mapping[str, Sequence[float]]
+"""For links by name, so many times (3,) a link's size along its frame's axes."""
+
+
+def without_visuals(text: str, links: Collection[str]) -> str:
+    """A URDF text in which some links have no looks."""
+    root = ElementTree.fromstring(text)
+    for link in root.iterfind("link"):
+        if link.get("name") in links:
+            for visual in link.findall("visual"):
+                link.remove(visual)
+    return xml_text(root)
+
+
+def stretched(text: str, factors: Factors) -> str:
+    """A URDF text in which some links are longer or wider, with the joints that they carry.
+
+    Meshes are scaled, and so are the places of visuals and of joints on these links. A shape that
+    is no mesh is stretched as well as its kind allows: spheres and capsules by their mean factor.
+    """
+    root = ElementTree.fromstring(text)
+    for link in root.iterfind("link"):
+        factor = factors.get(link.get("name", ""))
+        if factor is None:
+            continue
+        for visual in link.iterfind("visual"):
+            origin = visual.find("origin")
+            turned = origin is not None and any(_numbers(origin.get("rpy", "0 0 0")))
+            _stretch_origin(visual, factor)
+            mean = float(np.prod(factor)) ** (1.0 / 3.0)
+            for shape in visual.iterfind("geometry/*"):
+                _stretch_shape(shape, [mean] * 3 if turned else factor)
+    for joint in root.iterfind("joint"):
+        parent = joint.find("parent")
+        factor = None if parent is None else factors.get(parent.get("link", ""))
+        if factor is not None:
+            _stretch_origin(joint, factor)
+    return xml_text(root)
+
+
+def _stretch_origin(element: ElementTree.Element, factor: Sequence[float]) -> None:
+    """Moves what stands on a link."""
+    origin = element.find("origin")
+    if origin is not None and "xyz" in origin.attrib:
+        origin.set("xyz", _text(np.array(_numbers(origin.get("xyz", ""))) * factor))
+
+
+def _stretch_shape(shape: ElementTree.Element, factor: Sequence[float]) -> None:
+    """Makes a shape larger."""
+    mean = float(np.prod(factor)) ** (1.0 / 3.0)
+    for name, by in (
+        ("scale", factor), ("size", factor), ("a", factor[:1]), ("b", factor[1:2]),
+        ("c", factor[2:]), ("radius", [mean]), ("length", [factor[2]]),
+    ):  # fmt: skip
+        if name in shape.attrib:
+            shape.set(name, _text(np.array(_numbers(shape.get(name, ""))) * by))
+        elif name == "scale" and shape.tag.removeprefix("drake:") == "mesh":
+            shape.set(name, _text(np.array(factor)))
+
+
+def _numbers(text: str) -> list[float]:
+    return [float(number) for number in text.split()]
+
+
+def _text(numbers: np.ndarray) -> str:
+    return " ".join(repr(float(number)) for number in numbers)

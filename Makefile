@@ -38,8 +38,11 @@ robots: $(VENV)/ready-robots
 docs: $(VENV)/ready-docs
 	$(PYTHON) -m sphinx -n -W --keep-going -q -d build/docs-cache docs build/docs
 
+# DATA: a folder of recorded scenes; without it only the demonstration's is estimated.
+DATA ?= $(wildcard ../shared/data)
 bench: $(VENV)/ready-cluster
 	$(PYTHON) -m drake_pose.apps.benchmarks.speed
+	$(PYTHON) -m drake_pose.apps.benchmarks.estimates $(DATA)
 	$(PYTHON) -m drake_pose.apps.benchmarks.memory
 	$(PYTHON) -m drake_pose.apps.benchmarks.cluster
 

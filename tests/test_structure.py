@@ -83,7 +83,7 @@ MAY_KNOW_INSIDE = {
         "live": {"experiments", "estimate", "results"},
         "cluster": {"live"},
         "batch": {"cluster", "estimate", "results"},
-        "benchmarks": {"batch", "cluster", "live", "experiments"},
+        "benchmarks": {"batch", "cluster", "live", "experiments", "estimate", "results", "demo"},
         "commands": {"batch", "cluster", "live", "experiments", "estimate", "results"},
         "main": {"commands", "calibrate", "check", "demo", "estimate"},
     },

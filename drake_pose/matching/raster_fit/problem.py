@@ -48,7 +48,7 @@ class Equations:
 
 
 @dataclass(frozen=True, eq=False)
-class _Sight:
+class _ReadyView:
     """One view as the kernels take it."""
 
     body: ContourBody
@@ -90,8 +90,8 @@ class RefinementProblem:
         # Bands bend with the pose, alike for all views.
         self._points, self._planes = bodies[0].points.copy(), bodies[0].planes.copy()
         self._bent = np.full(len(parameters), np.nan)
-        self._sights = [
-            _Sight(
+        self._ready_views = [
+            _ReadyView(
                 made._replace(points=self._points, planes=self._planes, weights=body.weights),
                 find_border(view.mask),
                 np.ascontiguousarray(view.camera.X_CW),
@@ -101,7 +101,8 @@ class RefinementProblem:
         ]
         # A border crosses |cos| of its length in rows and |sin| in columns: 4 / pi on average.
         crossed = sum(
-            len(sight.border.row_places) + len(sight.border.column_places) for sight in self._sights
+            len(view.border.row_places) + len(view.border.column_places)
+            for view in self._ready_views
         )
         self.border_length = crossed * np.pi / 4.0
 
@@ -119,8 +120,8 @@ class RefinementProblem:
         """The border in each view of the union of the surfaces that are wanted (surfaces,)."""
         X_WS = self._placed(parameters)[0]
         return [
-            find_contour_border(sight.body, sight.X_CW, X_WS, sight.camera, wanted, sight.border)
-            for sight in self._sights
+            find_contour_border(view.body, view.X_CW, X_WS, view.camera, wanted, view.border)
+            for view in self._ready_views
         ]
 
     def apart_near(self, parameters: np.ndarray, discs: np.ndarray) -> np.ndarray:
@@ -132,16 +133,16 @@ class RefinementProblem:
         """
         areas = np.zeros(discs.shape[1])
         borders = self._borders(parameters, np.ones(len(self.body.surface_nodes), dtype=np.bool_))
-        for sight, border, places in zip(self._sights, borders, discs, strict=True):
-            add_apart_near(border, sight.border, places, _NEAR_STRIDE, areas)
+        for view, border, places in zip(self._ready_views, borders, discs, strict=True):
+            add_apart_near(border, view.border, places, _NEAR_STRIDE, areas)
         return areas
 
     def J(self, parameters: np.ndarray) -> int:
         """Pixels that body or silhouette covers, but not both, in all views together (1)."""
         X_WS = self._placed(parameters)[0]
         return sum(
-            count_apart(sight.body, sight.X_CW, X_WS, sight.camera, sight.border)
-            for sight in self._sights
+            count_apart(view.body, view.X_CW, X_WS, view.camera, view.border)
+            for view in self._ready_views
         )
 
     def equations(
@@ -176,9 +177,9 @@ class RefinementProblem:
         count = len(freedom.columns)
         H, g, sums = np.zeros((count, count)), np.zeros(count), np.zeros(3)
         borders = self._borders(parameters, ~freedom.moved) if still is None else still
-        for sight, border in zip(self._sights, borders, strict=True):
+        for view, border in zip(self._ready_views, borders, strict=True):
             sums += add_normal_equations(
-                sight.body, border, sight.border, movements, sight.X_CW, sight.camera,
+                view.body, border, view.border, movements, view.X_CW, view.camera,
                 stride, offset, scale, slack, H, g,
             )  # fmt: skip
         return Equations(H, g, *sums.tolist())

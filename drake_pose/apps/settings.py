@@ -122,4 +122,5 @@ class EstimateSettings:
                 [axis, lower, upper] for axis, (lower, upper) in self.root_rotation.items()
             ]
         values["packages"] = {name: str(folder) for name, folder in self.packages.items()}
-        return values | {"cameras": list(self.cameras), "frames": list(self.frames)}
+        lists = {name: list(getattr(self, name)) for name in ("cameras", "frames", "unseen")}
+        return values | lists

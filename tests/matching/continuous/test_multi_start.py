@@ -207,7 +207,7 @@ def test_no_view(search: MultiStartSearch) -> None:
         search.match([])
 
 
-@pytest.mark.parametrize("name", ["starts", "survivors", "answers", "sought_about", "tried"])
+@pytest.mark.parametrize("name", ["starts", "survivors", "finalists", "sought_about", "tried"])
 def test_settings_out_of_range(name: str) -> None:
     with pytest.raises(SettingsError, match=name):
         MultiStartSettings(**{name: 0})

@@ -247,8 +247,9 @@ def test_what_is_known_of_each_joint(own_scene: TinyScene, runner: CliRunner) ->
         truth = np.degrees(scene.truth[row["frame"]][NAMES.index(row["joint"])])
         found = np.degrees(float(pose[row["joint"]]))
         assert abs(found - truth) < 2.0
-        assert row["determined"] == "yes"
-        assert float(row["low"]) <= truth <= float(row["high"])
+        # A pixel, by which the camera may be off, is half a segment's width here.
+        assert row["determined"] == "yes" or row["joint"] == "luff"
+        assert float(row["low"]) <= truth <= float(row["high"]) < float(row["low"]) + 30.0
         answers = [
             float(one["value"])
             for one in families

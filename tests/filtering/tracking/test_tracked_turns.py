@@ -36,7 +36,9 @@ def test_turns_are_counted_while_a_body_is_followed(model):
         expected = truth.copy()
         # Past the end of its limits it must be in another turn.
         expected[1] -= 360.0 * (np.degrees(result.q[1]) < 180.0 and truth[1] > 350.0)
-        assert np.abs(np.degrees(result.q) - expected).max() < 12.0
+        # Folded back, the outer arm is hidden behind the inner one for three frames.
+        hidden = abs(truth[1] - 183.0) < 9.0
+        assert np.abs(np.degrees(result.q) - expected).max() < (15.0 if hidden else 8.0)
         values = np.concatenate(result.node_values)
         np.testing.assert_allclose(values, result.q, atol=1e-9)
         assert abs(result.q[1]) <= 6.2831853 + 1e-9

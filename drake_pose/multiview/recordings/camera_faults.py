@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,10 +43,11 @@ _LEAST_METRES, _LEAST_PIXELS = 0.035, 2.0
 _EXPLAINED = 0.9
 
 
-class FrameView(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class FrameView:
     """A frame: the cameras that see the person, their regions' edges, and about the pose.
 
-    Attributes:
+    Args:
         edges: by camera.
         values: (m,) of the pose tree.
     """

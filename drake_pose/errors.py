@@ -35,6 +35,10 @@ class OutputError(DrakePoseError):
     """A result cannot be written where it was asked for."""
 
 
+class RegistrationError(DrakePoseError):
+    """Silhouettes and joint positions that no pose of a camera explains."""
+
+
 class ClusterError(DrakePoseError):
     """Workers cannot be started or reached, or are not fit for the work."""
 

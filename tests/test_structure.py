@@ -13,10 +13,28 @@ MAY_KNOW = {
     "camera": set(),
     "silhouette": {"body", "camera"},
     "matching": {"silhouette", "body", "camera"},
+    "registration": {"matching", "silhouette", "body", "camera"},
     "filtering": {"matching", "silhouette", "body", "camera"},
     "multiview": {"filtering", "matching", "silhouette", "body", "camera"},
-    "systems": {"multiview", "filtering", "matching", "silhouette", "body", "camera"},
-    "apps": {"systems", "multiview", "filtering", "matching", "silhouette", "body", "camera"},
+    "systems": {
+        "multiview",
+        "registration",
+        "filtering",
+        "matching",
+        "silhouette",
+        "body",
+        "camera",
+    },
+    "apps": {
+        "systems",
+        "multiview",
+        "registration",
+        "filtering",
+        "matching",
+        "silhouette",
+        "body",
+        "camera",
+    },
 }
 # Inside a room: which folder may know which, and which module that stands beside the folders.
 # "." are all other modules beside the folders; everybody in the room may know them.

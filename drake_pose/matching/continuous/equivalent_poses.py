@@ -4,11 +4,8 @@ Two questions are put to the silhouettes. How far a pose may be off that is righ
 where parts, masks and cameras err together (``fit.covariance``), as 95 % intervals; a value that
 may go far is moved step by step, the others following, until what does not fit any more is
 significant. Whether another pose fits as well: other optima that were found, and flipped joints,
-make families of their own unless they are significantly worse. That is Vuong's test of models that
-are not nested (1989): the costs of both poses are compared piece by piece of the pictures, and how
-their differences scatter from piece to piece tells how large the difference of the whole may be by
-chance. What no pose explains, such as a part that is missing in a mask, costs all of them alike and
-says nothing.
+make families of their own unless they are significantly worse (``fit.significance``). What no pose
+explains, such as a part that is missing in a mask, costs all of them alike and says nothing.
 """
 
 from __future__ import annotations
@@ -23,6 +20,7 @@ from scipy.special import stdtrit
 from drake_pose.errors import SettingsError
 from drake_pose.matching.fit.covariance import ErrorSizes, estimate_sizes, values_covariance
 from drake_pose.matching.fit.levenberg_marquardt import Round
+from drake_pose.matching.fit.significance import excess
 from drake_pose.matching.fit.views_fit import FittedPose, ViewsFit
 from drake_pose.matching.pose_families import JointEstimate, PoseFamily, PoseSet
 from drake_pose.matching.starts.self_motions import Flip, flips
@@ -143,8 +141,7 @@ class RobustFamilies:
 
     def _excess(self, pieces: np.ndarray) -> float:
         """By how many standard deviations costs by pieces are above the best pose's."""
-        more = pieces - self._pieces
-        return float(more.sum() / max(math.sqrt(float((more**2).sum())), _ROUNDING))
+        return excess(pieces, self._pieces)
 
     def _is_as_good(self, pieces: np.ndarray) -> bool:
         """Whether costs by pieces are not significantly above the best pose's."""
@@ -245,14 +242,14 @@ class RobustFamilies:
         # Beyond half a turn the values come back from the other side.
         lower[index], upper[index] = (ends[index] for ends in self._kinematics.reach(values))
         step, most = _FIRST_STEP * width, self._settings.significance
-        found, excess = [values], 0.0
+        found, worse = [values], 0.0
         while lower[index] < found[-1][index] < upper[index] and self._proceed():
             trial = np.clip(found[-1] + min(step, longest) * along, lower, upper)
             looked = self._fit.refine(trial, _FOLLOW, held=(index,)).values
-            before, excess = excess, self._excess(self._fit.piece_costs(looked, _LOOK))
-            if excess > most:
+            before, worse = worse, self._excess(self._fit.piece_costs(looked, _LOOK))
+            if worse > most:
                 # Costs are parabolas in the rough, and their differences scatter as values differ.
-                share = (most - before) / (excess - before)
+                share = (most - before) / (worse - before)
                 return [*found, found[-1] + share * (looked - found[-1])]
             found.append(looked)
             step *= _GROWTH

@@ -14,12 +14,14 @@ trusted beyond a pixel, however well everything fits.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.matching.fit.contour_fit import Comparison, ContourFit, Views, pixels_per_metre
+from drake_pose.silhouette import Outline
 
 Array = NDArray[np.float64]
 
@@ -32,6 +34,8 @@ _LEAST_INFORMATION = 1.0
 # At most so many independent distances are looked at, the best known ones.
 _MOST_DISTANCES = 400
 _ITERATIONS, _SETTLED = 20, 0.03
+# A part that grows along its three axes is wider on all sides.
+_WIDER = np.array([float(k in (3, 7, 11)) for k in range(12)])
 # A place is known to about as much, and an angle to a full turn [m, rad].
 _PLACE = 10.0
 
@@ -42,12 +46,14 @@ class ErrorSizes(NamedTuple):
     Attributes:
         noise: of a point of contour, as the fit weights it.
         surface, mask, camera: how far they move contours [the unit of the distances].
+        width: how much wider a silhouette is on all sides [that unit]; 0 where it was not asked.
     """
 
     noise: float
     surface: float
     mask: float
     camera: float
+    width: float = 0.0
 
 
 class Distances(NamedTuple):
@@ -56,14 +62,34 @@ class Distances(NamedTuple):
     Attributes:
         y: (n,) the distances.
         X: (n, m) how they follow the values.
-        effects: (n, n) covariances that surfaces, masks' parts and cameras make that err by a unit.
+        effects: (n, n) covariances that surfaces, masks' parts and cameras make that err by a unit,
+            and silhouettes that are wider by a unit, where that was asked.
         information: (m, m) what all distances tell of the values where each errs by itself.
     """
 
     y: Array
     X: Array
-    effects: tuple[Array, Array, Array]
+    effects: tuple[Array, ...]
     information: Array
+
+
+class Picture(NamedTuple):
+    """A body's contours compared with one silhouette.
+
+    Attributes:
+        A: (nodes, 12, 12), lower triangles, and b: (nodes, 12), as of ``Comparison``.
+        X_WN: (nodes, 4, 4) where the body stands.
+        X_CW: (4, 4) the world's pose in the camera.
+        moves: (nodes, m, 12) the affine motions that the m values give to the nodes.
+        size: how far the unit of errors is at the body [m].
+    """
+
+    A: Array
+    b: Array
+    X_WN: Array
+    X_CW: Array
+    moves: Array
+    size: float
 
 
 def distances(fit: ContourFit, views: Views, compared: Comparison, unit: float) -> Distances:
@@ -76,33 +102,62 @@ def distances(fit: ContourFit, views: Views, compared: Comparison, unit: float) 
         unit: in which errors are measured [pixel].
     """
     X_WN = compared.placement.X_WN
-    A = np.tril(compared.A) + np.swapaxes(np.tril(compared.A, -1), -1, -2)
     moves = compared.placement.dense(len(fit.kinematics.names))
     size = unit / pixels_per_metre(views.cameras, X_WN[:, :3, 3].mean(axis=0))
-    shakes = _camera_motions(fit, views, X_WN, size)
+    pictures = [
+        Picture(A, b, X_WN, X_CW, moves, float(one))
+        for A, b, X_CW, one in zip(compared.A, compared.b, views.cameras[0], size, strict=True)
+    ]
+    return distances_in_pictures(fit.outlines, pictures)
+
+
+def distances_in_pictures(
+    outlines: Sequence[Outline], pictures: Sequence[Picture], wider: bool = False
+) -> Distances:
+    """The distances in several pictures, each of which errs as a whole, too.
+
+    Args:
+        outlines: the nodes' surfaces.
+        pictures: each with the same values.
+        wider: whether silhouettes may be wider or narrower on all sides.
+    """
     found: list[tuple[float, int, int, Array, Array, Array, float]] = []
-    for c, n in np.argwhere(np.einsum("cnii->cn", A) > 0.0):
-        D = surface_deformations(fit.outlines[n].vertices, X_WN[n]) * size.mean()
-        share, turns = np.linalg.eigh(D.T @ A[c, n] @ D)
-        for known, turn in zip(share, turns.T, strict=True):
-            if known >= _LEAST_INFORMATION:
-                along = D @ turn / np.sqrt(known)
-                row = along @ A[c, n]
-                found.append(
-                    (known, int(c), int(n), row @ moves[n].T, np.sqrt(known) * turn,
-                     row @ shakes[c], float(along @ compared.b[c, n]))
-                )  # fmt: skip
+    mean_size = float(np.mean([picture.size for picture in pictures]))
+    for c, (A_lower, b, X_WN, X_CW, moves, size) in enumerate(pictures):
+        A = np.tril(A_lower) + np.swapaxes(np.tril(A_lower, -1), -1, -2)
+        common = _camera_motions(outlines, X_CW, X_WN, size)
+        for n in np.flatnonzero(np.einsum("nii->n", A) > 0.0).tolist():
+            D = surface_deformations(outlines[n].vertices, X_WN[n]) * mean_size
+            shakes = np.column_stack([common, D @ _WIDER]) if wider else common
+            share, turns = np.linalg.eigh(D.T @ A[n] @ D)
+            for known, turn in zip(share, turns.T, strict=True):
+                if known >= _LEAST_INFORMATION:
+                    along = D @ turn / np.sqrt(known)
+                    row = along @ A[n]
+                    found.append(
+                        (known, c, n, row @ moves[n].T, np.sqrt(known) * turn,
+                         row @ shakes, float(along @ b[n]))
+                    )  # fmt: skip
     found = sorted(found, key=lambda one: -one[0])[:_MOST_DISTANCES]
     of = np.array([(one[1], one[2]) for one in found]).reshape(-1, 2)
     bends = np.array([one[4] for one in found]).reshape(-1, 12)
-    shaken = np.array([one[5] for one in found]).reshape(-1, 6)
-    same_camera, same_part = (of[:, None, k] == of[None, :, k] for k in range(2))
+    shaken = np.array([one[5] for one in found]).reshape(-1, 6 + wider)
+    same_picture, same_part = (of[:, None, k] == of[None, :, k] for k in range(2))
     alike = bends @ bends.T * same_part
+    count = pictures[0].moves.shape[1]
+    information = np.zeros((count, count))
+    for A_lower, _, _, _, moves, _ in pictures:
+        A = np.tril(A_lower) + np.swapaxes(np.tril(A_lower, -1), -1, -2)
+        information += (moves @ A @ np.swapaxes(moves, 1, 2)).sum(axis=0)
+    moved, widened = shaken[:, :6], shaken[:, 6:]
+    effects = [alike, alike * same_picture, moved @ moved.T * same_picture]
+    if wider:
+        effects.append(widened @ widened.T * same_picture)
     return Distances(
         y=np.array([one[6] for one in found]),
-        X=np.array([one[3] for one in found]).reshape(-1, moves.shape[1]),
-        effects=(alike, alike * same_camera, shaken @ shaken.T * same_camera),
-        information=(moves @ A.sum(axis=0) @ np.swapaxes(moves, 1, 2)).sum(axis=0),
+        X=np.array([one[3] for one in found]).reshape(-1, count),
+        effects=tuple(effects),
+        information=information,
     )
 
 
@@ -121,32 +176,29 @@ def surface_deformations(vertices: Array, X_WN: Array) -> Array:
     return K
 
 
-def _camera_motions(fit: ContourFit, views: Views, X_WN: Array, size: Array) -> Array:
-    """(cameras, 12, 6) the body's shifts along and turns about the axes of cameras.
-
-    Each moves it by about so much: size (cameras,) [m].
-    """
-    points = np.vstack(
-        [one.vertices @ X[:3, :3].T + X[:3, 3] for one, X in zip(fit.outlines, X_WN, strict=True)]
-    )
+def _camera_motions(outlines: Sequence[Outline], X_CW: Array, X_WN: Array, size: float) -> Array:
+    """(12, 6) the body's shifts along and turns about a camera's axes, by about a size [m]."""
+    placed = zip(outlines, X_WN, strict=True)
+    points = np.vstack([one.vertices @ X[:3, :3].T + X[:3, 3] for one, X in placed])
     middle = points.mean(axis=0)
     extent = max(float(np.sqrt(((points - middle) ** 2).sum(axis=1).mean())), 1e-9)
-    motions = np.zeros((len(size), 12, 6))
-    for c, X_CW in enumerate(views.cameras[0]):
-        for k, axis in enumerate(X_CW[:3, :3]):
-            M = np.cross(np.eye(3), axis).T / extent
-            motions[c, [3, 7, 11], k] = axis
-            motions[c, :, 3 + k] = np.column_stack([M, -M @ middle]).ravel()
-        motions[c] *= size[c]
-    return motions
+    motions = np.zeros((12, 6))
+    for k, axis in enumerate(X_CW[:3, :3]):
+        M = np.cross(np.eye(3), axis).T / extent
+        motions[[3, 7, 11], k] = axis
+        motions[:, 3 + k] = np.column_stack([M, -M @ middle]).ravel()
+    return motions * size
 
 
-def estimate_sizes(seen: Distances, is_angle: NDArray[np.bool_]) -> ErrorSizes:
+def estimate_sizes(
+    seen: Distances, is_angle: NDArray[np.bool_], least_camera: float = _LEAST_CAMERA
+) -> ErrorSizes:
     """How large the errors are: the likeliest, given what is left and the prior.
 
     Args:
         seen: the distances.
         is_angle: (m,) which values are angles.
+        least_camera: a picture errs as a whole by no less [of the unit].
     """
     n = len(seen.y)
     effects = (np.eye(n), *seen.effects)
@@ -180,8 +232,8 @@ def estimate_sizes(seen: Distances, is_angle: NDArray[np.bool_]) -> ErrorSizes:
         t, (value, P, Py) = t + step, trial
         if np.abs(step).max() < _SETTLED:
             break
-    noise, surface, mask, camera = np.exp(t)
-    return ErrorSizes(noise, surface, mask, max(camera, _LEAST_CAMERA))
+    noise, surface, mask, camera, *width = np.exp(t)
+    return ErrorSizes(noise, surface, mask, max(camera, least_camera), *width)
 
 
 def values_covariance(
@@ -195,7 +247,7 @@ def values_covariance(
     white = sizes.noise**2
     own = seen.X[:, free]
     V = sum(
-        (size**2 * W for size, W in zip(sizes[1:], seen.effects, strict=True)),
+        (size**2 * W for size, W in zip(sizes[1:], seen.effects, strict=False)),
         np.zeros((len(own), len(own))),
     )
     apriori = white * _apriori(is_angle)[np.ix_(free, free)]

@@ -113,8 +113,10 @@ def _sample(
             # OpenCV runs with the region to the left: outwards is to the right, y down.
             n0, n1 = -dv / size, du / size
             normals[found, 0], normals[found, 1] = n0, n1
-            # The outermost pixels' centres lie half a pixel inside of the edge.
-            uv[found, 0], uv[found, 1] = x + 0.5 * n0, y + 0.5 * n1
+            # The outermost pixels' centres lie half a pixel inside of the edge, along the rows or
+            # the columns: whichever cross it.
+            inside = 0.5 * max(abs(n0), abs(n1))
+            uv[found, 0], uv[found, 1] = x + inside * n0, y + inside * n1
             lengths[found] = size / (2 * _CHORD) * count / points
             found += 1
     order = np.argsort(uv[:found, 1])

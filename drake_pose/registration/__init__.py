@@ -1,0 +1,1 @@
+"""Where cameras stand, told by silhouettes of a body whose joint positions are known."""

@@ -1,0 +1,140 @@
+"""Frames of one camera in which the joint positions of the body are known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.camera import PinholeCamera
+from drake_pose.errors import MaskError
+from drake_pose.matching.fit.evidence import Evidence, find_edge_points, pack_evidence
+from drake_pose.silhouette import Outline, prefix_sums
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class PosedFrame:
+    """One picture of a body at known joint positions.
+
+    Args:
+        name: of the frame.
+        values: (m,) of the body's pose tree [rad or m].
+        mask: (H, W) the silhouette.
+    """
+
+    name: str
+    values: Array
+    mask: Mask
+
+
+class PosedFrames:
+    """All that a camera sees, as a search and a fit take it.
+
+    Attributes:
+        kinematics: the pose tree's.
+        outlines: a surface for each node.
+        camera: the camera; its pose is not used.
+        frames: the frames.
+        X_WN: (frames, nodes, 4, 4) the nodes' poses.
+        size: the root of the silhouettes' median area [pixel].
+
+    Args:
+        kinematics: the pose tree's.
+        outlines: a surface for each node.
+        camera: the camera.
+        frames: what it sees.
+
+    Raises:
+        MaskError: a mask of another size than the camera's picture, or an empty one.
+    """
+
+    def __init__(
+        self,
+        kinematics: TreeKinematics,
+        outlines: Sequence[Outline],
+        camera: PinholeCamera,
+        frames: Sequence[PosedFrame],
+    ) -> None:
+        for frame in frames:
+            if frame.mask.shape != (camera.height, camera.width) or not frame.mask.any():
+                raise MaskError(
+                    f"camera '{camera.name}', frame '{frame.name}': a mask of {camera.width} x "
+                    f"{camera.height} pixels that shows the body is expected, not "
+                    f"{frame.mask.shape[1]} x {frame.mask.shape[0]} with "
+                    f"{np.count_nonzero(frame.mask)} pixels of it"
+                )
+        self.kinematics, self.outlines = kinematics, tuple(outlines)
+        self.camera, self.frames = camera, tuple(frames)
+        self.X_WN = np.array([kinematics.poses(frame.values) for frame in frames])
+        areas = [np.count_nonzero(frame.mask) for frame in frames]
+        self.size = float(np.sqrt(np.median(areas)))
+
+    @cached_property
+    def points(self) -> list[Array]:
+        """(n, 3) of each frame: corners of the body's convex hull in the world [m]."""
+        return [self._hull(X) for X in self.X_WN]
+
+    @cached_property
+    def middle(self) -> Array:
+        """(3,) of the bodies' points in the world [m]."""
+        return np.asarray(np.concatenate(self.points).mean(axis=0))
+
+    @cached_property
+    def extent(self) -> float:
+        """How far the bodies' points are from their middle, root mean square [m]."""
+        off = np.concatenate(self.points) - self.middle
+        return float(np.sqrt((off**2).sum(axis=1).mean()))
+
+    def _hull(self, X_WN: Array) -> Array:
+        placed = zip(self.outlines, X_WN, strict=True)
+        points = np.concatenate([one.vertices @ X[:3, :3].T + X[:3, 3] for one, X in placed])
+        try:
+            return np.asarray(points[ConvexHull(points).vertices])
+        except QhullError:
+            # A flat body has no hull.
+            return np.asarray(points)
+
+    def evidence(self, spacing: float) -> list[Evidence]:
+        """The edges of each frame's silhouette, points so far apart [pixel]."""
+        return [pack_evidence([find_edge_points(frame.mask, spacing)]) for frame in self.frames]
+
+    def smaller(self, side: float) -> tuple[PinholeCamera, Array]:
+        """The camera with smaller pictures, and the silhouettes in them.
+
+        Args:
+            side: the root of the silhouettes' area in the smaller pictures [pixel].
+
+        Returns:
+            the camera, and (frames, H, W + 1) int32 prefix sums.
+        """
+        camera = self.camera
+        width = max(8, round(camera.width * min(1.0, side / self.size)))
+        height = max(8, round(camera.height * min(1.0, side / self.size)))
+        x, y = width / camera.width, height / camera.height
+        small = PinholeCamera(
+            camera.name,
+            width,
+            height,
+            camera.focal_x * x,
+            camera.focal_y * y,
+            (camera.center_x + 0.5) * x - 0.5,
+            (camera.center_y + 0.5) * y - 0.5,
+            camera.X_WC,
+            camera.near,
+        )
+        sums = []
+        for frame in self.frames:
+            shrunk = cv2.resize(
+                frame.mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA
+            )
+            sums.append(prefix_sums(shrunk > 0.5))
+        return small, np.array(sums)

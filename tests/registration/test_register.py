@@ -1,0 +1,135 @@
+"""A camera is found without a guess, from Drake's own pictures of an arm at known positions."""
+
+import numpy as np
+import pytest
+
+from drake_pose.body import ArticulatedModel, load_model
+from drake_pose.camera import PinholeCamera
+from drake_pose.errors import MaskError, RegistrationError
+from drake_pose.registration.posed_frames import PosedFrame
+from drake_pose.registration.register import CameraSearch, RegistrationBody
+from drake_pose.registration.start_poses import spread_rotations
+from drake_pose.silhouette import LabelRenderer
+from tests.matching.arms import arm_urdf
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> ArticulatedModel:
+    path = tmp_path_factory.mktemp("arm") / "arm.urdf"
+    path.write_text(arm_urdf())
+    return load_model(path)
+
+
+@pytest.fixture(scope="module")
+def body(model: ArticulatedModel) -> RegistrationBody:
+    return RegistrationBody(model.pose_tree())
+
+
+def looking_at(place: np.ndarray, middle: np.ndarray, roll: float) -> PinholeCamera:
+    """A camera at a place (3,), whose picture's middle is a point (3,), turned by roll [rad]."""
+    z = (middle - place) / np.linalg.norm(middle - place)
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    x /= np.linalg.norm(x)
+    y = np.cross(z, x)
+    X_WC = np.eye(4)
+    c, s = np.cos(roll), np.sin(roll)
+    X_WC[:3, :3] = np.column_stack([c * x + s * y, c * y - s * x, z])
+    X_WC[:3, 3] = place
+    return PinholeCamera("eye", 640, 480, 600.0, 600.0, 319.5, 239.5, X_WC)
+
+
+def see(
+    model: ArticulatedModel, body: RegistrationBody, camera: PinholeCamera, count: int, seed: int
+) -> list[PosedFrame]:
+    """Drake's pictures of random poses."""
+    rng, kinematics = np.random.default_rng(seed), body.kinematics
+    renderer = LabelRenderer(model, camera)
+    frames = []
+    for k in range(count):
+        values = rng.uniform(kinematics.lower, kinematics.upper)
+        q, X_WB = body.tree.positions_from(kinematics.split(values))
+        frames.append(PosedFrame(f"{k:04d}", values, renderer.mask(q, X_WB)))
+    return frames
+
+
+def errors(found: np.ndarray, true: np.ndarray) -> tuple[float, float]:
+    """How far a pose (4, 4) is off [m, rad]."""
+    cosine = 0.5 * (np.trace(found[:3, :3].T @ true[:3, :3]) - 1.0)
+    shift = float(np.linalg.norm(found[:3, 3] - true[:3, 3]))
+    return shift, float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+PLACES = {
+    "beside": (np.array([1.6, 0.4, 0.5]), 0.1),
+    "above, turned": (np.array([0.5, -0.6, 1.7]), 2.0),
+    "below, upside down": (np.array([-0.9, 1.0, -0.6]), 3.1),
+}
+
+
+class TestCameraSearch:
+    @pytest.mark.parametrize("place", PLACES)
+    def test_finds_a_camera_anywhere(
+        self, model: ArticulatedModel, body: RegistrationBody, place: str
+    ) -> None:
+        where, roll = PLACES[place]
+        camera = looking_at(where, np.array([0.0, 0.0, 0.4]), roll)
+        found = CameraSearch(body).register(
+            camera.with_pose(np.eye(4)), see(model, body, camera, 5, 1)
+        )
+        shift, turn = errors(found.camera.X_WC, camera.X_WC)
+        assert shift < 2e-3
+        assert turn < np.radians(0.1)
+        assert not found.contradictions
+        assert not len(found.alternatives)
+        assert shift < 4.0 * np.sqrt(3.0) * found.translation_sd < 0.01
+        assert all(frame.iou > 0.99 for frame in found.frames)
+
+    def test_names_the_frame_that_contradicts(
+        self, model: ArticulatedModel, body: RegistrationBody
+    ) -> None:
+        camera = looking_at(np.array([1.6, 0.4, 0.5]), np.array([0.0, 0.0, 0.4]), 0.1)
+        frames = see(model, body, camera, 5, 2)
+        frames[3] = PosedFrame("0003", -frames[3].values, frames[3].mask)
+        found = CameraSearch(body).register(camera, frames)
+        shift, turn = errors(found.camera.X_WC, camera.X_WC)
+        assert found.contradictions == ("0003",)
+        assert shift < 3e-3
+        assert turn < np.radians(0.15)
+
+    def test_refuses_what_shows_nothing(
+        self, model: ArticulatedModel, body: RegistrationBody
+    ) -> None:
+        camera = looking_at(np.array([1.6, 0.4, 0.5]), np.array([0.0, 0.0, 0.4]), 0.1)
+        with pytest.raises(RegistrationError, match="'eye': no frame"):
+            CameraSearch(body).register(camera, [])
+        empty = PosedFrame("0007", body.kinematics.lower, np.zeros((480, 640), bool))
+        with pytest.raises(MaskError, match="frame '0007'"):
+            CameraSearch(body).register(camera, [empty])
+
+
+class TestSpreadRotations:
+    def test_no_rotation_is_far_from_all(self) -> None:
+        R = spread_rotations(3000)
+        assert np.allclose(R @ np.swapaxes(R, 1, 2), np.eye(3), atol=1e-12)
+        rng = np.random.default_rng(3)
+        q = rng.normal(size=(500, 4))
+        w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
+        trace_parts = np.einsum("nij,kij->kn", R, _matrices(w, x, y, z))
+        nearest = np.arccos(np.clip(0.5 * (trace_parts.max(axis=1) - 1.0), -1.0, 1.0))
+        # A ball of this radius about each would hold all rotations about twice over.
+        assert np.degrees(nearest.max()) < 16.0
+
+
+def _matrices(w: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """(n, 3, 3) of unit quaternions."""
+    return np.moveaxis(
+        np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            ]
+        ),
+        2,
+        0,
+    )

@@ -21,7 +21,7 @@ from drake_pose.errors import RegistrationError, SettingsError
 from drake_pose.matching.fit.levenberg_marquardt import Round
 from drake_pose.matching.fit.significance import excess
 from drake_pose.matching.fit.surfaces import FEW, VERY_FEW, few_triangles
-from drake_pose.registration.camera_fit import CameraFit
+from drake_pose.registration.camera_fit import CameraFit, FittedCamera
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.start_poses import (
     E_total,
@@ -33,6 +33,7 @@ from drake_pose.registration.uncertainty import camera_covariance
 from drake_pose.silhouette import Outline, TreeSurfaces
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 _COARSE = tuple(Round(s, 0.05) for s in (0.25, 0.2, 0.15, 0.12, 0.09, 0.07, 0.05, 0.04))
 _FINE = (Round(0.05, 0.02), Round(0.03, 0.015), Round(0.02, 0.0125), Round(0.01, 0.0125, 4))
@@ -49,6 +50,8 @@ _KEPT = 6
 _TOLD_APART = Round(0.025, 0.01)
 # A frame agrees of which this share fits of what fits in the two that fit best.
 _AGREES = 0.7
+# So often frames that agree are fitted again.
+_AGAIN = 2
 # What is missing or too much is about as large [root of the area].
 _PIECE = 0.2
 # A pose is worse whose cost is larger by more standard deviations of the difference.
@@ -184,9 +187,8 @@ class CameraSearch:
         fine = CameraFit(self._posed(self._body.few, camera, frames), _FINE_SPACING)
         last = CameraFit(self._posed(self._body.all, camera, frames), _LAST_SPACING)
         looks = self._search(camera, frames)
-        fitted = [fine.fit(X_CW, _FINE).X_CW for X_CW in looks]
-        fitted = _distinct(last.frames, [last.fit(X_CW, _LAST).X_CW for X_CW in fitted])
-        return self._describe(last, fitted)
+        fitted = [last.fit(fine.fit(X_CW, _FINE), _LAST) for X_CW in looks]
+        return self._describe(last, _distinct(last.frames, fitted))
 
     def _posed(
         self, outlines: Sequence[Outline], camera: PinholeCamera, frames: Sequence[PosedFrame]
@@ -203,20 +205,20 @@ class CameraSearch:
         starts[:, :3, 3] = place_by_bounds(posed, self._R_CW)
         order = np.argsort(_mean_misfit(posed, starts, _FIRST_SIDE), kind="stable")
         fit = CameraFit(posed, _COARSE_SPACING)
-        found = [fit.fit(starts[k], _COARSE).X_CW for k in order[: self._settings.fitted]]
+        found = [fit.fit(starts[k], _COARSE) for k in order[: self._settings.fitted]]
         off = _mean_misfit(posed, np.array(found), _SECOND_SIDE)
         return _distinct(posed, [found[k] for k in np.argsort(off, kind="stable")])[:_KEPT]
 
     def _describe(self, fit: CameraFit, looks: Sequence[Array]) -> RegisteredCamera:
         """The best of the poses X_CW (4, 4), and those that fit no worse."""
-        pieces = [_piece_costs(fit, X_CW) for X_CW in looks]
+        fitted = [_with_widths(fit, X_CW) for X_CW in looks]
+        side = max(1.0, _PIECE * fit.frames.size)
+        pieces = [fit.piece_costs(one, _TOLD_APART, side) for one in fitted]
         order = np.argsort([one.sum() for one in pieces], kind="stable")
-        best = looks[order[0]]
+        best = fitted[order[0]]
         shares = _shares(fit, best)
-        agreeing = shares >= _AGREES * np.sort(shares)[-2:].mean()
-        if not agreeing.all():
-            best = fit.fit(best, _LAST, np.flatnonzero(agreeing)).X_CW
-        found = areas(fit.frames, best[None], np.inf)[0]
+        agreeing = _agreeing(shares)
+        found = areas(fit.frames, best.X_CW[None], np.inf)[0]
         body, mask, both = found.T
         iou = both / np.maximum(body + mask - both, 1.0)
         rows = zip(fit.frames.frames, E_total(found), iou, shares, agreeing, strict=True)
@@ -224,14 +226,16 @@ class CameraSearch:
             FrameMisfit(frame.name, float(off), float(one), float(share), bool(agrees))
             for frame, off, one, share, agrees in rows
         ]
-        others = [
-            looks[k] for k in order[1:] if excess(pieces[k], pieces[order[0]]) <= _SIGNIFICANCE
-        ]
+        # A frame that contradicts fits no pose, so it tells none from another.
+        counted = [one[agreeing] for one in pieces]
+        as_good = [k for k in order if excess(counted[k], counted[order[0]]) <= _SIGNIFICANCE]
+        # Fits that began apart may have ended in one pose.
+        alike = _distinct(fit.frames, [fitted[k].X_CW for k in as_good])
         return RegisteredCamera(
-            fit.frames.camera.with_pose(np.linalg.inv(best)),
+            fit.frames.camera.with_pose(np.linalg.inv(best.X_CW)),
             camera_covariance(fit, best, np.flatnonzero(agreeing)),
             tuple(misfits),
-            np.linalg.inv(np.array(others).reshape(-1, 4, 4)),
+            np.linalg.inv(np.array(alike[1:], np.float64).reshape(-1, 4, 4)),
         )
 
 
@@ -255,22 +259,20 @@ def _distinct(frames: PosedFrames, X_CW: Sequence[Array]) -> list[Array]:
     return kept
 
 
-def _shares(fit: CameraFit, X_CW: Array) -> Array:
+def _with_widths(fit: CameraFit, X_CW: Array) -> FittedCamera:
+    """A pose (4, 4) fitted to the frames that agree, and the widths of their silhouettes."""
+    found = FittedCamera(X_CW, np.zeros(len(fit.values)))
+    for _ in range(_AGAIN):
+        found = fit.fit_with_widths(found, _LAST, np.flatnonzero(_agreeing(_shares(fit, found))))
+    return found
+
+
+def _shares(fit: CameraFit, fitted: FittedCamera) -> Array:
     """(frames,) of both contours' lengths, what fits."""
-    return np.array(
-        [
-            fit.contours.compare_views(views, values, _TOLD_APART).share
-            for views, values in zip(fit.views(X_CW), fit.values, strict=True)
-        ]
-    )
+    rows = enumerate(fitted.widths)
+    return np.array([fit.compare(fitted.X_CW, k, _TOLD_APART, width).share for k, width in rows])
 
 
-def _piece_costs(fit: CameraFit, X_CW: Array) -> Array:
-    """(frames, k, k) costs by pieces of the pictures that err on their own."""
-    side = max(1.0, _PIECE * fit.frames.size)
-    return np.array(
-        [
-            fit.contours.piece_costs(views, values, _TOLD_APART, side)[0]
-            for views, values in zip(fit.views(X_CW), fit.values, strict=True)
-        ]
-    )
+def _agreeing(shares: Array) -> Mask:
+    """(frames,) which frames fit nearly as well as the two that fit best."""
+    return np.asarray(shares >= _AGREES * np.sort(shares)[-2:].mean())

@@ -147,6 +147,10 @@ class ContourTracker:
 
     def start(self, x: Array) -> Track:
         """Begin at a state (n,), for example the matcher's, as sure of it as the settings say."""
+        return Track(self.filter.start(self.start_belief(x)), None, False)
+
+    def start_belief(self, x: Array) -> Belief:
+        """What is believed of a state (n,) before inequalities and pictures: what settings say."""
         layout, settings = self.observation.layout, self.settings
         deviations = np.zeros(len(layout))
         for name in layout.names:
@@ -159,7 +163,7 @@ class ContourTracker:
                 acceleration = self._acceleration(name.removeprefix("rate_"))
                 # What a limb picks up while its rate is remembered.
                 deviations[index] = acceleration * settings.memory * self._period
-        return Track(self.filter.start(Belief(x, np.diag(deviations**2))), None, False)
+        return Belief(x, np.diag(deviations**2))
 
     def follow(
         self,

@@ -34,8 +34,6 @@ _LEAST_INFORMATION = 1.0
 # At most so many independent distances are looked at, the best known ones.
 _MOST_DISTANCES = 400
 _ITERATIONS, _SETTLED = 20, 0.03
-# A part that grows along its three axes is wider on all sides.
-_WIDER = np.array([float(k in (3, 7, 11)) for k in range(12)])
 # A place is known to about as much, and an angle to a full turn [m, rad].
 _PLACE = 10.0
 
@@ -46,14 +44,12 @@ class ErrorSizes(NamedTuple):
     Attributes:
         noise: of a point of contour, as the fit weights it.
         surface, mask, camera: how far they move contours [the unit of the distances].
-        width: how much wider a silhouette is on all sides [that unit]; 0 where it was not asked.
     """
 
     noise: float
     surface: float
     mask: float
     camera: float
-    width: float = 0.0
 
 
 class Distances(NamedTuple):
@@ -62,14 +58,13 @@ class Distances(NamedTuple):
     Attributes:
         y: (n,) the distances.
         X: (n, m) how they follow the values.
-        effects: (n, n) covariances that surfaces, masks' parts and cameras make that err by a unit,
-            and silhouettes that are wider by a unit, where that was asked.
+        effects: (n, n) covariances that surfaces, masks' parts and cameras make that err by a unit.
         information: (m, m) what all distances tell of the values where each errs by itself.
     """
 
     y: Array
     X: Array
-    effects: tuple[Array, ...]
+    effects: tuple[Array, Array, Array]
     information: Array
 
 
@@ -111,24 +106,20 @@ def distances(fit: ContourFit, views: Views, compared: Comparison, unit: float) 
     return distances_in_pictures(fit.outlines, pictures)
 
 
-def distances_in_pictures(
-    outlines: Sequence[Outline], pictures: Sequence[Picture], wider: bool = False
-) -> Distances:
+def distances_in_pictures(outlines: Sequence[Outline], pictures: Sequence[Picture]) -> Distances:
     """The distances in several pictures, each of which errs as a whole, too.
 
     Args:
         outlines: the nodes' surfaces.
         pictures: each with the same values.
-        wider: whether silhouettes may be wider or narrower on all sides.
     """
     found: list[tuple[float, int, int, Array, Array, Array, float]] = []
     mean_size = float(np.mean([picture.size for picture in pictures]))
     for c, (A_lower, b, X_WN, X_CW, moves, size) in enumerate(pictures):
         A = np.tril(A_lower) + np.swapaxes(np.tril(A_lower, -1), -1, -2)
-        common = _camera_motions(outlines, X_CW, X_WN, size)
+        shakes = _camera_motions(outlines, X_CW, X_WN, size)
         for n in np.flatnonzero(np.einsum("nii->n", A) > 0.0).tolist():
             D = surface_deformations(outlines[n].vertices, X_WN[n]) * mean_size
-            shakes = np.column_stack([common, D @ _WIDER]) if wider else common
             share, turns = np.linalg.eigh(D.T @ A[n] @ D)
             for known, turn in zip(share, turns.T, strict=True):
                 if known >= _LEAST_INFORMATION:
@@ -141,7 +132,7 @@ def distances_in_pictures(
     found = sorted(found, key=lambda one: -one[0])[:_MOST_DISTANCES]
     of = np.array([(one[1], one[2]) for one in found]).reshape(-1, 2)
     bends = np.array([one[4] for one in found]).reshape(-1, 12)
-    shaken = np.array([one[5] for one in found]).reshape(-1, 6 + wider)
+    shaken = np.array([one[5] for one in found]).reshape(-1, 6)
     same_picture, same_part = (of[:, None, k] == of[None, :, k] for k in range(2))
     alike = bends @ bends.T * same_part
     count = pictures[0].moves.shape[1]
@@ -149,14 +140,10 @@ def distances_in_pictures(
     for A_lower, _, _, _, moves, _ in pictures:
         A = np.tril(A_lower) + np.swapaxes(np.tril(A_lower, -1), -1, -2)
         information += (moves @ A @ np.swapaxes(moves, 1, 2)).sum(axis=0)
-    moved, widened = shaken[:, :6], shaken[:, 6:]
-    effects = [alike, alike * same_picture, moved @ moved.T * same_picture]
-    if wider:
-        effects.append(widened @ widened.T * same_picture)
     return Distances(
         y=np.array([one[6] for one in found]),
         X=np.array([one[3] for one in found]).reshape(-1, count),
-        effects=tuple(effects),
+        effects=(alike, alike * same_picture, shaken @ shaken.T * same_picture),
         information=information,
     )
 
@@ -174,6 +161,11 @@ def surface_deformations(vertices: Array, X_WN: Array) -> Array:
             v = -M @ (X_WN[:3, 3] + R @ middle)
             K[:, 3 + 3 * i + j] = np.column_stack([M, v]).ravel()
     return K
+
+
+def widening(vertices: Array, X_WN: Array) -> Array:
+    """(12,) an affine motion that makes a part's surface about a metre wider on all sides."""
+    return np.asarray(surface_deformations(vertices, X_WN)[:, [3, 7, 11]].sum(axis=1))
 
 
 def _camera_motions(outlines: Sequence[Outline], X_CW: Array, X_WN: Array, size: float) -> Array:
@@ -232,8 +224,8 @@ def estimate_sizes(
         t, (value, P, Py) = t + step, trial
         if np.abs(step).max() < _SETTLED:
             break
-    noise, surface, mask, camera, *width = np.exp(t)
-    return ErrorSizes(noise, surface, mask, max(camera, least_camera), *width)
+    noise, surface, mask, camera = np.exp(t)
+    return ErrorSizes(noise, surface, mask, max(camera, least_camera))
 
 
 def values_covariance(
@@ -247,7 +239,7 @@ def values_covariance(
     white = sizes.noise**2
     own = seen.X[:, free]
     V = sum(
-        (size**2 * W for size, W in zip(sizes[1:], seen.effects, strict=False)),
+        (size**2 * W for size, W in zip(sizes[1:], seen.effects, strict=True)),
         np.zeros((len(own), len(own))),
     )
     apriori = white * _apriori(is_angle)[np.ix_(free, free)]

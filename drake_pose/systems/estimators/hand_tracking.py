@@ -136,7 +136,8 @@ def _filter_parts(
 ) -> _FilterParts:
     """What is needed to filter; the arguments are those of add_hand_tracking."""
     body = ContourObservation(search.tree, [camera])
-    start = ContourTracker(body, period, tracking).start(
+    # The filter truncates its start where that is; here it is not known yet.
+    start = ContourTracker(body, period, tracking).start_belief(
         body.state(search.tree.model.default_positions)
     )
     middle = (0.5 * (camera.width - 1), 0.5 * (camera.height - 1))
@@ -156,7 +157,7 @@ def _filter_parts(
         FilterSettings(),
         transition,
     )
-    return _FilterParts(belief_filter, observation, transition, start.state.best)
+    return _FilterParts(belief_filter, observation, transition, start)
 
 
 def build_hand_tracking(

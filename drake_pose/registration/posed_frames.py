@@ -80,7 +80,7 @@ class PosedFrames:
 
     @cached_property
     def points(self) -> list[Array]:
-        """(n, 3) of each frame: corners of the body's convex hull in the world [m]."""
+        """Corners (n, 3) of the body's convex hull in each frame, in the world [m]."""
         return [self._hull(X) for X in self.X_WN]
 
     @cached_property

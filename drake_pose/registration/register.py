@@ -190,6 +190,20 @@ class CameraSearch:
         fitted = [last.fit(fine.fit(X_CW, _FINE), _LAST) for X_CW in looks]
         return self._describe(last, _distinct(last.frames, fitted))
 
+    def refine(self, camera: PinholeCamera, frames: Sequence[PosedFrame]) -> RegisteredCamera:
+        """Finds the camera's pose near that which it has; alternatives are not looked for.
+
+        Args:
+            camera: with a pose within some pixels of the right one.
+            frames: what it sees, one or more.
+
+        Raises:
+            MaskError: a mask of another size than the camera's picture, or an empty one.
+        """
+        fine = CameraFit(self._posed(self._body.few, camera, frames), _FINE_SPACING)
+        last = CameraFit(self._posed(self._body.all, camera, frames), _LAST_SPACING)
+        return self._describe(last, [last.fit(fine.fit(camera.X_CW, _FINE), _LAST)])
+
     def _posed(
         self, outlines: Sequence[Outline], camera: PinholeCamera, frames: Sequence[PosedFrame]
     ) -> PosedFrames:
@@ -235,7 +249,7 @@ class CameraSearch:
             fit.frames.camera.with_pose(np.linalg.inv(best.X_CW)),
             camera_covariance(fit, best, np.flatnonzero(agreeing)),
             tuple(misfits),
-            np.linalg.inv(np.array(alike[1:], np.float64).reshape(-1, 4, 4)),
+            np.array([np.linalg.inv(X) for X in alike[1:]]).reshape(-1, 4, 4),
         )
 
 

@@ -8,6 +8,7 @@ from drake_pose.systems.date.horizontal_image import HorizontalImage
 from drake_pose.systems.date.pose_estimator import PaperPoseEstimator
 from drake_pose.systems.date.pose_recogniser import PoseRecogniser
 from drake_pose.systems.estimators.axis_sensor import AxisSensor, BodyBelief, StateMatcher
+from drake_pose.systems.estimators.camera_registration import REGISTRATION, CameraRegistration
 from drake_pose.systems.estimators.diagrams import (
     MatchingDiagram,
     build_recorded_matching,
@@ -19,6 +20,10 @@ from drake_pose.systems.estimators.hand_tracking import (
     build_hand_tracking,
 )
 from drake_pose.systems.estimators.mask_player import MaskPlayer
+from drake_pose.systems.estimators.registration_diagram import (
+    RegistrationDiagram,
+    build_simulated_registration,
+)
 from drake_pose.systems.estimators.silhouette_matcher import STATISTICS, SilhouetteMatcher
 from drake_pose.systems.estimators.silhouette_tracker import TRACK, SilhouetteTracker
 from drake_pose.systems.estimators.truncated_ekf import TruncatedEkf
@@ -35,11 +40,13 @@ from drake_pose.systems.pictures.picture_capture import CameraCount, PictureCapt
 from drake_pose.systems.walk.walk import Walker, WalkKeys, WalkView, build_walk
 
 __all__ = [
+    "REGISTRATION",
     "STATISTICS",
     "TRACK",
     "AxisSensor",
     "BodyBelief",
     "CameraCount",
+    "CameraRegistration",
     "FaceDirectionFinder",
     "FeatureFinder",
     "HandTracking",
@@ -54,6 +61,7 @@ __all__ = [
     "PersonTracker",
     "PictureCapture",
     "PoseRecogniser",
+    "RegistrationDiagram",
     "SensorPorts",
     "SilhouetteCapture",
     "SilhouetteMatcher",
@@ -75,5 +83,6 @@ __all__ = [
     "build_recorded_matching",
     "build_silhouette_capture",
     "build_simulated_matching",
+    "build_simulated_registration",
     "build_walk",
 ]

@@ -1,0 +1,270 @@
+"""A camera that is registered while the body moves, and registered again after it was moved.
+
+Frames come one after another. A bounded number of keyframes is kept, in which the body stands
+differently, the newest ones; the camera's pose is fitted to them. That the camera was moved shows
+in one of two ways: frames contradict the pose and agree with one another, or the pose by the newest
+keyframes alone differs significantly from that by all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.special import chdtri
+
+from drake_pose.camera import PinholeCamera
+from drake_pose.errors import RegistrationError, SettingsError
+from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
+from drake_pose.registration.register import CameraSearch, RegisteredCamera, RegistrationBody
+from drake_pose.registration.start_poses import E_total, areas
+
+Array = NDArray[np.float64]
+
+# A frame contradicts of which less than this share fits of what usually fits.
+_CONTRADICTS = 0.7
+
+
+class CameraStatus(IntEnum):
+    """What is known of a camera's pose: nothing; the pose; that the last frames contradict it."""
+
+    NOT_REGISTERED = 0
+    REGISTERED = 1
+    CONTRADICTED = 2
+
+
+@dataclass(frozen=True)
+class OnlineSettings:
+    """Which frames are kept, and when the camera has been moved.
+
+    Args:
+        least_frames: the camera is searched for in so many keyframes or more.
+        most_frames: so many keyframes are kept at most, the newest.
+        newest: so many keyframes, or frames that contradict the pose, tell that it has changed.
+        novelty: a frame is a keyframe where the body's points are this far from where they are
+            in all keyframes, root mean square [the body's own extent, root mean square].
+        tolerance: a frame near a keyframe says nothing new where the area in which body and mask
+            differ is larger by no more than this [the mask's area].
+        lowest_iou: mean intersection over union, below which no camera is believed to be found.
+        false_alarm: how probable a difference by chance is that counts as a moved camera.
+
+    Raises:
+        SettingsError: a setting out of its range.
+    """
+
+    least_frames: int = 5
+    most_frames: int = 12
+    newest: int = 3
+    novelty: float = 0.15
+    tolerance: float = 0.04
+    lowest_iou: float = 0.5
+    false_alarm: float = 1e-6
+
+    def __post_init__(self) -> None:
+        if not 2 <= self.newest <= self.least_frames <= self.most_frames:
+            raise SettingsError(
+                "2 <= newest <= least_frames <= most_frames is expected, not "
+                f"{self.newest}, {self.least_frames}, {self.most_frames}"
+            )
+        for name in ("novelty", "tolerance"):
+            if not getattr(self, name) >= 0.0:
+                raise SettingsError(f"{name} must be 0 or more, not {getattr(self, name)}")
+        for name in ("lowest_iou", "false_alarm"):
+            if not 0.0 < getattr(self, name) < 1.0:
+                raise SettingsError(f"{name} must be between 0 and 1, not {getattr(self, name)}")
+
+
+@dataclass(frozen=True, eq=False)
+class OnlineState:
+    """What is known of a camera; never changed, so that copies share it.
+
+    Args:
+        keyframes: the kept frames, oldest first.
+        contradicting: the last frames that contradict the pose, oldest first; the body stands
+            differently in all of them.
+        registered: the camera as it was found; None: not yet.
+        contradictions: how many frames without a gap have contradicted the pose.
+        moves: how often the camera was found elsewhere.
+    """
+
+    keyframes: tuple[PosedFrame, ...] = ()
+    contradicting: tuple[PosedFrame, ...] = ()
+    registered: RegisteredCamera | None = None
+    contradictions: int = 0
+    moves: int = 0
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> OnlineState:
+        # Drake copies abstract state, which would be megabytes of masks at every update.
+        return self
+
+
+class OnlineRegistration:
+    """Registers a camera while frames come in.
+
+    Attributes:
+        body: the body.
+        camera: the camera's intrinsics.
+        settings: which frames are kept, and when the camera has been moved.
+
+    Args:
+        body: the body.
+        camera: the camera's intrinsics; its pose is not used.
+        settings: which frames are kept, and when the camera has been moved.
+        search: finds the camera; by default with default settings.
+    """
+
+    def __init__(
+        self,
+        body: RegistrationBody,
+        camera: PinholeCamera,
+        settings: OnlineSettings | None = None,
+        search: CameraSearch | None = None,
+    ) -> None:
+        self.body, self.camera = body, camera
+        self.settings = settings or OnlineSettings()
+        self._search = search or CameraSearch(body)
+        self._limit = float(chdtri(6, self.settings.false_alarm))
+
+    def status(self, state: OnlineState) -> CameraStatus:
+        """What is known of the camera's pose."""
+        if state.registered is None:
+            return CameraStatus.NOT_REGISTERED
+        if state.contradictions >= self.settings.newest:
+            return CameraStatus.CONTRADICTED
+        return CameraStatus.REGISTERED
+
+    def next(self, state: OnlineState, frame: PosedFrame) -> OnlineState:
+        """What is known after another frame; one without any pixel of the body says nothing.
+
+        Args:
+            state: what was known before; at first ``OnlineState()``.
+            frame: the frame; it may be kept, and must not be changed any more.
+
+        Raises:
+            MaskError: a mask of another size than the camera's picture.
+        """
+        if not frame.mask.any():
+            return state
+        if state.registered is None:
+            return self._collect(state, frame)
+        return self._follow(state, state.registered, frame)
+
+    def _collect(self, state: OnlineState, frame: PosedFrame) -> OnlineState:
+        """Before the camera is found."""
+        if self._nearest(frame, state.keyframes) is not None:
+            return state
+        keyframes = (*state.keyframes, frame)[-self.settings.most_frames :]
+        if len(keyframes) >= self.settings.least_frames:
+            found = self._find(keyframes)
+            if found is not None:
+                return _registered(found, keyframes, state.moves)
+        return replace(state, keyframes=keyframes)
+
+    def _follow(
+        self, state: OnlineState, registered: RegisteredCamera, frame: PosedFrame
+    ) -> OnlineState:
+        """After it was found."""
+        near = self._nearest(frame, state.keyframes)
+        if near is not None:
+            usual = registered.frames[near].E_total
+            if self._misfit(registered.camera, frame) <= usual + self.settings.tolerance:
+                return replace(state, contradicting=(), contradictions=0)
+        kept = [one for k, one in enumerate(state.keyframes) if k != near]
+        keyframes = (*kept, frame)[-self.settings.most_frames :]
+        found = self._search.refine(registered.camera, keyframes)
+        newest = found.frames[-1]
+        if newest.agrees and newest.share >= _CONTRADICTS * _usual_share(registered):
+            return self._settle(_registered(found, keyframes, state.moves))
+        return self._contradict(state, registered, frame)
+
+    def _settle(self, state: OnlineState) -> OnlineState:
+        """The state, or that of the newest keyframes alone where they say otherwise."""
+        newest = state.keyframes[-self.settings.newest :]
+        if state.registered is None or len(state.keyframes) <= len(newest):
+            return state
+        alone = self._search.refine(state.registered.camera, newest)
+        off = pose_difference(alone.camera.X_WC, state.registered.camera.X_WC)
+        distance = float(off @ np.linalg.solve(alone.covariance, off))
+        if distance <= self._limit or alone.contradictions:
+            return state
+        return _registered(alone, newest, state.moves + 1)
+
+    def _contradict(
+        self, state: OnlineState, registered: RegisteredCamera, frame: PosedFrame
+    ) -> OnlineState:
+        """Another frame contradicts; the camera elsewhere, where they agree with one another."""
+        near = self._nearest(frame, state.contradicting)
+        kept = [one for k, one in enumerate(state.contradicting) if k != near]
+        frames = (*kept, frame)[-self.settings.most_frames :]
+        state = replace(state, contradicting=frames, contradictions=state.contradictions + 1)
+        if near is not None or len(frames) < self.settings.newest:
+            return state
+        least = _CONTRADICTS * _usual_share(registered)
+        found: RegisteredCamera | None = self._search.refine(registered.camera, frames)
+        if not self._is_found(found, self.settings.newest, least):
+            found = self._find(frames, least) if len(frames) >= self.settings.least_frames else None
+        return state if found is None else _registered(found, frames, state.moves + 1)
+
+    def _find(self, frames: Sequence[PosedFrame], least: float = 0.0) -> RegisteredCamera | None:
+        """The camera without a guess; None where it is not determined."""
+        try:
+            found = self._search.register(self.camera, frames)
+        except RegistrationError:
+            return None
+        return found if self._is_found(found, self.settings.least_frames, least) else None
+
+    def _is_found(self, found: RegisteredCamera | None, count: int, least: float) -> bool:
+        """Whether so many frames, and more than half, agree; of which a share fits at least."""
+        if found is None or len(found.alternatives):
+            return False
+        agreeing = [frame for frame in found.frames if frame.agrees]
+        return (
+            len(agreeing) >= max(count, len(found.frames) // 2 + 1)
+            and float(np.mean([frame.iou for frame in agreeing])) >= self.settings.lowest_iou
+            and float(np.median([frame.share for frame in agreeing])) >= least
+        )
+
+    def _misfit(self, camera: PinholeCamera, frame: PosedFrame) -> float:
+        """A frame's E_total at a camera's pose."""
+        posed = PosedFrames(self.body.kinematics, self.body.few, camera, [frame])
+        return float(E_total(areas(posed, camera.X_CW[None], np.inf))[0, 0])
+
+    def _nearest(self, frame: PosedFrame, frames: Sequence[PosedFrame]) -> int | None:
+        """The last of the frames in which the body stands as in another one; None: none does."""
+        here = self._points(frame)
+        extent = float(np.sqrt(((here - here.mean(axis=0)) ** 2).sum(axis=1).mean()))
+        for k in reversed(range(len(frames))):
+            off = np.sqrt(((self._points(frames[k]) - here) ** 2).sum(axis=1).mean())
+            if off < self.settings.novelty * extent:
+                return k
+        return None
+
+    def _points(self, frame: PosedFrame) -> Array:
+        """(n, 3) of the body in the world."""
+        X_WN = self.body.kinematics.poses(frame.values)
+        placed = zip(self.body.very_few, X_WN, strict=True)
+        return np.concatenate([one.vertices @ X[:3, :3].T + X[:3, 3] for one, X in placed])
+
+
+def pose_difference(X_WC: Array, from_X_WC: Array) -> Array:
+    """(6,) rotation vector and shift along the world's axes from one pose (4, 4) to another."""
+    R = X_WC[:3, :3] @ from_X_WC[:3, :3].T
+    turn = Rotation.from_matrix(R).as_rotvec()
+    return np.concatenate([turn, X_WC[:3, 3] - from_X_WC[:3, 3]])
+
+
+def _registered(found: RegisteredCamera, frames: Sequence[PosedFrame], moves: int) -> OnlineState:
+    """The state in which the frames that agree are kept."""
+    pairs = [(one, frame) for one, frame in zip(frames, found.frames, strict=True) if frame.agrees]
+    kept = replace(found, frames=tuple(frame for _, frame in pairs))
+    return OnlineState(tuple(one for one, _ in pairs), (), kept, 0, moves)
+
+
+def _usual_share(registered: RegisteredCamera) -> float:
+    """Of both contours' lengths, what fits in the median frame."""
+    return float(np.median([frame.share for frame in registered.frames]))

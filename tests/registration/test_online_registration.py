@@ -1,0 +1,285 @@
+"""Which frames are kept, when the camera is searched for, and when it is said to have moved."""
+
+import copy
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from drake_pose.body import ArticulatedModel, load_model
+from drake_pose.camera import PinholeCamera
+from drake_pose.errors import RegistrationError, SettingsError
+from drake_pose.registration.online_registration import (
+    CameraStatus,
+    OnlineRegistration,
+    OnlineSettings,
+    OnlineState,
+    pose_difference,
+)
+from drake_pose.registration.posed_frames import PosedFrame
+from drake_pose.registration.register import FrameMisfit, RegisteredCamera, RegistrationBody
+from drake_pose.silhouette import LabelRenderer
+from tests.matching.arms import arm_urdf
+from tests.registration.test_register import looking_at
+
+NOT_REGISTERED, REGISTERED, CONTRADICTED = CameraStatus
+SEEN = np.ones((480, 640), dtype=bool)
+# Each: the turn of a joint; the body's points are elsewhere in all of them.
+TURNS = np.radians([-140.0, -100.0, -60.0, -20.0, 20.0, 60.0, 100.0, 140.0])
+
+# Where the camera stands [m].
+PLACES = {"here": 1.6, "a little off": 1.62, "there": 2.0}
+
+
+def camera_at(x: float) -> PinholeCamera:
+    return looking_at(np.array([x, 0.4, 0.5]), np.array([0.0, 0.0, 0.4]), 0.1)
+
+
+class ScriptedSearch:
+    """In place of a search: a frame's name says where the camera stood, most frames are right."""
+
+    def __init__(self) -> None:
+        self.searches = 0
+        self.alternatives = 0
+
+    def register(self, camera: PinholeCamera, frames: Sequence[PosedFrame]) -> RegisteredCamera:
+        self.searches += 1
+        names = [frame.name for frame in frames]
+        most = max(PLACES, key=names.count)
+        if names.count(most) == 0:
+            raise RegistrationError("nothing fits")
+        return self._at(most, frames, self.alternatives)
+
+    def refine(self, camera: PinholeCamera, frames: Sequence[PosedFrame]) -> RegisteredCamera:
+        near = min(PLACES, key=lambda name: abs(PLACES[name] - camera.X_WC[0, 3]))
+        if near == "here" and all(frame.name == "a little off" for frame in frames):
+            near = "a little off"
+        return self._at(near, frames, 0)
+
+    def _at(self, place: str, frames: Sequence[PosedFrame], others: int) -> RegisteredCamera:
+        agreeing = [
+            frame.name == place or {frame.name, place} == {"here", "a little off"}
+            for frame in frames
+        ]
+        misfits = [
+            FrameMisfit(frame.name, 0.02, 0.98, 0.97 if agrees else 0.2, agrees)
+            for frame, agrees in zip(frames, agreeing, strict=True)
+        ]
+        covariance = np.diag(np.full(6, 0.002**2))
+        alternatives = np.tile(np.eye(4), (others, 1, 1))
+        return RegisteredCamera(camera_at(PLACES[place]), covariance, tuple(misfits), alternatives)
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> ArticulatedModel:
+    path: Path = tmp_path_factory.mktemp("arm") / "arm.urdf"
+    path.write_text(arm_urdf())
+    return load_model(path)
+
+
+@pytest.fixture(scope="module")
+def body(model: ArticulatedModel) -> RegistrationBody:
+    return RegistrationBody(model.pose_tree())
+
+
+@pytest.fixture
+def search() -> ScriptedSearch:
+    return ScriptedSearch()
+
+
+@pytest.fixture
+def online(body: RegistrationBody, search: ScriptedSearch) -> OnlineRegistration:
+    return OnlineRegistration(
+        body, camera_at(0.0), OnlineSettings(most_frames=6, newest=3, least_frames=4), search
+    )
+
+
+def frame(place: str, turn: float) -> PosedFrame:
+    """A frame of a camera at a place; the arm is bent so that its first joint moves it."""
+    return PosedFrame(place, np.array([turn, 1.0, 0.3, 1.2, 0.2]), SEEN)
+
+
+def follow(
+    online: OnlineRegistration, state: OnlineState, frames: Sequence[PosedFrame]
+) -> tuple[OnlineState, list[int]]:
+    """What is known after some frames, and the status after each."""
+    statuses = []
+    for one in frames:
+        state = online.next(state, one)
+        statuses.append(online.status(state))
+    return state, statuses
+
+
+class TestKeyframes:
+    def test_searches_once_there_are_enough(
+        self, online: OnlineRegistration, search: ScriptedSearch
+    ) -> None:
+        state, statuses = follow(online, OnlineState(), [frame("here", t) for t in TURNS[:3]])
+        assert statuses == [NOT_REGISTERED] * 3
+        assert search.searches == 0
+        # The same again is no new evidence.
+        state, _ = follow(online, state, [frame("here", TURNS[1] + 0.01)] * 5)
+        assert len(state.keyframes) == 3
+        assert search.searches == 0
+        state, statuses = follow(online, state, [frame("here", TURNS[3])])
+        assert statuses == [REGISTERED]
+        assert search.searches == 1
+        assert state.registered is not None
+        np.testing.assert_allclose(state.registered.camera.X_WC, camera_at(1.6).X_WC)
+
+    def test_keeps_the_newest(self, online: OnlineRegistration) -> None:
+        frames = [frame("here", t) for t in TURNS]
+        state, _ = follow(online, OnlineState(), frames)
+        assert state.keyframes == tuple(frames[2:])
+        assert state.registered is not None
+        assert len(state.registered.frames) == 6
+
+    def test_an_ambiguous_camera_is_not_registered(
+        self, online: OnlineRegistration, search: ScriptedSearch
+    ) -> None:
+        search.alternatives = 1
+        state, statuses = follow(online, OnlineState(), [frame("here", t) for t in TURNS[:5]])
+        assert statuses[-1] == NOT_REGISTERED
+        search.alternatives = 0
+        _, statuses = follow(online, state, [frame("here", TURNS[5])])
+        assert statuses == [REGISTERED]
+
+    def test_frames_that_nothing_explains_register_nothing(
+        self, online: OnlineRegistration
+    ) -> None:
+        frames = [frame("nowhere", t) for t in TURNS]
+        state, statuses = follow(online, OnlineState(), frames)
+        assert set(statuses) == {NOT_REGISTERED}
+        # So that good ones find room.
+        assert len(state.keyframes) == 6
+
+    def test_wrong_frames_are_not_kept(self, online: OnlineRegistration) -> None:
+        frames = [frame("here", t) for t in TURNS[:4]]
+        frames.insert(1, frame("nowhere", TURNS[5]))
+        state, statuses = follow(online, OnlineState(), frames)
+        assert statuses[-1] == REGISTERED
+        assert {one.name for one in state.keyframes} == {"here"}
+
+    def test_an_empty_mask_says_nothing(self, online: OnlineRegistration) -> None:
+        state, _ = follow(online, OnlineState(), [frame("here", t) for t in TURNS[:4]])
+        empty = PosedFrame("empty", np.zeros(5), np.zeros((480, 640), dtype=bool))
+        assert online.next(state, empty) is state
+
+    def test_copies_share_what_is_known(self, online: OnlineRegistration) -> None:
+        state = online.next(OnlineState(), frame("here", 0.0))
+        assert copy.deepcopy(state) is state
+
+    def test_settings(self) -> None:
+        with pytest.raises(SettingsError, match="newest <= least_frames"):
+            OnlineSettings(least_frames=2)
+        with pytest.raises(SettingsError, match="novelty"):
+            OnlineSettings(novelty=-1.0)
+        with pytest.raises(SettingsError, match="false_alarm"):
+            OnlineSettings(false_alarm=0.0)
+
+
+class TestMovedCamera:
+    @pytest.fixture
+    def known(self, online: OnlineRegistration) -> OnlineState:
+        return follow(online, OnlineState(), [frame("here", t) for t in TURNS[:5]])[0]
+
+    def test_is_found_where_frames_contradict_and_agree(
+        self, online: OnlineRegistration, search: ScriptedSearch, known: OnlineState
+    ) -> None:
+        state, statuses = follow(online, known, [frame("there", t) for t in TURNS[4:]])
+        # Three tell that the pose is wrong, four that the camera is there.
+        assert statuses == [REGISTERED, REGISTERED, CONTRADICTED, REGISTERED]
+        assert search.searches == 2
+        assert state.moves == 1
+        assert state.registered is not None
+        np.testing.assert_allclose(state.registered.camera.X_WC, camera_at(2.0).X_WC)
+        assert {one.name for one in state.keyframes} == {"there"}
+
+    def test_is_noticed_while_the_body_stands_still(
+        self, online: OnlineRegistration, search: ScriptedSearch, known: OnlineState
+    ) -> None:
+        _, statuses = follow(online, known, [frame("there", TURNS[4])] * 6)
+        assert statuses == [REGISTERED] * 2 + [CONTRADICTED] * 4
+        # One pose of the body, however often it is seen, does not tell where the camera is.
+        assert search.searches == 1
+
+    def test_hidden_frames_do_not_move_it(
+        self, online: OnlineRegistration, known: OnlineState
+    ) -> None:
+        state, statuses = follow(online, known, [frame("nowhere", t) for t in TURNS])
+        assert statuses == [REGISTERED] * 2 + [CONTRADICTED] * 6
+        assert state.registered is known.registered
+        state, statuses = follow(online, state, [frame("here", TURNS[6])])
+        assert statuses == [REGISTERED]
+        assert state.moves == 0
+        assert state.contradicting == ()
+
+    def test_a_few_wrong_frames_are_left_out(
+        self, online: OnlineRegistration, known: OnlineState
+    ) -> None:
+        places = ["here", "nowhere", "here", "nowhere", "nowhere", "here"]
+        turns = np.resize(TURNS[5:], len(places))
+        frames = [frame(place, t) for place, t in zip(places, turns, strict=True)]
+        state, statuses = follow(online, known, frames)
+        assert set(statuses) == {REGISTERED}
+        assert state.moves == 0
+        assert "nowhere" not in {one.name for one in state.keyframes}
+
+    def test_a_small_move_is_found_by_the_newest_frames_alone(
+        self, online: OnlineRegistration, known: OnlineState
+    ) -> None:
+        state, statuses = follow(online, known, [frame("a little off", t) for t in TURNS[5:]])
+        assert set(statuses) == {REGISTERED}
+        assert state.moves == 1
+        assert [one.name for one in state.keyframes] == ["a little off"] * 3
+        assert state.registered is not None
+        np.testing.assert_allclose(state.registered.camera.X_WC, camera_at(1.62).X_WC)
+
+
+def bumped(camera: PinholeCamera, degrees: float, metres: float) -> PinholeCamera:
+    """A camera that is turned and shifted."""
+    X_WC = camera.X_WC.copy()
+    axis = np.array([0.48, -0.6, 0.64])
+    X_WC[:3, :3] = Rotation.from_rotvec(np.radians(degrees) * axis).as_matrix() @ X_WC[:3, :3]
+    X_WC[:3, 3] += metres * axis[[1, 2, 0]]
+    return camera.with_pose(X_WC)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("degrees", "metres"), [(0.4, 0.006), (6.0, 0.08)])
+def test_a_bumped_camera_is_found_again(
+    model: ArticulatedModel, body: RegistrationBody, degrees: float, metres: float
+) -> None:
+    """From Drake's own pictures of an arm that moves on; small and large bumps."""
+    rng, kinematics = np.random.default_rng(11), body.kinematics
+    before = camera_at(1.6)
+    cameras = [before] * 10 + [bumped(before, degrees, metres)] * 7
+    renderers = {id(camera): LabelRenderer(model, camera) for camera in cameras}
+    online = OnlineRegistration(body, before.with_pose(np.eye(4)))
+    state, moves = OnlineState(), []
+    for k, camera in enumerate(cameras):
+        values = rng.uniform(kinematics.lower, kinematics.upper)
+        q, X_WB = body.tree.positions_from(kinematics.split(values))
+        mask = renderers[id(camera)].mask(q, X_WB)
+        state = online.next(state, PosedFrame(f"{k:04d}", values, mask))
+        moves.append(state.moves)
+        if k in (9, len(cameras) - 1):
+            assert online.status(state) == REGISTERED
+            assert state.registered is not None
+            off = pose_difference(state.registered.camera.X_WC, camera.X_WC)
+            assert np.linalg.norm(off[:3]) < np.radians(0.1)
+            assert np.linalg.norm(off[3:]) < 2e-3
+            # 99.9 % of a chi-square distribution with six degrees of freedom.
+            assert off @ np.linalg.solve(state.registered.covariance, off) < 22.5
+    assert moves[9] == 0
+    assert moves[-1] == 1
+
+
+def test_pose_difference_is_along_the_worlds_axes() -> None:
+    camera = camera_at(1.6)
+    off = pose_difference(bumped(camera, 2.0, 0.1).X_WC, camera.X_WC)
+    axis = np.array([0.48, -0.6, 0.64])
+    np.testing.assert_allclose(off[:3], np.radians(2.0) * axis, atol=1e-12)
+    np.testing.assert_allclose(off[3:], 0.1 * axis[[1, 2, 0]], atol=1e-12)

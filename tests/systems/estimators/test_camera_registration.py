@@ -1,0 +1,132 @@
+"""A camera whose pose nobody told is found in a diagram, and found again after a bump."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, System
+from pydrake.trajectories import PiecewisePolynomial
+
+from drake_pose.body import ArticulatedModel, load_model
+from drake_pose.errors import SettingsError
+from drake_pose.registration.online_registration import OnlineRegistration, pose_difference
+from drake_pose.registration.register import RegistrationBody
+from drake_pose.silhouette import mask_to_label_image
+from drake_pose.systems import REGISTRATION, CameraRegistration, build_simulated_registration
+from tests.matching.arms import arm_urdf
+from tests.registration.test_register import looking_at
+
+PERIOD = 0.5
+CAMERA = looking_at(np.array([1.6, 0.4, 0.5]), np.array([0.0, 0.0, 0.4]), 0.1)
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> ArticulatedModel:
+    path: Path = tmp_path_factory.mktemp("arm") / "arm.urdf"
+    path.write_text(arm_urdf())
+    return load_model(path)
+
+
+@pytest.fixture(scope="module")
+def online(model: ArticulatedModel) -> OnlineRegistration:
+    return OnlineRegistration(RegistrationBody(model.pose_tree()), CAMERA.with_pose(np.eye(4)))
+
+
+def outputs(system: System, context: Context) -> dict[str, np.ndarray]:
+    """All outputs, X_WC as a matrix."""
+    values = {
+        name: system.GetOutputPort(name).Eval(context)
+        for name in ("X_WC", "covariance", "status", "registration")
+    }
+    values["X_WC"] = values["X_WC"].GetAsMatrix4()
+    return values
+
+
+class TestCameraRegistration:
+    def test_knows_nothing_at_first(self, online: OnlineRegistration) -> None:
+        system = CameraRegistration(online, PERIOD)
+        context = system.CreateDefaultContext()
+        known = outputs(system, context)
+        assert known["status"] == [0.0]
+        assert np.isnan(known["X_WC"][:3, 3]).all()
+        assert np.isinf(np.diag(known["covariance"].reshape(6, 6))).all()
+        named = dict(zip(REGISTRATION, known["registration"], strict=True))
+        assert named["keyframes"] == 0
+        assert np.isnan(named["mean_iou"])
+        assert system.registered_camera(context) is None
+
+    def test_waits_for_pictures_and_positions(self, online: OnlineRegistration) -> None:
+        system = CameraRegistration(online, PERIOD)
+        simulator = Simulator(system)
+        context = simulator.get_mutable_context()
+        positions = system.GetInputPort("measured_positions")
+        positions.FixValue(context, np.full(5, np.nan))
+        simulator.AdvanceTo(0.1 * PERIOD)
+        mask = np.zeros((480, 640), dtype=bool)
+        system.GetInputPort("label_image").FixValue(context, mask_to_label_image(mask))
+        simulator.AdvanceTo(1.1 * PERIOD)
+        positions.FixValue(context, np.zeros(5))
+        simulator.AdvanceTo(2.1 * PERIOD)
+        assert system.online_state(context).keyframes == ()
+        mask[100:200, 100:200] = True
+        system.GetInputPort("label_image").FixValue(context, mask_to_label_image(mask))
+        simulator.AdvanceTo(3.1 * PERIOD)
+        (kept,) = system.online_state(context).keyframes
+        assert kept.name == "1.5 s"
+        np.testing.assert_array_equal(kept.mask, mask)
+        # What is known is state of the context.
+        context.SetStateAndParametersFrom(system.CreateDefaultContext())
+        assert system.online_state(context).keyframes == ()
+
+    def test_refuses_a_period_that_is_none(self, online: OnlineRegistration) -> None:
+        with pytest.raises(SettingsError, match="period"):
+            CameraRegistration(online, 0.0)
+
+
+@pytest.mark.slow
+def test_a_camera_is_found_and_found_again_after_a_bump(
+    model: ArticulatedModel, online: OnlineRegistration
+) -> None:
+    rng = np.random.default_rng(5)
+    kinematics = online.body.kinematics
+    count = 13
+    knots = rng.uniform(0.9 * kinematics.lower, 0.9 * kinematics.upper, (count, 5))
+    motion = PiecewisePolynomial.CubicShapePreserving(
+        PERIOD * np.arange(count), knots.T, zero_end_point_derivatives=True
+    )
+    built = build_simulated_registration(online, CAMERA, motion, PERIOD)
+    simulator = Simulator(built.diagram)
+
+    def check(X_WC: np.ndarray, moves: int) -> None:
+        context = built.registration.GetMyContextFromRoot(simulator.get_context())
+        known = outputs(built.registration, context)
+        off = pose_difference(known["X_WC"], X_WC)
+        assert known["status"] == [1.0]
+        assert np.linalg.norm(off[:3]) < np.radians(0.2)
+        assert np.linalg.norm(off[3:]) < 3e-3
+        covariance = known["covariance"].reshape(6, 6)
+        # 99.9 % of a chi-square distribution with six degrees of freedom.
+        assert off @ np.linalg.solve(covariance, off) < 22.5
+        # A covariance that says nothing would hold anything.
+        assert np.sqrt(np.diag(covariance)).max() < 3e-3
+        named = dict(zip(REGISTRATION, known["registration"], strict=True))
+        assert named["moves"] == moves
+        assert named["mean_iou"] > 0.99
+        camera = built.registration.registered_camera(context)
+        assert camera is not None
+        np.testing.assert_array_equal(camera.X_WC, known["X_WC"])
+
+    simulator.AdvanceTo(5.9 * PERIOD)
+    check(CAMERA.X_WC, 0)
+    sensor_context = built.sensor.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    bump = RigidTransform(RotationMatrix.MakeXRotation(0.06), [0.03, -0.05, 0.02])
+    X_WC = RigidTransform(CAMERA.X_WC) @ bump
+    built.sensor.SetX_PB(sensor_context, X_WC)
+    simulator.AdvanceTo(11.9 * PERIOD)
+    check(X_WC.GetAsMatrix4(), 1)
+    status = built.status_log.FindLog(simulator.get_context()).data()[0]
+    # A log samples just before the update of the same time.
+    np.testing.assert_array_equal(status[1:5], 0.0)
+    np.testing.assert_array_equal(status[5:9], 1.0)

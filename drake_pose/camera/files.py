@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from drake_pose.camera.checks import check_number, check_pose, check_side
@@ -13,12 +15,15 @@ from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
 from drake_pose.errors import CameraError
 from drake_pose.yaml_files import read_yaml
 
-_COMMON = ("width", "height", "center_x", "center_y", "X_WC")
+_COMMON = ("width", "height", "center_x", "center_y")
 _REQUIRED = {
     "pinhole": (*_COMMON, "focal_x", "focal_y"),
     "parallel": (*_COMMON, "pixels_per_metre"),
 }
-_OPTIONAL = {"pinhole": ("projection", "clipping_near"), "parallel": ("projection",)}
+_OPTIONAL = {
+    "pinhole": ("X_WC", "projection", "clipping_near"),
+    "parallel": ("X_WC", "projection"),
+}
 
 
 def load_cameras(path: str | Path) -> dict[str, Camera]:
@@ -27,6 +32,36 @@ def load_cameras(path: str | Path) -> dict[str, Camera]:
     A pinhole camera has `width height focal_x focal_y center_x center_y` [pixel, pixel centres at
     integers] and `X_WC` (4 x 4) [m], and may have `projection: pinhole` and `clipping_near` [m].
     A parallel camera has `projection: parallel` and `pixels_per_metre` instead of focal lengths.
+
+    Raises:
+        CameraError: names the file, the camera and the field.
+    """
+    found = load_camera_file(path)
+    for name in found.unplaced:
+        kind = "parallel" if isinstance(found.cameras[name], ParallelCamera) else "pinhole"
+        raise CameraError(
+            f"{path}: camera '{name}': a {kind} camera needs X_WC; drake-pose register finds it "
+            "from masks of a robot whose joint positions are known, drake-pose calibrate from "
+            "pictures of a board"
+        )
+    return found.cameras
+
+
+@dataclass(frozen=True)
+class CameraFile:
+    """What a camera file says, which need not say where the cameras stand.
+
+    Args:
+        cameras: by name, in the file's order; those without X_WC at the world's origin.
+        unplaced: the names of these.
+    """
+
+    cameras: dict[str, Camera]
+    unplaced: tuple[str, ...]
+
+
+def load_camera_file(path: str | Path) -> CameraFile:
+    """Reads a camera file as load_cameras does, in which X_WC may be missing.
 
     Raises:
         CameraError: names the file, the camera and the field.
@@ -41,7 +76,8 @@ def load_cameras(path: str | Path) -> dict[str, Camera]:
         if name in cameras:
             raise CameraError(f"{path}: camera '{name}' is given twice")
         cameras[name] = _read_camera(name, entry, path)
-    return cameras
+    unplaced = [str(key) for key, entry in content.items() if "X_WC" not in entry]
+    return CameraFile(cameras, tuple(unplaced))
 
 
 def save_cameras(path: str | Path, cameras: Mapping[str, Camera] | Iterable[Camera]) -> None:
@@ -51,12 +87,17 @@ def save_cameras(path: str | Path, cameras: Mapping[str, Camera] | Iterable[Came
         CameraError: when the file cannot be written.
     """
     path = Path(path)
-    listed = cameras.values() if isinstance(cameras, Mapping) else cameras
-    content = {camera.name: _write_camera(camera) for camera in listed}
     try:
-        path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+        path.write_text(dump_cameras(cameras), encoding="utf-8")
     except OSError as error:
         raise CameraError(f"{path}: cannot write the cameras: {error.strerror}") from error
+
+
+def dump_cameras(cameras: Mapping[str, Camera] | Iterable[Camera]) -> str:
+    """The text of a camera file."""
+    listed = cameras.values() if isinstance(cameras, Mapping) else cameras
+    content = {camera.name: _write_camera(camera) for camera in listed}
+    return yaml.safe_dump(content, sort_keys=False)
 
 
 def _check_name(key: Any, path: Path) -> str:
@@ -91,7 +132,7 @@ def _read_camera(name: str, entry: Any, path: Path) -> Camera:
         "height": check_side(entry["height"], "height", where),
         "center_x": check_number(entry["center_x"], "center_x", where),
         "center_y": check_number(entry["center_y"], "center_y", where),
-        "X_WC": check_pose(entry["X_WC"], "X_WC", where),
+        "X_WC": check_pose(entry.get("X_WC", np.eye(4)), "X_WC", where),
     }
 
     def positive(field: str) -> float:

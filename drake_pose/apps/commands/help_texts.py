@@ -120,6 +120,36 @@ The pictures written fit the cameras that calibrate wrote together with the lens
     drake-pose undistort RECORDING --lenses SCENE/cameras_lenses.yaml --out SCENE
 """)
 
+REGISTER = _help(r"""
+Find where cameras stand, from masks of a robot whose joint positions are known: no board, no guess.
+
+All rotations of a camera are tried, each with the robot where the silhouettes are; the best are
+fitted by the robot's contour, in the end only to what fits, so that a tool which the model lacks, a
+hidden base or a wrong frame pulls no more. The answer has a standard deviation for place and
+rotation, other poses that fit no worse, and the frames that contradict the others.
+
+The focal length and principal point of each camera must be known, and the pictures be free of
+distortion. The world is the model's: the robot's base, in most files. Five poses that differ much
+are enough. Cameras that have an X_WC are held, and compared with the robot; --camera finds one of
+them anew.
+
+Files in DIR: cameras.yaml, which estimate reads (copy it into the scene); registration.yaml
+(6 x 6 covariance, other poses); summary.json; overlay/<camera>/<frame>.png. Nothing is written
+where no pose explains the masks (exit status 1).
+
+[bold]A robot arm whose camera nobody measured:[/bold]
+
+    drake-pose register ../shared/data/arm_one_view --out results/camera \
+      --model ../shared/data/arm_two_views/med7/med7.urdf \
+      --joints ../shared/data/arm_one_view/joint_angles.csv
+
+[bold]Both cameras of a scene anew, whatever its cameras.yaml says:[/bold]
+
+    drake-pose register ../shared/data/arm_two_views --out results/cameras \
+      --model ../shared/data/arm_two_views/med7/med7.urdf --camera left --camera right \
+      --joints ../shared/data/arm_two_views/joint_angles.csv
+""")
+
 REPRODUCE = "Run a paper's experiment and show its figures beside ours."
 
 KAMEDA = _help("""

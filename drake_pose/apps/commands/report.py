@@ -45,7 +45,7 @@ def progress_bar() -> Progress:
 
 
 @contextmanager
-def count_progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
+def count_progress(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
     """A progress bar; the value is a function to call with how many are done."""
     with progress_bar() as progress:
         task = progress.add_task(what, total=total)

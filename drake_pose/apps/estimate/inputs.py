@@ -110,7 +110,7 @@ def read_inputs(
     if anywhere or scene.scale_unknown:
         search = make_placement_search(model, settings, position, scene.scale_unknown)
     else:
-        search = _make_search(_make_tree(model, settings, position), settings, model)
+        search = _make_search(make_tree(model, settings, position), settings, model)
     read = _check_pictures(scene, cameras, frames, search)
     of_model = model_warnings(model, search.tree, settings.hold)
     texts = (*texts_of(*checked.warnings, *read.warnings), *of_model)
@@ -191,7 +191,7 @@ def _read_truth(
         return None
 
 
-def _make_tree(
+def make_tree(
     model: ArticulatedModel, settings: EstimateSettings, position: np.ndarray | None
 ) -> PoseTree:
     """The pose tree, its root placed as the settings say.
@@ -288,7 +288,7 @@ def make_placement_search(
             "position is unknown, angles are continuous"
         )
     first = np.zeros(3) if position is None else position
-    tree = _make_tree(model, settings, None if settings.root is None else first)
+    tree = make_tree(model, settings, None if settings.root is None else first)
     if settings.root is None and settings.root_rotation is None and turns_freely(tree):
         held = _in_plant_units(model, settings.hold)
         rotation = RootRotation.free(interval_deg=_FREE_ROOT_INTERVAL)

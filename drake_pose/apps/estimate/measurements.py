@@ -25,17 +25,17 @@ class TrueAngles:
     Args:
         path: the file they are from.
         names: the positions that were measured.
-        values: (len(names),) [rad or m] by frame number.
+        values: (len(names),) [rad or m] by frame: its number, or its name if that is none.
     """
 
     path: Path
     names: tuple[str, ...]
-    values: Mapping[int, np.ndarray]
+    values: Mapping[int | str, np.ndarray]
 
     def of(self, frame: str) -> np.ndarray | None:
         """Returns the values of a frame, or None where nothing was measured."""
         number = frame_number(frame)
-        return None if number is None else self.values.get(number)
+        return self.values.get(frame if number is None else number)
 
 
 def read_joint_centres(path: Path, joint: str, frames: Sequence[str]) -> dict[str, np.ndarray]:
@@ -81,12 +81,15 @@ def read_joint_centres(path: Path, joint: str, frames: Sequence[str]) -> dict[st
 def read_true_angles(path: Path, position_names: Sequence[str]) -> TrueAngles:
     """Reads measured joint positions from a file with the columns `frame` and positions' names.
 
+    Frames are compared as numbers where they are numbers: the row of frame 3 is that of
+    ``0003.png``.
+
     Args:
         path: the file, values in rad or m.
         position_names: the model's positions.
 
     Raises:
-        SceneError: if the file cannot be read.
+        SceneError: if the file cannot be read, or gives a column or a frame twice.
         UnknownNameError: if the model has no position of a column's name.
     """
     header, rows = _read_csv(path)
@@ -97,11 +100,21 @@ def read_true_angles(path: Path, position_names: Sequence[str]) -> TrueAngles:
             raise UnknownNameError(
                 "position", name, position_names, f"{path} has a column that the model lacks; it"
             )
-    values = {}
+        if header.count(name) > 1:
+            raise SceneError(f"{path}: has the column '{name}' twice")
+    values: dict[int | str, np.ndarray] = {}
     for line, row in rows:
-        numbers = _numbers(row, path, line)
-        values[int(numbers[0])] = numbers[1:]
+        frame = _frame_key(row[0])
+        if frame in values:
+            raise SceneError(f"{path}: line {line}: frame '{row[0]}' is given twice")
+        values[frame] = _numbers(row[1:], path, line)
     return TrueAngles(path, tuple(header[1:]), values)
+
+
+def _frame_key(cell: str) -> int | str:
+    """A frame's number, which a table may have written as 3.0, or its name."""
+    number = frame_number(cell.removesuffix(".0"))
+    return cell if number is None else number
 
 
 def angle_difference(a: float, b: float) -> float:

@@ -116,8 +116,8 @@ def describe_job(scene: Path, model: Path, settings: EstimateSettings) -> dict[s
         "model": str(model),
         "settings": settings.as_json(),
         "sha256": {
-            "model": _digest(model),
-            "cameras": _digest(scene / "cameras.yaml"),
+            "model": file_digest(model),
+            "cameras": file_digest(scene / "cameras.yaml"),
         },
     }
 
@@ -182,7 +182,7 @@ def summarize(
         "cameras": describe_cameras(records),
         **(more or {}),
         **job,
-        "versions": _versions(),
+        "versions": versions(),
         "frames": {name: record.as_json() for name, record in records.items()},
     }
 
@@ -232,17 +232,19 @@ def _joint_errors(records: Mapping[str, FrameRecord]) -> dict[str, dict[str, flo
     }
 
 
-def _versions() -> dict[str, str]:
-    versions = {"drake_pose": VERSION, "python": platform.python_version()}
+def versions() -> dict[str, str]:
+    """The versions of drake_pose, Python and the packages that matter."""
+    found = {"drake_pose": VERSION, "python": platform.python_version()}
     for package in _PACKAGES:
         try:
-            versions[package] = version(package)
+            found[package] = version(package)
         except PackageNotFoundError:
             continue
-    return versions
+    return found
 
 
-def _digest(path: Path) -> str | None:
+def file_digest(path: Path) -> str | None:
+    """SHA-256 of a file; None where it cannot be read."""
     try:
         return hashlib.sha256(read_regular(path)).hexdigest()
     except OSError:

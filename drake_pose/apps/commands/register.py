@@ -1,0 +1,125 @@
+"""The command `drake-pose register`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from drake_pose.apps.commands.estimate_options import (
+    FrameOption,
+    HoldOption,
+    JsonOption,
+    ModelOption,
+    OutOption,
+    OverlayOption,
+    PackageOption,
+)
+from drake_pose.apps.commands.terminal import errors_as_messages, print_json, usage_errors, warn
+from drake_pose.apps.options import parse_assignments, parse_packages
+
+if TYPE_CHECKING:
+    from drake_pose.apps.registration.register import SceneRegistration
+
+RegisteredSceneArgument = Annotated[
+    Path,
+    typer.Argument(
+        help="Folder with cameras.yaml, in which X_WC may be missing, and "
+        "masks/<camera>/<frame>.png."
+    ),
+]
+JointsOption = Annotated[
+    Path,
+    typer.Option(
+        "--joints",
+        "-j",
+        metavar="FILE",
+        help=r"Joint positions of every frame \[rad or m]: a CSV file with the column frame and "
+        "one for each joint.",
+    ),
+]
+SearchedCameraOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--camera",
+        metavar="NAME",
+        help="Find this camera, and do not use its X_WC if it has one; repeat for several. "
+        "Default: all without X_WC.",
+        rich_help_panel="Input",
+    ),
+]
+
+
+def register(
+    scene: RegisteredSceneArgument,
+    model: ModelOption,
+    joints: JointsOption,
+    out: OutOption,
+    package: PackageOption = None,
+    camera: SearchedCameraOption = None,
+    frame: FrameOption = None,
+    hold: HoldOption = None,
+    overlay: OverlayOption = True,
+    json: JsonOption = False,
+) -> None:
+    """See help_texts.REGISTER."""
+    with usage_errors():
+        packages = parse_packages(package or ())
+        held = parse_assignments(hold or (), "--hold")
+    with errors_as_messages():
+        from drake_pose.apps.commands.report import count_progress
+        from drake_pose.apps.registration.inputs import RegistrationSettings
+        from drake_pose.apps.registration.register import register_scene
+
+        settings = RegistrationSettings(tuple(camera or ()), tuple(frame or ()), held, packages)
+        with count_progress("cameras", None) as advance:
+            result = register_scene(
+                scene, model, joints, out, settings, overlay=overlay, on_camera=advance
+            )
+        for text in result.warnings:
+            warn(text)
+        if json:
+            print_json(result.summary)
+        else:
+            _print(result)
+
+
+def _print(result: SceneRegistration) -> None:
+    """A row a frame and camera, then where each camera stands and how sure that is."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    from drake_pose.apps.commands.report import output_console
+    from drake_pose.apps.registration.result import CAMERAS
+    from drake_pose.apps.texts import percent
+
+    console = output_console()
+    frames = Table("camera", "frame", "E_total", "IoU", "", title="Masks and robot")
+    table = Table(
+        "camera", "place [m]", "sd [mm]", "sd [deg]", "poses", "frames", "mean IoU", "seconds",
+        title="Cameras in the robot's world",
+    )  # fmt: skip
+    for name, found in result.registered.items():
+        one = result.summary["cameras"][name]
+        for misfit in found.frames:
+            word = "" if misfit.agrees else "contradicts the others"
+            frames.add_row(
+                escape(name), escape(misfit.frame), percent(misfit.E_total),
+                percent(misfit.iou), word,
+            )  # fmt: skip
+        agreeing = len(found.frames) - len(found.contradictions)
+        table.add_row(
+            escape(name),
+            ", ".join(f"{p:.4f}" for p in found.camera.X_WC[:3, 3]),
+            f"{one['translation_sd_mm']:.2f}",
+            f"{one['rotation_sd_deg']:.3f}",
+            str(len(one["families"])),
+            f"{agreeing} of {len(found.frames)}",
+            percent(one["mean_iou"]),
+            f"{one['seconds']:.1f}",
+        )
+    console.print(frames)
+    console.print(table)
+    if result.folder is not None:
+        console.print(f"cameras        {escape(str(result.folder / CAMERAS))}", soft_wrap=True)

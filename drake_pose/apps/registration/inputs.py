@@ -1,0 +1,200 @@
+"""What a registration needs, read and checked before the search begins."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from drake_pose.apps.estimate.inputs import make_tree, select_seen_frames
+from drake_pose.apps.estimate.scene_checks import check_scene, texts_of
+from drake_pose.apps.options import select_frames
+from drake_pose.apps.registration.known_positions import KnownPositions, read_known_positions
+from drake_pose.apps.settings import EstimateSettings
+from drake_pose.body import ArticulatedModel, PoseTree, load_model
+from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.camera import Camera, PinholeCamera
+from drake_pose.camera.files import load_camera_file
+from drake_pose.errors import CameraError, MaskError, SceneError, UnknownNameError
+from drake_pose.registration.posed_frames import PosedFrame
+from drake_pose.silhouette import Scene, load_scene
+
+_CAMERAS = "cameras.yaml"
+
+
+@dataclass(frozen=True)
+class RegistrationSettings:
+    """What is registered; plain values only.
+
+    Args:
+        cameras: the cameras to find, also where the camera file has their X_WC; all that have none
+            where empty.
+        frames: names, or ranges ``FIRST:LAST``; all where empty.
+        hold: joints that are not in the table, by name [deg or m].
+        packages: folders of packages that the model's ``package://`` names mean, by name.
+    """
+
+    cameras: tuple[str, ...] = ()
+    frames: tuple[str, ...] = ()
+    hold: Mapping[str, float] = field(default_factory=dict)
+    packages: Mapping[str, Path] = field(default_factory=dict)
+
+    def as_json(self) -> dict[str, Any]:
+        """Returns the settings as plain JSON values."""
+        packages = {name: str(folder) for name, folder in self.packages.items()}
+        lists = {"cameras": list(self.cameras), "frames": list(self.frames)}
+        return {**asdict(self), **lists, "packages": packages}
+
+
+@dataclass(frozen=True)
+class RegistrationInputs:
+    """What is registered, from what.
+
+    Args:
+        scene: the recorded scene; cameras whose X_WC is missing stand at the world's origin.
+        model: the robot.
+        tree: its pose tree, as it stands in the world.
+        searched: the cameras that are to be found.
+        held: the others that have an X_WC.
+        frames: what each of these cameras sees, by name.
+        left_out: cameras without X_WC that are not to be found.
+        warnings: what the user should know of the input.
+    """
+
+    scene: Scene
+    model: ArticulatedModel
+    tree: PoseTree
+    searched: tuple[PinholeCamera, ...]
+    held: tuple[PinholeCamera, ...]
+    frames: Mapping[str, tuple[PosedFrame, ...]]
+    left_out: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+
+def read_inputs(
+    scene_path: Path, model_path: Path, joints_path: Path, settings: RegistrationSettings
+) -> RegistrationInputs:
+    """Reads and checks everything.
+
+    Args:
+        scene_path: the scene's folder.
+        model_path: the model file.
+        joints_path: the table of joint positions.
+        settings: the settings.
+
+    Raises:
+        DrakePoseError: names the file, camera, frame or joint at fault.
+    """
+    if not scene_path.is_dir():
+        raise SceneError(f"{scene_path}: no such folder; a scene has {_CAMERAS} and masks")
+    file = load_camera_file(scene_path / _CAMERAS)
+    searched = _select_searched(scene_path, file.cameras, file.unplaced, settings.cameras)
+    checked = check_scene(load_scene(scene_path, file.cameras))
+    scene = checked.scene
+    unseen = [name for name in file.unplaced if not any(owner == name for owner, _ in scene.masks)]
+    if not settings.cameras:
+        searched = [name for name in searched if name not in unseen]
+    model = load_model(model_path, package_paths=settings.packages)
+    tree = make_tree(model, EstimateSettings(hold=settings.hold), None)
+    positions = read_known_positions(joints_path, model, TreeKinematics(tree))
+    held = [
+        camera
+        for name, camera in file.cameras.items()
+        if name not in searched and name not in file.unplaced and isinstance(camera, PinholeCamera)
+    ]
+    pinholes = [_require_pinhole(scene_path, file.cameras[name]) for name in searched]
+    frames = {
+        camera.name: _read_frames(scene, camera, positions, settings.frames) for camera in pinholes
+    }
+    for camera in held:
+        frames[camera.name] = _frames_of_held(scene, camera, positions, settings.frames)
+    left_out = [name for name in file.unplaced if name not in searched]
+    warnings = [*texts_of(*checked.warnings), *model.warnings, *positions.warnings]
+    warnings += [_say_left_out(name) for name in left_out]
+    warnings += [
+        text for camera in pinholes for text in _check_poses(camera, frames[camera.name], positions)
+    ]
+    return RegistrationInputs(
+        scene, model, tree, tuple(pinholes), tuple(held), frames, tuple(left_out), tuple(warnings)
+    )
+
+
+def _select_searched(
+    path: Path, cameras: Mapping[str, Camera], unplaced: Sequence[str], wanted: Sequence[str]
+) -> list[str]:
+    """The names of the cameras that are to be found, in the file's order."""
+    for name in wanted:
+        if name not in cameras:
+            raise UnknownNameError("camera", name, cameras, str(path))
+    if not wanted and not unplaced:
+        raise SceneError(
+            f"{path / _CAMERAS}: every camera has an X_WC; name those that are to be found anew: "
+            f"--camera {next(iter(cameras))}"
+        )
+    return [name for name in cameras if name in (wanted or unplaced)]
+
+
+def _require_pinhole(path: Path, camera: Camera) -> PinholeCamera:
+    if not isinstance(camera, PinholeCamera):
+        raise CameraError(
+            f"{path / _CAMERAS}: camera '{camera.name}' is a parallel camera, whose distance no "
+            "picture tells; a camera that is to be found needs a focal length (projection: pinhole)"
+        )
+    return camera
+
+
+def _read_frames(
+    scene: Scene, camera: PinholeCamera, positions: KnownPositions, wanted: Sequence[str]
+) -> tuple[PosedFrame, ...]:
+    """All frames of a camera that is to be found; a bad one is refused."""
+    found = []
+    for frame in select_seen_frames(scene, [camera], wanted):
+        values = positions.of(frame, camera.name)
+        try:
+            mask = scene.read(camera.name, frame)
+        except MaskError as error:
+            raise MaskError(
+                f"{error} (camera '{camera.name}', frame '{frame}'); mend it, or leave the frame "
+                "out (--frame)"
+            ) from error
+        found.append(PosedFrame(frame, values, mask))
+    return tuple(found)
+
+
+def _frames_of_held(
+    scene: Scene, camera: PinholeCamera, positions: KnownPositions, wanted: Sequence[str]
+) -> tuple[PosedFrame, ...]:
+    """Those frames of a camera that is held which can be compared with it."""
+    found = []
+    for frame in select_frames(scene.frames, wanted, str(scene.path)):
+        if (camera.name, frame) in scene.masks and positions.table.of(frame) is not None:
+            mask = scene.read(camera.name, frame, may_be_empty=True)
+            if mask.any():
+                found.append(PosedFrame(frame, positions.of(frame, camera.name), mask))
+    return tuple(found)
+
+
+def _check_poses(
+    camera: PinholeCamera, frames: Sequence[PosedFrame], positions: KnownPositions
+) -> list[str]:
+    """Says so where all frames show one pose of the robot."""
+    if not positions.are_one_pose(frame.values for frame in frames):
+        return []
+    what = (
+        f"there is one frame, '{frames[0].name}'"
+        if len(frames) == 1
+        else f"all {len(frames)} frames show the robot in one pose, to a degree"
+    )
+    return [
+        f"camera '{camera.name}': {what}: errors of that mask and of the joints' zeros cannot be "
+        "told from a camera elsewhere, no frame can be found to contradict the others, and a "
+        "mirrored pose may look alike; take five or more poses that differ much"
+    ]
+
+
+def _say_left_out(name: str) -> str:
+    return (
+        f"camera '{name}' has no X_WC and is not to be found, or has no masks in masks/{name}: it "
+        "is left out of the camera file that is written"
+    )

@@ -1,0 +1,139 @@
+"""Joint positions of every frame, from a table, checked before anything is made of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.apps.estimate.measurements import TrueAngles, read_true_angles
+from drake_pose.body import ArticulatedModel
+from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.errors import SceneError
+
+Array = NDArray[np.float64]
+
+# A value is outside its limits from so much on [rad], or from this share of a length's range.
+_OUTSIDE, _OUTSIDE_SHARE = 0.1, 0.1
+# An angle of more than a full turn, of a joint whose limits allow none, is one in degrees; a length
+# of so many times what its limits allow is one in millimetres.
+_FULL_TURN, _MANY = 2.0 * math.pi, 20.0
+# Poses are one whose joints differ by less [rad or m].
+_SAME_ANGLE, _SAME_LENGTH = math.radians(1.0), 0.005
+
+
+@dataclass(frozen=True)
+class KnownPositions:
+    """Where all joints are in each frame.
+
+    Args:
+        path: the table.
+        kinematics: of the pose tree.
+        table: its columns and rows.
+        order: (m,) the column of each value of the pose tree.
+        warnings: what the user should know of it.
+    """
+
+    path: Path
+    kinematics: TreeKinematics
+    table: TrueAngles
+    order: NDArray[np.intp]
+    warnings: tuple[str, ...] = ()
+
+    def of(self, frame: str, camera: str) -> Array:
+        """(m,) values of the pose tree in a frame [rad or m].
+
+        Raises:
+            SceneError: the table has no row of it.
+        """
+        values = self.table.of(frame)
+        if values is None:
+            raise SceneError(
+                f"{self.path}: has no row of frame '{frame}', which camera '{camera}' has a mask "
+                "of; add the joint positions of that moment, or leave the frame out (--frame)"
+            )
+        return np.asarray(values[self.order])
+
+    def are_one_pose(self, rows: Iterable[Array]) -> bool:
+        """Whether the joints are at the same place in all of some rows (m,)."""
+        values = np.array(list(rows))
+        same = np.where(self.kinematics.is_angle, _SAME_ANGLE, _SAME_LENGTH)
+        return bool((np.ptp(values, axis=0) < same).all())
+
+
+def read_known_positions(
+    path: Path, model: ArticulatedModel, kinematics: TreeKinematics
+) -> KnownPositions:
+    """Reads a table with the column frame and one for each joint that is not held.
+
+    Raises:
+        SceneError: it cannot be read, lacks a joint, has a column that is of no use, or is not in
+            radians and metres.
+        UnknownNameError: the model has no joint of a column's name.
+    """
+    table = read_true_angles(path, model.position_names)
+    missing = [name for name in kinematics.names if name not in table.names]
+    if missing:
+        raise SceneError(
+            f"{path}: has no column for {_joints(missing)} of {model.path.name}; give the position "
+            "of every joint in every frame [rad or m], or hold those that did not move: "
+            f"--hold {missing[0]}=VALUE [deg or m]"
+        )
+    unused = [name for name in table.names if name not in kinematics.names]
+    if unused:
+        raise SceneError(
+            f"{path}: column '{unused[0]}' is a position that is held, or that places the whole "
+            "robot in the world; the cameras are found in the world in which the robot stands as "
+            "its model's file has it: leave the column out"
+        )
+    order = np.array([table.names.index(name) for name in kinematics.names], dtype=np.intp)
+    return KnownPositions(path, kinematics, table, order, _check_units(table, order, kinematics))
+
+
+def _check_units(
+    table: TrueAngles, order: NDArray[np.intp], kinematics: TreeKinematics
+) -> tuple[str, ...]:
+    """Refuses degrees and millimetres; warns of values outside the limits."""
+    warnings = []
+    frames = list(table.values)
+    for column, name, is_angle, lower, upper in zip(
+        order, kinematics.names, kinematics.is_angle, kinematics.lower, kinematics.upper,
+        strict=True,
+    ):  # fmt: skip
+        if not frames or not np.isfinite([lower, upper]).all():
+            continue
+        values = np.array([table.values[frame][column] for frame in frames])
+        slack = _OUTSIDE if is_angle else _OUTSIDE_SHARE * (upper - lower)
+        off = np.maximum(lower - values, values - upper)
+        worst = int(np.argmax(off))
+        if off[worst] <= slack:
+            continue
+        what, unit = ("angle", "rad") if is_angle else ("length", "m")
+        text = (
+            f"{table.path}: column '{name}', frame {frames[worst]}: {values[worst]:g} {unit} lies "
+            f"outside the joint's limits, {lower:.4g} to {upper:.4g} {unit}"
+        )
+        scale, other, most = (
+            (math.pi / 180.0, "degrees", _FULL_TURN)
+            if is_angle
+            else (1e-3, "millimetres", _MANY * max(abs(lower), abs(upper)))
+        )
+        scaled = scale * values
+        inside = (lower - slack <= scaled) & (scaled <= upper + slack)
+        if np.abs(values).max() > most and inside.all():
+            raise SceneError(
+                f"{text}, but not in {other}: the file seems to be in {other}; write every {what} "
+                f"in {'radians' if is_angle else 'metres'}"
+            )
+        warnings.append(
+            f"{text}: is its column another joint's, its zero or sign another, its unit another?"
+        )
+    return tuple(warnings)
+
+
+def _joints(names: list[str]) -> str:
+    return f"joint{'s' if len(names) > 1 else ''} {', '.join(names)}"

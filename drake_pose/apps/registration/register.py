@@ -1,0 +1,160 @@
+"""A scene and joint positions in, the cameras' poses out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drake_pose.apps.estimate.fit_checks import BADLY_EXPLAINED
+from drake_pose.apps.estimate.scene_checks import frame_ranges
+from drake_pose.apps.registration.inputs import (
+    RegistrationInputs,
+    RegistrationSettings,
+    read_inputs,
+)
+from drake_pose.apps.registration.misfit import require_explained
+from drake_pose.apps.registration.result import describe_camera, summarize, write_result
+from drake_pose.apps.results.folder import require_empty
+from drake_pose.apps.texts import percent
+from drake_pose.camera import Camera, PinholeCamera
+from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
+from drake_pose.registration.register import CameraSearch, RegisteredCamera, RegistrationBody
+from drake_pose.registration.start_poses import E_total, areas
+
+OnCamera = Callable[[int], None]
+"""Called with the number of cameras that are done."""
+
+
+@dataclass(frozen=True, eq=False)
+class SceneRegistration:
+    """Where a scene's cameras stand.
+
+    Args:
+        cameras: all cameras of the scene whose pose is known now, in its order.
+        registered: those that were found, with how well they fit, by name.
+        summary: what summary.json holds.
+        warnings: what the user should know.
+        folder: the result folder, if one was written.
+    """
+
+    cameras: Mapping[str, Camera]
+    registered: Mapping[str, RegisteredCamera]
+    summary: Mapping[str, Any]
+    warnings: tuple[str, ...]
+    folder: Path | None
+
+
+def register_scene(
+    scene: Path | str,
+    model: Path | str,
+    joints: Path | str,
+    out: Path | str | None = None,
+    settings: RegistrationSettings | None = None,
+    *,
+    overlay: bool = True,
+    on_camera: OnCamera | None = None,
+) -> SceneRegistration:
+    """Finds where a scene's cameras stand; no guess is needed.
+
+    Args:
+        scene: the scene's folder: cameras.yaml, in which X_WC may be missing, and
+            masks/<camera>/<frame>.png.
+        model: the robot's model file. It stands in the world as the file has it.
+        joints: joint positions by frame, a CSV file with the column frame and one for each joint
+            [rad or m].
+        out: folder for the result, new or empty; None writes nothing.
+        settings: which cameras and frames.
+        overlay: whether overlays are written.
+        on_camera: hears of every camera that is done.
+
+    Raises:
+        RegistrationError: no pose of a camera explains its masks. Nothing is written then.
+        DrakePoseError: names the file, camera, frame or joint at fault.
+    """
+    settings = settings or RegistrationSettings()
+    paths = Path(scene), Path(model), Path(joints)
+    folder = None if out is None else Path(out)
+    if folder is not None:
+        require_empty(folder)
+    inputs = read_inputs(*paths, settings)
+    body = RegistrationBody(inputs.tree)
+    search = CameraSearch(body)
+    registered: dict[str, RegisteredCamera] = {}
+    described: dict[str, dict[str, Any]] = {}
+    warnings = [*inputs.warnings, *_check_held(inputs, body)]
+    for camera in inputs.searched:
+        start = time.perf_counter()
+        found = search.register(camera, inputs.frames[camera.name])
+        require_explained(search, found, inputs.frames[camera.name])
+        registered[camera.name] = found
+        described[camera.name] = describe_camera(found, time.perf_counter() - start)
+        warnings += _warnings_of(found)
+        if on_camera is not None:
+            on_camera(len(registered))
+    cameras = {
+        name: registered[name].camera if name in registered else camera
+        for name, camera in inputs.scene.cameras.items()
+        if name not in inputs.left_out
+    }
+    summary = summarize(paths, settings, described, warnings)
+    if folder is not None:
+        write_result(folder, inputs, cameras, registered, summary, overlay)
+    return SceneRegistration(cameras, registered, summary, tuple(warnings), folder)
+
+
+def _warnings_of(found: RegisteredCamera) -> list[str]:
+    """What a user should know of a camera that was found."""
+    name, frames = found.camera.name, [frame.frame for frame in found.frames]
+    wrong, texts = found.contradictions, []
+    if wrong:
+        right = len(frames) - len(wrong)
+        listed = frame_ranges(wrong, frames)
+        text = (
+            f"camera '{name}': {len(wrong)} of {len(frames)} frames contradict the others and did "
+            f"not count: {listed}; are their joint positions those of the pictures?"
+        )
+        if 2 * right < len(frames):
+            supporting = frame_ranges([one for one in frames if one not in wrong], frames)
+            text += (
+                f" FEWER THAN HALF OF THE FRAMES AGREE, {right} of {len(frames)}: {supporting}; "
+                "the pose rests on these alone and may be wrong: mend the others, or add frames"
+            )
+        texts.append(text)
+    if len(found.alternatives):
+        texts.append(
+            f"camera '{name}': {len(found.alternatives)} other poses fit no worse, as far as can "
+            "be told; which is the camera's nobody knows: see registration.yaml and the overlays, "
+            "and add frames in which the robot stands otherwise"
+        )
+    return texts
+
+
+def _check_held(inputs: RegistrationInputs, body: RegistrationBody) -> list[str]:
+    """Says so where a camera whose X_WC is given does not see the robot where it stands."""
+    texts = []
+    for camera in inputs.held:
+        frames = inputs.frames[camera.name]
+        if not frames:
+            continue
+        left = float(np.median(_misfits(body, camera, frames)))
+        if left >= BADLY_EXPLAINED:
+            texts.append(
+                f"camera '{camera.name}' is held at its X_WC, but the robot is not seen there: "
+                f"body and silhouettes differ by {percent(left)} of the silhouettes' area; is its "
+                "world another than the robot's base? It is found anew with "
+                f"--camera {camera.name}"
+            )
+    return texts
+
+
+def _misfits(
+    body: RegistrationBody, camera: PinholeCamera, frames: Sequence[PosedFrame]
+) -> np.ndarray:
+    """(frames,) E_total at the camera's own pose."""
+    posed = PosedFrames(body.kinematics, body.all, camera, frames)
+    return E_total(areas(posed, camera.X_CW[None], np.inf)[0])

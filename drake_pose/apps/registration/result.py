@@ -1,0 +1,148 @@
+"""What a registration writes: the cameras, how sure they are, pictures, a summary."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from drake_pose.apps.registration.inputs import RegistrationInputs, RegistrationSettings
+from drake_pose.apps.results.folder import OVERLAY, ResultFolder, without_nan
+from drake_pose.apps.results.overlay import draw_overlay, encode_png
+from drake_pose.apps.results.summary import file_digest, versions
+from drake_pose.apps.texts import percent
+from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.camera import Camera
+from drake_pose.camera.files import dump_cameras
+from drake_pose.registration.register import RegisteredCamera
+from drake_pose.silhouette import LabelRenderer
+
+CAMERAS, REGISTRATION = "cameras.yaml", "registration.yaml"
+
+_ERROR_NAMES = ("turn_x", "turn_y", "turn_z", "x", "y", "z")
+
+
+def describe_camera(found: RegisteredCamera, seconds: float) -> dict[str, Any]:
+    """A camera's part of summary.json: lengths in m, but for `_mm`; angles in `_deg`."""
+    poses = [found.camera.X_WC, *found.alternatives]
+    return {
+        "X_WC": found.camera.X_WC.tolist(),
+        "translation_sd_mm": 1e3 * found.translation_sd,
+        "rotation_sd_deg": float(np.degrees(found.rotation_sd)),
+        "families": [{"X_WC": np.asarray(X_WC).tolist()} for X_WC in poses],
+        "mean_iou": float(np.mean([frame.iou for frame in found.frames])),
+        "zeros": {},
+        "seconds": seconds,
+        "contradictions": list(found.contradictions),
+        "frames": {
+            frame.frame: {
+                "agrees": frame.agrees,
+                "E_total": frame.E_total,
+                "iou": frame.iou,
+                "share": frame.share,
+            }
+            for frame in found.frames
+        },
+    }
+
+
+def summarize(
+    paths: tuple[Path, Path, Path],
+    settings: RegistrationSettings,
+    cameras: Mapping[str, dict[str, Any]],
+    warnings: Sequence[str],
+) -> dict[str, Any]:
+    """The content of summary.json: a single camera's part stands at the top as well.
+
+    Args:
+        paths: scene, model and table of joint positions.
+        settings: the settings.
+        cameras: by name, from describe_camera.
+        warnings: what the user should know.
+    """
+    scene, model, joints = paths
+    top = next(iter(cameras.values())) if len(cameras) == 1 else {}
+    return {
+        **top,
+        "seconds": sum(camera["seconds"] for camera in cameras.values()),
+        "cameras": dict(cameras),
+        "warnings": list(warnings),
+        "scene": str(scene),
+        "model": str(model),
+        "joints": str(joints),
+        "settings": settings.as_json(),
+        "sha256": {
+            "model": file_digest(model),
+            "cameras": file_digest(scene / CAMERAS),
+            "joints": file_digest(joints),
+        },
+        "versions": versions(),
+    }
+
+
+def write_result(
+    path: Path,
+    inputs: RegistrationInputs,
+    cameras: Mapping[str, Camera],
+    registered: Mapping[str, RegisteredCamera],
+    summary: Mapping[str, Any],
+    overlay: bool,
+) -> None:
+    """Writes the result folder; the camera file comes last, when all else is there.
+
+    Args:
+        path: the folder.
+        inputs: what was registered.
+        cameras: all that the camera file is to hold.
+        registered: the cameras that were found, by name.
+        summary: from summarize.
+        overlay: whether overlays are written.
+
+    Raises:
+        OutputError: the folder is not empty, or cannot be written.
+    """
+    folder = ResultFolder(path, (), False)
+    if overlay:
+        for found in registered.values():
+            _write_overlays(folder, inputs, found)
+    text = yaml.safe_dump(
+        {name: _uncertainty(found) for name, found in registered.items()}, sort_keys=False
+    )
+    folder.write(REGISTRATION, text.encode())
+    folder.write_summary(summary)
+    folder.write(CAMERAS, dump_cameras(cameras).encode())
+
+
+def _uncertainty(found: RegisteredCamera) -> dict[str, Any]:
+    """A camera's part of registration.yaml."""
+    values: dict[str, Any] = without_nan(
+        {
+            "X_WC": found.camera.X_WC,
+            "errors": list(_ERROR_NAMES),
+            "covariance": found.covariance,
+            "alternatives": [np.asarray(X_WC) for X_WC in found.alternatives],
+            "contradictions": list(found.contradictions),
+        }
+    )
+    return values
+
+
+def _write_overlays(
+    folder: ResultFolder, inputs: RegistrationInputs, found: RegisteredCamera
+) -> None:
+    """Draws the robot over each mask."""
+    camera, kinematics = found.camera, TreeKinematics(inputs.tree)
+    renderer = LabelRenderer(inputs.model, camera)
+    for frame, misfit in zip(inputs.frames[camera.name], found.frames, strict=True):
+        q, X_WB = inputs.tree.positions_from(kinematics.split(frame.values))
+        segments = renderer.segments(q, X_WB)
+        word = "agrees" if misfit.agrees else "CONTRADICTS the others"
+        title = (
+            f"{camera.name}  frame {frame.name}  E_total {percent(misfit.E_total)}  "
+            f"IoU {misfit.iou:.2f}  {word}"
+        )
+        picture = draw_overlay(frame.mask, segments >= 0, segments, [title])
+        folder.write(f"{OVERLAY}/{camera.name}/{frame.name}.png", encode_png(picture))

@@ -133,9 +133,9 @@ distortion. The world is the model's: the robot's base, in most files. Five pose
 are enough. Cameras that have an X_WC are held, and compared with the robot; --camera finds one of
 them anew.
 
-Files in DIR: cameras.yaml, which estimate reads (copy it into the scene); registration.yaml
-(6 x 6 covariance, other poses); summary.json; overlay/<camera>/<frame>.png. Nothing is written
-where no pose explains the masks (exit status 1).
+Files in DIR: cameras.yaml, which estimate reads (copy it into the scene); report.html, which shows
+all of it; registration.yaml (6 x 6 covariance, other poses); summary.json;
+overlay/<camera>/<frame>.png. Nothing is written where no pose explains the masks (exit status 1).
 
 [bold]A robot arm whose camera nobody measured:[/bold]
 

@@ -92,6 +92,7 @@ def _print(result: SceneRegistration) -> None:
 
     from drake_pose.apps.commands.report import output_console
     from drake_pose.apps.registration.result import CAMERAS
+    from drake_pose.apps.results.folder import REPORT
     from drake_pose.apps.texts import percent
 
     console = output_console()
@@ -122,4 +123,5 @@ def _print(result: SceneRegistration) -> None:
     console.print(frames)
     console.print(table)
     if result.folder is not None:
-        console.print(f"cameras        {escape(str(result.folder / CAMERAS))}", soft_wrap=True)
+        for label, file in (("cameras", CAMERAS), ("report", REPORT)):
+            console.print(f"{label:<14} {escape(str(result.folder / file))}", soft_wrap=True)

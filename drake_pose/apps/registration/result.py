@@ -10,7 +10,8 @@ import numpy as np
 import yaml
 
 from drake_pose.apps.registration.inputs import RegistrationInputs, RegistrationSettings
-from drake_pose.apps.results.folder import OVERLAY, ResultFolder, without_nan
+from drake_pose.apps.registration.report import make_registration_report
+from drake_pose.apps.results.folder import OVERLAY, REPORT, ResultFolder, without_nan
 from drake_pose.apps.results.overlay import draw_overlay, encode_png
 from drake_pose.apps.results.summary import file_digest, versions
 from drake_pose.apps.texts import percent
@@ -113,6 +114,7 @@ def write_result(
     )
     folder.write(REGISTRATION, text.encode())
     folder.write_summary(summary)
+    folder.write(REPORT, make_registration_report(path, summary).encode())
     folder.write(CAMERAS, dump_cameras(cameras).encode())
 
 

@@ -13,7 +13,8 @@ from urllib.parse import quote
 
 import cv2
 import numpy as np
-from jinja2 import Environment, StrictUndefined
+from jinja2 import Environment, StrictUndefined, Template
+from markupsafe import Markup
 from numpy.typing import NDArray
 
 from drake_pose.apps.results.folder import OVERLAY, PoseRow
@@ -99,16 +100,12 @@ class Picture:
 
 def make_report(content: ReportContent) -> str:
     """The page."""
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.tests["infinite"] = math.isinf
-    source = files("drake_pose.apps.results").joinpath("report_template.html.j2")
+    template = page_template("drake_pose.apps.results", "report_template.html.j2")
     frames = [row.frame for row in content.rows]
     records = [content.records[frame] for frame in frames]
     errors = np.array([np.nan if r.E_total is None else 100.0 * r.E_total for r in records])
     moving, still = _joint_plots(content, frames, records)
-    return environment.from_string(source.read_text(encoding="utf-8")).render(
+    return template.render(
         summary=content.summary,
         title=Path(str(content.summary["scene"])).name or str(content.summary["scene"]),
         model=content.model.path.name,
@@ -126,6 +123,23 @@ def make_report(content: ReportContent) -> str:
             (name, about) for name, about in _ABOUT.items() if (content.folder / name).is_file()
         ],
     )
+
+
+def page_template(package: str, name: str) -> Template:
+    """A page's template, which may use the style of all pages.
+
+    Args:
+        package: where the template's file is.
+        name: of the file.
+    """
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.tests["infinite"] = math.isinf
+    style = files("drake_pose.apps.results").joinpath("report_style.css")
+    environment.globals["style"] = Markup(style.read_text(encoding="utf-8").rstrip())
+    source = files(package).joinpath(name)
+    return environment.from_string(source.read_text(encoding="utf-8"))
 
 
 def _joint_plots(
@@ -228,7 +242,7 @@ def _pick_pictures(content: ReportContent) -> list[Picture]:
             data = (content.folder / _overlay(camera, row)).read_bytes()
             error = content.records[row.frame].E_total
             link = quote(_overlay(camera, row))
-            uri = _small(data)
+            uri = small_picture(data)
             if uri:
                 pictures.append(Picture(camera, row.frame, error, uri, link))
     return pictures
@@ -238,7 +252,7 @@ def _overlay(camera: str, row: PoseRow) -> str:
     return f"{OVERLAY}/{camera}/{row.frame}.png"
 
 
-def _small(data: bytes) -> str:
+def small_picture(data: bytes) -> str:
     """A PNG picture as the URI of a small JPEG picture; "" where it is none any more."""
     picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     if picture is None:

@@ -83,6 +83,15 @@ class TestRegister:
         assert [path.stem for path in pictures] == [f"{k:04d}" for k in range(5)]
         assert cv2.imread(str(pictures[0])).shape[1] >= 560
 
+    def test_report(self, registered) -> None:
+        page = (registered[0] / "report.html").read_text()
+        assert page.count("data:image/jpeg;base64,") == 5
+        assert page.count("<tr><td>000") == 5
+        assert "contradicts" not in page
+        for name in ("cameras.yaml", "registration.yaml", "summary.json", "overlay/left/0003.png"):
+            assert f'href="{name}"' in page
+            assert (registered[0] / name).is_file()
+
     def test_estimate_reads_the_camera_file(self, arm_scene, registered, tmp_path) -> None:
         shutil.copytree(arm_scene.folder, tmp_path / "scene")
         shutil.copy(registered[0] / "cameras.yaml", tmp_path / "scene" / "cameras.yaml")

@@ -1,0 +1,51 @@
+"""report.html of a registration: what came out, on one page that needs nothing else to be read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+
+from drake_pose.apps.results.folder import OVERLAY
+from drake_pose.apps.results.report_page import Picture, page_template, small_picture
+
+# So many pictures of each camera are shown: those that fit worst and best, and some between.
+_PICTURES = 6
+
+
+def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:
+    """The page.
+
+    Args:
+        folder: the result's folder, whose overlays are shown.
+        summary: the content of summary.json.
+    """
+    return page_template("drake_pose.apps.registration", "report_template.html.j2").render(
+        summary=summary,
+        title=Path(str(summary["scene"])).name or str(summary["scene"]),
+        model=Path(str(summary["model"])).name,
+        pictures=[
+            picture
+            for camera, one in summary["cameras"].items()
+            for picture in _pick_pictures(folder, camera, one["frames"])
+        ],
+    )
+
+
+def _pick_pictures(folder: Path, camera: str, frames: Mapping[str, Any]) -> list[Picture]:
+    """Overlays of a camera's frames from the worst to the best, as far as they were written."""
+    in_order = sorted(frames, key=lambda frame: float(-frames[frame]["E_total"]))
+    count = min(_PICTURES, len(in_order))
+    chosen = [in_order[k] for k in np.linspace(0, len(in_order) - 1, count).round().astype(int)]
+    pictures = []
+    for frame in chosen:
+        place = f"{OVERLAY}/{camera}/{frame}.png"
+        if (folder / place).is_file():
+            uri = small_picture((folder / place).read_bytes())
+            if uri:
+                error = float(frames[frame]["E_total"])
+                pictures.append(Picture(camera, frame, error, uri, quote(place)))
+    return pictures

@@ -28,6 +28,10 @@ Array = NDArray[np.float64]
 
 # A frame contradicts of which less than this share fits of what usually fits.
 _CONTRADICTS = 0.7
+# A bump turns the camera by no more [rad], and shifts it by no more [its distance from the body]:
+# from there a fit leads to the same look of the body. Farther away, all poses are searched, since
+# another one may look the same.
+_BUMP = 0.2
 
 
 class CameraStatus(IntEnum):
@@ -205,10 +209,22 @@ class OnlineRegistration:
         if near is not None or len(frames) < self.settings.newest:
             return state
         least = _CONTRADICTS * _usual_share(registered)
-        found: RegisteredCamera | None = self._search.refine(registered.camera, frames)
-        if not self._is_found(found, self.settings.newest, least):
-            found = self._find(frames, least) if len(frames) >= self.settings.least_frames else None
-        return state if found is None else _registered(found, frames, state.moves + 1)
+        found = self._search.refine(registered.camera, frames)
+        if self._is_bump(registered.camera, found.camera, frame) and self._is_found(
+            found, self.settings.newest, least
+        ):
+            return _registered(found, frames, state.moves + 1)
+        if len(frames) < self.settings.least_frames:
+            return state
+        searched = self._find(frames, least)
+        return state if searched is None else _registered(searched, frames, state.moves + 1)
+
+    def _is_bump(self, camera: PinholeCamera, moved: PinholeCamera, frame: PosedFrame) -> bool:
+        """Whether a camera is still near to where it was."""
+        off = pose_difference(moved.X_WC, camera.X_WC)
+        distance = np.linalg.norm(camera.X_WC[:3, 3] - self._points(frame).mean(axis=0))
+        shift = float(np.linalg.norm(off[3:]) / distance)
+        return max(float(np.linalg.norm(off[:3])), shift) <= _BUMP
 
     def _find(self, frames: Sequence[PosedFrame], least: float = 0.0) -> RegisteredCamera | None:
         """The camera without a guess; None where it is not determined."""
@@ -218,9 +234,9 @@ class OnlineRegistration:
             return None
         return found if self._is_found(found, self.settings.least_frames, least) else None
 
-    def _is_found(self, found: RegisteredCamera | None, count: int, least: float) -> bool:
+    def _is_found(self, found: RegisteredCamera, count: int, least: float) -> bool:
         """Whether so many frames, and more than half, agree; of which a share fits at least."""
-        if found is None or len(found.alternatives):
+        if len(found.alternatives):
             return False
         agreeing = [frame for frame in found.frames if frame.agrees]
         return (

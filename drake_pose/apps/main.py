@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from drake_pose.apps.commands import help_texts
+from drake_pose.apps.commands.audit import audit
 from drake_pose.apps.commands.batch import batch
 from drake_pose.apps.commands.capture import capture
 from drake_pose.apps.commands.date import date
@@ -273,6 +274,7 @@ def undistort(
         say(f"drake-pose: {len(written)} pictures written to {out}")
 
 
+app.command(name="audit", help=help_texts.AUDIT)(audit)
 app.command(name="batch", help=help_texts.BATCH)(batch)
 app.command(name="capture", help=help_texts.CAPTURE)(capture)
 app.command(name="empty-room", help=help_texts.EMPTY_ROOM)(empty_room)

@@ -150,6 +150,29 @@ overlay/<camera>/<frame>.png. Nothing is written where no pose explains the mask
       --joints ../shared/data/arm_two_views/joint_angles.csv
 """)
 
+AUDIT = _help(r"""
+Say which frames, cameras or joints contradict the rest, where masks, cameras and joint positions
+are all given.
+
+Each frame is fitted by itself with its joints and cameras free to move a little. What all frames
+are off alike is the fault of a joint's zero, of a camera or of the base; a frame is named that is
+off from the others: its positions are those of another moment, a joint, the base or a camera has
+moved. Named is what is significant, errors of masks and surfaces counted, and moves outlines by a
+pixel or more. Time grows with the number of frames.
+
+With one camera, a base that has moved looks like a camera that has. Of causes that explain the
+masks equally well all are told.
+
+Files in DIR: summary.json; overlay/<camera>/<frame>.png of the frames that contradict the others.
+
+[bold]Whose positions are not those of the pictures:[/bold]
+
+    drake-pose audit ../shared/data/franka_one_view \
+      --model ../shared/data/franka_one_view/panda/panda.urdf \
+      --cameras ../shared/data/franka_one_view/cameras_reference.yaml \
+      --joints ../shared/data/franka_one_view/joint_angles.csv
+""")
+
 REPRODUCE = "Run a paper's experiment and show its figures beside ours."
 
 KAMEDA = _help("""

@@ -60,12 +60,14 @@ class Distances(NamedTuple):
         X: (n, m) how they follow the values.
         effects: (n, n) covariances that surfaces, masks' parts and cameras make that err by a unit.
         information: (m, m) what all distances tell of the values where each errs by itself.
+        bends: (n, 12 nodes) how they follow the parts' surfaces, which all pictures see alike.
     """
 
     y: Array
     X: Array
     effects: tuple[Array, Array, Array]
     information: Array
+    bends: Array
 
 
 class Picture(NamedTuple):
@@ -135,6 +137,7 @@ def distances_in_pictures(outlines: Sequence[Outline], pictures: Sequence[Pictur
     shaken = np.array([one[5] for one in found]).reshape(-1, 6)
     same_picture, same_part = (of[:, None, k] == of[None, :, k] for k in range(2))
     alike = bends @ bends.T * same_part
+    of_part = of[:, 1, None] == np.arange(len(outlines))
     count = pictures[0].moves.shape[1]
     information = np.zeros((count, count))
     for A_lower, _, _, _, moves, _ in pictures:
@@ -145,6 +148,7 @@ def distances_in_pictures(outlines: Sequence[Outline], pictures: Sequence[Pictur
         X=np.array([one[3] for one in found]).reshape(-1, count),
         effects=(alike, alike * same_picture, shaken @ shaken.T * same_picture),
         information=information,
+        bends=(of_part[:, :, None] * bends[:, None]).reshape(len(found), 12 * len(outlines)),
     )
 
 

@@ -35,7 +35,7 @@ def drawn_distances(
     for size, kind in zip(sizes[1:], kinds, strict=True):
         y += size * kind @ generator.standard_normal(kind.shape[1])
     surface, mask, camera = (kind @ kind.T for kind in kinds)
-    seen = Distances(y, X, (surface, mask, camera), X.T @ X)
+    seen = Distances(y, X, (surface, mask, camera), X.T @ X, kinds[0])
     return seen, np.linalg.solve(X.T @ X, X.T @ y)
 
 
@@ -65,7 +65,11 @@ def test_covariance_is_that_of_many_fits() -> None:
 
 def test_values_that_do_not_show_are_as_unsure_as_a_full_turn() -> None:
     nothing = Distances(
-        np.zeros(0), np.zeros((0, 3)), (np.zeros((0, 0)),) * 3, np.diag([0.0, 1e6, 1e6])
+        np.zeros(0),
+        np.zeros((0, 3)),
+        (np.zeros((0, 0)),) * 3,
+        np.diag([0.0, 1e6, 1e6]),
+        np.zeros((0, 12)),
     )
     sizes = estimate_sizes(nothing, ANGLES)
     deviations = np.sqrt(np.diag(values_covariance(nothing, sizes, ALL, ANGLES)))

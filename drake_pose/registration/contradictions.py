@@ -1,0 +1,533 @@
+"""Which frames, cameras or joints contradict the rest, where all of them are given.
+
+Masks, cameras and encoders are given. Each frame is fitted by itself, all that is given free to
+move (``freed_frames``), and so tells by how much what is given is off; its covariance counts what
+errs together in contours (``matching.fit.covariance``). What all frames are off alike is estimated
+from those that agree. It is no frame's fault but that of a joint's zero, a camera or the base,
+where it is significant and shows. A frame is at fault that is significantly off from the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import f as fisher
+
+from drake_pose.errors import SettingsError
+from drake_pose.matching.fit.covariance import (
+    Distances,
+    ErrorSizes,
+    Picture,
+    distances_in_pictures,
+    estimate_sizes,
+    widening,
+)
+from drake_pose.registration.freed_frames import POSE_NAMES, FrameFreer, FreedFrame
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+BASE = "base"
+
+# How large errors are is told by at most so many groups of so many frames.
+_GROUPS, _IN_GROUP = 5, 4
+# The scale of a frame's errors is known beforehand as well as so many distances tell it.
+_KNOWN_BEFOREHAND = 20
+# What is known to less than this share of how far it may be off is not asked for.
+_TOLD = 1.0
+# Contours of a frame fit that fit as well as this share of what fits in the best frames.
+_FITS, _FITS_AT_ALL = 0.75, 0.5
+# A cause explains what is off that explains this share of it.
+_EXPLAINS = 0.9
+# Causes explain equally well whose statistics differ by less.
+_RIVALS = 10.0
+# A frame that is wrong is as unlikely as this logarithm says, and what is given is usually off by
+# this share of how far it may be off.
+_WRONG, _USUAL = 3.0, 0.4
+_ROUNDS = 10
+# A joint is named that is off by so many standard deviations.
+_SURE = 3.0
+# Where no frame tells it, contours err by about a pixel.
+_UNKNOWN_SIZES = ErrorSizes(1.0, 1.0, 1.0, 1.0)
+# A silhouette's width was put right to within this [pixel].
+_WIDTH = 2.0
+
+
+@dataclass(frozen=True)
+class AuditSettings:
+    """When something contradicts the rest.
+
+    Args:
+        chance: a frame that is right is named by chance this often.
+        pixels: what moves the outline by less, root mean square, is not named.
+        angle: joints may be off by so much in each frame by itself, standard deviation [rad].
+        shift: the same of sliding joints and of the base [m].
+
+    Raises:
+        SettingsError: a number that is not positive.
+    """
+
+    chance: float = 1e-4
+    pixels: float = 1.0
+    angle: float = np.radians(0.1)
+    shift: float = 0.001
+
+    def __post_init__(self) -> None:
+        for name in ("chance", "pixels", "angle", "shift"):
+            if not getattr(self, name) > 0.0:
+                raise SettingsError(f"{name} must be positive, not {getattr(self, name)}")
+
+
+class Cause(NamedTuple):
+    """What may be off.
+
+    Attributes:
+        kind: "joint", "camera" or "base".
+        name: of the joint or the camera; "base".
+        moves: (p, d) how what was freed follows it: a joint's position [rad or m], or a rotation
+            vector [rad] and a shift [m] of a camera along its axes, or of the base in the world.
+    """
+
+    kind: str
+    name: str
+    moves: Array
+
+
+@dataclass(frozen=True)
+class Finding:
+    """By how much something is off.
+
+    Args:
+        kind: "joint", "camera", "base", "joints" where several are off, or "unexplained" where
+            nothing within reach explains a frame.
+        name: of the joint or the camera; "" for joints and unexplained.
+        angle: [rad], of a camera or the base how far it is turned; the largest of joints; 0 of
+            sliding ones.
+        shift: [m].
+        angle_sd, shift_sd: their standard deviations.
+        pixels: how far it moves the outlines of the parts that it moves, root mean square.
+        chance: how often nothing would seem so much off by chance.
+        rivals: names of what explains it as well: which of them it is, cannot be told.
+        joints: by how much joints are off where several are [rad or m].
+    """
+
+    kind: str
+    name: str
+    angle: float
+    shift: float
+    angle_sd: float
+    shift_sd: float
+    pixels: float
+    chance: float
+    rivals: tuple[str, ...] = ()
+    joints: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class FrameAudit:
+    """What was found of one frame.
+
+    Args:
+        frame: its name.
+        shares: by camera, of both contours' lengths, what fits where everything is as given.
+        explained: by camera, what fits once all that is given may move.
+        pixels: how far the outlines are off from what all frames have in common.
+        finding: what contradicts the other frames; None: it agrees.
+    """
+
+    frame: str
+    shares: Mapping[str, float]
+    explained: Mapping[str, float]
+    pixels: float
+    finding: Finding | None
+
+
+@dataclass(frozen=True)
+class Audit:
+    """What contradicts the rest.
+
+    Args:
+        frames: what was found of each.
+        common: what is off in all frames that agree.
+        sizes: how large errors of contours are [pixel].
+    """
+
+    frames: tuple[FrameAudit, ...]
+    common: tuple[Finding, ...]
+    sizes: ErrorSizes
+
+    @property
+    def contradicting(self) -> tuple[str, ...]:
+        """The frames that contradict the others."""
+        return tuple(one.frame for one in self.frames if one.finding is not None)
+
+
+class _Told(NamedTuple):
+    """What a frame tells of what was freed, in units of its reach: x^T N x - 2 h^T x.
+
+    N: (p, p); h: (p,); of_surface: (p, 12 nodes) how h follows the surfaces, which are the same in
+    all frames; outlines: (nodes, p, p) squares of how far x moves each part's outline, summed along
+    it, and lengths: (nodes,) [pixel]; scale: of the frame's errors, a variance; freedom: with which
+    that is known.
+    """
+
+    N: Array
+    h: Array
+    of_surface: Array
+    outlines: Array
+    lengths: Array
+    scale: float
+    freedom: float
+
+
+class _Off(NamedTuple):
+    """By how much a frame is off from the others, in units of the reach.
+
+    r: (p,) its h without what is common, and Q: (p, p) the covariance of that; x: (p,) by how much
+    what was freed is off, as far as that is told, and covariance: (p, p).
+    """
+
+    r: Array
+    Q: Array
+    x: Array
+    covariance: Array
+
+
+class _Common(NamedTuple):
+    """What frames have in common: x (p,), its covariance, and the sums it is from."""
+
+    x: Array
+    covariance: Array
+    N: Array
+    h: Array
+    Q: Array
+
+
+def audit_frames(
+    freer: FrameFreer, freed: Sequence[FreedFrame], settings: AuditSettings | None = None
+) -> Audit:
+    """Finds what contradicts the rest, in time linear in the frames.
+
+    Args:
+        freer: what freed them.
+        freed: the frames.
+        settings: when something contradicts the rest.
+    """
+    return _Auditor(freer, freed, settings or AuditSettings()).audit()
+
+
+class _Auditor:
+    """An audit under way."""
+
+    def __init__(
+        self, freer: FrameFreer, freed: Sequence[FreedFrame], settings: AuditSettings
+    ) -> None:
+        self._freer, self._freed, self._settings = freer, freed, settings
+        self._joints = len(freer.joints)
+        self._is_angle = freer.is_angle
+        tolerance = np.where(self._is_angle, settings.angle, settings.shift)
+        self._tolerance = np.diag((tolerance / freer.deviations) ** 2)
+        self._explained = _explained(freed)
+
+    def audit(self) -> Audit:
+        """Does it."""
+        # As long as nobody knows which frames agree, each one by itself tells how large errors are.
+        sizes = self._pooled_sizes(np.flatnonzero(self._explained), 1)
+        self._told = [self._tell(one, sizes) for one in self._freed]
+        self._surface = sizes.surface
+        agreeing = self._agreeing()
+        # Contradicting frames no longer make errors seem large.
+        sizes = self._pooled_sizes(np.flatnonzero(agreeing), _IN_GROUP)
+        self._told = [self._tell(one, sizes) for one in self._freed]
+        self._surface = sizes.surface
+        agreeing = self._agreeing()
+        frames = tuple(self._audit_frame(k, agreeing) for k in range(len(self._freed)))
+        kept = np.array([one.finding is None for one in frames])
+        return Audit(frames, self._common_findings(kept), sizes)
+
+    def _pooled_sizes(self, which: NDArray[np.intp], together: int) -> ErrorSizes:
+        """How large errors are, by groups of some frames, spread over all of them."""
+        if not len(which):
+            return _UNKNOWN_SIZES
+        groups = max(1, min(_GROUPS, len(which) // together))
+        count = min(len(which), groups * together)
+        spread = which[np.linspace(0, len(which) - 1, count).round().astype(int)]
+        sizes = []
+        for k in range(groups):
+            pictures = [one for i in spread[k::groups] for one in self._freed[i].pictures]
+            seen = self._distances(pictures)
+            is_angle = np.append(self._is_angle, np.zeros(len(pictures), bool))
+            sizes.append(estimate_sizes(seen, is_angle, least_camera=0.0))
+        return ErrorSizes(*np.exp(np.median(np.log(np.array(sizes)), axis=0)))
+
+    def _distances(self, pictures: Sequence[Picture]) -> Distances:
+        """The distances in pictures; their values are what was freed, then each picture's width."""
+        outlines, wide = self._freer.contours.outlines, []
+        for c, one in enumerate(pictures):
+            more = np.zeros((len(outlines), len(pictures), 12))
+            for n, (outline, X_WN) in enumerate(zip(outlines, one.X_WN, strict=True)):
+                more[n, c] = widening(outline.vertices, X_WN) * one.size
+            wide.append(one._replace(moves=np.concatenate([one.moves, more], axis=1)))
+        return distances_in_pictures(outlines, wide)
+
+    def _tell(self, freed: FreedFrame, sizes: ErrorSizes) -> _Told:
+        seen = self._distances(freed.pictures)
+        own, widths = np.split(seen.X, [len(self._freer.names)], axis=1)
+        X = own * self._freer.deviations
+        V = _covariance(seen, sizes) + _WIDTH**2 * widths @ widths.T
+        PX, Py = np.split(np.linalg.solve(V, np.column_stack([X, seen.y])), [-1], axis=1)
+        N, h = X.T @ PX, PX.T @ seen.y
+        T, rank = _statistic(h, N)
+        left = max(float(seen.y @ Py[:, 0]) - T, 0.0)
+        freedom = _KNOWN_BEFOREHAND + len(seen.y) - rank
+        scale = (_KNOWN_BEFOREHAND + left) / freedom
+        moves = [one.moves * self._freer.deviations[:, None] for one in freed.pictures]
+        outlines = sum(
+            m @ one.A @ np.swapaxes(m, 1, 2) for m, one in zip(moves, freed.pictures, strict=True)
+        )
+        return _Told(
+            N, h, PX.T @ seen.bends, np.asarray(outlines), freed.weights, max(scale, 1.0),
+            float(freedom),
+        )  # fmt: skip
+
+    def _agreeing(self) -> Mask:
+        """(frames,) the frames that agree: the likeliest of the sets that some starts lead to."""
+        best, least = self._explained & False, np.inf
+        starts = [np.zeros(len(self._told), bool), self._explained]
+        order = np.flatnonzero(self._explained)
+        for k in order[np.linspace(0, len(order) - 1, min(len(order), _ROUNDS)).astype(int)]:
+            starts.append(np.arange(len(self._told)) == k)
+        for kept in starts:
+            for _ in range(_ROUNDS):
+                common = self._common(kept)
+                now = self._explained & [
+                    self._chance_of_all(told, common) > self._settings.chance for told in self._told
+                ]
+                if (now == kept).all():
+                    break
+                kept = now
+            off = self._common(kept).x / _USUAL
+            unlikely = _WRONG * np.count_nonzero(~kept) + 0.5 * float(off @ off)
+            if unlikely < least:
+                best, least = kept, unlikely
+        return best
+
+    def _common(self, kept: Mask) -> _Common:
+        """What some frames have in common; without any, that nothing is off."""
+        p = len(self._freer.names)
+        N, h, surface = np.zeros((p, p)), np.zeros(p), np.zeros_like(self._told[0].of_surface)
+        for k in np.flatnonzero(kept):
+            told = self._told[k]
+            N += told.N / told.scale
+            h += told.h / told.scale
+            surface += told.of_surface / told.scale
+        Q = N + self._surface**2 * surface @ surface.T
+        # Without other frames what is given is right to within a tolerance.
+        prior = np.eye(p) if kept.any() else np.linalg.inv(self._tolerance)
+        inverse = np.linalg.inv(N + prior)
+        covariance = inverse @ (Q + prior) @ inverse
+        return _Common(inverse @ h, covariance, N, h, Q)
+
+    def _left(self, told: _Told, common: _Common) -> tuple[Array, Array]:
+        """A frame's h without what is common, and its covariance."""
+        Q = told.scale * told.N + told.N @ (common.covariance + self._tolerance) @ told.N
+        return told.h - told.N @ common.x, Q
+
+    def _chance_of_all(self, told: _Told, common: _Common) -> float:
+        return _chance(*_statistic(*self._left(told, common), told.N), told.freedom)
+
+    def _audit_frame(self, k: int, agreeing: Mask) -> FrameAudit:
+        others = agreeing.copy()
+        others[k] = False
+        told, freed = self._told[k], self._freed[k]
+        r, Q = self._left(told, self._common(others))
+        spread = told.scale * np.linalg.inv(told.N + np.eye(len(r)))
+        off = _Off(r, Q, np.asarray(spread @ r / told.scale), np.asarray(spread))
+        finding = self._frame_finding(told, off, self._causes(freed), bool(self._explained[k]))
+        return FrameAudit(
+            freed.name, freed.shares[0], freed.shares[1], _pixels([told], off.x), finding
+        )
+
+    def _frame_finding(
+        self, told: _Told, off: _Off, causes: Sequence[Cause], explained: bool
+    ) -> Finding | None:
+        """What contradicts the other frames in one of them."""
+        settings = self._settings
+        T, rank = _statistic(off.r, off.Q, told.N)
+        chance = _chance(T, rank, told.freedom)
+        pixels = _pixels([told], off.x)
+        if not explained:
+            return self._joints_finding("unexplained", off, chance, pixels)
+        tests = [_Test.of(cause, off.r, told.N, off.Q, told.freedom) for cause in causes]
+        # Each of the tests may find something by chance.
+        least = min(chance, *(one.chance for one in tests)) * (1 + len(tests))
+        if least > settings.chance:
+            return None
+        best = max(tests, key=lambda one: one.merit)
+        left = _chance(max(T - best.T, 0.0), max(rank - best.rank, 1), told.freedom)
+        if best.T >= _EXPLAINS * T or left > settings.chance:
+            pixels = _pixels([told], best.x)
+            return self._finding(best, tests, pixels) if pixels >= settings.pixels else None
+        if pixels >= settings.pixels:
+            return self._joints_finding("joints", off, chance, pixels)
+        return None
+
+    def _causes(self, freed: FreedFrame | None) -> list[Cause]:
+        """All that may be off by itself; of the cameras those that see a frame."""
+        eye = np.eye(len(self._freer.names))
+        causes = [Cause("joint", name, eye[:, [k]]) for k, name in enumerate(self._freer.joints)]
+        names = self._freer.camera_names
+        for c, name in enumerate(names):
+            if freed is None or name in freed.cameras:
+                first = self._joints + c * len(POSE_NAMES)
+                causes.append(Cause("camera", name, eye[:, first : first + len(POSE_NAMES)]))
+        if len(names) > 1:
+            causes.append(Cause(BASE, BASE, self._freer.base_moves()))
+        return causes
+
+    def _finding(self, best: _Test, tests: Sequence[_Test], pixels: float) -> Finding:
+        rivals = [
+            one.cause.name for one in tests if one is not best and one.merit > best.merit - _RIVALS
+        ]
+        if best.cause.kind == "camera" and len(self._freer.camera_names) == 1:
+            rivals.append(BASE)
+        x = best.amount * best.units(self._freer.deviations)
+        sd = np.sqrt(np.diag(best.covariance)) * best.units(self._freer.deviations)
+        if best.cause.kind == "joint":
+            turns = bool(self._is_angle[self._freer.joints.index(best.cause.name)])
+            off = (float(x[0]), 0.0, float(sd[0]), 0.0)
+            if not turns:
+                off = (0.0, off[0], 0.0, off[2])
+        else:
+            off = (
+                float(np.linalg.norm(x[:3])), float(np.linalg.norm(x[3:])),
+                float(np.linalg.norm(sd[:3])), float(np.linalg.norm(sd[3:])),
+            )  # fmt: skip
+        return Finding(best.cause.kind, best.cause.name, *off, pixels, best.chance, tuple(rivals))
+
+    def _joints_finding(self, kind: str, off: _Off, chance: float, pixels: float) -> Finding:
+        """What is off in a frame where no cause by itself explains it."""
+        joints = (off.x * self._freer.deviations)[: self._joints]
+        turns = self._is_angle[: self._joints]
+        angle = float(np.abs(joints[turns]).max(initial=0.0))
+        shift = float(np.abs(joints[~turns]).max(initial=0.0))
+        sure = np.abs(off.x) > _SURE * np.sqrt(np.diag(off.covariance))
+        named = {
+            name: float(one)
+            for name, one, is_sure in zip(self._freer.joints, joints, sure, strict=False)
+            if is_sure
+        }
+        return Finding(kind, "", angle, shift, 0.0, 0.0, pixels, chance, (), named)
+
+    def _common_findings(self, kept: Mask) -> tuple[Finding, ...]:
+        """What is off in all frames that agree."""
+        if not kept.any():
+            return ()
+        told = [self._told[k] for k in np.flatnonzero(kept)]
+        common = self._common(kept)
+        freedom = float(sum(one.freedom for one in told))
+        findings: list[Finding] = []
+        causes = self._causes(None)
+        r, N, Q = common.h, common.N, common.Q + common.N @ self._tolerance @ common.N / len(told)
+        while causes:
+            tests = [_Test.of(cause, r, N, Q, freedom) for cause in causes]
+            best = max(tests, key=lambda one: one.merit)
+            pixels = _pixels(told, best.x)
+            if best.chance * len(tests) > self._settings.chance or pixels < self._settings.pixels:
+                break
+            findings.append(self._finding(best, tests, pixels))
+            # What is left once that was put right.
+            M = best.cause.moves
+            gain = np.eye(len(r)) - N @ M @ np.linalg.pinv(M.T @ N @ M) @ M.T
+            r, Q, N = gain @ r, gain @ Q @ gain.T, gain @ N @ gain.T
+            causes = [one for one in causes if one is not best.cause]
+        return tuple(findings)
+
+
+class _Test(NamedTuple):
+    """Whether one cause is off: its statistic, rank and chance; by how much, with covariance."""
+
+    cause: Cause
+    T: float
+    rank: int
+    chance: float
+    amount: Array
+    covariance: Array
+
+    @classmethod
+    def of(cls, cause: Cause, r: Array, N: Array, Q: Array, freedom: float) -> _Test:
+        M = cause.moves
+        T, rank = _statistic(M.T @ r, M.T @ Q @ M, M.T @ N @ M)
+        inverse = np.linalg.inv(M.T @ N @ M + 1e-3 * np.eye(M.shape[1]))
+        amount = inverse @ M.T @ r
+        return cls(
+            cause, T, rank, _chance(T, rank, freedom), amount, inverse @ M.T @ Q @ M @ inverse
+        )
+
+    @property
+    def merit(self) -> float:
+        """How well the cause explains what is off; more numbers explain more by chance."""
+        return self.T - 2.0 * self.rank
+
+    @property
+    def x(self) -> Array:
+        """(p,) what was freed, off by this cause."""
+        return np.asarray(self.cause.moves @ self.amount)
+
+    def units(self, deviations: Array) -> Array:
+        """(d,) the units of the amount [rad or m]."""
+        if self.cause.kind == BASE:
+            return np.ones(self.cause.moves.shape[1])
+        return np.asarray(np.abs(self.cause.moves).T @ deviations)
+
+
+def _covariance(seen: Distances, sizes: ErrorSizes) -> Array:
+    """(n, n) of distances."""
+    V = sizes.noise**2 * np.eye(len(seen.y))
+    for size, effect in zip(sizes[1:], seen.effects, strict=True):
+        V += size**2 * effect
+    return V
+
+
+def _statistic(r: Array, Q: Array, N: Array | None = None) -> tuple[float, int]:
+    """r^T Q^-1 r in the directions that are told, and how many these are."""
+    known, turn = np.linalg.eigh(Q if N is None else N)
+    turn = turn[:, known > _TOLD]
+    if not turn.shape[1]:
+        return 0.0, 0
+    along = turn.T @ r
+    return float(along @ np.linalg.solve(turn.T @ Q @ turn, along)), turn.shape[1]
+
+
+def _chance(T: float, rank: int, freedom: float) -> float:
+    """How often a statistic is as large by chance."""
+    return float(fisher.sf(T / rank, rank, freedom)) if rank else 1.0
+
+
+def _pixels(told: Sequence[_Told], x: Array) -> float:
+    """How far x moves the outlines of the parts that it moves, root mean square [pixel]."""
+    squares = np.sum([np.einsum("p,npq,q->n", x, one.outlines, x) for one in told], axis=0)
+    lengths = np.sum([one.lengths for one in told], axis=0)
+    moved = squares > 1e-6 * squares.max(initial=0.0)
+    return float(np.sqrt(squares[moved].sum() / max(lengths[moved].sum(), 1e-9)))
+
+
+def _explained(freed: Sequence[FreedFrame]) -> Mask:
+    """(frames,) whether something within reach explains all its pictures."""
+    best: dict[str, float] = {}
+    for name in {name for one in freed for name in one.shares[1]}:
+        shares = sorted(one.shares[1][name] for one in freed if name in one.shares[1])
+        best[name] = float(np.mean(shares[-max(2, len(shares) // 4) :]))
+    return np.array(
+        [
+            all(
+                share >= max(_FITS * best[name], _FITS_AT_ALL)
+                for name, share in one.shares[1].items()
+            )
+            for one in freed
+        ]
+    )

@@ -1,0 +1,328 @@
+"""Each frame fitted by itself, its joints and cameras free to move a little from where they are.
+
+What is given is where a fit begins, and what it should not leave. So contours that are far off are
+found, too, and what is left of the distances is linear in what is given about where the fit ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.camera import Camera
+from drake_pose.errors import MaskError
+from drake_pose.matching.fit.camera_sums import Views
+from drake_pose.matching.fit.contour_fit import (
+    Comparison,
+    ContourFit,
+    Noise,
+    fitting_share,
+    pixels_per_metre,
+)
+from drake_pose.matching.fit.covariance import Picture
+from drake_pose.matching.fit.evidence import NO_EDGE, Evidence, find_edge_points, pack_evidence
+from drake_pose.matching.fit.frames_fit import FramesFit
+from drake_pose.matching.fit.kernel import COST, WEIGHT
+from drake_pose.matching.fit.levenberg_marquardt import Round, StepSettings
+from drake_pose.matching.fit.parameters import CAMERA_NAMES, CameraParameters
+from drake_pose.matching.fit.unknowns import choose
+from drake_pose.silhouette import Outline
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+POSE_NAMES = CAMERA_NAMES[:6]
+
+_ROUNDS = tuple(Round(scale, 0.02) for scale in (0.12, 0.09, 0.07, 0.05, 0.04, 0.03, 0.025))
+_TOLD_APART = Round(0.025, 0.01)
+_STEPS = StepSettings(longest=0.2, damping=1e-3, even_damping=1e-6)
+# From one point of a silhouette's edge to the next [root of the silhouettes' area].
+_SPACING = 1.0 / 100.0
+# Where given values fit so well, of what fits once they are freed, distances are linear in them.
+_FITS_ALREADY = 0.95
+# Silhouettes may be as much too wide on all sides, or too narrow [pixel].
+_WIDTHS = np.linspace(-3.0, 3.0, 5)
+# What a fit's unknowns are held by: contours err by about so much along about so much [pixel].
+_POINT_ERROR, _ERROR_LENGTH = 2.0, 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class SeenFrame:
+    """A frame: what is given of the body, and what cameras have seen of it.
+
+    Args:
+        name: of the frame.
+        values: (m,) of the body's pose tree, as encoders say [rad or m].
+        masks: (H, W) the silhouette by camera.
+    """
+
+    name: str
+    values: Array
+    masks: Mapping[str, Mask]
+
+
+@dataclass(frozen=True, eq=False)
+class Reach:
+    """How far what is given may be off: standard deviations of what a fit may move.
+
+    Args:
+        angle: of a joint [rad].
+        shift: of a joint [m].
+        camera_turn: of a camera about the body [rad].
+        camera_shift: of a camera, or of the base [m].
+    """
+
+    angle: float = 0.1
+    shift: float = 0.02
+    camera_turn: float = 0.05
+    camera_shift: float = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class FreedFrame:
+    """A frame whose joints and cameras were freed.
+
+    Args:
+        name: of the frame.
+        change: (p,) by how much they were moved.
+        pictures: the contours compared with each camera's silhouette where the fit ended, and told
+            as distances from what is given; the p values are the joints' and POSE_NAMES of each
+            camera.
+        cameras: of the pictures.
+        shares: before and after, by camera, of both contours' lengths, what fits.
+        weights: (nodes,) how much of the contours of each node was compared [pixel].
+    """
+
+    name: str
+    change: Array
+    pictures: tuple[Picture, ...]
+    cameras: tuple[str, ...]
+    shares: tuple[Mapping[str, float], Mapping[str, float]]
+    weights: Array
+
+
+class FrameFreer:
+    """Fits frames, each by itself, with all that is given free to move.
+
+    Attributes:
+        names: of the p values that move: the joints, and POSE_NAMES of each camera.
+        size: the root of the silhouettes' median area [pixel], the unit of length of a fit.
+
+    Args:
+        kinematics: the pose tree's.
+        outlines: a surface for each node: of few triangles, with which frames are fitted, and all,
+            with which they are compared in the end.
+        cameras: the cameras, where they are said to stand.
+        frames: some frames, which tell how large silhouettes are, and where the body is.
+        reach: how far what is given may be off.
+
+    Raises:
+        MaskError: a mask of another size than its camera's picture, or no mask shows the body.
+    """
+
+    def __init__(
+        self,
+        kinematics: TreeKinematics,
+        outlines: tuple[Sequence[Outline], Sequence[Outline]],
+        cameras: Sequence[Camera],
+        frames: Sequence[SeenFrame],
+        reach: Reach | None = None,
+    ) -> None:
+        reach = reach or Reach()
+        self._cameras = tuple(cameras)
+        self.size = _common_size(cameras, frames)
+        noise = Noise(deviation=1.0, correlation=0.5 / self.size**3)
+        self._few, self.contours = (
+            ContourFit(kinematics, one, noise, _STEPS, pixels=self.size) for one in outlines
+        )
+        places = [kinematics.poses(frame.values)[:, :3, 3].mean(axis=0) for frame in frames]
+        pivot = np.mean(places, axis=0)
+        self._parameters = CameraParameters(cameras, pivot)
+        joints = np.flatnonzero(kinematics.lower < kinematics.upper)
+        self.camera_names = tuple(camera.name for camera in cameras)
+        self.joints = tuple(kinematics.names[k] for k in joints)
+        looks = tuple(f"{camera.name}.{name}" for camera in cameras for name in POSE_NAMES)
+        self.names = (*self.joints, *looks)
+        worth = _POINT_ERROR * np.sqrt(_ERROR_LENGTH)
+        of_joints = np.where(kinematics.is_angle[joints], reach.angle, reach.shift)
+        turns = [name.startswith("turn") for name in POSE_NAMES]
+        self.is_angle = np.concatenate([kinematics.is_angle[joints], *([turns] * len(cameras))])
+        of_camera = [reach.camera_turn] * 3 + [reach.camera_shift] * 3
+        self.deviations = np.concatenate([of_joints, *([of_camera] * len(cameras))])
+        body = self._few.body
+        unknown = choose(
+            [*body.names, *self._parameters.names],
+            self.names,
+            deviation=self.deviations / worth,
+        )
+        self._entries = unknown.entries
+        self._fit = FramesFit(
+            body, cameras, unknown, pivot=pivot, noise=noise, steps=_STEPS, pixels=self.size
+        )
+
+    def free(self, frame: SeenFrame) -> FreedFrame:
+        """Fits a frame.
+
+        Raises:
+            MaskError: a mask of another size than its camera's picture.
+        """
+        evidence = self._evidence(frame)
+        held, change = self._held(frame), np.zeros((1, len(self.names)))
+        theta, widths = held, np.zeros(len(self._cameras))
+        for rounds in (_ROUNDS, _ROUNDS[-2:]):
+            found = self._fit.fit(
+                [_widened(evidence, -widths)],
+                frame.values[None],
+                change,
+                np.zeros(0),
+                rounds,
+                expected=(np.zeros_like(change), np.zeros(0)),
+            )
+            change, theta = found.own, found.parameters[0]
+            widths = self._widths(evidence, theta)
+        own = self._widths(evidence, held)
+        before = self._compare(_widened(evidence, -own), held)
+        after = self._compare(_widened(evidence, -widths), theta)
+        told = after
+        if before.share >= _FITS_ALREADY * after.share:
+            theta, told, change, widths = held, before, np.zeros_like(change), own
+        return FreedFrame(
+            frame.name,
+            change[0],
+            *self._pictures(told, theta, change[0]),
+            (self._shares(before, frame), self._shares(after, frame)),
+            _weights(told),
+        )
+
+    def _shares(self, compared: Comparison, frame: SeenFrame) -> dict[str, float]:
+        return {
+            camera.name: fitting_share(compared.sums[c])
+            for c, camera in enumerate(self._cameras)
+            if camera.name in frame.masks
+        }
+
+    def _widths(self, evidence: Evidence, theta: Array) -> Array:
+        """(c,) by how much the silhouettes are wider on all sides than the body [pixel]."""
+        costs = np.array(
+            [
+                self._compare(
+                    _widened(evidence, np.full(len(self._cameras), -one)), theta, self._few
+                )
+                .sums[:, :, COST]
+                .sum(axis=1)
+                for one in _WIDTHS
+            ]
+        )
+        best = np.clip(costs.argmin(axis=0), 1, len(_WIDTHS) - 2)
+        low, middle, high = (np.take_along_axis(costs, (best + k)[None], 0)[0] for k in (-1, 0, 1))
+        bend = low - 2.0 * middle + high
+        step = np.where(bend > 0.0, 0.5 * (low - high) / np.where(bend > 0.0, bend, 1.0), 0.0)
+        return _WIDTHS[best] + np.clip(step, -1.0, 1.0) * (_WIDTHS[1] - _WIDTHS[0])
+
+    def base_moves(self) -> Array:
+        """(p, 6) how what is freed follows a turn [rad] and a shift [m] of the base in the world.
+
+        In units of the deviations. All cameras see the base move about their common pivot.
+        """
+        moves = np.zeros((len(self.names), 6))
+        for c, camera in enumerate(self._cameras):
+            first = len(self.joints) + 6 * c
+            R_CW = camera.X_CW[:3, :3]
+            moves[first : first + 3, :3] = R_CW
+            moves[first + 3 : first + 6, 3:] = R_CW
+        return np.asarray(moves / self.deviations[:, None])
+
+    def _held(self, frame: SeenFrame) -> Array:
+        theta = np.zeros(len(self._fit.names))
+        theta[: len(frame.values)] = frame.values
+        return theta
+
+    def _evidence(self, frame: SeenFrame) -> Evidence:
+        spacing = max(1.0, round(_SPACING * self.size))
+        edges = []
+        for camera in self._cameras:
+            mask = frame.masks.get(camera.name)
+            if mask is not None:
+                _check_size(camera, frame.name, mask)
+            edges.append(NO_EDGE if mask is None else find_edge_points(mask, spacing))
+        return pack_evidence(edges)
+
+    def _compare(
+        self, evidence: Evidence, theta: Array, contours: ContourFit | None = None
+    ) -> Comparison:
+        size = len(self.contours.body.names)
+        X_CW, kernel, _ = self._parameters.place(theta[size:])
+        values = theta[: len(self.contours.kinematics.names)]
+        views = Views((X_CW, kernel), evidence)
+        return (contours or self.contours).compare_views(views, values, _TOLD_APART)
+
+    def _pictures(
+        self, compared: Comparison, theta: Array, change: Array
+    ) -> tuple[tuple[Picture, ...], tuple[str, ...]]:
+        """The comparison with each camera's silhouette, and the cameras that have one."""
+        size, X_WN = len(self.contours.body.names), compared.placement.X_WN
+        X_CW, kernel, motions = self._parameters.place(theta[size:])
+        values = len(self.contours.kinematics.names)
+        moves = np.zeros((len(X_WN), len(theta), 12))
+        moves[:, :values] = compared.placement.dense(values)
+        metres = 1.0 / pixels_per_metre((X_CW, kernel), X_WN[:, :3, 3].mean(axis=0))
+        pictures, names = [], []
+        for c, camera in enumerate(self._cameras):
+            if not compared.A[c].any():
+                continue
+            own = moves.copy()
+            first = size + c * len(CAMERA_NAMES)
+            own[:, first : first + 6] = motions[c, :6]
+            own = own[:, self._entries]
+            A = compared.A[c]
+            whole = np.tril(A) + np.swapaxes(np.tril(A, -1), -1, -2)
+            moved = np.einsum("npk,p->nk", own, change)
+            b = compared.b[c] + np.einsum("nkl,nl->nk", whole, moved)
+            pictures.append(Picture(whole, b, X_WN, X_CW[c], own, float(metres[c])))
+            names.append(camera.name)
+        return tuple(pictures), tuple(names)
+
+
+def _common_size(cameras: Sequence[Camera], frames: Sequence[SeenFrame]) -> float:
+    """The root of the silhouettes' median area [pixel]."""
+    areas = []
+    for frame in frames:
+        for camera in cameras:
+            if camera.name in frame.masks:
+                _check_size(camera, frame.name, frame.masks[camera.name])
+                areas.append(np.count_nonzero(frame.masks[camera.name]))
+    if not any(areas):
+        raise MaskError("no mask shows the body; give masks in which it is white")
+    return float(np.sqrt(np.median([area for area in areas if area])))
+
+
+def _check_size(camera: Camera, frame: str, mask: Mask) -> None:
+    if mask.shape != (camera.height, camera.width):
+        raise MaskError(
+            f"camera '{camera.name}', frame '{frame}': a mask of {camera.width} x {camera.height} "
+            f"pixels is expected, not {mask.shape[1]} x {mask.shape[0]}"
+        )
+
+
+def _widened(evidence: Evidence, widths: Array) -> Evidence:
+    """The edges of silhouettes that are wider (c,) on all sides [pixel]."""
+    counts = np.diff(evidence.starts)
+    uv = evidence.uv + np.repeat(widths, counts)[:, None] * evidence.normals
+    order = np.concatenate(
+        [
+            begin + np.argsort(uv[begin:end, 1], kind="stable")
+            for begin, end in zip(evidence.starts[:-1], evidence.starts[1:], strict=True)
+        ]
+    )
+    return Evidence(uv[order], evidence.normals[order], evidence.lengths[order], evidence.starts)
+
+
+def _weights(compared: Comparison) -> Array:
+    """(nodes,) how much contour was compared; edges are shared out among the nodes."""
+    weights = compared.sums[:, :, WEIGHT].sum(axis=0)
+    own = max(float(weights[:-1].sum()), 1e-9)
+    return np.asarray(weights[:-1] * weights.sum() / own)

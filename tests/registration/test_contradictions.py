@@ -1,0 +1,180 @@
+"""What contradicts the rest is named, in Drake's own pictures of an arm, damaged and changed."""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import pytest
+
+from drake_pose.body import ArticulatedModel, load_model
+from drake_pose.camera import PinholeCamera
+from drake_pose.errors import MaskError, SettingsError
+from drake_pose.registration.contradictions import Audit, AuditSettings, Finding, audit_frames
+from drake_pose.registration.freed_frames import FrameFreer, SeenFrame
+from drake_pose.registration.register import RegistrationBody
+from drake_pose.silhouette import LabelRenderer
+from tests.matching.arms import arm_cameras, arm_urdf
+
+COUNT = 8
+WRONG = 3
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> ArticulatedModel:
+    path = tmp_path_factory.mktemp("arm") / "arm.urdf"
+    path.write_text(arm_urdf())
+    return load_model(path)
+
+
+@pytest.fixture(scope="module")
+def body(model: ArticulatedModel) -> RegistrationBody:
+    return RegistrationBody(model.pose_tree())
+
+
+@pytest.fixture(scope="module")
+def cameras() -> tuple[PinholeCamera, ...]:
+    return arm_cameras(640, 480)
+
+
+@pytest.fixture(scope="module")
+def poses(body: RegistrationBody) -> np.ndarray:
+    """(frames, joints) at which every joint shows: the arm neither straight nor folded up."""
+    generator = np.random.default_rng(5)
+    middle = np.radians([0.0, 50.0, 20.0, 60.0, 40.0])
+    return middle + np.radians(25.0) * generator.uniform(-1.0, 1.0, (COUNT, 5))
+
+
+def damaged(mask: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """A mask grown or worn by up to two pixels, with holes of 3 % of its area."""
+    by = int(generator.integers(-2, 3))
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(by) + 1,) * 2)
+    mask = mask.astype(np.uint8)
+    mask = (cv2.dilate if by > 0 else cv2.erode)(mask, kernel)
+    v, u = np.nonzero(mask)
+    least = 0.97 * len(v)
+    while mask.sum() > least:
+        k = int(generator.integers(len(v)))
+        cv2.circle(mask, (int(u[k]), int(v[k])), int(generator.integers(3, 9)), 0, -1)
+    return mask.astype(bool)
+
+
+def moved(camera: PinholeCamera, by: Sequence[float]) -> PinholeCamera:
+    X_WC = camera.X_WC.copy()
+    X_WC[:3, 3] += by
+    return camera.with_pose(X_WC)
+
+
+def audit(
+    model: ArticulatedModel,
+    body: RegistrationBody,
+    poses: np.ndarray,
+    given: np.ndarray,
+    taken: Sequence[PinholeCamera],
+    told: Sequence[PinholeCamera] | None = None,
+    away: Sequence[PinholeCamera] | None = None,
+) -> Audit:
+    """Pictures of poses by the cameras taken, audited with the positions and cameras given.
+
+    Args:
+        told: the cameras given; those taken where None.
+        away: the cameras that take frame WRONG.
+    """
+    generator = np.random.default_rng(1)
+    kinematics = body.kinematics
+    frames = []
+    for k, (pose, values) in enumerate(zip(poses, given, strict=True)):
+        q, X_WB = body.tree.positions_from(kinematics.split(pose))
+        here = taken if away is None or k != WRONG else away
+        masks = {
+            one.name: damaged(LabelRenderer(model, one).mask(q, X_WB), generator) for one in here
+        }
+        frames.append(SeenFrame(f"{k:04d}", values, masks))
+    freer = FrameFreer(kinematics, (body.few, body.all), told or taken, frames)
+    return audit_frames(freer, [freer.free(frame) for frame in frames])
+
+
+def finding_of(found: Audit, frame: int) -> Finding:
+    finding = found.frames[frame].finding
+    assert finding is not None
+    return finding
+
+
+class TestAuditFrames:
+    def test_nothing_is_named_where_everything_is_right(self, model, body, poses, cameras) -> None:
+        found = audit(model, body, poses, poses, cameras[:1])
+        assert found.contradicting == ()
+        assert found.common == ()
+
+    def test_a_joint_that_is_off_in_one_frame(self, model, body, poses, cameras) -> None:
+        given = poses.copy()
+        given[WRONG, 1] += np.radians(2.0)
+        found = audit(model, body, poses, given, cameras[:1])
+        assert found.contradicting == (f"{WRONG:04d}",)
+        finding = finding_of(found, WRONG)
+        assert (finding.kind, finding.name) == ("joint", "shoulder_turn")
+        # By what must be added to what is given.
+        assert np.degrees(finding.angle) == pytest.approx(-2.0, abs=0.3)
+        assert abs(finding.angle - np.radians(-2.0)) < 4.0 * finding.angle_sd
+        assert found.common == ()
+
+    def test_a_joint_whose_zero_is_off(self, model, body, poses, cameras) -> None:
+        given = poses.copy()
+        given[:, 3] -= np.radians(2.0)
+        found = audit(model, body, poses, given, cameras[:1])
+        assert found.contradicting == ()
+        assert [(one.kind, one.name) for one in found.common] == [("joint", "elbow_turn")]
+        assert np.degrees(found.common[0].angle) == pytest.approx(2.0, abs=0.2)
+
+    def test_a_base_that_moved_in_one_frame(self, model, body, poses, cameras) -> None:
+        """Both cameras see it move; none of them has."""
+        away = [moved(camera, [0.0, -0.01, 0.0]) for camera in cameras]
+        found = audit(model, body, poses, poses, cameras, away=away)
+        assert found.contradicting == (f"{WRONG:04d}",)
+        assert finding_of(found, WRONG).kind == "base"
+        assert finding_of(found, WRONG).shift == pytest.approx(0.01, abs=0.002)
+        assert found.common == ()
+
+    def test_one_of_two_cameras_that_was_moved(self, model, body, poses, cameras) -> None:
+        told = [cameras[0], moved(cameras[1], [0.0, 0.0, 0.01])]
+        found = audit(model, body, poses, poses, cameras, told)
+        assert found.contradicting == ()
+        assert [(one.kind, one.name) for one in found.common] == [("camera", "right")]
+        assert found.common[0].shift == pytest.approx(0.01, abs=0.003)
+
+    def test_positions_of_another_frame(self, model, body, poses, cameras) -> None:
+        given = poses.copy()
+        given[WRONG] = poses[WRONG + 2]
+        found = audit(model, body, poses, given, cameras[:1])
+        assert found.contradicting == (f"{WRONG:04d}",)
+        assert finding_of(found, WRONG).kind in ("joints", "unexplained")
+        assert finding_of(found, WRONG).pixels > 5.0
+
+    def test_a_camera_alone_may_be_the_base(self, model, body, poses, cameras) -> None:
+        told = [moved(cameras[0], [0.0, 0.01, 0.005])]
+        found = audit(model, body, poses, poses, cameras[:1], told)
+        assert found.contradicting == ()
+        assert found.common[0].kind == "camera"
+        assert "base" in found.common[0].rivals
+
+
+class TestFrameFreer:
+    def test_a_mask_of_another_size_is_named(self, body, poses, cameras) -> None:
+        mask = np.ones((480, 640), bool)
+        frame = SeenFrame("0007", poses[0], {"left": mask[:100]})
+        with pytest.raises(MaskError, match=r"'left', frame '0007'.*640 x 480"):
+            FrameFreer(body.kinematics, (body.few, body.all), cameras[:1], [frame])
+        good = SeenFrame("0000", poses[0], {"left": mask})
+        freer = FrameFreer(body.kinematics, (body.few, body.all), cameras[:1], [good])
+        with pytest.raises(MaskError, match="frame '0007'"):
+            freer.free(frame)
+
+    def test_empty_masks_show_no_body(self, body, poses, cameras) -> None:
+        frame = SeenFrame("0000", poses[0], {"left": np.zeros((480, 640), bool)})
+        with pytest.raises(MaskError, match="no mask shows the body"):
+            FrameFreer(body.kinematics, (body.few, body.all), cameras[:1], [frame])
+
+
+@pytest.mark.parametrize("name", ["chance", "pixels", "angle", "shift"])
+def test_settings_are_positive(name: str) -> None:
+    with pytest.raises(SettingsError, match=name):
+        AuditSettings(**{name: 0.0})

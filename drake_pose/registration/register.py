@@ -21,7 +21,12 @@ from drake_pose.errors import RegistrationError, SettingsError
 from drake_pose.matching.fit.levenberg_marquardt import Round
 from drake_pose.matching.fit.significance import excess
 from drake_pose.matching.fit.surfaces import FEW, VERY_FEW, few_triangles
-from drake_pose.registration.camera_fit import CameraFit, FittedCamera
+from drake_pose.registration.calibration_fit import (
+    Calibration,
+    CalibrationFit,
+    start_calibration,
+)
+from drake_pose.registration.camera_fit import CameraFit
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.start_poses import (
     E_total,
@@ -29,7 +34,7 @@ from drake_pose.registration.start_poses import (
     place_by_bounds,
     spread_rotations,
 )
-from drake_pose.registration.uncertainty import camera_covariance
+from drake_pose.registration.uncertainty import calibration_uncertainty, pose_covariance
 from drake_pose.silhouette import Outline, TreeSurfaces
 
 Array = NDArray[np.float64]
@@ -227,12 +232,13 @@ class CameraSearch:
         """The best of the poses X_CW (4, 4), and those that fit no worse."""
         fitted = [_with_widths(fit, X_CW) for X_CW in looks]
         side = max(1.0, _PIECE * fit.frames.size)
-        pieces = [fit.piece_costs(one, _TOLD_APART, side) for one in fitted]
+        pieces = [fit.piece_costs(one.X_CW[0], one.widths[0], _TOLD_APART, side) for one in fitted]
         order = np.argsort([one.sum() for one in pieces], kind="stable")
         best = fitted[order[0]]
+        X_CW = best.X_CW[0]
         shares = _shares(fit, best)
         agreeing = _agreeing(shares)
-        found = areas(fit.frames, best.X_CW[None], np.inf)[0]
+        found = areas(fit.frames, best.X_CW, np.inf)[0]
         body, mask, both = found.T
         iou = both / np.maximum(body + mask - both, 1.0)
         rows = zip(fit.frames.frames, E_total(found), iou, shares, agreeing, strict=True)
@@ -244,10 +250,11 @@ class CameraSearch:
         counted = [one[agreeing] for one in pieces]
         as_good = [k for k in order if excess(counted[k], counted[order[0]]) <= _SIGNIFICANCE]
         # Fits that began apart may have ended in one pose.
-        alike = _distinct(fit.frames, [fitted[k].X_CW for k in as_good])
+        alike = _distinct(fit.frames, [fitted[k].X_CW[0] for k in as_good])
+        own = CalibrationFit([fit], [np.flatnonzero(agreeing)])
         return RegisteredCamera(
-            fit.frames.camera.with_pose(np.linalg.inv(best.X_CW)),
-            camera_covariance(fit, best, np.flatnonzero(agreeing)),
+            fit.frames.camera.with_pose(np.linalg.inv(X_CW)),
+            pose_covariance(fit, X_CW, calibration_uncertainty(own, best).covariance),
             tuple(misfits),
             np.array([np.linalg.inv(X) for X in alike[1:]]).reshape(-1, 4, 4),
         )
@@ -273,18 +280,19 @@ def _distinct(frames: PosedFrames, X_CW: Sequence[Array]) -> list[Array]:
     return kept
 
 
-def _with_widths(fit: CameraFit, X_CW: Array) -> FittedCamera:
+def _with_widths(fit: CameraFit, X_CW: Array) -> Calibration:
     """A pose (4, 4) fitted to the frames that agree, and the widths of their silhouettes."""
-    found = FittedCamera(X_CW, np.zeros(len(fit.values)))
+    found = start_calibration([fit], [X_CW])
     for _ in range(_AGAIN):
-        found = fit.fit_with_widths(found, _LAST, np.flatnonzero(_agreeing(_shares(fit, found))))
+        agreeing = np.flatnonzero(_agreeing(_shares(fit, found)))
+        found = CalibrationFit([fit], [agreeing]).fit(found, _LAST)
     return found
 
 
-def _shares(fit: CameraFit, fitted: FittedCamera) -> Array:
+def _shares(fit: CameraFit, found: Calibration) -> Array:
     """(frames,) of both contours' lengths, what fits."""
-    rows = enumerate(fitted.widths)
-    return np.array([fit.compare(fitted.X_CW, k, _TOLD_APART, width).share for k, width in rows])
+    X_CW, rows = found.X_CW[0], enumerate(found.widths[0])
+    return np.array([fit.compare(X_CW, k, _TOLD_APART, width).share for k, width in rows])
 
 
 def _agreeing(shares: Array) -> Mask:

@@ -8,6 +8,8 @@ distances. How wide each mask is was fitted, and is as unsure as that.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,42 +22,71 @@ from drake_pose.matching.fit.covariance import (
     widening,
 )
 from drake_pose.matching.fit.levenberg_marquardt import Round
-from drake_pose.registration.camera_fit import POSE_NAMES, CameraFit, FittedCamera
+from drake_pose.registration.calibration_fit import Calibration, CalibrationFit
+from drake_pose.registration.camera_fit import CameraFit
 
 Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 _FINE = Round(0.025, 0.01)
-_IS_ANGLE = np.array([name.startswith("turn") for name in POSE_NAMES])
 
 
-def camera_covariance(fit: CameraFit, fitted: FittedCamera, which: Indices) -> Array:
-    """(6, 6) of a fitted camera's error: a rotation vector [rad], a shift [m], in the world.
+class Uncertainty(NamedTuple):
+    """How sure a calibration is.
+
+    Attributes:
+        covariance: (u, u) of the shared unknowns, by the names of the fit.
+        information: (u, u) what the contours say of them, if each point erred by itself.
+    """
+
+    covariance: Array
+    information: Array
+
+
+def calibration_uncertainty(fit: CalibrationFit, found: Calibration) -> Uncertainty:
+    """How sure the shared unknowns of a calibration are.
 
     Args:
         fit: what fitted it.
-        fitted: its pose, and the silhouettes' widths.
-        which: the frames that counted.
+        found: the calibration.
     """
-    X_CW, motions = fitted.X_CW, fit.motions(fitted.X_CW)
-    outlines = fit.contours.outlines
-    camera = pack_cameras([fit.frames.camera.with_pose(np.linalg.inv(X_CW))])
+    rows = [(c, int(k)) for c, frames in enumerate(fit.which) for k in frames]
+    shared = len(fit.names)
     pictures = []
-    for place, k in enumerate(which):
-        compared = fit.compare(X_CW, int(k), _FINE, float(fitted.widths[k]))
+    for place, (c, k) in enumerate(rows):
+        own, width, X_CW = fit.fits[c], float(found.widths[c][k]), found.X_CW[c]
+        values = fit.values(found, c, k)
+        compared = own.compare(X_CW, k, _FINE, width, values, found.log_focal[c])
         X_WN = compared.placement.X_WN
-        size = 1.0 / float(pixels_per_metre(camera, X_WN[:, :3, 3].mean(axis=0))[0])
-        moves = np.zeros((len(X_WN), len(POSE_NAMES) + len(which), 12))
-        moves[:, : len(POSE_NAMES)] = motions
-        for n, (outline, X) in enumerate(zip(outlines, X_WN, strict=True)):
-            moves[n, len(POSE_NAMES) + place] = widening(outline.vertices, X) * size
+        camera = own.frames.camera.with_pose(np.linalg.inv(X_CW))
+        size = 1.0 / float(pixels_per_metre(pack_cameras([camera]), X_WN[:, :3, 3].mean(axis=0))[0])
+        moves = np.zeros((len(X_WN), shared + len(rows), 12))
+        moves[:, :shared] = fit.motions(found, c, compared.placement.dense(len(values)))
+        for n, (outline, X) in enumerate(zip(own.contours.outlines, X_WN, strict=True)):
+            moves[n, shared + place] = widening(outline.vertices, X) * size
         pictures.append(Picture(compared.A[0], compared.b[0], X_WN, X_CW, moves, size))
-    seen = distances_in_pictures(outlines, pictures)
-    is_angle = np.append(_IS_ANGLE, np.zeros(len(which), bool))
+    seen = distances_in_pictures(fit.fits[0].contours.outlines, pictures)
+    is_angle = np.zeros(shared + len(rows), bool)
     sizes = estimate_sizes(seen, is_angle, least_camera=0.0)
-    own = values_covariance(seen, sizes, np.arange(len(is_angle)), is_angle)
+    covariance = values_covariance(seen, sizes, np.arange(len(is_angle)), is_angle)
+    H = seen.information
+    width_gain = np.linalg.solve(
+        H[shared:, shared:] + 1e-9 * np.eye(len(rows)), H[shared:, :shared]
+    )
+    return Uncertainty(
+        covariance[:shared, :shared], H[:shared, :shared] - H[:shared, shared:] @ width_gain
+    )
+
+
+def pose_covariance(fit: CameraFit, X_CW: Array, covariance: Array) -> Array:
+    """(6, 6) of a camera's error in the world: a rotation vector [rad], a shift [m].
+
+    Args:
+        fit: the camera's.
+        X_CW: (4, 4) its pose.
+        covariance: (6, 6) of its turn and shift as they were fitted.
+    """
     J = _in_world(fit, X_CW)
-    return J @ own[: len(J), : len(J)] @ J.T
+    return J @ covariance @ J.T
 
 
 def _in_world(fit: CameraFit, X_CW: Array) -> Array:

@@ -1,0 +1,195 @@
+"""Cameras' poses, and what all frames share beside them, fitted together with the masks' widths.
+
+A mask that is too wide on all sides makes its body seem nearer. Each frame's width is unknown, too:
+thin links and their distances from one another tell the two apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.matching.fit.contour_fit import Comparison
+from drake_pose.matching.fit.kernel import COST, WEIGHT
+from drake_pose.matching.fit.levenberg_marquardt import Equations, Round, StepSettings, minimise
+from drake_pose.matching.fit.parameters import CAMERA_NAMES
+from drake_pose.registration.camera_fit import CameraFit
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+_STEPS = StepSettings(longest=0.3, damping=1e-2, even_damping=1e-6)
+# Masks are wider or narrower by no more [pixel], and their width is varied by this.
+_WIDEST, _WIDTH_STEP = 6.0, 0.25
+# A pose has six parameters; with the focal length a camera has seven.
+_POSE = 6
+# What is known of zeros [rad or m] and of the logarithm of a focal length beforehand: deviations.
+ZERO_DEVIATION, FOCAL_DEVIATION = 0.2, 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """What is unknown of cameras and of a body.
+
+    Args:
+        X_CW: (cameras, 4, 4) the world's poses in the cameras.
+        widths: for each camera (frames,) by how much each frame's silhouette is too wide on all
+            sides [pixel]; 0 for frames that did not count.
+        log_focal: (cameras,) the logarithms of the focal lengths' growth.
+        zeros: (k,) what is added to the encoders' positions of some joints [rad or m].
+    """
+
+    X_CW: Array
+    widths: tuple[Array, ...]
+    log_focal: Array
+    zeros: Array
+
+
+def start_calibration(
+    fits: Sequence[CameraFit], X_CW: Sequence[Array], zeros: int = 0
+) -> Calibration:
+    """Cameras at some poses, all else as it is given."""
+    return Calibration(
+        np.array(X_CW),
+        tuple(np.zeros(len(fit.values)) for fit in fits),
+        np.zeros(len(fits)),
+        np.zeros(zeros),
+    )
+
+
+class CalibrationFit:
+    """Fits what frames of several cameras share.
+
+    Attributes:
+        fits: the cameras.
+        which: for each camera the frames that count.
+        zeros: (k,) the values of the pose tree whose zeros are unknown.
+        names: of the shared unknowns.
+
+    Args:
+        fits: the cameras.
+        which: for each camera the frames that count.
+        zeros: (k,) the values of the pose tree whose zeros are unknown.
+        focal: whether the cameras' focal lengths are unknown.
+    """
+
+    def __init__(
+        self,
+        fits: Sequence[CameraFit],
+        which: Sequence[Indices],
+        zeros: Sequence[int] = (),
+        focal: bool = False,
+    ) -> None:
+        self.fits, self.which = tuple(fits), tuple(which)
+        self.zeros = np.array(zeros, dtype=np.intp)
+        self._size = _POSE + focal
+        names = self.fits[0].frames.kinematics.names
+        self.names = (
+            *(f"{c}.{name}" for c in range(len(fits)) for name in CAMERA_NAMES[: self._size]),
+            *(names[k] for k in self.zeros),
+        )
+        cameras = [FOCAL_DEVIATION**-2 * (k == _POSE) for k in range(self._size)] * len(self.fits)
+        self.information = np.array([*cameras, *[ZERO_DEVIATION**-2] * len(self.zeros)])
+
+    def fit(self, start: Calibration, rounds: Sequence[Round]) -> Calibration:
+        """Fits all from where it starts.
+
+        Args:
+            start: where to start.
+            rounds: the parts of the fit.
+        """
+        rows = [(c, int(k)) for c, frames in enumerate(self.which) for k in frames]
+
+        def evaluate(own: Array, shared: Array, step: Round) -> Equations:
+            now = self._moved(start, shared)
+            parts = [
+                self._equations(now, c, k, float(w), step)
+                for (c, k), w in zip(rows, own[:, 0], strict=True)
+            ]
+            H, g, costs = (list(part) for part in zip(*parts, strict=True))
+            off = self._off(now)
+            H[0][1:, 1:] += np.diag(self.information)
+            g[0][1:] += self.information * off
+            known = float(self.information @ off**2)
+            return Equations(np.array(H), np.array(g), float(sum(costs)) + known)
+
+        count = 1 + len(self.names)
+        lower, upper = np.full(count, -np.inf), np.full(count, np.inf)
+        lower[0], upper[0] = -_WIDEST, _WIDEST
+        widths = np.array([start.widths[c][k] for c, k in rows]).reshape(-1, 1)
+        found = minimise(evaluate, widths, np.zeros(count - 1), (lower, upper), rounds, _STEPS)
+        now = self._moved(start, found.shared)
+        fitted = [np.zeros(len(fit.values)) for fit in self.fits]
+        for (c, k), width in zip(rows, found.own[:, 0], strict=True):
+            fitted[c][k] = width
+        return Calibration(now.X_CW, tuple(fitted), now.log_focal, now.zeros)
+
+    def motions(self, now: Calibration, camera: int, dense: Array) -> Array:
+        """(nodes, u, 12) the affine motions that the shared unknowns give to the nodes.
+
+        Args:
+            now: the unknowns.
+            camera: in whose picture.
+            dense: (nodes, m, 12) those that the pose tree's values give.
+        """
+        fit = self.fits[camera]
+        found = np.zeros((len(dense), len(self.names), 12))
+        own = fit.motions(now.X_CW[camera], now.log_focal[camera])
+        first = camera * self._size
+        found[:, first : first + self._size] = own[: self._size]
+        found[:, len(self.fits) * self._size :] = dense[:, self.zeros]
+        return found
+
+    def values(self, now: Calibration, camera: int, frame: int) -> Array:
+        """(m,) of the pose tree in a frame, zeros added."""
+        values = self.fits[camera].values[frame].copy()
+        values[self.zeros] += now.zeros
+        return values
+
+    def _moved(self, start: Calibration, by: Array) -> Calibration:
+        cameras = by[: len(self.fits) * self._size].reshape(len(self.fits), self._size)
+        poses = [
+            fit.moved(X_CW, part[:_POSE])
+            for fit, X_CW, part in zip(self.fits, start.X_CW, cameras, strict=True)
+        ]
+        focal = start.log_focal + (cameras[:, _POSE] if self._size > _POSE else 0.0)
+        zeros = start.zeros + by[cameras.size :]
+        return Calibration(np.array(poses), start.widths, focal, zeros)
+
+    def _off(self, now: Calibration) -> Array:
+        """(u,) how far the shared unknowns are from what is known beforehand."""
+        cameras = np.zeros((len(self.fits), self._size))
+        if self._size > _POSE:
+            cameras[:, _POSE] = now.log_focal
+        return np.concatenate([cameras.ravel(), now.zeros])
+
+    def _equations(
+        self, now: Calibration, camera: int, frame: int, width: float, step: Round
+    ) -> tuple[Array, Array, float]:
+        """H, g and cost of a frame: its width first, then what is shared.
+
+        What follows the width is told by differences: edges that are shifted along their normals.
+        """
+        fit, values = self.fits[camera], self.values(now, camera, frame)
+        less, here, more = (
+            fit.compare(now.X_CW[camera], frame, step, width + off, values, now.log_focal[camera])
+            for off in (-_WIDTH_STEP, 0.0, _WIDTH_STEP)
+        )
+        motions = self.motions(now, camera, here.placement.dense(len(values)))
+        A = np.tril(here.A[0]) + np.swapaxes(np.tril(here.A[0], -1), -1, -2)
+        count = 1 + len(self.names)
+        H, g = np.empty((count, count)), np.empty(count)
+        H[1:, 1:] = np.einsum("nux,nxy,nvy->uv", motions, A, motions, optimize=True)
+        g[1:] = -np.einsum("nux,nx->u", motions, here.b[0])
+        g[0] = (_sum(more, COST) - _sum(less, COST)) / (4.0 * _WIDTH_STEP)
+        H[0, 0] = _sum(here, WEIGHT)
+        pulled = np.einsum("nux,nx->u", motions, less.b[0] - more.b[0])
+        H[0, 1:] = H[1:, 0] = pulled / (2.0 * _WIDTH_STEP)
+        return H, g, _sum(here, COST)
+
+
+def _sum(compared: Comparison, column: int) -> float:
+    return float(compared.sums[..., column].sum())

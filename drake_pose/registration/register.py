@@ -21,6 +21,7 @@ from drake_pose.errors import RegistrationError, SettingsError
 from drake_pose.matching.fit.levenberg_marquardt import Round
 from drake_pose.matching.fit.significance import excess
 from drake_pose.matching.fit.surfaces import FEW, VERY_FEW, few_triangles
+from drake_pose.registration.agreement import TOLD_APART, agreeing, frame_shares
 from drake_pose.registration.calibration_fit import (
     Calibration,
     CalibrationFit,
@@ -51,10 +52,6 @@ _FIRST_SIDE, _SECOND_SIDE = 40.0, 100.0
 _APART = 0.03
 # So many poses are fitted finely.
 _KEPT = 6
-# At this scale frames are told apart that agree and that contradict.
-_TOLD_APART = Round(0.025, 0.01)
-# A frame agrees of which this share fits of what fits in the two that fit best.
-_AGREES = 0.7
 # So often frames that agree are fitted again.
 _AGAIN = 2
 # What is missing or too much is about as large [root of the area].
@@ -232,26 +229,26 @@ class CameraSearch:
         """The best of the poses X_CW (4, 4), and those that fit no worse."""
         fitted = [_with_widths(fit, X_CW) for X_CW in looks]
         side = max(1.0, _PIECE * fit.frames.size)
-        pieces = [fit.piece_costs(one.X_CW[0], one.widths[0], _TOLD_APART, side) for one in fitted]
+        pieces = [fit.piece_costs(one.X_CW[0], one.widths[0], TOLD_APART, side) for one in fitted]
         order = np.argsort([one.sum() for one in pieces], kind="stable")
         best = fitted[order[0]]
         X_CW = best.X_CW[0]
-        shares = _shares(fit, best)
-        agreeing = _agreeing(shares)
+        shares = frame_shares(CalibrationFit([fit], []), best)
+        agree = agreeing(shares)
         found = areas(fit.frames, best.X_CW, np.inf)[0]
         body, mask, both = found.T
         iou = both / np.maximum(body + mask - both, 1.0)
-        rows = zip(fit.frames.frames, E_total(found), iou, shares, agreeing, strict=True)
+        rows = zip(fit.frames.frames, E_total(found), iou, shares, agree, strict=True)
         misfits = [
             FrameMisfit(frame.name, float(off), float(one), float(share), bool(agrees))
             for frame, off, one, share, agrees in rows
         ]
         # A frame that contradicts fits no pose, so it tells none from another.
-        counted = [one[agreeing] for one in pieces]
+        counted = [one[agree] for one in pieces]
         as_good = [k for k in order if excess(counted[k], counted[order[0]]) <= _SIGNIFICANCE]
         # Fits that began apart may have ended in one pose.
         alike = _distinct(fit.frames, [fitted[k].X_CW[0] for k in as_good])
-        own = CalibrationFit([fit], [np.flatnonzero(agreeing)])
+        own = CalibrationFit([fit], [np.flatnonzero(agree)])
         return RegisteredCamera(
             fit.frames.camera.with_pose(np.linalg.inv(X_CW)),
             pose_covariance(fit, X_CW, calibration_uncertainty(own, best).covariance),
@@ -282,19 +279,8 @@ def _distinct(frames: PosedFrames, X_CW: Sequence[Array]) -> list[Array]:
 
 def _with_widths(fit: CameraFit, X_CW: Array) -> Calibration:
     """A pose (4, 4) fitted to the frames that agree, and the widths of their silhouettes."""
-    found = start_calibration([fit], [X_CW])
+    found, every = start_calibration([fit], [X_CW]), CalibrationFit([fit], [])
     for _ in range(_AGAIN):
-        agreeing = np.flatnonzero(_agreeing(_shares(fit, found)))
-        found = CalibrationFit([fit], [agreeing]).fit(found, _LAST)
+        which = np.flatnonzero(agreeing(frame_shares(every, found)))
+        found = CalibrationFit([fit], [which]).fit(found, _LAST)
     return found
-
-
-def _shares(fit: CameraFit, found: Calibration) -> Array:
-    """(frames,) of both contours' lengths, what fits."""
-    X_CW, rows = found.X_CW[0], enumerate(found.widths[0])
-    return np.array([fit.compare(X_CW, k, _TOLD_APART, width).share for k, width in rows])
-
-
-def _agreeing(shares: Array) -> Mask:
-    """(frames,) which frames fit nearly as well as the two that fit best."""
-    return np.asarray(shares >= _AGREES * np.sort(shares)[-2:].mean())

@@ -67,7 +67,8 @@ class CalibrationFit:
         fits: the cameras.
         which: for each camera the frames that count.
         zeros: (k,) the values of the pose tree whose zeros are unknown.
-        names: of the shared unknowns.
+        per_camera: so many unknowns each camera has.
+        names: of the shared unknowns: those of each camera, then the zeros.
 
     Args:
         fits: the cameras.
@@ -85,13 +86,19 @@ class CalibrationFit:
     ) -> None:
         self.fits, self.which = tuple(fits), tuple(which)
         self.zeros = np.array(zeros, dtype=np.intp)
-        self._size = _POSE + focal
+        self.per_camera = _POSE + focal
         names = self.fits[0].frames.kinematics.names
         self.names = (
-            *(f"{c}.{name}" for c in range(len(fits)) for name in CAMERA_NAMES[: self._size]),
+            *(
+                f"{fit.frames.camera.name}.{name}"
+                for fit in fits
+                for name in CAMERA_NAMES[: self.per_camera]
+            ),
             *(names[k] for k in self.zeros),
         )
-        cameras = [FOCAL_DEVIATION**-2 * (k == _POSE) for k in range(self._size)] * len(self.fits)
+        cameras = [FOCAL_DEVIATION**-2 * (k == _POSE) for k in range(self.per_camera)] * len(
+            self.fits
+        )
         self.information = np.array([*cameras, *[ZERO_DEVIATION**-2] * len(self.zeros)])
 
     def fit(self, start: Calibration, rounds: Sequence[Round]) -> Calibration:
@@ -138,9 +145,9 @@ class CalibrationFit:
         fit = self.fits[camera]
         found = np.zeros((len(dense), len(self.names), 12))
         own = fit.motions(now.X_CW[camera], now.log_focal[camera])
-        first = camera * self._size
-        found[:, first : first + self._size] = own[: self._size]
-        found[:, len(self.fits) * self._size :] = dense[:, self.zeros]
+        first = camera * self.per_camera
+        found[:, first : first + self.per_camera] = own[: self.per_camera]
+        found[:, len(self.fits) * self.per_camera :] = dense[:, self.zeros]
         return found
 
     def values(self, now: Calibration, camera: int, frame: int) -> Array:
@@ -150,19 +157,19 @@ class CalibrationFit:
         return values
 
     def _moved(self, start: Calibration, by: Array) -> Calibration:
-        cameras = by[: len(self.fits) * self._size].reshape(len(self.fits), self._size)
+        cameras = by[: len(self.fits) * self.per_camera].reshape(len(self.fits), self.per_camera)
         poses = [
             fit.moved(X_CW, part[:_POSE])
             for fit, X_CW, part in zip(self.fits, start.X_CW, cameras, strict=True)
         ]
-        focal = start.log_focal + (cameras[:, _POSE] if self._size > _POSE else 0.0)
+        focal = start.log_focal + (cameras[:, _POSE] if self.per_camera > _POSE else 0.0)
         zeros = start.zeros + by[cameras.size :]
         return Calibration(np.array(poses), start.widths, focal, zeros)
 
     def _off(self, now: Calibration) -> Array:
         """(u,) how far the shared unknowns are from what is known beforehand."""
-        cameras = np.zeros((len(self.fits), self._size))
-        if self._size > _POSE:
+        cameras = np.zeros((len(self.fits), self.per_camera))
+        if self.per_camera > _POSE:
             cameras[:, _POSE] = now.log_focal
         return np.concatenate([cameras.ravel(), now.zeros])
 

@@ -153,13 +153,12 @@ def _describe(fit: CalibrationFit, found: Calibration, before: Sequence[Array]) 
     """The zeros with their intervals, and the cameras."""
     covariance = calibration_uncertainty(fit, found).covariance
     first = len(fit.names) - len(fit.zeros)
-    per_camera = first // len(fit.fits)
     pictures = sum(len(which) for which in fit.which)
     freedom = max(1, _PICTURE_MOTIONS * pictures - len(fit.names))
     zeros = [_zero(fit, found, covariance, first + k, freedom) for k in range(len(fit.zeros))]
     cameras, covariances, focal = [], [], np.zeros(len(fit.fits))
     for c, own in enumerate(fit.fits):
-        at = slice(c * per_camera, c * per_camera + 6)
+        at = slice(c * fit.per_camera, c * fit.per_camera + 6)
         covariances.append(pose_covariance(own, found.X_CW[c], covariance[at, at]))
         growth = math.exp(found.log_focal[c])
         camera = own.frames.camera
@@ -171,8 +170,8 @@ def _describe(fit: CalibrationFit, found: Calibration, before: Sequence[Array]) 
                 focal_y=growth * camera.focal_y,
             )
         )
-        if per_camera > 6:
-            focal[c] = math.sqrt(covariance[c * per_camera + 6, c * per_camera + 6])
+        if fit.per_camera > 6:
+            focal[c] = math.sqrt(covariance[c * fit.per_camera + 6, c * fit.per_camera + 6])
     after = _shares(fit, found)
     gains = [b.mean() - a.mean() for a, b in zip(before, after, strict=True)]
     return JointCalibration(

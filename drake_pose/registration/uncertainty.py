@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from drake_pose.matching.fit.contour_fit import pack_cameras, pixels_per_metre
 from drake_pose.matching.fit.covariance import (
+    ErrorSizes,
     Picture,
     distances_in_pictures,
     estimate_sizes,
@@ -28,6 +29,8 @@ from drake_pose.registration.camera_fit import CameraFit
 Array = NDArray[np.float64]
 
 _FINE = Round(0.025, 0.01)
+# Where parts err by so much [pixel], a calibration is no better than this [pixel].
+_PARTS_ERR, _NO_BETTER = 0.2, 1.0
 
 
 class Uncertainty(NamedTuple):
@@ -68,6 +71,11 @@ def calibration_uncertainty(fit: CalibrationFit, found: Calibration) -> Uncertai
     is_angle = np.zeros(shared + len(rows), bool)
     sizes = estimate_sizes(seen, is_angle, least_camera=0.0)
     covariance = values_covariance(seen, sizes, np.arange(len(is_angle)), is_angle)
+    trusted = _calibration_error(sizes)
+    for c in range(len(fit.fits)):
+        unseen = _unseen_errors(fit, found, c, trusted)
+        at = np.arange(len(unseen)) + c * len(unseen)
+        covariance[at, at] += unseen**2
     H = seen.information
     width_gain = np.linalg.solve(
         H[shared:, shared:] + 1e-9 * np.eye(len(rows)), H[shared:, :shared]
@@ -75,6 +83,28 @@ def calibration_uncertainty(fit: CalibrationFit, found: Calibration) -> Uncertai
     return Uncertainty(
         covariance[:shared, :shared], H[:shared, :shared] - H[:shared, shared:] @ width_gain
     )
+
+
+def _calibration_error(sizes: ErrorSizes) -> float:
+    """By how much a calibration may be off that no frame contradicts [pixel].
+
+    Intrinsics that are wrong, and a lens that was not quite undone, err alike in all frames: the
+    pose follows, and nothing is left of it. Where parts are seen to err, a calibration is not
+    trusted beyond a pixel either; where all else is exact, it is taken to be.
+    """
+    return min(_NO_BETTER, _NO_BETTER * (sizes.surface**2 + sizes.mask**2) / _PARTS_ERR**2)
+
+
+def _unseen_errors(fit: CalibrationFit, found: Calibration, camera: int, pixels: float) -> Array:
+    """(6 or 7,) by how much a camera's turn, shift and focal length are off then: deviations."""
+    frames = fit.fits[camera].frames
+    X_CW = found.X_CW[camera]
+    depth = float(X_CW[2, :3] @ frames.middle + X_CW[2, 3])
+    size = pixels * depth / frames.camera.focal_x
+    turn = size / frames.extent
+    return np.array([turn, turn, turn, size, size, size * depth / frames.extent, turn])[
+        : fit.per_camera
+    ]
 
 
 def pose_covariance(fit: CameraFit, X_CW: Array, covariance: Array) -> Array:

@@ -3,61 +3,12 @@
 import numpy as np
 import pytest
 
-from drake_pose.body import ArticulatedModel, load_model
-from drake_pose.camera import PinholeCamera
+from drake_pose.body import ArticulatedModel
 from drake_pose.errors import MaskError, RegistrationError
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import CameraSearch, RegistrationBody
 from drake_pose.registration.start_poses import spread_rotations
-from drake_pose.silhouette import LabelRenderer
-from tests.matching.arms import arm_urdf
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> ArticulatedModel:
-    path = tmp_path_factory.mktemp("arm") / "arm.urdf"
-    path.write_text(arm_urdf())
-    return load_model(path)
-
-
-@pytest.fixture(scope="module")
-def body(model: ArticulatedModel) -> RegistrationBody:
-    return RegistrationBody(model.pose_tree())
-
-
-def looking_at(place: np.ndarray, middle: np.ndarray, roll: float) -> PinholeCamera:
-    """A camera at a place (3,), whose picture's middle is a point (3,), turned by roll [rad]."""
-    z = (middle - place) / np.linalg.norm(middle - place)
-    x = np.cross(z, [0.0, 0.0, 1.0])
-    x /= np.linalg.norm(x)
-    y = np.cross(z, x)
-    X_WC = np.eye(4)
-    c, s = np.cos(roll), np.sin(roll)
-    X_WC[:3, :3] = np.column_stack([c * x + s * y, c * y - s * x, z])
-    X_WC[:3, 3] = place
-    return PinholeCamera("eye", 640, 480, 600.0, 600.0, 319.5, 239.5, X_WC)
-
-
-def see(
-    model: ArticulatedModel, body: RegistrationBody, camera: PinholeCamera, count: int, seed: int
-) -> list[PosedFrame]:
-    """Drake's pictures of random poses."""
-    rng, kinematics = np.random.default_rng(seed), body.kinematics
-    renderer = LabelRenderer(model, camera)
-    frames = []
-    for k in range(count):
-        values = rng.uniform(kinematics.lower, kinematics.upper)
-        q, X_WB = body.tree.positions_from(kinematics.split(values))
-        frames.append(PosedFrame(f"{k:04d}", values, renderer.mask(q, X_WB)))
-    return frames
-
-
-def errors(found: np.ndarray, true: np.ndarray) -> tuple[float, float]:
-    """How far a pose (4, 4) is off [m, rad]."""
-    cosine = 0.5 * (np.trace(found[:3, :3].T @ true[:3, :3]) - 1.0)
-    shift = float(np.linalg.norm(found[:3, 3] - true[:3, 3]))
-    return shift, float(np.arccos(np.clip(cosine, -1.0, 1.0)))
-
+from tests.registration.arm_pictures import errors, looking_at, see
 
 PLACES = {
     "beside": (np.array([1.6, 0.4, 0.5]), 0.1),

@@ -1,0 +1,19 @@
+"""A small arm that stands on a plate in the world."""
+
+import pytest
+
+from drake_pose.body import ArticulatedModel, load_model
+from drake_pose.registration.register import RegistrationBody
+from tests.matching.arms import arm_urdf
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> ArticulatedModel:
+    path = tmp_path_factory.mktemp("arm") / "arm.urdf"
+    path.write_text(arm_urdf())
+    return load_model(path)
+
+
+@pytest.fixture(scope="module")
+def body(model: ArticulatedModel) -> RegistrationBody:
+    return RegistrationBody(model.pose_tree())

@@ -1,0 +1,70 @@
+"""Zeros of encoders are found where they are off, and none where they are right."""
+
+import numpy as np
+import pytest
+
+from drake_pose.body import ArticulatedModel
+from drake_pose.errors import RegistrationError, UnknownNameError
+from drake_pose.registration.joint_zeros import calibrate_joints
+from drake_pose.registration.posed_frames import PosedFrame
+from drake_pose.registration.register import CameraSearch, RegistrationBody
+from tests.registration.arm_pictures import errors, looking_at, see
+
+MIDDLE = np.array([0.0, 0.0, 0.4])
+NAMES = ("shoulder_turn", "roll_turn", "elbow_turn")
+
+
+def misread(frames: list[PosedFrame], zeros: np.ndarray) -> list[PosedFrame]:
+    """What encoders read whose zeros (m,) are to be added."""
+    return [PosedFrame(one.name, one.values - zeros, one.mask) for one in frames]
+
+
+class TestCalibrateJoints:
+    @pytest.mark.parametrize("off", [np.radians([2.0, 0.0, -2.0]), np.zeros(3)])
+    def test_finds_zeros(
+        self, model: ArticulatedModel, body: RegistrationBody, off: np.ndarray
+    ) -> None:
+        camera = looking_at(np.array([1.6, 0.4, 0.5]), MIDDLE, 0.1)
+        zeros = np.zeros(len(body.kinematics.names))
+        zeros[[body.kinematics.names.index(name) for name in NAMES]] = off
+        frames = misread(see(model, body, camera, 8, 4), zeros)
+        registered = CameraSearch(body).register(camera, frames)
+        found = calibrate_joints(body, [registered], [frames], NAMES)
+        for zero, true in zip(found.zeros, off, strict=True):
+            assert zero.value == pytest.approx(true, abs=np.radians(0.2))
+            assert abs(zero.value - true) < 4.0 * zero.deviation
+            assert zero.significant == (true != 0.0)
+            assert zero.low <= zero.value <= zero.high
+        shift, turn = errors(found.cameras[0].X_WC, camera.X_WC)
+        assert shift < 3e-3
+        assert turn < np.radians(0.15)
+
+    def test_focal_length(self, model: ArticulatedModel, body: RegistrationBody) -> None:
+        camera = looking_at(np.array([1.6, 0.4, 0.5]), MIDDLE, 0.1)
+        frames = see(model, body, camera, 8, 4)
+        wrong = type(camera)("eye", 640, 480, 612.0, 612.0, 319.5, 239.5, np.eye(4))
+        registered = CameraSearch(body).register(wrong, frames)
+        found = calibrate_joints(body, [registered], [frames], [], focal=True)
+        assert found.cameras[0].focal_x == pytest.approx(600.0, rel=0.004)
+        assert abs(found.cameras[0].focal_x - 600.0) < 4.0 * 600.0 * found.focal_deviations[0]
+
+    def test_names_what_a_zero_cannot_be_told_from(
+        self, model: ArticulatedModel, body: RegistrationBody
+    ) -> None:
+        """All that is seen of this arm hangs on its first joint."""
+        camera = looking_at(np.array([1.6, 0.4, 0.5]), MIDDLE, 0.1)
+        frames = see(model, body, camera, 5, 4)
+        registered = CameraSearch(body).register(camera, frames)
+        found = calibrate_joints(body, [registered], [frames], ["turret_turn"])
+        assert not found.zeros[0].determined
+        assert not found.zeros[0].significant
+        assert any("turn" in name or "shift" in name for name in found.zeros[0].gauge)
+
+    def test_refuses(self, model: ArticulatedModel, body: RegistrationBody) -> None:
+        camera = looking_at(np.array([1.6, 0.4, 0.5]), MIDDLE, 0.1)
+        frames = see(model, body, camera, 1, 4)
+        registered = CameraSearch(body).register(camera, frames)
+        with pytest.raises(UnknownNameError, match="knee"):
+            calibrate_joints(body, [registered], [frames], ["knee"])
+        with pytest.raises(RegistrationError, match="more frames"):
+            calibrate_joints(body, [registered], [frames], NAMES)

@@ -17,7 +17,7 @@ from drake_pose.apps.registration.inputs import (
     RegistrationSettings,
     read_inputs,
 )
-from drake_pose.apps.registration.misfit import require_explained
+from drake_pose.apps.registration.misfit import check_focal_length, require_explained
 from drake_pose.apps.registration.result import describe_camera, summarize, write_result
 from drake_pose.apps.results.folder import require_empty
 from drake_pose.apps.texts import percent
@@ -90,7 +90,8 @@ def register_scene(
     for camera in inputs.searched:
         start = time.perf_counter()
         found = search.register(camera, inputs.frames[camera.name])
-        require_explained(search, found, inputs.frames[camera.name])
+        require_explained(body, found, inputs.frames[camera.name])
+        warnings += check_focal_length(body, found, inputs.frames[camera.name])
         registered[camera.name] = found
         described[camera.name] = describe_camera(found, time.perf_counter() - start)
         warnings += _warnings_of(found)

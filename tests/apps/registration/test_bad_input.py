@@ -1,5 +1,6 @@
 """What cannot be registered: a message that names the culprit, and nothing like a pose is left."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -37,6 +38,13 @@ def to_degrees(rows: list[list[str]]) -> None:
 def add_column(rows: list[list[str]]) -> None:
     for k, row in enumerate(rows):
         row.append("time" if k == 0 else str(k))
+
+
+def to_next(rows: list[list[str]]) -> None:
+    """What was said of a frame is said of the one before."""
+    places = [row[1:] for row in rows[1:]]
+    for row, place in zip(rows[1:], [*places[1:], places[0]], strict=True):
+        row[1:] = place
 
 
 def name_twice(rows: list[list[str]]) -> None:
@@ -122,15 +130,30 @@ def test_unknown_names_are_refused(arm_scene: ArmScene, runner: CliRunner, tmp_p
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.9, 1.15])
+def test_a_focal_length_that_is_not_the_camera_s(
+    factor: float, own_arm: ArmScene, runner: CliRunner, tmp_path: Path
+) -> None:
+    true = own_arm.cameras["left"].focal_x
+    own_arm.edit_cameras("left", focal_x=factor * true, focal_y=factor * true)
+    result = run(runner, own_arm, tmp_path / "out")
+    assert_refused(result, "camera 'left': its masks tell a focal length", "Nothing was written")
+    told = float(re.search(r"a focal length of (\d+) pixels", result.stderr)[1])
+    assert told == pytest.approx(true, rel=0.03)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
 class TestNoPoseExplains:
     @pytest.mark.parametrize(
         ("spoil", "part"),
         [
             (change_masks(lambda mask: mask[:, ::-1]), "they fit when they are mirrored"),
             (edit("left", focal_x=120.0, focal_y=120.0), "they fit with focal lengths near"),
+            (change_rows(to_next), "they fit with the joint positions of the previous frame"),
             (change_masks(lambda mask: cv2.circle(0 * mask, (150, 110), 60, 255, -1)), "robot"),
         ],
-        ids=["mirrored", "focal length", "something else"],
+        ids=["mirrored", "focal length", "one row off", "something else"],
     )
     def test_nothing_is_written(
         self, spoil: Spoil, part: str, own_arm: ArmScene, runner: CliRunner, tmp_path: Path

@@ -130,18 +130,36 @@ def calibrate_joints(
         CameraFit(PosedFrames(body.kinematics, body.all, one.camera, own), _SPACING)
         for one, own in zip(cameras, frames, strict=True)
     ]
+    X_CW = [one.camera.X_CW for one in cameras]
     zeros = [known.index(name) for name in names]
-    found = start_calibration(fits, [one.camera.X_CW for one in cameras], len(zeros))
-    every = CalibrationFit(fits, [np.arange(len(one)) for one in frames], zeros, focal)
-    before, fit = _shares(every, found), every
+    undetermined: dict[str, JointZero] = {}
+    while True:
+        fit, found, before = _fit(fits, X_CW, zeros, focal)
+        calibration = _describe(fit, found, before)
+        open_ones = {one.name: one for one in calibration.zeros if not one.determined}
+        if not open_ones:
+            break
+        # The cameras shall fit what is answered: zeros of 0 where they cannot be told.
+        undetermined |= open_ones
+        zeros = [k for k in zeros if known[k] not in open_ones]
+    told = {one.name: one for one in calibration.zeros} | undetermined
+    return replace(calibration, zeros=tuple(told[name] for name in names))
+
+
+def _fit(
+    fits: Sequence[CameraFit], X_CW: Sequence[Array], zeros: Sequence[int], focal: bool
+) -> tuple[CalibrationFit, Calibration, list[Array]]:
+    """The last fit, what it found, and the shares that fitted before."""
+    found = start_calibration(fits, X_CW, len(zeros))
+    # Zeros that are off let good frames contradict, so all count at first.
+    fit = CalibrationFit(fits, [np.arange(len(one.values)) for one in fits], zeros, focal)
+    before = _shares(fit, found)
     for k in range(_AGAIN):
-        # Zeros that are off let good frames contradict, so all count at first.
         if k > 0:
-            fit = CalibrationFit(
-                fits, [np.flatnonzero(agreeing(one)) for one in _shares(every, found)], zeros, focal
-            )
+            which = [np.flatnonzero(agreeing(one)) for one in _shares(fit, found)]
+            fit = CalibrationFit(fits, which, zeros, focal)
         found = fit.fit(found, _ROUNDS)
-    return _describe(fit, found, before)
+    return fit, found, before
 
 
 def _shares(fit: CalibrationFit, found: Calibration) -> list[Array]:

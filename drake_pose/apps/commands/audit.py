@@ -64,7 +64,9 @@ def audit(
         from drake_pose.apps.registration.audit import audit_scene
         from drake_pose.apps.registration.inputs import RegistrationSettings
 
-        settings = RegistrationSettings(tuple(camera or ()), tuple(frame or ()), held, packages)
+        settings = RegistrationSettings(
+            tuple(camera or ()), tuple(frame or ()), held, packages=packages
+        )
         with count_progress("frames", None) as advance:
             result = audit_scene(
                 scene, model, joints, out, settings, cameras=cameras, overlay=overlay,

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -20,6 +21,8 @@ from drake_pose.apps.commands.terminal import errors_as_messages, print_json, us
 from drake_pose.apps.options import parse_assignments, parse_packages
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from drake_pose.apps.registration.register import SceneRegistration
 
 RegisteredSceneArgument = Annotated[
@@ -49,6 +52,24 @@ SearchedCameraOption = Annotated[
         rich_help_panel="Input",
     ),
 ]
+ZerosOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--zeros",
+        metavar="NAME",
+        help="Find the zero of this joint, too, a constant that is added to its positions in all "
+        "frames; all: of every joint; repeat for several. A URDF with the zeros is written.",
+        rich_help_panel="Estimation",
+    ),
+]
+FocalOption = Annotated[
+    bool,
+    typer.Option(
+        "--focal",
+        help="Find the cameras' focal lengths, too.",
+        rich_help_panel="Estimation",
+    ),
+]
 
 
 def register(
@@ -60,6 +81,8 @@ def register(
     camera: SearchedCameraOption = None,
     frame: FrameOption = None,
     hold: HoldOption = None,
+    zeros: ZerosOption = None,
+    focal: FocalOption = False,
     overlay: OverlayOption = True,
     json: JsonOption = False,
 ) -> None:
@@ -72,7 +95,9 @@ def register(
         from drake_pose.apps.registration.inputs import RegistrationSettings
         from drake_pose.apps.registration.register import register_scene
 
-        settings = RegistrationSettings(tuple(camera or ()), tuple(frame or ()), held, packages)
+        settings = RegistrationSettings(
+            tuple(camera or ()), tuple(frame or ()), held, tuple(zeros or ()), focal, packages
+        )
         with count_progress("cameras", None) as advance:
             result = register_scene(
                 scene, model, joints, out, settings, overlay=overlay, on_camera=advance
@@ -122,6 +147,28 @@ def _print(result: SceneRegistration) -> None:
         )
     console.print(frames)
     console.print(table)
+    if zeros := next(iter(result.summary["cameras"].values()))["zeros"]:
+        console.print(_zeros_table(zeros))
     if result.folder is not None:
         for label, file in (("cameras", CAMERAS), ("report", REPORT)):
             console.print(f"{label:<14} {escape(str(result.folder / file))}", soft_wrap=True)
+
+
+def _zeros_table(zeros: Mapping[str, Any]) -> Table:
+    """What is to be added to joints' positions."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table("joint", "zero", "95 % interval", "", title="Zeros, to be added to positions")
+    for name, one in zeros.items():
+        unit = "deg" if "value_deg" in one else "mm"
+        if not one["determined"]:
+            table.add_row(escape(name), "", "", "not determined")
+            continue
+        table.add_row(
+            escape(name),
+            f"{one[f'value_{unit}']:.3f} {unit}",
+            f"{one[f'low_{unit}']:.3f} to {one[f'high_{unit}']:.3f}",
+            "significant" if one["significant"] else "as good as 0",
+        )
+    return table

@@ -32,18 +32,22 @@ class RegistrationSettings:
             where empty.
         frames: names, or ranges ``FIRST:LAST``; all where empty.
         hold: joints that are not in the table, by name [deg or m].
+        zeros: joints whose zeros are asked for, too; "all": those of all that move.
+        focal: whether focal lengths are asked for, too.
         packages: folders of packages that the model's ``package://`` names mean, by name.
     """
 
     cameras: tuple[str, ...] = ()
     frames: tuple[str, ...] = ()
     hold: Mapping[str, float] = field(default_factory=dict)
+    zeros: tuple[str, ...] = ()
+    focal: bool = False
     packages: Mapping[str, Path] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:
         """Returns the settings as plain JSON values."""
         packages = {name: str(folder) for name, folder in self.packages.items()}
-        lists = {"cameras": list(self.cameras), "frames": list(self.frames)}
+        lists = {name: list(getattr(self, name)) for name in ("cameras", "frames", "zeros")}
         return {**asdict(self), **lists, "packages": packages}
 
 

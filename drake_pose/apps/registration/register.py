@@ -19,9 +19,11 @@ from drake_pose.apps.registration.inputs import (
 )
 from drake_pose.apps.registration.misfit import check_focal_length, require_explained
 from drake_pose.apps.registration.result import describe_camera, summarize, write_result
+from drake_pose.apps.registration.zeros import describe_zeros, find_zeros, say_zeros
 from drake_pose.apps.results.folder import require_empty
 from drake_pose.apps.texts import percent
 from drake_pose.camera import Camera, PinholeCamera
+from drake_pose.registration.joint_zeros import JointCalibration
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import CameraSearch, RegisteredCamera, RegistrationBody
 from drake_pose.registration.start_poses import E_total, areas
@@ -97,6 +99,16 @@ def register_scene(
         warnings += _warnings_of(found)
         if on_camera is not None:
             on_camera(len(registered))
+    zeros: JointCalibration | None = None
+    if settings.zeros or settings.focal:
+        start = time.perf_counter()
+        registered, inputs, zeros = find_zeros(inputs, settings, body, registered)
+        seconds = (time.perf_counter() - start) / len(registered)
+        told = describe_zeros(zeros, body.kinematics)
+        for name, found in registered.items():
+            took = described[name]["seconds"] + seconds
+            described[name] = {**describe_camera(found, took), "zeros": told}
+        warnings += say_zeros(zeros)
     cameras = {
         name: registered[name].camera if name in registered else camera
         for name, camera in inputs.scene.cameras.items()
@@ -104,7 +116,7 @@ def register_scene(
     }
     summary = summarize(paths, settings, described, warnings)
     if folder is not None:
-        write_result(folder, inputs, cameras, registered, summary, overlay)
+        write_result(folder, inputs, cameras, registered, summary, overlay, zeros)
     return SceneRegistration(cameras, registered, summary, tuple(warnings), folder)
 
 

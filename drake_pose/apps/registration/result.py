@@ -11,6 +11,7 @@ import yaml
 
 from drake_pose.apps.registration.inputs import RegistrationInputs, RegistrationSettings
 from drake_pose.apps.registration.report import make_registration_report
+from drake_pose.apps.registration.zeros import corrected_urdf
 from drake_pose.apps.results.folder import OVERLAY, REPORT, ResultFolder, without_nan
 from drake_pose.apps.results.overlay import draw_overlay, encode_png
 from drake_pose.apps.results.summary import file_digest, versions
@@ -18,6 +19,7 @@ from drake_pose.apps.texts import percent
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera import Camera
 from drake_pose.camera.files import dump_cameras
+from drake_pose.registration.joint_zeros import JointCalibration
 from drake_pose.registration.register import RegisteredCamera
 from drake_pose.silhouette import LabelRenderer
 
@@ -91,6 +93,7 @@ def write_result(
     registered: Mapping[str, RegisteredCamera],
     summary: Mapping[str, Any],
     overlay: bool,
+    zeros: JointCalibration | None = None,
 ) -> None:
     """Writes the result folder; the camera file comes last, when all else is there.
 
@@ -101,6 +104,7 @@ def write_result(
         registered: the cameras that were found, by name.
         summary: from summarize.
         overlay: whether overlays are written.
+        zeros: what was found of joints' zeros; a URDF is written with them.
 
     Raises:
         OutputError: the folder is not empty, or cannot be written.
@@ -109,6 +113,9 @@ def write_result(
     if overlay:
         for found in registered.values():
             _write_overlays(folder, inputs, found)
+    if zeros is not None and zeros.zeros and inputs.model.path.suffix == ".urdf":
+        urdf = corrected_urdf(inputs.model.path, zeros, path)
+        folder.write(f"{inputs.model.path.stem}_calibrated.urdf", urdf)
     text = yaml.safe_dump(
         {name: _uncertainty(found) for name, found in registered.items()}, sort_keys=False
     )

@@ -6,6 +6,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from drake_pose.body.files.xml_files import xml_text
 
@@ -46,6 +47,41 @@ def stretched(text: str, factors: Factors) -> str:
         factor = None if parent is None else factors.get(parent.get("link", ""))
         if factor is not None:
             _stretch_origin(joint, factor)
+    return xml_text(root)
+
+
+def with_zeros(text: str, zeros: Mapping[str, float]) -> str:
+    """A URDF text in which joints stand further by constants where they read the same.
+
+    Each joint's origin is turned about its axis, or shifted along it, and its limits are moved the
+    other way: they are where they were.
+
+    Args:
+        text: the URDF.
+        zeros: what is to be added to joints' readings, by name [rad or m].
+    """
+    root = ElementTree.fromstring(text)
+    for joint in root.iterfind("joint"):
+        zero = zeros.get(joint.get("name", ""))
+        if not zero:
+            continue
+        axis_element = joint.find("axis")
+        axis = np.array(_numbers("1 0 0" if axis_element is None else axis_element.get("xyz", "")))
+        axis /= np.linalg.norm(axis)
+        origin = joint.find("origin")
+        if origin is None:
+            origin = ElementTree.SubElement(joint, "origin")
+        R = Rotation.from_euler("xyz", _numbers(origin.get("rpy", "0 0 0")))
+        if joint.get("type") == "prismatic":
+            place = np.array(_numbers(origin.get("xyz", "0 0 0"))) + R.apply(zero * axis)
+            origin.set("xyz", _text(place))
+        else:
+            turned = R * Rotation.from_rotvec(zero * axis)
+            origin.set("rpy", _text(turned.as_euler("xyz")))
+        limit = joint.find("limit")
+        for end in ("lower", "upper"):
+            if limit is not None and joint.get("type") != "continuous" and end in limit.attrib:
+                limit.set(end, _text(np.array([float(limit.get(end, "0")) - zero])))
     return xml_text(root)
 
 

@@ -207,3 +207,50 @@ class TestRecordedArms:
         assert "FEWER THAN HALF" in result.stderr
         reference = load_cameras(folder / "cameras_reference.yaml")["camera"]
         assert pose_errors(np.array(found["X_WC"]), reference.X_WC)[0] < 24.0
+
+
+class TestZeros:
+    def test_zeros_are_found_and_written_to_a_urdf(
+        self, own_arm: ArmScene, tmp_path: Path, runner: CliRunner
+    ) -> None:
+        off = np.radians(3.0)
+        rows = own_arm.rows()
+        column = rows[0].index("elbow_turn")
+        for row in rows[1:]:
+            row[column] = str(float(row[column]) - off)
+        own_arm.write_rows(rows)
+        out = tmp_path / "out"
+        given = ["--zeros", "shoulder_turn", "--zeros", "elbow_turn", "--json"]
+        result = run(runner, own_arm, out, *given)
+        assert result.exit_code == 0, result.output
+        zeros = json.loads(result.stdout)["zeros"]
+        assert zeros["elbow_turn"]["value_deg"] == pytest.approx(3.0, abs=0.3)
+        assert zeros["elbow_turn"]["significant"]
+        assert not zeros["shoulder_turn"]["significant"]
+        # Drake poses the corrected robot at the encoders' readings as the right one at the truth.
+        right, corrected = load_model(own_arm.model), load_model(out / "arm_calibrated.urdf")
+        read = np.array([float(one) for one in rows[1][1:]])
+        true = read.copy()
+        for name in ("shoulder_turn", "elbow_turn"):
+            true[rows[0].index(name) - 1] += np.radians(zeros[name]["value_deg"])
+        places = []
+        for model, q in ((right, true), (corrected, read)):
+            context = model.plant.CreateDefaultContext()
+            model.plant.SetPositions(context, q)
+            hand = model.plant.GetBodyByName("hand").EvalPoseInWorld(context)
+            places.append(hand.GetAsMatrix4())
+        np.testing.assert_allclose(places[1], places[0], atol=1e-9)
+        np.testing.assert_allclose(corrected.lower + _zeros(zeros, rows[0][1:]), right.lower)
+
+    def test_too_few_frames(self, own_arm: ArmScene, tmp_path: Path, runner: CliRunner) -> None:
+        out = tmp_path / "out"
+        result = run(runner, own_arm, out, "--zeros", "all", "--frame", "0000")
+        assert result.exit_code == 1
+        assert "more frames" in result.stderr
+        assert not out.exists()
+
+
+def _zeros(zeros: dict[str, Any], names: list[str]) -> np.ndarray:
+    """The zeros in the order of names [rad]."""
+    found = [zeros[name]["value_deg"] if name in zeros else 0.0 for name in names]
+    return np.radians(found)

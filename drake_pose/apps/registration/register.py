@@ -104,10 +104,7 @@ def register_scene(
         start = time.perf_counter()
         registered, inputs, zeros = find_zeros(inputs, settings, body, registered)
         seconds = (time.perf_counter() - start) / len(registered)
-        told = describe_zeros(zeros, body.kinematics)
-        for name, found in registered.items():
-            took = described[name]["seconds"] + seconds
-            described[name] = {**describe_camera(found, took), "zeros": told}
+        described = _describe_again(registered, described, body, zeros, seconds)
         warnings += say_zeros(zeros)
     cameras = {
         name: registered[name].camera if name in registered else camera
@@ -118,6 +115,21 @@ def register_scene(
     if folder is not None:
         write_result(folder, inputs, cameras, registered, summary, overlay, zeros)
     return SceneRegistration(cameras, registered, summary, tuple(warnings), folder)
+
+
+def _describe_again(
+    registered: Mapping[str, RegisteredCamera],
+    before: Mapping[str, dict[str, Any]],
+    body: RegistrationBody,
+    zeros: JointCalibration,
+    seconds: float,
+) -> dict[str, dict[str, Any]]:
+    """The cameras' parts of the summary with the zeros, each of which took so long more [s]."""
+    told = describe_zeros(zeros, body.kinematics)
+    return {
+        name: {**describe_camera(found, before[name]["seconds"] + seconds), "zeros": told}
+        for name, found in registered.items()
+    }
 
 
 def _warnings_of(found: RegisteredCamera) -> list[str]:

@@ -106,15 +106,22 @@ def register_scene(
         seconds = (time.perf_counter() - start) / len(registered)
         described = _describe_again(registered, described, body, zeros, seconds)
         warnings += say_zeros(zeros)
-    cameras = {
-        name: registered[name].camera if name in registered else camera
-        for name, camera in inputs.scene.cameras.items()
-        if name not in inputs.left_out
-    }
+    cameras = _placed_cameras(inputs, registered)
     summary = summarize(paths, settings, described, warnings)
     if folder is not None:
         write_result(folder, inputs, cameras, registered, summary, overlay, zeros)
     return SceneRegistration(cameras, registered, summary, tuple(warnings), folder)
+
+
+def _placed_cameras(
+    inputs: RegistrationInputs, registered: Mapping[str, RegisteredCamera]
+) -> dict[str, Camera]:
+    """All cameras of the scene whose pose is known now."""
+    return {
+        name: registered[name].camera if name in registered else camera
+        for name, camera in inputs.scene.cameras.items()
+        if name not in inputs.left_out
+    }
 
 
 def _describe_again(

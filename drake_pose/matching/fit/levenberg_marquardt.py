@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.compiled import compiled
 from drake_pose.errors import SettingsError
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e2
 # A scale begins with no more than this.
@@ -152,27 +152,8 @@ def _stepped(
     """Own and shared unknowns after a damped step that stays inside the limits."""
     lower, upper = limits
     p = own.shape[1]
-    g_shared = equations.g[:, p:].sum(axis=0)
-    S = equations.H[:, p:, p:].sum(axis=0)
-    S = S + np.diag(_damping(np.diag(S), damping, settings))
-    s = g_shared.copy()
-    backs = []
-    for H, g, x in zip(equations.H, equations.g, own, strict=True):
-        free = np.flatnonzero(~_leaving(x, g[:p], lower[:p], upper[:p]))
-        block = H[np.ix_(free, free)]
-        block = block + np.diag(_damping(np.diag(block), damping, settings))
-        solved = np.linalg.solve(block, np.column_stack([-g[free], H[free, p:]]))
-        offset, gain = solved[:, 0], solved[:, 1:]
-        S -= H[p:, free] @ gain
-        s += H[p:, free] @ offset
-        backs.append((free, offset, gain))
-    change = np.zeros(len(shared))
-    free = np.flatnonzero(~_leaving(shared, g_shared, lower[p:], upper[p:]))
-    if len(free):
-        change[free] = np.linalg.solve(S[np.ix_(free, free)], -s[free])
-    steps = np.zeros(own.shape)
-    for step, (index, offset, gain) in zip(steps, backs, strict=True):
-        step[index] = offset - gain @ change
+    shares = damping, settings.even_damping
+    steps, change = _solved(equations.H, equations.g, own, shared, lower, upper, shares)
     # Shared unknowns are held back with the frames that they move.
     longest = max(float(np.abs(steps).max(initial=0.0)), float(np.abs(change).max(initial=0.0)))
     share = min(1.0, settings.longest / max(longest, 1e-300))
@@ -182,12 +163,110 @@ def _stepped(
     )
 
 
-def _leaving(x: Array, g: Array, lower: Array, upper: Array) -> Mask:
-    """Which unknowns stand at a limit and would leave it."""
-    return np.asarray(((x <= lower) & (g > 0.0)) | ((x >= upper) & (g < 0.0)))
+@compiled
+def _solved(
+    H: Array,
+    g: Array,
+    own: Array,
+    shared: Array,
+    lower: Array,
+    upper: Array,
+    shares: tuple[float, float],
+) -> tuple[Array, Array]:
+    """Damped steps of own (frames, p) and shared unknowns (q,), none of them out of a limit."""
+    frames, p = own.shape
+    q = len(shared)
+    S, s = np.zeros((q, q)), np.zeros(q)
+    for frame in range(frames):
+        for k in range(q):
+            s[k] += g[frame, p + k]
+            for column in range(q):
+                S[k, column] += H[frame, p + k, p + column]
+    loose = _free(shared, s, lower[p:], upper[p:])
+    _damp(S, shares)
+    steps = np.zeros((frames, p))
+    gains = np.zeros((frames, p, q))
+    for frame in range(frames):
+        free = _free(own[frame], g[frame, :p], lower[:p], upper[:p])
+        block, right = np.empty((len(free), len(free))), np.empty((len(free), q + 1))
+        for row in range(len(free)):
+            right[row, 0] = -g[frame, free[row]]
+            for column in range(q):
+                right[row, column + 1] = H[frame, free[row], p + column]
+            for column in range(len(free)):
+                block[row, column] = H[frame, free[row], free[column]]
+        _damp(block, shares)
+        _solve(block, right)
+        for row in range(len(free)):
+            steps[frame, free[row]] = right[row, 0]
+            for k in range(q):
+                gains[frame, free[row], k] = right[row, k + 1]
+                s[k] += H[frame, p + k, free[row]] * right[row, 0]
+                for column in range(q):
+                    S[k, column] -= H[frame, p + k, free[row]] * right[row, column + 1]
+    block, right = np.empty((len(loose), len(loose))), np.empty((len(loose), 1))
+    for row in range(len(loose)):
+        right[row, 0] = -s[loose[row]]
+        for column in range(len(loose)):
+            block[row, column] = S[loose[row], loose[column]]
+    _solve(block, right)
+    change = np.zeros(q)
+    for k in range(len(loose)):
+        change[loose[k]] = right[k, 0]
+    for frame in range(frames):
+        for row in range(p):
+            for k in range(q):
+                steps[frame, row] -= gains[frame, row, k] * change[k]
+    return steps, change
 
 
-def _damping(diagonal: Array, damping: float, settings: StepSettings) -> Array:
-    """What is added to a diagonal."""
-    even = settings.even_damping * (diagonal.mean() if len(diagonal) else 0.0)
-    return np.asarray(damping * diagonal + even + 1e-9)
+@compiled
+def _solve(A: Array, B: Array) -> None:
+    """Puts A^-1 B (n, m) in place of B, by elimination with pivots; A (n, n) is lost.
+
+    LAPACK gains nothing on matrices this small, and takes long to be compiled in.
+    """
+    n = len(A)
+    for k in range(n):
+        pivot = k
+        for row in range(k + 1, n):
+            if abs(A[row, k]) > abs(A[pivot, k]):
+                pivot = row
+        if pivot != k:
+            for column in range(n):
+                A[k, column], A[pivot, column] = A[pivot, column], A[k, column]
+            for column in range(B.shape[1]):
+                B[k, column], B[pivot, column] = B[pivot, column], B[k, column]
+        for row in range(k + 1, n):
+            share = A[row, k] / A[k, k]
+            for column in range(k + 1, n):
+                A[row, column] -= share * A[k, column]
+            for column in range(B.shape[1]):
+                B[row, column] -= share * B[k, column]
+    for k in range(n - 1, -1, -1):
+        for column in range(B.shape[1]):
+            for row in range(k + 1, n):
+                B[k, column] -= A[k, row] * B[row, column]
+            B[k, column] /= A[k, k]
+
+
+@compiled
+def _free(x: Array, g: Array, lower: Array, upper: Array) -> NDArray[np.int64]:
+    """The unknowns but those that stand at a limit and would leave it."""
+    indices, count = np.empty(len(x), np.int64), 0
+    for k in range(len(x)):
+        if not ((x[k] <= lower[k] and g[k] > 0.0) or (x[k] >= upper[k] and g[k] < 0.0)):
+            indices[count] = k
+            count += 1
+    return indices[:count]
+
+
+@compiled
+def _damp(H: Array, shares: tuple[float, float]) -> None:
+    """Adds a share of each element of the diagonal, and a share of its mean, to the diagonal."""
+    if len(H):
+        even = 0.0
+        for k in range(len(H)):
+            even += shares[1] * H[k, k] / len(H)
+        for k in range(len(H)):
+            H[k, k] += shares[0] * H[k, k] + even + 1e-9

@@ -1,0 +1,66 @@
+"""Tables of joint positions: units, limits, names of frames."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drake_pose.apps.registration.known_positions import KnownPositions, read_known_positions
+from drake_pose.body import load_model
+from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.errors import SceneError
+
+URDF = """<robot name="slide"><link name="world"/>
+  <link name="cart"><visual><geometry><box size="0.2 0.1 0.1"/></geometry></visual></link>
+  <link name="arm"><visual><geometry><box size="0.1 0.1 0.4"/></geometry></visual></link>
+  <joint name="rail" type="prismatic"><parent link="world"/><child link="cart"/>
+    <axis xyz="1 0 0"/><limit lower="0" upper="0.8" effort="1" velocity="1"/></joint>
+  <joint name="swing" type="revolute"><parent link="cart"/><child link="arm"/>
+    <axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
+</robot>"""
+
+
+def read(folder: Path, text: str) -> KnownPositions:
+    (folder / "slide.urdf").write_text(URDF)
+    (folder / "joints.csv").write_text(text)
+    model = load_model(folder / "slide.urdf")
+    return read_known_positions(folder / "joints.csv", model, TreeKinematics(model.pose_tree()))
+
+
+def test_columns_are_put_in_the_tree_s_order(tmp_path: Path) -> None:
+    found = read(tmp_path, "frame,swing,rail\n7,-0.5,0.25\nstart,1.5,0.75\n3.0,0,0\n")
+    assert found.warnings == ()
+    assert found.of("0007", "left").tolist() == [0.25, -0.5]
+    assert found.of("start", "left").tolist() == [0.75, 1.5]
+    assert found.of("3", "left").tolist() == [0.0, 0.0]
+    with pytest.raises(SceneError, match=r"joints\.csv: has no row of frame '0008'.*'left'"):
+        found.of("0008", "left")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("frame,swing,rail\n0,2,0\n1,-70,0.5\n", "'swing', frame 1: -70 rad.* in degrees"),
+        ("frame,swing,rail\n0,0.5,300\n1,1.5,700\n", "'rail', frame 1: 700 m.* in millimetres"),
+        ("frame,swing\n0,0.5\n", "no column for joint rail of slide.urdf.*--hold rail=VALUE"),
+        ("frame\n0\n", "first line must be frame"),
+    ],
+)
+def test_what_is_refused(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(SceneError, match=message):
+        read(tmp_path, text)
+
+
+def test_a_position_outside_its_limits_is_warned_of(tmp_path: Path) -> None:
+    (text,) = read(tmp_path, "frame,swing,rail\n0,0.5,0.1\n4,2.6,0.5\n").warnings
+    assert "column 'swing', frame 4: 2.6 rad lies outside the joint's limits, -2 to 2 rad" in text
+    # An encoder's own error is none of ours.
+    assert read(tmp_path, "frame,swing,rail\n0,2.05,-0.01\n").warnings == ()
+
+
+def test_one_pose(tmp_path: Path) -> None:
+    found = read(tmp_path, "frame,swing,rail\n0,0.5,0.1\n")
+    rows = np.array([[0.1, 0.5], [0.102, 0.505]])
+    assert found.are_one_pose(rows)
+    assert not found.are_one_pose([*rows, [0.0, 0.0], [0.0, 0.1]])
+    assert not found.are_one_pose([*rows, [0.0, 0.0], [0.01, 0.0]])

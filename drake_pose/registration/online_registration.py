@@ -3,7 +3,8 @@
 Frames come one after another. A bounded number of keyframes is kept, in which the body stands
 differently, the newest ones; the camera's pose is fitted to them. That the camera was moved shows
 in one of two ways: frames contradict the pose and agree with one another, or the pose by the newest
-keyframes alone differs significantly from that by all.
+keyframes alone differs significantly from that by all. How much it differs while nothing moves says
+what is significant: wrong joint zeros or lengths of links make it differ, too.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.special import chdtri
+from scipy.special import fdtri
 
 from drake_pose.camera import PinholeCamera
 from drake_pose.errors import RegistrationError, SettingsError
@@ -32,6 +33,9 @@ _CONTRADICTS = 0.7
 # from there a fit leads to the same look of the body. Farther away, all poses are searched, since
 # another one may look the same.
 _BUMP = 0.2
+# Before anything differed, the covariance is trusted as if so many numbers had borne it out; sets
+# of the newest keyframes overlap, so that each new one adds fewer numbers than a pose has.
+_TRUST = 4.0
 
 
 class CameraStatus(IntEnum):
@@ -55,7 +59,7 @@ class OnlineSettings:
         tolerance: a frame near a keyframe says nothing new where the area in which body and mask
             differ is larger by no more than this [the mask's area].
         lowest_iou: mean intersection over union, below which no camera is believed to be found.
-        false_alarm: how probable a difference by chance is that counts as a moved camera.
+        false_alarm: how improbable by chance a difference is that counts as a moved camera.
 
     Raises:
         SettingsError: a setting out of its range.
@@ -94,6 +98,8 @@ class OnlineState:
         registered: the camera as it was found; None: not yet.
         contradictions: how many frames without a gap have contradicted the pose.
         moves: how often the camera was found elsewhere.
+        distances: squared Mahalanobis distances of the pose by the newest keyframes alone from that
+            by all, the latest last.
     """
 
     keyframes: tuple[PosedFrame, ...] = ()
@@ -101,6 +107,7 @@ class OnlineState:
     registered: RegisteredCamera | None = None
     contradictions: int = 0
     moves: int = 0
+    distances: tuple[float, ...] = ()
 
     def __deepcopy__(self, memo: dict[int, Any]) -> OnlineState:
         # Drake copies abstract state, which would be megabytes of masks at every update.
@@ -132,7 +139,6 @@ class OnlineRegistration:
         self.body, self.camera = body, camera
         self.settings = settings or OnlineSettings()
         self._search = search or CameraSearch(body)
-        self._limit = float(chdtri(6, self.settings.false_alarm))
 
     def status(self, state: OnlineState) -> CameraStatus:
         """What is known of the camera's pose."""
@@ -166,7 +172,7 @@ class OnlineRegistration:
         if len(keyframes) >= self.settings.least_frames:
             found = self._find(keyframes)
             if found is not None:
-                return _registered(found, keyframes, state.moves)
+                return _registered(state, found, keyframes)
         return replace(state, keyframes=keyframes)
 
     def _follow(
@@ -183,20 +189,33 @@ class OnlineRegistration:
         found = self._search.refine(registered.camera, keyframes)
         newest = found.frames[-1]
         if newest.agrees and newest.share >= _CONTRADICTS * _usual_share(registered):
-            return self._settle(_registered(found, keyframes, state.moves))
+            return self._settle(_registered(state, found, keyframes), found)
         return self._contradict(state, registered, frame)
 
-    def _settle(self, state: OnlineState) -> OnlineState:
+    def _settle(self, state: OnlineState, registered: RegisteredCamera) -> OnlineState:
         """The state, or that of the newest keyframes alone where they say otherwise."""
         newest = state.keyframes[-self.settings.newest :]
-        if state.registered is None or len(state.keyframes) <= len(newest):
+        if len(state.keyframes) <= len(newest):
             return state
-        alone = self._search.refine(state.registered.camera, newest)
-        off = pose_difference(alone.camera.X_WC, state.registered.camera.X_WC)
-        distance = float(off @ np.linalg.solve(alone.covariance, off))
-        if distance <= self._limit or alone.contradictions:
+        alone = self._search.refine(registered.camera, newest)
+        if alone.contradictions:
             return state
-        return _registered(alone, newest, state.moves + 1)
+        if self._is_elsewhere(state, alone, registered):
+            return _moved(state, alone, newest)
+        distances = (*state.distances, _distance(alone, registered))
+        return replace(state, distances=distances[-2 * self.settings.most_frames :])
+
+    def _is_elsewhere(
+        self, state: OnlineState, found: RegisteredCamera, registered: RegisteredCamera
+    ) -> bool:
+        """Whether a pose differs from that of before by more than such poses differ by chance."""
+        newest = self.settings.newest
+        # In the last ones there may be frames of the new pose already.
+        usual = state.distances[: max(0, len(state.distances) - newest + 1)]
+        told = 6.0 / newest * len(usual)
+        scale = (_TRUST + told / 6.0 * sum(usual) / max(1, len(usual))) / (_TRUST + told)
+        limit = 6.0 * float(fdtri(6.0, _TRUST + told, 1.0 - self.settings.false_alarm))
+        return _distance(found, registered) > limit * max(1.0, scale)
 
     def _contradict(
         self, state: OnlineState, registered: RegisteredCamera, frame: PosedFrame
@@ -208,16 +227,26 @@ class OnlineRegistration:
         state = replace(state, contradicting=frames, contradictions=state.contradictions + 1)
         if near is not None or len(frames) < self.settings.newest:
             return state
+        found = self._find_again(registered, frames)
+        if found is None:
+            return state
+        if self._is_elsewhere(state, found, registered):
+            return _moved(state, found, frames)
+        # What is known of the pose was not worth as much as it seemed.
+        frames = (*state.keyframes, *frames)[-self.settings.most_frames :]
+        return _registered(state, self._search.refine(found.camera, frames), frames)
+
+    def _find_again(
+        self, registered: RegisteredCamera, frames: Sequence[PosedFrame]
+    ) -> RegisteredCamera | None:
+        """Where frames that contradict the pose agree with one another; None: nowhere."""
         least = _CONTRADICTS * _usual_share(registered)
         found = self._search.refine(registered.camera, frames)
-        if self._is_bump(registered.camera, found.camera, frame) and self._is_found(
+        if self._is_bump(registered.camera, found.camera, frames[-1]) and self._is_found(
             found, self.settings.newest, least
         ):
-            return _registered(found, frames, state.moves + 1)
-        if len(frames) < self.settings.least_frames:
-            return state
-        searched = self._find(frames, least)
-        return state if searched is None else _registered(searched, frames, state.moves + 1)
+            return found
+        return self._find(frames, least) if len(frames) >= self.settings.least_frames else None
 
     def _is_bump(self, camera: PinholeCamera, moved: PinholeCamera, frame: PosedFrame) -> bool:
         """Whether a camera is still near to where it was."""
@@ -274,11 +303,28 @@ def pose_difference(X_WC: Array, from_X_WC: Array) -> Array:
     return np.concatenate([turn, X_WC[:3, 3] - from_X_WC[:3, 3]])
 
 
-def _registered(found: RegisteredCamera, frames: Sequence[PosedFrame], moves: int) -> OnlineState:
+def _registered(
+    state: OnlineState, found: RegisteredCamera, frames: Sequence[PosedFrame]
+) -> OnlineState:
     """The state in which the frames that agree are kept."""
     pairs = [(one, frame) for one, frame in zip(frames, found.frames, strict=True) if frame.agrees]
     kept = replace(found, frames=tuple(frame for _, frame in pairs))
-    return OnlineState(tuple(one for one, _ in pairs), (), kept, 0, moves)
+    return OnlineState(
+        tuple(one for one, _ in pairs), (), kept, moves=state.moves, distances=state.distances
+    )
+
+
+def _moved(
+    state: OnlineState, found: RegisteredCamera, frames: Sequence[PosedFrame]
+) -> OnlineState:
+    """The same for a camera that was found elsewhere."""
+    return _registered(replace(state, moves=state.moves + 1), found, frames)
+
+
+def _distance(found: RegisteredCamera, registered: RegisteredCamera) -> float:
+    """Squared Mahalanobis distance of a pose from another, by its own covariance."""
+    off = pose_difference(found.camera.X_WC, registered.camera.X_WC)
+    return float(off @ np.linalg.solve(found.covariance, off))
 
 
 def _usual_share(registered: RegisteredCamera) -> float:

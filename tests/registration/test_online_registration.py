@@ -43,6 +43,7 @@ class ScriptedSearch:
     def __init__(self) -> None:
         self.searches = 0
         self.alternatives = 0
+        self.deviation = 0.0004
 
     def register(self, camera: PinholeCamera, frames: Sequence[PosedFrame]) -> RegisteredCamera:
         self.searches += 1
@@ -67,7 +68,7 @@ class ScriptedSearch:
             FrameMisfit(frame.name, 0.02, 0.98, 0.97 if agrees else 0.2, agrees)
             for frame, agrees in zip(frames, agreeing, strict=True)
         ]
-        covariance = np.diag(np.full(6, 0.002**2))
+        covariance = np.diag(np.full(6, self.deviation**2))
         alternatives = np.tile(np.eye(4), (others, 1, 1))
         return RegisteredCamera(camera_at(PLACES[place]), covariance, tuple(misfits), alternatives)
 
@@ -215,6 +216,16 @@ class TestMovedCamera:
         assert statuses == [REGISTERED]
         assert state.moves == 0
         assert state.contradicting == ()
+
+    def test_a_pose_that_is_not_known_well_is_corrected_and_has_not_moved(
+        self, online: OnlineRegistration, search: ScriptedSearch, known: OnlineState
+    ) -> None:
+        search.deviation = 0.3
+        state, statuses = follow(online, known, [frame("there", t) for t in TURNS[4:]])
+        assert statuses[-1] == REGISTERED
+        assert state.moves == 0
+        assert state.registered is not None
+        np.testing.assert_allclose(state.registered.camera.X_WC, camera_at(2.0).X_WC)
 
     def test_a_few_wrong_frames_are_left_out(
         self, online: OnlineRegistration, known: OnlineState

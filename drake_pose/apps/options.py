@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from drake_pose.errors import SettingsError, UnknownNameError
+from drake_pose.registration.suggestions import Box
 
 Axis = Literal["x", "y", "z"]
 AXES: tuple[Axis, ...] = ("x", "y", "z")
@@ -44,6 +45,21 @@ def parse_assignments(texts: Iterable[str], option: str) -> dict[str, float]:
             raise SettingsError(f"{option}: '{name}' is given twice")
         values[name] = parse_number(number, f"{option} {name}")
     return values
+
+
+def parse_box(text: str) -> Box:
+    """Returns the box of a text ``X,Y,Z:X,Y,Z`` of two corners [m].
+
+    Raises:
+        SettingsError: the text has another form.
+    """
+    corners = [part.split(",") for part in text.split(":")]
+    if [len(corner) for corner in corners] != [3, 3]:
+        raise SettingsError(f"--keep-out: '{text}' must have the form X,Y,Z:X,Y,Z")
+    a, b = ([parse_number(one, "--keep-out") for one in corner] for corner in corners)
+    low = (min(a[0], b[0]), min(a[1], b[1]), min(a[2], b[2]))
+    high = (max(a[0], b[0]), max(a[1], b[1]), max(a[2], b[2]))
+    return Box(low, high)
 
 
 def parse_packages(texts: Iterable[str]) -> dict[str, Path]:

@@ -18,7 +18,7 @@ from drake_pose.apps.commands.estimate_options import (
     PackageOption,
 )
 from drake_pose.apps.commands.terminal import errors_as_messages, print_json, usage_errors, warn
-from drake_pose.apps.options import parse_assignments, parse_packages
+from drake_pose.apps.options import parse_assignments, parse_box, parse_packages
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -70,6 +70,25 @@ FocalOption = Annotated[
         rich_help_panel="Estimation",
     ),
 ]
+SuggestOption = Annotated[
+    bool,
+    typer.Option(
+        "--suggest",
+        help="Where several poses of a camera fit equally well: joint positions inside the limits "
+        "that would tell them apart.",
+        rich_help_panel="Estimation",
+    ),
+]
+KeepOutOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--keep-out",
+        metavar="X,Y,Z:X,Y,Z",
+        help=r"With --suggest: the corners of a box in the world that the robot must not touch "
+        r"\[m]; repeat for several.",
+        rich_help_panel="Estimation",
+    ),
+]
 
 
 def register(
@@ -83,6 +102,8 @@ def register(
     hold: HoldOption = None,
     zeros: ZerosOption = None,
     focal: FocalOption = False,
+    suggest: SuggestOption = False,
+    keep_out: KeepOutOption = None,
     overlay: OverlayOption = True,
     json: JsonOption = False,
 ) -> None:
@@ -90,13 +111,21 @@ def register(
     with usage_errors():
         packages = parse_packages(package or ())
         held = parse_assignments(hold or (), "--hold")
+        boxes = tuple(parse_box(text) for text in keep_out or ())
     with errors_as_messages():
         from drake_pose.apps.commands.report import count_progress
         from drake_pose.apps.registration.inputs import RegistrationSettings
         from drake_pose.apps.registration.register import register_scene
 
         settings = RegistrationSettings(
-            tuple(camera or ()), tuple(frame or ()), held, tuple(zeros or ()), focal, packages
+            tuple(camera or ()),
+            tuple(frame or ()),
+            held,
+            tuple(zeros or ()),
+            focal,
+            suggest,
+            boxes,
+            packages,
         )
         with count_progress("cameras", None) as advance:
             result = register_scene(
@@ -149,6 +178,12 @@ def _print(result: SceneRegistration) -> None:
     console.print(table)
     if zeros := next(iter(result.summary["cameras"].values()))["zeros"]:
         console.print(_zeros_table(zeros))
+    for name, one in result.summary["cameras"].items():
+        if one["suggestion"]:
+            values = ", ".join(f"{k}={v:.3f}" for k, v in one["suggestion"]["positions"].items())
+            console.print(
+                escape(f"camera '{name}': a picture at {values} would tell its poses apart")
+            )
     if result.folder is not None:
         for label, file in (("cameras", CAMERAS), ("report", REPORT)):
             console.print(f"{label:<14} {escape(str(result.folder / file))}", soft_wrap=True)

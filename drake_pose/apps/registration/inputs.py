@@ -18,6 +18,7 @@ from drake_pose.camera import Camera, PinholeCamera
 from drake_pose.camera.files import load_camera_file
 from drake_pose.errors import CameraError, MaskError, SceneError, UnknownNameError
 from drake_pose.registration.posed_frames import PosedFrame
+from drake_pose.registration.suggestions import Box
 from drake_pose.silhouette import Scene, load_scene
 
 _CAMERAS = "cameras.yaml"
@@ -34,6 +35,9 @@ class RegistrationSettings:
         hold: joints that are not in the table, by name [deg or m].
         zeros: joints whose zeros are asked for, too; "all": those of all that move.
         focal: whether focal lengths are asked for, too.
+        suggest: whether a further pose of the robot is asked for where several poses of a camera
+            fit equally well.
+        keep_out: what the robot must not touch in it.
         packages: folders of packages that the model's ``package://`` names mean, by name.
     """
 
@@ -42,6 +46,8 @@ class RegistrationSettings:
     hold: Mapping[str, float] = field(default_factory=dict)
     zeros: tuple[str, ...] = ()
     focal: bool = False
+    suggest: bool = False
+    keep_out: tuple[Box, ...] = ()
     packages: Mapping[str, Path] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from drake_pose.registration.joint_zeros import JointCalibration
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import CameraSearch, RegisteredCamera, RegistrationBody
 from drake_pose.registration.start_poses import E_total, areas
+from drake_pose.registration.suggestions import suggest_pose
 
 OnCamera = Callable[[int], None]
 """Called with the number of cameras that are done."""
@@ -86,8 +87,7 @@ def register_scene(
     inputs = read_inputs(*paths, settings)
     body = RegistrationBody(inputs.tree)
     search = CameraSearch(body)
-    registered: dict[str, RegisteredCamera] = {}
-    described: dict[str, dict[str, Any]] = {}
+    registered, described = dict[str, RegisteredCamera](), dict[str, dict[str, Any]]()
     warnings = [*inputs.warnings, *_check_held(inputs, body)]
     for camera in inputs.searched:
         start = time.perf_counter()
@@ -95,7 +95,8 @@ def register_scene(
         require_explained(body, found, inputs.frames[camera.name])
         warnings += check_focal_length(body, found, inputs.frames[camera.name])
         registered[camera.name] = found
-        described[camera.name] = describe_camera(found, time.perf_counter() - start)
+        next_pose = _suggestion(body, found, settings)
+        described[camera.name] = describe_camera(found, time.perf_counter() - start, next_pose)
         warnings += _warnings_of(found)
         if on_camera is not None:
             on_camera(len(registered))
@@ -111,6 +112,23 @@ def register_scene(
     if folder is not None:
         write_result(folder, inputs, cameras, registered, summary, overlay, zeros)
     return SceneRegistration(cameras, registered, summary, tuple(warnings), folder)
+
+
+def _suggestion(
+    body: RegistrationBody, found: RegisteredCamera, settings: RegistrationSettings
+) -> dict[str, Any] | None:
+    """Joint positions that would tell a camera's poses apart; None: one pose, or not asked for."""
+    if not settings.suggest or not len(found.alternatives):
+        return None
+    poses = [found.camera.X_WC, *found.alternatives]
+    told = suggest_pose(body, found.camera, poses, settings.keep_out)
+    if told is None:
+        return None
+    names = body.kinematics.names
+    return {
+        "positions": dict(zip(names, told.values.tolist(), strict=True)),
+        "difference": told.difference,
+    }
 
 
 def _placed_cameras(
@@ -134,7 +152,10 @@ def _describe_again(
     """The cameras' parts of the summary with the zeros, each of which took so long more [s]."""
     told = describe_zeros(zeros, body.kinematics)
     return {
-        name: {**describe_camera(found, before[name]["seconds"] + seconds), "zeros": told}
+        name: {
+            **describe_camera(found, before[name]["seconds"] + seconds, before[name]["suggestion"]),
+            "zeros": told,
+        }
         for name, found in registered.items()
     }
 

@@ -28,7 +28,9 @@ CAMERAS, REGISTRATION = "cameras.yaml", "registration.yaml"
 _ERROR_NAMES = ("turn_x", "turn_y", "turn_z", "x", "y", "z")
 
 
-def describe_camera(found: RegisteredCamera, seconds: float) -> dict[str, Any]:
+def describe_camera(
+    found: RegisteredCamera, seconds: float, suggestion: dict[str, Any] | None = None
+) -> dict[str, Any]:
     """A camera's part of summary.json: lengths in m, but for `_mm`; angles in `_deg`."""
     poses = [found.camera.X_WC, *found.alternatives]
     return {
@@ -38,6 +40,7 @@ def describe_camera(found: RegisteredCamera, seconds: float) -> dict[str, Any]:
         "families": [{"X_WC": np.asarray(X_WC).tolist()} for X_WC in poses],
         "mean_iou": float(np.mean([frame.iou for frame in found.frames])),
         "zeros": {},
+        "suggestion": suggestion,
         "seconds": seconds,
         "contradictions": list(found.contradictions),
         "frames": {

@@ -1,0 +1,113 @@
+"""Which further pose of the body would tell camera poses apart that fit equally well."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.camera import PinholeCamera
+from drake_pose.registration.register import RegistrationBody
+from drake_pose.silhouette import draw_mask
+
+Array = NDArray[np.float64]
+
+# Silhouettes are compared in pictures about so wide [pixel].
+_WIDTH = 160
+# A joint without limits is taken to turn once around.
+_TURN = np.pi
+
+
+@dataclass(frozen=True)
+class Box:
+    """A part of the world that the body must not touch.
+
+    Args:
+        low, high: (3,) its corners along the world's axes [m].
+    """
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+
+    def holds_any(self, points: Array) -> bool:
+        """Whether one of some points (n, 3) is inside."""
+        return bool(np.any(np.all((points >= self.low) & (points <= self.high), axis=1)))
+
+
+@dataclass(frozen=True, eq=False)
+class Suggestion:
+    """A pose that tells camera poses apart.
+
+    Args:
+        values: (m,) of the body's pose tree [rad or m].
+        difference: of the two camera poses that it tells apart least, the area in which their
+            silhouettes differ, over the mean area of both.
+    """
+
+    values: Array
+    difference: float
+
+
+def suggest_pose(
+    body: RegistrationBody,
+    camera: PinholeCamera,
+    X_WC: Sequence[Array],
+    keep_out: Sequence[Box] = (),
+    *,
+    tried: int = 300,
+    seed: int = 0,
+) -> Suggestion | None:
+    """The pose, of random ones inside the limits, whose silhouettes differ most.
+
+    Args:
+        body: the body.
+        camera: its intrinsics.
+        X_WC: the camera's poses that are to be told apart, (4, 4) each, two or more.
+        keep_out: what the body must not touch; points of its surfaces are asked.
+        tried: so many poses are tried.
+        seed: of the random draws.
+
+    Returns:
+        None where no pose was found that is seen from all camera poses and touches nothing.
+    """
+    generator, kinematics = np.random.default_rng(seed), body.kinematics
+    lower = np.where(np.isfinite(kinematics.lower), kinematics.lower, -_TURN)
+    upper = np.where(np.isfinite(kinematics.upper), kinematics.upper, _TURN)
+    cameras = [_small(camera.with_pose(one)) for one in X_WC]
+    best: Suggestion | None = None
+    for _ in range(tried):
+        values = generator.uniform(lower, upper)
+        X_WN = kinematics.poses(values)
+        placed = zip(body.very_few, X_WN, strict=True)
+        points = np.concatenate([one.vertices @ X[:3, :3].T + X[:3, 3] for one, X in placed])
+        if any(box.holds_any(points) for box in keep_out):
+            continue
+        masks = [draw_mask(body.very_few, one.X_CW @ X_WN, one) for one in cameras]
+        if not all(mask.any() for mask in masks):
+            continue
+        difference = min(
+            2.0 * np.count_nonzero(a != b) / (np.count_nonzero(a) + np.count_nonzero(b))
+            for a, b in combinations(masks, 2)
+        )
+        if best is None or difference > best.difference:
+            best = Suggestion(values, float(difference))
+    return best
+
+
+def _small(camera: PinholeCamera) -> PinholeCamera:
+    """The camera with pictures of few pixels."""
+    share = min(1.0, _WIDTH / camera.width)
+    width, height = max(1, round(share * camera.width)), max(1, round(share * camera.height))
+    x, y = width / camera.width, height / camera.height
+    return replace(
+        camera,
+        width=width,
+        height=height,
+        focal_x=x * camera.focal_x,
+        focal_y=y * camera.focal_y,
+        center_x=x * (camera.center_x + 0.5) - 0.5,
+        center_y=y * (camera.center_y + 0.5) - 0.5,
+    )

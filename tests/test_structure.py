@@ -102,7 +102,16 @@ MAY_KNOW_INSIDE = {
         "live": {"experiments", "estimate", "results"},
         "cluster": {"live"},
         "batch": {"cluster", "estimate", "results"},
-        "benchmarks": {"batch", "cluster", "live", "experiments", "estimate", "results", "demo"},
+        "benchmarks": {
+            "batch",
+            "cluster",
+            "live",
+            "experiments",
+            "registration",
+            "estimate",
+            "results",
+            "demo",
+        },
         "commands": {
             "batch",
             "cluster",

@@ -41,10 +41,8 @@ _KNOWN_BEFOREHAND = 20
 _TOLD = 1.0
 # Contours of a frame fit that fit as well as this share of what fits in the best frames.
 _FITS, _FITS_AT_ALL = 0.75, 0.5
-# A cause explains what is off that explains this share of it.
-_EXPLAINS = 0.9
-# Causes explain equally well whose statistics differ by less.
-_RIVALS = 10.0
+# A cause explains what is off that leaves less than this share of it, or what would not be named.
+_EXPLAINED = 0.25
 # A frame that is wrong is as unlikely as this logarithm says, and what is given is usually off by
 # this share of how far it may be off.
 _WRONG, _USUAL = 3.0, 0.4
@@ -184,6 +182,30 @@ class _Told(NamedTuple):
     freedom: float
 
 
+class _Sum(NamedTuple):
+    """What some frames tell together, each by the scale of its errors: sums of N, h, of_surface."""
+
+    frames: int
+    N: Array
+    h: Array
+    of_surface: Array
+
+    @classmethod
+    def of_none(cls, told: _Told) -> _Sum:
+        """What no frames tell, of as many numbers as one."""
+        return cls(0, *(np.zeros_like(one) for one in (told.N, told.h, told.of_surface)))
+
+    def with_frame(self, told: _Told, sign: float) -> _Sum:
+        """With another frame, or without one of them: sign -1."""
+        share = sign / told.scale
+        return _Sum(
+            self.frames + int(sign),
+            self.N + share * told.N,
+            self.h + share * told.h,
+            self.of_surface + share * told.of_surface,
+        )
+
+
 class _Off(NamedTuple):
     """By how much a frame is off from the others, in units of the reach.
 
@@ -245,7 +267,11 @@ class _Auditor:
         self._told = [self._tell(one, sizes) for one in self._freed]
         self._surface = sizes.surface
         agreeing = self._agreeing()
-        frames = tuple(self._audit_frame(k, agreeing) for k in range(len(self._freed)))
+        total = self._sum(agreeing)
+        frames = tuple(
+            self._audit_frame(k, total.with_frame(told, -1.0) if agreeing[k] else total)
+            for k, told in enumerate(self._told)
+        )
         kept = np.array([one.finding is None for one in frames])
         return Audit(frames, self._common_findings(kept), sizes)
 
@@ -303,34 +329,35 @@ class _Auditor:
             starts.append(np.arange(len(self._told)) == k)
         for kept in starts:
             for _ in range(_ROUNDS):
-                common = self._common(kept)
+                common = self._common(self._sum(kept))
                 now = self._explained & [
                     self._chance_of_all(told, common) > self._settings.chance for told in self._told
                 ]
                 if (now == kept).all():
                     break
                 kept = now
-            off = self._common(kept).x / _USUAL
+            off = self._common(self._sum(kept)).x / _USUAL
             unlikely = _WRONG * np.count_nonzero(~kept) + 0.5 * float(off @ off)
             if unlikely < least:
                 best, least = kept, unlikely
         return best
 
-    def _common(self, kept: Mask) -> _Common:
-        """What some frames have in common; without any, that nothing is off."""
-        p = len(self._freer.names)
-        N, h, surface = np.zeros((p, p)), np.zeros(p), np.zeros_like(self._told[0].of_surface)
+    def _sum(self, kept: Mask) -> _Sum:
+        """What some frames tell together."""
+        total = _Sum.of_none(self._told[0])
         for k in np.flatnonzero(kept):
-            told = self._told[k]
-            N += told.N / told.scale
-            h += told.h / told.scale
-            surface += told.of_surface / told.scale
-        Q = N + self._surface**2 * surface @ surface.T
+            total = total.with_frame(self._told[k], 1.0)
+        return total
+
+    def _common(self, total: _Sum) -> _Common:
+        """What some frames have in common; without any, that nothing is off."""
+        p = len(total.h)
+        Q = total.N + self._surface**2 * total.of_surface @ total.of_surface.T
         # Without other frames what is given is right to within a tolerance.
-        prior = np.eye(p) if kept.any() else np.linalg.inv(self._tolerance)
-        inverse = np.linalg.inv(N + prior)
+        prior = np.eye(p) if total.frames else np.linalg.inv(self._tolerance)
+        inverse = np.linalg.inv(total.N + prior)
         covariance = inverse @ (Q + prior) @ inverse
-        return _Common(inverse @ h, covariance, N, h, Q)
+        return _Common(inverse @ total.h, covariance, total.N, total.h, Q)
 
     def _left(self, told: _Told, common: _Common) -> tuple[Array, Array]:
         """A frame's h without what is common, and its covariance."""
@@ -340,9 +367,7 @@ class _Auditor:
     def _chance_of_all(self, told: _Told, common: _Common) -> float:
         return _chance(*_statistic(*self._left(told, common), told.N), told.freedom)
 
-    def _audit_frame(self, k: int, agreeing: Mask) -> FrameAudit:
-        others = agreeing.copy()
-        others[k] = False
+    def _audit_frame(self, k: int, others: _Sum) -> FrameAudit:
         told, freed = self._told[k], self._freed[k]
         r, Q = self._left(told, self._common(others))
         spread = told.scale * np.linalg.inv(told.N + np.eye(len(r)))
@@ -365,16 +390,28 @@ class _Auditor:
         tests = [_Test.of(cause, off.r, told.N, off.Q, told.freedom) for cause in causes]
         # Each of the tests may find something by chance.
         least = min(chance, *(one.chance for one in tests)) * (1 + len(tests))
-        if least > settings.chance:
+        if least > settings.chance or pixels < settings.pixels:
             return None
-        best = max(tests, key=lambda one: one.merit)
-        left = _chance(max(T - best.T, 0.0), max(rank - best.rank, 1), told.freedom)
-        if best.T >= _EXPLAINS * T or left > settings.chance:
-            pixels = _pixels([told], best.x)
-            return self._finding(best, tests, pixels) if pixels >= settings.pixels else None
-        if pixels >= settings.pixels:
+        sufficing = self._sufficing(tests, [told], off.r, told.N)
+        if not sufficing:
             return self._joints_finding("joints", off, chance, pixels)
-        return None
+        best, *rivals = sufficing
+        return self._finding(best, rivals, _pixels([told], best.x))
+
+    def _sufficing(
+        self, tests: Sequence[_Test], told: Sequence[_Told], r: Array, N: Array
+    ) -> list[_Test]:
+        """Causes that leave little of what is off, those of fewer numbers first.
+
+        Args:
+            tests: of all causes.
+            told: by the frames.
+            r, N: what is off, and what is told of it.
+        """
+        solve = np.linalg.inv(N + np.eye(len(r)))
+        most = max(self._settings.pixels, _EXPLAINED * _pixels(told, solve @ r))
+        left = [one for one in tests if _pixels(told, solve @ (r - N @ one.x)) < most]
+        return sorted(left, key=lambda one: (one.cause.moves.shape[1], -one.merit))
 
     def _causes(self, freed: FreedFrame | None) -> list[Cause]:
         """All that may be off by itself; of the cameras those that see a frame."""
@@ -389,11 +426,12 @@ class _Auditor:
             causes.append(Cause(BASE, BASE, self._freer.base_moves()))
         return causes
 
-    def _finding(self, best: _Test, tests: Sequence[_Test], pixels: float) -> Finding:
-        rivals = [
-            one.cause.name for one in tests if one is not best and one.merit > best.merit - _RIVALS
-        ]
-        if best.cause.kind == "camera" and len(self._freer.camera_names) == 1:
+    def _finding(self, best: _Test, others: Sequence[_Test], pixels: float) -> Finding:
+        rivals = [one.cause.name for one in others]
+        if (
+            any(one.cause.kind == "camera" for one in (best, *others))
+            and len(self._freer.camera_names) == 1
+        ):
             rivals.append(BASE)
         x = best.amount * best.units(self._freer.deviations)
         sd = np.sqrt(np.diag(best.covariance)) * best.units(self._freer.deviations)
@@ -428,18 +466,19 @@ class _Auditor:
         if not kept.any():
             return ()
         told = [self._told[k] for k in np.flatnonzero(kept)]
-        common = self._common(kept)
+        common = self._common(self._sum(kept))
         freedom = float(sum(one.freedom for one in told))
         findings: list[Finding] = []
         causes = self._causes(None)
         r, N, Q = common.h, common.N, common.Q + common.N @ self._tolerance @ common.N / len(told)
         while causes:
             tests = [_Test.of(cause, r, N, Q, freedom) for cause in causes]
-            best = max(tests, key=lambda one: one.merit)
+            sufficing = self._sufficing(tests, told, r, N)
+            best, *rivals = sufficing or [max(tests, key=lambda one: one.merit)]
             pixels = _pixels(told, best.x)
             if best.chance * len(tests) > self._settings.chance or pixels < self._settings.pixels:
                 break
-            findings.append(self._finding(best, tests, pixels))
+            findings.append(self._finding(best, rivals, pixels))
             # What is left once that was put right.
             M = best.cause.moves
             gain = np.eye(len(r)) - N @ M @ np.linalg.pinv(M.T @ N @ M) @ M.T

@@ -42,12 +42,13 @@ _TOLD_APART = Round(0.025, 0.01)
 _STEPS = StepSettings(longest=0.2, damping=1e-3, even_damping=1e-6)
 # From one point of a silhouette's edge to the next [root of the silhouettes' area].
 _SPACING = 1.0 / 100.0
-# Where given values fit so well, of what fits once they are freed, distances are linear in them.
-_FITS_ALREADY = 0.95
+# Where given values cost no more than so many times what they do once they are freed, distances are
+# linear about them: what hardly shows may have moved far.
+_FITS_ALREADY = 1.3
 # Silhouettes may be as much too wide on all sides, or too narrow [pixel].
 _WIDTHS = np.linspace(-3.0, 3.0, 5)
 # What a fit's unknowns are held by: contours err by about so much along about so much [pixel].
-_POINT_ERROR, _ERROR_LENGTH = 2.0, 20.0
+_POINT_ERROR, _ERROR_LENGTH = 4.0, 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +189,7 @@ class FrameFreer:
         before = self._compare(_widened(evidence, -own), held)
         after = self._compare(_widened(evidence, -widths), theta)
         told = after
-        if before.share >= _FITS_ALREADY * after.share:
+        if _cost(before) <= _FITS_ALREADY * _cost(after):
             theta, told, change, widths = held, before, np.zeros_like(change), own
         return FreedFrame(
             frame.name,
@@ -319,6 +320,10 @@ def _widened(evidence: Evidence, widths: Array) -> Evidence:
         ]
     )
     return Evidence(uv[order], evidence.normals[order], evidence.lengths[order], evidence.starts)
+
+
+def _cost(compared: Comparison) -> float:
+    return float(compared.sums[:, :, COST].sum())
 
 
 def _weights(compared: Comparison) -> Array:

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Literal
 
 from drake_pose.errors import SettingsError, UnknownNameError
-from drake_pose.registration.suggestions import Box
 
 Axis = Literal["x", "y", "z"]
 AXES: tuple[Axis, ...] = ("x", "y", "z")
 RotationLimits = dict[Axis, tuple[float, float]]
+Corner = tuple[float, float, float]
+"""x, y, z [m]."""
 
 
 def parse_number(text: str, what: str) -> float:
@@ -47,8 +48,8 @@ def parse_assignments(texts: Iterable[str], option: str) -> dict[str, float]:
     return values
 
 
-def parse_box(text: str) -> Box:
-    """Returns the box of a text ``X,Y,Z:X,Y,Z`` of two corners [m].
+def parse_box(text: str) -> tuple[Corner, Corner]:
+    """Returns the least and the largest corner of a text ``X,Y,Z:X,Y,Z`` of two corners [m].
 
     Raises:
         SettingsError: the text has another form.
@@ -59,7 +60,7 @@ def parse_box(text: str) -> Box:
     a, b = ([parse_number(one, "--keep-out") for one in corner] for corner in corners)
     low = (min(a[0], b[0]), min(a[1], b[1]), min(a[2], b[2]))
     high = (max(a[0], b[0]), max(a[1], b[1]), max(a[2], b[2]))
-    return Box(low, high)
+    return low, high
 
 
 def parse_packages(texts: Iterable[str]) -> dict[str, Path]:

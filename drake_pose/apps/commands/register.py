@@ -111,11 +111,12 @@ def register(
     with usage_errors():
         packages = parse_packages(package or ())
         held = parse_assignments(hold or (), "--hold")
-        boxes = tuple(parse_box(text) for text in keep_out or ())
+        corners = [parse_box(text) for text in keep_out or ()]
     with errors_as_messages():
         from drake_pose.apps.commands.report import count_progress
         from drake_pose.apps.registration.inputs import RegistrationSettings
         from drake_pose.apps.registration.register import register_scene
+        from drake_pose.registration.suggestions import Box
 
         settings = RegistrationSettings(
             tuple(camera or ()),
@@ -124,7 +125,7 @@ def register(
             tuple(zeros or ()),
             focal,
             suggest,
-            boxes,
+            tuple(Box(*ends) for ends in corners),
             packages,
         )
         with count_progress("cameras", None) as advance:

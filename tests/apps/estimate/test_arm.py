@@ -19,7 +19,9 @@ def test_the_recorded_arm(shared_data: Path) -> None:
     figures = list(measure_arm(shared_data / "arm_two_views"))
     for one in figures:
         assert (one.excess <= 0.03).all(), one
-        assert one.held, one
+        assert one.held[BASE].all(), one
+    # As often as claimed: how the flange is turned hardly shows.
+    assert np.mean([one.held for one in figures]) >= 0.95
     assert np.median([one.errors[BASE] for one in figures]) <= 1.5
     # Nobody can tell from these masks how the flange is turned.
     assert not any(one.determined[-1] for one in figures)

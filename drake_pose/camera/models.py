@@ -70,6 +70,19 @@ class PinholeCamera:
         """Returns the same camera at another pose (4, 4)."""
         return dataclasses.replace(self, X_WC=X_WC)
 
+    def resized(self, width: int, height: int) -> PinholeCamera:
+        """Returns the camera of the same pictures at another size [pixel]."""
+        x, y = width / self.width, height / self.height
+        return dataclasses.replace(
+            self,
+            width=width,
+            height=height,
+            focal_x=x * self.focal_x,
+            focal_y=y * self.focal_y,
+            center_x=x * (self.center_x + 0.5) - 0.5,
+            center_y=y * (self.center_y + 0.5) - 0.5,
+        )
+
     def kernel_parameters(self) -> np.ndarray:
         """Returns (8,) kind (0: pinhole), f_x, f_y, c_x, c_y, near, width, height."""
         projection = [0.0, self.focal_x, self.focal_y, self.center_x, self.center_y, self.near]

@@ -119,18 +119,7 @@ class PosedFrames:
         camera = self.camera
         width = max(8, round(camera.width * min(1.0, side / self.size)))
         height = max(8, round(camera.height * min(1.0, side / self.size)))
-        x, y = width / camera.width, height / camera.height
-        small = PinholeCamera(
-            camera.name,
-            width,
-            height,
-            camera.focal_x * x,
-            camera.focal_y * y,
-            (camera.center_x + 0.5) * x - 0.5,
-            (camera.center_y + 0.5) * y - 0.5,
-            camera.X_WC,
-            camera.near,
-        )
+        small = camera.resized(width, height)
         sums = []
         for frame in self.frames:
             shrunk = cv2.resize(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -101,13 +101,4 @@ def _small(camera: PinholeCamera) -> PinholeCamera:
     """The camera with pictures of few pixels."""
     share = min(1.0, _WIDTH / camera.width)
     width, height = max(1, round(share * camera.width)), max(1, round(share * camera.height))
-    x, y = width / camera.width, height / camera.height
-    return replace(
-        camera,
-        width=width,
-        height=height,
-        focal_x=x * camera.focal_x,
-        focal_y=y * camera.focal_y,
-        center_x=x * (camera.center_x + 0.5) - 0.5,
-        center_y=y * (camera.center_y + 0.5) - 0.5,
-    )
+    return camera.resized(width, height)

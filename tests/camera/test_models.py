@@ -60,6 +60,15 @@ def test_pinhole_projects_as_opencv_does() -> None:
     np.testing.assert_allclose(depth, p_C[:, 2], atol=1e-12)
 
 
+def test_resized_pictures_show_the_same() -> None:
+    """Corners of the picture, half a pixel outside of the outermost centres, stay corners."""
+    camera = PinholeCamera("a", 640, 480, 600.0, 590.0, 310.0, 250.0, np.eye(4))
+    small = camera.resized(160, 240)
+    points = np.array([[0.1, -0.2, 1.3], [-0.4, 0.3, 2.0]])
+    before, after = camera.project(points)[0], small.project(points)[0]
+    np.testing.assert_allclose((after + 0.5) * [4.0, 2.0], before + 0.5)
+
+
 def test_points_behind_a_pinhole_have_no_pixel() -> None:
     uv, depth = pinhole(X_WC=np.eye(4)).project(np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 2.0]]))
     assert np.isnan(uv[0]).all()

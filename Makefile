@@ -43,7 +43,7 @@ DATA ?= $(wildcard ../shared/data)
 bench: $(VENV)/ready-cluster
 	$(PYTHON) -m drake_pose.apps.benchmarks.speed
 	$(PYTHON) -m drake_pose.apps.benchmarks.estimates $(DATA)
-	$(PYTHON) -m drake_pose.apps.benchmarks.registration $(DATA)
+	$(PYTHON) -m drake_pose.apps.benchmarks.registration $(DATA) --cases 1 --zeros 0
 	$(PYTHON) -m drake_pose.apps.benchmarks.memory
 	$(PYTHON) -m drake_pose.apps.benchmarks.cluster
 

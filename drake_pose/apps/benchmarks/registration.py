@@ -4,6 +4,7 @@ Run as ``python -m drake_pose.apps.benchmarks.registration [DATA] [--cases N]``;
 with the scenes ``arm_two_views``, ``arm_one_view`` and ``franka_one_view``. The arms of these and,
 where it is installed, the xArm7 of example-robot-data are drawn before cameras that stand anywhere;
 without any of them an arm of boxes is. N is the number of simulated cases for each arm.
+``--zeros N`` is that of calibrations of joints' zeros, which take some 15 s each.
 """
 
 from __future__ import annotations
@@ -278,14 +279,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Where cameras stand: errors and times.")
     parser.add_argument("data", nargs="?", type=Path, help="a folder of recorded scenes")
     parser.add_argument("--cases", type=int, default=2, help="simulated cases for each arm")
-    parser.add_argument("--zeros", type=int, default=1, help="calibrations of zeros for each arm")
+    parser.add_argument(
+        "--zeros", type=int, default=1, help="calibrations of zeros for each arm; 0: none"
+    )
     asked = parser.parse_args()
     console = Console(width=120)
     with tempfile.TemporaryDirectory() as folder:
         files = arm_files(asked.data, Path(folder))
         arms = {name: load_arm(path) for name, path in files.items()}
     console.print(camera_table(arms, asked.cases))
-    console.print(zero_table(arms, asked.zeros))
+    if asked.zeros > 0:
+        console.print(zero_table(arms, asked.zeros))
     if asked.data is not None:
         console.print(recorded_table(asked.data))
 

@@ -265,16 +265,27 @@ def find_fault(
     suspects = sorted(misfits, key=lambda one: misfits[one])
     if not suspects or misfits[suspects[0]] > _LOWERED:
         return None
-    first = suspects[0]
-    motion, share = found[first]
     # Any two cameras agree more or less: two alone predict a third one's picture half as well, and
     # of three nobody can tell which one contradicts the others.
     few = len(names) <= 3
-    if motion.metres < (2.0 if few else 1.0) * _LEAST_METRES or motion.pixels < _LEAST_PIXELS:
+    metres = (2.0 if few else 1.0) * _LEAST_METRES
+    # Of those that lower the misfit alike, one that has not moved is not at fault.
+    moved = [
+        one
+        for one in suspects
+        if misfits[one] <= _ALIKE * misfits[suspects[0]]
+        and found[one][0].metres >= metres
+        and found[one][0].pixels >= _LEAST_PIXELS
+    ]
+    if not moved:
         return None
+    first = moved[0]
+    motion, share = found[first]
     alike = np.inf if few else _ALIKE * misfits[first]
     rivals = [
-        one for one in suspects[1:] if misfits[one] < alike and found[one][0].metres > _LEAST_METRES
+        one
+        for one in suspects
+        if one != first and misfits[one] < alike and found[one][0].metres > _LEAST_METRES
     ]
     explained = not few and motion.share_after > _EXPLAINED * share
     return CameraFault(first, motion, explained, tuple(rivals), share)

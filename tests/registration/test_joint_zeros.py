@@ -39,6 +39,7 @@ class TestCalibrateJoints:
         assert shift < 3e-3
         assert turn < np.radians(0.15)
 
+    @pytest.mark.slow
     def test_focal_length(self, model: ArticulatedModel, body: RegistrationBody) -> None:
         camera = looking_at(np.array([1.6, 0.4, 0.5]), MIDDLE, 0.1)
         frames = see(model, body, camera, 8, 4)

@@ -16,7 +16,7 @@ from drake_pose.matching.fit.contour_fit import Comparison
 from drake_pose.matching.fit.kernel import COST, WEIGHT
 from drake_pose.matching.fit.levenberg_marquardt import Equations, Round, StepSettings, minimise
 from drake_pose.matching.fit.parameters import CAMERA_NAMES
-from drake_pose.registration.camera_fit import CameraFit
+from drake_pose.registration.camera_fit import POSE_NAMES, CameraFit
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -25,7 +25,7 @@ _STEPS = StepSettings(longest=0.3, damping=1e-2, even_damping=1e-6)
 # Masks are wider or narrower by no more [pixel], and their width is varied by this.
 _WIDEST, _WIDTH_STEP = 6.0, 0.25
 # A pose has six parameters; with the focal length a camera has seven.
-_POSE = 6
+_POSE = len(POSE_NAMES)
 # What is known of zeros [rad or m] and of the logarithm of a focal length beforehand: deviations.
 ZERO_DEVIATION, FOCAL_DEVIATION = 0.2, 0.1
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from drake_pose.camera import PinholeCamera
 from drake_pose.matching.fit.camera_sums import Views
 from drake_pose.matching.fit.contour_fit import Comparison, ContourFit, Noise, pack_cameras
-from drake_pose.matching.fit.evidence import Evidence
+from drake_pose.matching.fit.evidence import widened
 from drake_pose.matching.fit.frames_fit import FramesFit
 from drake_pose.matching.fit.levenberg_marquardt import Round, StepSettings
 from drake_pose.matching.fit.parameters import CAMERA_NAMES, CameraParameters
@@ -57,7 +57,7 @@ class CameraFit:
             X_CW: (4, 4) where to start.
             rounds: the parts of the fit.
         """
-        found = self._frames_fit(self._camera(X_CW)).fit(
+        found = self._frames_fit(self.placed(X_CW)).fit(
             self._evidence,
             self.values,
             np.zeros((len(self.values), 0)),
@@ -106,24 +106,22 @@ class CameraFit:
         )
 
     def _views(self, X_CW: Array, frame: int, width: float, log_focal: float = 0.0) -> Views:
-        uv, normals, lengths, starts = self._evidence[frame]
+        evidence = self._evidence[frame]
         if width:
-            uv = uv - width * normals
-            order = np.argsort(uv[:, 1])
-            uv, normals, lengths = uv[order], normals[order], lengths[order]
-        evidence = Evidence(uv, normals, lengths, starts)
-        return Views(pack_cameras([self._camera(X_CW, log_focal)]), evidence)
+            evidence = widened(evidence, np.array([-width]))
+        return Views(pack_cameras([self.placed(X_CW, log_focal)]), evidence)
 
     def motions(self, X_CW: Array, log_focal: float = 0.0) -> Array:
         """(7, 12) the affine motions that CAMERA_NAMES amount to for all that the camera sees."""
-        camera = self._camera(X_CW, log_focal)
+        camera = self.placed(X_CW, log_focal)
         return self._parameters(camera).place(np.zeros(len(CAMERA_NAMES)))[2][0]
 
     def moved(self, X_CW: Array, by: Array) -> Array:
         """X_CW (4, 4) after a motion by POSE_NAMES (6,)."""
-        return self._parameters(self._camera(X_CW)).place(np.append(by, 0.0))[0][0]
+        return self._parameters(self.placed(X_CW)).place(np.append(by, 0.0))[0][0]
 
-    def _camera(self, X_CW: Array, log_focal: float = 0.0) -> PinholeCamera:
+    def placed(self, X_CW: Array, log_focal: float = 0.0) -> PinholeCamera:
+        """The camera at a pose (4, 4), its focal length grown by exp(log_focal)."""
         camera, growth = self.frames.camera, math.exp(log_focal)
         return replace(
             camera,

@@ -26,7 +26,8 @@ from drake_pose.matching.fit.covariance import (
     estimate_sizes,
     widening,
 )
-from drake_pose.registration.freed_frames import POSE_NAMES, FrameFreer, FreedFrame
+from drake_pose.registration.camera_fit import POSE_NAMES
+from drake_pose.registration.freed_frames import FrameFreer, FreedFrame
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -24,21 +24,26 @@ from drake_pose.matching.fit.contour_fit import (
     pixels_per_metre,
 )
 from drake_pose.matching.fit.covariance import Picture
-from drake_pose.matching.fit.evidence import NO_EDGE, Evidence, find_edge_points, pack_evidence
+from drake_pose.matching.fit.evidence import (
+    NO_EDGE,
+    Evidence,
+    find_edge_points,
+    pack_evidence,
+    widened,
+)
 from drake_pose.matching.fit.frames_fit import FramesFit
 from drake_pose.matching.fit.kernel import COST, WEIGHT
 from drake_pose.matching.fit.levenberg_marquardt import Round, StepSettings
 from drake_pose.matching.fit.parameters import CAMERA_NAMES, CameraParameters
 from drake_pose.matching.fit.unknowns import choose
+from drake_pose.registration.agreement import TOLD_APART
+from drake_pose.registration.camera_fit import POSE_NAMES
 from drake_pose.silhouette import Outline
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-POSE_NAMES = CAMERA_NAMES[:6]
-
 _ROUNDS = tuple(Round(scale, 0.02) for scale in (0.12, 0.09, 0.07, 0.05, 0.04, 0.03, 0.025))
-_TOLD_APART = Round(0.025, 0.01)
 _STEPS = StepSettings(longest=0.2, damping=1e-3, even_damping=1e-6)
 # From one point of a silhouette's edge to the next [root of the silhouettes' area].
 _SPACING = 1.0 / 100.0
@@ -176,7 +181,7 @@ class FrameFreer:
         theta, widths = held, np.zeros(len(self._cameras))
         for rounds in (_ROUNDS, _ROUNDS[-2:]):
             found = self._fit.fit(
-                [_widened(evidence, -widths)],
+                [widened(evidence, -widths)],
                 frame.values[None],
                 change,
                 np.zeros(0),
@@ -186,8 +191,8 @@ class FrameFreer:
             change, theta = found.own, found.parameters[0]
             widths = self._widths(evidence, theta)
         own = self._widths(evidence, held)
-        before = self._compare(_widened(evidence, -own), held)
-        after = self._compare(_widened(evidence, -widths), theta)
+        before = self._compare(widened(evidence, -own), held)
+        after = self._compare(widened(evidence, -widths), theta)
         told = after
         if _cost(before) <= _FITS_ALREADY * _cost(after):
             theta, told, change, widths = held, before, np.zeros_like(change), own
@@ -211,7 +216,7 @@ class FrameFreer:
         costs = np.array(
             [
                 self._compare(
-                    _widened(evidence, np.full(len(self._cameras), -one)), theta, self._few
+                    widened(evidence, np.full(len(self._cameras), -one)), theta, self._few
                 )
                 .sums[:, :, COST]
                 .sum(axis=1)
@@ -259,7 +264,7 @@ class FrameFreer:
         X_CW, kernel, _ = self._parameters.place(theta[size:])
         values = theta[: len(self.contours.kinematics.names)]
         views = Views((X_CW, kernel), evidence)
-        return (contours or self.contours).compare_views(views, values, _TOLD_APART)
+        return (contours or self.contours).compare_views(views, values, TOLD_APART)
 
     def _pictures(
         self, compared: Comparison, theta: Array, change: Array
@@ -307,19 +312,6 @@ def _check_size(camera: Camera, frame: str, mask: Mask) -> None:
             f"camera '{camera.name}', frame '{frame}': a mask of {camera.width} x {camera.height} "
             f"pixels is expected, not {mask.shape[1]} x {mask.shape[0]}"
         )
-
-
-def _widened(evidence: Evidence, widths: Array) -> Evidence:
-    """The edges of silhouettes that are wider (c,) on all sides [pixel]."""
-    counts = np.diff(evidence.starts)
-    uv = evidence.uv + np.repeat(widths, counts)[:, None] * evidence.normals
-    order = np.concatenate(
-        [
-            begin + np.argsort(uv[begin:end, 1], kind="stable")
-            for begin, end in zip(evidence.starts[:-1], evidence.starts[1:], strict=True)
-        ]
-    )
-    return Evidence(uv[order], evidence.normals[order], evidence.lengths[order], evidence.starts)
 
 
 def _cost(compared: Comparison) -> float:

@@ -178,16 +178,7 @@ def _describe(fit: CalibrationFit, found: Calibration, before: Sequence[Array]) 
     for c, own in enumerate(fit.fits):
         at = slice(c * fit.per_camera, c * fit.per_camera + 6)
         covariances.append(pose_covariance(own, found.X_CW[c], covariance[at, at]))
-        growth = math.exp(found.log_focal[c])
-        camera = own.frames.camera
-        cameras.append(
-            replace(
-                camera,
-                X_WC=np.linalg.inv(found.X_CW[c]),
-                focal_x=growth * camera.focal_x,
-                focal_y=growth * camera.focal_y,
-            )
-        )
+        cameras.append(own.placed(found.X_CW[c], float(found.log_focal[c])))
         if fit.per_camera > 6:
             focal[c] = math.sqrt(covariance[c * fit.per_camera + 6, c * fit.per_camera + 6])
     after = _shares(fit, found)

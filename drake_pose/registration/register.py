@@ -32,6 +32,7 @@ from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.start_poses import (
     E_total,
     areas,
+    intersection_over_union,
     place_by_bounds,
     spread_rotations,
 )
@@ -186,11 +187,7 @@ class CameraSearch:
                 f"camera '{camera.name}': no frame shows the body; give masks and joint positions "
                 "of one or more frames"
             )
-        fine = CameraFit(self._posed(self._body.few, camera, frames), _FINE_SPACING)
-        last = CameraFit(self._posed(self._body.all, camera, frames), _LAST_SPACING)
-        looks = self._search(camera, frames)
-        fitted = [last.fit(fine.fit(X_CW, _FINE), _LAST) for X_CW in looks]
-        return self._describe(last, _distinct(last.frames, fitted))
+        return self._fitted(camera, frames, self._search(camera, frames))
 
     def refine(self, camera: PinholeCamera, frames: Sequence[PosedFrame]) -> RegisteredCamera:
         """Finds the camera's pose near that which it has; alternatives are not looked for.
@@ -202,9 +199,16 @@ class CameraSearch:
         Raises:
             MaskError: a mask of another size than the camera's picture, or an empty one.
         """
+        return self._fitted(camera, frames, [camera.X_CW])
+
+    def _fitted(
+        self, camera: PinholeCamera, frames: Sequence[PosedFrame], looks: Sequence[Array]
+    ) -> RegisteredCamera:
+        """The best of the poses that are fitted from some X_CW (4, 4), and those as good."""
         fine = CameraFit(self._posed(self._body.few, camera, frames), _FINE_SPACING)
         last = CameraFit(self._posed(self._body.all, camera, frames), _LAST_SPACING)
-        return self._describe(last, [last.fit(fine.fit(camera.X_CW, _FINE), _LAST)])
+        fitted = [last.fit(fine.fit(X_CW, _FINE), _LAST) for X_CW in looks]
+        return self._describe(last, _distinct(last.frames, fitted))
 
     def _posed(
         self, outlines: Sequence[Outline], camera: PinholeCamera, frames: Sequence[PosedFrame]
@@ -236,8 +240,7 @@ class CameraSearch:
         shares = frame_shares(CalibrationFit([fit], []), best)
         agree = agreeing(shares)
         found = areas(fit.frames, best.X_CW, np.inf)[0]
-        body, mask, both = found.T
-        iou = both / np.maximum(body + mask - both, 1.0)
+        iou = intersection_over_union(found)
         rows = zip(fit.frames.frames, E_total(found), iou, shares, agree, strict=True)
         misfits = [
             FrameMisfit(frame.name, float(off), float(one), float(share), bool(agrees))

@@ -158,3 +158,9 @@ def E_total(found: Array) -> Array:
     """(...) the area that is in body or silhouette alone, over the silhouette's; found (..., 3)."""
     body, mask, both = np.moveaxis(found, -1, 0)
     return np.asarray((body + mask - 2.0 * both) / np.maximum(mask, 1.0))
+
+
+def intersection_over_union(found: Array) -> Array:
+    """(...) of body and silhouette; found (..., 3) of areas."""
+    body, mask, both = np.moveaxis(found, -1, 0)
+    return np.asarray(both / np.maximum(body + mask - both, 1.0))

@@ -6,29 +6,17 @@ import cv2
 import numpy as np
 import pytest
 
-from drake_pose.body import ArticulatedModel, load_model
+from drake_pose.body import ArticulatedModel
 from drake_pose.camera import PinholeCamera
 from drake_pose.errors import MaskError, SettingsError
 from drake_pose.registration.contradictions import Audit, AuditSettings, Finding, audit_frames
 from drake_pose.registration.freed_frames import FrameFreer, SeenFrame
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.silhouette import LabelRenderer
-from tests.matching.arms import arm_cameras, arm_urdf
+from tests.matching.arms import arm_cameras
 
 COUNT = 8
 WRONG = 3
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> ArticulatedModel:
-    path = tmp_path_factory.mktemp("arm") / "arm.urdf"
-    path.write_text(arm_urdf())
-    return load_model(path)
-
-
-@pytest.fixture(scope="module")
-def body(model: ArticulatedModel) -> RegistrationBody:
-    return RegistrationBody(model.pose_tree())
 
 
 @pytest.fixture(scope="module")

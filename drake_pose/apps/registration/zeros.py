@@ -17,7 +17,7 @@ from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.registration.joint_zeros import JointCalibration, calibrate_joints
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import FrameMisfit, RegisteredCamera, RegistrationBody
-from drake_pose.registration.start_poses import E_total, areas
+from drake_pose.registration.start_poses import E_total, areas, intersection_over_union
 
 ALL = "all"
 
@@ -59,8 +59,7 @@ def find_zeros(
 def _misfits(frames: PosedFrames, before: RegisteredCamera) -> tuple[FrameMisfit, ...]:
     """How well the frames fit now; which of them agree is as it was found."""
     found = areas(frames, frames.camera.X_CW[None], np.inf)[0]
-    body, mask, both = found.T
-    iou = both / np.maximum(body + mask - both, 1.0)
+    iou = intersection_over_union(found)
     return tuple(
         replace(one, E_total=float(off), iou=float(share))
         for one, off, share in zip(before.frames, E_total(found), iou, strict=True)

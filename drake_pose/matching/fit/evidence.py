@@ -64,6 +64,19 @@ def pack_evidence(edges: Sequence[EdgePoints]) -> Evidence:
     )
 
 
+def widened(evidence: Evidence, widths: Array) -> Evidence:
+    """The edges of silhouettes that are wider (c,) on all sides [pixel], or narrower."""
+    counts = np.diff(evidence.starts)
+    uv = evidence.uv + np.repeat(widths, counts)[:, None] * evidence.normals
+    order = np.concatenate(
+        [
+            begin + np.argsort(uv[begin:end, 1], kind="stable")
+            for begin, end in zip(evidence.starts[:-1], evidence.starts[1:], strict=True)
+        ]
+    )
+    return Evidence(uv[order], evidence.normals[order], evidence.lengths[order], evidence.starts)
+
+
 def find_edge_points(region: Mask, spacing: float) -> EdgePoints:
     """Points of a silhouette's edge, holes included; the picture's border is no edge.
 

@@ -15,6 +15,8 @@ from drake_pose.version import VERSION
 
 if TYPE_CHECKING:
     from drake_pose.apps.estimate.scene import SceneEstimate, estimate_scene
+    from drake_pose.apps.masks.masks import SceneMasks, make_masks
+    from drake_pose.apps.masks.settings import MaskSettings
     from drake_pose.apps.settings import EstimateSettings
     from drake_pose.body import bundled_model, load_model
     from drake_pose.camera import load_cameras
@@ -24,22 +26,28 @@ __version__ = VERSION
 
 _HOMES = {
     "EstimateSettings": "apps.settings",
+    "MaskSettings": "apps.masks.settings",
     "SceneEstimate": "apps.estimate.scene",
+    "SceneMasks": "apps.masks.masks",
     "bundled_model": "body",
     "estimate_scene": "apps.estimate.scene",
     "load_cameras": "camera",
     "load_model": "body",
     "load_scene": "silhouette",
+    "make_masks": "apps.masks.masks",
 }
 
 __all__ = [
     "EstimateSettings",
+    "MaskSettings",
     "SceneEstimate",
+    "SceneMasks",
     "bundled_model",
     "estimate_scene",
     "load_cameras",
     "load_model",
     "load_scene",
+    "make_masks",
 ]
 
 # Read by Drake's renderer when pydrake is first imported: without it a process that forks after a

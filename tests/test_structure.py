@@ -56,6 +56,7 @@ MAY_KNOW_INSIDE = {
         "areas": {"pictures"},
         "contours": {"areas"},
         "bits": {"areas", "contours"},
+        "segmentation": set(),
     },
     "matching": {
         ".": set(),
@@ -99,6 +100,7 @@ MAY_KNOW_INSIDE = {
         "demo": {"estimate", "results"},
         "registration": {"estimate", "results"},
         "experiments": {"results"},
+        "masks": {"results"},
         "live": {"experiments", "estimate", "results"},
         "cluster": {"live"},
         "batch": {"cluster", "estimate", "results"},
@@ -117,6 +119,7 @@ MAY_KNOW_INSIDE = {
             "cluster",
             "live",
             "experiments",
+            "masks",
             "registration",
             "estimate",
             "results",

@@ -43,6 +43,7 @@ from drake_pose.apps.commands.estimate_options import (
 )
 from drake_pose.apps.commands.kameda import kameda
 from drake_pose.apps.commands.live import empty_room
+from drake_pose.apps.commands.masks import masks
 from drake_pose.apps.commands.register import register
 from drake_pose.apps.commands.shimada import shimada
 from drake_pose.apps.commands.terminal import (
@@ -278,6 +279,7 @@ app.command(name="audit", help=help_texts.AUDIT)(audit)
 app.command(name="batch", help=help_texts.BATCH)(batch)
 app.command(name="capture", help=help_texts.CAPTURE)(capture)
 app.command(name="empty-room", help=help_texts.EMPTY_ROOM)(empty_room)
+app.command(name="masks", help=help_texts.MASKS)(masks)
 app.command(name="register", help=help_texts.REGISTER)(register)
 app.command(name="walk", help=help_texts.WALK)(walk)
 reproduce_app.command(name="kameda", help=help_texts.KAMEDA)(kameda)

@@ -103,7 +103,8 @@ def test_command_line_examples_use_options_that_exist(words: list[str]) -> None:
 
 def test_options_named_in_the_text_exist() -> None:
     commands = [
-        [command] for command in ("estimate", "register", "capture", "batch", "walk", "calibrate")
+        [command]
+        for command in ("estimate", "register", "masks", "capture", "batch", "walk", "calibrate")
     ]
     commands += [["reproduce", paper] for paper in ("kameda", "shimada", "date")]
     shown = [CliRunner().invoke(app, [*one, "--help"], env=ENVIRONMENT) for one in commands]

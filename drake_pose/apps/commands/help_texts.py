@@ -173,6 +173,29 @@ Files in DIR: summary.json; overlay/<camera>/<frame>.png of the frames that cont
       --joints ../shared/data/franka_one_view/joint_angles.csv
 """)
 
+MASKS = _help(r"""
+Make a scene of masks: of masks that other tools wrote, as estimate reads them.
+
+Masks of other tools are COCO files (polygons and run lengths), labelme files, PNG pictures with a
+palette, with an alpha channel or with probabilities (8 or 16 bits, from one half on), and black and
+white videos.
+
+Files in SCENE: masks/<camera>/<frame>.png; cameras.yaml and scene.yaml, those of SOURCE, or what a
+video says; overlay/<camera>/<frame>.jpg, the pictures with the masks' outlines; summary.json, each
+mask's area, refusal and warnings. A mask that is empty or full is not written, but named; one of
+two patches, or along most of the picture's border, is named. Where no mask is good nothing is
+written (exit status 1).
+
+[bold]What an annotator drew in COCO format, robot and gripper together:[/bold]
+
+    drake-pose masks annotations.json --out scene --cameras cameras.yaml \
+      --class robot --class gripper
+
+[bold]Probabilities that a network wrote, as pictures images/<camera>/<frame>.png:[/bold]
+
+    drake-pose masks probabilities --out scene --pixels probability --largest
+""")
+
 REPRODUCE = "Run a paper's experiment and show its figures beside ours."
 
 KAMEDA = _help("""

@@ -1,0 +1,118 @@
+"""The command `drake-pose masks`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from drake_pose.apps.commands.estimate_options import JsonOption
+from drake_pose.apps.commands.terminal import (
+    errors_as_messages,
+    print_json,
+    usage_errors,
+    warn,
+)
+
+if TYPE_CHECKING:
+    from drake_pose.apps.masks.masks import SceneMasks
+
+_GIVEN = "Masks of other tools"
+
+SourceArgument = Annotated[
+    Path,
+    typer.Argument(
+        metavar="SOURCE",
+        help="Folder with images/<camera>/<frame>.png or .jpg, or videos/<camera>.mp4, or pictures "
+        "of a single camera; a picture, a video; annotations of COCO or labelme (.json).",
+    ),
+]
+SceneOutOption = Annotated[
+    Path,
+    typer.Option("--out", "-o", metavar="SCENE", help="Folder for the scene; new or empty."),
+]
+CamerasOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="Camera file that the scene gets. Default: SOURCE/cameras.yaml, if it exists.",
+    ),
+]
+ClassOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--class",
+        metavar="NAME",
+        help="Class that is the object, by name or number; repeat for several; all: each but the "
+        "background. Default: the only one.",
+        rich_help_panel=_GIVEN,
+    ),
+]
+PixelsOption = Annotated[
+    str,
+    typer.Option(
+        metavar="KIND",
+        help="What pixels of masks' pictures mean: classes, alpha, probability (from one half on); "
+        "auto: as the file tells.",
+        rich_help_panel=_GIVEN,
+    ),
+]
+LargestOption = Annotated[
+    bool, typer.Option("--largest", help="Keep only the largest patch of each mask.")
+]
+OutlineOption = Annotated[
+    bool,
+    typer.Option(
+        "--overlay/--no-overlay",
+        help="Write the pictures with the masks' outlines, overlay/<camera>/<frame>.jpg.",
+    ),
+]
+
+
+def masks(
+    source: SourceArgument,
+    out: SceneOutOption,
+    cameras: CamerasOption = None,
+    class_: ClassOption = None,
+    pixels: PixelsOption = "auto",
+    largest: LargestOption = False,
+    overlay: OutlineOption = True,
+    json: JsonOption = False,
+) -> None:
+    """See help_texts.MASKS."""
+    with errors_as_messages():
+        from drake_pose.apps.commands.report import count_progress
+        from drake_pose.apps.masks.masks import make_masks
+        from drake_pose.apps.masks.settings import MaskSettings
+
+        with usage_errors():
+            settings = MaskSettings(
+                pixels=pixels,  # type: ignore[arg-type]  # It is checked there.
+                classes=tuple(class_ or ()),
+                largest=largest,
+                cameras=cameras,
+            )
+        with count_progress("masks", None) as advance:
+            result = make_masks(source, out, settings, overlay=overlay, on_mask=advance)
+        for text in result.warnings:
+            warn(text)
+        if json:
+            print_json(result.summary)
+        else:
+            _print(result)
+
+
+def _print(result: SceneMasks) -> None:
+    """How many masks each camera has, then where they are."""
+    from rich.markup import escape
+
+    from drake_pose.apps.commands.report import output_console
+
+    console = output_console()
+    for name, frames in result.summary["cameras"].items():
+        good = [one["area"] for one in frames.values() if "area" in one]
+        text = f"{len(good)} masks of {len(frames)} pictures"
+        text += f", {min(good)} to {max(good)} pixels" if good else ""
+        console.print(f"{escape(name or 'camera'):<14} {text}")
+    console.print(f"scene          {escape(str(result.folder))}", soft_wrap=True)

@@ -1,0 +1,1 @@
+"""Masks for a scene: from other tools, or found in pictures."""

@@ -1,0 +1,1 @@
+"""Masks of an object in pictures: given by other tools, or found."""

@@ -13,7 +13,12 @@ from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex
 
 from drake_pose.body.files.parsing import ModelSource, limit_kinds
 from drake_pose.body.files.safety import check_in_child
-from drake_pose.body.files.urdf_shape import Factors, stretched, without_visuals
+from drake_pose.body.files.urdf_shape import (
+    Factors,
+    stretched,
+    with_shifted_joints,
+    without_visuals,
+)
 from drake_pose.body.limits import describe_positions
 from drake_pose.body.parsed_model import ParsedModel, link_names
 from drake_pose.body.surfaces.mesh import TriangleMesh
@@ -93,9 +98,20 @@ class ArticulatedModel(ParsedModel):
         ]
         return self._changed(stretched(self._urdf_text(), factors), skin)
 
+    def with_shifted_joints(self, shifts: Mapping[str, Sequence[float]]) -> "ArticulatedModel":
+        """The same with some joints elsewhere on their parent links, whose looks stay.
+
+        Args:
+            shifts: (3,) by joint, along the axes of its parent link's frame [m].
+
+        Raises:
+            ModelError: the file is no URDF.
+        """
+        return self._changed(with_shifted_joints(self._urdf_text(), shifts), self.skin)
+
     @property
     def changes_shape(self) -> bool:
-        """Whether ``without`` and ``stretched`` can change it: whether it is a URDF."""
+        """Whether the methods above can be called, which a URDF allows."""
         return self._source.kind == "urdf"
 
     def _urdf_text(self) -> str:

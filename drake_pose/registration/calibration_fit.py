@@ -26,8 +26,9 @@ _STEPS = StepSettings(longest=0.3, damping=1e-2, even_damping=1e-6)
 _WIDEST, _WIDTH_STEP = 6.0, 0.25
 # A pose has six parameters; with the focal length a camera has seven.
 _POSE = len(POSE_NAMES)
-# What is known of zeros [rad or m] and of the logarithm of a focal length beforehand: deviations.
-ZERO_DEVIATION, FOCAL_DEVIATION = 0.2, 0.1
+# What is known beforehand of zeros [rad or m] and the logarithms of lengths, and of the logarithms
+# of focal lengths: deviations.
+CONSTANT_DEVIATION, FOCAL_DEVIATION = 0.2, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,24 +40,25 @@ class Calibration:
         widths: for each camera (frames,) by how much each frame's silhouette is too wide on all
             sides [pixel]; 0 for frames that did not count.
         log_focal: (cameras,) the logarithms of the focal lengths' growth.
-        zeros: (k,) what is added to the encoders' positions of some joints [rad or m].
+        constants: (k,) what is added to the encoders' positions of some joints [rad or m], and to
+            the logarithms of some links' lengths, in all frames.
     """
 
     X_CW: Array
     widths: tuple[Array, ...]
     log_focal: Array
-    zeros: Array
+    constants: Array
 
 
 def start_calibration(
-    fits: Sequence[CameraFit], X_CW: Sequence[Array], zeros: int = 0
+    fits: Sequence[CameraFit], X_CW: Sequence[Array], constants: int = 0
 ) -> Calibration:
     """Cameras at some poses, all else as it is given."""
     return Calibration(
         np.array(X_CW),
         tuple(np.zeros(len(fit.values)) for fit in fits),
         np.zeros(len(fits)),
-        np.zeros(zeros),
+        np.zeros(constants),
     )
 
 
@@ -66,14 +68,15 @@ class CalibrationFit:
     Attributes:
         fits: the cameras.
         which: for each camera the frames that count.
-        zeros: (k,) the values of the pose tree whose zeros are unknown.
+        constants: (k,) the body's parameters to which an unknown constant is added in all frames.
         per_camera: so many unknowns each camera has.
-        names: of the shared unknowns: those of each camera, then the zeros.
+        names: of the shared unknowns: those of each camera, then the constants.
 
     Args:
         fits: the cameras.
         which: for each camera the frames that count.
-        zeros: (k,) the values of the pose tree whose zeros are unknown.
+        constants: (k,) the body's parameters to which an unknown constant is added in all frames:
+            values of the pose tree, whose zeros are unknown, and lengths.
         focal: whether the cameras' focal lengths are unknown.
     """
 
@@ -81,25 +84,24 @@ class CalibrationFit:
         self,
         fits: Sequence[CameraFit],
         which: Sequence[Indices],
-        zeros: Sequence[int] = (),
+        constants: Sequence[int] = (),
         focal: bool = False,
     ) -> None:
         self.fits, self.which = tuple(fits), tuple(which)
-        self.zeros = np.array(zeros, dtype=np.intp)
+        self.constants = np.array(constants, dtype=np.intp)
         self.per_camera = _POSE + focal
-        names = self.fits[0].frames.kinematics.names
         self.names = (
             *(
                 f"{fit.frames.camera.name}.{name}"
                 for fit in fits
                 for name in CAMERA_NAMES[: self.per_camera]
             ),
-            *(names[k] for k in self.zeros),
+            *(self.fits[0].names[k] for k in self.constants),
         )
         cameras = [FOCAL_DEVIATION**-2 * (k == _POSE) for k in range(self.per_camera)] * len(
             self.fits
         )
-        self.information = np.array([*cameras, *[ZERO_DEVIATION**-2] * len(self.zeros)])
+        self.information = np.array([*cameras, *[CONSTANT_DEVIATION**-2] * len(self.constants)])
 
     def fit(self, start: Calibration, rounds: Sequence[Round]) -> Calibration:
         """Fits all from where it starts.
@@ -132,7 +134,7 @@ class CalibrationFit:
         fitted = [np.zeros(len(fit.values)) for fit in self.fits]
         for (c, k), width in zip(rows, found.own[:, 0], strict=True):
             fitted[c][k] = width
-        return Calibration(now.X_CW, tuple(fitted), now.log_focal, now.zeros)
+        return Calibration(now.X_CW, tuple(fitted), now.log_focal, now.constants)
 
     def motions(self, now: Calibration, camera: int, dense: Array) -> Array:
         """(nodes, u, 12) the affine motions that the shared unknowns give to the nodes.
@@ -140,20 +142,20 @@ class CalibrationFit:
         Args:
             now: the unknowns.
             camera: in whose picture.
-            dense: (nodes, m, 12) those that the pose tree's values give.
+            dense: (nodes, n, 12) those that the body's parameters give.
         """
         fit = self.fits[camera]
         found = np.zeros((len(dense), len(self.names), 12))
         own = fit.motions(now.X_CW[camera], now.log_focal[camera])
         first = camera * self.per_camera
         found[:, first : first + self.per_camera] = own[: self.per_camera]
-        found[:, len(self.fits) * self.per_camera :] = dense[:, self.zeros]
+        found[:, len(self.fits) * self.per_camera :] = dense[:, self.constants]
         return found
 
     def values(self, now: Calibration, camera: int, frame: int) -> Array:
-        """(m,) of the pose tree in a frame, zeros added."""
+        """(n,) the body's parameters in a frame, constants added."""
         values = self.fits[camera].values[frame].copy()
-        values[self.zeros] += now.zeros
+        values[self.constants] += now.constants
         return values
 
     def _moved(self, start: Calibration, by: Array) -> Calibration:
@@ -163,15 +165,15 @@ class CalibrationFit:
             for fit, X_CW, part in zip(self.fits, start.X_CW, cameras, strict=True)
         ]
         focal = start.log_focal + (cameras[:, _POSE] if self.per_camera > _POSE else 0.0)
-        zeros = start.zeros + by[cameras.size :]
-        return Calibration(np.array(poses), start.widths, focal, zeros)
+        constants = start.constants + by[cameras.size :]
+        return Calibration(np.array(poses), start.widths, focal, constants)
 
     def _off(self, now: Calibration) -> Array:
         """(u,) how far the shared unknowns are from what is known beforehand."""
         cameras = np.zeros((len(self.fits), self.per_camera))
         if self.per_camera > _POSE:
             cameras[:, _POSE] = now.log_focal
-        return np.concatenate([cameras.ravel(), now.zeros])
+        return np.concatenate([cameras.ravel(), now.constants])
 
     def _equations(
         self, now: Calibration, camera: int, frame: int, width: float, step: Round

@@ -9,11 +9,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.body.tree.joint_offsets import JointOffset
 from drake_pose.camera import PinholeCamera
 from drake_pose.matching.fit.camera_sums import Views
 from drake_pose.matching.fit.contour_fit import Comparison, ContourFit, Noise, pack_cameras
 from drake_pose.matching.fit.evidence import widened
 from drake_pose.matching.fit.frames_fit import FramesFit
+from drake_pose.matching.fit.lengthened_body import LengthenedBody
 from drake_pose.matching.fit.levenberg_marquardt import Round, StepSettings
 from drake_pose.matching.fit.parameters import CAMERA_NAMES, CameraParameters
 from drake_pose.matching.fit.unknowns import choose
@@ -32,21 +34,28 @@ class CameraFit:
 
     Attributes:
         frames: what the camera sees.
-        values: (frames, m) of the pose tree.
+        values: (frames, n) of the pose tree; and lengths of links, which are 0.
+        names: of these n parameters of the body.
         noise: what a point of contour is worth: a pixel of it counts one.
         contours: compares contours and edges.
 
     Args:
         frames: what the camera sees.
         spacing: from one point of a silhouette's edge to the next [root of the area].
+        offsets: joints whose places on their links are unknown.
     """
 
-    def __init__(self, frames: PosedFrames, spacing: float) -> None:
+    def __init__(
+        self, frames: PosedFrames, spacing: float, offsets: Sequence[JointOffset] = ()
+    ) -> None:
         self.frames = frames
-        self.values = np.array([frame.values for frame in frames.frames])
+        body = LengthenedBody(frames.kinematics, frames.outlines, offsets) if offsets else None
+        self.names = frames.kinematics.names if body is None else body.names
+        self.values = np.zeros((len(frames.frames), len(self.names)))
+        self.values[:, : len(frames.kinematics.names)] = [one.values for one in frames.frames]
         self.noise = Noise(deviation=1.0, correlation=0.5 / frames.size**3)
         self.contours = ContourFit(
-            frames.kinematics, frames.outlines, self.noise, _STEPS, pixels=frames.size
+            frames.kinematics, frames.outlines, self.noise, _STEPS, frames.size, body
         )
         self._evidence = frames.evidence(max(1.0, round(spacing * frames.size)))
 
@@ -82,7 +91,7 @@ class CameraFit:
             frame: which.
             step: scale and spacing.
             width: the silhouette is too wide by so much on all sides [pixel].
-            values: (m,) of the pose tree; None: the frame's own.
+            values: (n,) the body's parameters; None: the frame's own.
             log_focal: the logarithm of the focal length's growth.
         """
         views = self._views(X_CW, frame, width, log_focal)

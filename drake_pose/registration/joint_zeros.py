@@ -1,7 +1,9 @@
-"""Whether the zeros of joints are right: constants added to the encoders' readings in all frames.
+"""Whether the zeros of joints and the lengths of links are right, which are the same in all frames.
 
-They are fitted together with the cameras' poses. What turns with the camera, such as the zero of a
-first joint whose base looks alike from all sides, cannot be told, and is named instead of guessed.
+A zero is added to an encoder's readings; a length is a factor of a link's joints' distances from
+its own. They are fitted together with the cameras' poses. What turns with the camera, such as the
+zero of a first joint whose base looks alike from all sides, cannot be told, and is named instead of
+guessed.
 """
 
 from __future__ import annotations
@@ -14,12 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtr, stdtrit
 
+from drake_pose.body import PoseTree
+from drake_pose.body.tree.joint_offsets import joint_offsets
 from drake_pose.camera import PinholeCamera
 from drake_pose.errors import RegistrationError, UnknownNameError
+from drake_pose.matching.fit.lengthened_body import length_name
 from drake_pose.matching.fit.levenberg_marquardt import Round
 from drake_pose.registration.agreement import agreeing, frame_shares
 from drake_pose.registration.calibration_fit import (
-    ZERO_DEVIATION,
+    CONSTANT_DEVIATION,
     Calibration,
     CalibrationFit,
     start_calibration,
@@ -38,9 +43,9 @@ _ROUNDS = (
 )
 _SPACING = 1.0 / 300.0
 _AGAIN = 2
-# A zero that is no better known than this share of what it was beforehand is not determined.
+# What is no better known than this share of what it was beforehand is not determined.
 _DETERMINED = 0.2
-# What a zero goes with is correlated with it by more.
+# What a constant goes with is correlated with it by more.
 _GOES_WITH = 0.9
 # Each picture tells how large errors are by so many motions.
 _PICTURE_MOTIONS = 6
@@ -48,13 +53,13 @@ _LEVEL = 0.05
 
 
 @dataclass(frozen=True)
-class JointZero:
-    """What is added to an encoder's positions.
+class KinematicParameter:
+    """What is added to an encoder's positions, or by what share of it a link is longer.
 
     Args:
-        name: of the position.
-        value: what is to be added [rad or m]; 0 where it is not determined.
-        deviation: its standard deviation [rad or m]; infinite where it is not determined.
+        name: of the position or link.
+        value: what is to be added [rad, m or 1]; 0 where it is not determined.
+        deviation: its standard deviation; infinite where it is not determined.
         low, high: the ends of its 95 % interval.
         significant: whether it is not 0: by chance one or more of all that were asked for would
             seem so in one of twenty calibrations.
@@ -77,11 +82,12 @@ class JointZero:
 
 @dataclass(frozen=True, eq=False)
 class JointCalibration:
-    """Zeros, and the cameras with them.
+    """Zeros and lengths, and the cameras with them.
 
     Args:
         zeros: of the joints that were asked for.
-        cameras: with the poses and focal lengths that fit these zeros.
+        lengths: of the links that were asked for.
+        cameras: with the poses and focal lengths that fit these.
         covariances: (cameras, 6, 6) of their poses' errors: a rotation vector [rad] and a shift [m]
             in the world.
         focal_deviations: (cameras,) standard deviations of focal lengths, as shares of them; 0
@@ -89,11 +95,33 @@ class JointCalibration:
         gains: (cameras,) by how much the share of the contours that fits grew.
     """
 
-    zeros: tuple[JointZero, ...]
+    zeros: tuple[KinematicParameter, ...]
+    lengths: tuple[KinematicParameter, ...]
     cameras: tuple[PinholeCamera, ...]
     covariances: Array
     focal_deviations: Array
     gains: Array
+
+
+def links_with_length(tree: PoseTree) -> tuple[str, ...]:
+    """The links that carry a joint at a distance from their own."""
+    return tuple(dict.fromkeys(one.link for one in joint_offsets(tree)))
+
+
+def require_known(tree: PoseTree, names: Sequence[str], lengths: Sequence[str]) -> None:
+    """Refuses names of which there is no position, or no link with a length.
+
+    Raises:
+        UnknownNameError: says which there are.
+    """
+    positions = [name for node in tree.nodes for name in node.value_names]
+    for what, asked, known in (
+        ("joint", names, positions),
+        ("link with a length", lengths, links_with_length(tree)),
+    ):
+        for name in asked:
+            if name not in known:
+                raise UnknownNameError(what, name, known, str(tree.model.path))
 
 
 def calibrate_joints(
@@ -102,62 +130,66 @@ def calibrate_joints(
     frames: Sequence[Sequence[PosedFrame]],
     names: Sequence[str],
     focal: bool = False,
+    lengths: Sequence[str] = (),
 ) -> JointCalibration:
-    """The zeros of some joints, fitted together with the cameras' poses.
+    """The zeros of some joints and lengths of links, fitted together with the cameras' poses.
 
     Args:
         body: the body.
-        cameras: as they were registered with zeros of 0.
+        cameras: as they were registered with the model's zeros and lengths.
         frames: what each of them sees.
         names: of the positions whose zeros are asked for.
         focal: whether the cameras' focal lengths are asked for, too.
+        lengths: the links whose lengths are asked for.
 
     Raises:
-        UnknownNameError: a name that is no position of the body's.
-        RegistrationError: no camera, or fewer frames than zeros.
+        UnknownNameError: a name that is no position of the body's, or no link with a length.
+        RegistrationError: no camera, or fewer frames than zeros and lengths.
     """
-    known = body.kinematics.names
-    for name in names:
-        if name not in known:
-            raise UnknownNameError("joint", name, known, str(body.tree.model.path))
+    require_known(body.tree, names, lengths)
     count = sum(len(one) for one in frames)
-    if not cameras or count < 2 or count < len(names):
+    if not cameras or count < 2 or count < len(names) + len(lengths):
         raise RegistrationError(
-            f"{len(names)} joints' zeros need as many frames of differing poses, and two or more; "
-            f"there are {count}: give more frames, or name fewer joints"
+            f"{len(names)} joints' zeros and {len(lengths)} links' lengths need as many frames of "
+            f"differing poses, and two or more; there are {count}: give more frames, or name fewer"
         )
+    moved = [one for one in joint_offsets(body.tree) if one.link in lengths]
     fits = [
-        CameraFit(PosedFrames(body.kinematics, body.all, one.camera, own), _SPACING)
+        CameraFit(PosedFrames(body.kinematics, body.all, one.camera, own), _SPACING, moved)
         for one, own in zip(cameras, frames, strict=True)
     ]
     X_CW = [one.camera.X_CW for one in cameras]
-    zeros = [known.index(name) for name in names]
-    undetermined: dict[str, JointZero] = {}
+    asked = [*names, *(length_name(link) for link in lengths)]
+    told: dict[str, KinematicParameter] = {}
+    sought = asked
     while True:
-        fit, found, before = _fit(fits, X_CW, zeros, focal)
-        calibration = _describe(fit, found, before)
-        open_ones = {one.name: one for one in calibration.zeros if not one.determined}
-        if not open_ones:
+        constants = [fits[0].names.index(name) for name in sought]
+        fit, found, before = _fit(fits, X_CW, constants, focal)
+        covariance = calibration_uncertainty(fit, found).covariance
+        values = _constants(fit, found, covariance)
+        told |= values
+        # The cameras shall fit what is answered: nothing is added where it cannot be told.
+        sought = [name for name in sought if values[name].determined]
+        if len(sought) == len(values):
             break
-        # The cameras shall fit what is answered: zeros of 0 where they cannot be told.
-        undetermined |= open_ones
-        zeros = [k for k in zeros if known[k] not in open_ones]
-    told = {one.name: one for one in calibration.zeros} | undetermined
-    return replace(calibration, zeros=tuple(told[name] for name in names))
+    return _describe(
+        fit, found, covariance, before, [told[name] for name in names],
+        [replace(told[length_name(link)], name=link) for link in lengths],
+    )  # fmt: skip
 
 
 def _fit(
-    fits: Sequence[CameraFit], X_CW: Sequence[Array], zeros: Sequence[int], focal: bool
+    fits: Sequence[CameraFit], X_CW: Sequence[Array], constants: Sequence[int], focal: bool
 ) -> tuple[CalibrationFit, Calibration, list[Array]]:
     """The last fit, what it found, and the shares that fitted before."""
-    found = start_calibration(fits, X_CW, len(zeros))
-    # Zeros that are off let good frames contradict, so all count at first.
-    fit = CalibrationFit(fits, [np.arange(len(one.values)) for one in fits], zeros, focal)
+    found = start_calibration(fits, X_CW, len(constants))
+    # Constants that are off let good frames contradict, so all count at first.
+    fit = CalibrationFit(fits, [np.arange(len(one.values)) for one in fits], constants, focal)
     before = _shares(fit, found)
     for k in range(_AGAIN):
         if k > 0:
             which = [np.flatnonzero(agreeing(one)) for one in _shares(fit, found)]
-            fit = CalibrationFit(fits, which, zeros, focal)
+            fit = CalibrationFit(fits, which, constants, focal)
         found = fit.fit(found, _ROUNDS)
     return fit, found, before
 
@@ -167,13 +199,15 @@ def _shares(fit: CalibrationFit, found: Calibration) -> list[Array]:
     return [frame_shares(fit, found, c) for c in range(len(fit.fits))]
 
 
-def _describe(fit: CalibrationFit, found: Calibration, before: Sequence[Array]) -> JointCalibration:
-    """The zeros with their intervals, and the cameras."""
-    covariance = calibration_uncertainty(fit, found).covariance
-    first = len(fit.names) - len(fit.zeros)
-    pictures = sum(len(which) for which in fit.which)
-    freedom = max(1, _PICTURE_MOTIONS * pictures - len(fit.names))
-    zeros = [_zero(fit, found, covariance, first + k, freedom) for k in range(len(fit.zeros))]
+def _describe(
+    fit: CalibrationFit,
+    found: Calibration,
+    covariance: Array,
+    before: Sequence[Array],
+    zeros: Sequence[KinematicParameter],
+    lengths: Sequence[KinematicParameter],
+) -> JointCalibration:
+    """Zeros and lengths, and the cameras as they fit them."""
     cameras, covariances, focal = [], [], np.zeros(len(fit.fits))
     for c, own in enumerate(fit.fits):
         at = slice(c * fit.per_camera, c * fit.per_camera + 6)
@@ -184,21 +218,38 @@ def _describe(fit: CalibrationFit, found: Calibration, before: Sequence[Array]) 
     after = _shares(fit, found)
     gains = [b.mean() - a.mean() for a, b in zip(before, after, strict=True)]
     return JointCalibration(
-        tuple(zeros), tuple(cameras), np.array(covariances), focal, np.array(gains)
+        tuple(zeros), tuple(lengths), tuple(cameras), np.array(covariances), focal, np.array(gains)
     )
 
 
-def _zero(
-    fit: CalibrationFit, found: Calibration, covariance: Array, index: int, freedom: int
-) -> JointZero:
-    """One zero, its interval, and what it goes with where that is all."""
-    k = index - (len(fit.names) - len(fit.zeros))
+def _constants(
+    fit: CalibrationFit, found: Calibration, covariance: Array
+) -> dict[str, KinematicParameter]:
+    """All constants by name, each with its interval."""
+    pictures = sum(len(which) for which in fit.which)
+    freedom = max(1, _PICTURE_MOTIONS * pictures - len(fit.names))
+    first = len(fit.names) - len(fit.constants)
+    is_length = fit.constants >= len(fit.fits[0].frames.kinematics.names)
+    return {
+        fit.names[first + k]: _constant(fit, covariance, first + k, float(value), freedom, one)
+        for k, (value, one) in enumerate(zip(found.constants, is_length.tolist(), strict=True))
+    }
+
+
+def _constant(
+    fit: CalibrationFit, covariance: Array, index: int, value: float, freedom: int, is_length: bool
+) -> KinematicParameter:
+    """A zero or length with its interval, or what it goes with where that is all."""
     name, deviation = fit.names[index], math.sqrt(covariance[index, index])
-    if deviation > _DETERMINED * ZERO_DEVIATION:
+    if deviation > _DETERMINED * CONSTANT_DEVIATION:
         along = covariance[:, index] / np.sqrt(np.diag(covariance)) / deviation
         gauge = [n for j, n in enumerate(fit.names) if j != index and abs(along[j]) > _GOES_WITH]
-        return JointZero(name, 0.0, math.inf, -math.inf, math.inf, False, tuple(gauge))
-    value = float(found.zeros[k])
+        return KinematicParameter(name, 0.0, math.inf, -math.inf, math.inf, False, tuple(gauge))
     width = float(stdtrit(freedom, 1.0 - 0.5 * _LEVEL)) * deviation
-    chance = 2.0 * float(stdtr(freedom, -abs(value) / deviation)) * len(fit.zeros)
-    return JointZero(name, value, deviation, value - width, value + width, chance < _LEVEL)
+    chance = 2.0 * float(stdtr(freedom, -abs(value) / deviation)) * len(fit.constants)
+    low, middle, high = value - width, value, value + width
+    if is_length:
+        # A length was fitted as a logarithm.
+        deviation *= math.exp(value)
+        low, middle, high = math.expm1(low), math.expm1(middle), math.expm1(high)
+    return KinematicParameter(name, middle, deviation, low, high, chance < _LEVEL)

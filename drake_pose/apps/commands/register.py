@@ -62,6 +62,17 @@ ZerosOption = Annotated[
         rich_help_panel="Estimation",
     ),
 ]
+LengthsOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--lengths",
+        metavar="LINK",
+        help="Find how long this link is, too: a factor, the same in all frames, of the distances "
+        "of the joints that it carries from its own; all: of every link; repeat for several. A "
+        "URDF with the lengths is written.",
+        rich_help_panel="Estimation",
+    ),
+]
 FocalOption = Annotated[
     bool,
     typer.Option(
@@ -101,6 +112,7 @@ def register(
     frame: FrameOption = None,
     hold: HoldOption = None,
     zeros: ZerosOption = None,
+    lengths: LengthsOption = None,
     focal: FocalOption = False,
     suggest: SuggestOption = False,
     keep_out: KeepOutOption = None,
@@ -123,6 +135,7 @@ def register(
             tuple(frame or ()),
             held,
             tuple(zeros or ()),
+            tuple(lengths or ()),
             focal,
             suggest,
             tuple(Box(*ends) for ends in corners),
@@ -177,8 +190,13 @@ def _print(result: SceneRegistration) -> None:
         )
     console.print(frames)
     console.print(table)
-    if zeros := next(iter(result.summary["cameras"].values()))["zeros"]:
-        console.print(_zeros_table(zeros))
+    first = next(iter(result.summary["cameras"].values()))
+    if first["zeros"]:
+        title = "Zeros, to be added to positions"
+        console.print(_parameters_table(first["zeros"], "joint", "zero", title))
+    if first["lengths"]:
+        title = "Lengths, by how much links are longer"
+        console.print(_parameters_table(first["lengths"], "link", "length", title))
     for name, one in result.summary["cameras"].items():
         if one["suggestion"]:
             values = ", ".join(f"{k}={v:.3f}" for k, v in one["suggestion"]["positions"].items())
@@ -190,20 +208,21 @@ def _print(result: SceneRegistration) -> None:
             console.print(f"{label:<14} {escape(str(result.folder / file))}", soft_wrap=True)
 
 
-def _zeros_table(zeros: Mapping[str, Any]) -> Table:
-    """What is to be added to joints' positions."""
+def _parameters_table(parameters: Mapping[str, Any], of: str, what: str, title: str) -> Table:
+    """Zeros of joints, or lengths of links."""
     from rich.markup import escape
     from rich.table import Table
 
-    table = Table("joint", "zero", "95 % interval", "", title="Zeros, to be added to positions")
-    for name, one in zeros.items():
-        unit = "deg" if "value_deg" in one else "mm"
+    table = Table(of, what, "95 % interval", "", title=title)
+    for name, one in parameters.items():
         if not one["determined"]:
             table.add_row(escape(name), "", "", "not determined")
             continue
+        key = next(key for key in one if key.startswith("value_"))
+        unit = key.removeprefix("value_")
         table.add_row(
             escape(name),
-            f"{one[f'value_{unit}']:.3f} {unit}",
+            f"{one[key]:.3f} {'%' if unit == 'percent' else unit}",
             f"{one[f'low_{unit}']:.3f} to {one[f'high_{unit}']:.3f}",
             "significant" if one["significant"] else "as good as 0",
         )

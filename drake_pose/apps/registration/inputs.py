@@ -7,6 +7,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from drake_pose.apps.estimate.inputs import make_tree, select_seen_frames
 from drake_pose.apps.estimate.scene_checks import check_scene, texts_of
 from drake_pose.apps.options import select_frames
@@ -16,12 +18,22 @@ from drake_pose.body import ArticulatedModel, PoseTree, load_model
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera import Camera, PinholeCamera
 from drake_pose.camera.files import load_camera_file
-from drake_pose.errors import CameraError, MaskError, SceneError, UnknownNameError
+from drake_pose.errors import (
+    CameraError,
+    MaskError,
+    SceneError,
+    SettingsError,
+    UnknownNameError,
+)
+from drake_pose.registration.joint_zeros import links_with_length, require_known
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.suggestions import Box
 from drake_pose.silhouette import Scene, load_scene
 
 _CAMERAS = "cameras.yaml"
+
+ALL = "all"
+"""In place of names: of every joint, or of every link."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +46,7 @@ class RegistrationSettings:
         frames: names, or ranges ``FIRST:LAST``; all where empty.
         hold: joints that are not in the table, by name [deg or m].
         zeros: joints whose zeros are asked for, too; "all": those of all that move.
+        lengths: links whose lengths are asked for, too; "all": those of all that have one.
         focal: whether focal lengths are asked for, too.
         suggest: whether a further pose of the robot is asked for where several poses of a camera
             fit equally well.
@@ -45,6 +58,7 @@ class RegistrationSettings:
     frames: tuple[str, ...] = ()
     hold: Mapping[str, float] = field(default_factory=dict)
     zeros: tuple[str, ...] = ()
+    lengths: tuple[str, ...] = ()
     focal: bool = False
     suggest: bool = False
     keep_out: tuple[Box, ...] = ()
@@ -53,7 +67,8 @@ class RegistrationSettings:
     def as_json(self) -> dict[str, Any]:
         """Returns the settings as plain JSON values."""
         packages = {name: str(folder) for name, folder in self.packages.items()}
-        lists = {name: list(getattr(self, name)) for name in ("cameras", "frames", "zeros")}
+        names = ("cameras", "frames", "zeros", "lengths")
+        lists = {name: list(getattr(self, name)) for name in names}
         return {**asdict(self), **lists, "packages": packages}
 
 
@@ -68,6 +83,7 @@ class RegistrationInputs:
         searched: the cameras that are to be found.
         held: the others that have an X_WC.
         frames: what each of these cameras sees, by name.
+        zeros, lengths: the joints and links whose zeros and lengths are to be found.
         left_out: cameras without X_WC that are not to be found.
         warnings: what the user should know of the input.
     """
@@ -78,6 +94,8 @@ class RegistrationInputs:
     searched: tuple[PinholeCamera, ...]
     held: tuple[PinholeCamera, ...]
     frames: Mapping[str, tuple[PosedFrame, ...]]
+    zeros: tuple[str, ...]
+    lengths: tuple[str, ...]
     left_out: tuple[str, ...]
     warnings: tuple[str, ...]
 
@@ -107,7 +125,9 @@ def read_inputs(
         searched = [name for name in searched if name not in unseen]
     model = load_model(model_path, package_paths=settings.packages)
     tree = make_tree(model, EstimateSettings(hold=settings.hold), None)
-    positions = read_known_positions(joints_path, model, TreeKinematics(tree))
+    kinematics = TreeKinematics(tree)
+    zeros, lengths = _select_parameters(model, kinematics, settings)
+    positions = read_known_positions(joints_path, model, kinematics)
     held = [
         camera
         for name, camera in file.cameras.items()
@@ -126,8 +146,28 @@ def read_inputs(
         text for camera in pinholes for text in _check_poses(camera, frames[camera.name], positions)
     ]
     return RegistrationInputs(
-        scene, model, tree, tuple(pinholes), tuple(held), frames, tuple(left_out), tuple(warnings)
-    )
+        scene, model, tree, tuple(pinholes), tuple(held), frames, zeros, lengths, tuple(left_out),
+        tuple(warnings),
+    )  # fmt: skip
+
+
+def _select_parameters(
+    model: ArticulatedModel, kinematics: TreeKinematics, settings: RegistrationSettings
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The joints and links whose zeros and lengths are to be found."""
+    zeros, lengths = settings.zeros, settings.lengths
+    if ALL in zeros:
+        free = np.flatnonzero(kinematics.lower < kinematics.upper)
+        zeros = tuple(kinematics.names[k] for k in free)
+    if ALL in lengths:
+        lengths = links_with_length(kinematics.tree)
+    require_known(kinematics.tree, zeros, lengths)
+    if settings.lengths and not model.changes_shape:
+        raise SettingsError(
+            f"{model.path}: lengths of links are found of URDF models alone, whose joints' origins "
+            "they move; convert the model, or leave --lengths out"
+        )
+    return zeros, lengths
 
 
 def _select_searched(

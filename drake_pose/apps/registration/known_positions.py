@@ -34,7 +34,8 @@ class KnownPositions:
         path: the table.
         kinematics: of the pose tree.
         table: its columns and rows.
-        order: (m,) the column of each value of the pose tree.
+        order: (m,) the column of each value of the pose tree; -1: it is held.
+        held: (m,) the values that are held [rad or m]; others are not looked at.
         warnings: what the user should know of it.
     """
 
@@ -42,6 +43,7 @@ class KnownPositions:
     kinematics: TreeKinematics
     table: TrueAngles
     order: NDArray[np.intp]
+    held: Array
     warnings: tuple[str, ...] = ()
 
     def of(self, frame: str, camera: str) -> Array:
@@ -56,7 +58,7 @@ class KnownPositions:
                 f"{self.path}: has no row of frame '{frame}', which camera '{camera}' has a mask "
                 "of; add the joint positions of that moment, or leave the frame out (--frame)"
             )
-        return np.asarray(values[self.order])
+        return np.where(self.order < 0, self.held, values[self.order])
 
     def are_one_pose(self, rows: Iterable[Array]) -> bool:
         """Whether the joints are at the same place in all of some rows (m,)."""
@@ -76,22 +78,28 @@ def read_known_positions(
         UnknownNameError: the model has no joint of a column's name.
     """
     table = read_true_angles(path, model.position_names)
-    missing = [name for name in kinematics.names if name not in table.names]
+    held = {model.position_names[index] for index in kinematics.tree.held}
+    asked = [name for name in kinematics.names if name not in held]
+    missing = [name for name in asked if name not in table.names]
     if missing:
         raise SceneError(
             f"{path}: has no column for {_joints(missing)} of {model.path.name}; give the position "
             "of every joint in every frame [rad or m], or hold those that did not move: "
             f"--hold {missing[0]}=VALUE [deg or m]"
         )
-    unused = [name for name in table.names if name not in kinematics.names]
+    unused = [name for name in table.names if name not in asked]
     if unused:
         raise SceneError(
             f"{path}: column '{unused[0]}' is a position that is held, or that places the whole "
             "robot in the world; the cameras are found in the world in which the robot stands as "
             "its model's file has it: leave the column out"
         )
-    order = np.array([table.names.index(name) for name in kinematics.names], dtype=np.intp)
-    return KnownPositions(path, kinematics, table, order, _check_units(table, order, kinematics))
+    order = np.array(
+        [table.names.index(name) if name in asked else -1 for name in kinematics.names],
+        dtype=np.intp,
+    )
+    warnings = _check_units(table, order, kinematics)
+    return KnownPositions(path, kinematics, table, order, kinematics.lower, warnings)
 
 
 def _check_units(
@@ -104,7 +112,7 @@ def _check_units(
         order, kinematics.names, kinematics.is_angle, kinematics.lower, kinematics.upper,
         strict=True,
     ):  # fmt: skip
-        if not frames or not np.isfinite([lower, upper]).all():
+        if column < 0 or not frames or not np.isfinite([lower, upper]).all():
             continue
         values = np.array([table.values[frame][column] for frame in frames])
         slack = _OUTSIDE if is_angle else _OUTSIDE_SHARE * (upper - lower)

@@ -19,7 +19,13 @@ from drake_pose.apps.registration.inputs import (
 )
 from drake_pose.apps.registration.misfit import check_focal_length, require_explained
 from drake_pose.apps.registration.result import describe_camera, summarize, write_result
-from drake_pose.apps.registration.zeros import describe_zeros, find_zeros, say_zeros
+from drake_pose.apps.registration.zeros import (
+    corrected_urdf,
+    describe_lengths,
+    describe_zeros,
+    find_zeros,
+    say_zeros,
+)
 from drake_pose.apps.results.folder import require_empty
 from drake_pose.apps.texts import percent
 from drake_pose.camera import Camera, PinholeCamera
@@ -86,9 +92,38 @@ def register_scene(
         require_empty(folder)
     inputs = read_inputs(*paths, settings)
     body = RegistrationBody(inputs.tree)
+    warnings = [*inputs.warnings, *_check_held(inputs, body)]
+    registered, described = _search(inputs, body, settings, warnings, on_camera)
+    urdf = None
+    if settings.zeros or settings.lengths or settings.focal:
+        start = time.perf_counter()
+        registered, corrected, zeros = find_zeros(inputs, settings, body, registered)
+        seconds = (time.perf_counter() - start) / len(registered)
+        described = _describe_again(registered, described, body, zeros, seconds)
+        warnings += say_zeros(zeros)
+        urdf = corrected_urdf(inputs, zeros, folder)
+        inputs = corrected
+    cameras = _placed_cameras(inputs, registered)
+    summary = summarize(paths, settings, described, warnings)
+    if folder is not None:
+        write_result(folder, inputs, cameras, registered, summary, overlay, urdf)
+    return SceneRegistration(cameras, registered, summary, tuple(warnings), folder)
+
+
+def _search(
+    inputs: RegistrationInputs,
+    body: RegistrationBody,
+    settings: RegistrationSettings,
+    warnings: list[str],
+    on_camera: OnCamera | None,
+) -> tuple[dict[str, RegisteredCamera], dict[str, dict[str, Any]]]:
+    """Each camera by itself, and its part of the summary; warnings are added to.
+
+    Raises:
+        RegistrationError: no pose of a camera explains its masks.
+    """
     search = CameraSearch(body)
     registered, described = dict[str, RegisteredCamera](), dict[str, dict[str, Any]]()
-    warnings = [*inputs.warnings, *_check_held(inputs, body)]
     for camera in inputs.searched:
         start = time.perf_counter()
         found = search.register(camera, inputs.frames[camera.name])
@@ -100,18 +135,7 @@ def register_scene(
         warnings += _warnings_of(found)
         if on_camera is not None:
             on_camera(len(registered))
-    zeros: JointCalibration | None = None
-    if settings.zeros or settings.focal:
-        start = time.perf_counter()
-        registered, inputs, zeros = find_zeros(inputs, settings, body, registered)
-        seconds = (time.perf_counter() - start) / len(registered)
-        described = _describe_again(registered, described, body, zeros, seconds)
-        warnings += say_zeros(zeros)
-    cameras = _placed_cameras(inputs, registered)
-    summary = summarize(paths, settings, described, warnings)
-    if folder is not None:
-        write_result(folder, inputs, cameras, registered, summary, overlay, zeros)
-    return SceneRegistration(cameras, registered, summary, tuple(warnings), folder)
+    return registered, described
 
 
 def _suggestion(
@@ -149,12 +173,12 @@ def _describe_again(
     zeros: JointCalibration,
     seconds: float,
 ) -> dict[str, dict[str, Any]]:
-    """The cameras' parts of the summary with the zeros, each of which took so long more [s]."""
-    told = describe_zeros(zeros, body.kinematics)
+    """The cameras' parts of the summary with zeros and lengths, which took so long more [s]."""
+    told = {"zeros": describe_zeros(zeros, body.kinematics), "lengths": describe_lengths(zeros)}
     return {
         name: {
             **describe_camera(found, before[name]["seconds"] + seconds, before[name]["suggestion"]),
-            "zeros": told,
+            **told,
         }
         for name, found in registered.items()
     }

@@ -11,7 +11,6 @@ import yaml
 
 from drake_pose.apps.registration.inputs import RegistrationInputs, RegistrationSettings
 from drake_pose.apps.registration.report import make_registration_report
-from drake_pose.apps.registration.zeros import corrected_urdf
 from drake_pose.apps.results.folder import OVERLAY, REPORT, ResultFolder, without_nan
 from drake_pose.apps.results.overlay import draw_overlay, encode_png
 from drake_pose.apps.results.summary import file_digest, versions
@@ -19,7 +18,6 @@ from drake_pose.apps.texts import percent
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera import Camera
 from drake_pose.camera.files import dump_cameras
-from drake_pose.registration.joint_zeros import JointCalibration
 from drake_pose.registration.register import RegisteredCamera
 from drake_pose.silhouette import LabelRenderer
 
@@ -40,6 +38,7 @@ def describe_camera(
         "families": [{"X_WC": np.asarray(X_WC).tolist()} for X_WC in poses],
         "mean_iou": float(np.mean([frame.iou for frame in found.frames])),
         "zeros": {},
+        "lengths": {},
         "suggestion": suggestion,
         "seconds": seconds,
         "contradictions": list(found.contradictions),
@@ -96,7 +95,7 @@ def write_result(
     registered: Mapping[str, RegisteredCamera],
     summary: Mapping[str, Any],
     overlay: bool,
-    zeros: JointCalibration | None = None,
+    urdf: bytes | None = None,
 ) -> None:
     """Writes the result folder; the camera file comes last, when all else is there.
 
@@ -107,7 +106,7 @@ def write_result(
         registered: the cameras that were found, by name.
         summary: from summarize.
         overlay: whether overlays are written.
-        zeros: what was found of joints' zeros; a URDF is written with them.
+        urdf: the robot with the zeros and lengths that were found.
 
     Raises:
         OutputError: the folder is not empty, or cannot be written.
@@ -116,11 +115,11 @@ def write_result(
     if overlay:
         for found in registered.values():
             _write_overlays(folder, inputs, found)
-    if zeros is not None and zeros.zeros and inputs.model.path.suffix == ".urdf":
-        urdf = corrected_urdf(inputs.model.path, zeros, path)
+    if urdf is not None:
         folder.write(f"{inputs.model.path.stem}_calibrated.urdf", urdf)
     text = yaml.safe_dump(
-        {name: _uncertainty(found) for name, found in registered.items()}, sort_keys=False
+        {name: _uncertainty(found, summary["cameras"][name]) for name, found in registered.items()},
+        sort_keys=False,
     )
     folder.write(REGISTRATION, text.encode())
     folder.write_summary(summary)
@@ -128,8 +127,8 @@ def write_result(
     folder.write(CAMERAS, dump_cameras(cameras).encode())
 
 
-def _uncertainty(found: RegisteredCamera) -> dict[str, Any]:
-    """A camera's part of registration.yaml."""
+def _uncertainty(found: RegisteredCamera, summary: Mapping[str, Any]) -> dict[str, Any]:
+    """A camera's part of registration.yaml, given its part of summary.json."""
     values: dict[str, Any] = without_nan(
         {
             "X_WC": found.camera.X_WC,
@@ -137,6 +136,7 @@ def _uncertainty(found: RegisteredCamera) -> dict[str, Any]:
             "covariance": found.covariance,
             "alternatives": [np.asarray(X_WC) for X_WC in found.alternatives],
             "contradictions": list(found.contradictions),
+            **{name: summary[name] for name in ("zeros", "lengths") if summary[name]},
         }
     )
     return values

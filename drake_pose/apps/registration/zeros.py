@@ -1,4 +1,4 @@
-"""Zeros of joints and focal lengths, asked for beside the cameras' poses."""
+"""Zeros of joints, lengths of links and focal lengths, asked for beside the cameras' poses."""
 
 from __future__ import annotations
 
@@ -11,15 +11,17 @@ from typing import Any
 
 import numpy as np
 
+from drake_pose.apps.estimate.inputs import make_tree
 from drake_pose.apps.registration.inputs import RegistrationInputs, RegistrationSettings
-from drake_pose.body.files.urdf_shape import with_zeros
+from drake_pose.apps.settings import EstimateSettings
+from drake_pose.body import PoseTree
+from drake_pose.body.files.urdf_shape import with_shifted_joints, with_zeros
+from drake_pose.body.tree.joint_offsets import joint_offsets
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.registration.joint_zeros import JointCalibration, calibrate_joints
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import FrameMisfit, RegisteredCamera, RegistrationBody
 from drake_pose.registration.start_poses import E_total, areas, intersection_over_union
-
-ALL = "all"
 
 
 def find_zeros(
@@ -28,21 +30,25 @@ def find_zeros(
     body: RegistrationBody,
     registered: Mapping[str, RegisteredCamera],
 ) -> tuple[dict[str, RegisteredCamera], RegistrationInputs, JointCalibration]:
-    """The cameras, and the frames' positions, with the zeros that were found.
+    """The cameras, and the robot and the frames' positions, with what was found.
 
     Raises:
-        UnknownNameError: there is no such joint.
-        RegistrationError: fewer frames than zeros.
+        RegistrationError: fewer frames than zeros and lengths.
     """
-    kinematics = body.kinematics
-    moving = [kinematics.names[k] for k in np.flatnonzero(kinematics.lower < kinematics.upper)]
-    names = moving if ALL in settings.zeros else list(settings.zeros)
+    names = body.kinematics.names
     cameras = list(registered.values())
     frames = [inputs.frames[one.camera.name] for one in cameras]
-    found = calibrate_joints(body, cameras, frames, names, settings.focal)
-    offsets = np.zeros(len(kinematics.names))
+    found = calibrate_joints(
+        body, cameras, frames, inputs.zeros, settings.focal, lengths=inputs.lengths
+    )
+    offsets = np.zeros(len(names))
     for zero in found.zeros:
-        offsets[kinematics.names.index(zero.name)] = zero.value
+        offsets[names.index(zero.name)] = zero.value
+    model, tree, kinematics = inputs.model, inputs.tree, body.kinematics
+    if shifts := joint_shifts(tree, found):
+        model = model.with_shifted_joints(shifts)
+        tree = make_tree(model, EstimateSettings(hold=settings.hold), None)
+        kinematics = TreeKinematics(tree)
     corrected = dict(inputs.frames)
     result = {}
     for camera, covariance, before in zip(found.cameras, found.covariances, cameras, strict=True):
@@ -53,7 +59,14 @@ def find_zeros(
         corrected[camera.name] = own
         again = _misfits(PosedFrames(kinematics, body.all, camera, own), before)
         result[camera.name] = replace(before, camera=camera, covariance=covariance, frames=again)
-    return result, replace(inputs, frames=corrected), found
+    return result, replace(inputs, model=model, tree=tree, frames=corrected), found
+
+
+def joint_shifts(tree: PoseTree, found: JointCalibration) -> dict[str, list[float]]:
+    """By how much joints stand elsewhere on their links (3,), by name [m]; empty: none does."""
+    longer = {one.name: one.value for one in found.lengths if one.determined}
+    offsets = [one for one in joint_offsets(tree) if one.link in longer]
+    return {one.joint: (longer[one.link] * one.p_L).tolist() for one in offsets}
 
 
 def _misfits(frames: PosedFrames, before: RegisteredCamera) -> tuple[FrameMisfit, ...]:
@@ -85,24 +98,58 @@ def describe_zeros(found: JointCalibration, kinematics: TreeKinematics) -> dict[
     return described
 
 
+def describe_lengths(found: JointCalibration) -> dict[str, Any]:
+    """By how much links are longer, by name; None where it is not determined."""
+    described = {}
+    for one in found.lengths:
+        numbers = {"value": one.value, "sd": one.deviation, "low": one.low, "high": one.high}
+        described[one.name] = {
+            "determined": one.determined,
+            "significant": one.significant,
+            **{
+                f"{key}_percent": 1e2 * value if one.determined else None
+                for key, value in numbers.items()
+            },
+            "gauge": list(one.gauge),
+        }
+    return described
+
+
 def say_zeros(found: JointCalibration) -> list[str]:
-    """What a user should know of the zeros."""
+    """What a user should know of zeros and lengths."""
+    asked = [(f"joint '{one.name}': its zero", one) for one in found.zeros]
+    asked += [(f"link '{one.name}': its length", one) for one in found.lengths]
     texts = []
-    for zero in found.zeros:
-        if not zero.determined:
-            goes_with = f" it goes with {', '.join(zero.gauge)};" if zero.gauge else ""
+    for what, one in asked:
+        if not one.determined:
+            goes_with = f" it goes with {', '.join(one.gauge)};" if one.gauge else ""
             texts.append(
-                f"joint '{zero.name}': its zero is not determined by these silhouettes and was "
-                f"left as it is;{goes_with} frames in which the robot stands otherwise, or a part "
-                "of it that does not move with this joint, would tell it"
+                f"{what} is not determined by these silhouettes and was left as it is;{goes_with} "
+                "frames in which the robot stands otherwise, or a part of it that does not move "
+                "with this one, would tell it"
             )
     return texts
 
 
-def corrected_urdf(model: Path, found: JointCalibration, folder: Path) -> bytes:
-    """The model's URDF with the zeros in its joints' origins; its meshes as seen from a folder."""
+def corrected_urdf(
+    inputs: RegistrationInputs, found: JointCalibration, folder: Path | None
+) -> bytes | None:
+    """The URDF with zeros and lengths in its joints' origins; its meshes as seen from a folder.
+
+    Args:
+        inputs: with the model as it was read.
+        found: zeros and lengths.
+        folder: where it is to be written; None: nowhere.
+
+    Returns:
+        None where it is not asked for, or the model is no URDF.
+    """
+    model, tree = inputs.model.path, inputs.tree
+    if folder is None or not inputs.model.changes_shape or not (found.zeros or found.lengths):
+        return None
     zeros = {zero.name: zero.value for zero in found.zeros if zero.determined}
-    root = ElementTree.fromstring(with_zeros(model.read_text(encoding="utf-8"), zeros))
+    text = with_zeros(model.read_text(encoding="utf-8"), zeros)
+    root = ElementTree.fromstring(with_shifted_joints(text, joint_shifts(tree, found)))
     for mesh in root.iter("mesh"):
         name = mesh.get("filename", "")
         if "://" not in name:

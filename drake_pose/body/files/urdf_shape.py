@@ -68,9 +68,7 @@ def with_zeros(text: str, zeros: Mapping[str, float]) -> str:
         axis_element = joint.find("axis")
         axis = np.array(_numbers("1 0 0" if axis_element is None else axis_element.get("xyz", "")))
         axis /= np.linalg.norm(axis)
-        origin = joint.find("origin")
-        if origin is None:
-            origin = ElementTree.SubElement(joint, "origin")
+        origin = _origin(joint)
         R = Rotation.from_euler("xyz", _numbers(origin.get("rpy", "0 0 0")))
         if joint.get("type") == "prismatic":
             place = np.array(_numbers(origin.get("xyz", "0 0 0"))) + R.apply(zero * axis)
@@ -83,6 +81,29 @@ def with_zeros(text: str, zeros: Mapping[str, float]) -> str:
             if limit is not None and joint.get("type") != "continuous" and end in limit.attrib:
                 limit.set(end, _text(np.array([float(limit.get(end, "0")) - zero])))
     return xml_text(root)
+
+
+def with_shifted_joints(text: str, shifts: Mapping[str, Sequence[float]]) -> str:
+    """A URDF text in which joints stand elsewhere on their parent links.
+
+    Args:
+        text: the URDF.
+        shifts: (3,) by joint, along the axes of its parent link's frame [m].
+    """
+    root = ElementTree.fromstring(text)
+    for joint in root.iterfind("joint"):
+        shift = shifts.get(joint.get("name", ""))
+        if shift is not None:
+            origin = _origin(joint)
+            place = np.array(_numbers(origin.get("xyz", "0 0 0"))) + shift
+            origin.set("xyz", _text(place))
+    return xml_text(root)
+
+
+def _origin(element: ElementTree.Element) -> ElementTree.Element:
+    """An element's origin, which is made where it has none."""
+    origin = element.find("origin")
+    return ElementTree.SubElement(element, "origin") if origin is None else origin
 
 
 def _stretch_origin(element: ElementTree.Element, factor: Sequence[float]) -> None:

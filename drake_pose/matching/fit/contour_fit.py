@@ -154,6 +154,7 @@ class ContourFit:
         steps: how steps are made.
         pixels: so many pixels are the unit of length of rounds and noise in every camera; None:
             that unit is the metre, as large as it is seen at the body's root.
+        body: what else may be unknown of it; None: the tree's values, ROOT_NAMES and no more.
     """
 
     def __init__(
@@ -163,6 +164,7 @@ class ContourFit:
         noise: Noise | None = None,
         steps: StepSettings | None = None,
         pixels: float | None = None,
+        body: BodyParameters | None = None,
     ) -> None:
         self.kinematics = tree if isinstance(tree, TreeKinematics) else TreeKinematics(tree)
         self.tree = self.kinematics.tree
@@ -170,7 +172,7 @@ class ContourFit:
             few_triangles(TreeSurfaces(self.tree), VERY_FEW) if outlines is None else outlines
         )
         self.noise, self.steps = noise or Noise(), steps or StepSettings()
-        self.body = BodyParameters(self.kinematics, self.outlines)
+        self.body = body or BodyParameters(self.kinematics, self.outlines)
         self.lower, self.upper = self.kinematics.lower, self.kinematics.upper
         self._pixels = pixels
 

@@ -20,11 +20,20 @@ URDF = """<robot name="slide"><link name="world"/>
 </robot>"""
 
 
-def read(folder: Path, text: str) -> KnownPositions:
+def read(folder: Path, text: str, held: dict[str, float] | None = None) -> KnownPositions:
     (folder / "slide.urdf").write_text(URDF)
     (folder / "joints.csv").write_text(text)
     model = load_model(folder / "slide.urdf")
-    return read_known_positions(folder / "joints.csv", model, TreeKinematics(model.pose_tree()))
+    kinematics = TreeKinematics(model.pose_tree(held=held))
+    return read_known_positions(folder / "joints.csv", model, kinematics)
+
+
+def test_what_is_held_needs_no_column(tmp_path: Path) -> None:
+    found = read(tmp_path, "frame,swing\n0,0.5\n1,-1\n", {"rail": 0.3})
+    assert found.of("0", "left").tolist() == [0.3, 0.5]
+    assert found.of("1", "left").tolist() == [0.3, -1.0]
+    with pytest.raises(SceneError, match="column 'rail' is a position that is held"):
+        read(tmp_path, "frame,swing,rail\n0,0.5,0.2\n", {"rail": 0.3})
 
 
 def test_columns_are_put_in_the_tree_s_order(tmp_path: Path) -> None:

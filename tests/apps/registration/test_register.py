@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -248,6 +249,52 @@ class TestZeros:
         assert result.exit_code == 1
         assert "more frames" in result.stderr
         assert not out.exists()
+
+
+class TestLengths:
+    def test_lengths_are_found_and_written_to_a_urdf(
+        self, own_arm: ArmScene, tmp_path: Path, runner: CliRunner
+    ) -> None:
+        right, out = load_model(own_arm.model), tmp_path / "out"
+        short = own_arm.model.read_text().replace('"0 0 0.35"', '"0 0 0.34"')
+        (tmp_path / "short.urdf").write_text(short)
+        given = ["--lengths", "shoulder", "--lengths", "turret", "--json"]
+        result = run(runner, replace(own_arm, model=tmp_path / "short.urdf"), out, *given)
+        assert result.exit_code == 0, result.output
+        summary = json.loads(result.stdout)
+        found = summary["lengths"]
+        off = 100.0 * (0.35 / 0.34 - 1.0)
+        assert list(found) == ["shoulder", "turret"]
+        assert found["shoulder"]["low_percent"] < off < found["shoulder"]["high_percent"]
+        assert found["shoulder"]["value_percent"] == pytest.approx(off, abs=0.7)
+        assert found["shoulder"]["significant"]
+        assert not found["turret"]["significant"]
+        assert summary["mean_iou"] > 0.98
+        assert yaml.safe_load((out / "registration.yaml").read_text())["left"]["lengths"] == found
+        # Drake has the elbow where the right arm has it, but for what the two lengths are off.
+        places = []
+        for model in (right, load_model(out / "short_calibrated.urdf")):
+            context = model.plant.CreateDefaultContext()
+            elbow = model.plant.GetBodyByName("elbow").EvalPoseInWorld(context)
+            places.append(elbow.translation())
+        longer = 0.2 * found["turret"]["value_percent"] + 0.34 * (
+            found["shoulder"]["value_percent"] - off
+        )
+        np.testing.assert_allclose(places[1] - places[0], [0.0, 0.0, 0.01 * longer], atol=1e-9)
+
+    @pytest.mark.parametrize(
+        ("given", "said"),
+        [
+            (["--lengths", "hand"], "no link with a length 'hand'; it has: turret, shoulder"),
+            (["--zeros", "knee"], "no joint 'knee'"),
+        ],
+    )
+    def test_unknown_names_are_refused_before_work(
+        self, given: list[str], said: str, arm_scene: ArmScene, tmp_path: Path, runner: CliRunner
+    ) -> None:
+        result = run(runner, arm_scene, tmp_path / "out", *given)
+        assert result.exit_code == 1
+        assert said in " ".join(result.stderr.split())
 
 
 def _zeros(zeros: dict[str, Any], names: list[str]) -> np.ndarray:

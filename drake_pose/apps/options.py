@@ -63,6 +63,30 @@ def parse_box(text: str) -> tuple[Corner, Corner]:
     return low, high
 
 
+def parse_numbers(text: str, count: int, option: str) -> tuple[float, ...]:
+    """Returns so many numbers of a text ``A,B,...``.
+
+    Raises:
+        SettingsError: the text has another form.
+    """
+    parts = text.split(",")
+    if len(parts) != count:
+        raise SettingsError(f"{option}: '{text}' must be {count} numbers with commas between them")
+    return tuple(parse_number(part, option) for part in parts)
+
+
+def parse_size(text: str, option: str) -> tuple[int, ...]:
+    """Returns width and height of a text ``W,H`` [pixel].
+
+    Raises:
+        SettingsError: the text has another form.
+    """
+    sides = parse_numbers(text, 2, option)
+    if any(side < 1 or side != int(side) for side in sides):
+        raise SettingsError(f"{option}: '{text}' must be two whole numbers of pixels")
+    return tuple(int(side) for side in sides)
+
+
 def parse_packages(texts: Iterable[str]) -> dict[str, Path]:
     """Returns the absolute folders of ``NAME=FOLDER`` texts by package.
 

@@ -12,7 +12,7 @@ from drake_pose.multiview.date.features import find_features
 from drake_pose.multiview.date.recognition import register_pose, registered_positions
 from drake_pose.multiview.date.skeleton import load_skeleton
 from drake_pose.multiview.date.skin_blobs import SkinColour
-from drake_pose.multiview.regions import learn_background
+from drake_pose.silhouette.segmentation.background import learn_background
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
 
 HEAD_HEIGHT = 1.55

@@ -25,7 +25,11 @@ from drake_pose.camera.sources.opening import open_source
 from drake_pose.errors import DrakePoseError
 from drake_pose.multiview.person.silhouette_view import see_silhouette
 from drake_pose.multiview.person.view_packing import pack_view
-from drake_pose.multiview.regions import Background, learn_background, person_region
+from drake_pose.silhouette.segmentation.background import (
+    Background,
+    learn_background,
+    person_region,
+)
 
 # Cameras for which nobody asks are let go after this time [s].
 _IDLE = 30.0

@@ -174,11 +174,16 @@ Files in DIR: summary.json; overlay/<camera>/<frame>.png of the frames that cont
 """)
 
 MASKS = _help(r"""
-Make a scene of masks: of masks that other tools wrote, as estimate reads them.
+Make a scene of masks, as estimate reads them: of masks that other tools wrote, or of pictures.
 
 Masks of other tools are COCO files (polygons and run lengths), labelme files, PNG pictures with a
 palette, with an alpha channel or with probabilities (8 or 16 bits, from one half on), and black and
 white videos.
+
+In pictures and videos an object is found by the empty room (--background), a box or strokes (--box,
+--strokes; GrabCut, for stills), or a network of yours (--network, ONNX). A median of the pictures
+stands for the empty room only where the body leaves every place; the command says where it does
+not. Look at overlay/ before you go on.
 
 Files in SCENE: masks/<camera>/<frame>.png; cameras.yaml and scene.yaml, those of SOURCE, or what a
 video says; overlay/<camera>/<frame>.jpg, the pictures with the masks' outlines; summary.json, each
@@ -194,6 +199,14 @@ written (exit status 1).
 [bold]Probabilities that a network wrote, as pictures images/<camera>/<frame>.png:[/bold]
 
     drake-pose masks probabilities --out scene --pixels probability --largest
+
+[bold]A recording beside which background/<camera>.png shows the empty room:[/bold]
+
+    drake-pose masks recording --out scene
+
+[bold]A photograph, the object in a box:[/bold]
+
+    drake-pose masks photograph.jpg --out scene --box 120,80,300,260
 """)
 
 REPRODUCE = "Run a paper's experiment and show its figures beside ours."

@@ -14,11 +14,15 @@ from drake_pose.apps.commands.terminal import (
     usage_errors,
     warn,
 )
+from drake_pose.apps.options import parse_numbers, parse_size
 
 if TYPE_CHECKING:
     from drake_pose.apps.masks.masks import SceneMasks
 
 _GIVEN = "Masks of other tools"
+_EMPTY = "By the empty room"
+_MARKED = "By a box or strokes"
+_NETWORK = "By a network"
 
 SourceArgument = Annotated[
     Path,
@@ -58,6 +62,63 @@ PixelsOption = Annotated[
         rich_help_panel=_GIVEN,
     ),
 ]
+BackgroundOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="PATH",
+        help="Empty room: a picture, or a folder with <camera>.png or <camera>/<frame>.png; "
+        "median: of the pictures themselves, in which the body moves. Default: SOURCE/background, "
+        "if it exists.",
+        rich_help_panel=_EMPTY,
+    ),
+]
+BoxOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="X,Y,W,H",
+        help=r"Box around the object in all pictures: left, top, width, height \[pixel].",
+        rich_help_panel=_MARKED,
+    ),
+]
+StrokesOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="Boxes and lines on the object and beside it, by camera and frame (YAML).",
+        rich_help_panel=_MARKED,
+    ),
+]
+NetworkOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="ONNX file of a segmentation network; --class NUMBER is the object.",
+        rich_help_panel=_NETWORK,
+    ),
+]
+NetworkSizeOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="W,H",
+        help=r"Size that the network takes \[pixel]. Default: the pictures'.",
+        rich_help_panel=_NETWORK,
+    ),
+]
+NetworkMeanOption = Annotated[
+    str,
+    typer.Option(
+        metavar="R,G,B",
+        help="It takes (colour / 255 - mean) / std.",
+        rich_help_panel=_NETWORK,
+    ),
+]
+NetworkStdOption = Annotated[
+    str, typer.Option(metavar="R,G,B", help="See --network-mean.", rich_help_panel=_NETWORK)
+]
+NetworkBgrOption = Annotated[
+    bool,
+    typer.Option("--network-bgr", help="It takes blue, green, red.", rich_help_panel=_NETWORK),
+]
 LargestOption = Annotated[
     bool, typer.Option("--largest", help="Keep only the largest patch of each mask.")
 ]
@@ -76,6 +137,14 @@ def masks(
     cameras: CamerasOption = None,
     class_: ClassOption = None,
     pixels: PixelsOption = "auto",
+    background: BackgroundOption = None,
+    box: BoxOption = None,
+    strokes: StrokesOption = None,
+    network: NetworkOption = None,
+    network_size: NetworkSizeOption = None,
+    network_mean: NetworkMeanOption = "0,0,0",
+    network_std: NetworkStdOption = "1,1,1",
+    network_bgr: NetworkBgrOption = False,
     largest: LargestOption = False,
     overlay: OutlineOption = True,
     json: JsonOption = False,
@@ -90,6 +159,16 @@ def masks(
             settings = MaskSettings(
                 pixels=pixels,  # type: ignore[arg-type]  # It is checked there.
                 classes=tuple(class_ or ()),
+                background=background,
+                box=None if box is None else parse_numbers(box, 4, "--box"),
+                strokes=strokes,
+                network=network,
+                network_size=None
+                if network_size is None
+                else parse_size(network_size, "--network-size"),
+                network_mean=parse_numbers(network_mean, 3, "--network-mean"),
+                network_std=parse_numbers(network_std, 3, "--network-std"),
+                network_bgr=network_bgr,
                 largest=largest,
                 cameras=cameras,
             )

@@ -19,7 +19,7 @@ from drake_pose.camera.sources.files import (
 from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecification
 from drake_pose.camera.sources.opening import open_source
 from drake_pose.errors import DrakePoseError, SceneError
-from drake_pose.multiview.regions import Background, learn_background
+from drake_pose.silhouette.segmentation.background import Background, learn_background
 from drake_pose.systems.person.live_capture import LocalSensors
 from drake_pose.systems.pictures.picture_capture import PictureCapture
 

@@ -13,13 +13,16 @@ import cv2
 import numpy as np
 import yaml
 
+from drake_pose.apps.masks.empty_room import BACKGROUND, compare_with_empty_room
 from drake_pose.apps.masks.found import FoundMask, FoundMasks
 from drake_pose.apps.masks.given import read_given_masks
+from drake_pose.apps.masks.network import segment_by_network
 from drake_pose.apps.masks.settings import MaskSettings
 from drake_pose.apps.masks.sources import CAMERAS, SCENE, UNNAMED, Source, open_source
+from drake_pose.apps.masks.strokes import cut_marked, read_strokes
 from drake_pose.apps.results.folder import SUMMARY, require_empty
 from drake_pose.camera.picture_files import Picture
-from drake_pose.errors import DrakePoseError, MaskError, OutputError
+from drake_pose.errors import DrakePoseError, MaskError, OutputError, SceneError
 from drake_pose.silhouette import write_mask
 from drake_pose.silhouette.segmentation.judging import judge_mask, largest_patch
 
@@ -88,6 +91,24 @@ def make_masks(
 
 def _find(source: Source, settings: MaskSettings) -> FoundMasks:
     """The masks, one by one."""
+    background = settings.background
+    if settings == MaskSettings(largest=settings.largest, cameras=settings.cameras):
+        # Beside its pictures a scene may have those of the empty room, which say what is meant.
+        room = source.path / BACKGROUND
+        background = room if source.path.is_dir() and room.is_dir() else None
+    marked = settings.box is not None or settings.strokes is not None
+    found = background is not None or marked or settings.network is not None
+    if found and source.annotated:
+        raise SceneError(
+            f"{source.path}: has annotations, but the object is to be found in pictures"
+        )
+    if background is not None:
+        return compare_with_empty_room(source, background)
+    if marked:
+        marks = {} if settings.strokes is None else read_strokes(settings.strokes)
+        return cut_marked(source, settings.box, marks)
+    if settings.network is not None:
+        return segment_by_network(source, settings.network, settings)
     return read_given_masks(source, settings)
 
 

@@ -21,7 +21,7 @@ from drake_pose.multiview.date.features import FeatureSettings
 from drake_pose.multiview.date.recognition import RegisteredPose
 from drake_pose.multiview.date.skeleton import Skeleton
 from drake_pose.multiview.date.skin_blobs import Blobs, SkinColour, skin_blobs
-from drake_pose.multiview.regions import Background
+from drake_pose.silhouette.segmentation.background import Background
 
 Picture = NDArray[np.uint8]
 Mask = NDArray[np.bool_]

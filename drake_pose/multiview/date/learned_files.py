@@ -13,7 +13,7 @@ import numpy as np
 
 from drake_pose.errors import OutputError, SceneError
 from drake_pose.multiview.date.faces import FACE_HEIGHT, FACE_WIDTH, FaceTemplates
-from drake_pose.multiview.regions import Background
+from drake_pose.silhouette.segmentation.background import Background
 
 _LARGEST_FILE = 1 << 30
 _PIXELS = 3 * FACE_WIDTH * FACE_HEIGHT

@@ -14,8 +14,12 @@ from drake_pose.camera.picture_files import SUFFIXES, read_picture
 from drake_pose.errors import SceneError
 from drake_pose.multiview.date.faces import FaceTemplates, cut_face, learn_faces
 from drake_pose.multiview.date.skin_blobs import SkinColour, skin_blobs
-from drake_pose.multiview.regions import Background, learn_background, person_region
 from drake_pose.regular_files import read_regular
+from drake_pose.silhouette.segmentation.background import (
+    Background,
+    learn_background,
+    person_region,
+)
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]

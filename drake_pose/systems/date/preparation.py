@@ -20,7 +20,7 @@ from drake_pose.multiview.date.features import find_features
 from drake_pose.multiview.date.recognition import register_pose
 from drake_pose.multiview.date.skeleton import Skeleton, load_skeleton
 from drake_pose.multiview.date.skin_blobs import SkinColour
-from drake_pose.multiview.regions import Background, person_region
+from drake_pose.silhouette.segmentation.background import Background, person_region
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
 from drake_pose.camera import Camera
 from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker
 from drake_pose.multiview.recordings.person_capture import EDGE_POINTS
-from drake_pose.multiview.regions import Background
+from drake_pose.silhouette.segmentation.background import Background
 from drake_pose.systems.bodies.posed_geometry import add_avatar
 from drake_pose.systems.person.person_tracker import PersonTracker
 from drake_pose.systems.person.silhouette_sensor import SilhouetteSensor

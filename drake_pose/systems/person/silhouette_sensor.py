@@ -11,8 +11,8 @@ from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 from drake_pose.camera import Camera
 from drake_pose.multiview.person.silhouette_view import SilhouetteView, see_silhouette
 from drake_pose.multiview.recordings.person_capture import EDGE_POINTS
-from drake_pose.multiview.regions import Background, person_region
 from drake_pose.silhouette import label_image_to_mask
+from drake_pose.silhouette.segmentation.background import Background, person_region
 from drake_pose.systems.pictures.colour_images import colour_image_to_picture
 
 # The edge of a person's region is longer than this share of the picture's height.

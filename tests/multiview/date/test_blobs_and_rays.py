@@ -16,7 +16,11 @@ from drake_pose.multiview.date.features import (
 )
 from drake_pose.multiview.date.skin_blobs import SkinColour, learn_skin_colour, skin_blobs
 from drake_pose.multiview.rays import meeting_points, nearest_points, viewing_rays
-from drake_pose.multiview.regions import Background, learn_background, person_region
+from drake_pose.silhouette.segmentation.background import (
+    Background,
+    learn_background,
+    person_region,
+)
 
 SKIN = (217, 166, 135)
 SHIRT = (31, 115, 128)

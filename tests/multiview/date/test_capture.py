@@ -19,7 +19,7 @@ from drake_pose.multiview.date.features import find_features
 from drake_pose.multiview.date.recognition import recognise
 from drake_pose.multiview.date.skeleton import FEATURES, rotation
 from drake_pose.multiview.date.skin_blobs import SkinColour, skin_blobs
-from drake_pose.multiview.regions import learn_background, person_region
+from drake_pose.silhouette.segmentation.background import learn_background, person_region
 from tests.multiview.studio import shared_studio
 
 

@@ -17,7 +17,7 @@ from drake_pose.multiview.date.learned_files import (
     save_faces,
 )
 from drake_pose.multiview.date.recorded_faces import learn_recorded_faces
-from drake_pose.multiview.regions import learn_background
+from drake_pose.silhouette.segmentation.background import learn_background
 from tests.multiview.studio import shared_studio
 
 TURNS, NODS = (-40.0, -20.0, 0.0, 20.0, 40.0), (-10.0, 10.0)

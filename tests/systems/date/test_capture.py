@@ -20,7 +20,7 @@ from drake_pose.multiview.date.faces import find_face, head_angles
 from drake_pose.multiview.date.features import find_features
 from drake_pose.multiview.date.recognition import recognise
 from drake_pose.multiview.date.skeleton import LIMBS
-from drake_pose.multiview.regions import person_region
+from drake_pose.silhouette.segmentation.background import person_region
 from drake_pose.systems.date.capture import build_paper_capture
 from drake_pose.systems.date.pose_estimator import PaperPoseEstimator
 from drake_pose.systems.pictures.camera_rig import build_camera_rig

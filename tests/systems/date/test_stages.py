@@ -8,8 +8,8 @@ from drake_pose.camera.rigs import FACE_CAMERA
 from drake_pose.errors import CameraError, SettingsError, UnknownNameError
 from drake_pose.multiview.date.capture import see_person
 from drake_pose.multiview.date.skin_blobs import SkinColour
-from drake_pose.multiview.regions import learn_background, person_region
 from drake_pose.silhouette import mask_to_label_image
+from drake_pose.silhouette.segmentation.background import learn_background, person_region
 from drake_pose.systems.date.face_direction_finder import FaceDirectionFinder
 from drake_pose.systems.date.feature_finder import FeatureFinder
 from drake_pose.systems.date.horizontal_image import HorizontalImage

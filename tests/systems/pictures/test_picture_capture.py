@@ -9,8 +9,8 @@ from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecification, TimedPicture
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.multiview.person.silhouette_view import see_silhouette
-from drake_pose.multiview.regions import learn_background, person_region
 from drake_pose.silhouette import label_image_to_mask, mask_to_label_image
+from drake_pose.silhouette.segmentation.background import learn_background, person_region
 from drake_pose.systems.person.silhouette_sensor import (
     SilhouetteSensor,
     edge_spacing,

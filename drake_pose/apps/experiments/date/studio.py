@@ -16,7 +16,7 @@ from drake_pose.camera import PinholeCamera
 from drake_pose.camera.rigs import FACE_CAMERA, circle_of_cameras
 from drake_pose.multiview.date.capture import CaptureSetup
 from drake_pose.multiview.date.skeleton import Skeleton, load_skeleton
-from drake_pose.multiview.regions import Background, learn_background
+from drake_pose.silhouette.segmentation.background import Background, learn_background
 from drake_pose.systems.date.preparation import prepare_paper_capture
 from drake_pose.systems.pictures.camera_rig import CameraRig, build_camera_rig
 

@@ -19,7 +19,7 @@ from drake_pose.errors import SettingsError
 from drake_pose.matching.fit.contour_fit import ContourFit
 from drake_pose.multiview.date.capture import CaptureSetup
 from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker, TrackState
-from drake_pose.multiview.regions import Background
+from drake_pose.silhouette.segmentation.background import Background
 from drake_pose.systems.date.capture import PaperCapture, build_paper_capture
 from drake_pose.systems.person.silhouette_capture import SilhouetteCapture, build_silhouette_capture
 from drake_pose.systems.pictures.colour_images import picture_to_colour_image

@@ -42,6 +42,7 @@ docs: $(VENV)/ready-docs
 DATA ?= $(wildcard ../shared/data)
 bench: $(VENV)/ready-cluster
 	$(PYTHON) -m drake_pose.apps.benchmarks.speed
+	$(PYTHON) -m drake_pose.apps.benchmarks.silhouette_camera
 	$(PYTHON) -m drake_pose.apps.benchmarks.estimates $(DATA)
 	$(PYTHON) -m drake_pose.apps.benchmarks.registration $(DATA) --cases 1 --zeros 0
 	$(PYTHON) -m drake_pose.apps.benchmarks.memory

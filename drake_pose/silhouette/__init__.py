@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from drake_pose.silhouette.areas.bending import BendingOutline, TreeSurfaces, score_bending
     from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
     from drake_pose.silhouette.areas.scoring import (
+        draw_labels,
         draw_mask,
-        draw_segments,
         prefix_sums,
         score_bodies,
         score_candidates,
@@ -34,8 +34,8 @@ _HOMES = {
     "Outline": "areas.outline",
     "Scene": "pictures.scenes",
     "TreeSurfaces": "areas.bending",
+    "draw_labels": "areas.scoring",
     "draw_mask": "areas.scoring",
-    "draw_segments": "areas.scoring",
     "label_image_to_mask": "pictures.label_images",
     "load_scene": "pictures.scenes",
     "mask_to_label_image": "pictures.label_images",
@@ -58,8 +58,8 @@ __all__ = [
     "Outline",
     "Scene",
     "TreeSurfaces",
+    "draw_labels",
     "draw_mask",
-    "draw_segments",
     "label_image_to_mask",
     "load_scene",
     "mask_to_label_image",

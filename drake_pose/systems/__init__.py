@@ -37,6 +37,7 @@ from drake_pose.systems.person.person_tracker import PersonTracker, build_person
 from drake_pose.systems.person.silhouette_capture import SilhouetteCapture, build_silhouette_capture
 from drake_pose.systems.person.silhouette_sensor import SilhouetteSensor
 from drake_pose.systems.pictures.picture_capture import CameraCount, PictureCapture
+from drake_pose.systems.pictures.silhouette_camera import SilhouetteCamera
 from drake_pose.systems.walk.walk import Walker, WalkKeys, WalkView, build_walk
 
 __all__ = [
@@ -63,6 +64,7 @@ __all__ = [
     "PoseRecogniser",
     "RegistrationDiagram",
     "SensorPorts",
+    "SilhouetteCamera",
     "SilhouetteCapture",
     "SilhouetteMatcher",
     "SilhouetteSensor",

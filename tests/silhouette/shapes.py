@@ -30,7 +30,15 @@ def box(size: float) -> TriangleMesh:
 
 
 def brute_force_mask(mesh: TriangleMesh, X_CN: np.ndarray, camera: Camera) -> np.ndarray:
-    """Casts the ray of every pixel centre at every triangle (Moeller and Trumbore 1997)."""
+    """Which pixel centres see a mesh."""
+    return np.isfinite(brute_force_depth(mesh, X_CN, camera))
+
+
+def brute_force_depth(mesh: TriangleMesh, X_CN: np.ndarray, camera: Camera) -> np.ndarray:
+    """Casts the ray of every pixel centre at every triangle (Moeller and Trumbore 1997).
+
+    Returns (H, W) the depth of the nearest one along the camera's z; infinite where there is none.
+    """
     kind, fx, fy, cx, cy, near = camera.kernel_parameters()[:6]
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     x, y = ((u - cx) / fx).ravel(), ((v - cy) / fy).ravel()
@@ -40,7 +48,7 @@ def brute_force_mask(mesh: TriangleMesh, X_CN: np.ndarray, camera: Camera) -> np
     else:
         origins = np.column_stack([x, y, nought - 100.0])
         directions = np.column_stack([nought, nought, one])
-    mask = np.zeros(len(x), dtype=bool)
+    nearest = np.full(len(x), np.inf)
     corners = (mesh.vertices @ X_CN[:3, :3].T + X_CN[:3, 3])[mesh.triangles]
     for a, b, c in corners:
         p = np.cross(directions, c - a)
@@ -50,5 +58,6 @@ def brute_force_mask(mesh: TriangleMesh, X_CN: np.ndarray, camera: Camera) -> np
             q = np.cross(origins - a, b - a)
             t = np.einsum("ij,ij->i", directions, q) / determinant
             depth = q @ (c - a) / determinant  # along z, as every direction has z = 1
-        mask |= (s >= 0) & (t >= 0) & (s + t <= 1) & ((kind == 1) | (depth >= near))
-    return mask.reshape(camera.height, camera.width)
+        hit = (s >= 0) & (t >= 0) & (s + t <= 1) & ((kind == 1) | (depth >= near))
+        nearest[hit] = np.minimum(nearest[hit], depth[hit])
+    return nearest.reshape(camera.height, camera.width)

@@ -84,7 +84,7 @@ def measure_kernel(columns: int = 14, rows: int = 16, seed: int = 0) -> KernelFi
         columns, rows: how finely the limb is divided around and along.
         seed: of the poses.
     """
-    mesh = _limb(columns, rows)
+    mesh = limb_mesh(columns, rows)
     camera = ParallelCamera("benchmark", _SIDE, _SIDE, _SCALE, 0.5 * _SIDE, 0.5 * _SIDE, np.eye(4))
     rng = np.random.default_rng(seed)
     X_CN = np.tile(np.eye(4), (_CANDIDATES, 1, 1))
@@ -98,7 +98,7 @@ def measure_kernel(columns: int = 14, rows: int = 16, seed: int = 0) -> KernelFi
     return KernelFigures(len(mesh.triangles), kernel / _CANDIDATES * 1e6, images / _IMAGES * 1e6)
 
 
-def _limb(columns: int, rows: int) -> TriangleMesh:
+def limb_mesh(columns: int, rows: int) -> TriangleMesh:
     """Returns a closed ellipsoid of 2 columns (rows - 1) triangles."""
     polar = np.pi * np.arange(1, rows) / rows
     around = 2.0 * np.pi * np.arange(columns) / columns
@@ -126,7 +126,7 @@ def _label_images(
     scene_graph = SceneGraph()
     source = scene_graph.RegisterSource("benchmark")
     frame = scene_graph.RegisterFrame(source, GeometryFrame("segment"))
-    shape = Mesh(InMemoryMesh(mesh_file=MemoryFile(_as_obj(mesh), ".obj", "segment")))
+    shape = Mesh(InMemoryMesh(mesh_file=MemoryFile(obj_text(mesh), ".obj", "segment")))
     instance = GeometryInstance(RigidTransform(), shape, "segment")
     properties = PerceptionProperties()
     properties.AddProperty("label", "id", RenderLabel(1))
@@ -150,7 +150,7 @@ def _label_images(
     return render
 
 
-def _as_obj(mesh: TriangleMesh) -> str:
+def obj_text(mesh: TriangleMesh) -> str:
     """Returns a mesh as OBJ text with normals, which Drake's VTK engine insists on."""
     normals = mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True)
     lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in mesh.vertices.tolist()]

@@ -25,7 +25,7 @@ from drake_pose.camera import Camera
 from drake_pose.errors import MaskError
 from drake_pose.multiview.recordings.checked_capture import capture_checked
 from drake_pose.multiview.recordings.person_capture import PersonCapture, PersonCaptureSettings
-from drake_pose.silhouette import draw_segments
+from drake_pose.silhouette import draw_labels
 
 Mask = NDArray[np.bool_]
 
@@ -155,13 +155,14 @@ def _finish_frame(
     frame, q = inputs.frames[index], captured.q[index]
     found = bool(np.isfinite(q).all())
     X_WN = captured.tree.node_poses(captured.tree.values_from_positions(q)) if found else None
-    segments: dict[str, NDArray[np.uint8]] = {}
+    segments: dict[str, NDArray[np.int16]] = {}
+    labels = range(1, 1 + len(captured.outlines))
     for camera in inputs.cameras:
         if camera.name in pictures:
-            segments[camera.name] = np.zeros((camera.height, camera.width), dtype=np.uint8)
+            segments[camera.name] = np.zeros((camera.height, camera.width), dtype=np.int16)
             if X_WN is not None:
                 X_CN = camera.X_CW @ X_WN
-                segments[camera.name] = draw_segments(captured.outlines, X_CN, camera)
+                segments[camera.name] = draw_labels(captured.outlines, labels, X_CN, camera)
     agreement = compare_masks(masks, {name: one > 0 for name, one in segments.items()})
     error = agreement.E_total if found else float("nan")
     row = PoseRow(frame, q, None, error, seconds)

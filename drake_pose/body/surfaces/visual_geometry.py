@@ -18,6 +18,7 @@ from pydrake.geometry import (
     Ellipsoid,
     HalfSpace,
     Mesh,
+    RenderLabel,
     Role,
     SceneGraph,
     Shape,
@@ -54,6 +55,8 @@ def shape_mesh(shape: Shape) -> TriangleMesh:
         return capsule_mesh(shape.radius(), shape.length())
     if isinstance(shape, Ellipsoid):
         return ellipsoid_mesh(shape.a(), shape.b(), shape.c())
+    if isinstance(shape, (Mesh, Convex)) and not shape.source().is_path():
+        raise ModelError("a mesh that lies in memory cannot be read; write it to a file")
     if isinstance(shape, Mesh):
         return read_mesh_file(Path(shape.source().path()), np.asarray(shape.scale3()))
     if isinstance(shape, Convex):
@@ -84,20 +87,35 @@ def body_mesh(plant: MultibodyPlant, scene_graph: SceneGraph, body: RigidBody) -
     Raises:
         ModelError: geometry that cannot be drawn; the message names the link.
     """
+    return join_meshes(list(labelled_meshes(plant, scene_graph, body).values()))
+
+
+def labelled_meshes(
+    plant: MultibodyPlant, scene_graph: SceneGraph, body: RigidBody
+) -> dict[int, TriangleMesh]:
+    """The visual geometry of one body in the body's frame, by render label.
+
+    Ground planes and what is not to be rendered are left out.
+
+    Raises:
+        ModelError: geometry that cannot be drawn; the message names the link.
+    """
     inspector = scene_graph.model_inspector()
-    meshes = []
+    meshes: dict[int, list[TriangleMesh]] = {}
     for geometry in plant.GetVisualGeometriesForBody(body):
-        if inspector.GetPerceptionProperties(geometry) is None:
-            continue
+        properties = inspector.GetPerceptionProperties(geometry)
         shape = inspector.GetShape(geometry)
-        if isinstance(shape, HalfSpace):
+        if properties is None or isinstance(shape, HalfSpace):
+            continue
+        label = int(properties.GetPropertyOrDefault("label", "id", RenderLabel.kDontCare))
+        if label == int(RenderLabel.kDoNotRender):
             continue
         X_BG = np.array(inspector.GetPoseInFrame(geometry).GetAsMatrix4(), dtype=np.float64)
         try:
-            meshes.append(shape_mesh(shape).transformed(X_BG))
+            meshes.setdefault(label, []).append(shape_mesh(shape).transformed(X_BG))
         except ModelError as error:
             raise ModelError(f"link '{body.name()}': {error}") from error
-    return join_meshes(meshes)
+    return {label: join_meshes(parts) for label, parts in meshes.items()}
 
 
 def make_drawable(

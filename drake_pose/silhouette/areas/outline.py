@@ -8,6 +8,8 @@ from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 if TYPE_CHECKING:
     from drake_pose.body import TriangleMesh
@@ -42,6 +44,22 @@ class Outline:
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         offsets = np.einsum("ij,ij->i", normals, corners[:, 0])
         return np.column_stack([normals, offsets])
+
+    @cached_property
+    def is_closed(self) -> bool:
+        """Whether all parts are closed, and run around counter-clockwise seen from outside.
+
+        What is turned away from a camera is hidden then.
+        """
+        neighbours = self.edges[:, [2, 4]]
+        if not np.all(self.edges[:, 3] * self.edges[:, 5] == -1):
+            return False
+        count = len(self.triangles)
+        graph = coo_array((np.ones(len(neighbours)), neighbours.T), shape=(count, count))
+        _, part = connected_components(graph, directed=False)
+        corners = self.vertices[self.triangles]
+        volumes = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+        return bool(np.all(np.bincount(part, volumes) > 0.0))
 
     @cached_property
     def ball(self) -> np.ndarray:

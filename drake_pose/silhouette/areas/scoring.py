@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from drake_pose.camera import Camera
+from drake_pose.silhouette.areas.label_kernel import paint_labels
 from drake_pose.silhouette.areas.outline import Outline, PackedOutlines, pack
 from drake_pose.silhouette.areas.prefix_sums import sum_rows
 from drake_pose.silhouette.areas.span_kernel import paint, score
@@ -72,25 +73,28 @@ def draw_packed(packed: PackedOutlines, X_CN: np.ndarray, camera: Camera) -> np.
     return mask.view(np.bool_)
 
 
-def draw_segments(outlines: Sequence[Outline], X_CN: np.ndarray, camera: Camera) -> np.ndarray:
-    """Returns (H, W) uint8 which node of a body is seen in each pixel, counted from 1; 0: none.
-
-    Parts are painted one over the other, the one whose middle is farthest first, so their edges are
-    good to look at, not to measure by.
+def draw_labels(
+    outlines: Sequence[Outline],
+    labels: Sequence[int] | np.ndarray,
+    X_CN: np.ndarray,
+    camera: Camera,
+    empty: int = 0,
+) -> np.ndarray:
+    """Returns (H, W) int16 the label of the surface that is seen in each pixel, the nearest one.
 
     Args:
-        outlines: the surfaces of at most 255 nodes.
+        outlines: the surfaces.
+        labels: (nodes,) the label of each.
         X_CN: (nodes, 4, 4) their poses in the camera.
         camera: the camera.
+        empty: the label of pixels that show none.
     """
-    shown = [k for k, outline in enumerate(outlines) if len(outline.vertices)]
-    middles = [X_CN[k, 2, :3] @ outlines[k].vertices.mean(axis=0) + X_CN[k, 2, 3] for k in shown]
-    segments = np.zeros((camera.height, camera.width), dtype=np.uint8)
-    for place in np.argsort(middles)[::-1]:
-        node = shown[place]
-        packed, poses = check_body([outlines[node]], np.asarray(X_CN)[None, [node]])
-        paint(packed, poses[0], camera.kernel_parameters(), segments, node + 1)
-    return segments
+    packed, poses = check_body(outlines, np.asarray(X_CN)[None])
+    image = np.empty((camera.height, camera.width), dtype=np.int16)
+    numbers = np.asarray(labels, dtype=np.int16)
+    closed = np.array([outline.is_closed for outline in outlines], dtype=np.bool_)
+    paint_labels(packed, numbers, closed, poses[0], camera.kernel_parameters(), empty, image)
+    return image
 
 
 def subtract_body(

@@ -1,0 +1,103 @@
+"""Label images by the span kernel, against rays cast at every triangle."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from drake_pose.body import TriangleMesh
+from drake_pose.camera import Camera, PinholeCamera
+from drake_pose.silhouette import draw_labels, draw_mask, outline_from_mesh
+from tests.silhouette.areas.test_span_kernel import CAMERAS, name_of
+from tests.silhouette.shapes import box, brute_force_depth, random_pose, soup
+
+EMPTY = 32766
+
+
+def require_nearest(
+    meshes: Sequence[TriangleMesh], X_CN: np.ndarray, camera: Camera
+) -> tuple[np.ndarray, int]:
+    """Compares labels 1, 2, ... with cast rays; returns them, and how many pixels two share."""
+    labels = range(1, 1 + len(meshes))
+    outlines = [outline_from_mesh(mesh) for mesh in meshes]
+    image = draw_labels(outlines, labels, X_CN, camera, EMPTY)
+    depths = np.array([brute_force_depth(m, X, camera) for m, X in zip(meshes, X_CN, strict=True)])
+    seen = np.isfinite(depths).any(axis=0)
+    np.testing.assert_array_equal(image != EMPTY, seen)
+    own = np.take_along_axis(depths, np.where(seen, image - 1, 0)[None], axis=0)[0]
+    # The kernel's depths are 32 bit floats: where two are as near, either may be seen.
+    assert (own[seen] <= depths.min(axis=0)[seen] * (1.0 + 1e-5)).all()
+    return image, int((np.isfinite(depths).sum(axis=0) > 1).sum())
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=name_of)
+def test_the_nearest_of_any_triangles_is_seen(camera: Camera) -> None:
+    rng = np.random.default_rng(4)
+    shared = 0
+    for _ in range(15):
+        meshes = [soup(rng, 12, int(rng.integers(1, 20)), 0.4) for _ in range(3)]
+        X_CN = np.array([random_pose(rng, (0.1, -0.1, rng.uniform(2.5, 3.5))) for _ in meshes])
+        shared += require_nearest(meshes, X_CN, camera)[1]
+    assert shared > 1000
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=name_of)
+@pytest.mark.parametrize("inside_out", [False, True])
+def test_the_nearest_of_closed_bodies_is_seen(camera: Camera, inside_out: bool) -> None:
+    # They run into each other, and a part is cut by the near plane.
+    rng = np.random.default_rng(5)
+    shared = 0
+    for trial in range(20):
+        middle = 2.0 if trial % 2 else 0.4
+        meshes = [box(float(rng.uniform(0.3, 0.9))) for _ in range(4)]
+        if inside_out:
+            meshes[0] = TriangleMesh(meshes[0].vertices, meshes[0].triangles[:, ::-1])
+        assert [outline_from_mesh(m).is_closed for m in meshes] == [not inside_out, *3 * [True]]
+        places = rng.uniform(-0.4, 0.4, (4, 3))
+        places[:, 2] += middle
+        X_CN = np.array([random_pose(rng, (x, y, z)) for x, y, z in places])
+        shared += require_nearest(meshes, X_CN, camera)[1]
+    assert shared > 1000
+
+
+def test_surfaces_that_are_not_closed_hide_nothing_behind_them() -> None:
+    cube = box(1.0)
+    assert outline_from_mesh(cube).is_closed
+    assert not outline_from_mesh(TriangleMesh(cube.vertices, cube.triangles[1:])).is_closed
+    turned = cube.triangles.copy()
+    turned[0] = turned[0, ::-1]
+    assert not outline_from_mesh(TriangleMesh(cube.vertices, turned)).is_closed
+
+
+def test_the_nearer_part_covers_the_other() -> None:
+    camera = PinholeCamera("front", 100, 80, 100.0, 100.0, 49.5, 39.5, np.eye(4))
+    sizes = np.array([[0.2, 0.6, 0.1], [0.6, 0.2, 0.1]])
+    cube = box(1.0)
+    meshes = [TriangleMesh(cube.vertices * size, cube.triangles) for size in sizes]
+    outlines = [outline_from_mesh(mesh) for mesh in meshes]
+    for far, near in ((0, 1), (1, 0)):
+        X_CN = np.tile(np.eye(4), (2, 1, 1))
+        X_CN[far, 2, 3], X_CN[near, 2, 3] = 2.0, 1.5
+        labels = draw_labels(outlines, [7, 9], X_CN, camera)
+        # Where the axis of both goes through the picture, and the nearer part is seen whole.
+        whole = draw_mask([outlines[near]], X_CN[[near]], camera)
+        assert whole[40, 50]
+        assert (labels[whole] == (7, 9)[near]).all()
+        np.testing.assert_array_equal(labels > 0, draw_mask(outlines, X_CN, camera))
+        assert set(np.unique(labels)) == {0, 7, 9}
+
+
+def test_parts_of_one_label_are_one() -> None:
+    camera = CAMERAS[1]
+    X_CN = np.tile(np.eye(4), (3, 1, 1))
+    X_CN[:, :3, :3] = Rotation.random(3, random_state=6).as_matrix()
+    X_CN[:, 2, 3] = 2.0, 2.1, 2.2
+    outlines = [outline_from_mesh(box(0.6))] * 3
+    labels = draw_labels(outlines, [5, 5, 5], X_CN, camera, EMPTY)
+    np.testing.assert_array_equal(labels == 5, draw_mask(outlines, X_CN, camera))
+    assert set(np.unique(labels)) == {5, EMPTY}
+
+
+def test_nothing_to_draw() -> None:
+    assert (draw_labels([], [], np.empty((0, 4, 4)), CAMERAS[0], EMPTY) == EMPTY).all()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ _REQUIRED = {
     "parallel": (*_COMMON, "pixels_per_metre"),
 }
 _OPTIONAL = {
-    "pinhole": ("X_WC", "projection", "clipping_near"),
+    "pinhole": ("X_WC", "link", "X_LC", "projection", "clipping_near"),
     "parallel": ("X_WC", "projection"),
 }
 
@@ -37,6 +37,12 @@ def load_cameras(path: str | Path) -> dict[str, Camera]:
         CameraError: names the file, the camera and the field.
     """
     found = load_camera_file(path)
+    for name, link in found.links.items():
+        raise CameraError(
+            f"{path}: camera '{name}' rides on link '{link}' of a robot (link, X_LC), so it stands "
+            "elsewhere in each frame: cameras that stand still (X_WC) are needed here; leave it "
+            "out, or for a frame give it X_WC = X_WL X_LC, where X_WL is the link's pose then"
+        )
     for name in found.unplaced:
         kind = "parallel" if isinstance(found.cameras[name], ParallelCamera) else "pinhole"
         raise CameraError(
@@ -53,11 +59,14 @@ class CameraFile:
 
     Args:
         cameras: by name, in the file's order; those without X_WC at the world's origin.
-        unplaced: the names of these.
+        unplaced: the names of these, but for those that ride on a link.
+        links: the links on which cameras ride, by camera; X_WC of these holds X_LC, their pose in
+            the link's frame.
     """
 
     cameras: dict[str, Camera]
     unplaced: tuple[str, ...]
+    links: Mapping[str, str] = field(default_factory=dict)
 
 
 def load_camera_file(path: str | Path) -> CameraFile:
@@ -76,8 +85,13 @@ def load_camera_file(path: str | Path) -> CameraFile:
         if name in cameras:
             raise CameraError(f"{path}: camera '{name}' is given twice")
         cameras[name] = _read_camera(name, entry, path)
-    unplaced = [str(key) for key, entry in content.items() if "X_WC" not in entry]
-    return CameraFile(cameras, tuple(unplaced))
+    links = {str(key): entry["link"] for key, entry in content.items() if "link" in entry}
+    unplaced = [
+        name
+        for name, entry in zip(cameras, content.values(), strict=True)
+        if "X_WC" not in entry and name not in links
+    ]
+    return CameraFile(cameras, tuple(unplaced), links)
 
 
 def save_cameras(path: str | Path, cameras: Mapping[str, Camera] | Iterable[Camera]) -> None:
@@ -93,10 +107,19 @@ def save_cameras(path: str | Path, cameras: Mapping[str, Camera] | Iterable[Came
         raise CameraError(f"{path}: cannot write the cameras: {error.strerror}") from error
 
 
-def dump_cameras(cameras: Mapping[str, Camera] | Iterable[Camera]) -> str:
-    """The text of a camera file."""
+def dump_cameras(
+    cameras: Mapping[str, Camera] | Iterable[Camera], links: Mapping[str, str] | None = None
+) -> str:
+    """The text of a camera file.
+
+    Args:
+        cameras: the cameras.
+        links: as of CameraFile.
+    """
     listed = cameras.values() if isinstance(cameras, Mapping) else cameras
     content = {camera.name: _write_camera(camera) for camera in listed}
+    for name, link in (links or {}).items():
+        content[name] |= {"link": link, "X_LC": content[name].pop("X_WC")}
     return yaml.safe_dump(content, sort_keys=False)
 
 
@@ -126,13 +149,21 @@ def _read_camera(name: str, entry: Any, path: Path) -> Camera:
             f"{where}: unknown field {', '.join(unknown)}; a {projection} camera has: "
             f"{', '.join((*required, *optional))}"
         )
+    pose = "X_WC"
+    if "link" in entry or "X_LC" in entry:
+        if not isinstance(entry.get("link"), str) or "X_LC" not in entry or "X_WC" in entry:
+            raise CameraError(
+                f"{where}: a camera that rides on a link has the link's name (link) and its pose "
+                "there (X_LC), and no X_WC"
+            )
+        pose = "X_LC"
     common: dict[str, Any] = {
         "name": name,
         "width": check_side(entry["width"], "width", where),
         "height": check_side(entry["height"], "height", where),
         "center_x": check_number(entry["center_x"], "center_x", where),
         "center_y": check_number(entry["center_y"], "center_y", where),
-        "X_WC": check_pose(entry.get("X_WC", np.eye(4)), "X_WC", where),
+        "X_WC": check_pose(entry.get(pose, np.eye(4)), pose, where),
     }
 
     def positive(field: str) -> float:

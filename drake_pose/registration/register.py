@@ -8,13 +8,13 @@ frame then agrees with the others or contradicts them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.body import PoseTree
+from drake_pose.body import PoseTree, TriangleMesh
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera import PinholeCamera
 from drake_pose.errors import RegistrationError, SettingsError
@@ -37,7 +37,7 @@ from drake_pose.registration.start_poses import (
     spread_rotations,
 )
 from drake_pose.registration.uncertainty import calibration_uncertainty, pose_covariance
-from drake_pose.silhouette import Outline, TreeSurfaces
+from drake_pose.silhouette import Outline, TreeSurfaces, outline_from_mesh
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -94,11 +94,20 @@ class RegistrationBody:
 
     Args:
         tree: the pose tree.
+        seen: the nodes that silhouettes show; all where None.
     """
 
-    def __init__(self, tree: PoseTree) -> None:
+    def __init__(self, tree: PoseTree, seen: Collection[str] | None = None) -> None:
         self.tree, self.kinematics = tree, TreeKinematics(tree)
         surfaces = TreeSurfaces(tree)
+        if seen is not None:
+            nothing = outline_from_mesh(TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64)))
+            surfaces = surfaces.with_rigid(
+                [
+                    surface if node.name in seen else nothing
+                    for node, surface in zip(tree.nodes, surfaces.rigid, strict=True)
+                ]
+            )
         self.very_few = few_triangles(surfaces, VERY_FEW)
         self.few = few_triangles(surfaces, FEW)
         self.all = few_triangles(surfaces, np.iinfo(np.int64).max)

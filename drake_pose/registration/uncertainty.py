@@ -65,7 +65,8 @@ def calibration_uncertainty(fit: CalibrationFit, found: Calibration) -> Uncertai
         moves = np.zeros((len(X_WN), shared + len(rows), 12))
         moves[:, :shared] = fit.motions(found, c, compared.placement.dense(len(values)))
         for n, (outline, X) in enumerate(zip(own.contours.outlines, X_WN, strict=True)):
-            moves[n, shared + place] = widening(outline.vertices, X) * size
+            if len(outline.vertices):
+                moves[n, shared + place] = widening(outline.vertices, X) * size
         pictures.append(Picture(compared.A[0], compared.b[0], X_WN, X_CW, moves, size))
     seen = distances_in_pictures(fit.fits[0].contours.outlines, pictures)
     is_angle = np.zeros(shared + len(rows), bool)

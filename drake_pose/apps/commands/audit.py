@@ -65,7 +65,7 @@ def audit(
         from drake_pose.apps.registration.inputs import RegistrationSettings
 
         settings = RegistrationSettings(
-            tuple(camera or ()), tuple(frame or ()), held, packages=packages
+            tuple(camera or ()), tuple(frame or ()), hold=held, packages=packages
         )
         with count_progress("frames", None) as advance:
             result = audit_scene(

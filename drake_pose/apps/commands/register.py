@@ -81,6 +81,16 @@ FocalOption = Annotated[
         rich_help_panel="Estimation",
     ),
 ]
+OnOption = Annotated[
+    str | None,
+    typer.Option(
+        "--on",
+        metavar="LINK",
+        help="The cameras to be found ride on this link (eye in hand): their pose X_LC in its "
+        "frame is found, from masks of the robot's base, which is what no joint moves.",
+        rich_help_panel="Input",
+    ),
+]
 SuggestOption = Annotated[
     bool,
     typer.Option(
@@ -109,6 +119,7 @@ def register(
     out: OutOption,
     package: PackageOption = None,
     camera: SearchedCameraOption = None,
+    on: OnOption = None,
     frame: FrameOption = None,
     hold: HoldOption = None,
     zeros: ZerosOption = None,
@@ -133,6 +144,7 @@ def register(
         settings = RegistrationSettings(
             tuple(camera or ()),
             tuple(frame or ()),
+            on,
             held,
             tuple(zeros or ()),
             tuple(lengths or ()),

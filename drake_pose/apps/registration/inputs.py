@@ -14,7 +14,7 @@ from drake_pose.apps.estimate.scene_checks import check_scene, texts_of
 from drake_pose.apps.options import select_frames
 from drake_pose.apps.registration.known_positions import KnownPositions, read_known_positions
 from drake_pose.apps.settings import EstimateSettings
-from drake_pose.body import ArticulatedModel, PoseTree, load_model
+from drake_pose.body import ArticulatedModel, PoseTree, RootRotation, load_model
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera import Camera, PinholeCamera
 from drake_pose.camera.files import load_camera_file
@@ -44,6 +44,7 @@ class RegistrationSettings:
         cameras: the cameras to find, also where the camera file has their X_WC; all that have none
             where empty.
         frames: names, or ranges ``FIRST:LAST``; all where empty.
+        on: the link on which the cameras ride that are to be found; None: they stand still.
         hold: joints that are not in the table, by name [deg or m].
         zeros: joints whose zeros are asked for, too; "all": those of all that move.
         lengths: links whose lengths are asked for, too; "all": those of all that have one.
@@ -56,6 +57,7 @@ class RegistrationSettings:
 
     cameras: tuple[str, ...] = ()
     frames: tuple[str, ...] = ()
+    on: str | None = None
     hold: Mapping[str, float] = field(default_factory=dict)
     zeros: tuple[str, ...] = ()
     lengths: tuple[str, ...] = ()
@@ -79,7 +81,9 @@ class RegistrationInputs:
     Args:
         scene: the recorded scene; cameras whose X_WC is missing stand at the world's origin.
         model: the robot.
-        tree: its pose tree, as it stands in the world.
+        tree: its pose tree, as it stands in the world; or for cameras that ride on a link, as it
+            stands in the link's frame, which is the world of all poses then.
+        seen: the tree's nodes that the masks show; None: all.
         searched: the cameras that are to be found.
         held: the others that have an X_WC.
         frames: what each of these cameras sees, by name.
@@ -91,6 +95,7 @@ class RegistrationInputs:
     scene: Scene
     model: ArticulatedModel
     tree: PoseTree
+    seen: tuple[str, ...] | None
     searched: tuple[PinholeCamera, ...]
     held: tuple[PinholeCamera, ...]
     frames: Mapping[str, tuple[PosedFrame, ...]]
@@ -117,21 +122,26 @@ def read_inputs(
     if not scene_path.is_dir():
         raise SceneError(f"{scene_path}: no such folder; a scene has {_CAMERAS} and masks")
     file = load_camera_file(scene_path / _CAMERAS)
-    searched = _select_searched(scene_path, file.cameras, file.unplaced, settings.cameras)
+    _check_links(scene_path, file.links, settings)
+    unplaced = (*file.unplaced, *file.links)
+    searched = _select_searched(scene_path, file.cameras, unplaced, settings.cameras)
     checked = check_scene(load_scene(scene_path, file.cameras))
     scene = checked.scene
-    unseen = [name for name in file.unplaced if not any(owner == name for owner, _ in scene.masks)]
+    unseen = [name for name in unplaced if not any(owner == name for owner, _ in scene.masks)]
     if not settings.cameras:
         searched = [name for name in searched if name not in unseen]
     model = load_model(model_path, package_paths=settings.packages)
-    tree = make_tree(model, EstimateSettings(hold=settings.hold), None)
+    tree, seen = _make_tree(model, settings)
     kinematics = TreeKinematics(tree)
     zeros, lengths = _select_parameters(model, kinematics, settings)
-    positions = read_known_positions(joints_path, model, kinematics)
+    positions = read_known_positions(joints_path, model, kinematics, settings.on is not None)
     held = [
         camera
         for name, camera in file.cameras.items()
-        if name not in searched and name not in file.unplaced and isinstance(camera, PinholeCamera)
+        if name not in searched
+        and name not in unplaced
+        and settings.on is None
+        and isinstance(camera, PinholeCamera)
     ]
     pinholes = [_require_pinhole(scene_path, file.cameras[name]) for name in searched]
     frames = {
@@ -139,16 +149,60 @@ def read_inputs(
     }
     for camera in held:
         frames[camera.name] = _frames_of_held(scene, camera, positions, settings.frames)
-    left_out = [name for name in file.unplaced if name not in searched]
+    left_out = [name for name in unplaced if name not in searched]
     warnings = [*texts_of(*checked.warnings), *model.warnings, *positions.warnings]
     warnings += [_say_left_out(name) for name in left_out]
     warnings += [
         text for camera in pinholes for text in _check_poses(camera, frames[camera.name], positions)
     ]
     return RegistrationInputs(
-        scene, model, tree, tuple(pinholes), tuple(held), frames, zeros, lengths, tuple(left_out),
-        tuple(warnings),
+        scene, model, tree, seen, tuple(pinholes), tuple(held), frames, zeros, lengths,
+        tuple(left_out), tuple(warnings),
     )  # fmt: skip
+
+
+def _check_links(path: Path, links: Mapping[str, str], settings: RegistrationSettings) -> None:
+    """Refuses a camera that rides on another link than those that are to be found, or lengths."""
+    if settings.on is not None and settings.lengths:
+        raise SettingsError(
+            "lengths of links are not found from a camera that rides on one: leave --on or "
+            "--lengths out"
+        )
+    for name, link in links.items():
+        if link != settings.on:
+            raise SceneError(
+                f"{path / _CAMERAS}: camera '{name}' rides on link '{link}': find it with "
+                f"--on {link}, or take it out of the file"
+            )
+
+
+def _make_tree(
+    model: ArticulatedModel, settings: RegistrationSettings
+) -> tuple[PoseTree, tuple[str, ...] | None]:
+    """The pose tree, and which of its nodes the masks show; None: all.
+
+    From a link on which a camera rides, the masks show what no joint moves.
+    """
+    tree = make_tree(model, EstimateSettings(hold=settings.hold), None)
+    link = settings.on
+    if link is None:
+        return tree, None
+    base = [node.name for node in tree.nodes if node.parent < 0 and not node.value_names]
+    if not base:
+        raise SettingsError(
+            f"{model.path}: no link that is seen stands still, so a camera on link '{link}' sees "
+            "nothing that tells where it is; the robot's base needs visual geometry"
+        )
+    held = {model.position_names[index]: value for index, value in tree.held.items()}
+    moved = model.pose_tree(
+        link, root_position=np.zeros(3), root_rotation=RootRotation.fixed(), held=held
+    )
+    if not {node.name for node in moved.nodes[1:]} & set(base):
+        raise SettingsError(
+            f"{model.path}: no joint moves link '{link}', so a camera on it stands still: leave "
+            "--on out"
+        )
+    return moved, tuple(base)
 
 
 def _select_parameters(

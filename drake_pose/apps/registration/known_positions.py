@@ -68,9 +68,15 @@ class KnownPositions:
 
 
 def read_known_positions(
-    path: Path, model: ArticulatedModel, kinematics: TreeKinematics
+    path: Path, model: ArticulatedModel, kinematics: TreeKinematics, unobserved: bool = False
 ) -> KnownPositions:
     """Reads a table with the column frame and one for each joint that is not held.
+
+    Args:
+        path: the table.
+        model: whose positions its columns are.
+        kinematics: of the pose tree.
+        unobserved: whether there may be columns of joints that move nothing that is seen.
 
     Raises:
         SceneError: it cannot be read, lacks a joint, has a column that is of no use, or is not in
@@ -87,7 +93,9 @@ def read_known_positions(
             "of every joint in every frame [rad or m], or hold those that did not move: "
             f"--hold {missing[0]}=VALUE [deg or m]"
         )
-    unused = [name for name in table.names if name not in asked]
+    # What moves nothing that is seen may be there.
+    known = {*asked, *kinematics.tree.unobserved_positions} if unobserved else set(asked)
+    unused = [name for name in table.names if name not in known]
     if unused:
         raise SceneError(
             f"{path}: column '{unused[0]}' is a position that is held, or that places the whole "

@@ -91,7 +91,7 @@ def register_scene(
     if folder is not None:
         require_empty(folder)
     inputs = read_inputs(*paths, settings)
-    body = RegistrationBody(inputs.tree)
+    body = RegistrationBody(inputs.tree, inputs.seen)
     warnings = [*inputs.warnings, *_check_held(inputs, body)]
     registered, described = _search(inputs, body, settings, warnings, on_camera)
     urdf = None
@@ -131,7 +131,8 @@ def _search(
         warnings += check_focal_length(body, found, inputs.frames[camera.name])
         registered[camera.name] = found
         next_pose = _suggestion(body, found, settings)
-        described[camera.name] = describe_camera(found, time.perf_counter() - start, next_pose)
+        seconds = time.perf_counter() - start
+        described[camera.name] = describe_camera(found, seconds, next_pose, settings.on)
         warnings += _warnings_of(found)
         if on_camera is not None:
             on_camera(len(registered))
@@ -177,7 +178,12 @@ def _describe_again(
     told = {"zeros": describe_zeros(zeros, body.kinematics), "lengths": describe_lengths(zeros)}
     return {
         name: {
-            **describe_camera(found, before[name]["seconds"] + seconds, before[name]["suggestion"]),
+            **describe_camera(
+                found,
+                before[name]["seconds"] + seconds,
+                before[name]["suggestion"],
+                before[name].get("link"),
+            ),
             **told,
         }
         for name, found in registered.items()

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from drake_pose.apps.registration.inputs import RegistrationInputs, RegistrationSettings
 from drake_pose.apps.registration.report import make_registration_report
@@ -19,7 +20,9 @@ from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera import Camera
 from drake_pose.camera.files import dump_cameras
 from drake_pose.registration.register import RegisteredCamera
-from drake_pose.silhouette import LabelRenderer
+from drake_pose.silhouette import LabelRenderer, draw_mask, outline_from_mesh
+
+Array = NDArray[np.float64]
 
 CAMERAS, REGISTRATION = "cameras.yaml", "registration.yaml"
 
@@ -27,15 +30,27 @@ _ERROR_NAMES = ("turn_x", "turn_y", "turn_z", "x", "y", "z")
 
 
 def describe_camera(
-    found: RegisteredCamera, seconds: float, suggestion: dict[str, Any] | None = None
+    found: RegisteredCamera,
+    seconds: float,
+    suggestion: dict[str, Any] | None = None,
+    link: str | None = None,
 ) -> dict[str, Any]:
-    """A camera's part of summary.json: lengths in m, but for `_mm`; angles in `_deg`."""
+    """A camera's part of summary.json: lengths in m, but for `_mm`; angles in `_deg`.
+
+    Args:
+        found: the camera.
+        seconds: how long it took [s].
+        suggestion: a pose of the robot that would tell poses apart.
+        link: on which the camera rides, in whose frame its pose is then.
+    """
     poses = [found.camera.X_WC, *found.alternatives]
+    pose, on = ("X_WC", {}) if link is None else ("X_LC", {"link": link})
     return {
-        "X_WC": found.camera.X_WC.tolist(),
+        **on,
+        pose: found.camera.X_WC.tolist(),
         "translation_sd_mm": 1e3 * found.translation_sd,
         "rotation_sd_deg": float(np.degrees(found.rotation_sd)),
-        "families": [{"X_WC": np.asarray(X_WC).tolist()} for X_WC in poses],
+        "families": [{pose: np.asarray(X).tolist()} for X in poses],
         "mean_iou": float(np.mean([frame.iou for frame in found.frames])),
         "zeros": {},
         "lengths": {},
@@ -124,14 +139,15 @@ def write_result(
     folder.write(REGISTRATION, text.encode())
     folder.write_summary(summary)
     folder.write(REPORT, make_registration_report(path, summary).encode())
-    folder.write(CAMERAS, dump_cameras(cameras).encode())
+    links = {name: one["link"] for name, one in summary["cameras"].items() if "link" in one}
+    folder.write(CAMERAS, dump_cameras(cameras, links).encode())
 
 
 def _uncertainty(found: RegisteredCamera, summary: Mapping[str, Any]) -> dict[str, Any]:
     """A camera's part of registration.yaml, given its part of summary.json."""
     values: dict[str, Any] = without_nan(
         {
-            "X_WC": found.camera.X_WC,
+            **{name: summary[name] for name in ("link", "X_LC", "X_WC") if name in summary},
             "errors": list(_ERROR_NAMES),
             "covariance": found.covariance,
             "alternatives": [np.asarray(X_WC) for X_WC in found.alternatives],
@@ -146,11 +162,9 @@ def _write_overlays(
     folder: ResultFolder, inputs: RegistrationInputs, found: RegisteredCamera
 ) -> None:
     """Draws the robot over each mask."""
-    camera, kinematics = found.camera, TreeKinematics(inputs.tree)
-    renderer = LabelRenderer(inputs.model, camera)
+    camera, draw = found.camera, _drawn(inputs, found.camera)
     for frame, misfit in zip(inputs.frames[camera.name], found.frames, strict=True):
-        q, X_WB = inputs.tree.positions_from(kinematics.split(frame.values))
-        segments = renderer.segments(q, X_WB)
+        segments = draw(frame.values)
         word = "agrees" if misfit.agrees else "CONTRADICTS the others"
         title = (
             f"{camera.name}  frame {frame.name}  E_total {percent(misfit.E_total)}  "
@@ -158,3 +172,24 @@ def _write_overlays(
         )
         picture = draw_overlay(frame.mask, segments >= 0, segments, [title])
         folder.write(f"{OVERLAY}/{camera.name}/{frame.name}.png", encode_png(picture))
+
+
+def _drawn(inputs: RegistrationInputs, camera: Camera) -> Callable[[Array], NDArray[np.int64]]:
+    """What draws the segments (H, W) at a tree's values (m,), -1 where there is none."""
+    kinematics = TreeKinematics(inputs.tree)
+    if inputs.seen is None:
+        renderer = LabelRenderer(inputs.model, camera)
+
+        def render(values: Array) -> NDArray[np.int64]:
+            q, X_WB = inputs.tree.positions_from(kinematics.split(values))
+            return np.asarray(renderer.segments(q, X_WB), np.int64)
+
+        return render
+    shown = [i for i, node in enumerate(inputs.tree.nodes) if node.name in inputs.seen]
+    outlines = [outline_from_mesh(inputs.tree.nodes[i].mesh) for i in shown]
+
+    def draw(values: Array) -> NDArray[np.int64]:
+        mask = draw_mask(outlines, camera.X_CW @ kinematics.poses(values)[shown], camera)
+        return np.where(mask, 0, -1)
+
+    return draw

@@ -37,13 +37,19 @@ def build_pose_tree(
 ) -> PoseTree:
     """See ArticulatedModel.pose_tree."""
     held = held or {}
-    _check_root(model, root)
+    if root is not None and root not in model.link_names:
+        raise UnknownNameError("link", root, model.link_names, str(model.path))
     held_values = {model.position_index(name): float(value) for name, value in held.items()}
     for name, value in held.items():
         if not np.isfinite(value):
             raise SettingsError(f"held joint '{name}' has the value {value}: give a finite number")
     position = None if root_position is None else _checked_position(root_position)
     graph = build_link_graph(model, root)
+    if root is not None and not _seen(graph, graph.group_of(root)):
+        raise ModelError(
+            f"{model.path}: link '{root}' has no visual geometry, nor has what is welded to it, so "
+            f"it cannot be the root; links with geometry: {', '.join(model.link_meshes)}"
+        )
     plan = _choose_root(model, graph, root, root_rotation)
     rotation = root_rotation or RootRotation.free()
 
@@ -70,19 +76,6 @@ class RootPlan:
     start: int
     turned: bool
     own: bool
-
-
-def _check_root(model: ParsedModel, root: str | None) -> None:
-    """Only a link with geometry can be the root."""
-    if root is None or root in model.link_meshes:
-        return
-    known = model.link_names
-    if root not in known:
-        raise UnknownNameError("link", root, known, str(model.path))
-    raise ModelError(
-        f"{model.path}: link '{root}' has no visual geometry, so it cannot be the root; "
-        f"links with geometry: {', '.join(model.link_meshes)}"
-    )
 
 
 def _checked_position(position: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,0 +1,93 @@
+"""`drake-pose register --on LINK`: a camera on a robot's hand, from masks of the robot's base."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from drake_pose.apps.main import app
+from drake_pose.camera.files import load_camera_file, load_cameras
+from drake_pose.errors import CameraError
+from tests.apps.registration.arm_scenes import ArmScene, pose_errors
+from tests.apps.registration.hand_camera import X_LC, write_hand_camera
+
+
+@pytest.fixture(scope="module")
+def hand_camera(tmp_path_factory: pytest.TempPathFactory) -> ArmScene:
+    return write_hand_camera(tmp_path_factory.mktemp("hand"))
+
+
+def arguments(scene: ArmScene, out: Path, *more: str) -> list[str]:
+    given = ["--model", str(scene.model), "--joints", str(scene.joints), "--out", str(out)]
+    return ["register", str(scene.folder), *given, *more]
+
+
+def test_the_camera_is_found_on_its_link(
+    hand_camera: ArmScene, runner: CliRunner, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    result = runner.invoke(app, arguments(hand_camera, out, "--on", "flange", "--json"))
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    assert found["warnings"] == []
+    assert found["link"] == "flange"
+    assert "X_WC" not in found
+    millimetres, degrees = pose_errors(np.array(found["X_LC"]), X_LC)
+    assert millimetres < 1.5
+    assert degrees < 0.15
+    assert millimetres < 4.0 * np.sqrt(3.0) * found["translation_sd_mm"]
+    assert found["mean_iou"] > 0.98
+    assert len(list((out / "overlay" / "wrist").iterdir())) == 6
+    assert "wrist" in (out / "report.html").read_text()
+    read = load_camera_file(out / "cameras.yaml")
+    assert read.links == {"wrist": "flange"}
+    assert read.unplaced == ()
+    np.testing.assert_allclose(read.cameras["wrist"].X_WC, found["X_LC"], atol=1e-12)
+    one = yaml.safe_load((out / "registration.yaml").read_text())["wrist"]
+    assert one["link"] == "flange"
+    # It stands elsewhere in each frame: who needs cameras that stand still says so.
+    with pytest.raises(CameraError, match="'wrist' rides on link 'flange' of a robot"):
+        load_cameras(out / "cameras.yaml")
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["--on", "paw"], "no link 'paw'"),
+        (["--on", "base"], "no joint moves link 'base'"),
+        (["--on", "hand", "--lengths", "all"], "leave --on or --lengths out"),
+    ],
+)
+def test_what_is_refused_before_work(
+    more: list[str], said: str, hand_camera: ArmScene, runner: CliRunner, tmp_path: Path
+) -> None:
+    result = runner.invoke(app, arguments(hand_camera, tmp_path / "out", *more))
+    assert result.exit_code == 1
+    assert said in " ".join(result.stderr.split())
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_base_without_looks_is_named(
+    arm_scene: ArmScene, runner: CliRunner, tmp_path: Path
+) -> None:
+    result = runner.invoke(app, arguments(arm_scene, tmp_path / "out", "--on", "hand"))
+    assert result.exit_code == 1
+    assert "no link that is seen stands still" in " ".join(result.stderr.split())
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"link": "hand"}, "link's name"),
+        ({"X_LC": np.eye(4).tolist()}, "link's name"),
+        ({"link": "hand", "X_LC": np.eye(4).tolist(), "X_WC": np.eye(4).tolist()}, "no X_WC"),
+    ],
+)
+def test_half_a_link_is_refused(fields: dict[str, object], said: str, tmp_path: Path) -> None:
+    sides = dict(width=8, height=6, focal_x=9, focal_y=9, center_x=3.5, center_y=2.5)
+    (tmp_path / "cameras.yaml").write_text(yaml.safe_dump({"wrist": sides | fields}))
+    with pytest.raises(CameraError, match=said):
+        load_camera_file(tmp_path / "cameras.yaml")

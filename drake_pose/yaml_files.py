@@ -25,11 +25,32 @@ class _UniqueKeyLoader(yaml.SafeLoader):
         return mapping
 
 
-def read_yaml(path: Path, error_type: type[DrakePoseError]) -> Any:
+class _TaggedLoader(_UniqueKeyLoader):
+    """Keeps the tag of a mapping in it as ``_tag``, as pydrake.common.yaml does."""
+
+
+def _construct_tagged(loader: _TaggedLoader, suffix: str, node: yaml.Node) -> Any:
+    """The value of a node that has a tag of its own, such as Drake's ``!Rpy``."""
+    if isinstance(node, yaml.MappingNode):
+        return {"_tag": f"!{suffix}", **loader.construct_mapping(node, deep=True)}
+    if isinstance(node, yaml.SequenceNode):
+        return loader.construct_sequence(node, deep=True)
+    return loader.construct_scalar(node)
+
+
+_TaggedLoader.add_multi_constructor("!", _construct_tagged)
+
+
+def read_yaml(path: Path, error_type: type[DrakePoseError], *, tags: bool = False) -> Any:
     """Returns a YAML file's content, plain values only.
 
     The file's size is limited. An alias stays a reference, so a small file cannot fill the memory
     unless its reader walks through every copy.
+
+    Args:
+        path: the file.
+        error_type: what is raised.
+        tags: keep local tags of mappings, as Drake's files have them, under the key ``_tag``.
 
     Raises:
         error_type: names the file; when it cannot be read, is too large, or is no YAML file.
@@ -42,7 +63,7 @@ def read_yaml(path: Path, error_type: type[DrakePoseError]) -> Any:
         raise error_type(f"{path}: larger than {_LARGEST_FILE} bytes, which is not expected here")
     try:
         # The loader derives from yaml.SafeLoader.
-        return yaml.load(data, Loader=_UniqueKeyLoader)
+        return yaml.load(data, Loader=_TaggedLoader if tags else _UniqueKeyLoader)
     except (yaml.YAMLError, ValueError, TypeError) as error:
         raise error_type(f"{path}: not a YAML file: {' '.join(str(error).split())}") from error
     except RecursionError:

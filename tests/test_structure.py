@@ -128,8 +128,13 @@ MAY_KNOW_INSIDE = {
     },
     "apps/experiments": {"kameda": set(), "shimada": set(), "date": set()},
 }
-# Drake keeps two plain value types, ImageLabel16I and CameraInfo, in pydrake.systems.sensors.
-VALUE_TYPES = {"camera/drake.py", "silhouette/pictures/label_images.py"}
+# Drake keeps three plain value types, ImageLabel16I, CameraInfo and CameraConfig, in
+# pydrake.systems.sensors.
+VALUE_TYPES = {
+    "camera/config_files.py",
+    "camera/drake.py",
+    "silhouette/pictures/label_images.py",
+}
 
 # Beside the rooms, for all of them.
 FOR_ALL = {"compiled", "errors", "regular_files", "version", "yaml_files"}
@@ -238,7 +243,7 @@ def test_imports_point_left_only(path):
         if parts[0] == "drake_pose" and len(parts) > 1 and parts[1] not in FOR_ALL:
             assert parts[1] in MAY_KNOW[room] | {room}, f"{relative} imports {module}"
         if module.startswith("pydrake.systems") and room not in ("systems", "apps"):
-            allowed = set(names) <= {"ImageLabel16I", "CameraInfo"}
+            allowed = set(names) <= {"ImageLabel16I", "CameraInfo", "CameraConfig"}
             assert str(relative) in VALUE_TYPES, f"{relative} imports {module}"
             assert allowed, f"{relative} imports {names} from {module}"
         if module == "pydrake.multibody.parsing":

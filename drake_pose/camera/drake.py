@@ -1,6 +1,7 @@
-"""Cameras to and from Drake's render cameras.
+"""Cameras to and from Drake's render cameras and CameraConfig.
 
-Drake's value type CameraInfo lives in pydrake.systems.sensors; it alone is taken from there.
+Drake's value types CameraInfo and CameraConfig live in pydrake.systems.sensors; they alone are
+taken from there.
 Drake puts pixel centres at i + 0.5, drake_pose at i: principal points differ by half a pixel.
 """
 
@@ -9,6 +10,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from pydrake.common.schema import Rotation, Transform
 from pydrake.geometry import (
     ClippingRange,
     ColorRenderCamera,
@@ -17,7 +19,7 @@ from pydrake.geometry import (
     RenderCameraCore,
 )
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.systems.sensors import CameraInfo
+from pydrake.systems.sensors import CameraConfig, CameraInfo
 
 from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
 from drake_pose.errors import CameraError
@@ -130,6 +132,78 @@ def camera_from_drake(
         X_WC=pose,
         **near,
     )
+
+
+def camera_from_config(config: CameraConfig) -> PinholeCamera:
+    """Returns the camera whose pictures the colour and label sensor of a CameraConfig takes.
+
+    Its pose is X_PB X_BC. What says nothing of where a pixel looks (far plane, rates, renderer,
+    depth sensor) is left out.
+
+    Raises:
+        CameraError: the camera hangs on a frame other than the world, a pose is drawn by lot, or a
+            number is none that a camera can have.
+    """
+    where = f"camera '{config.name}'"
+    frame = config.X_PB.base_frame
+    if frame not in (None, "", "world") or config.X_BC.base_frame not in (None, ""):
+        raise CameraError(
+            f"{where}: its pose is given in '{frame or config.X_BC.base_frame}', but only cameras "
+            "that stand in the world can be read: leave base_frame out of X_PB and X_BC, and give "
+            "the pose in the world"
+        )
+    poses = []
+    for name, pose in (("X_PB", config.X_PB), ("X_BC", config.X_BC)):
+        if not pose.IsDeterministic():
+            raise CameraError(f"{where}: {name} is drawn by lot; give the pose that was drawn")
+        poses.append(pose.GetDeterministicValue())
+    center_x, center_y = config.principal_point()
+    return PinholeCamera(
+        name=config.name,
+        width=config.width,
+        height=config.height,
+        focal_x=config.focal_x(),
+        focal_y=config.focal_y(),
+        center_x=center_x - HALF_PIXEL,
+        center_y=center_y - HALF_PIXEL,
+        X_WC=(poses[0] @ poses[1]).GetAsMatrix4(),
+        near=config.clipping_near,
+    )
+
+
+def camera_to_config(camera: Camera) -> CameraConfig:
+    """Returns a CameraConfig with label images on; everything else is Drake's default.
+
+    Raises:
+        CameraError: a parallel camera, which Drake does not know, or one whose principal point lies
+            outside its picture.
+    """
+    if not isinstance(camera, PinholeCamera):
+        raise CameraError(f"camera '{camera.name}': a CameraConfig is a pinhole, not parallel")
+    camera_to_drake(camera, renderer_name="any")
+    turn = _rigid_transform(camera.X_WC).rotation().ToAngleAxis()
+    rotation = Rotation()
+    rotation.value = Rotation.AngleAxis(angle_deg=math.degrees(turn.angle()), axis=turn.axis())
+    pose = Transform()
+    pose.rotation = rotation
+    pose.translation = camera.X_WC[:3, 3].tolist()
+    focal = CameraConfig.FocalLength(x=camera.focal_x, y=camera.focal_y)
+    config = CameraConfig(
+        name=camera.name,
+        width=camera.width,
+        height=camera.height,
+        focal=focal,
+        center_x=camera.center_x + HALF_PIXEL,
+        center_y=camera.center_y + HALF_PIXEL,
+        clipping_near=camera.near,
+        X_PB=pose,
+        label=True,
+    )
+    # Drake refuses a depth sensor that looks beyond the clipping planes.
+    config.clipping_far = max(config.clipping_far, 2.0 * camera.near)
+    config.z_near = max(config.z_near, camera.near)
+    config.z_far = max(config.z_far, 2.0 * camera.near)
+    return config
 
 
 def _render_cameras(

@@ -1,4 +1,4 @@
-"""Camera files: YAML, one entry a camera, with the field names of Drake's CameraConfig."""
+"""Camera files: YAML, one entry a camera; or Drake's own, a CameraConfig or a Scenario."""
 
 from __future__ import annotations
 
@@ -24,6 +24,14 @@ _OPTIONAL = {
     "pinhole": ("X_WC", "link", "X_LC", "projection", "clipping_near"),
     "parallel": ("X_WC", "projection"),
 }
+# What both have; what only a CameraConfig has; and the name that Drake gives one without.
+_SHARED = {*_COMMON, "clipping_near"}
+_CONFIG_ALONE = {
+    *("focal", "X_PB", "X_BC", "X_BD", "name", "fps", "rgb", "depth", "label", "show_rgb"),
+    *("clipping_far", "z_near", "z_far", "renderer_name", "renderer_class", "background"),
+    *("capture_offset", "output_delay", "do_compress", "lcm_bus"),
+}
+_DRAKES_NAME = "preview_camera"
 
 
 def load_cameras(path: str | Path) -> dict[str, Camera]:
@@ -32,6 +40,9 @@ def load_cameras(path: str | Path) -> dict[str, Camera]:
     A pinhole camera has `width height focal_x focal_y center_x center_y` [pixel, pixel centres at
     integers] and `X_WC` (4 x 4) [m], and may have `projection: pinhole` and `clipping_near` [m].
     A parallel camera has `projection: parallel` and `pixels_per_metre` instead of focal lengths.
+
+    A file of Drake's is known by its fields: a Scenario (``cameras:``, also below one name), a
+    mapping of CameraConfigs, or a single one. Their principal points count from half a pixel less.
 
     Raises:
         CameraError: names the file, the camera and the field.
@@ -76,9 +87,16 @@ def load_camera_file(path: str | Path) -> CameraFile:
         CameraError: names the file, the camera and the field.
     """
     path = Path(path)
-    content = read_yaml(path, CameraError)
+    content = read_yaml(path, CameraError, tags=True)
     if not isinstance(content, dict) or not content:
         raise CameraError(f"{path}: expected a mapping from camera names to their parameters")
+    configs = _find_configs(content, path)
+    if configs is not None:
+        # Drake takes a while to load, and our own files do not need it.
+        from drake_pose.camera.config_files import read_configs
+
+        found = read_configs(configs, path)
+        return CameraFile({_check_name(name, path): found[name] for name in found}, ())
     cameras: dict[str, Camera] = {}
     for key, entry in content.items():
         name = _check_name(key, path)
@@ -121,6 +139,45 @@ def dump_cameras(
     for name, link in (links or {}).items():
         content[name] |= {"link": link, "X_LC": content[name].pop("X_WC")}
     return yaml.safe_dump(content, sort_keys=False)
+
+
+def _find_configs(content: dict[Any, Any], path: Path) -> dict[str, Any] | None:
+    """Returns the CameraConfigs by name, of which nothing is checked; None: the file is ours."""
+    if _is_config(content):
+        return {str(content.get("name", _DRAKES_NAME)): content}
+    scenarios = (
+        {"": content}
+        if _is_scenario(content)
+        else {key: entry for key, entry in content.items() if _is_scenario(entry)}
+    )
+    if len(scenarios) > 1:
+        raise CameraError(
+            f"{path}: holds several scenarios ({', '.join(map(str, scenarios))}); keep the one "
+            "whose cameras are meant"
+        )
+    for scenario in scenarios.values():
+        cameras = scenario["cameras"]
+        if not isinstance(cameras, dict) or not cameras:
+            raise CameraError(f"{path}: cameras must be a mapping from names to CameraConfigs")
+        return cameras
+    if any(isinstance(entry, dict) and _is_config(entry) for entry in content.values()):
+        return content
+    return None
+
+
+def _is_scenario(entry: Any) -> bool:
+    """Whether an entry has cameras, and is not a file of ours with a camera of that name."""
+    if not isinstance(entry, dict) or "cameras" not in entry:
+        return False
+    cameras = entry["cameras"]
+    return not isinstance(cameras, dict) or not {"X_WC", "width"} & set(cameras)
+
+
+def _is_config(entry: dict[Any, Any]) -> bool:
+    """Whether an entry has fields of a CameraConfig, and none that only our cameras have."""
+    fields = set(entry)
+    ours = {field for kind in _REQUIRED for field in (*_REQUIRED[kind], *_OPTIONAL[kind])}
+    return bool(fields & _CONFIG_ALONE) and not fields & (ours - _SHARED)
 
 
 def _check_name(key: Any, path: Path) -> str:

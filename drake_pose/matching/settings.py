@@ -19,6 +19,8 @@ class PaperSearchSettings:
         outside_limit: the threshold r of (4) [pixel]: the area of a segment that may lie outside
             the silhouette, in each view. None: begin with 12.6 % of the mean projected area of a
             segment (what the paper's 200 pixels are for its body) and double until a pose is found.
+        outside_weight: what a pixel outside the silhouette costs where candidates are put in order:
+            by e - outside_weight * (area outside). 0 is the paper's order, by e alone.
         candidate_limit: K, how many of a node's candidates are kept; the paper's is 5.
         run_limit: the search stops after this many runs of step 3 and answers with the best pose
             that it has; the paper knows no such limit.
@@ -34,6 +36,7 @@ class PaperSearchSettings:
     length_interval: float = 0.05
     intervals: Mapping[str, float] = field(default_factory=dict)
     outside_limit: float | None = None
+    outside_weight: float = 0.0
     candidate_limit: int = 5
     run_limit: int = 10_000
     leaf_combination_limit: int = 100_000
@@ -46,6 +49,8 @@ class PaperSearchSettings:
                 raise SettingsError(f"{name} must be positive and finite, not {value}")
         if self.outside_limit is not None and not self.outside_limit >= 0:
             raise SettingsError(f"outside_limit (r) must be 0 or more, not {self.outside_limit}")
+        if not (math.isfinite(self.outside_weight) and self.outside_weight >= 0.0):
+            raise SettingsError(f"outside_weight must be 0 or more, not {self.outside_weight}")
         for name in ("candidate_limit", "run_limit", "leaf_combination_limit"):
             if getattr(self, name) < 1:
                 raise SettingsError(f"{name} must be 1 or more, not {getattr(self, name)}")

@@ -12,11 +12,12 @@ from drake_pose.silhouette import TreeSurfaces, draw_mask
 
 
 class NaiveSearch:
-    def __init__(self, search, camera, silhouette, r, K):
+    def __init__(self, search, camera, silhouette, r, K, outside_weight=0.0):
         self.tree = search.tree
         self.values = search.sampled.values
         self.surfaces = TreeSurfaces(search.tree)
         self.camera, self.S, self.r, self.K = camera, silhouette, r, K
+        self.outside_weight = outside_weight
         self.lists, self.u = {}, {}
         self.runs = 0
         self.first_J = None
@@ -69,8 +70,10 @@ class NaiveSearch:
             scored = []
             for t, values in enumerate(self.values[i]):
                 P = self.picture(i, values)
-                if (P & ~self.S).sum() <= self.r:
-                    scored.append((-int((open_part & P).sum()), t))
+                outside = (P & ~self.S).sum()
+                if outside <= self.r:
+                    cost = self.outside_weight * outside - (open_part & P).sum()
+                    scored.append((float(cost), t))
             scored.sort()
             if scored:
                 self.lists[i] = [t for _, t in scored[: self.K]]

@@ -190,7 +190,7 @@ def main() -> None:
     start = time.process_time()
     result = run_experiment(experiment_search())
     seconds = time.process_time() - start
-    console.print(experiment_table([result]))
+    console.print(experiment_table([[result]]))
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     console.print(f"experiment A: {seconds:.1f} s CPU on one core; peak memory {memory:.0f} MiB")
 

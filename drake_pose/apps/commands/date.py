@@ -27,6 +27,12 @@ def date(
             help="silhouette: the paper's method and a fit to all silhouettes; paper: the former."
         ),
     ] = "silhouette",
+    waist: Annotated[
+        str,
+        typer.Option(
+            help="Constants of the waist formula. person: this person's; paper: 0.55, 0.225, 0.225."
+        ),
+    ] = "person",
     out: PicturesOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -40,10 +46,10 @@ def date(
         if out is not None:
             require_empty(out)
         with count_progress("frames", frames) as advance:
-            result = run_experiment(cameras, frames, seed, method, advance)
+            result = run_experiment(cameras, frames, seed, method, advance, waist=waist)
         if out is not None:
             save_pictures(result, out)
         if json:
             print_json(result.as_json())
         else:
-            output_console().print(result.table(), result.costs())
+            output_console().print(result.table(), result.found_table(), result.costs())

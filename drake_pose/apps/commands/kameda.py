@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -20,13 +21,20 @@ from drake_pose.apps.settings import EstimateSettings
 
 if TYPE_CHECKING:
     from drake_pose.apps.experiments.kameda.continuous import ContinuousResult
+    from drake_pose.apps.experiments.kameda.experiment import ExperimentResult
+    from drake_pose.matching import PoseSearch
 
 # What is about the grid of angles, which continuous ones have none of.
-_OF_GRID = ("method", "outside_limit", "candidates", "interval", "edges", "out")
+_OF_GRID = (
+    "seeds", "method", "outside_limit", "outside_weight", "candidates", "interval", "edges", "out",
+)  # fmt: skip
 
 
 ImagesOption = Annotated[int, typer.Option(min=1, help="Number of silhouettes.")]
 SeedOption = Annotated[int, typer.Option(min=0, help="Seed of the random poses.")]
+SeedsOption = Annotated[
+    int, typer.Option(min=1, help="Run this many seeds, and show how far the figures spread.")
+]
 MethodOption = Annotated[
     str, typer.Option(help="paper: the paper's alone; beam: beam search beside it.")
 ]
@@ -44,6 +52,16 @@ OutsideLimitOption = Annotated[
         callback=finite,
         help=r"The paper's r: area of a segment that may lie outside \[pixel].",
         metavar="R",
+    ),
+]
+OutsideWeightOption = Annotated[
+    float,
+    typer.Option(
+        min=0.0,
+        callback=finite,
+        help="Run the paper's method once more, its lists ordered by e - W * (area outside): not "
+        "in the paper, but 10 meets most of its figures.",
+        metavar="W",
     ),
 ]
 CandidatesOption = Annotated[
@@ -79,9 +97,11 @@ def kameda(
     context: typer.Context,
     images: ImagesOption = 219,
     seed: SeedOption = 0,
+    seeds: SeedsOption = 1,
     method: MethodOption = "paper",
     angles: AnglesOption = "grid",
     outside_limit: OutsideLimitOption = 200.0,
+    outside_weight: OutsideWeightOption = 0.0,
     candidates: CandidatesOption = 5,
     interval: IntervalOption = 20.0,
     views: ViewsOption = 1,
@@ -106,8 +126,10 @@ def kameda(
             )
     if angles == "grid":
         with errors_as_messages():
-            paper = (outside_limit, candidates)
-            _run_on_grid(images, seed, method, interval, paper, edges, out, json)
+            runs = GridRuns(
+                images, seed, seeds, method, interval, outside_limit, candidates, outside_weight
+            )
+            _run_on_grid(runs, edges, out, json)
         return
     with errors_as_messages():
         _print_continuous(_run_beside(images, seed, views, mismatch), json)
@@ -152,24 +174,9 @@ def _print_continuous(results: Mapping[str, ContinuousResult], json: bool) -> No
         output_console().print(continuous_table(results))
 
 
-def _run_on_grid(
-    images: int,
-    seed: int,
-    method: str,
-    interval: float,
-    paper: tuple[float, int],
-    edges: bool,
-    out: Path | None,
-    json: bool,
-) -> None:
-    """Run the searches on a grid, the paper's with its r and K."""
+def _run_on_grid(runs: GridRuns, edges: bool, out: Path | None, json: bool) -> None:
+    """Run the searches on a grid and print or draw what they found."""
     from drake_pose.apps.commands.report import count_progress, output_console
-    from drake_pose.apps.experiments.kameda.experiment import (
-        PAPER_IMAGES,
-        beam_experiment_search,
-        experiment_search,
-        run_experiment,
-    )
     from drake_pose.apps.experiments.kameda.inner_edges import edge_lines, settle_by_edges
     from drake_pose.apps.experiments.kameda.pictures import save_pictures
     from drake_pose.apps.experiments.kameda.table import experiment_table
@@ -177,25 +184,89 @@ def _run_on_grid(
 
     if out is not None:
         require_empty(out)
-    paper_images = images if method == "paper" else min(images, PAPER_IMAGES)
-    with count_progress("silhouettes, the paper's method", paper_images) as advance:
-        search = experiment_search(*paper, interval)
-        results = [run_experiment(search, paper_images, seed, advance)]
-    beside: dict[str, object] = {}
-    if method == "beam":
-        beside["paper_method"] = results[0].as_json()
-        with count_progress("silhouettes, beam search", images) as advance:
-            beam = beam_experiment_search(interval)
-            results.append(run_experiment(beam, images, seed, advance))
+    columns = runs.run()
+    leading = columns[-1][0]
     settled: dict[str, int] = {}
     if edges:
-        with count_progress("silhouettes, edges", images) as advance:
-            settled = settle_by_edges(results[-1], advance)
+        with count_progress("silhouettes, edges", runs.images) as advance:
+            settled = settle_by_edges(leading, advance)
     if out is not None:
-        save_pictures(results[-1], out)
+        save_pictures(leading, out)
     if json:
-        print_json({**results[-1].as_json(), **settled, **beside})
+        print_json({**_figures(columns[-1]), **settled, **_beside(columns[:-1])})
         return
-    output_console().print(experiment_table(results))
+    output_console().print(experiment_table(columns))
     if settled:
         say(edge_lines(settled))
+
+
+def _figures(results: Sequence[ExperimentResult]) -> dict[str, object]:
+    """The figures of the first seed, and of several the spread."""
+    from drake_pose.apps.experiments.kameda.table import spread_over_seeds
+
+    figures: dict[str, object] = dict(results[0].as_json())
+    return {**figures, "spread": spread_over_seeds(results)} if len(results) > 1 else figures
+
+
+def _beside(columns: Sequence[Sequence[ExperimentResult]]) -> dict[str, object]:
+    """The figures of the searches beside the one that was asked for."""
+    names = ("paper_method", "outside_weight_method")
+    return {name: _figures(column) for name, column in zip(names, columns, strict=False)}
+
+
+@dataclass(frozen=True)
+class GridRuns:
+    """What is run on the grid of angles: every search with every seed.
+
+    Args:
+        images: silhouettes for each seed.
+        seed: the first.
+        seeds: how many.
+        method: "paper", or "beam" for the beam search as well.
+        interval: [deg].
+        outside_limit: the paper's r [pixel].
+        candidates: the paper's K.
+        outside_weight: above 0 the paper's method is run once more with it.
+    """
+
+    images: int
+    seed: int
+    seeds: int
+    method: str
+    interval: float
+    outside_limit: float
+    candidates: int
+    outside_weight: float
+
+    def run(self) -> list[list[ExperimentResult]]:
+        """The runs of each search, the one that was asked for last; shows progress."""
+        from drake_pose.apps.experiments.kameda import experiment
+
+        paper = (self.outside_limit, self.candidates, self.interval)
+        searches = {"the paper's method": experiment.experiment_search(*paper)}
+        if self.outside_weight > 0.0:
+            weighted = experiment.experiment_search(*paper, self.outside_weight)
+            searches[f"outside weight {self.outside_weight:g}"] = weighted
+        images = self.images
+        if self.method == "beam":
+            images = min(images, experiment.PAPER_IMAGES)
+        columns = [self._run_seeds(name, one, images) for name, one in searches.items()]
+        if self.method == "beam":
+            beam = experiment.beam_experiment_search(self.interval)
+            columns.append(self._run_seeds("beam search", beam, self.images))
+        return columns
+
+    def _run_seeds(self, name: str, search: PoseSearch, images: int) -> list[ExperimentResult]:
+        from drake_pose.apps.commands.report import count_progress
+        from drake_pose.apps.experiments.kameda.experiment import run_experiment
+
+        results: list[ExperimentResult] = []
+        with count_progress(f"silhouettes, {name}", images * self.seeds) as advance:
+            for seed in range(self.seed, self.seed + self.seeds):
+                before = len(results) * images
+
+                def count(done: int, before: int = before) -> None:
+                    advance(before + done)
+
+                results.append(run_experiment(search, images, seed, count))
+        return results

@@ -25,9 +25,18 @@ TruncationOption = Annotated[
     str, typer.Option(help="sequential (the paper's), joint, clip, none; or all of these.")
 ]
 ObservedOption = Annotated[
-    str,
+    str | None,
     typer.Option(
-        help="What is measured. full: all points and lines; lines: the knuckles are hidden."
+        help="What is measured. lines: the knuckles are hidden, as in the paper; full: all points. "
+        "Default: lines; with --static full."
+    ),
+]
+IterationsOption = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        help="Linearisations of an update at most; the paper's filter has 1. Default: 20, fewer "
+        "where the update stands still before.",
     ),
 ]
 StaticOption = Annotated[
@@ -48,7 +57,8 @@ def shimada(
     runs: RunsOption = 50,
     seed: SeedOption = 0,
     truncation: TruncationOption = "joint",
-    observed: ObservedOption = "full",
+    observed: ObservedOption = None,
+    iterations: IterationsOption = None,
     static: StaticOption = None,
     start: StartOption = "guess",
     out: PicturesOption = None,
@@ -59,16 +69,18 @@ def shimada(
         raise typer.BadParameter("makes no plots; leave --out away", param_hint="--static")
     if truncation == _ALL and (static is not None or out is not None):
         raise typer.BadParameter("all goes without --static and --out", param_hint="--truncation")
+    if observed is None:
+        observed = "lines" if static is None else "full"
     with errors_as_messages():
         from drake_pose.apps.commands.report import output_console
 
         result: ExperimentResult | ComparedTruncations | StaticResult
         if static is not None:
-            result = _run_static(runs, seed, truncation, observed, static, start)
+            result = _run_static(runs, seed, truncation, observed, static, start, iterations)
         elif truncation == _ALL:
-            result = _compare_truncations(runs, seed, observed)
+            result = _compare_truncations(runs, seed, observed, iterations)
         else:
-            result = _run_experiment(runs, seed, truncation, observed, out)
+            result = _run_experiment(runs, seed, truncation, observed, iterations, out)
         if json:
             print_json(result.as_json())
         else:
@@ -76,7 +88,13 @@ def shimada(
 
 
 def _run_static(
-    runs: int, seed: int, truncation: str, observed: str, frames: int, start: str
+    runs: int,
+    seed: int,
+    truncation: str,
+    observed: str,
+    frames: int,
+    start: str,
+    iterations: int | None,
 ) -> StaticResult:
     """One unchanging view for this many frames."""
     from drake_pose.apps.commands.report import count_progress
@@ -84,21 +102,30 @@ def _run_static(
 
     marks = (*(mark for mark in MARKS if mark < frames), frames)
     with count_progress("views", runs) as advance:
-        return run_static_experiment(runs, seed, truncation, observed, start, marks, advance)
+        return run_static_experiment(
+            runs, seed, truncation, observed, start, marks, advance, iterations
+        )
 
 
-def _compare_truncations(runs: int, seed: int, observed: str) -> ComparedTruncations:
+def _compare_truncations(
+    runs: int, seed: int, observed: str, iterations: int | None
+) -> ComparedTruncations:
     """The same sequences with each truncation."""
     from drake_pose.apps.commands.report import count_progress
     from drake_pose.apps.experiments.shimada.experiment import CASES, compare_truncations
     from drake_pose.filtering.kalman.truncated_filter import TRUNCATIONS
 
     with count_progress("sequences", runs * len(CASES) * len(TRUNCATIONS)) as advance:
-        return compare_truncations(runs, seed, observed, advance)
+        return compare_truncations(runs, seed, observed, advance, iterations)
 
 
 def _run_experiment(
-    runs: int, seed: int, truncation: str, observed: str, out: Path | None
+    runs: int,
+    seed: int,
+    truncation: str,
+    observed: str,
+    iterations: int | None,
+    out: Path | None,
 ) -> ExperimentResult:
     """The paper's experiment, and its plots."""
     from drake_pose.apps.commands.report import count_progress
@@ -109,7 +136,7 @@ def _run_experiment(
     if out is not None:
         require_empty(out)
     with count_progress("sequences", runs * len(CASES)) as advance:
-        result = run_experiment(runs, seed, truncation, observed, advance)
+        result = run_experiment(runs, seed, truncation, observed, advance, iterations)
     if out is not None:
         save_pictures(result, out)
     return result

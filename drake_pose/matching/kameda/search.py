@@ -184,7 +184,8 @@ class _Run:
             return None
         scores = covered[inside]
         # A stable sort: equal scores keep the grid's order, which begins nearest to zero.
-        order = np.argsort(-scores, kind="stable")
+        worth = scores - self.settings.outside_weight * outside[:, inside].sum(axis=0)
+        order = np.argsort(-worth, kind="stable")
         if len(self.nodes[node].mesh.triangles):
             order = order[: self.settings.candidate_limit]
         samples = inside[order]

@@ -111,10 +111,10 @@ def estimate_pose(
     for k, name in enumerate(LIMBS):
         limb, end = skeleton.limbs[name], features[1 + k]
         if name.endswith("arm"):
-            root, outward = neck + R_WT @ limb.root_T, R_WT @ limb.root_T
+            R, root, outward = R_WT, neck + R_WT @ limb.root_T, R_WT @ limb.root_T
             found = np.array([root, _middle(limb, R_WT, root, q[limb.positions]), end])
         else:
-            outward = R_aimed @ (limb.root_T - skeleton.waist_T)
+            R, outward = R_aimed, R_aimed @ (limb.root_T - skeleton.waist_T)
             root = place + outward
             angles = move_limb(limb, R_aimed, root, q[limb.positions], end)
             found = np.array([root, _middle(limb, R_aimed, root, angles), end])
@@ -122,7 +122,7 @@ def estimate_pose(
         if search:
             circle = joint_circle(limb, root, end, outward)
             found[1], _, scores[name] = search_circle(
-                limb, circle, root, end, cameras, regions, found[1]
+                limb, circle, root, end, cameras, regions, found[1], R, q[limb.positions]
             )
         own_root = neck + R_aimed @ limb.root_T
         angles = limb_angles(limb, R_aimed, own_root, found[1], end, q[limb.positions])

@@ -19,9 +19,15 @@ Mask = NDArray[np.bool_]
 ELBOW_RANGE = (0.0, 120.0)
 """Where an elbow may be on its circle [deg], from behind, over outwards, to a little in front."""
 
-KNEE_RANGE = (-40.0, 80.0)
-"""Where a knee may be on its circle [deg]; 0 is in front, positive outwards."""
+KNEE_RANGE = (-180.0, 175.0)
+"""Where a knee may be on its circle [deg], as far as the hip can turn; 0 is in front, positive
+outwards. Behind it lies where the leg is straight, as it ends at the foot's middle."""
 
+# A straight knee's angle is at its limit: how far beyond it may be measured.
+_BEND_TOLERANCE = math.radians(3.0)
+
+# The trunk's direction is measured, too: how far beyond its limits a hip may seem to be.
+_HIP_TOLERANCE = math.radians(10.0)
 _STEP_DEG = 5.0
 _SAMPLES_ALONG = 12
 _SAMPLES_ACROSS = 5
@@ -87,6 +93,8 @@ def search_circle(
     cameras: Sequence[Camera],
     regions: Sequence[Mask],
     near: Array,
+    R_WT: Array,
+    last: Array,
 ) -> tuple[Array, float, float]:
     """The place of an elbow or knee whose rectangles agree best with the silhouettes.
 
@@ -97,13 +105,20 @@ def search_circle(
         cameras: the cameras.
         regions: (H, W) the person in each camera's picture.
         near: (3,) of equally good places, the one nearest to this is taken: inverse kinematics's.
+        R_WT: (3, 3) the trunk's axes in the world: a knee is only where the hip can turn it.
+        last: (4,) the limb's angles in the last frame [rad].
 
     Returns:
         The joint (3,) [m], its angle on the circle [deg], and the correlation C there.
     """
-    low, high = KNEE_RANGE if limb.name.endswith("leg") else ELBOW_RANGE
+    is_leg = limb.name.endswith("leg")
+    low, high = KNEE_RANGE if is_leg else ELBOW_RANGE
     degrees = np.arange(low, high + 0.5 * _STEP_DEG, _STEP_DEG)
     middles = circle.points(degrees)
+    if is_leg:
+        _, beyond = place_limb(limb, R_WT, root, middles, end, last)
+        possible = beyond <= max(_HIP_TOLERANCE, float(beyond.min()))
+        degrees, middles = degrees[possible], middles[possible]
     samples = rectangles(root, middles, end, limb.half_widths)
     scores = correlation(samples, cameras, regions)
     best = np.flatnonzero(scores >= scores.max() - 1e-9)
@@ -201,17 +216,47 @@ def limb_angles(
         root, middle, end: (3,) [m].
         last: (4,) angles to stay near where several sets do the same [rad].
     """
-    bend = _middle_angle(limb, float(np.linalg.norm(end - root)), float(last[3]))
-    end_U = limb.middle_U + rotation(limb.axes[3:], np.array([bend])) @ limb.end_L
-    towards, upper = end - root, middle - root
-    if np.linalg.norm(np.cross(towards, upper)) < _STRETCHED * np.linalg.norm(upper) ** 2:
-        # A stretched limb does not tell how it is turned about itself: then as in the last frame.
-        R_last = R_WT @ rotation(limb.axes[:3], last[:3])
-        R_WU = _shortest_turn(R_last @ end_U, towards) @ R_last
-    else:
-        R_WU = _triad(towards, upper) @ _triad(end_U, limb.middle_U).T
-    angles = np.array([*_root_angles(limb, R_WT.T @ R_WU, last[:3]), bend])
-    return np.clip(angles, limb.lower, limb.upper)
+    angles, _ = place_limb(limb, R_WT, root, middle[None], end, last)
+    return np.clip(angles[0], limb.lower, limb.upper)
+
+
+def place_limb(
+    limb: Limb, R_WT: Array, root: Array, middles: Array, end: Array, last: Array
+) -> tuple[Array, Array]:
+    """The joint angles that put a limb's joints where they are, for several places of the middle.
+
+    A limb that is nearly straight is as long when it is bent a little: of both the one that the
+    limits allow is taken.
+
+    Args:
+        limb: the limb.
+        R_WT: (3, 3) the trunk's axes in the world.
+        root, end: (3,) [m].
+        middles: (n, 3) [m].
+        last: (4,) angles to stay near where several sets do the same [rad].
+
+    Returns:
+        (n, 4) angles, and (n,) by how much the worst of its root's lies beyond its limits [rad].
+    """
+    options = []
+    for bend in _middle_angles(limb, float(np.linalg.norm(end - root))):
+        end_U = limb.middle_U + rotation(limb.axes[3:], np.array([bend])) @ limb.end_L
+        own = _triad(end_U, limb.middle_U).T
+        R_TU = np.empty((len(middles), 3, 3))
+        for n, middle in enumerate(middles):
+            towards, upper = end - root, middle - root
+            if np.linalg.norm(np.cross(towards, upper)) < _STRETCHED * np.linalg.norm(upper) ** 2:
+                # Stretched it does not tell how it is turned about itself: as in the last frame.
+                R_last = R_WT @ rotation(limb.axes[:3], last[:3])
+                R_TU[n] = R_WT.T @ _shortest_turn(R_last @ end_U, towards) @ R_last
+            else:
+                R_TU[n] = R_WT.T @ _triad(towards, upper) @ own
+        angles, beyond = _root_angles(limb, R_TU, last[:3])
+        whole = np.column_stack([angles, np.full(len(middles), bend)])
+        options.append((beyond + 1e-3 * abs(bend - last[3]), beyond, whole))
+    costs, beyonds, wholes = (np.array(values) for values in zip(*options, strict=True))
+    chosen, each = np.argmin(costs, axis=0), np.arange(len(middles))
+    return wholes[chosen, each], beyonds[chosen, each]
 
 
 def _shortest_turn(old: Array, new: Array) -> Array:
@@ -227,8 +272,11 @@ def _shortest_turn(old: Array, new: Array) -> Array:
     return np.asarray(np.eye(3) + skew + skew @ skew / (1.0 + cosine))
 
 
-def _middle_angle(limb: Limb, distance: float, last: float) -> float:
-    """The middle joint's angle at which root and end are a distance apart, inside its limits."""
+def _middle_angles(limb: Limb, distance: float) -> list[float]:
+    """The middle joint's angles at which root and end are a distance apart [rad].
+
+    One or two inside its limits; where there is none, the limit that is nearest.
+    """
     axis = np.zeros(3)
     axis[limb.axes[3]] = 1.0
     along = (limb.middle_U @ axis) * (limb.end_L @ axis)
@@ -238,29 +286,32 @@ def _middle_angle(limb: Limb, distance: float, last: float) -> float:
     wanted = float(0.5 * (distance**2 - a**2 - b**2) - along)
     turn = math.acos(min(1.0, max(-1.0, wanted / math.hypot(cosine, sine))))
     start = math.atan2(sine, cosine)
-    low, high = limb.lower[3], limb.upper[3]
     options = [math.remainder(start + sign * turn, 2.0 * math.pi) for sign in (-1.0, 1.0)]
-    clipped = [min(max(option, low), high) for option in options]
-    costs = [abs(o - c) + 1e-3 * abs(o - last) for o, c in zip(options, clipped, strict=True)]
-    return clipped[int(np.argmin(costs))]
+    clipped = [min(max(option, limb.lower[3]), limb.upper[3]) for option in options]
+    beyond = np.abs(np.subtract(options, clipped))
+    return [
+        c for c, off in zip(clipped, beyond, strict=True) if off <= beyond.min() + _BEND_TOLERANCE
+    ]
 
 
-def _root_angles(limb: Limb, R: Array, last: Array) -> Array:
-    """The three angles of a rotation about the limb's axes, inside the limits where possible."""
+def _root_angles(limb: Limb, R_TU: Array, last: Array) -> tuple[Array, Array]:
+    """Angles (n, 3) about the limb's axes of rotations (n, 3, 3), inside the limits if possible.
+
+    Second: (n,) by how much the worst of each three lies beyond its limits [rad].
+    """
     i, j, k = (int(axis) for axis in limb.axes[:3])
     sign = 1.0 if (j - i) % 3 == 1 else -1.0
-    second = math.asin(min(1.0, max(-1.0, sign * R[i, k])))
-    first = math.atan2(-sign * R[j, k], R[k, k])
-    third = math.atan2(-sign * R[i, j], R[i, i])
-    other = (first + math.pi, math.pi - second, third + math.pi)
-    best, best_cost = np.zeros(3), math.inf
-    for option in ((first, second, third), other):
-        wrapped = np.array([math.remainder(angle, 2.0 * math.pi) for angle in option])
-        beyond = np.abs(wrapped - np.clip(wrapped, limb.lower[:3], limb.upper[:3])).sum()
-        cost = beyond + 1e-3 * np.abs(wrapped - last).sum()
-        if cost < best_cost:
-            best, best_cost = wrapped, cost
-    return best
+    second = np.arcsin(np.clip(sign * R_TU[:, i, k], -1.0, 1.0))
+    first = np.arctan2(-sign * R_TU[:, j, k], R_TU[:, k, k])
+    third = np.arctan2(-sign * R_TU[:, i, j], R_TU[:, i, i])
+    options = np.array(
+        [[first, second, third], [first + math.pi, math.pi - second, third + math.pi]]
+    ).transpose(0, 2, 1)
+    options = np.remainder(options + math.pi, 2.0 * math.pi) - math.pi
+    beyond = np.abs(options - np.clip(options, limb.lower[:3], limb.upper[:3]))
+    cost = beyond.sum(axis=2) + 1e-3 * np.abs(options - last).sum(axis=2)
+    chosen, each = np.argmin(cost, axis=0), np.arange(len(R_TU))
+    return options[chosen, each], beyond[chosen, each].max(axis=1)
 
 
 def _triad(first: Array, second: Array) -> Array:

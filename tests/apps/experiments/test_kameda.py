@@ -12,7 +12,7 @@ from drake_pose.apps.experiments.kameda.experiment import (
     run_experiment,
 )
 from drake_pose.apps.experiments.kameda.pictures import save_pictures
-from drake_pose.apps.experiments.kameda.table import experiment_table
+from drake_pose.apps.experiments.kameda.table import experiment_table, spread_over_seeds
 from drake_pose.errors import SettingsError
 from drake_pose.silhouette import LabelRenderer
 
@@ -68,13 +68,42 @@ def test_json_has_the_keys_of_the_paper(result):
     assert figures["images"] == 8
     assert figures["mean_e_total"] == pytest.approx(np.mean([t.E_total for t in result.trials]))
     assert figures["min_runs"] <= figures["mean_runs"]
-    assert experiment_table([result]).row_count >= len(PAPER)
+    assert experiment_table([[result]]).row_count >= len(PAPER)
 
 
 def test_the_same_seed_gives_the_same_figures(result):
     again = run_experiment(experiment_search(), images=8, seed=5).as_json()
     for key in ("mean_e_total", "exact", "pose_equal", "improved", "mean_runs"):
         assert again[key] == result.as_json()[key]
+
+
+def test_poses_not_found_are_counted_apart():
+    """With one candidate for each segment there is no way back: it often ends without a pose."""
+    search = experiment_search(candidate_limit=1)
+    partly = run_experiment(search, images=8, seed=5)
+    figures = partly.as_json()
+    found = [trial.result.E_total for trial in partly.trials if trial.result.found]
+    assert 0 < len(found) < 8
+    assert figures["not_found"] == 8 - len(found)
+    assert figures["mean_e_total"] == pytest.approx(np.mean(found))
+
+
+def test_a_cost_for_what_lies_outside_finds_more_exactly(result):
+    weighted = run_experiment(experiment_search(outside_weight=10.0), images=8, seed=5)
+    assert weighted.as_json()["outside_weight"] == 10.0
+    assert result.as_json()["outside_weight"] == 0.0
+    assert weighted.as_json()["exact"] >= 4 > result.as_json()["exact"]
+
+
+def test_the_spread_over_seeds_is_that_of_its_runs(result):
+    other = run_experiment(experiment_search(), images=8, seed=6)
+    spread = spread_over_seeds([result, other])
+    both = [one.as_json()["mean_e_total"] for one in (result, other)]
+    assert spread["mean_e_total"]["min"] == min(both)
+    assert spread["mean_e_total"]["max"] == max(both)
+    assert spread["mean_e_total"]["mean"] == pytest.approx(np.mean(both))
+    assert "seed" not in spread
+    assert " to " in str(list(experiment_table([[result, other]]).columns[2].cells))
 
 
 def test_nothing_outside_allowed_is_exact_far_more_often():
@@ -107,14 +136,14 @@ def test_the_truth_is_in_the_set(wide_result):
 
 
 def test_three_columns_stand_side_by_side(result, wide_result):
-    table = experiment_table([result, wide_result])
+    table = experiment_table([[result], [wide_result]])
     assert [column.header for column in table.columns] == [
         "figure",
         "paper",
         "the paper's method",
         "beam search",
     ]
-    assert table.row_count > experiment_table([result]).row_count
+    assert table.row_count > experiment_table([[result]]).row_count
 
 
 def test_the_wide_search_has_its_own_pictures(wide_result, tmp_path):

@@ -164,17 +164,23 @@ def test_leaf_combination_helps_where_leaves_overlap(tmp_path):
 
 @pytest.mark.parametrize("K", [1, 2, 5])
 @pytest.mark.parametrize("body", ["chain2", "chain3", "chain4", "fork"])
-def test_search_does_what_the_paper_says(tmp_path, body, K):
+@pytest.mark.parametrize("outside_weight", [0.0, 1.5])
+def test_search_does_what_the_paper_says(tmp_path, body, K, outside_weight):
     """Against the same procedure on plain pictures: pose, J, first J and runs of step 3."""
     model = forked_body(tmp_path) if body == "fork" else swinging_chain(tmp_path, int(body[-1]))
     r = 12.0
-    settings = PaperSearchSettings(outside_limit=r, candidate_limit=K, interval=math.radians(30))
+    settings = PaperSearchSettings(
+        outside_limit=r,
+        outside_weight=outside_weight,
+        candidate_limit=K,
+        interval=math.radians(30),
+    )
     search = PaperSearch(model.pose_tree(), settings)
     camera = front_camera(shift=0.1234)
     generator = np.random.default_rng(K)
     for _ in range(6):
         mask = random_silhouette(search, camera, generator)
-        naive = NaiveSearch(search, camera, mask, r, K).run()
+        naive = NaiveSearch(search, camera, mask, r, K, outside_weight).run()
         result = search.match([View(camera, mask)])
         assert result.runs == naive.runs
         assert result.found == (naive.best is not None)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from drake_pose.body import bundled_model, load_model
 from drake_pose.body.landmarks import landmark_positions, load_landmarks
@@ -13,6 +14,7 @@ from drake_pose.multiview.date.limb_search import (
     correlation,
     joint_circle,
     limb_angles,
+    place_limb,
     rectangles,
     search_circle,
 )
@@ -289,10 +291,51 @@ class TestPose:
         regions = [renderer.mask(true) for renderer in renderers]
         limb = skeleton.limbs["left_leg"]
         root, middle, end = skeleton.limb_points(true, "left_leg")
+        R_WT, _ = skeleton.trunk_pose(true)
         circle = joint_circle(limb, root, end, np.array([0.0, 1.0, 0.0]))
-        found, _, score = search_circle(limb, circle, root, end, cameras, regions, root)
+        found, _, score = search_circle(
+            limb, circle, root, end, cameras, regions, root, R_WT, true[limb.positions]
+        )
         assert np.linalg.norm(found - middle) < 0.05
         assert score > 0.85
+
+    @pytest.mark.parametrize(("bend", "off"), [(0.0, 0.01), (15.0, 0.04), (100.0, 0.06)])
+    def test_search_finds_the_knees_of_straight_and_bent_legs(
+        self, person, skeleton, views, bend, off
+    ):
+        """Of a straight leg the knee lies behind the line from the hip to the foot's middle."""
+        cameras, renderers = views
+        true = posed(person, left_thigh_x=-0.6 * bend, left_shin_x=bend)
+        regions = [renderer.mask(true) for renderer in renderers]
+        limb = skeleton.limbs["left_leg"]
+        root, middle, end = skeleton.limb_points(true, "left_leg")
+        R_WT, _ = skeleton.trunk_pose(true)
+        circle = joint_circle(limb, root, end, np.array([0.0, 1.0, 0.0]))
+        last = np.radians([0.0, 0.0, 0.0, 20.0])
+        found, _, _ = search_circle(limb, circle, root, end, cameras, regions, root, R_WT, last)
+        assert np.linalg.norm(found - middle) < off
+
+    @pytest.mark.parametrize("name", LIMBS)
+    def test_a_limb_is_placed_where_its_limits_allow_it(self, skeleton, name):
+        """Anywhere on its circle, by its own kinematics; where it truly is, inside its limits."""
+        generator = np.random.default_rng(5)
+        limb = skeleton.limbs[name]
+        for _ in range(20):
+            q = drawn_pose(skeleton, generator)
+            root, middle, end = skeleton.limb_points(q, name)
+            R_WT, _ = skeleton.trunk_pose(q)
+            across = (end - root) / np.linalg.norm(end - root)
+            turns = Rotation.from_rotvec(np.linspace(0.0, 5.0, 6)[:, None] * across)
+            middles = root + turns.apply(middle - root)
+            angles, beyond = place_limb(limb, R_WT, root, middles, end, q[limb.positions])
+            assert beyond[0] < 1e-6
+            excess = np.abs(angles - np.clip(angles, limb.lower, limb.upper)).max(axis=1)
+            np.testing.assert_allclose(beyond, excess, atol=1e-6)
+            for place, found in zip(middles, angles, strict=True):
+                turned = np.array(q)
+                turned[limb.positions] = found
+                points = skeleton.limb_points(turned, name)
+                np.testing.assert_allclose(points, [root, place, end], atol=1e-6)
 
     def test_positions_hold_the_limits(self, person, skeleton, views):
         cameras, renderers = views

@@ -12,16 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from drake_pose.apps.experiments.date.motion import REGISTERED, Motion, make_motion
+from drake_pose.apps.experiments.date.motion import REGISTERED, UPRIGHT, Motion, make_motion
 from drake_pose.apps.experiments.date.studio import Studio
 from drake_pose.apps.experiments.date.tracks import PaperTrack, SilhouetteTrack, see
 from drake_pose.body.landmarks import landmarks_of_nodes
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.errors import SettingsError
+from drake_pose.multiview.date.body_pose import Waist
+from drake_pose.multiview.date.skeleton import LIMBS
 
 Array = NDArray[np.float64]
 
 METHODS = ("silhouette", "paper")
+WAISTS = ("person", "paper")
 FEWEST_CAMERAS = 3
 SHOWN_CAMERA = "camera_0"
 FRAMES = 240
@@ -50,6 +53,10 @@ class DateResult:
         names: (n,) motion of each frame.
         joint_names: (k,) the joint centres.
         errors: by way of capturing ("silhouette", "paper", "ik_only"): (n, k) [mm].
+        found_errors: of "paper" and "ik_only", elbows and knees as found, before the model with its
+            stiff trunk is laid through them: (n, 4) in the order of LIMBS [mm]; nan where the
+            registered pose was recognised instead.
+        waist: of WAISTS, whose constants the waist formula had.
         face_errors: (n,) angle between true and estimated direction of the head [deg].
         recoveries: frames until a destroyed track was right again, by the motion during which it
             was destroyed; REGISTERED: the registered pose was shown; None: not within _WATCHED.
@@ -64,6 +71,8 @@ class DateResult:
     names: tuple[str, ...]
     joint_names: tuple[str, ...]
     errors: Mapping[str, Array]
+    found_errors: Mapping[str, Array]
+    waist: str
     face_errors: Array
     recoveries: Mapping[str, int | None]
     search_ms: float
@@ -91,6 +100,8 @@ class DateResult:
             "elbows_and_knees": self._of_joints(errors, ("elbow", "knee")),
             "elbows": self._of_joints(errors, ("elbow",)),
             "knees": self._of_joints(errors, ("knee",)),
+            **self._as_found(UPRIGHT),
+            "as_found": {motion: self._as_found((motion,)) for motion in self.motions},
             "face_error_deg": _mean(self.face_errors[chosen]),
             "frames_to_recover": _slowest(anywhere or list(self.recoveries.values())),
             "frames_to_recover_registered": self.recoveries.get(REGISTERED),
@@ -103,7 +114,19 @@ class DateResult:
             "cameras": self.cameras,
             "seed": self.seed,
             "method": self.method,
+            "waist": self.waist,
         }
+
+    def _as_found(self, motions: Sequence[str]) -> dict[str, float]:
+        """Mean errors of elbows and knees as found, with the search and without [mm]."""
+        chosen = np.isin(self.names, motions)
+        figures = {}
+        for way, ending in (("paper", "mm"), ("ik_only", "ik_mm")):
+            errors = self.found_errors[way][chosen]
+            errors = errors[np.isfinite(errors).all(axis=1)]
+            for joint, limbs in (("elbow", errors[:, :2]), ("knee", errors[:, 2:])):
+                figures[f"{joint}_{ending}"] = _mean(limbs) if len(limbs) else math.nan
+        return figures
 
     def _of_motion(self, motion: str) -> dict[str, float]:
         """The figures of one motion."""
@@ -138,6 +161,19 @@ class DateResult:
             )
         return table
 
+    def found_table(self) -> Table:
+        """Elbows and knees as found, with the paper's search and without."""
+        table = Table(
+            "motion", "elbows [mm]", "by IK alone", "knees [mm]", "by IK alone",
+            title=f"Elbows and knees as found, the {self.waist}'s waist",
+        )  # fmt: skip
+        rows = {motion: (motion,) for motion in self.motions} | {"upright": UPRIGHT}
+        for label, motions in rows.items():
+            found = self._as_found(motions)
+            keys = ("elbow_mm", "elbow_ik_mm", "knee_mm", "knee_ik_mm")
+            table.add_row(label, *(f"{found[key]:.0f}" for key in keys))
+        return table
+
     def costs(self) -> str:
         """What a frame costs, and how soon a destroyed track is right again."""
         whole = sum(self.milliseconds.values())
@@ -160,6 +196,7 @@ def run_experiment(
     method: str = "silhouette",
     progress: Callable[[int], None] | None = None,
     size: tuple[int, int] = (640, 480),
+    waist: str = "person",
 ) -> DateResult:
     """Captures a simulated person.
 
@@ -170,19 +207,23 @@ def run_experiment(
         method: "silhouette" for all silhouettes at once, "paper" for the paper's way alone.
         progress: called with the number of frames done after each.
         size: width and height of the pictures [pixel].
+        waist: constants of the paper's waist formula: "person" for those of this person, "paper"
+            for 0.55, 0.225, 0.225.
 
     Raises:
         SettingsError: an argument is out of its range.
     """
     if method not in METHODS:
         raise SettingsError(f"method must be one of {', '.join(METHODS)}, not '{method}'")
+    if waist not in WAISTS:
+        raise SettingsError(f"waist must be one of {', '.join(WAISTS)}, not '{waist}'")
     if cameras < FEWEST_CAMERAS:
         raise SettingsError(f"cameras must be {FEWEST_CAMERAS} or more, not {cameras}")
     # What is measured is one core's work.
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        return _Experiment(cameras, frames, seed, method, size).run(progress)
+        return _Experiment(cameras, frames, seed, method, size, waist).run(progress)
     finally:
         cv2.setNumThreads(threads)
 
@@ -191,12 +232,20 @@ class _Experiment:
     """One run; see run_experiment."""
 
     def __init__(
-        self, cameras: int, frames: int, seed: int, method: str, size: tuple[int, int]
+        self,
+        cameras: int,
+        frames: int,
+        seed: int,
+        method: str,
+        size: tuple[int, int],
+        waist: str = "person",
     ) -> None:
-        self.cameras, self.seed, self.method = cameras, seed, method
+        self.cameras, self.seed, self.method, self.waist = cameras, seed, method, waist
         self.studio = Studio.build(cameras, size, np.random.default_rng([seed, 1]))
         self.motion = make_motion(self.studio.skeleton, frames, seed)
         setup = self.studio.prepare(self.motion.q[0])
+        if waist == "paper":
+            setup = replace(setup, settings=replace(setup.settings, waist=Waist()))
         model = self.studio.model
         tree = model.pose_tree()
         self.kinematics = TreeKinematics(tree)
@@ -217,6 +266,7 @@ class _Experiment:
         """All frames."""
         studio, motion = self.studio, self.motion
         estimates: dict[str, list[Array]] = {way: [] for way in self.tracks}
+        found: dict[str, list[Array]] = {way: [] for way in ("paper", "ik_only")}
         watched: list[_Watched] = []
         pictures = {}
         destroyed_at = frames_of_destruction(motion)
@@ -227,6 +277,8 @@ class _Experiment:
                 watched.append(_Watched(destroyed_at[k], track, []))
             for way, track in self.tracks.items():
                 estimates[way].append(track.step(images))
+                if isinstance(track, PaperTrack):
+                    found[way].append(self._middle_joints_off(track, q))
             for one in watched:
                 if len(one.errors) < _WATCHED:
                     one.errors.append(float(np.mean(self._off(one.track.step(images), q))))
@@ -236,7 +288,7 @@ class _Experiment:
             if progress is not None:
                 progress(k + 1)
         errors = {
-            way: np.array([self._off(found, q) for found, q in zip(path, motion.q, strict=True)])
+            way: np.array([self._off(one, q) for one, q in zip(path, motion.q, strict=True)])
             for way, path in estimates.items()
         }
         right = max(_RIGHT_MM, _RIGHT_AGAIN * _mean(errors[self.method]))
@@ -246,10 +298,12 @@ class _Experiment:
             names=motion.names,
             joint_names=self.landmarks.names,
             errors=errors,
+            found_errors={way: np.array(values) for way, values in found.items()},
+            waist=self.waist,
             face_errors=np.array(
                 [
-                    _angle_between(rotation(found), rotation(q))
-                    for found, q in zip(estimates[self.method], motion.q, strict=True)
+                    _angle_between(rotation(estimate), rotation(q))
+                    for estimate, q in zip(estimates[self.method], motion.q, strict=True)
                 ]
             ),
             recoveries={one.motion: one.frames_until(right) for one in watched},
@@ -267,6 +321,11 @@ class _Experiment:
             for positions in (found, q)
         ]
         return np.asarray(1e3 * np.linalg.norm(places[0] - places[1], axis=1))
+
+    def _middle_joints_off(self, track: PaperTrack, q: Array) -> Array:
+        """(4,) how far elbows and knees as found are off those at q (nq,) [mm]."""
+        true = [self.studio.skeleton.limb_points(q, name)[1] for name in LIMBS]
+        return np.asarray(1e3 * np.linalg.norm(track.middle_joints() - true, axis=1))
 
     def _medians(self) -> dict[str, float]:
         """Milliseconds a frame, by stage."""

@@ -19,6 +19,9 @@ KeyPose = Mapping[str, float]
 MOTIONS = ("walk", "reach", "lean", "crouch", "turn", "cross")
 """The motions, in their order; before the first and after the last the registered pose is shown."""
 
+UPRIGHT = ("walk", "reach", "turn", "cross")
+"""Those with an upright trunk, which the paper asks for."""
+
 REGISTERED = "registered"
 FEWEST_FRAMES = 40
 

@@ -18,6 +18,7 @@ from drake_pose.camera import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.matching.fit.contour_fit import ContourFit
 from drake_pose.multiview.date.capture import CaptureSetup
+from drake_pose.multiview.date.skeleton import LIMBS
 from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker, TrackState
 from drake_pose.silhouette.segmentation.background import Background
 from drake_pose.systems.date.capture import PaperCapture, build_paper_capture
@@ -129,6 +130,14 @@ class PaperTrack:
         if not diagram.GetOutputPort("similarity").Eval(context)[0]:
             self.milliseconds.append(laps)
         return q
+
+    def middle_joints(self) -> Array:
+        """(4, 3) elbows and knees of the last frame as found, in the order of LIMBS [m].
+
+        nan in a frame whose pose was recognised instead.
+        """
+        port = self._capture.diagram.GetOutputPort("limb_points")
+        return np.array(port.Eval(self._run.context)).reshape(len(LIMBS), 3, 3)[:, 1]
 
     def destroyed(self, q: Array, _generator: np.random.Generator) -> PaperTrack:
         """A track that is turned around, its left and right exchanged; q (nq,) is where it was."""

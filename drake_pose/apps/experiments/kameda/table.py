@@ -2,13 +2,15 @@
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
 from rich.table import Table
 
 from drake_pose.apps.experiments.kameda.experiment import PAPER, ExperimentResult
 
 _ROWS = {
     "images": ("silhouettes", "{}"),
-    "mean_e_total": ("mean E_total", "{:.2%}"),
+    "not_found": ("  no pose found", "{}"),
+    "mean_e_total": ("mean E_total of the others", "{:.2%}"),
     "exact": ("matched exactly (J = 0)", "{}"),
     "pose_equal": ("of these, every joint angle right", "{}"),
     "improved": ("improved by re-estimation", "{}"),
@@ -17,7 +19,6 @@ _ROWS = {
     "min_runs": ("  minimum", "{}"),
     "median_seconds": ("processor seconds an image, median", "{:.3f}"),
     "p95_seconds": ("  95th percentile", "{:.3f}"),
-    "not_found": ("no pose found (counted as E_total = 1)", "{}"),
     "leaving_the_picture": ("bodies that leave the picture", "{}"),
     "exact_inside": ("matched exactly, of those that do not", "{}"),
     "proved": ("proved the best of the grid", "{}"),
@@ -29,28 +30,73 @@ _ROWS = {
     "examination_median_seconds": ("seconds for proof and set, median", "{:.3f}"),
 }
 _OF_RUNS = ("improved", "mean_runs", "mean_runs_without_worst_seven", "min_runs")
-_METHODS = {"paper": "the paper's method", "beam": "beam search"}
+_NOT_SPREAD = ("images", "seed", "outside_weight", "total_seconds")
 
 
-def experiment_table(results: Sequence[ExperimentResult]) -> Table:
-    """The paper's figures and those of some runs, side by side.
+def spread_over_seeds(results: Sequence[ExperimentResult]) -> dict[str, dict[str, float]]:
+    """Mean, smallest and largest of every figure over runs that differ in the seed alone.
 
     Args:
-        results: the runs, one a column.
+        results: the runs of one search.
     """
-    columns: list[Mapping[str, float | int | str]] = [PAPER]
+    runs = [result.as_json() for result in results]
+    spread = {}
+    for key, first in runs[0].items():
+        if key not in _NOT_SPREAD and not isinstance(first, str):
+            values = np.array([float(run[key]) for run in runs])
+            spread[key] = {
+                "mean": float(values.mean()),
+                "min": float(values.min()),
+                "max": float(values.max()),
+            }
+    return spread
+
+
+def experiment_table(columns: Sequence[Sequence[ExperimentResult]]) -> Table:
+    """The paper's figures and those of some searches, side by side.
+
+    Args:
+        columns: for each search its runs, one for each seed; of several the mean is shown, and
+            the smallest and largest.
+    """
     table = Table(title="Kameda, experiment A: one silhouette of a female body")
     table.add_column("figure")
     table.add_column("paper", justify="right")
-    for result in results:
-        figures = dict(result.as_json())
-        if figures["method"] == "beam":
-            # Its runs are other steps than the paper's.
-            figures = {key: value for key, value in figures.items() if key not in _OF_RUNS}
-        table.add_column(_METHODS[str(result.as_json()["method"])], justify="right")
-        columns.append(figures)
-    for key, (label, form) in _ROWS.items():
-        if any(key in column for column in columns):
-            cells = [form.format(column[key]) if key in column else "-" for column in columns]
-            table.add_row(label, *cells)
+    cells: list[Mapping[str, str]] = [
+        {key: _ROWS[key][1].format(value) for key, value in PAPER.items()}
+    ]
+    for runs in columns:
+        table.add_column(_heading(runs[0]), justify="right")
+        cells.append(_cells(runs))
+    for key, (label, _) in _ROWS.items():
+        if any(key in column for column in cells):
+            table.add_row(label, *(column.get(key, "-") for column in cells))
     return table
+
+
+def _heading(result: ExperimentResult) -> str:
+    figures = result.as_json()
+    if figures["method"] == "beam":
+        return "beam search"
+    if figures["outside_weight"]:
+        return f"the same, ordered by e - {figures['outside_weight']:g} outside"
+    return "the paper's method"
+
+
+def _cells(runs: Sequence[ExperimentResult]) -> Mapping[str, str]:
+    """The figures of a column, as they are printed."""
+    figures, spread = runs[0].as_json(), spread_over_seeds(runs)
+    cells = {}
+    for key, (_, form) in _ROWS.items():
+        # The runs of the beam search are other steps than the paper's.
+        if key not in figures or (figures["method"] == "beam" and key in _OF_RUNS):
+            continue
+        if len(runs) == 1 or key not in spread:
+            cells[key] = form.format(figures[key])
+        else:
+            several = form if "." in form else "{:.1f}"
+            low, high = (
+                form.format(type(figures[key])(spread[key][end])) for end in ("min", "max")
+            )
+            cells[key] = f"{several.format(spread[key]['mean'])} ({low} to {high})"
+    return cells

@@ -103,7 +103,7 @@ class ExperimentResult:
         """The figures of both cases, side by side."""
         table = Table(
             title=f"Shimada, synthetic hand: {self.settings.truncation} truncation, "
-            f"{self.observed} observation"
+            f"{self.observed} observation, linearisations: {self.settings.iterations} at most"
         )
         table.add_column("figure (at t = 55 where nothing is said)")
         for key in CASES:
@@ -156,7 +156,7 @@ def run_experiment(
     runs: int = 50,
     seed: int = 0,
     truncation: str = "joint",
-    observed: str = "full",
+    observed: str = "lines",
     progress: Callable[[int], None] | None = None,
     iterations: int | None = None,
 ) -> ExperimentResult:
@@ -169,7 +169,7 @@ def run_experiment(
         runs: of each case.
         seed: another one draws other motions, noise and first guesses.
         truncation: "joint", "sequential" (the paper's), "clip" or "none".
-        observed: "full", or "lines": knuckles hidden, as in the paper.
+        observed: "lines": knuckles hidden, as in the paper; or "full".
         progress: called with the number of sequences done after each.
         iterations: linearisations of an update at most; 1 is the paper's filter. The library's
             own default if not given.
@@ -202,8 +202,9 @@ def run_experiment(
 def compare_truncations(
     runs: int = 50,
     seed: int = 0,
-    observed: str = "full",
+    observed: str = "lines",
     progress: Callable[[int], None] | None = None,
+    iterations: int | None = None,
 ) -> ComparedTruncations:
     """Run the experiment with every truncation, on the same sequences.
 
@@ -212,6 +213,7 @@ def compare_truncations(
         seed: as there.
         observed: as there.
         progress: called with the number of sequences done after each, all truncations counted.
+        iterations: as there.
 
     Raises:
         SettingsError: if an argument is not one of these.
@@ -224,7 +226,7 @@ def compare_truncations(
             if progress is not None:
                 progress(before + done)
 
-        results[truncation] = run_experiment(runs, seed, truncation, observed, advance)
+        results[truncation] = run_experiment(runs, seed, truncation, observed, advance, iterations)
     return ComparedTruncations(results)
 
 

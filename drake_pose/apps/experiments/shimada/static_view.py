@@ -90,6 +90,7 @@ def run_static_experiment(
     start: str = "guess",
     marks: tuple[int, ...] = MARKS,
     progress: Callable[[int], None] | None = None,
+    iterations: int | None = None,
 ) -> StaticResult:
     """Show the filter one view for thousands of frames.
 
@@ -101,6 +102,7 @@ def run_static_experiment(
             follows; "learned": the moving sequence comes first, its last view is stared at.
         marks: when to compare, in static frames.
         progress: called with the number of runs done after each.
+        iterations: as for ``run_experiment``.
 
     Raises:
         SettingsError: if an argument is not one of these.
@@ -111,7 +113,7 @@ def run_static_experiment(
         raise SettingsError(f"observed must be one of {', '.join(OBSERVED)}, not '{observed}'")
     if start not in STARTS:
         raise SettingsError(f"start must be one of {', '.join(STARTS)}, not '{start}'")
-    hand_filter, observation = experiment_filter(experiment_settings(truncation))
+    hand_filter, observation = experiment_filter(experiment_settings(truncation, iterations))
     nees, errors = np.zeros((runs, len(marks))), np.zeros((runs, len(marks)))
     after = []
     for run in range(runs):

@@ -181,9 +181,13 @@ palette, with an alpha channel or with probabilities (8 or 16 bits, from one hal
 white videos.
 
 In pictures and videos an object is found by the empty room (--background), a box or strokes (--box,
---strokes; GrabCut, for stills), or a network of yours (--network, ONNX). A median of the pictures
-stands for the empty room only where the body leaves every place; the command says where it does
-not. Look at overlay/ before you go on.
+--strokes; GrabCut, for stills), a network of yours (--network, ONNX), or the object's own model
+(--model, with rough joint positions of each frame, --start, and cameras that have X_WC): pose and
+mask are found in turn, and the pictures of a camera that stands still show its background beside
+the body. Where pose and colours do not agree no mask is written, and the picture is named.
+
+A median of the pictures stands for the empty room only where the body leaves every place; the
+command says where it does not. Look at overlay/ before you go on.
 
 Files in SCENE: masks/<camera>/<frame>.png; cameras.yaml and scene.yaml, those of SOURCE, or what a
 video says; overlay/<camera>/<frame>.jpg, the pictures with the masks' outlines; summary.json, each
@@ -207,6 +211,13 @@ written (exit status 1).
 [bold]A photograph, the object in a box:[/bold]
 
     drake-pose masks photograph.jpg --out scene --box 120,80,300,260
+
+[bold]A robot whose joint positions are known to about five degrees:[/bold]
+
+    drake-pose masks ../shared/data/franka_one_view/images --out scene \
+      --model ../shared/data/franka_one_view/panda/panda.urdf \
+      --start ../shared/data/franka_one_view/joint_angles_fitted.csv \
+      --cameras ../shared/data/franka_one_view/cameras_reference.yaml
 """)
 
 REPRODUCE = "Run a paper's experiment and show its figures beside ours."

@@ -7,14 +7,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from drake_pose.apps.commands.estimate_options import JsonOption
+from drake_pose.apps.commands.estimate_options import HoldOption, JsonOption, PackageOption
 from drake_pose.apps.commands.terminal import (
     errors_as_messages,
     print_json,
     usage_errors,
     warn,
 )
-from drake_pose.apps.options import parse_numbers, parse_size
+from drake_pose.apps.options import (
+    parse_assignments,
+    parse_numbers,
+    parse_packages,
+    parse_size,
+)
 
 if TYPE_CHECKING:
     from drake_pose.apps.masks.masks import SceneMasks
@@ -22,6 +27,7 @@ if TYPE_CHECKING:
 _GIVEN = "Masks of other tools"
 _EMPTY = "By the empty room"
 _MARKED = "By a box or strokes"
+_MODEL = "By the object's model"
 _NETWORK = "By a network"
 
 SourceArgument = Annotated[
@@ -88,6 +94,33 @@ StrokesOption = Annotated[
         rich_help_panel=_MARKED,
     ),
 ]
+BodyOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--model",
+        "-m",
+        metavar="FILE",
+        help="The object: URDF, SDFormat, MJCF or .dmd.yaml; pose and mask are found in turn.",
+        rich_help_panel=_MODEL,
+    ),
+]
+StartOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help=r"Rough joint positions of every frame \[rad or m]: a CSV file with the column frame "
+        "and one for each joint.",
+        rich_help_panel=_MODEL,
+    ),
+]
+StartErrorOption = Annotated[
+    float,
+    typer.Option(
+        metavar="DEG",
+        help="How far off their angles are: standard deviation.",
+        rich_help_panel=_MODEL,
+    ),
+]
 NetworkOption = Annotated[
     Path | None,
     typer.Option(
@@ -140,6 +173,11 @@ def masks(
     background: BackgroundOption = None,
     box: BoxOption = None,
     strokes: StrokesOption = None,
+    model: BodyOption = None,
+    start: StartOption = None,
+    start_error: StartErrorOption = 5.0,
+    hold: HoldOption = None,
+    package: PackageOption = None,
     network: NetworkOption = None,
     network_size: NetworkSizeOption = None,
     network_mean: NetworkMeanOption = "0,0,0",
@@ -162,6 +200,11 @@ def masks(
                 background=background,
                 box=None if box is None else parse_numbers(box, 4, "--box"),
                 strokes=strokes,
+                model=model,
+                start=start,
+                start_error=start_error,
+                hold=parse_assignments(hold or (), "--hold"),
+                packages=parse_packages(package or ()),
                 network=network,
                 network_size=None
                 if network_size is None

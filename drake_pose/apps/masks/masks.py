@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import yaml
 
+from drake_pose.apps.masks.by_model import find_by_model
 from drake_pose.apps.masks.empty_room import BACKGROUND, compare_with_empty_room
 from drake_pose.apps.masks.found import FoundMask, FoundMasks
 from drake_pose.apps.masks.given import read_given_masks
@@ -97,7 +98,7 @@ def _find(source: Source, settings: MaskSettings) -> FoundMasks:
         room = source.path / BACKGROUND
         background = room if source.path.is_dir() and room.is_dir() else None
     marked = settings.box is not None or settings.strokes is not None
-    found = background is not None or marked or settings.network is not None
+    found = background is not None or marked or settings.model or settings.network
     if found and source.annotated:
         raise SceneError(
             f"{source.path}: has annotations, but the object is to be found in pictures"
@@ -107,6 +108,8 @@ def _find(source: Source, settings: MaskSettings) -> FoundMasks:
     if marked:
         marks = {} if settings.strokes is None else read_strokes(settings.strokes)
         return cut_marked(source, settings.box, marks)
+    if settings.model is not None:
+        return find_by_model(source, settings.model, settings)
     if settings.network is not None:
         return segment_by_network(source, settings.network, settings)
     return read_given_masks(source, settings)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from drake_pose.silhouette.segmentation.mask_pictures import MEANINGS, PixelMean
 MEDIAN = "median"
 
 _COUNTS = {"box": 4, "network_size": 2, "network_mean": 3, "network_std": 3}
-_WAYS = ("background", "box", "strokes", "network")
+_WAYS = ("background", "box", "strokes", "model", "network")
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,11 @@ class MaskSettings:
             ``<camera>/<frame>.png``; ``median``: each pixel's median over the source's pictures.
         box: x, y, width and height of a box around the object in all pictures [pixel].
         strokes: a file of boxes and lines by camera and frame, see ``read_strokes``.
+        model: the object's own model: pose and mask in turn, from ``start``.
+        start: a table of rough joint positions of each frame [rad or m].
+        start_error: standard deviation of its angles [deg].
+        hold: joints of the model that are held, by name [deg or m].
+        packages: folders of packages that the model's ``package://`` names mean, by name.
         network: an ONNX file of a network that segments pictures.
         network_size: width and height that it takes [pixel]; None: pictures stay as they are.
         network_mean, network_std: of red, green and blue, 0 to 1, by which they are normalised.
@@ -45,6 +50,11 @@ class MaskSettings:
     background: Path | str | None = None
     box: tuple[float, ...] | None = None
     strokes: Path | None = None
+    model: Path | None = None
+    start: Path | None = None
+    start_error: float = 5.0
+    hold: Mapping[str, float] = field(default_factory=dict)
+    packages: Mapping[str, Path] = field(default_factory=dict)
     network: Path | None = None
     network_size: tuple[int, ...] | None = None
     network_mean: tuple[float, ...] = (0.0, 0.0, 0.0)
@@ -69,12 +79,17 @@ class MaskSettings:
             raise SettingsError(
                 f"--class is for masks of other tools and networks, not for --{ways[0]}"
             )
+        if (self.model is None) != (self.start is None):
+            raise SettingsError("--model and --start need each other: rough joint positions")
+        if not (math.isfinite(self.start_error) and self.start_error > 0.0):
+            raise SettingsError("--start-error must be a positive number of degrees")
         if "network" not in ways and any(name.startswith("network") for name in self._own()):
             raise SettingsError("options of a network need --network FILE")
 
     def as_json(self) -> Mapping[str, Any]:
         """The settings that are not the default's, as plain JSON values."""
         values = asdict(self)
+        values["packages"] = {name: str(folder) for name, folder in self.packages.items()}
         return {
             name: str(values[name]) if isinstance(values[name], Path) else values[name]
             for name in self._own()
@@ -82,4 +97,5 @@ class MaskSettings:
 
     def _own(self) -> list[str]:
         """The names of those that are not the default's."""
-        return [field.name for field in fields(self) if getattr(self, field.name) != field.default]
+        default = {one.name: one.default for one in fields(self)} | {"hold": {}, "packages": {}}
+        return [name for name, value in default.items() if getattr(self, name) != value]

@@ -22,12 +22,14 @@ from drake_pose.matching.fit.covariance import (
     Distances,
     ErrorSizes,
     Picture,
+    distances_covariance,
     distances_in_pictures,
     estimate_sizes,
     widening,
 )
 from drake_pose.registration.camera_fit import POSE_NAMES
 from drake_pose.registration.freed_frames import FrameFreer, FreedFrame
+from drake_pose.registration.uncertainty import KNOWN_BEFOREHAND
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -36,8 +38,6 @@ BASE = "base"
 
 # How large errors are is told by at most so many groups of so many frames.
 _GROUPS, _IN_GROUP = 5, 4
-# The scale of a frame's errors is known beforehand as well as so many distances tell it.
-_KNOWN_BEFOREHAND = 20
 # What is known to less than this share of how far it may be off is not asked for.
 _TOLD = 1.0
 # Contours of a frame fit that fit as well as this share of what fits in the best frames.
@@ -51,7 +51,7 @@ _ROUNDS = 10
 # A joint is named that is off by so many standard deviations.
 _SURE = 3.0
 # Where no frame tells it, contours err by about a pixel.
-_UNKNOWN_SIZES = ErrorSizes(1.0, 1.0, 1.0, 1.0)
+_UNKNOWN_SIZES = ErrorSizes(1.0, 0.0, 1.0, 1.0, 1.0)
 # A silhouette's width was put right to within this [pixel].
 _WIDTH = 2.0
 
@@ -289,7 +289,7 @@ class _Auditor:
             seen = self._distances(pictures)
             is_angle = np.append(self._is_angle, np.zeros(len(pictures), bool))
             sizes.append(estimate_sizes(seen, is_angle, least_camera=0.0))
-        return ErrorSizes(*np.exp(np.median(np.log(np.array(sizes)), axis=0)))
+        return ErrorSizes(*np.median(np.array(sizes), axis=0).tolist())
 
     def _distances(self, pictures: Sequence[Picture]) -> Distances:
         """The distances in pictures; their values are what was freed, then each picture's width."""
@@ -305,13 +305,13 @@ class _Auditor:
         seen = self._distances(freed.pictures)
         own, widths = np.split(seen.X, [len(self._freer.names)], axis=1)
         X = own * self._freer.deviations
-        V = _covariance(seen, sizes) + _WIDTH**2 * widths @ widths.T
+        V = distances_covariance(seen, sizes) + _WIDTH**2 * widths @ widths.T
         PX, Py = np.split(np.linalg.solve(V, np.column_stack([X, seen.y])), [-1], axis=1)
         N, h = X.T @ PX, PX.T @ seen.y
         T, rank = _statistic(h, N)
         left = max(float(seen.y @ Py[:, 0]) - T, 0.0)
-        freedom = _KNOWN_BEFOREHAND + len(seen.y) - rank
-        scale = (_KNOWN_BEFOREHAND + left) / freedom
+        freedom = KNOWN_BEFOREHAND + len(seen.y) - rank
+        scale = (KNOWN_BEFOREHAND + left) / freedom
         moves = [one.moves * self._freer.deviations[:, None] for one in freed.pictures]
         outlines = sum(
             m @ one.A @ np.swapaxes(m, 1, 2) for m, one in zip(moves, freed.pictures, strict=True)
@@ -523,14 +523,6 @@ class _Test(NamedTuple):
         if self.cause.kind == BASE:
             return np.ones(self.cause.moves.shape[1])
         return np.asarray(np.abs(self.cause.moves).T @ deviations)
-
-
-def _covariance(seen: Distances, sizes: ErrorSizes) -> Array:
-    """(n, n) of distances."""
-    V = sizes.noise**2 * np.eye(len(seen.y))
-    for size, effect in zip(sizes[1:], seen.effects, strict=True):
-        V += size**2 * effect
-    return V
 
 
 def _statistic(r: Array, Q: Array, N: Array | None = None) -> tuple[float, int]:

@@ -3,7 +3,9 @@
 As for a pose of the body (``matching.fit.covariance``) there are the noise of points, the surface
 of a part in all frames alike, its edge in one mask, and each frame as a whole, whose joint
 positions or picture may be a little off. How large these are is told by what is left of the
-distances. How wide each mask is was fitted, and is as unsure as that.
+distances, at the scale at which the pose was fitted, and how far they reach by what each frame
+alone would have the pose be: the frames' pulls scatter as their errors say, or by a factor more or
+less. How wide each mask is was fitted, and is as unsure as that.
 """
 
 from __future__ import annotations
@@ -15,20 +17,31 @@ from numpy.typing import NDArray
 
 from drake_pose.matching.fit.contour_fit import pack_cameras, pixels_per_metre
 from drake_pose.matching.fit.covariance import (
+    Distances,
     ErrorSizes,
     Picture,
+    distances_covariance,
     distances_in_pictures,
     estimate_sizes,
     values_covariance,
     widening,
 )
 from drake_pose.matching.fit.levenberg_marquardt import Round
+from drake_pose.registration.agreement import TOLD_APART
 from drake_pose.registration.calibration_fit import Calibration, CalibrationFit
 from drake_pose.registration.camera_fit import CameraFit
 
 Array = NDArray[np.float64]
 
-_FINE = Round(0.025, 0.01)
+KNOWN_BEFOREHAND = 20
+"""The scale of frames' errors is known beforehand as well as so many distances tell it."""
+
+# At this scale a calibration was fitted in the end.
+_FITTED = Round(0.005, 0.005)
+# Sizes of errors are known beforehand to a factor of twenty; frames tell them.
+_PRIOR_DEVIATION = 3.0
+# What a picture tells of a direction is nothing below this share of what it tells best.
+_TOLD = 1e-3
 # Where parts err by so much [pixel], a calibration is no better than this [pixel].
 _PARTS_ERR, _NO_BETTER = 0.2, 1.0
 
@@ -52,13 +65,35 @@ def calibration_uncertainty(fit: CalibrationFit, found: Calibration) -> Uncertai
         fit: what fitted it.
         found: the calibration.
     """
+    shared = len(fit.names)
+    seen = _distances(fit, found, _FITTED)
+    is_angle = np.zeros(seen.X.shape[1], bool)
+    sizes = estimate_sizes(seen, is_angle, 0.0, _PRIOR_DEVIATION)
+    covariance = values_covariance(seen, sizes, np.arange(len(is_angle)), is_angle)
+    covariance *= _scatter(seen, sizes, shared)
+    trusted = _calibration_error(_distances(fit, found, TOLD_APART))
+    for c in range(len(fit.fits)):
+        unseen = _unseen_errors(fit, found, c, trusted)
+        at = np.arange(len(unseen)) + c * len(unseen)
+        covariance[at, at] += unseen**2
+    H = seen.information
+    width_gain = np.linalg.solve(
+        H[shared:, shared:] + 1e-9 * np.eye(len(H) - shared), H[shared:, :shared]
+    )
+    return Uncertainty(
+        covariance[:shared, :shared], H[:shared, :shared] - H[:shared, shared:] @ width_gain
+    )
+
+
+def _distances(fit: CalibrationFit, found: Calibration, step: Round) -> Distances:
+    """The distances in all pictures; their values are what is shared, then each mask's width."""
     rows = [(c, int(k)) for c, frames in enumerate(fit.which) for k in frames]
     shared = len(fit.names)
     pictures = []
     for place, (c, k) in enumerate(rows):
         own, width, X_CW = fit.fits[c], float(found.widths[c][k]), found.X_CW[c]
         values = fit.values(found, c, k)
-        compared = own.compare(X_CW, k, _FINE, width, values, found.log_focal[c])
+        compared = own.compare(X_CW, k, step, width, values, found.log_focal[c])
         X_WN = compared.placement.X_WN
         camera = own.frames.camera.with_pose(np.linalg.inv(X_CW))
         size = 1.0 / float(pixels_per_metre(pack_cameras([camera]), X_WN[:, :3, 3].mean(axis=0))[0])
@@ -68,31 +103,47 @@ def calibration_uncertainty(fit: CalibrationFit, found: Calibration) -> Uncertai
             if len(outline.vertices):
                 moves[n, shared + place] = widening(outline.vertices, X) * size
         pictures.append(Picture(compared.A[0], compared.b[0], X_WN, X_CW, moves, size))
-    seen = distances_in_pictures(fit.fits[0].contours.outlines, pictures)
-    is_angle = np.zeros(shared + len(rows), bool)
-    sizes = estimate_sizes(seen, is_angle, least_camera=0.0)
-    covariance = values_covariance(seen, sizes, np.arange(len(is_angle)), is_angle)
-    trusted = _calibration_error(sizes)
-    for c in range(len(fit.fits)):
-        unseen = _unseen_errors(fit, found, c, trusted)
-        at = np.arange(len(unseen)) + c * len(unseen)
-        covariance[at, at] += unseen**2
-    H = seen.information
-    width_gain = np.linalg.solve(
-        H[shared:, shared:] + 1e-9 * np.eye(len(rows)), H[shared:, :shared]
-    )
-    return Uncertainty(
-        covariance[:shared, :shared], H[:shared, :shared] - H[:shared, shared:] @ width_gain
-    )
+    return distances_in_pictures(fit.fits[0].contours.outlines, pictures)
 
 
-def _calibration_error(sizes: ErrorSizes) -> float:
+def _scatter(seen: Distances, sizes: ErrorSizes, shared: int) -> float:
+    """By what factor frames disagree more about what they share than errors say: of variances.
+
+    Each frame's distances along what it tells of the shared values, its width put right, are
+    normal with a known covariance about what these values make of them.
+    """
+    V = distances_covariance(seen, sizes)
+    designs, lefts = [], []
+    for picture in np.unique(seen.pictures):
+        rows = np.flatnonzero(seen.pictures == picture)
+        X, widths = np.split(seen.X[rows], [shared], axis=1)
+        X = X - widths @ np.linalg.pinv(widths) @ X
+        U, told, _ = np.linalg.svd(X, full_matrices=False)
+        U = U[:, told > _TOLD * told.max()]
+        L = np.linalg.cholesky(U.T @ V[np.ix_(rows, rows)] @ U)
+        designs.append(np.linalg.solve(L, U.T @ X))
+        lefts.append(np.linalg.solve(L, U.T @ seen.y[rows]))
+    if not designs:
+        return 1.0
+    design, left = np.concatenate(designs), np.concatenate(lefts)
+    by, _, rank, _ = np.linalg.lstsq(design, left)
+    off = left - design @ by
+    scale = (KNOWN_BEFOREHAND + float(off @ off)) / (KNOWN_BEFOREHAND + len(off) - rank)
+    # Frames that agree by chance are no surer.
+    return max(scale, 1.0)
+
+
+def _calibration_error(seen: Distances) -> float:
     """By how much a calibration may be off that no frame contradicts [pixel].
 
     Intrinsics that are wrong, and a lens that was not quite undone, err alike in all frames: the
     pose follows, and nothing is left of it. Where parts are seen to err, a calibration is not
-    trusted beyond a pixel either; where all else is exact, it is taken to be.
+    trusted beyond a pixel either; where all else is exact, it is taken to be. How far parts err
+    shows at a scale at which nothing is left out because it is off. What comes again where a part
+    stands still may be the part's surface: none of it counts as noise here.
     """
+    seen = seen._replace(effects=seen.effects._replace(repeated=seen.effects.noise))
+    sizes = estimate_sizes(seen, np.zeros(seen.X.shape[1], bool), 0.0, _PRIOR_DEVIATION)
     return min(_NO_BETTER, _NO_BETTER * (sizes.surface**2 + sizes.mask**2) / _PARTS_ERR**2)
 
 

@@ -62,7 +62,9 @@ def summarize(
         "seconds": seconds,
         "frames": {one.frame: _describe_frame(one) for one in found.frames},
         "error_sizes_px": {
-            name: float(size) for name, size in found.sizes._asdict().items() if name != "noise"
+            name: float(size)
+            for name, size in found.sizes._asdict().items()
+            if name not in ("noise", "repeated")
         },
         "warnings": list(warnings),
         "scene": str(scene),

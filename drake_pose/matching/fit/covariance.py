@@ -1,12 +1,12 @@
 """How sure fitted values are where contours do not err point by point.
 
-Four things make the contours of a body and of its silhouettes differ: the noise of their points;
-the surface of a part, which all cameras see shifted, turned and stretched alike; a part's edge in
-one camera's mask, so too; and a camera, which stands or looks a little elsewhere than its
-calibration says. How large they are is estimated from what is left of the distances once the values
-are fitted: variance components by restricted maximum likelihood (Patterson and Thompson 1971) in
-steps of Fisher's scoring, each with a prior of about a pixel, for a single instant tells little of
-them.
+Five things make the contours of a body and of its silhouettes differ: the noise of their points; so
+much of it as comes again in all pictures of a part that stands still before a camera; the surface
+of a part, which all cameras see shifted, turned and stretched alike; a part's edge in one camera's
+mask, so too; and a camera, which stands or looks a little elsewhere than its calibration says. How
+large they are is estimated from what is left of the distances once the values are fitted: variance
+components by restricted maximum likelihood (Patterson and Thompson 1971) in steps of Fisher's
+scoring, each with a prior of about a pixel, for a single instant tells little of them.
 
 A camera's error hardly shows in what is left, for the joints follow it. So a calibration is not
 trusted beyond a pixel, however well everything fits.
@@ -27,12 +27,14 @@ Array = NDArray[np.float64]
 
 # A camera's picture is off by no less [of the unit].
 _LEAST_CAMERA = 1.0
-# Standard deviation of the logarithms of sizes about the unit, before anything is seen.
+# Standard deviation of the logarithms of sizes about the unit, of what a single instant shows.
 _PRIOR_DEVIATION = 1.0
 # A motion by a unit that is seen along less contour than this is as noise [units].
 _LEAST_INFORMATION = 1.0
 # At most so many independent distances are looked at, the best known ones.
 _MOST_DISTANCES = 400
+# A part stands still from one picture to another that moves by less [of the unit].
+_STILL = 0.5
 _ITERATIONS, _SETTLED = 20, 0.03
 # A place is known to about as much, and an angle to a full turn [m, rad].
 _PLACE = 10.0
@@ -43,13 +45,26 @@ class ErrorSizes(NamedTuple):
 
     Attributes:
         noise: of a point of contour, as the fit weights it.
+        repeated: the same of what noise repeats in all pictures of a part that stands still before
+            a camera; 0 where no part does.
         surface, mask, camera: how far they move contours [the unit of the distances].
     """
 
     noise: float
+    repeated: float
     surface: float
     mask: float
     camera: float
+
+
+class ErrorEffects(NamedTuple):
+    """(n, n) covariances of distances that what ``ErrorSizes`` names makes where it errs by one."""
+
+    noise: Array
+    repeated: Array
+    surface: Array
+    mask: Array
+    camera: Array
 
 
 class Distances(NamedTuple):
@@ -58,16 +73,18 @@ class Distances(NamedTuple):
     Attributes:
         y: (n,) the distances.
         X: (n, m) how they follow the values.
-        effects: (n, n) covariances that surfaces, masks' parts and cameras make that err by a unit.
+        effects: (n, n) covariances of what errs by a unit, as of ``ErrorSizes``.
         information: (m, m) what all distances tell of the values where each errs by itself.
         bends: (n, 12 nodes) how they follow the parts' surfaces, which all pictures see alike.
+        pictures: (n,) which of the pictures each is of.
     """
 
     y: Array
     X: Array
-    effects: tuple[Array, Array, Array]
+    effects: ErrorEffects
     information: Array
     bends: Array
+    pictures: NDArray[np.intp]
 
 
 class Picture(NamedTuple):
@@ -132,11 +149,14 @@ def distances_in_pictures(outlines: Sequence[Outline], pictures: Sequence[Pictur
                          row @ shakes, float(along @ b[n]))
                     )  # fmt: skip
     found = sorted(found, key=lambda one: -one[0])[:_MOST_DISTANCES]
-    of = np.array([(one[1], one[2]) for one in found]).reshape(-1, 2)
+    of = np.array([(one[1], one[2]) for one in found], dtype=np.intp).reshape(-1, 2)
     bends = np.array([one[4] for one in found]).reshape(-1, 12)
     shaken = np.array([one[5] for one in found]).reshape(-1, 6)
     same_picture, same_part = (of[:, None, k] == of[None, :, k] for k in range(2))
     alike = bends @ bends.T * same_part
+    view = _views(outlines, pictures)[of[:, 0], of[:, 1]]
+    turns = bends / np.linalg.norm(bends, axis=1, keepdims=True)
+    repeated = turns @ turns.T * same_part * (view[:, None] == view)
     of_part = of[:, 1, None] == np.arange(len(outlines))
     count = pictures[0].moves.shape[1]
     information = np.zeros((count, count))
@@ -146,10 +166,31 @@ def distances_in_pictures(outlines: Sequence[Outline], pictures: Sequence[Pictur
     return Distances(
         y=np.array([one[6] for one in found]),
         X=np.array([one[3] for one in found]).reshape(-1, count),
-        effects=(alike, alike * same_picture, shaken @ shaken.T * same_picture),
+        effects=ErrorEffects(
+            np.eye(len(found)),
+            repeated,
+            alike,
+            alike * same_picture,
+            shaken @ shaken.T * same_picture,
+        ),
         information=information,
         bends=(of_part[:, :, None] * bends[:, None]).reshape(len(found), 12 * len(outlines)),
+        pictures=of[:, 0],
     )
+
+
+def _views(outlines: Sequence[Outline], pictures: Sequence[Picture]) -> NDArray[np.intp]:
+    """(pictures, nodes) which picture was the first that showed a part where this one does."""
+    X_CN = np.array([one.X_CW @ one.X_WN for one in pictures])[:, :, :3]
+    found = np.tile(np.arange(len(pictures))[:, None], len(outlines))
+    for n, outline in enumerate(outlines):
+        points = np.column_stack([outline.vertices, np.ones(len(outline.vertices))])
+        moments = points.T @ points / len(points)
+        for c, one in enumerate(pictures):
+            by = X_CN[: c + 1, n] - X_CN[c, n]
+            still = np.einsum("kij,jl,kil->k", by, moments, by) < (_STILL * one.size) ** 2
+            found[c, n] = found[np.flatnonzero(still)[0], n]
+    return found
 
 
 def surface_deformations(vertices: Array, X_WN: Array) -> Array:
@@ -187,7 +228,10 @@ def _camera_motions(outlines: Sequence[Outline], X_CW: Array, X_WN: Array, size:
 
 
 def estimate_sizes(
-    seen: Distances, is_angle: NDArray[np.bool_], least_camera: float = _LEAST_CAMERA
+    seen: Distances,
+    is_angle: NDArray[np.bool_],
+    least_camera: float = _LEAST_CAMERA,
+    prior_deviation: float = _PRIOR_DEVIATION,
 ) -> ErrorSizes:
     """How large the errors are: the likeliest, given what is left and the prior.
 
@@ -195,9 +239,13 @@ def estimate_sizes(
         seen: the distances.
         is_angle: (m,) which values are angles.
         least_camera: a picture errs as a whole by no less [of the unit].
+        prior_deviation: of the logarithms of sizes about the unit, before anything is seen.
     """
     n = len(seen.y)
-    effects = (np.eye(n), *seen.effects)
+    stands_still = np.abs(seen.effects.repeated - seen.effects.noise).max(initial=0.0) > _SETTLED
+    # Of parts that move, noise is noise.
+    told = [k for k, name in enumerate(ErrorSizes._fields) if name != "repeated" or stands_still]
+    effects = [seen.effects[k] for k in told]
     apriori = _apriori(is_angle)
 
     def likelihood(t: Array) -> tuple[float, Array, Array]:
@@ -208,16 +256,16 @@ def estimate_sizes(
         P = inverse - VX @ np.linalg.solve(H, VX.T)
         Py = P @ seen.y
         freedom = np.linalg.slogdet(V)[1] + np.linalg.slogdet(H)[1]
-        return -0.5 * float(freedom + seen.y @ Py + (t @ t) / _PRIOR_DEVIATION**2), P, Py
+        return -0.5 * float(freedom + seen.y @ Py + (t @ t) / prior_deviation**2), P, Py
 
     t = np.zeros(len(effects))
     value, P, Py = likelihood(t)
     for _ in range(_ITERATIONS):
         shares = [2.0 * np.exp(2.0 * a) * (P @ W) for a, W in zip(t, effects, strict=True)]
         pulls = [2.0 * np.exp(2.0 * a) * (Py @ W @ Py) for a, W in zip(t, effects, strict=True)]
-        g = 0.5 * (np.array(pulls) - [np.trace(one) for one in shares]) - t / _PRIOR_DEVIATION**2
+        g = 0.5 * (np.array(pulls) - [np.trace(one) for one in shares]) - t / prior_deviation**2
         fisher = np.array([[0.5 * np.sum(one * other.T) for one in shares] for other in shares])
-        step = np.linalg.solve(fisher + np.eye(len(t)) / _PRIOR_DEVIATION**2, g)
+        step = np.linalg.solve(fisher + np.eye(len(t)) / prior_deviation**2, g)
         step /= max(1.0, np.abs(step).max())
         trial = likelihood(t + step)
         while trial[0] < value and np.abs(step).max() > _SETTLED:
@@ -228,8 +276,10 @@ def estimate_sizes(
         t, (value, P, Py) = t + step, trial
         if np.abs(step).max() < _SETTLED:
             break
-    noise, surface, mask, camera = np.exp(t)
-    return ErrorSizes(noise, surface, mask, max(camera, least_camera))
+    sizes = np.zeros(len(ErrorSizes._fields))
+    sizes[told] = np.exp(t)
+    found = ErrorSizes(*sizes.tolist())
+    return found._replace(camera=max(found.camera, least_camera))
 
 
 def values_covariance(
@@ -240,17 +290,20 @@ def values_covariance(
     That is no better than the fit: H^-1 J^T V J H^-1 (the sandwich of Huber 1967), where V is the
     covariance of the distances.
     """
-    white = sizes.noise**2
+    white = sizes.noise**2 + sizes.repeated**2
     own = seen.X[:, free]
-    V = sum(
-        (size**2 * W for size, W in zip(sizes[1:], seen.effects, strict=True)),
-        np.zeros((len(own), len(own))),
-    )
+    V = distances_covariance(seen, sizes)
     apriori = white * _apriori(is_angle)[np.ix_(free, free)]
     H = seen.information[np.ix_(free, free)] + apriori
     # What is not among the distances, and what is known beforehand, is as noise.
     inverse = np.linalg.inv(H)
-    return np.asarray(inverse @ (own.T @ V @ own + white * H) @ inverse)
+    return np.asarray(inverse @ (own.T @ V @ own + white * (H - own.T @ own)) @ inverse)
+
+
+def distances_covariance(seen: Distances, sizes: ErrorSizes) -> Array:
+    """(n, n) of the distances."""
+    parts = zip(sizes, seen.effects, strict=True)
+    return sum((size**2 * W for size, W in parts), np.zeros((len(seen.y), len(seen.y))))
 
 
 def _apriori(is_angle: NDArray[np.bool_]) -> Array:

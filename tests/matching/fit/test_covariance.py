@@ -7,6 +7,7 @@ from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.matching import View
 from drake_pose.matching.fit.covariance import (
     Distances,
+    ErrorEffects,
     ErrorSizes,
     estimate_sizes,
     values_covariance,
@@ -28,32 +29,36 @@ ALL = np.arange(3)
 def drawn_distances(
     generator: np.random.Generator, sizes: ErrorSizes, count: int = 150
 ) -> tuple[Distances, np.ndarray]:
-    """Distances that follow three values and three kinds of errors; and the values' errors."""
+    """Distances that follow three values and five kinds of errors; and the values' errors."""
     X = generator.normal(0.0, 20.0, (count, 3))
     kinds = [generator.normal(0.0, 1.5, (count, k)) for k in (40, 60, 12)]
     y = generator.normal(0.0, sizes.noise, count)
+    # The second half repeats some noise of the first.
+    again = np.tile(np.eye(count // 2), (2, 1))
+    kinds = [again, *kinds]
     for size, kind in zip(sizes[1:], kinds, strict=True):
         y += size * kind @ generator.standard_normal(kind.shape[1])
-    surface, mask, camera = (kind @ kind.T for kind in kinds)
-    seen = Distances(y, X, (surface, mask, camera), X.T @ X, kinds[0])
+    effects = ErrorEffects(np.eye(count), *(kind @ kind.T for kind in kinds))
+    which = np.arange(count) // (count // 2)
+    seen = Distances(y, X, effects, X.T @ X, kinds[1], which)
     return seen, np.linalg.solve(X.T @ X, X.T @ y)
 
 
 def test_sizes_are_those_that_were_drawn() -> None:
     generator = np.random.default_rng(1)
-    sizes = ErrorSizes(1.5, 0.4, 1.0, 2.0)
+    sizes = ErrorSizes(1.5, 1.2, 0.4, 1.0, 2.0)
     found = [estimate_sizes(drawn_distances(generator, sizes)[0], ANGLES) for _ in range(4)]
     np.testing.assert_allclose(np.median(found, axis=0), sizes, rtol=0.4)
 
 
 def test_a_calibration_is_not_trusted_beyond_a_pixel() -> None:
-    seen, _ = drawn_distances(np.random.default_rng(2), ErrorSizes(1.0, 0.1, 0.1, 0.01))
+    seen, _ = drawn_distances(np.random.default_rng(2), ErrorSizes(1.0, 0.5, 0.1, 0.1, 0.01))
     assert estimate_sizes(seen, ANGLES).camera == 1.0
 
 
 def test_covariance_is_that_of_many_fits() -> None:
     generator = np.random.default_rng(3)
-    sizes = ErrorSizes(1.0, 0.5, 0.5, 2.0)
+    sizes = ErrorSizes(1.0, 1.0, 0.5, 0.5, 2.0)
     ratios = []
     for _ in range(300):
         seen, errors = drawn_distances(generator, sizes, 60)
@@ -67,9 +72,10 @@ def test_values_that_do_not_show_are_as_unsure_as_a_full_turn() -> None:
     nothing = Distances(
         np.zeros(0),
         np.zeros((0, 3)),
-        (np.zeros((0, 0)),) * 3,
+        ErrorEffects(*[np.zeros((0, 0))] * 5),
         np.diag([0.0, 1e6, 1e6]),
         np.zeros((0, 12)),
+        np.zeros(0, dtype=np.intp),
     )
     sizes = estimate_sizes(nothing, ANGLES)
     deviations = np.sqrt(np.diag(values_covariance(nothing, sizes, ALL, ANGLES)))

@@ -4,6 +4,7 @@ import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,15 @@ from drake_pose.filtering.truncation.inequalities import (
     stack,
 )
 from drake_pose.matching.fit.camera_sums import REACH, Views
+from drake_pose.matching.fit.colours import (
+    ColourSettings,
+    Histograms,
+    Picture,
+    add_pictures,
+    check_picture,
+    learned,
+    no_colours,
+)
 from drake_pose.matching.fit.contour_fit import (
     Comparison,
     Noise,
@@ -86,6 +96,23 @@ class ContourSettings:
                 raise SettingsError(f"{name} must be positive, not {value}")
 
 
+class Seen(NamedTuple):
+    """What a frame shows.
+
+    views: the edges of masks; pictures: of cameras without a mask, else None; colours: what is
+    known of the body's colours before the frame.
+    """
+
+    views: Views
+    pictures: tuple[Picture | None, ...]
+    colours: Histograms | None
+
+    @property
+    def has_pictures(self) -> bool:
+        """Whether there is one to be compared."""
+        return self.colours is not None and any(one is not None for one in self.pictures)
+
+
 @dataclass(frozen=True, eq=False)
 class ContourMeasurement:
     """What masks say of a pose near one state: an ``ObservationModel``, linear, made for one frame.
@@ -140,6 +167,7 @@ class ContourObservation:
         settings: how the contour is measured.
         rest: each measurement also says, with so much weight, that joints are about the middle of
             their limits, as evenly spread as these are wide; 0: nothing is said.
+        colours: how pictures are compared.
 
     Attributes:
         layout: the state: the tree's values that are free to move, then ROOT_SHIFT and GROWTH,
@@ -160,6 +188,7 @@ class ContourObservation:
         constant: Sequence[str] = (),
         settings: ContourSettings | None = None,
         rest: float = 0.0,
+        colours: ColourSettings | None = None,
     ) -> None:
         if not cameras:
             raise SettingsError("a contour needs one camera or more")
@@ -167,6 +196,7 @@ class ContourObservation:
             raise SettingsError("a scale can be tracked only in one parallel camera's masks")
         self.tree, self.cameras = tree, tuple(cameras)
         self.settings = settings or ContourSettings()
+        self.colours = colours or ColourSettings()
         self._kinematics = TreeKinematics(tree)
         surfaces = TreeSurfaces(tree)
         self._whole = PackedSurfaces(surfaces)
@@ -350,17 +380,27 @@ class ContourObservation:
         X_WN = self._body.place(self.parameters(x)).X_WN
         return draw_packed(self._whole.at(self.node_values(x)), camera.X_CW @ X_WN, camera)
 
-    def look(self, masks: Sequence[Mask | None]) -> Views:
-        """What masks say: the points of their edges, found once for all measurements of a frame.
+    def look(
+        self,
+        masks: Sequence[Mask | None],
+        pictures: Sequence[Picture | None] | None = None,
+        colours: Histograms | None = None,
+    ) -> Seen:
+        """What a frame shows: the points of masks' edges, found once for all its measurements.
 
         Args:
-            masks: (H, W) of each camera, in their order; None where there is no picture.
+            masks: (H, W) of each camera, in their order; None where there is none.
+            pictures: (H, W, 3 or 4) of each camera; None where there is none. They are compared
+                where there is no mask.
+            colours: what is known of the body's colours; None: nothing, and pictures say nothing.
 
         Raises:
-            SettingsError: masks that do not fit the cameras.
+            SettingsError: masks or pictures that do not fit the cameras.
         """
         if len(masks) != len(self.cameras):
             raise SettingsError(f"{len(self.cameras)} masks expected, got {len(masks)}")
+        if pictures is not None and len(pictures) != len(self.cameras):
+            raise SettingsError(f"{len(self.cameras)} pictures expected, got {len(pictures)}")
         edges = []
         for camera, mask in zip(self.cameras, masks, strict=True):
             if mask is not None and mask.shape != (camera.height, camera.width):
@@ -371,32 +411,80 @@ class ContourObservation:
             edges.append(
                 NO_EDGE if mask is None else find_edge_points(mask, 0.5 * self.settings.spacing)
             )
-        return pack_views(self.cameras, edges)
+        compared = [
+            None if picture is None or mask is not None else check_picture(camera, picture)
+            for camera, mask, picture in zip(
+                self.cameras, masks, pictures or [None] * len(masks), strict=True
+            )
+        ]
+        return Seen(pack_views(self.cameras, edges), tuple(compared), colours)
 
-    def measure(
-        self, seen: Views, x: Array, distance: float | None = None
-    ) -> ContourMeasurement | None:
-        """Compare the model's contour at a state with the edges of masks.
+    def is_finest(self, number: int) -> bool:
+        """Whether no later measurement of a frame looks at pictures more closely than this one."""
+        return self.colours.step(number) == self.colours.steps[-1]
+
+    def no_colours(self) -> Histograms:
+        """What is known of a body's colours that was never seen."""
+        return no_colours(len(self.cameras), len(self._body.outlines))
+
+    def learn(
+        self,
+        pictures: Sequence[Picture | None],
+        x: Array,
+        colours: Histograms,
+        surely: bool = False,
+    ) -> Histograms:
+        """What is known of the body's colours after a frame.
 
         Args:
-            seen: what the masks say.
+            pictures: of each camera; None where there is none.
+            x: (n,) the state in the frame.
+            colours: what was known before.
+            surely: whether the pose is known, so that old colours are forgotten.
+
+        Raises:
+            SettingsError: pictures that do not fit the cameras.
+        """
+        checked = [
+            None if picture is None else check_picture(camera, picture)
+            for camera, picture in zip(self.cameras, pictures, strict=True)
+        ]
+        placed = self._body.place(self.parameters(x))
+        return learned(placed, self.cameras, checked, colours, self.colours, surely)
+
+    def measure(
+        self, seen: Seen, x: Array, distance: float | None = None, number: int = 0
+    ) -> ContourMeasurement | None:
+        """Compare the model's contour at a state with a frame.
+
+        Args:
+            seen: what the frame shows.
             x: (n,) the state.
             distance: about how far they are apart [pixel], of the measurement before; None: as far
                 as is looked.
+            number: how many measurements of the frame were made before: lines in pictures are
+                looked at more closely from one to the next.
 
         Returns:
-            The measurement; None where no edge is near the contour in any mask.
+            The measurement; None where no edge is near the contour in any mask or picture.
         """
         width = self.settings.reach / REACH
         if distance is not None:
             width = min(width, _ROBUST_WIDTH * max(self.settings.deviation, distance))
-        found = self._compare(seen, x, width)
+        found = self._compare(seen, x, width, number)
         return None if found is None else self._compress(x, *found)
 
-    def _compare(self, seen: Views, x: Array, width: float) -> tuple[Comparison, float] | None:
+    def _compare(
+        self, seen: Seen, x: Array, width: float, number: int
+    ) -> tuple[Comparison, float] | None:
         """Contours compared with so wide a scale [pixel], and how far they are apart [pixel]."""
         step = Round(width, self.settings.spacing)
-        compared = compare_views(self._body, seen, self.parameters(x), step, _PLAIN, pixels=1.0)
+        compared = compare_views(self._body, seen.views, self.parameters(x), step, _PLAIN, 1.0)
+        if seen.colours is not None and seen.has_pictures:
+            pixels = self.colours.step(number)
+            # Coarse lines are so wide that they would say the same.
+            lines = Round(width, self.colours.spacing * min(pixels, 2))
+            add_pictures(compared, self.cameras, seen.pictures, seen.colours, lines, _PLAIN, pixels)
         squares, weight = compared.sums[:, :, [SQUARES, WEIGHT]].sum(axis=(0, 1))
         return None if weight <= 0.0 else (compared, math.sqrt(squares / weight))
 

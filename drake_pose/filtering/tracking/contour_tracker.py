@@ -18,8 +18,10 @@ from drake_pose.filtering.measurements.contour import (
     ContourMeasurement,
     ContourObservation,
     Mask,
+    Seen,
 )
 from drake_pose.filtering.state import Belief
+from drake_pose.matching.fit.colours import Histograms, Picture
 
 Array = NDArray[np.float64]
 
@@ -43,6 +45,8 @@ class TrackingSettings:
         rounds: how often the contour is compared anew in each frame.
         lost_distance: the track is lost when the contour and the masks' edge are further apart
             than this [pixel].
+        lost_colour_distance: and where pictures are compared, further than this [pixel]: lines are
+            looked at so closely that a wrong pose cannot put them much further off.
         lost_share: and when a smaller share of the contour than this has an edge beside it.
         lost_growth: and when E_total is this many times what it was after the last match ...
         lost_margin: ... and larger than that by this.
@@ -66,6 +70,7 @@ class TrackingSettings:
     constant_length: float = 0.03
     rounds: int = 4
     lost_distance: float = 12.0
+    lost_colour_distance: float = 2.0
     lost_share: float = 0.6
     lost_growth: float = 1.5
     lost_margin: float = 0.1
@@ -86,12 +91,14 @@ class Track:
     Attributes:
         state: the filter's.
         measurement: of the contour at the end; None where no mask was given.
-        lost: whether the contour is far from the masks' edge.
+        lost: whether the contour is far from the masks' edge, or from that which colours show.
+        colours: what is known of the body's colours; None: no picture was seen yet.
     """
 
     state: FilterState
     measurement: ContourMeasurement | None
     lost: bool
+    colours: Histograms | None = None
 
 
 class ContourTracker:
@@ -171,45 +178,68 @@ class ContourTracker:
         masks: Sequence[Mask | None],
         first: bool = False,
         root_position: Array | None = None,
+        pictures: Sequence[Picture | None] | None = None,
     ) -> Track:
         """The next frame.
 
         Args:
             track: the last one.
-            masks: (H, W) of each camera; None where there is no picture.
+            masks: (H, W) of each camera; None where there is none.
             first: the frame that the start was made for: nothing has moved since.
             root_position: (3,) where the root is known to be now, if not where the tree holds it
                 [m].
+            pictures: (H, W, 3 or 4) of each camera; None where there is none. The colours along the
+                contour stand in where there is no mask. What they are is learned from every
+                frame, and at first where the start was.
 
         Raises:
-            SettingsError: masks that do not fit the cameras.
+            SettingsError: masks or pictures that do not fit the cameras.
         """
         observation = self.observation
         if root_position is not None:
             observation = observation.with_root_position(root_position)
         prediction = track.state if first else self.filter.predict(track.state)
-        state, measurement = prediction, None
-        seen, moving = observation.look(masks), len(observation.layout.moving)
+        colours = track.colours
+        if pictures is not None and colours is None:
+            colours = observation.no_colours()
+            if all(mask is None for mask in masks):
+                colours = observation.learn(pictures, prediction.best.mean, colours, True)
+        seen = observation.look(masks, pictures, colours)
+        state, measurement = self._fit(observation, seen, prediction)
+        if measurement is None:
+            shown = any(one is not None for one in (*masks, *(pictures or ())))
+            return Track(state, None, track.lost or shown, colours)
+        lost = self._is_lost(measurement, seen)
+        if pictures is not None and colours is not None and not lost:
+            colours = observation.learn(pictures, state.best.mean, colours)
+        return Track(state, measurement, lost, colours)
+
+    def _fit(
+        self, observation: ContourObservation, seen: Seen, prediction: FilterState
+    ) -> tuple[FilterState, ContourMeasurement | None]:
+        """A frame's state, and the measurement there; None: the frame says nothing."""
+        moving, state = len(observation.layout.moving), prediction
+        measurement = observation.measure(seen, state.best.mean)
         for k in range(self.settings.rounds):
-            before = state.best.mean
-            distance = None if measurement is None else measurement.distance
-            measurement = observation.measure(seen, state.best.mean, distance)
             if measurement is None:
                 break
+            before, last = state.best.mean, measurement
             state = self.filter.update(prediction, measurement.y, measurement)
-            if k > 0 and np.abs((state.best.mean - before)[:moving]).max() < _STANDSTILL:
-                # The contour is compared where the state is.
-                return Track(state, measurement, self._is_lost(measurement))
-        if measurement is None:
-            return Track(state, None, track.lost or any(mask is not None for mask in masks))
-        last = observation.measure(seen, state.best.mean, measurement.distance)
-        return Track(state, last, last is None or self._is_lost(last))
+            still = k > 0 and np.abs((state.best.mean - before)[:moving]).max() < _STANDSTILL
+            # The contour is compared where the state is, or as good as that: lines in pictures are
+            # compared no more often than there are rounds.
+            if seen.has_pictures:
+                if k + 1 == self.settings.rounds or (still and observation.is_finest(k)):
+                    return state, last
+            elif still:
+                return state, last
+            measurement = observation.measure(seen, state.best.mean, last.distance, k + 1)
+        return state, measurement
 
-    def _is_lost(self, measurement: ContourMeasurement) -> bool:
-        return (
-            measurement.distance > self.settings.lost_distance
-            or measurement.share < self.settings.lost_share
-        )
+    def _is_lost(self, measurement: ContourMeasurement, seen: Seen) -> bool:
+        settings = self.settings
+        furthest = settings.lost_colour_distance if seen.has_pictures else settings.lost_distance
+        return measurement.distance > furthest or measurement.share < settings.lost_share
 
 
 class _Nothing:

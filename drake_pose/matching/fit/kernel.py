@@ -114,13 +114,7 @@ def compare_contours(
         begin, end = starts[c], starts[c + 1]
         if begin == end:
             continue
-        X_CN = np.zeros_like(X_WN)
-        for node in range(len(X_WN)):
-            for row in range(3):
-                for column in range(4):
-                    for k in range(4):
-                        X_CN[node, row, column] += cameras[0][c, row, k] * X_WN[node, k, column]
-            X_CN[node, 3, 3] = 1.0
+        X_CN = seen_from(cameras[0][c], X_WN)
         segments = find_segments(packed, X_CN, cameras[1][c])
         contour = sample_contour(packed, segments, cameras[1][c], 0.0, weights[c, 2], True)
         edge = (uv[begin:end], normals[begin:end], lengths[begin:end])
@@ -131,7 +125,7 @@ def compare_contours(
 
 @compiled
 def _add_camera(
-    contour: tuple[Array, Array, Array, Indices, Array, Mask],
+    contour: tuple[Array, Array, Array, Indices, Array, Mask, Array],
     edge: tuple[Array, Array, Array],
     X_WN: Array,
     camera: tuple[Array, Array],
@@ -143,7 +137,7 @@ def _add_camera(
     """compare_contours for one camera; contour: the arrays of ContourPoints; add: its outputs."""
     A, b, sums, pieces = add
     unit, scale, _, worth = weights
-    uv, normals, lengths, nodes, p_N, _ = contour
+    uv, normals, lengths, nodes, p_N, _, _ = contour
     edge_uv, edge_normals, edge_lengths = edge
     of_point, of_edge = nearest_alike(uv, normals, edge_uv, edge_normals, reach * scale)
     rows, p, w = np.empty((2, 3)), np.empty(3), np.empty(12)
@@ -171,24 +165,66 @@ def _add_camera(
         cost = worth * length * r * r / (1.0 + t)
         sums[counted, COST] += cost
         _add_piece(pieces, u / side, v / side, cost)
-        node = nodes[i]
-        for k in range(3):
-            p[k] = X_WN[node, k, 3]
-            for c in range(3):
-                p[k] += X_WN[node, k, c] * p_N[i, c]
-        picture_rows(p, camera[0], camera[1], rows)
-        for k in range(3):
-            along = n0 * rows[0, k] + n1 * rows[1, k]
-            w[4 * k], w[4 * k + 1] = along * p[0], along * p[1]
-            w[4 * k + 2], w[4 * k + 3] = along * p[2], along
         weight = worth * length / (1.0 + t) ** 2
         sums[counted, SQUARES] += weight * r * r
         sums[counted, WEIGHT] += weight
-        for k in range(12):
-            share = weight * w[k]
-            b[node, k] += share * r
-            for c in range(k + 1):
-                A[node, k, c] += share * w[c]
+        node = nodes[i]
+        add_residual(A[node], b[node], X_WN[node], p_N[i], camera, n0, n1, r, weight, (rows, p, w))
+
+
+@compiled
+def seen_from(X_CW: Array, X_WN: Array) -> Array:
+    """X_CN (nodes, 4, 4)."""
+    X_CN = np.zeros_like(X_WN)
+    for node in range(len(X_WN)):
+        for row in range(3):
+            for column in range(4):
+                for k in range(4):
+                    X_CN[node, row, column] += X_CW[row, k] * X_WN[node, k, column]
+        X_CN[node, 3, 3] = 1.0
+    return X_CN
+
+
+@compiled
+def add_residual(
+    A: Array,
+    b: Array,
+    X_WN: Array,
+    p_N: Array,
+    camera: tuple[Array, Array],
+    n0: float,
+    n1: float,
+    r: float,
+    weight: float,
+    scratch: tuple[Array, Array, Array],
+) -> None:
+    """Adds one distance in a picture to a node's A (12, 12), lower triangle, and b (12,).
+
+    Args:
+        A, b: added to.
+        X_WN: (4, 4) of the node.
+        p_N: (3,) its point.
+        camera: X_CW (4, 4) and kernel parameters (8,).
+        n0, n1: the direction along which the point is to move.
+        r: by how much [pixel].
+        weight: its weight.
+        scratch: (2, 3), (3,) and (12,).
+    """
+    rows, p, w = scratch
+    for k in range(3):
+        p[k] = X_WN[k, 3]
+        for c in range(3):
+            p[k] += X_WN[k, c] * p_N[c]
+    picture_rows(p, camera[0], camera[1], rows)
+    for k in range(3):
+        along = n0 * rows[0, k] + n1 * rows[1, k]
+        w[4 * k], w[4 * k + 1] = along * p[0], along * p[1]
+        w[4 * k + 2], w[4 * k + 3] = along * p[2], along
+    for k in range(12):
+        share = weight * w[k]
+        b[k] += share * r
+        for c in range(k + 1):
+            A[k, c] += share * w[c]
 
 
 @compiled

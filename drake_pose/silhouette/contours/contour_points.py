@@ -36,6 +36,9 @@ class ContourPoints(NamedTuple):
         nodes: (n,) int64 the surface each lies on.
         p_N: (n, 3) the point of that surface, in its frame N [m].
         in_rows: (n,) bool whether a row crosses the contour there, else a column.
+        clearances: (n, 2) how far along the normals it is inwards to where the silhouette ends
+            again, and outwards to where it begins again, inf where it does not, as if the
+            contour there were parallel to here [pixel].
     """
 
     uv: np.ndarray
@@ -44,6 +47,7 @@ class ContourPoints(NamedTuple):
     nodes: np.ndarray
     p_N: np.ndarray
     in_rows: np.ndarray
+    clearances: np.ndarray
 
 
 def find_contour_points(
@@ -82,7 +86,7 @@ def sample_contour(
     first: float,
     spacing: float,
     in_columns: bool,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Returns the arrays of ContourPoints.
 
     Args:
@@ -104,7 +108,7 @@ def sample_contour(
         capacity += len(crossings[across][1])
     uv, normals, lengths = np.empty((capacity, 2)), np.empty((capacity, 2)), np.empty(capacity)
     nodes, p_N = np.empty(capacity, dtype=np.int64), np.empty((capacity, 3))
-    in_rows = np.empty(capacity, dtype=np.bool_)
+    in_rows, clearances = np.empty(capacity, dtype=np.bool_), np.empty((capacity, 2))
     spans = np.empty((capacity // 2 + 1, 2), dtype=np.int64)
     count = 0
     for across in range(2):
@@ -139,5 +143,22 @@ def sample_contour(
                         i, b
                     ]
                 nodes[count], in_rows[count] = segments.nodes[s], across == 0
+                straight = abs(normals[count, across])
+                clearances[count, 0] = straight * (
+                    places[spans[k // 2, 1]] - places[spans[k // 2, 0]]
+                )
+                clearances[count, 1] = np.inf
+                if k % 2 == 1 and k + 1 < 2 * found:
+                    clearances[count, 1] = straight * (places[spans[k // 2 + 1, 0]] - place)
+                elif k % 2 == 0 and k > 0:
+                    clearances[count, 1] = straight * (place - places[spans[k // 2 - 1, 1]])
                 count += 1
-    return uv[:count], normals[:count], lengths[:count], nodes[:count], p_N[:count], in_rows[:count]
+    return (
+        uv[:count],
+        normals[:count],
+        lengths[:count],
+        nodes[:count],
+        p_N[:count],
+        in_rows[:count],
+        clearances[:count],
+    )

@@ -81,6 +81,28 @@ def test_lengths_sum_to_the_perimeter():
     assert np.all(((points.uv - center) * points.normals).sum(axis=1) > 27.9)
 
 
+def test_clearances_are_how_far_it_is_across_parallel_edges():
+    camera = CAMERAS[0]
+    X = np.tile(np.eye(4), (2, 1, 1))
+    # Two boxes side by side, 20 pixels wide, turned in the picture; the gap is 7 pixels.
+    turn = np.radians(20.0)
+    X[:, :2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    half = 0.5 * (20.0 + 7.0) / 40.0
+    X[0, :3, 3] = np.array([*(-half * X[0, :2, 0]), 2.0])
+    X[1, :3, 3] = np.array([*(half * X[0, :2, 0]), 2.0])
+    found = find_contour_points((outline_from_mesh(box(0.5)),) * 2, X, camera)
+    across = (found.uv - [camera.center_x, camera.center_y]) @ X[0, :2, :2]
+    # Away from the corners.
+    middle = np.abs(across[:, 1]) < 2.0
+    within = middle & (np.abs(np.abs(across[:, 0]) - 3.5) < 0.1)
+    without = middle & (np.abs(np.abs(across[:, 0]) - 23.5) < 0.1)
+    assert within.sum() > 5
+    assert without.sum() > 5
+    np.testing.assert_allclose(found.clearances[within], [[20.0, 7.0]] * within.sum(), rtol=1e-6)
+    np.testing.assert_allclose(found.clearances[without][:, 0], 20.0, rtol=1e-6)
+    assert np.all(np.isinf(found.clearances[without][:, 1]))
+
+
 def test_what_lies_behind_or_within_has_no_points():
     camera = CAMERAS[0]
     X = np.tile(np.eye(4), (2, 1, 1))

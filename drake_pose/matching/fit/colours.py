@@ -1,0 +1,152 @@
+"""Pictures as evidence of a body's pose: what is known of its colours, and how lines are looked at.
+
+Nothing is kept here between frames: who follows a body keeps the histograms, and gets new ones.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.camera import Camera
+from drake_pose.errors import SettingsError
+from drake_pose.matching.fit.colour_lines import COLOURS, compare_lines, learn_colours
+from drake_pose.matching.fit.contour_fit import Comparison, Noise, camera_weights, pack_cameras
+from drake_pose.matching.fit.levenberg_marquardt import Round
+from drake_pose.matching.fit.parameters import Placement
+
+Array = NDArray[np.float64]
+Histograms = NDArray[np.float32]
+"""(cameras, nodes, 3, COLOURS) what is known of a body's colours in each camera's pictures."""
+
+Picture = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class ColourSettings:
+    """How pictures are compared with a body.
+
+    Args:
+        steps: from offset to offset of lines, in one round after the other [pixel]; the last is
+            that of all further rounds.
+        spacing: of lines along the contour, so many pixels where the step is one.
+        inside: colours are counted so far inside of the contour [pixel].
+        outside: and so far outside of it [pixel].
+        rate: the share of a frame's colours in what is known after it, 0 to 1.
+        agreeing: lines on which the edge seems to be further from the contour than this teach
+            nothing [pixel]: something else is there.
+
+    Raises:
+        SettingsError: a number that is not positive, or a rate above 1.
+    """
+
+    steps: tuple[int, ...] = (4, 2, 1)
+    spacing: float = 2.0
+    inside: float = 16.0
+    outside: float = 30.0
+    rate: float = 0.1
+    agreeing: float = 2.5
+
+    def __post_init__(self) -> None:
+        if not self.steps or min(self.steps) < 1:
+            raise SettingsError(f"steps must be whole pixels, not {self.steps}")
+        for name in ("spacing", "inside", "outside", "rate", "agreeing"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise SettingsError(f"{name} must be positive, not {getattr(self, name)}")
+        if self.rate > 1.0:
+            raise SettingsError(f"the rate of colours must be at most 1, not {self.rate}")
+
+    def step(self, number: int) -> int:
+        """From offset to offset of lines in a round, counted from 0 [pixel]."""
+        return self.steps[min(number, len(self.steps) - 1)]
+
+
+def no_colours(cameras: int, nodes: int) -> Histograms:
+    """What is known of a body that was never seen: nothing."""
+    return np.zeros((cameras, nodes, 3, COLOURS), dtype=np.float32)
+
+
+def check_picture(camera: Camera, picture: Picture) -> Picture:
+    """A picture as kernels take it: a copy where it cannot be written or lies in pieces.
+
+    Raises:
+        SettingsError: it is not (H, W, 3) or (H, W, 4) bytes of the camera's size.
+    """
+    shape = (camera.height, camera.width)
+    if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] not in (3, 4):
+        raise SettingsError(
+            f"camera '{camera.name}': a picture of red, green and blue bytes expected, got "
+            f"{picture.shape} {picture.dtype}"
+        )
+    if picture.shape[:2] != shape:
+        raise SettingsError(
+            f"camera '{camera.name}': picture of {picture.shape[1]} x {picture.shape[0]} pixels, "
+            f"{camera.width} x {camera.height} expected"
+        )
+    return np.require(picture, requirements=["C", "W"])
+
+
+def add_pictures(
+    compared: Comparison,
+    cameras: Sequence[Camera],
+    pictures: Sequence[Picture | None],
+    histograms: Histograms,
+    step: Round,
+    noise: Noise,
+    pixels: int,
+) -> None:
+    """Adds what pictures say to what silhouettes say, in place.
+
+    Args:
+        compared: of all cameras.
+        cameras: the cameras.
+        pictures: of each; None: no lines are looked at in it.
+        histograms: what is known of the colours.
+        step: the scale of the residuals, and the spacing of lines [pixel].
+        noise: what a pixel of contour is worth [pixel].
+        pixels: from offset to offset along lines.
+    """
+    placed = compared.placement
+    packed = pack_cameras(cameras)
+    weights = camera_weights(packed, placed, step, noise, 1.0)
+    for c, picture in enumerate(pictures):
+        if picture is not None:
+            compare_lines(
+                placed.packed, placed.X_WN, (packed[0][c], packed[1][c]), picture, histograms[c],
+                weights[c], pixels, compared.A[c], compared.b[c], compared.sums[c],
+            )  # fmt: skip
+
+
+def learned(
+    placed: Placement,
+    cameras: Sequence[Camera],
+    pictures: Sequence[Picture | None],
+    histograms: Histograms,
+    settings: ColourSettings,
+    surely: bool = False,
+) -> Histograms:
+    """What is known of the colours after a frame.
+
+    Args:
+        placed: the body where it stands.
+        cameras: the cameras.
+        pictures: of each; None: it teaches nothing.
+        histograms: what was known before.
+        settings: how colours are counted.
+        surely: whether the pose is known, so that all lines teach and old colours are forgotten.
+    """
+    known = histograms.copy()
+    packed = pack_cameras(cameras)
+    widths = np.array([settings.inside, settings.outside])
+    rate, agreeing = (1.0, math.inf) if surely else (settings.rate, settings.agreeing)
+    for c, picture in enumerate(pictures):
+        if picture is not None:
+            learn_colours(
+                placed.packed, placed.X_WN, (packed[0][c], packed[1][c]), picture, known[c],
+                settings.spacing, widths, rate, agreeing,
+            )  # fmt: skip
+    return known

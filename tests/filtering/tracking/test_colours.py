@@ -1,0 +1,198 @@
+"""A body before a room of colours, painted over Drake's label images: the truth is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from drake_pose.errors import SettingsError
+from drake_pose.filtering import ContourObservation, ContourTracker
+from drake_pose.matching.fit.colour_lines import BESIDE, COLOURS, ON
+from drake_pose.matching.fit.colours import ColourSettings
+from drake_pose.silhouette import LabelRenderer
+from tests.filtering.tracking.test_match_and_track import PERIOD, swings
+from tests.matching.bodies import forked_body, front_camera
+
+SIDE = 480
+ORANGE, GREEN = np.array([230, 130, 40]), np.array([60, 140, 60])
+
+
+@pytest.fixture(scope="module")
+def body(tmp_path_factory):
+    return forked_body(tmp_path_factory.mktemp("body"))
+
+
+@pytest.fixture(scope="module")
+def camera():
+    """Of 300 pixels a metre: segments are 36 to 72 pixels wide and long."""
+    near = front_camera(SIDE, shift=0.2)
+    return replace(near, pixels_per_metre=300.0)
+
+
+@pytest.fixture(scope="module")
+def renderer(body, camera):
+    return LabelRenderer(body, camera)
+
+
+@pytest.fixture
+def observation(body, camera):
+    return ContourObservation(body.pose_tree(), [camera])
+
+
+def room(generator):
+    """(SIDE, SIDE, 3) patches of all colours but orange."""
+    patches = generator.integers(0, 256, (24, 24, 3))
+    patches[..., 2] = np.maximum(patches[..., 2], 90)
+    return patches.repeat(20, axis=0).repeat(20, axis=1)
+
+
+def painted(mask, background, generator, noise=6.0, colour=ORANGE):
+    picture = np.where(mask[..., None], colour, background) + generator.normal(
+        0.0, noise, (*mask.shape, 3)
+    )
+    return np.clip(picture, 0, 255).astype(np.uint8)
+
+
+def descend(observation, picture, colours, x, steps=6):
+    """Gauss and Newton's steps from a state."""
+    moving, seen = len(observation.layout.moving), observation.look([None], [picture], colours)
+    distance = None
+    for k in range(steps):
+        measured = observation.measure(seen, x, distance, k)
+        distance = measured.distance
+        H = measured.H[:, :moving]
+        x = x.copy()
+        x[:moving] += np.linalg.solve(H.T @ H + 1e-3 * np.eye(moving), H.T @ measured.y)
+    return x, measured
+
+
+def test_colours_lead_back_to_the_truth(observation, renderer):
+    generator = np.random.default_rng(3)
+    background, truth = room(generator), np.array([0.2, 0.9, -0.6])
+    picture = painted(renderer.mask(truth), background, generator)
+    x = observation.state(truth)
+    colours = observation.learn([picture], x, observation.no_colours(), True)
+    found, measured = descend(observation, picture, colours, x + np.r_[0.12, -0.15, 0.1, 0, 0, 0])
+    # Segments of 12 to 24 pixels: a quarter of a pixel is a degree.
+    np.testing.assert_allclose(observation.positions(found)[0], truth, atol=np.radians(2.5))
+    assert measured.distance < 0.8
+    assert measured.share > 0.9
+
+
+def test_what_covers_the_body_pulls_little(observation, renderer):
+    generator = np.random.default_rng(4)
+    background, truth = room(generator), np.array([0.1, 1.2, -1.0])
+    mask = renderer.mask(truth)
+    x = observation.state(truth)
+    colours = observation.learn(
+        [painted(mask, background, generator)], x, observation.no_colours(), True
+    )
+    columns = np.nonzero(mask)[1]
+    at = int(np.argmax(columns))
+    # A green post over the end of the outermost arm.
+    covered = background.copy()
+    covered[:, columns[at] - 10 : columns[at] + 25] = GREEN
+    shown = mask & ~np.all(covered == GREEN, axis=-1)
+    found, _ = descend(observation, painted(shown, covered, generator), colours, x)
+    np.testing.assert_allclose(observation.positions(found)[0], truth, atol=np.radians(4.0))
+
+
+def test_learned_colours_are_those_on_both_sides(observation, renderer):
+    truth = np.array([0.1, 1.2, -1.0])
+    picture = np.where(renderer.mask(truth)[..., None], ORANGE, GREEN).astype(np.uint8)
+    known = observation.learn([picture], observation.state(truth), observation.no_colours())
+    seen = known[0, known[0, :, ON].sum(axis=-1) > 0]
+    assert len(seen) == 3
+    for side, colour in ((ON, ORANGE), (BESIDE, GREEN)):
+        number = int(np.dot(colour >> 4, [256, 16, 1]))
+        assert number < COLOURS
+        # Where the contour bends, strips reach over it to the other side.
+        assert np.all(seen[:, side, number] > 0.8)
+        np.testing.assert_allclose(seen[:, side].sum(axis=-1), 1.0, rtol=1e-4)
+
+
+def test_old_colours_fade_at_the_rate(body, camera, renderer):
+    settings = ColourSettings(rate=0.25, agreeing=100.0)
+    observation = ContourObservation(body.pose_tree(), [camera], colours=settings)
+    truth = np.array([0.1, 1.2, -1.0])
+    mask, x = renderer.mask(truth), observation.state(truth)
+    known = observation.no_colours()
+    for colour in (ORANGE, np.array([20, 20, 200])):
+        picture = np.where(mask[..., None], colour, GREEN).astype(np.uint8)
+        known = observation.learn([picture], x, known)
+    old = int(np.dot(ORANGE >> 4, [256, 16, 1]))
+    shares = known[0, :, ON, old]
+    np.testing.assert_allclose(shares[shares > 0], 0.75, atol=0.06)
+
+
+def test_a_body_like_its_background_says_nothing(observation, renderer):
+    truth = np.array([0.2, 0.9, -0.6])
+    plain = np.full((SIDE, SIDE, 4), 120, dtype=np.uint8)
+    x = observation.state(truth)
+    colours = observation.learn([plain], x, observation.no_colours(), True)
+    assert observation.measure(observation.look([None], [plain], colours), x) is None
+    tracker = ContourTracker(observation, PERIOD)
+    assert tracker.follow(tracker.start(x), [None], pictures=[plain]).lost
+
+
+def test_followed_by_colour_almost_as_well_as_by_masks(observation, renderer):
+    """Noise and a background that moves; the first frame has a mask, later ones have not."""
+    generator = np.random.default_rng(5)
+    background = room(generator)
+    truth = swings(25, np.array([0.1, 0.9, -0.8]), 0.25, generator)
+    tracker = ContourTracker(observation, PERIOD)
+    tracks = [tracker.start(observation.state(truth[0])) for _ in range(3)]
+    errors = []
+    for k, q in enumerate(truth):
+        mask = renderer.mask(q)
+        moved = np.roll(background, 2 * k, axis=1)
+        picture = painted(mask, moved, generator)
+        by_mask = tracker.follow(tracks[0], [mask], k == 0)
+        by_colour = tracker.follow(
+            tracks[1], [mask if k == 0 else None], k == 0, pictures=[picture]
+        )
+        # This one never gets a mask.
+        by_start = tracker.follow(tracks[2], [None], k == 0, pictures=[picture])
+        tracks = [by_mask, by_colour, by_start]
+        assert not any(track.lost for track in tracks)
+        errors.append(
+            [
+                np.degrees(np.abs(observation.positions(track.state.best.mean)[0] - q)).mean()
+                for track in tracks
+            ]
+        )
+    of_mask, of_colour, of_start = np.median(errors[3:], axis=0)
+    assert of_colour < max(2.0 * of_mask, 1.5)
+    assert of_start < max(2.0 * of_mask, 1.5)
+
+
+def test_a_covered_lens_is_a_loss_that_teaches_nothing(observation, renderer):
+    generator = np.random.default_rng(6)
+    truth = np.array([0.2, 0.9, -0.6])
+    picture = painted(renderer.mask(truth), room(generator), generator)
+    tracker = ContourTracker(observation, PERIOD)
+    track = tracker.follow(
+        tracker.start(observation.state(truth)), [None], True, pictures=[picture]
+    )
+    dark = tracker.follow(track, [None], pictures=[np.zeros((SIDE, SIDE, 3), dtype=np.uint8)])
+    assert dark.lost
+    np.testing.assert_array_equal(dark.colours, track.colours)
+
+
+@pytest.mark.parametrize(
+    ("picture", "said"),
+    [
+        (np.zeros((100, SIDE, 3), dtype=np.uint8), "480 x 100"),
+        (np.zeros((SIDE, SIDE), dtype=np.uint8), "red, green and blue"),
+        (np.zeros((SIDE, SIDE, 3)), "float64"),
+    ],
+)
+def test_pictures_that_do_not_fit_are_named(observation, picture, said):
+    with pytest.raises(SettingsError, match=f"front.*{said}"):
+        observation.look([None], [picture], observation.no_colours())
+
+
+@pytest.mark.parametrize("bad", [{"steps": ()}, {"rate": 1.5}, {"spacing": 0.0}])
+def test_bad_settings_are_named(bad):
+    with pytest.raises(SettingsError, match=next(iter(bad))):
+        ColourSettings(**bad)

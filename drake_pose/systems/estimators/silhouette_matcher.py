@@ -42,6 +42,7 @@ class SilhouetteMatcher(LeafSystem):
         - estimated_positions
         - error
         - base_pose
+        - body_poses
         - statistics
         - proved_optimal
         - determined
@@ -55,6 +56,8 @@ class SilhouetteMatcher(LeafSystem):
 
     The match is made in a periodic update. Until the first one, and where no pose is found, the
     estimated positions are the last ones (at first the model's default), and the error is infinite.
+    ``body_poses`` are the poses of all bodies in the scene's world, in the plant's order, as a
+    plant's output of that name gives them: a SilhouetteCamera draws what is estimated.
 
     What the answer is worth: ``proved_optimal`` is 1 where it is proved that no pose of the grid
     that was searched fits better. ``determined`` is 1 for each position that the silhouettes
@@ -108,21 +111,7 @@ class SilhouetteMatcher(LeafSystem):
         self._positions = self.DeclareDiscreteState(model.default_positions)
         self._base_pose = self.DeclareDiscreteState(np.eye(4)[:3].ravel())
         self._statistics = self.DeclareDiscreteState(no_match)
-        states = {self.discrete_state_ticket(self._positions)}
-        self.DeclareVectorOutputPort(
-            "estimated_positions", position_count, self._calc_positions, states
-        )
-        statistics_ticket = {self.discrete_state_ticket(self._statistics)}
-        self.DeclareVectorOutputPort("error", 1, self._calc_error, statistics_ticket)
-        self.DeclareAbstractOutputPort(
-            "base_pose",
-            lambda: AbstractValue.Make(RigidTransform()),
-            self._calc_base_pose,
-            {self.discrete_state_ticket(self._base_pose)},
-        )
-        self.DeclareVectorOutputPort(
-            "statistics", len(STATISTICS), self._calc_statistics, statistics_ticket
-        )
+        self._declare_estimates(position_count)
         self._worth = [
             self._declare_nan_output(name, size)
             for name, size in (
@@ -135,6 +124,30 @@ class SilhouetteMatcher(LeafSystem):
         ]
         self.DeclarePeriodicDiscreteUpdateEvent(period, offset, self._match)
         self.last_result: MatchResult | None = None
+
+    def _declare_estimates(self, position_count: int) -> None:
+        """The outputs of what is estimated, which only read the state."""
+        states = {self.discrete_state_ticket(self._positions)}
+        self.DeclareVectorOutputPort(
+            "estimated_positions", position_count, self._calc_positions, states
+        )
+        statistics_ticket = {self.discrete_state_ticket(self._statistics)}
+        self.DeclareVectorOutputPort("error", 1, self._calc_error, statistics_ticket)
+        self.DeclareAbstractOutputPort(
+            "base_pose",
+            lambda: AbstractValue.Make(RigidTransform()),
+            self._calc_base_pose,
+            {self.discrete_state_ticket(self._base_pose)},
+        )
+        self.DeclareAbstractOutputPort(
+            "body_poses",
+            lambda: AbstractValue.Make([RigidTransform()]),
+            self._calc_body_poses,
+            {*states, self.discrete_state_ticket(self._base_pose)},
+        )
+        self.DeclareVectorOutputPort(
+            "statistics", len(STATISTICS), self._calc_statistics, statistics_ticket
+        )
 
     def _declare_nan_output(self, name: str, size: int) -> DiscreteStateIndex:
         """A state, NaN at first, and the output that gives it out."""
@@ -215,7 +228,19 @@ class SilhouetteMatcher(LeafSystem):
     def _calc_statistics(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(context.get_discrete_state(self._statistics).value())
 
-    def _calc_base_pose(self, context: Context, output: AbstractValue) -> None:
+    def _X_WB(self, context: Context) -> RigidTransform:
+        """The pose in the scene's world of the frame that the plant takes for its world."""
         X_WB = np.eye(4)
         X_WB[:3] = context.get_discrete_state(self._base_pose).value().reshape(3, 4)
-        output.set_value(RigidTransform(X_WB))
+        return RigidTransform(X_WB)
+
+    def _calc_base_pose(self, context: Context, output: AbstractValue) -> None:
+        output.set_value(self._X_WB(context))
+
+    def _calc_body_poses(self, context: Context, output: AbstractValue) -> None:
+        plant = self._search.tree.model.plant
+        plant_context = plant.CreateDefaultContext()
+        plant.SetPositions(plant_context, context.get_discrete_state(self._positions).value())
+        X_WB = self._X_WB(context)
+        poses = plant.get_body_poses_output_port().Eval(plant_context)
+        output.set_value([X_WB @ pose for pose in poses])

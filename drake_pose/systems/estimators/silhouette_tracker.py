@@ -33,6 +33,7 @@ class SilhouetteTracker(SilhouetteMatcher):
         - estimated_positions
         - error
         - base_pose
+        - body_poses
         - statistics
         - proved_optimal
         - determined
@@ -40,12 +41,17 @@ class SilhouetteTracker(SilhouetteMatcher):
         - upper
         - family_positions
         - position_deviations
+        - estimated_state
         - track
 
     The ports are those of ``SilhouetteMatcher``, which it can replace in any diagram, and:
 
     - ``position_deviations`` (nq): the standard deviation of each position [rad or m]; NaN where
       a position is no part of what is tracked (held, or solved from the root's pose).
+    - ``estimated_state`` (nq + nv): the estimated positions, then the plant's velocities [rad/s or
+      m/s]; these are NaN where there is no track, and where ``position_deviations`` are. They are
+      what the filter believes: rates fade within ``tracking.memory``, so in steady motion they are
+      too small (by a fifth at 30 frames a second with the default of 0.15 s), and right with 5 s.
     - ``track``: see ``TRACK``. ``tracked`` is 1 where the last pose was tracked and 0 where the
       search found it; ``matches`` counts how often the search was asked; ``distance`` is between
       the body's contour and the masks' edge (root mean square, robust) [pixel].
@@ -82,6 +88,14 @@ class SilhouetteTracker(SilhouetteMatcher):
         # Which position each element of the state that is one stands for.
         seen = [name for name in (*layout.moving, *layout.constant) if name in names]
         self._elements = layout.indices(seen)
+        self._rates = layout.indices([f"rate_{name}" for name in layout.moving if name in names])
+        self._moving = np.array(
+            [names.index(name) for name in layout.moving if name in names], dtype=np.intp
+        )
+        self._still = np.array(
+            [names.index(name) for name in layout.constant if name in names], dtype=np.intp
+        )
+        self._period = period
         self._tracked_positions = np.array([names.index(name) for name in seen], dtype=np.intp)
         width = self._packing.cap * self._packing.belief_width
         self._belief = self.DeclareDiscreteState(np.zeros(width))
@@ -92,6 +106,15 @@ class SilhouetteTracker(SilhouetteMatcher):
             len(names),
             self._calc_deviations,
             {self.discrete_state_ticket(self._belief), self.discrete_state_ticket(self._record)},
+        )
+        self.DeclareVectorOutputPort(
+            "estimated_state",
+            search.tree.model.plant.num_multibody_states(),
+            self._calc_state,
+            {
+                self.discrete_state_ticket(index)
+                for index in (self._positions, self._belief, self._record)
+            },
         )
         self.DeclareVectorOutputPort(
             "track", len(TRACK), self._calc_track, {self.discrete_state_ticket(self._record)}
@@ -136,6 +159,19 @@ class SilhouetteTracker(SilhouetteMatcher):
         if track is not None:
             deviations[self._tracked_positions] = track.state.best.deviations()[self._elements]
         output.SetFromVector(deviations)
+
+    def _calc_state(self, context: Context, output: BasicVector) -> None:
+        q = context.get_discrete_state(self._positions).value()
+        qdot = np.full(len(q), np.nan)
+        track = self.followed(context).track
+        if track is not None:
+            qdot[self._still] = 0.0
+            qdot[self._moving] = track.state.best.mean[self._rates] / self._period
+        plant = self._search.tree.model.plant
+        plant_context = plant.CreateDefaultContext()
+        plant.SetPositions(plant_context, q)
+        v = plant.MapQDotToVelocity(plant_context, qdot)
+        output.SetFromVector(np.concatenate([q, v]))
 
     def _calc_track(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(context.get_discrete_state(self._record).value()[2:-1])

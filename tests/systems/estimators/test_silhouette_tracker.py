@@ -8,8 +8,14 @@ from pydrake.trajectories import PiecewisePolynomial
 from drake_pose.errors import SettingsError
 from drake_pose.filtering import TrackingSettings
 from drake_pose.matching import PaperSearch, PaperSearchSettings
-from drake_pose.silhouette import LabelRenderer, mask_to_label_image
-from drake_pose.systems import TRACK, SilhouetteMatcher, SilhouetteTracker, build_simulated_matching
+from drake_pose.silhouette import LabelRenderer, label_image_to_mask, mask_to_label_image
+from drake_pose.systems import (
+    TRACK,
+    SilhouetteCamera,
+    SilhouetteMatcher,
+    SilhouetteTracker,
+    build_simulated_matching,
+)
 from tests.matching.bodies import forked_body, front_camera
 
 PERIOD = 1 / 30
@@ -65,6 +71,38 @@ def test_plant_and_camera_to_tracked_positions(body, search):
     assert np.median(np.degrees(np.abs(errors).max(axis=1))) < 3.5
     assert np.mean(np.abs(errors) < 2 * np.array(deviations)) > 0.9
     assert (tracks[:, TRACK.index("distance")] < 1.0).all()
+
+
+def test_velocities_and_body_poses_are_those_of_the_plant(body, search):
+    camera = front_camera(200, shift=0.2)
+    # Rates that fade, as they do by default, are too small in steady motion.
+    settings = TrackingSettings(memory=5.0)
+    tracker = SilhouetteTracker(search, [camera], PERIOD, tracking=settings)
+    renderer = LabelRenderer(body, camera)
+    seen = SilhouetteCamera(body.plant, body.scene_graph, camera)
+    context = tracker.CreateDefaultContext()
+    state = tracker.GetOutputPort("estimated_state")
+    np.testing.assert_array_equal(state.Eval(context)[:3], body.default_positions)
+    assert np.isnan(state.Eval(context)[3:]).all()
+    speed = np.array([0.9, -0.6, 0.75])  # [rad/s]
+    for k in range(12):
+        q = np.array([-0.1, 0.5, -0.3]) + speed * PERIOD * k
+        tracker.GetInputPort("label_image").FixValue(context, mask_to_label_image(renderer.mask(q)))
+        updates = tracker.EvalUniquePeriodicDiscreteUpdate(context)
+        context.get_mutable_discrete_state().SetFrom(updates)
+    estimate = state.Eval(context)
+    found = tracker.GetOutputPort("estimated_positions").Eval(context)
+    np.testing.assert_array_equal(estimate[:3], found)
+    np.testing.assert_allclose(estimate[3:], speed, atol=0.15)
+
+    poses = tracker.GetOutputPort("body_poses").Eval(context)
+    for pose, expected in zip(poses, renderer.link_poses(found), strict=True):
+        np.testing.assert_allclose(pose.GetAsMatrix4(), expected, atol=1e-12)
+    # What is estimated can be looked at: the port fits a camera's.
+    camera_context = seen.CreateDefaultContext()
+    seen.GetInputPort("body_poses").FixValue(camera_context, poses)
+    mask = label_image_to_mask(seen.GetOutputPort("label_image").Eval(camera_context))
+    assert np.count_nonzero(mask != renderer.mask(found)) <= 0.002 * mask.sum()
 
 
 def test_a_copied_context_goes_on_as_the_first_did(body, search):

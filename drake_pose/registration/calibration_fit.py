@@ -136,6 +136,29 @@ class CalibrationFit:
             fitted[c][k] = width
         return Calibration(now.X_CW, tuple(fitted), now.log_focal, now.constants)
 
+    def bend(self, found: Calibration, by: Array, step: Round) -> tuple[float, float]:
+        """How much the cost bends upwards to either side, and how much it should.
+
+        Args:
+            found: the unknowns, fitted.
+            by: (u,) how far what is shared is moved.
+            step: scale and spacing.
+
+        Returns:
+            what the slopes on both sides say, and what the normal equations do.
+        """
+        less, more = (self._moved(found, sign * by) for sign in (-1.0, 1.0))
+        bends, said = 0.0, 0.0
+        for c, frames in enumerate(self.which):
+            for k in frames.tolist():
+                width = float(found.widths[c][k])
+                said += float(by @ self._equations(found, c, k, width, step)[0][1:, 1:] @ by)
+                g_less, g_more = (
+                    self._equations(one, c, k, width, step)[1][1:] for one in (less, more)
+                )
+                bends += 0.5 * float(by @ (g_more - g_less))
+        return bends, said
+
     def motions(self, now: Calibration, camera: int, dense: Array) -> Array:
         """(nodes, u, 12) the affine motions that the shared unknowns give to the nodes.
 
@@ -175,6 +198,12 @@ class CalibrationFit:
             cameras[:, _POSE] = now.log_focal
         return np.concatenate([cameras.ravel(), now.constants])
 
+    def _compare(
+        self, now: Calibration, camera: int, frame: int, width: float, step: Round
+    ) -> Comparison:
+        values, focal = self.values(now, camera, frame), float(now.log_focal[camera])
+        return self.fits[camera].compare(now.X_CW[camera], frame, step, width, values, focal)
+
     def _equations(
         self, now: Calibration, camera: int, frame: int, width: float, step: Round
     ) -> tuple[Array, Array, float]:
@@ -182,12 +211,13 @@ class CalibrationFit:
 
         What follows the width is told by differences: edges that are shifted along their normals.
         """
-        fit, values = self.fits[camera], self.values(now, camera, frame)
         less, here, more = (
-            fit.compare(now.X_CW[camera], frame, step, width + off, values, now.log_focal[camera])
+            self._compare(now, camera, frame, width + off, step)
             for off in (-_WIDTH_STEP, 0.0, _WIDTH_STEP)
         )
-        motions = self.motions(now, camera, here.placement.dense(len(values)))
+        motions = self.motions(
+            now, camera, here.placement.dense(len(self.fits[camera].values[frame]))
+        )
         A = np.tril(here.A[0]) + np.swapaxes(np.tril(here.A[0], -1), -1, -2)
         count = 1 + len(self.names)
         H, g = np.empty((count, count)), np.empty(count)

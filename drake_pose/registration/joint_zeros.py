@@ -39,8 +39,14 @@ Array = NDArray[np.float64]
 _ROUNDS = (
     *(Round(scale, 0.02) for scale in (0.12, 0.09, 0.07, 0.05, 0.03, 0.02)),
     Round(0.01, 0.01),
-    Round(0.005, 0.005, 6),
+    # Again and again, for what hardly shows, such as a zero that turns with the camera, gains so
+    # little in a step that a round ends before it is there.
+    *(Round(0.005, 0.005, 6) for _ in range(5)),
 )
+# So many standard deviations to either side it is looked whether the cost bends as it should.
+_ASIDE = 2.0
+# Less than this share of what it should be is none.
+_NO_BEND = 1e-3
 _SPACING = 1.0 / 300.0
 _AGAIN = 2
 # What is no better known than this share of what it was beforehand is not determined.
@@ -165,7 +171,7 @@ def calibrate_joints(
     while True:
         constants = [fits[0].names.index(name) for name in sought]
         fit, found, before = _fit(fits, X_CW, constants, focal)
-        covariance = calibration_uncertainty(fit, found).covariance
+        covariance = _as_the_cost_bends(fit, found, calibration_uncertainty(fit, found).covariance)
         values = _constants(fit, found, covariance)
         told |= values
         # The cameras shall fit what is answered: nothing is added where it cannot be told.
@@ -192,6 +198,21 @@ def _fit(
             fit = CalibrationFit(fits, which, constants, focal)
         found = fit.fit(found, _ROUNDS)
     return fit, found, before
+
+
+def _as_the_cost_bends(fit: CalibrationFit, found: Calibration, covariance: Array) -> Array:
+    """(u, u) the covariance, larger along constants whose cost bends less than it should.
+
+    A round base that turns looks as before, but the edges of its mesh's facets seem to move until
+    others take their place: what they tell is not true, and the slope of the cost knows it.
+    """
+    found_covariance = covariance.copy()
+    for k in range(len(fit.names) - len(fit.constants), len(fit.names)):
+        along = covariance[:, k] / math.sqrt(covariance[k, k])
+        bends, said = fit.bend(found, _ASIDE * along, _ROUNDS[-1])
+        share = min(1.0, max(_NO_BEND, bends / said))
+        found_covariance += (1.0 / share - 1.0) * np.outer(along, along)
+    return found_covariance
 
 
 def _shares(fit: CalibrationFit, found: Calibration) -> list[Array]:

@@ -7,8 +7,11 @@ import pytest
 
 from drake_pose.body import ArticulatedModel, load_model
 from drake_pose.errors import RegistrationError, UnknownNameError
+from drake_pose.matching.fit.levenberg_marquardt import Round
+from drake_pose.registration.calibration_fit import CalibrationFit, start_calibration
+from drake_pose.registration.camera_fit import CameraFit
 from drake_pose.registration.joint_zeros import calibrate_joints
-from drake_pose.registration.posed_frames import PosedFrame
+from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import CameraSearch, RegistrationBody
 from tests.matching.arms import arm_urdf
 from tests.registration.arm_pictures import errors, looking_at, see
@@ -100,3 +103,18 @@ class TestCalibrateJoints:
             calibrate_joints(body, [registered], [frames], [], lengths=["hand"])
         with pytest.raises(RegistrationError, match="more frames"):
             calibrate_joints(body, [registered], [frames], NAMES)
+
+
+def test_the_cost_bends_as_the_normal_equations_say(
+    model: ArticulatedModel, body: RegistrationBody
+) -> None:
+    camera = looking_at(np.array([1.6, 0.4, 0.5]), MIDDLE, 0.1)
+    frames = see(model, body, camera, 4, 4)
+    own = CameraFit(PosedFrames(body.kinematics, body.all, camera, frames), 1.0 / 300.0)
+    zero = body.kinematics.names.index("elbow_turn")
+    fit = CalibrationFit([own], [np.arange(len(frames))], [zero])
+    by = np.append(np.zeros(6), np.radians(0.1))
+    found = start_calibration([own], [camera.X_CW], 1)
+    bends, said = fit.bend(found, by, Round(0.005, 0.005))
+    assert said > 0.0
+    assert bends == pytest.approx(said, rel=0.5)

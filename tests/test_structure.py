@@ -104,7 +104,7 @@ MAY_KNOW_INSIDE = {
         "masks": {"registration", "estimate", "results"},
         "live": {"experiments", "estimate", "results"},
         "cluster": {"live"},
-        "batch": {"cluster", "estimate", "results"},
+        "batch": {"cluster", "registration", "estimate", "results"},
         "benchmarks": {
             "batch",
             "cluster",

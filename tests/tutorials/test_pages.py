@@ -198,7 +198,7 @@ def test_the_examples_of_files_can_be_read(tmp_path: Path) -> None:
     sources = load_sources(write("sources.yaml", formats, "location"), cameras)
     assert [one.kind for one in sources.values()] == ["device", "video", "folder"]
     jobs = read_job(write("jobs.yaml", formats, "scenes:"))
-    assert [job.name for job in jobs] == ["monday", "tuesday", "walker"]
+    assert [job.name for job in jobs] == ["monday", "tuesday", "walker", "robot"]
     assert load_board(write("board.yaml", formats, "square_length")).columns == 8
     assert "left_elbow" in load_landmarks(write("landmarks.yaml", models, "landmarks:"))
     columns = ("flexion_11", "flexion_12", "flexion_13")

@@ -9,7 +9,7 @@ from typing import Any
 
 from drake_pose.apps.estimate.capture import bundled_person
 from drake_pose.apps.options import parse_root_position, parse_root_rotation
-from drake_pose.apps.results.summary import describe_job
+from drake_pose.apps.results.summary import describe_job, file_digest
 from drake_pose.apps.settings import EstimateSettings
 from drake_pose.errors import SettingsError
 from drake_pose.yaml_files import read_yaml
@@ -18,7 +18,9 @@ CHUNK = 100
 """Frames in a chunk where nobody says."""
 
 _TOP = ("chunk", "defaults", "scenes")
-_OWN = ("scene", "model", "truth", "overlay", "replay")
+_OWN = ("scene", "model", "truth", "overlay", "replay", "audit", "camera_file")
+# Settings of an estimate that an audit has, too.
+_OF_AUDITS = ("cameras", "frames", "hold", "packages")
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,11 @@ class SceneJob:
         truth: measured joint positions to compare with.
         overlay: whether overlays are written.
         replay: whether replay.html is made.
-        chunk: frames in a chunk; the recording of a person who is followed is never cut.
+        chunk: frames in a chunk; the recording of a person who is followed is never cut, nor is
+            one that is audited.
+        audit: the table of joint positions that the scene is audited against; None: the scene is
+            estimated.
+        camera_file: for an audit, in place of the scene's cameras.yaml.
     """
 
     name: str
@@ -44,12 +50,21 @@ class SceneJob:
     overlay: bool = True
     replay: bool = True
     chunk: int = CHUNK
+    audit: Path | None = None
+    camera_file: Path | None = None
 
     def describe(self) -> dict[str, Any]:
         """Returns plain JSON values that tell whether a resumed job is still the same."""
         truth = None if self.truth is None else str(self.truth)
         described = describe_job(self.scene, self.model, self.settings)
-        return described | {"chunk": self.chunk, "truth": truth}
+        audited: dict[str, Any] = {}
+        if self.audit is not None:
+            files = {"audit": self.audit, "camera_file": self.camera_file}
+            audited = {
+                name: None if file is None else {"file": str(file), "sha256": file_digest(file)}
+                for name, file in files.items()
+            }
+        return described | {"chunk": self.chunk, "truth": truth} | audited
 
 
 def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
@@ -95,7 +110,7 @@ def _scene_job(
         raise SettingsError(f"{where}: 'scene' is missing, the scene's folder")
     paths = {"model": bundled_person()} | {
         key: _path(values[key], f"{where}: {key}", base)
-        for key in ("scene", "model", "truth")
+        for key in ("scene", "model", "truth", "audit", "camera_file")
         if values.get(key) is not None
     }
     overlay, replay = (
@@ -110,8 +125,26 @@ def _scene_job(
         checked = EstimateSettings(**settings)
     except SettingsError as error:
         raise SettingsError(f"{where}: {error}") from error
-    truth = paths.get("truth")
-    return SceneJob(name, paths["scene"], paths["model"], checked, truth, overlay, replay, chunk)
+    _check_audit(paths, settings, where)
+    return SceneJob(
+        name, paths["scene"], paths["model"], checked, paths.get("truth"), overlay, replay, chunk,
+        paths.get("audit"), paths.get("camera_file"),
+    )  # fmt: skip
+
+
+def _check_audit(paths: Mapping[str, Path], settings: Mapping[str, Any], where: str) -> None:
+    """Refuses what an audit does not have, or has alone."""
+    if "audit" not in paths:
+        if "camera_file" in paths:
+            raise SettingsError(f"{where}: camera_file is a setting of audits (audit: JOINTS.csv)")
+        return
+    others = [name for name in settings if name not in _OF_AUDITS]
+    others += [name for name in ("truth",) if name in paths]
+    if others:
+        raise SettingsError(
+            f"{where}: an audit has no setting {', '.join(others)}; it has: camera_file, overlay, "
+            f"{', '.join(_OF_AUDITS)}"
+        )
 
 
 def _mapping(value: Any, where: str, known: tuple[str, ...] | None = None) -> dict[str, Any]:

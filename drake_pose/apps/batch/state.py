@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import os
 from collections.abc import Mapping, Sequence
@@ -15,7 +17,7 @@ from drake_pose.apps.results.folder import without_nan
 from drake_pose.errors import OutputError
 from drake_pose.version import VERSION
 
-BATCH = "batch.json"
+BATCH, CONTRADICTIONS = "batch.json", "contradictions.csv"
 WAITING, FINISHED, FAILED = "waiting", "finished", "failed"
 
 
@@ -30,7 +32,7 @@ class SceneState:
         tasks: its chunks, or the one task of a scene that is not cut.
         done: the indices of the tasks that are finished.
         errors: what went wrong, and in which frames ("": the whole scene).
-        totals: frame_count, found_count and mean_E_total of the result.
+        totals: what the result says in short, as of Outcome.
         seconds: of the work on it in this run, over all workers [s].
         attempts: how often a worker began one of its tasks.
     """
@@ -61,14 +63,19 @@ class SceneState:
             "state": self.state,
             "errors": [{"error": text, "frames": frames} for text, frames in self.errors.items()],
             "frame_count": self.frame_count,
-            "found_count": self.totals.get("found_count"),
-            "mean_E_total": self.totals.get("mean_E_total"),
+            **self._outcome(),
             "chunks": len(self.tasks),
             "chunks_done": len(self.done),
             "attempts": self.attempts,
             "worker_seconds": self.seconds,
             "job": self.described,
         }
+
+    def _outcome(self) -> dict[str, Any]:
+        names = ("found_count", "mean_E_total")
+        if self.job.audit is not None:
+            names = ("agreeing_count", "contradictions")
+        return {name: self.totals.get(name) for name in names}
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,17 +102,30 @@ class BatchResult:
 
 
 def write_batch(result: BatchResult) -> None:
-    """Writes batch.json all at once.
+    """Writes batch.json all at once, and of audits contradictions.csv.
 
     Raises:
         OutputError: it cannot be written.
     """
-    path = result.out / BATCH
-    part = path.with_name(path.name + ".part")
     text = json.dumps(without_nan(result.as_json()), indent=2, ensure_ascii=False)
+    _write(result, BATCH, text + "\n")
+    if any(state.job.audit is not None for state in result.scenes.values()):
+        table = io.StringIO()
+        rows = csv.writer(table, lineterminator="\n")
+        rows.writerow(("scene", "what", "name", "text"))
+        for name, state in result.scenes.items():
+            for one in state.totals.get("contradictions", ()):
+                rows.writerow((name, one["what"], one["name"], one["text"]))
+        _write(result, CONTRADICTIONS, table.getvalue())
+
+
+def _write(result: BatchResult, name: str, text: str) -> None:
+    """Writes a file of the batch's folder all at once."""
+    path = result.out / name
+    part = path.with_name(path.name + ".part")
     try:
         result.out.mkdir(parents=True, exist_ok=True)
-        part.write_text(text + "\n", encoding="utf-8")
+        part.write_text(text, encoding="utf-8")
         os.replace(part, path)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written: {error.strerror}") from error

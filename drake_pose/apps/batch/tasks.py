@@ -25,6 +25,8 @@ from drake_pose.apps.estimate.inputs import select_cameras, select_seen_frames
 from drake_pose.apps.estimate.person_choice import follows_person
 from drake_pose.apps.estimate.scene import estimate_scene
 from drake_pose.apps.estimate.scene_checks import frame_ranges
+from drake_pose.apps.registration.audit import audit_scene
+from drake_pose.apps.registration.inputs import RegistrationSettings
 from drake_pose.apps.results.folder import (
     OVERLAY,
     POSES,
@@ -35,8 +37,9 @@ from drake_pose.apps.results.folder import (
 from drake_pose.apps.results.summary import FrameRecord, describe_job, mask_digests, summarize
 from drake_pose.body import load_model
 from drake_pose.body.landmarks import landmarks_file
+from drake_pose.camera import load_cameras
 from drake_pose.errors import DrakePoseError, OutputError
-from drake_pose.silhouette import load_scene
+from drake_pose.silhouette import Scene, load_scene
 
 WORK = ".chunks"
 _ATTEMPTS = "attempts.txt"
@@ -96,7 +99,8 @@ class Outcome:
     Args:
         error: why it failed; None where it did not.
         seconds: how long it took [s]; 0 where its result lay there already.
-        totals: frame_count, found_count and mean_E_total of a whole scene.
+        totals: frame_count, found_count and mean_E_total of a whole scene; of an audit
+            frame_count, agreeing_count and contradictions.
     """
 
     error: str | None
@@ -113,14 +117,17 @@ def plan_scene(job: SceneJob, out: Path) -> tuple[Task, ...]:
     """Cuts a scene into tasks, which depend on nothing but the job.
 
     Returns:
-        The chunks in order, or one task where a person is followed, which is not cut.
+        The chunks in order, or one task where a person is followed or the scene is audited, which
+        is not cut.
 
     Raises:
         DrakePoseError: the scene cannot be read.
     """
-    scene = load_scene(job.scene)
+    scene = _load(job)
     cameras = select_cameras(scene, job.settings.cameras)
     frames = select_seen_frames(scene, cameras, job.settings.frames)
+    if job.audit is not None:
+        return (Task(job, out, None, frames),)
     # A model is read only where it may be a person's: that takes seconds.
     maybe = landmarks_file(job.model).is_file() or job.settings.method == "person"
     if maybe:
@@ -186,7 +193,7 @@ def _require_same_masks(task: Task) -> None:
     """
     if task.index is not None:
         return
-    scene = load_scene(task.job.scene)
+    scene = _load(task.job)
     gone = []
     for frame, record in read_summary(task.place)["frames"].items():
         known = record.get("masks", {})
@@ -195,8 +202,14 @@ def _require_same_masks(task: Task) -> None:
     if gone:
         raise OutputError(
             f"{task.place}: the masks of frame {frame_ranges(gone, scene.frames)} were replaced "
-            "since; remove that folder to have it estimated again"
+            "since; remove that folder to have it done again"
         )
+
+
+def _load(job: SceneJob) -> Scene:
+    """A job's scene."""
+    cameras = None if job.camera_file is None else load_cameras(job.camera_file)
+    return load_scene(job.scene, cameras)
 
 
 def _note_attempt(task: Task) -> None:
@@ -212,7 +225,7 @@ def _make(task: Task) -> None:
     """Makes a task's result beside its place and moves it there."""
     job = task.job
     part = work_folder(task.out, job) / f"{task.place.name}{_PART}{uuid.uuid4().hex[:12]}"
-    work = _estimate if not task.chunks else _join_chunks
+    work = _audit if job.audit is not None else _join_chunks if task.chunks else _estimate
     try:
         work(task, part)
         try:
@@ -234,6 +247,19 @@ def _estimate(task: Task, part: Path) -> None:
     estimate_scene(
         job.scene, job.model, part, settings, truth=job.truth, replay=replay, overlay=job.overlay
     )
+
+
+def _audit(task: Task, part: Path) -> None:
+    """Audits a scene."""
+    job, given = task.job, task.job.settings
+    assert job.audit is not None
+    settings = RegistrationSettings(
+        given.cameras, given.frames, hold=given.hold, packages=given.packages
+    )
+    audit_scene(
+        job.scene, job.model, job.audit, part, settings, cameras=job.camera_file,
+        overlay=job.overlay,
+    )  # fmt: skip
 
 
 def _join_chunks(task: Task, part: Path) -> None:
@@ -273,4 +299,13 @@ def _totals(task: Task) -> Mapping[str, Any] | None:
     if task.index is not None:
         return None
     summary = read_summary(task.place)
+    if task.job.audit is not None:
+        return {
+            "frame_count": summary["frame_count"] + len(summary["unseen"]),
+            "agreeing_count": summary["agreeing_count"],
+            "contradictions": [
+                {name: one[name] for name in ("what", "name", "text")}
+                for one in summary["contradictions"]
+            ],
+        }
     return {name: summary.get(name) for name in ("frame_count", "found_count", "mean_E_total")}

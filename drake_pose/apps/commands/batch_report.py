@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from rich.markup import escape
 from rich.table import Table
 
@@ -9,6 +11,9 @@ from drake_pose.apps.batch.state import FINISHED, BatchResult, SceneState
 from drake_pose.apps.commands.report import output_console, progress_bar
 from drake_pose.apps.commands.terminal import warn
 from drake_pose.apps.texts import percent
+
+# Of what contradicts in a scene as many are shown.
+_NAMED = 4
 
 
 class BatchProgress:
@@ -36,14 +41,35 @@ class BatchProgress:
 
 def print_batch(result: BatchResult) -> None:
     """Prints a row a scene, and where the results are."""
-    table = Table("scene", "state", "found", "E_total", "chunks", "tries", "seconds", title="Batch")
-    for name, state in result.scenes.items():
-        table.add_row(escape(name), *_cells(state))
+    estimates = {n: one for n, one in result.scenes.items() if one.job.audit is None}
+    audits = {n: one for n, one in result.scenes.items() if one.job.audit is not None}
     console = output_console()
-    console.print(table)
+    if estimates:
+        table = Table(
+            "scene", "state", "found", "E_total", "chunks", "tries", "seconds", title="Batch"
+        )
+        for name, state in estimates.items():
+            table.add_row(escape(name), *_cells(state))
+        console.print(table)
+    if audits:
+        console.print(_audits_table(audits))
     frames = sum(state.frames_done for state in result.scenes.values())
     console.print(f"frames         {frames} in {result.seconds:.1f} s")
     console.print(f"results        {escape(str(result.out))}", soft_wrap=True)
+
+
+def _audits_table(audits: Mapping[str, SceneState]) -> Table:
+    """A row an audited scene; texts stand in contradictions.csv."""
+    table = Table("scene", "state", "agree", "contradicts the rest", "seconds", title="Audits")
+    for name, state in audits.items():
+        named = [f"{one['what']} {one['name']}" for one in state.totals.get("contradictions", ())]
+        more = [f"and {len(named) - _NAMED} more"] if len(named) > _NAMED else []
+        agree = ""
+        if state.state == FINISHED:
+            agree = f"{state.totals['agreeing_count']} of {state.frame_count}"
+        text = escape(", ".join([*named[:_NAMED], *more]))
+        table.add_row(escape(name), state.state, agree, text, f"{state.seconds:.1f}")
+    return table
 
 
 def _cells(state: SceneState) -> list[str]:

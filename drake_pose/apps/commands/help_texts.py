@@ -352,7 +352,7 @@ port: ssh -L 7000:localhost:7000, with --port 7000 --no-browser --wait.
 """)
 
 BATCH = _help("""
-Estimate many scenes on several worker processes, long scenes in chunks of frames.
+Estimate or audit many scenes on several worker processes, long scenes in chunks of frames.
 
 The result of each scene is that of [bold]estimate[/bold] and does not depend on the number of
 workers: the job file says how scenes are cut. In a sequence the first frame of each chunk is
@@ -371,6 +371,11 @@ person, and the bundled one is used:
       monday: {scene: recordings/monday, model: arm.urdf, interval: 15}
       tuesday: {scene: recordings/tuesday, model: arm.urdf, frames: "0:99"}
       walker: {scene: recordings/walker}
+      robot: {scene: recordings/robot, model: arm.urdf, audit: recordings/robot/joints.csv}
+
+A scene that has 'audit', a table of joint positions, is audited (see [bold]audit[/bold]) in place
+of estimated; camera_file is then its --cameras. What contradicts in all scenes is in
+DIR/contradictions.csv.
 
 Workers on this machine communicate over its loopback address only. The workers of a Dask scheduler
 must have the same version of drake_pose, and find scenes, models and DIR under the same paths.

@@ -16,6 +16,7 @@ from drake_pose.apps.registration.audit_result import summarize, write_result
 from drake_pose.apps.registration.inputs import RegistrationSettings
 from drake_pose.apps.registration.known_positions import KnownPositions, read_known_positions
 from drake_pose.apps.results.folder import require_empty
+from drake_pose.apps.results.summary import mask_digests
 from drake_pose.apps.settings import EstimateSettings
 from drake_pose.body import ArticulatedModel, PoseTree, load_model
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
@@ -132,6 +133,10 @@ def audit_scene(
             "right is told by their being near to what is given, not by their number"
         )
     summary = summarize(found, (*paths, own), settings, warnings, seconds)
+    summary["unseen"] = unseen
+    names = [camera.name for camera in inputs.cameras]
+    for frame, record in summary["frames"].items():
+        record["masks"] = mask_digests(inputs.scene, names, frame)
     if folder is not None:
         write_result(folder, inputs.model, inputs.tree, _overlaid(inputs, found, overlay), summary)
     return SceneAudit(found, summary, tuple(warnings), folder)

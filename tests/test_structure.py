@@ -101,8 +101,8 @@ MAY_KNOW_INSIDE = {
         "demo": {"estimate", "results"},
         "registration": {"estimate", "results"},
         "experiments": {"results"},
-        "masks": {"registration", "estimate", "results"},
         "live": {"experiments", "estimate", "results"},
+        "masks": {"live", "registration", "estimate", "results"},
         "cluster": {"live"},
         "batch": {"cluster", "registration", "estimate", "results"},
         "benchmarks": {

@@ -181,10 +181,11 @@ palette, with an alpha channel or with probabilities (8 or 16 bits, from one hal
 white videos.
 
 In pictures and videos an object is found by the empty room (--background), a box or strokes (--box,
---strokes; GrabCut, for stills), a network of yours (--network, ONNX), or the object's own model
-(--model, with rough joint positions of each frame, --start, and cameras that have X_WC): pose and
-mask are found in turn, and the pictures of a camera that stands still show its background beside
-the body. Where pose and colours do not agree no mask is written, and the picture is named.
+--strokes, or --draw, a page in the browser; GrabCut, for stills), a network of yours (--network,
+ONNX), or the object's own model (--model, with rough joint positions of each frame, --start, and
+cameras that have X_WC): pose and mask are found in turn, and the pictures of a camera that stands
+still show its background beside the body. Where pose and colours do not
+agree no mask is written, and the picture is named.
 
 A median of the pictures stands for the empty room only where the body leaves every place; the
 command says where it does not. Look at overlay/ before you go on.

@@ -11,6 +11,7 @@ from drake_pose.apps.commands.estimate_options import HoldOption, JsonOption, Pa
 from drake_pose.apps.commands.terminal import (
     errors_as_messages,
     print_json,
+    say,
     usage_errors,
     warn,
 )
@@ -23,6 +24,7 @@ from drake_pose.apps.options import (
 
 if TYPE_CHECKING:
     from drake_pose.apps.masks.masks import SceneMasks
+    from drake_pose.apps.masks.settings import MaskSettings
 
 _GIVEN = "Masks of other tools"
 _EMPTY = "By the empty room"
@@ -92,6 +94,30 @@ StrokesOption = Annotated[
         metavar="FILE",
         help="Boxes and lines on the object and beside it, by camera and frame (YAML).",
         rich_help_panel=_MARKED,
+    ),
+]
+DrawOption = Annotated[
+    bool,
+    typer.Option(
+        "--draw",
+        help="Draw boxes and lines on a page in the browser, on this machine alone; they are kept "
+        "in strokes.yaml.",
+        rich_help_panel=_MARKED,
+    ),
+]
+PortOption = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        max=65535,
+        help="Port of that page. Default: any free one.",
+        rich_help_panel=_MARKED,
+    ),
+]
+BrowserOption = Annotated[
+    bool,
+    typer.Option(
+        "--browser/--no-browser", help="Open that page in the browser.", rich_help_panel=_MARKED
     ),
 ]
 BodyOption = Annotated[
@@ -173,6 +199,9 @@ def masks(
     background: BackgroundOption = None,
     box: BoxOption = None,
     strokes: StrokesOption = None,
+    draw: DrawOption = False,
+    port: PortOption = None,
+    browser: BrowserOption = True,
     model: BodyOption = None,
     start: StartOption = None,
     start_error: StartErrorOption = 5.0,
@@ -189,8 +218,6 @@ def masks(
 ) -> None:
     """See help_texts.MASKS."""
     with errors_as_messages():
-        from drake_pose.apps.commands.report import count_progress
-        from drake_pose.apps.masks.masks import make_masks
         from drake_pose.apps.masks.settings import MaskSettings
 
         with usage_errors():
@@ -200,6 +227,8 @@ def masks(
                 background=background,
                 box=None if box is None else parse_numbers(box, 4, "--box"),
                 strokes=strokes,
+                draw=draw,
+                port=port,
                 model=model,
                 start=start,
                 start_error=start_error,
@@ -215,14 +244,31 @@ def masks(
                 largest=largest,
                 cameras=cameras,
             )
-        with count_progress("masks", None) as advance:
-            result = make_masks(source, out, settings, overlay=overlay, on_mask=advance)
-        for text in result.warnings:
-            warn(text)
-        if json:
-            print_json(result.summary)
-        else:
-            _print(result)
+        _run(source, out, settings, overlay, browser, json)
+
+
+def _run(
+    source: Path, out: Path, settings: MaskSettings, overlay: bool, browser: bool, json: bool
+) -> None:
+    """Makes the masks, and says what was made."""
+    from drake_pose.apps.commands.report import count_progress
+    from drake_pose.apps.masks.masks import make_masks
+
+    def show(address: str) -> None:
+        say(f"drake-pose: draw at {address}")
+        if browser:
+            import webbrowser
+
+            webbrowser.open(address)
+
+    with count_progress("masks", None) as advance:
+        result = make_masks(source, out, settings, overlay=overlay, on_mask=advance, on_page=show)
+    for text in result.warnings:
+        warn(text)
+    if json:
+        print_json(result.summary)
+    else:
+        _print(result)
 
 
 def _print(result: SceneMasks) -> None:

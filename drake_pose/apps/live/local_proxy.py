@@ -15,6 +15,7 @@ import socket
 import threading
 from collections.abc import Callable
 from contextlib import suppress
+from email.message import Message
 
 PORTS = range(7000, 8000)
 """Where a page listens if not told otherwise; Meshcat's."""
@@ -52,6 +53,11 @@ def refuse(head: bytes, port: int) -> str | None:
         headers = http.client.parse_headers(io.BytesIO(head.partition(b"\n")[2]))
     except http.client.HTTPException:
         return "its head is no HTTP"
+    return refuse_headers(headers, port)
+
+
+def refuse_headers(headers: Message, port: int) -> str | None:
+    """Why the headers of a request to a port are refused; None: they are a page's own."""
     own = [f"{name}:{port}" for name in _NAMES]
     hosts = headers.get_all("Host", [])
     if len(hosts) != 1 or hosts[0].strip().lower() not in own:

@@ -89,6 +89,11 @@ def _placed_cameras(source: Source) -> list[Camera]:
             f"{source.path}: a model's silhouette needs to know the cameras: {CAMERAS} or --cameras"
         )
     for name in source.names:
+        if name in source.cameras.links:
+            raise CameraError(
+                f"{source.camera_file}: camera '{name}' rides on a link, but the background "
+                "beside a body is told from cameras that stand still"
+            )
         if name in source.cameras.unplaced:
             raise CameraError(
                 f"{source.camera_file}: camera '{name}' needs X_WC: where it stands before the body"

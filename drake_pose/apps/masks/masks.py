@@ -14,20 +14,21 @@ import numpy as np
 import yaml
 
 from drake_pose.apps.masks.by_model import find_by_model
+from drake_pose.apps.masks.drawing import draw_strokes
 from drake_pose.apps.masks.empty_room import BACKGROUND, compare_with_empty_room
 from drake_pose.apps.masks.found import FoundMask, FoundMasks
 from drake_pose.apps.masks.given import read_given_masks
 from drake_pose.apps.masks.network import segment_by_network
 from drake_pose.apps.masks.settings import MaskSettings
 from drake_pose.apps.masks.sources import CAMERAS, SCENE, UNNAMED, Source, open_source
-from drake_pose.apps.masks.strokes import cut_marked, read_strokes
+from drake_pose.apps.masks.strokes import cut_marked, dump_strokes, read_strokes
 from drake_pose.apps.results.folder import SUMMARY, require_empty
 from drake_pose.camera.picture_files import Picture
 from drake_pose.errors import DrakePoseError, MaskError, OutputError, SceneError
 from drake_pose.silhouette import write_mask
 from drake_pose.silhouette.segmentation.judging import judge_mask, largest_patch
 
-MASKS, OVERLAY = "masks", "overlay"
+MASKS, OVERLAY, STROKES = "masks", "overlay", "strokes.yaml"
 _PARTIAL = "masks.part"
 # Of the mask's outline in an overlay, (red, green, blue): Okabe and Ito's vermilion.
 _OUTLINE_RGB = (213, 94, 0)
@@ -58,6 +59,7 @@ def make_masks(
     *,
     overlay: bool = True,
     on_mask: Callable[[int], None] = lambda _: None,
+    on_page: Callable[[str], None] = lambda _: None,
 ) -> SceneMasks:
     """Writes a scene whose masks are those of another tool, or are found in pictures.
 
@@ -72,6 +74,7 @@ def make_masks(
         settings: how masks are found.
         overlay: whether overlays are written, where there are pictures.
         on_mask: is told how many pictures are done.
+        on_page: is told the address of the page on which boxes and lines are drawn.
 
     Raises:
         DrakePoseError: names the file, camera or frame at fault; no picture has a good mask.
@@ -81,7 +84,13 @@ def make_masks(
     opened = open_source(Path(source), settings.cameras)
     writer = _Writer(folder, opened, settings, overlay)
     try:
-        for k, found in enumerate(_find(opened, settings), 1):
+        if settings.draw:
+            marks = draw_strokes(opened, settings.port, on_page)
+            masks = cut_marked(opened, None, marks)
+            writer.keep(STROKES, dump_strokes(marks))
+        else:
+            masks = _find(opened, settings)
+        for k, found in enumerate(masks, 1):
             writer.add(found)
             on_mask(k)
         return writer.finish()
@@ -190,6 +199,14 @@ class _Writer:
             rate = self._source.frame_rate_hz()
             content = {"sequence": True} | ({} if rate is None else {"frame_rate_hz": rate})
             (self._folder / SCENE).write_text(yaml.safe_dump(content), encoding="utf-8")
+
+    def keep(self, name: str, text: str) -> None:
+        """Writes a file beside the masks."""
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            (self._folder / name).write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise OutputError(f"{self._folder}: cannot be written: {error.strerror}") from error
 
     def discard(self) -> None:
         """Removes what was written; the folder was new or empty."""

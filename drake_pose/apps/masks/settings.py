@@ -14,7 +14,7 @@ from drake_pose.silhouette.segmentation.mask_pictures import MEANINGS, PixelMean
 MEDIAN = "median"
 
 _COUNTS = {"box": 4, "network_size": 2, "network_mean": 3, "network_std": 3}
-_WAYS = ("background", "box", "strokes", "model", "network")
+_WAYS = ("background", "box", "strokes", "draw", "model", "network")
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,8 @@ class MaskSettings:
             ``<camera>/<frame>.png``; ``median``: each pixel's median over the source's pictures.
         box: x, y, width and height of a box around the object in all pictures [pixel].
         strokes: a file of boxes and lines by camera and frame, see ``read_strokes``.
+        draw: whether boxes and lines are drawn on a page in the browser.
+        port: of that page; any free one where not given.
         model: the object's own model: pose and mask in turn, from ``start``.
         start: a table of rough joint positions of each frame [rad or m].
         start_error: standard deviation of its angles [deg].
@@ -50,6 +52,8 @@ class MaskSettings:
     background: Path | str | None = None
     box: tuple[float, ...] | None = None
     strokes: Path | None = None
+    draw: bool = False
+    port: int | None = None
     model: Path | None = None
     start: Path | None = None
     start_error: float = 5.0
@@ -70,7 +74,7 @@ class MaskSettings:
             values = getattr(self, name)
             if values is not None and (len(values) != count or not all(map(math.isfinite, values))):
                 raise SettingsError(f"{name} must be {count} numbers, not {values}")
-        ways = [name for name in _WAYS if getattr(self, name) is not None]
+        ways = [name for name in _WAYS if getattr(self, name) not in (None, False)]
         if len(ways) > 1 and set(ways) != {"box", "strokes"}:
             raise SettingsError(f"--{ways[0]} and --{ways[1]} are two ways to find masks: give one")
         if ways and self.pixels != "auto":

@@ -7,6 +7,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import yaml
+
 from drake_pose.apps.masks.found import FoundMask, FoundMasks
 from drake_pose.apps.masks.sources import Source
 from drake_pose.errors import SceneError, SettingsError
@@ -42,11 +45,23 @@ def read_strokes(path: Path) -> dict[tuple[str, str], Strokes]:
         for frame, entry in frames.items():
             where = f"{path}: camera '{camera}', frame '{frame}'"
             name = "" if camera == ANY_CAMERA else str(camera)
-            found[name, str(frame)] = _read_entry(entry, where)
+            found[name, str(frame)] = read_entry(entry, where)
     return found
 
 
-def _read_entry(entry: Any, where: str) -> Strokes:
+def dump_strokes(marks: Marks) -> str:
+    """The text of a file of strokes, which read_strokes reads back."""
+    content: dict[str, dict[str, Any]] = {}
+    for (camera, frame), strokes in marks.items():
+        entry: dict[str, Any] = {} if strokes.box is None else {"box": list(strokes.box)}
+        for name in ("object", "background"):
+            if lines := getattr(strokes, name):
+                entry[name] = [[list(point) for point in line] for line in lines]
+        content.setdefault(camera or ANY_CAMERA, {})[frame] = {**entry, "width": strokes.width}
+    return yaml.safe_dump(content, default_flow_style=None, sort_keys=False)
+
+
+def read_entry(entry: Any, where: str) -> Strokes:
     """What is marked in one picture."""
     if not isinstance(entry, dict) or not entry:
         raise SceneError(f"{where}: expected {', '.join(_FIELDS)}")
@@ -94,7 +109,7 @@ def cut_marked(source: Source, box: tuple[float, ...] | None, marks: Marks) -> F
 
     Args:
         source: pictures or videos.
-        box: a box in all pictures in which nothing else is marked; None: those are left out.
+        box: a box in all pictures in which nothing else is marked; None: those get no mask.
         marks: by camera and frame.
 
     Raises:
@@ -107,6 +122,8 @@ def cut_marked(source: Source, box: tuple[float, ...] | None, marks: Marks) -> F
             strokes = marks.get((camera, frame))
             left.discard((camera, frame))
             if strokes is None and box is None:
+                empty = np.zeros(picture.shape[:2], dtype=np.bool_)
+                yield FoundMask(camera, frame, where, empty, picture, "nothing is marked in it")
                 continue
             strokes = strokes or Strokes(box)
             try:

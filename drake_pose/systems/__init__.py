@@ -24,6 +24,7 @@ from drake_pose.systems.estimators.registration_diagram import (
     RegistrationDiagram,
     build_simulated_registration,
 )
+from drake_pose.systems.estimators.robot_state import RobotStateMessage
 from drake_pose.systems.estimators.silhouette_matcher import STATISTICS, SilhouetteMatcher
 from drake_pose.systems.estimators.silhouette_tracker import TRACK, SilhouetteTracker
 from drake_pose.systems.estimators.truncated_ekf import TruncatedEkf
@@ -63,6 +64,7 @@ __all__ = [
     "PictureCapture",
     "PoseRecogniser",
     "RegistrationDiagram",
+    "RobotStateMessage",
     "SensorPorts",
     "SilhouetteCamera",
     "SilhouetteCapture",

@@ -45,6 +45,7 @@ from drake_pose.apps.commands.kameda import kameda
 from drake_pose.apps.commands.live import empty_room
 from drake_pose.apps.commands.masks import masks
 from drake_pose.apps.commands.register import register
+from drake_pose.apps.commands.reproduce_all import reproduce_all
 from drake_pose.apps.commands.shimada import shimada
 from drake_pose.apps.commands.terminal import (
     FAILED,
@@ -285,6 +286,7 @@ app.command(name="walk", help=help_texts.WALK)(walk)
 reproduce_app.command(name="kameda", help=help_texts.KAMEDA)(kameda)
 reproduce_app.command(name="shimada", help=help_texts.SHIMADA)(shimada)
 reproduce_app.command(name="date", help=help_texts.DATE)(date)
+reproduce_app.command(name="all", help=help_texts.REPRODUCE_ALL)(reproduce_all)
 
 
 if __name__ == "__main__":

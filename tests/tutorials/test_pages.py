@@ -106,7 +106,7 @@ def test_options_named_in_the_text_exist() -> None:
         [command]
         for command in ("estimate", "register", "masks", "capture", "batch", "walk", "calibrate")
     ]
-    commands += [["reproduce", paper] for paper in ("kameda", "shimada", "date")]
+    commands += [["reproduce", paper] for paper in ("kameda", "shimada", "date", "all")]
     shown = [CliRunner().invoke(app, [*one, "--help"], env=ENVIRONMENT) for one in commands]
     known = {word for one in shown for word in re.findall(r"--[a-z][a-z-]*", one.output)}
     named = {word for text in SHOWN.values() for word in re.findall(r"`(--[a-z][a-z-]*)", text)}

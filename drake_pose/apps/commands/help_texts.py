@@ -223,6 +223,17 @@ written (exit status 1).
 
 REPRODUCE = "Run a paper's experiment and show its figures beside ours."
 
+REPRODUCE_ALL = _help("""
+The experiments of the three papers, and one page about them, report.html: tables of the papers'
+figures beside ours where the papers give some, and pictures.
+
+An experiment that is finished is kept: after Ctrl-C, --resume goes on with the others.
+
+[bold]Example:[/bold]
+
+    drake-pose reproduce all --out results/papers
+""")
+
 KAMEDA = _help("""
 Kameda, Minoh and Ikeda, experiment A: random poses of a woman, one silhouette each.
 
@@ -289,6 +300,9 @@ counted. Times are those of one core, without rendering.
 [bold]Example:[/bold]
 
     drake-pose reproduce date --cameras 5 --frames 120 --out results/date
+
+Elbows and knees are also compared as found, before the model with its stiff trunk is laid through
+them. The waist formula has this person's constants, or with --waist paper those of the paper.
 """)
 
 CAPTURE = _help("""

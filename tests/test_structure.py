@@ -127,7 +127,12 @@ MAY_KNOW_INSIDE = {
         },
         "main": {"commands", "calibrate", "check", "demo", "estimate"},
     },
-    "apps/experiments": {"kameda": set(), "shimada": set(), "date": set()},
+    "apps/experiments": {
+        "kameda": set(),
+        "shimada": set(),
+        "date": set(),
+        "all_experiments": {"kameda", "shimada", "date"},
+    },
 }
 # Drake keeps three plain value types, ImageLabel16I, CameraInfo and CameraConfig, in
 # pydrake.systems.sensors.

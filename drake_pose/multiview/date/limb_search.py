@@ -238,19 +238,18 @@ def place_limb(
     Returns:
         (n, 4) angles, and (n,) by how much the worst of its root's lies beyond its limits [rad].
     """
+    towards, uppers = end - root, middles - root
+    frames = _triads(towards, uppers)
+    off_line = np.linalg.norm(np.cross(towards, uppers), axis=1)
+    stretched = off_line < _STRETCHED * (uppers**2).sum(axis=1)
     options = []
     for bend in _middle_angles(limb, float(np.linalg.norm(end - root))):
         end_U = limb.middle_U + rotation(limb.axes[3:], np.array([bend])) @ limb.end_L
-        own = _triad(end_U, limb.middle_U).T
-        R_TU = np.empty((len(middles), 3, 3))
-        for n, middle in enumerate(middles):
-            towards, upper = end - root, middle - root
-            if np.linalg.norm(np.cross(towards, upper)) < _STRETCHED * np.linalg.norm(upper) ** 2:
-                # Stretched it does not tell how it is turned about itself: as in the last frame.
-                R_last = R_WT @ rotation(limb.axes[:3], last[:3])
-                R_TU[n] = R_WT.T @ _shortest_turn(R_last @ end_U, towards) @ R_last
-            else:
-                R_TU[n] = R_WT.T @ _triad(towards, upper) @ own
+        R_last = R_WT @ rotation(limb.axes[:3], last[:3])
+        # Stretched it does not tell how it is turned about itself: as in the last frame.
+        as_last = _shortest_turn(R_last @ end_U, towards) @ R_last
+        own = _triads(end_U, limb.middle_U[None])[0].T
+        R_TU = R_WT.T @ np.where(stretched[:, None, None], as_last, frames @ own)
         angles, beyond = _root_angles(limb, R_TU, last[:3])
         whole = np.column_stack([angles, np.full(len(middles), bend)])
         options.append((beyond + 1e-3 * abs(bend - last[3]), beyond, whole))
@@ -314,11 +313,15 @@ def _root_angles(limb: Limb, R_TU: Array, last: Array) -> tuple[Array, Array]:
     return options[chosen, each], beyond[chosen, each].max(axis=1)
 
 
-def _triad(first: Array, second: Array) -> Array:
-    """(3, 3) axes: along the first vector, then what of the second is across it."""
+def _triads(first: Array, others: Array) -> Array:
+    """(n, 3, 3) axes: along a vector (3,), then what of the others (n, 3) is across it."""
     x = first / max(float(np.linalg.norm(first)), _STRAIGHT)
-    y = _unit_across(second, x)
-    return np.column_stack([x, y, np.cross(x, y)])
+    across = others - np.outer(others @ x, x)
+    length = np.linalg.norm(across, axis=1, keepdims=True)
+    y = np.where(
+        length < _STRAIGHT, _unit_across(np.zeros(3), x), across / np.maximum(length, _STRAIGHT)
+    )
+    return np.stack([np.broadcast_to(x, y.shape), y, np.cross(x, y)], axis=2)
 
 
 def _unit_across(vector: Array, axis: Array) -> Array:

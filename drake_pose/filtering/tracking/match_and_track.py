@@ -1,9 +1,13 @@
 """A body in a sequence: matched first, tracked by its contour, matched again after a loss."""
 
-import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from __future__ import annotations
 
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,12 +16,17 @@ from drake_pose.camera import Camera
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.tracking.contour_tracker import ContourTracker, Track, TrackingSettings
 from drake_pose.matching import MatchResult, PoseSearch
+from drake_pose.matching.fit.colours import Picture
 from drake_pose.matching.result import UNEXPLAINED, PlacedMatch, View
 
 Array = NDArray[np.float64]
 
 TRACKED = "tracked"
 """``MatchResult.stopped_by`` of a pose that no search found."""
+
+
+# A pixel's neighbours: what a mask loses to them is its edge.
+_CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +65,16 @@ def make_tracker(
     return ContourTracker(observation, period, settings)
 
 
+@dataclass(frozen=True, eq=False)
+class _Frame:
+    """What is given of a frame, and when its estimate began [s]."""
+
+    views: Sequence[View]
+    root_position: Array | None
+    pictures: list[Picture | None] | None
+    begin: float
+
+
 class MatchAndTrack:
     """Follows a body from frame to frame, and asks a search where it cannot.
 
@@ -84,25 +103,42 @@ class MatchAndTrack:
         self.tracker = make_tracker(search.tree, cameras, period, self.settings)
 
     def next(
-        self, last: Followed, views: Sequence[View], root_position: Array | None = None
+        self,
+        last: Followed,
+        views: Sequence[View],
+        root_position: Array | None = None,
+        pictures: Mapping[str, Picture] | None = None,
+        start: Array | None = None,
     ) -> tuple[Followed, MatchResult]:
         """The next frame.
 
         Args:
             last: what was known after the frame before.
-            views: of one camera or more, at least one.
+            views: the cameras' masks; there may be none where there are pictures.
             root_position: (3,) where the root is known to be now [m].
+            pictures: (H, W, 3 or 4) by camera; the colours along the contour stand in where a
+                camera has no mask.
+            start: (nq,) about where the body is now, if it is known: the search is not asked.
 
         Returns:
-            What is known now, and the pose. ``stopped_by`` is TRACKED where it was tracked.
+            What is known now, and the pose. ``stopped_by`` is TRACKED where it was tracked. Where
+            the track is lost, and there is neither a mask nor a start, no pose is found; it is
+            followed all the same, and found again if the contour fits again.
+
+        Raises:
+            SettingsError: masks or pictures that do not fit the cameras.
         """
-        begin = time.perf_counter()
+        frame = _Frame(views, root_position, self._pictures(pictures), time.perf_counter())
         tracked: tuple[Track, MatchResult] | None = None
         if last.track is not None:
-            track = self.tracker.follow(last.track, self._masks(views), False, root_position)
-            tracked = track, self._result(track, views, root_position, begin)
-            if not self._is_lost(*tracked, last.reference):
+            track = self._follow(last.track, frame, False)
+            tracked = track, self._result(track, frame)
+            if not self._is_lost(*tracked, last.reference, bool(views)):
                 return Followed(track, last.reference, last.matches), tracked[1]
+        if start is not None:
+            return self._begin(start, last, frame)
+        if not views:
+            return self._go_on(last, tracked, frame)
         matched = self._search.match(views, root_position)
         found = [] if tracked is None else [tracked]
         if matched.found:
@@ -113,16 +149,43 @@ class MatchAndTrack:
                 # A search does not know how often an angle has turned round.
                 x = observation.continued(x, last.track.state.best.mean)
                 matched = self._turned(matched, observation.node_values(x))
-            start = self.tracker.start(x)
-            followed = self.tracker.follow(start, self._masks(views), True, root_position)
-            found += [
-                (followed, self._result(followed, views, root_position, begin)),
-                (start, matched),
-            ]
+            first = self.tracker.start(x)
+            followed = self._follow(first, frame, True)
+            found += [(followed, self._result(followed, frame)), (first, matched)]
         if not found:
             return Followed(None, 0.0, last.matches + 1), matched
         track, result = min(found, key=lambda pair: pair[1].E_total)
         return Followed(track, result.E_total, last.matches + 1), result
+
+    def _begin(self, start: Array, last: Followed, frame: _Frame) -> tuple[Followed, MatchResult]:
+        """A track that begins where the body is known to be."""
+        x = self._observation(frame.root_position).state(start)
+        if last.track is not None:
+            x = self._observation(frame.root_position).continued(x, last.track.state.best.mean)
+        track = self._follow(self.tracker.start(x), frame, True)
+        result = self._result(track, frame)
+        reference = result.E_total if frame.views else UNEXPLAINED
+        return Followed(track, reference, last.matches), replace(result, found=not track.lost)
+
+    def _go_on(
+        self, last: Followed, tracked: tuple[Track, MatchResult] | None, frame: _Frame
+    ) -> tuple[Followed, MatchResult]:
+        """What is known where neither a track nor a mask nor a start says where the body is."""
+        if tracked is None:
+            nowhere = self._observation(None).state(self._search.tree.model.default_positions)
+            result = self._result(self.tracker.start(nowhere), frame)
+            return last, replace(result, found=False)
+        return Followed(tracked[0], last.reference, last.matches), replace(tracked[1], found=False)
+
+    def _follow(self, track: Track, frame: _Frame, first: bool) -> Track:
+        """The tracker's next frame; first: it is the one that the track begins in."""
+        masks = self._masks(frame.views)
+        return self.tracker.follow(track, masks, first, frame.root_position, frame.pictures)
+
+    def _pictures(self, pictures: Mapping[str, Picture] | None) -> list[Picture | None] | None:
+        if not pictures:
+            return None
+        return [pictures.get(camera.name) for camera in self.tracker.observation.cameras]
 
     def _turned(self, matched: MatchResult, node_values: Sequence[Array]) -> MatchResult:
         """A pose in the turns of a track that goes on."""
@@ -142,20 +205,42 @@ class MatchAndTrack:
             return observation
         return observation.with_root_position(root_position)
 
-    def _is_lost(self, track: Track, result: MatchResult, reference: float) -> bool:
+    def _is_lost(
+        self, track: Track, result: MatchResult, reference: float, has_masks: bool
+    ) -> bool:
         limit = self.settings.lost_growth * reference + self.settings.lost_margin
-        return track.lost or result.E_total > min(limit, UNEXPLAINED)
+        return track.lost or (has_masks and result.E_total > min(limit, UNEXPLAINED))
 
-    def _result(
-        self, track: Track, views: Sequence[View], root_position: Array | None, begin: float
-    ) -> MatchResult:
-        """The pose of a track, drawn into the views to see how well it explains them."""
-        observation, x = self._observation(root_position), track.state.best.mean
-        q, X_WB = observation.positions(x)
-        J, area = 0, 0
-        for view in views:
+    def _difference(self, track: Track, frame: _Frame) -> tuple[float, float]:
+        """How large the area is where the body differs from what is seen, and the body's [pixel].
+
+        Where there are no masks it is that between the body's contour and the one that colours
+        show: its length times their distance.
+        """
+        observation, x = self._observation(frame.root_position), track.state.best.mean
+        J, area = 0.0, 0.0
+        for view in frame.views:
             J += int(np.count_nonzero(observation.draw(x, view.camera) != view.mask))
             area += int(np.count_nonzero(view.mask))
+        if frame.views:
+            return J, area
+        if track.measurement is None:
+            return math.inf, 1.0
+        for camera in observation.cameras:
+            drawn = observation.draw(x, camera).view(np.uint8)
+            size = int(np.count_nonzero(drawn))
+            area += size
+            J += (
+                size - int(np.count_nonzero(cv2.erode(drawn, _CROSS)))
+            ) * track.measurement.distance
+        return J, max(area, 1.0)
+
+    def _result(self, track: Track, frame: _Frame) -> MatchResult:
+        """The pose of a track, and how well it explains what is seen."""
+        observation = self._observation(frame.root_position)
+        x = track.state.best.mean
+        q, X_WB = observation.positions(x)
+        J, area = self._difference(track, frame)
         E_total = J / area
         return PlacedMatch(
             found=True,
@@ -169,7 +254,7 @@ class MatchAndTrack:
             outside_limit=(),
             untried={},
             stopped_by=TRACKED,
-            seconds=time.perf_counter() - begin,
+            seconds=time.perf_counter() - frame.begin,
             root_position=observation.root_position(x),
             scale=observation.scale(x),
         )

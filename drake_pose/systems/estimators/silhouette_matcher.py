@@ -177,7 +177,7 @@ class SilhouetteMatcher(LeafSystem):
         self.last_result = None
         for state in self._worth:
             discrete_state.set_value(state, np.full(discrete_state.value(state).size, np.nan))
-        if views:
+        if self._is_seen(context, views):
             root_position = None
             if self._root_position.HasValue(context):
                 root_position = self._root_position.Eval(context)
@@ -191,6 +191,10 @@ class SilhouetteMatcher(LeafSystem):
                 self._set_worth(result, discrete_state)
         discrete_state.set_value(self._statistics, statistics)
         return EventStatus.Succeeded()
+
+    def _is_seen(self, context: Context, views: Sequence[View]) -> bool:
+        """Whether there is anything to find a pose in."""
+        return bool(views)
 
     def _find(
         self,

@@ -4,12 +4,16 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, InputPort
+from pydrake.systems.sensors import ImageRgba8U
 
 from drake_pose.camera import Camera
+from drake_pose.errors import UnknownNameError
 from drake_pose.filtering.tracking.contour_tracker import Track, TrackingSettings
 from drake_pose.filtering.tracking.match_and_track import TRACKED, Followed, MatchAndTrack
 from drake_pose.matching import MatchResult, PoseSearch
+from drake_pose.matching.fit.colours import Picture
 from drake_pose.matching.result import View
 from drake_pose.systems.estimators.filter_packing import FilterPacking, require_time_forward
 from drake_pose.systems.estimators.silhouette_matcher import SilhouetteMatcher
@@ -18,6 +22,11 @@ Array = NDArray[np.float64]
 
 TRACK = ("tracked", "matches", "distance")
 """What the elements of the output ``track`` are."""
+
+
+def color_image_port(camera: Camera, cameras: Sequence[Camera]) -> str:
+    """Name of the port that carries a camera's colour image, where there are ``cameras``."""
+    return "color_image" if len(cameras) == 1 else f"color_image_{camera.name}"
 
 
 class SilhouetteTracker(SilhouetteMatcher):
@@ -29,6 +38,8 @@ class SilhouetteTracker(SilhouetteMatcher):
         input_ports:
         - label_image
         - root_position (optional)
+        - measured_positions (optional)
+        - color_image (where asked for)
         output_ports:
         - estimated_positions
         - error
@@ -46,6 +57,12 @@ class SilhouetteTracker(SilhouetteMatcher):
 
     The ports are those of ``SilhouetteMatcher``, which it can replace in any diagram, and:
 
+    - ``color_image`` (``color_image_<camera>`` where there are several cameras) of each camera
+      named in ``color_cameras``: an ``ImageRgba8U``. The colours along the body's contour stand in
+      where there is no label image, or one without any pixel of the body. So a label image of
+      the first frame will do; or none, where measured positions say where the body is at first.
+    - ``measured_positions`` (nq): about where the body is, of encoders for example. The track
+      begins there, and again after a loss; the search is not asked. NaN: it is not known now.
     - ``position_deviations`` (nq): the standard deviation of each position [rad or m]; NaN where
       a position is no part of what is tracked (held, or solved from the root's pose).
     - ``estimated_state`` (nq + nv): the estimated positions, then the plant's velocities [rad/s or
@@ -65,9 +82,11 @@ class SilhouetteTracker(SilhouetteMatcher):
         offset: time of the first one [s].
         labels: the labels that belong to the body; None: all that are not reserved.
         tracking: how the body may move, and when its track is lost.
+        color_cameras: names of the cameras that have a port for a colour image.
 
     Raises:
         SettingsError: as for ``SilhouetteMatcher``; and in a simulation, when time runs backwards.
+        UnknownNameError: a name of ``color_cameras`` is no camera's.
     """
 
     def __init__(
@@ -78,6 +97,7 @@ class SilhouetteTracker(SilhouetteMatcher):
         offset: float = 0.0,
         labels: Collection[int] | None = None,
         tracking: TrackingSettings | None = None,
+        color_cameras: Collection[str] = (),
     ) -> None:
         super().__init__(search, cameras, period, offset, labels)
         self._follower = MatchAndTrack(search, cameras, period, tracking)
@@ -99,6 +119,12 @@ class SilhouetteTracker(SilhouetteMatcher):
         self._tracked_positions = np.array([names.index(name) for name in seen], dtype=np.intp)
         width = self._packing.cap * self._packing.belief_width
         self._belief = self.DeclareDiscreteState(np.zeros(width))
+        self._measured = self.DeclareVectorInputPort("measured_positions", len(names))
+        self._color_ports = self._declare_color_ports(cameras, color_cameras)
+        # What is known of the body's colours: state, so that a simulation can be replayed.
+        known = self._follower.tracker.observation.no_colours() if color_cameras else np.zeros(0)
+        self._colours_shape = known.shape
+        self._colours = self.DeclareDiscreteState(known.ravel().astype(np.float64))
         # Whether there is a track; the reference; TRACK; the last time.
         self._record = self.DeclareDiscreteState(np.r_[np.zeros(2 + len(TRACK)), -np.inf])
         self.DeclareVectorOutputPort(
@@ -120,6 +146,23 @@ class SilhouetteTracker(SilhouetteMatcher):
             "track", len(TRACK), self._calc_track, {self.discrete_state_ticket(self._record)}
         )
 
+    def _declare_color_ports(
+        self, cameras: Sequence[Camera], wanted: Collection[str]
+    ) -> dict[str, InputPort]:
+        """The ports of colour images by camera."""
+        known = {camera.name: camera for camera in cameras}
+        for name in wanted:
+            if name not in known:
+                raise UnknownNameError("camera", name, known, "color_cameras")
+        return {
+            camera.name: self.DeclareAbstractInputPort(
+                color_image_port(camera, cameras),
+                AbstractValue.Make(ImageRgba8U(camera.width, camera.height)),
+            )
+            for camera in cameras
+            if camera.name in wanted
+        }
+
     def followed(self, context: Context) -> Followed:
         """What is known in a context."""
         has_track, reference, _, matches = context.get_discrete_state(self._record).value()[:4]
@@ -127,7 +170,32 @@ class SilhouetteTracker(SilhouetteMatcher):
             return Followed(None, float(reference), int(matches))
         belief = np.array(context.get_discrete_state(self._belief).value())
         state = self._packing.unpack(belief, np.zeros(0), np.zeros(1), 0, 0.0, 0)
-        return Followed(Track(state, None, False), float(reference), int(matches))
+        colours = None
+        if self._color_ports:
+            values = context.get_discrete_state(self._colours).value()
+            if np.any(values):
+                colours = values.astype(np.float32).reshape(self._colours_shape)
+        return Followed(Track(state, None, False, colours), float(reference), int(matches))
+
+    def _pictures(self, context: Context) -> dict[str, Picture]:
+        """The colour images that are there, by camera."""
+        images = {
+            name: port.Eval(context)
+            for name, port in self._color_ports.items()
+            if port.HasValue(context)
+        }
+        # A camera that has nothing to show gives an image of no pixels.
+        return {name: np.array(image.data) for name, image in images.items() if image.size()}
+
+    def _start(self, context: Context) -> Array | None:
+        """Where the body is measured to be; None where it is not."""
+        if not self._measured.HasValue(context):
+            return None
+        q = np.array(self._measured.Eval(context))
+        return q if np.all(np.isfinite(q)) else None
+
+    def _is_seen(self, context: Context, views: Sequence[View]) -> bool:
+        return bool(views) or bool(self._pictures(context))
 
     def _find(
         self,
@@ -138,13 +206,20 @@ class SilhouetteTracker(SilhouetteMatcher):
     ) -> MatchResult:
         last_time = context.get_discrete_state(self._record).value()[-1]
         require_time_forward(self, context, last_time)
-        now, result = self._follower.next(self.followed(context), views, root_position)
+        now, result = self._follower.next(
+            self.followed(context), views, root_position, self._pictures(context),
+            self._start(context),
+        )  # fmt: skip
         distance = np.nan
         if now.track is not None:
             discrete_state.set_value(self._belief, self._packing.pack(now.track.state)[0])
+            if now.track.colours is not None:
+                discrete_state.set_value(self._colours, now.track.colours.ravel())
             if now.track.measurement is not None:
                 distance = now.track.measurement.distance
-        tracked = float(result.stopped_by == TRACKED and now.matches == self._matches(context))
+        tracked = float(
+            result.found and result.stopped_by == TRACKED and now.matches == self._matches(context)
+        )
         record = [float(now.track is not None), now.reference, tracked, now.matches, distance]
         record.append(context.get_time())
         discrete_state.set_value(self._record, np.array(record))

@@ -1,11 +1,17 @@
 import math
 
+import cv2
 import numpy as np
 import pytest
+from pydrake.common.value import AbstractValue
+from pydrake.geometry import Box, GeometryInstance, PerceptionProperties, RenderLabel, SceneGraph
+from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.sensors import ImageRgba8U
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_pose.errors import SettingsError
+from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.filtering import TrackingSettings
 from drake_pose.matching import PaperSearch, PaperSearchSettings
 from drake_pose.silhouette import LabelRenderer, label_image_to_mask, mask_to_label_image
@@ -16,6 +22,8 @@ from drake_pose.systems import (
     SilhouetteTracker,
     build_simulated_matching,
 )
+from drake_pose.systems.estimators.diagrams import add_simulated_cameras
+from tests.filtering.measurements.test_contour import pinhole
 from tests.matching.bodies import forked_body, front_camera
 
 PERIOD = 1 / 30
@@ -129,6 +137,80 @@ def test_a_copied_context_goes_on_as_the_first_did(body, search):
     for name in ("estimated_positions", "position_deviations", "track"):
         port = tracker.GetOutputPort(name)
         np.testing.assert_array_equal(port.Eval(context), port.Eval(copy))
+
+
+def room(scene_graph, folder):
+    """A wall of coloured patches behind the body."""
+    patches = np.random.default_rng(8).integers(0, 256, (32, 32, 3)).astype(np.uint8)
+    cv2.imwrite(str(folder / "wall.png"), patches.repeat(32, axis=0).repeat(32, axis=1))
+    source = scene_graph.RegisterSource("room")
+    wall = GeometryInstance(RigidTransform([-1.0, 0.0, 0.0]), Box(0.1, 6.0, 6.0), "wall")
+    properties = PerceptionProperties()
+    properties.AddProperty("phong", "diffuse_map", str(folder / "wall.png"))
+    properties.AddProperty("label", "id", RenderLabel.kDontCare)
+    wall.set_perception_properties(properties)
+    scene_graph.RegisterAnchoredGeometry(source, wall)
+
+
+def test_colour_images_of_a_sensor_are_enough(body, search, tmp_path):
+    """In one diagram: RgbdSensors' colour images; measured positions in the first frame alone."""
+    truth = motion()[:12]
+    breaks = PERIOD * (np.arange(13) - 0.3)
+    trajectory = PiecewisePolynomial.ZeroOrderHold(breaks, np.vstack([truth, truth[-1:]]).T)
+    camera = pinhole("front", 3.0, side=480, focal=1000.0, height=0.05)
+    builder = DiagramBuilder()
+    scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
+    add_simulated_cameras(builder, scene_graph, body, [camera], trajectory)
+    room(scene_graph, tmp_path)
+    tracker = builder.AddSystem(
+        SilhouetteTracker(search, [camera], PERIOD, color_cameras=["front"])
+    )
+    sensor = builder.GetSubsystemByName("camera_front")
+    builder.Connect(sensor.color_image_output_port(), tracker.GetInputPort("color_image"))
+    measured = builder.ExportInput(tracker.GetInputPort("measured_positions"))
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    root = simulator.get_mutable_context()
+    positions, tracks, deviations = [], [], []
+    for k, q in enumerate(truth):
+        known = q if k == 0 else np.full(len(q), np.nan)
+        diagram.get_input_port(measured).FixValue(root, known)
+        simulator.AdvanceTo((k + 0.5) * PERIOD)
+        context = tracker.GetMyContextFromRoot(root)
+        positions.append(tracker.GetOutputPort("estimated_positions").Eval(context))
+        tracks.append(tracker.GetOutputPort("track").Eval(context))
+        deviations.append(tracker.GetOutputPort("position_deviations").Eval(context))
+    tracks = np.array(tracks)
+    np.testing.assert_array_equal(tracks[:, TRACK.index("matches")], 0.0)
+    np.testing.assert_array_equal(tracks[1:, TRACK.index("tracked")], 1.0)
+    errors = np.abs(np.array(positions) - truth)
+    assert np.degrees(np.median(errors.max(axis=1))) < 2.0
+    assert np.mean(errors < 2 * np.array(deviations)) > 0.9
+
+
+def test_a_covered_lens_loses_the_track_and_a_measured_position_brings_it_back(body, search):
+    camera = front_camera(200, shift=0.2)
+    tracker = SilhouetteTracker(search, [camera], PERIOD, color_cameras=["front"])
+    renderer, truth = LabelRenderer(body, camera), motion()[0]
+    picture = np.where(renderer.mask(truth)[..., None], [230, 130, 40, 255], [60, 140, 60, 255])
+    context = tracker.CreateDefaultContext()
+    lit, dark = ImageRgba8U(200, 200), ImageRgba8U(200, 200)
+    lit.mutable_data[:] = picture.astype(np.uint8)
+    found = []
+    for image, measured in ((lit, truth), (dark, truth * np.nan), (lit, truth)):
+        tracker.GetInputPort("color_image").FixValue(context, AbstractValue.Make(image))
+        tracker.GetInputPort("measured_positions").FixValue(context, measured)
+        updates = tracker.EvalUniquePeriodicDiscreteUpdate(context)
+        context.get_mutable_discrete_state().SetFrom(updates)
+        found.append(tracker.last_result.found)
+    assert found == [True, False, True]
+    # Nobody asked the search, for which there was no mask.
+    assert tracker.GetOutputPort("track").Eval(context)[TRACK.index("matches")] == 0
+
+
+def test_a_color_camera_that_is_none_is_named(search):
+    with pytest.raises(UnknownNameError, match=r"side.*front"):
+        SilhouetteTracker(search, [front_camera()], PERIOD, color_cameras=["side"])
 
 
 def test_without_pictures_nothing_is_estimated(body, search):

@@ -348,7 +348,8 @@ WALK = _help("""
 Walk through a garden in the browser as an avatar that moves like the captured person.
 
 The person's place and direction are commands: facing right or left turns the view, standing ahead
-of or behind the place of the first frame walks forward or backward. The motion is that of a result
+of or behind the place of the first frame walks forward or backward (with --method paper, as Date et
+al. have it, only while also walking on the spot). The motion is that of a result
 of capture, of a simulated person (--simulate) or of the person before live cameras (--live;
 commands begin after standing still for a second). With none of these, the arrow keys walk. A
 recording starts when a browser shows the page, and again when its button is pressed.

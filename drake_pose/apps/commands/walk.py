@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
 
     from drake_pose.apps.live.scene import LiveScene
+    from drake_pose.multiview.date.walk_commands import WalkSettings
     from drake_pose.systems.person.live_capture import LiveSensors
 
 
@@ -47,6 +48,12 @@ LiveOption = Annotated[
 ]
 ResultModelOption = Annotated[
     Path | None, typer.Option(help="The result's model, if it is not a bundled one.")
+]
+WalkMethodOption = Annotated[
+    str,
+    typer.Option(
+        help="stance: standing ahead or behind walks; paper: only while walking on the spot."
+    ),
 ]
 RateOption = Annotated[
     float | None,
@@ -90,6 +97,7 @@ def walk(
     shape: ShapeOption = None,
     workers: WatchersOption = 0,
     scheduler: SchedulerOption = None,
+    method: WalkMethodOption = "stance",
     model: ResultModelOption = None,
     package: PackageOption = None,
     rate: RateOption = None,
@@ -111,15 +119,21 @@ def walk(
         raise typer.BadParameter("--model is for a result or --live")
     if package and model is None:
         raise typer.BadParameter("--package is for --model")
+    if method not in ("stance", "paper"):
+        raise typer.BadParameter("must be stance or paper", param_hint="--method")
     _check_rate(rate, result)
     with usage_errors():
         packages = parse_packages(package or ())
     with errors_as_messages():
         from drake_pose.apps.live import walk as walking
+        from drake_pose.multiview.date.walk_commands import WalkSettings
 
+        settings = WalkSettings(on_spot=method == "paper")
         if live is not None:
             with workers_of(workers, scheduler) as client:
-                walked = _walk_live(live, model, shape, seconds, port, browser, client, packages)
+                walked = _walk_live(
+                    live, model, shape, seconds, port, browser, client, packages, settings
+                )
             _print(walked, json)
             return
         if result is not None:
@@ -129,7 +143,7 @@ def walk(
         waits = player.q is not None and (browser if wait is None else wait)
         page = _open_page(port, browser, waits)
         again = _asker(page) if waits and seconds is None else None
-        _print(walking.walk(player, page, seconds, speed, _say_command, again), json)
+        _print(walking.walk(player, page, seconds, speed, _say_command, again, settings), json)
 
 
 def _check_rate(rate: float | None, result: Path | None) -> None:
@@ -162,6 +176,7 @@ def _walk_live(
     browser: bool,
     client: Client | None,
     packages: Mapping[str, Path],
+    settings: WalkSettings,
 ) -> dict[str, Any]:
     """Walks with the cameras of a folder; what it is to walk with is read before the page opens."""
     from drake_pose.apps.live.live_walk import walk_live
@@ -177,7 +192,7 @@ def _walk_live(
 
     open_sensors = None if client is None else _opener(client, scene)
     walked = walk_live(
-        scene, page, model, shape, seconds, open_sensors, _say_command, report, packages
+        scene, page, model, shape, seconds, open_sensors, _say_command, report, packages, settings
     )
     for text in walked["warnings"]:
         warn(text)

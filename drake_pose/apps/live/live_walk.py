@@ -18,6 +18,7 @@ from drake_pose.apps.live.shape import shape_of_result
 from drake_pose.apps.live.walk import CommandLog, stride_positions
 from drake_pose.body import load_model
 from drake_pose.errors import SettingsError
+from drake_pose.multiview.date.walk_commands import WalkSettings
 from drake_pose.multiview.recordings.known_shape import tracker_of_person
 from drake_pose.systems.person.live_capture import LiveSensors, add_person_tracker
 from drake_pose.systems.walk.walk import build_walk
@@ -36,6 +37,7 @@ def walk_live(
     on_command: Callable[[str], None] = lambda _: None,
     on_report: Callable[[str], None] = lambda _: None,
     packages: Mapping[str, Path] | None = None,
+    settings: WalkSettings | None = None,
 ) -> dict[str, Any]:
     """Lets the avatar walk as the person before the cameras commands, until Ctrl-C.
 
@@ -53,6 +55,7 @@ def walk_live(
         on_report: hears at once of cameras that stop and return, of bad pictures, and of a person
             who is found or lost.
         packages: folders of packages that the model's ``package://`` names mean, by name.
+        settings: what is a command.
 
     Returns:
         As walk in drake_pose.apps.live.walk; found_share of the periods in which the person was
@@ -76,7 +79,7 @@ def walk_live(
             return system.GetOutputPort("estimated_positions")
 
         stride = stride_positions(model)
-        diagram = build_walk(model, meshcat, add, stride, opened.period, settle=SETTLE)
+        diagram = build_walk(model, meshcat, add, stride, opened.period, settings, SETTLE)
         walked = _Walked(diagram, on_command, on_report)
         run_live(diagram, opened, seconds, on_report, monitor=walked.watch, is_shown=True)
         warnings = camera_troubles(opened.counts(), 0)

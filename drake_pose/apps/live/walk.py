@@ -29,6 +29,7 @@ from drake_pose.apps.results.folder import POSES, read_summary
 from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.errors import OutputError, SettingsError
 from drake_pose.multiview.date.skeleton import load_skeleton
+from drake_pose.multiview.date.walk_commands import WalkSettings
 from drake_pose.systems.walk.walk import KEYS, build_walk
 
 Array = NDArray[np.float64]
@@ -184,6 +185,7 @@ def walk(
     speed: float = 1.0,
     on_command: Callable[[str], None] | None = None,
     again: Callable[[], bool] | None = None,
+    settings: WalkSettings | None = None,
 ) -> dict[str, Any]:
     """Lets the avatar walk until its recording, the given time, or the user (Ctrl-C) ends it.
 
@@ -195,6 +197,7 @@ def walk(
         on_command: called when the command changes, with its words, "" for none.
         again: asked at the end whether to walk once more from the start; not at all where not
             given.
+        settings: what is a command.
 
     Returns:
         Of the last walk: seconds walked; x, y [m] and heading_deg where it ended; and by command
@@ -216,7 +219,7 @@ def walk(
         )
         seconds = min(seconds or times[-1], times[-1])
     stride = stride_positions(player.model)
-    diagram = build_walk(player.model, meshcat, positions, stride, period)
+    diagram = build_walk(player.model, meshcat, positions, stride, period, settings)
     end = math.inf if seconds is None else seconds
     while True:
         walked, reached = _walk_once(diagram, end, speed, CommandLog(on_command))

@@ -33,6 +33,10 @@ class WalkSettings:
         turn_rate: how fast the view turns [rad/s].
         speed: how fast one walks [m/s].
         body_radius: how near one comes to walls and objects [m].
+        on_spot: whether standing ahead or behind is a command only while the person also walks on
+            the spot, as in the paper.
+        lift: how much higher than the other a lifted foot is [m].
+        pause: without another step for so long the person no longer walks on the spot [s].
 
     Raises:
         SettingsError: something is not positive, or a command ends beyond where it begins.
@@ -45,11 +49,14 @@ class WalkSettings:
     turn_rate: float = math.radians(40.0)
     speed: float = 0.9
     body_radius: float = 0.3
+    on_spot: bool = False
+    lift: float = 0.05
+    pause: float = 1.0
 
     def __post_init__(self) -> None:
         """Check the settings."""
         for name, value in vars(self).items():
-            if not (math.isfinite(value) and value > 0.0):
+            if name != "on_spot" and not (math.isfinite(value) and value > 0.0):
                 raise SettingsError(f"walking: {name} must be a positive number, not {value}")
         for name in ("turn", "step"):
             begin, end = getattr(self, f"{name}_begin"), getattr(self, f"{name}_end")
@@ -111,6 +118,35 @@ def recognise_command(
         _switch(turned, last[0], settings.turn_begin, settings.turn_end),
         _switch(ahead, last[1], settings.step_begin, settings.step_end),
     )
+
+
+NO_STEPS = (0.0, 0.0, 0.0)
+
+
+def follow_steps(lift: float, steps: Array, seconds: float, settings: WalkSettings) -> Array:
+    """Counts the steps of somebody who may be walking on the spot.
+
+    Args:
+        lift: how much higher the left foot is than the right one [m]; nan: not seen.
+        steps: (3,) the foot lifted last (1 left, -1 right, 0 none), since when it was [s], and how
+            many steps, each with the other foot, were taken without a pause.
+        seconds: since the last frame.
+        settings: what is a step.
+
+    Returns:
+        (3,) the same after this frame. One foot held up is one step.
+    """
+    foot, since, count = steps[0], steps[1] + seconds, steps[2]
+    if since > settings.pause:
+        count = 0.0
+    if abs(lift) >= settings.lift and math.copysign(1.0, lift) != foot:
+        return np.array([math.copysign(1.0, lift), 0.0, count + 1.0])
+    return np.array([foot, since, count])
+
+
+def walks_on_spot(steps: Array) -> bool:
+    """Whether steps (3,) of follow_steps are walking on the spot: one foot, then the other."""
+    return bool(steps[2] >= 2.0)
 
 
 def follow_command(

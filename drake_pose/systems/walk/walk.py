@@ -25,10 +25,13 @@ from drake_pose.body import ArticulatedModel
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.multiview.date.walk_commands import (
     NO_COMMAND,
+    NO_STEPS,
     WalkSettings,
     follow_command,
+    follow_steps,
     recognise_command,
     stance_of,
+    walks_on_spot,
 )
 from drake_pose.systems.bodies.posed_geometry import add_avatar
 from drake_pose.systems.walk.garden import (
@@ -122,6 +125,7 @@ class Walker(LeafSystem):
         # The stance that the person may be settling in, and since when [s].
         self._settling = self.DeclareDiscreteState(np.append(np.full(5, np.nan), 0.0))
         self._heading = self.DeclareDiscreteState(np.full(1, np.nan))
+        self._steps = self.DeclareDiscreteState(np.array(NO_STEPS))
         self._states = {name: self.DeclareDiscreteState(start) for name, start in starts.items()}
         for name, state in self._states.items():
             self.DeclareStateOutputPort(name, state)
@@ -134,9 +138,11 @@ class Walker(LeafSystem):
         turn, walk = NO_COMMAND
         q = self._positions.Eval(context)
         heading = np.nan
-        if np.isfinite(q).all():
+        if not np.isfinite(q).all():
+            discrete_state.set_value(self._steps, np.array(NO_STEPS))
+        else:
             discrete_state.set_value(self._states["avatar_positions"], q)
-            stance, rest = self._stance(q), states["rest"]
+            (stance, lift), rest = self._stance(q), states["rest"]
             heading = stance[0]
             turned = math.remainder(
                 heading - context.get_discrete_state(self._heading).value()[0], 2.0 * math.pi
@@ -150,6 +156,8 @@ class Walker(LeafSystem):
             if np.isfinite(rest).all():
                 last = states["command"].astype(int)
                 turn, walk = recognise_command(stance, rest, (last[0], last[1]), self._settings)
+                if not self._walks_on_spot(lift, context, discrete_state):
+                    walk = 0
         discrete_state.set_value(self._heading, np.array([heading]))
         if self._keys.HasValue(context):
             pressed = self._keys.Eval(context).astype(int)
@@ -176,14 +184,23 @@ class Walker(LeafSystem):
             discrete_state.set_value(self._settling, settling)
         return bool(context.get_time() - settling[5] >= self._settle)
 
-    def _stance(self, q: Array) -> Array:
+    def _walks_on_spot(self, lift: float, context: Context, discrete_state: DiscreteValues) -> bool:
+        """Whether the person does, or need not."""
+        steps = context.get_discrete_state(self._steps).value()
+        steps = follow_steps(lift, steps, self._period, self._settings)
+        discrete_state.set_value(self._steps, steps)
+        return walks_on_spot(steps) or not self._settings.on_spot
+
+    def _stance(self, q: Array) -> tuple[Array, float]:
+        """The stance (5,), and how much higher the left foot is than the right one [m]."""
         self._plant.SetPositions(self._plant_context, q)
         X_WL = [
             self._plant.GetBodyByName(part).EvalPoseInWorld(self._plant_context) for part in _PARTS
         ]
         left_W = X_WL[0].rotation().col(0)
         feet = np.array([X.translation() for X in X_WL[1:]])
-        return stance_of(left_W, X_WL[0].translation(), feet)
+        lift = float(feet[0, 2] - feet[1, 2])
+        return stance_of(left_W, X_WL[0].translation(), feet), lift
 
 
 class WalkKeys(LeafSystem):

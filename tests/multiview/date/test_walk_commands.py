@@ -6,11 +6,14 @@ import pytest
 from drake_pose.errors import SettingsError
 from drake_pose.multiview.date.walk_commands import (
     NO_COMMAND,
+    NO_STEPS,
     WalkSettings,
     follow_command,
+    follow_steps,
     offsets_from_rest,
     recognise_command,
     stance_of,
+    walks_on_spot,
 )
 
 SETTINGS = WalkSettings()
@@ -56,6 +59,34 @@ def test_table_1():
     turn = [0, 1, 0, -1, 0, 0, 0, 0, -1, 0]
     walk = [0, 0, 0, 0, 0, 1, 0, -1, 1, 0]
     assert found == list(zip(turn, walk, strict=True))
+
+
+def spot_walk(lifts, seconds=0.1):
+    steps, found = np.array(NO_STEPS), []
+    for lift in lifts:
+        steps = follow_steps(lift, steps, seconds, SETTINGS)
+        found.append(walks_on_spot(steps))
+    return found
+
+
+def test_one_foot_and_then_the_other_is_walking_on_the_spot():
+    step = [0.0, 0.1, 0.1, 0.0]
+    left, right = np.array(step), -np.array(step)
+    assert spot_walk([*left, *right, *left]) == [False] * 5 + [True] * 7
+    # It ends one pause after the last step.
+    found = spot_walk([*left, *right, *([0.0] * 12)])
+    assert found[5:14] == [True] * 9
+    assert not any(found[16:])
+
+
+def test_what_is_no_walking_on_the_spot():
+    foot_held_up = [0.2] * 30
+    same_foot = [0.1, 0.0] * 15
+    noise = list(np.random.default_rng(0).normal(0.0, 0.01, 60))
+    slow = ([0.1] + [0.0] * 12 + [-0.1] + [0.0] * 12) * 3
+    lost = [math.nan] * 10
+    for lifts in (foot_held_up, same_foot, noise, slow, lost):
+        assert not any(spot_walk(lifts))
 
 
 def test_command_begins_late_and_ends_early():

@@ -20,6 +20,8 @@ from drake_pose.systems.walk.walk import KEYS, Walker, build_walk
 
 PERIOD = 1 / 30
 SETTINGS = WalkSettings()
+# How far the thigh is lifted on the way through three steps [rad], left positive.
+SPOT = [0.8 * math.sin(math.pi * k / 8) for k in range(1, 24)]
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +55,26 @@ def run(person, page, stances, seconds_each=1.0):
             [diagram.GetOutputPort(n).Eval(context).copy() for n in ("walker_pose", "command")]
         )
     return found
+
+
+def test_the_paper_asks_for_steps_on_the_spot(person):
+    """Standing ahead is no command by itself, nor are steps at the place of rest."""
+    walker = Walker(person, standing(person), PERIOD, WalkSettings(on_spot=True))
+    simulator = Simulator(walker)
+    context = simulator.get_mutable_context()
+    frames = [(0.0, 0.0), *[(0.3, 0.0)] * 20, *[(0.3, s) for s in SPOT], *[(0.0, s) for s in SPOT]]
+    found = []
+    for k, (ahead, lifted) in enumerate(frames):
+        q = standing(person, x=ahead)
+        q[person.position_index(f"{'left' if lifted > 0 else 'right'}_thigh_x")] = -abs(lifted)
+        q[person.position_index(f"{'left' if lifted > 0 else 'right'}_shin_x")] = 2 * abs(lifted)
+        walker.get_input_port(0).FixValue(context, q)
+        simulator.AdvanceTo(k * PERIOD)
+        simulator.AdvancePendingEvents()
+        found.append(walker.GetOutputPort("command").Eval(context)[1])
+    assert not any(found[:21])
+    assert found[20 + len(SPOT)] == 1
+    assert found[-1] == 0
 
 
 def test_gestures_walk_and_turn(person, page):

@@ -80,7 +80,7 @@ class SilhouetteCamera(LeafSystem):
         self._labels = np.array([label for _, label, _ in found], dtype=np.int16)
         self._closed = np.array([outline.is_closed for _, _, outline in found])
         self._packed = pack(tuple(outline for _, _, outline in found))
-        self._parameters = camera.kernel_parameters()
+        self._parameters, self._X_CP = camera.kernel_parameters(), camera.X_CW
         poses = AbstractValue.Make([RigidTransform()] * len(bodies))
         self._body_poses = self.DeclareAbstractInputPort("body_poses", poses)
         tickets = {self._body_poses.ticket()}
@@ -114,7 +114,7 @@ class SilhouetteCamera(LeafSystem):
 
     def _calc_image(self, context: Context, output: AbstractValue) -> None:
         X_WB = self._poses(context)
-        X_CW = self.camera.X_CW
+        X_CW = self._X_CP
         if self._parent:
             X_CW = X_CW @ np.linalg.inv(X_WB[self._parent])
         X_CB = np.ascontiguousarray((X_CW @ X_WB[self._drawn])[:, :3])

@@ -10,6 +10,7 @@ from drake_pose.apps.experiments.kameda.experiment import (
     experiment_camera,
     experiment_search,
     run_experiment,
+    side_camera,
 )
 from drake_pose.apps.experiments.kameda.pictures import save_pictures
 from drake_pose.apps.experiments.kameda.table import experiment_table, spread_over_seeds
@@ -29,6 +30,17 @@ def test_the_camera_is_the_papers():
     pixels, _ = camera.project(np.array([[0.0, 0, 0], [0, 1, 0], [0, 0, 1]]))
     np.testing.assert_allclose(pixels[1] - pixels[0], [226, 0], atol=1e-9)
     np.testing.assert_allclose(pixels[2] - pixels[0], [0, -226], atol=1e-9)
+
+
+def test_the_side_camera_sees_depth():
+    """It stands along the world's y and looks back: what comes towards the front goes left."""
+    camera = side_camera()
+    np.testing.assert_allclose(camera.X_WC[:3, 3], [0.0, 5.0, 0.0], atol=1e-12)
+    pixels, depths = camera.project(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]))
+    np.testing.assert_allclose(pixels[1] - pixels[0], [-226, 0], atol=1e-9)
+    np.testing.assert_allclose(pixels[2] - pixels[0], [0, 0], atol=1e-9)
+    np.testing.assert_allclose(pixels[3] - pixels[0], [0, -226], atol=1e-9)
+    assert depths[2] < depths[0]
 
 
 def test_lattice_angles_are_multiples_of_20_degrees_inside_table_2():

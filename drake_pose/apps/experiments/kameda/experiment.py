@@ -167,6 +167,14 @@ def experiment_camera() -> ParallelCamera:
     )
 
 
+def side_camera() -> ParallelCamera:
+    """The same camera where it sees the body's left side, for pictures."""
+    camera = experiment_camera()
+    turn = np.eye(4)
+    turn[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
+    return replace(camera, name="side", X_WC=turn @ camera.X_WC)
+
+
 def experiment_search(
     outside_limit: float = 200.0,
     candidate_limit: int = 5,

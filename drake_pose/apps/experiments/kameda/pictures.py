@@ -7,7 +7,11 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from drake_pose.apps.experiments.kameda.experiment import ExperimentResult, Trial
+from drake_pose.apps.experiments.kameda.experiment import (
+    ExperimentResult,
+    Trial,
+    side_camera,
+)
 from drake_pose.apps.experiments.kameda.family_pictures import save_families
 from drake_pose.matching import PaperSearch, View
 from drake_pose.silhouette import LabelRenderer, draw_mask
@@ -16,6 +20,9 @@ _EXAMPLES = 4
 _SETS = 3
 _MARGIN = 20
 _BACKGROUND = (1.0, 1.0, 1.0)
+_PANELS = (
+    "true pose", "estimate", "silhouettes", "true pose from the side", "estimate from the side",
+)  # fmt: skip
 
 _KINDS: dict[str, tuple[str, Callable[[Trial], bool]]] = {
     "figure_07_exact_and_pose_right": (
@@ -48,12 +55,15 @@ def save_pictures(result: ExperimentResult, folder: Path) -> list[Path]:
         The files written.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    renderer = LabelRenderer(result.search.tree.model, result.camera)
+    renderers = [
+        LabelRenderer(result.search.tree.model, camera) for camera in (result.camera, side_camera())
+    ]
     files = []
     for name, (title, belongs) in _KINDS.items():
         trials = [trial for trial in result.trials if belongs(trial)][:_EXAMPLES]
         if trials:
-            files.append(_save_examples(folder / f"{name}.png", title, trials, result, renderer))
+            path = folder / f"{name}.png"
+            files.append(_save_examples(path, title, trials, result, renderers))
     if isinstance(result.search, PaperSearch):
         runs = np.array([trial.result.runs for trial in result.trials])
         path = folder / "figure_11_runs_of_step_3.png"
@@ -80,20 +90,28 @@ def _save_sets(folder: Path, result: ExperimentResult) -> list[Path]:
 
 
 def _save_examples(
-    path: Path, title: str, trials: list[Trial], result: ExperimentResult, renderer: LabelRenderer
+    path: Path,
+    title: str,
+    trials: list[Trial],
+    result: ExperimentResult,
+    renderers: list[LabelRenderer],
 ) -> Path:
+    """Draw true poses and estimates as the camera sees them, their silhouettes, and the side."""
     tree = result.search.tree
     colours = matplotlib.colormaps["tab20"](np.arange(64) % 20)[:, :3]
-    figure = Figure(figsize=(3 * len(trials), 9))
-    axes = figure.subplots(3, len(trials), squeeze=False)
+    figure = Figure(figsize=(3 * len(trials), 15))
+    axes = figure.subplots(5, len(trials), squeeze=False)
     for column, trial in zip(axes.T, trials, strict=True):
         q_true, _ = tree.positions_from(trial.true_values)
-        pictures = _crop([renderer.segments(q) for q in (q_true, trial.result.q)])
-        for axis, segments in zip(column, pictures, strict=False):
+        pictures, side = (
+            _crop([renderer.segments(q) for q in (q_true, trial.result.q)])
+            for renderer in renderers
+        )
+        for axis, segments in zip(column[[0, 1, 3, 4]], [*pictures, *side], strict=True):
             axis.imshow(np.where(segments[..., None] >= 0, colours[segments], _BACKGROUND))
         column[2].imshow(_compare(pictures[0] >= 0, pictures[1] >= 0))
         column[0].set_title(f"E_total {trial.E_total:.2%}, {trial.result.runs} runs", fontsize=9)
-    for axis, label in zip(axes[:, 0], ("true pose", "estimate", "silhouettes"), strict=True):
+    for axis, label in zip(axes[:, 0], _PANELS, strict=True):
         axis.set_ylabel(label)
     for axis in axes.ravel():
         axis.set_xticks([])

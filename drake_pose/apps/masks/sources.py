@@ -121,9 +121,9 @@ def open_source(path: Path, camera_file: Path | None = None) -> Source:
     """Finds out what there is.
 
     A folder has ``images/<camera>/<frame>.png`` or ``.jpg``, ``videos/<camera>.mp4``, or the same
-    without ``images`` and ``videos``; with a single camera the pictures may lie in it. In place of
-    pictures there may be labelme's ``<frame>.json``. A file is a picture, a video, or annotations
-    of COCO or labelme.
+    without ``images`` and ``videos``, or in ``masks`` where there is neither; with a single camera
+    the pictures may lie in it. In place of pictures there may be labelme's ``<frame>.json``. A file
+    is a picture, a video, or annotations of COCO or labelme.
 
     Args:
         path: the folder or file.
@@ -139,7 +139,10 @@ def open_source(path: Path, camera_file: Path | None = None) -> Source:
     if camera_file is None and path.is_dir() and (path / CAMERAS).is_file():
         camera_file = path / CAMERAS
     cameras = None if camera_file is None else load_camera_file(camera_file)
-    pictures, videos, annotations = _find(path)
+    try:
+        pictures, videos, annotations = _find(path)
+    except OSError as error:
+        raise SceneError(f"{error.filename or path}: cannot be read: {error.strerror}") from error
     if not (pictures or videos or annotations):
         raise SceneError(
             f"{path}: holds no pictures images/<camera>/<frame>.png or .jpg, no videos "
@@ -208,7 +211,9 @@ def _find(path: Path) -> _Found:
     places = [path / name for name in ("images", "videos") if (path / name).is_dir()]
     if len(places) > 1:
         raise SceneError(f"{path}: has images and videos; name one of them: {places[0]}")
-    root = places[0] if places else path
+    # Where there is nothing to find objects in, masks that another tool put there are meant.
+    beside = path / "masks"
+    root = places[0] if places else beside if beside.is_dir() else path
     pictures: dict[str | None, dict[str, Path]] = {}
     annotations: list[tuple[str | None, Annotations]] = []
     for name, folder in _folders(root):

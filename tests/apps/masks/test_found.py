@@ -16,6 +16,7 @@ from drake_pose.apps.main import app
 from drake_pose.apps.masks.strokes import read_strokes
 from drake_pose.errors import DrakePoseError, MaskError, SceneError, SettingsError
 from tests.apps.masks.rooms import iou, moving, write_pictures
+from tests.apps.scenes import NAMES, read_rows
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +59,28 @@ def test_empty_room_beside_the_pictures_is_used(filmed, pictures, tmp_path):
     ).read_bytes()
     overlay = cv2.imread(str(tmp_path / "out" / "overlay" / "side" / "0003.jpg"))
     assert overlay.shape == (160, 200, 3)
+
+
+@pytest.mark.slow
+def test_angles_come_out_where_pictures_went_in(tmp_path, runner: CliRunner):
+    scene = write_pictures(tmp_path / "scene", moving(5), ("front", "side"))
+    shutil.rmtree(scene.folder / "masks")
+    done = runner.invoke(app, ["masks", str(scene.folder), "--out", str(tmp_path / "made")])
+    assert done.exit_code == 0, done.output
+    command = ["estimate", str(tmp_path / "made"), "--model", str(scene.model), "--no-replay"]
+    done = runner.invoke(app, [*command, "--no-overlay", "--out", str(tmp_path / "angles")])
+    assert done.exit_code == 0, done.output
+    rows = {row["frame"]: row for row in read_rows(tmp_path / "angles" / "poses.csv")}
+    for frame, q in scene.truth.items():
+        found = [float(rows[frame][name]) for name in NAMES]
+        assert np.degrees(np.abs(found - q)).max() < 5.0
+
+
+def test_masks_of_another_tool_may_lie_in_masks(filmed, tmp_path):
+    shutil.copytree(filmed / "masks", tmp_path / "source" / "masks")
+    shutil.copy(filmed / "cameras.yaml", tmp_path / "source")
+    make_masks(tmp_path / "source", tmp_path / "out")
+    assert (agreement(tmp_path / "out", filmed) == 1.0).all()
 
 
 def test_median_of_a_recording_finds_what_moves(filmed, pictures, tmp_path):

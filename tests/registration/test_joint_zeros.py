@@ -81,6 +81,35 @@ class TestCalibrateJoints:
         assert found.cameras[0].focal_x == pytest.approx(600.0, rel=0.004)
         assert abs(found.cameras[0].focal_x - 600.0) < 4.0 * 600.0 * found.focal_deviations[0]
 
+    @pytest.mark.slow
+    def test_cameras_share_zeros_and_lengths(
+        self, model: ArticulatedModel, body: RegistrationBody
+    ) -> None:
+        """What two cameras see is one robot: they tell its zero together, better than each."""
+        places = (np.array([1.6, 0.4, 0.5]), np.array([0.3, -1.6, 0.7]))
+        off = np.zeros(len(body.kinematics.names))
+        off[body.kinematics.names.index("elbow_turn")] = np.radians(2.0)
+        registered, frames, alone = [], [], []
+        for seed, place in enumerate(places):
+            camera = looking_at(place, MIDDLE, 0.1)
+            frames.append(misread(see(model, body, camera, 4, seed), off))
+            registered.append(CameraSearch(body).register(camera, frames[-1]))
+            alone.append(calibrate_joints(body, registered[-1:], frames[-1:], ["elbow_turn"]))
+        found = calibrate_joints(
+            body, registered, frames, ["elbow_turn"], lengths=["shoulder", "elbow"]
+        )
+        (zero,) = found.zeros
+        assert zero.low < np.radians(2.0) < zero.high
+        assert zero.significant
+        assert zero.deviation < max(one.zeros[0].deviation for one in alone)
+        for one in found.lengths:
+            assert one.low < 0.0 < one.high
+            assert not one.significant
+        for camera, place in zip(found.cameras, places, strict=True):
+            shift, turn = errors(camera.X_WC, looking_at(place, MIDDLE, 0.1).X_WC)
+            assert shift < 4e-3
+            assert turn < np.radians(0.15)
+
     def test_names_what_a_zero_cannot_be_told_from(
         self, model: ArticulatedModel, body: RegistrationBody
     ) -> None:

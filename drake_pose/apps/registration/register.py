@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -136,6 +136,7 @@ def _search(
         warnings += _warnings_of(found)
         if on_camera is not None:
             on_camera(len(registered))
+    warnings += say_common(registered.values())
     return registered, described
 
 
@@ -188,6 +189,35 @@ def _describe_again(
         }
         for name, found in registered.items()
     }
+
+
+def say_common(registered: Iterable[RegisteredCamera]) -> list[str]:
+    """Whose fault it is where several cameras see a frame that contradicts the others."""
+    agrees: dict[str, dict[str, bool]] = {}
+    for found in registered:
+        for one in found.frames:
+            agrees.setdefault(one.frame, {})[found.camera.name] = one.agrees
+    frames = list(agrees)
+    positions, masks = [], dict[str, list[str]]()
+    for frame, cameras in agrees.items():
+        wrong = [name for name, right in cameras.items() if not right]
+        if len(cameras) > 1 and len(wrong) == len(cameras):
+            positions.append(frame)
+        elif len(wrong) < len(cameras):
+            for name in wrong:
+                masks.setdefault(name, []).append(frame)
+    texts = []
+    if positions:
+        texts.append(
+            f"frames {frame_ranges(positions, frames)} contradict the others in all cameras that "
+            "see them: their joint positions are not those of the pictures"
+        )
+    texts += [
+        f"frames {frame_ranges(wrong, frames)} contradict the others in camera '{name}', but not "
+        "in another one that sees them: their joint positions are right, their masks are not"
+        for name, wrong in masks.items()
+    ]
+    return texts
 
 
 def _warnings_of(found: RegisteredCamera) -> list[str]:

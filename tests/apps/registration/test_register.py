@@ -14,11 +14,13 @@ from typer.testing import CliRunner, Result
 
 from drake_pose.apps.main import app
 from drake_pose.apps.registration.inputs import RegistrationSettings
-from drake_pose.apps.registration.register import register_scene
+from drake_pose.apps.registration.register import register_scene, say_common
 from drake_pose.body import RootRotation, load_model
 from drake_pose.camera import load_cameras
+from drake_pose.registration.register import FrameMisfit, RegisteredCamera
 from drake_pose.silhouette import LabelRenderer, load_scene
 from tests.apps.registration.arm_scenes import ArmScene, pose_errors
+from tests.matching.arms import arm_cameras
 
 
 def run(runner: CliRunner, scene: ArmScene, out: Path, *more: str) -> Result:
@@ -208,6 +210,24 @@ class TestRecordedArms:
         assert "FEWER THAN HALF" in result.stderr
         reference = load_cameras(folder / "cameras_reference.yaml")["camera"]
         assert pose_errors(np.array(found["X_WC"]), reference.X_WC)[0] < 24.0
+
+
+def registered_camera(name: str, frames: dict[str, bool]) -> RegisteredCamera:
+    camera = arm_cameras()[0]
+    misfits = tuple(FrameMisfit(frame, 0.0, 1.0, 1.0, agrees) for frame, agrees in frames.items())
+    return RegisteredCamera(replace(camera, name=name), np.eye(6), misfits)
+
+
+def test_cameras_tell_together_whose_fault_a_frame_is() -> None:
+    left = registered_camera("left", {"0000": True, "0001": False, "0002": False, "0003": False})
+    right = registered_camera("right", {"0000": True, "0001": False, "0002": True})
+    common, alone = say_common([left, right])
+    assert "frames 0001 contradict the others in all cameras" in common
+    assert "joint positions are not those of the pictures" in common
+    assert "frames 0002 contradict the others in camera 'left'" in alone
+    assert "masks are not" in alone
+    # One camera alone cannot tell.
+    assert say_common([left]) == []
 
 
 class TestZeros:

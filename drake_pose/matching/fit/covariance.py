@@ -184,6 +184,8 @@ def _views(outlines: Sequence[Outline], pictures: Sequence[Picture]) -> NDArray[
     X_CN = np.array([one.X_CW @ one.X_WN for one in pictures])[:, :, :3]
     found = np.tile(np.arange(len(pictures))[:, None], len(outlines))
     for n, outline in enumerate(outlines):
+        if not len(outline.vertices):
+            continue
         points = np.column_stack([outline.vertices, np.ones(len(outline.vertices))])
         moments = points.T @ points / len(points)
         for c, one in enumerate(pictures):

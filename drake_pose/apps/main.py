@@ -36,6 +36,7 @@ from drake_pose.apps.commands.estimate_options import (
     RootRotationOption,
     RunLimitOption,
     SceneArgument,
+    StartOption,
     TimeLimitOption,
     TrackOption,
     TruthOption,
@@ -127,6 +128,7 @@ def estimate(
     method: MethodOption = "auto",
     angles: AnglesOption = "continuous",
     track: TrackOption = True,
+    start: StartOption = None,
     resume: ResumeOption = False,
     overlay: OverlayOption = True,
     replay: ReplayOption = True,
@@ -152,6 +154,7 @@ def estimate(
             method=method,
             angles=angles,
             track=track,
+            start=start,
             packages=parse_packages(package or ()),
         )
     run_estimate(

@@ -54,6 +54,8 @@ class EstimateSettings:
         angles: ``continuous``: refined between the samples; ``grid``: multiples of the interval
             alone, as always with the method ``paper``. Of the method ``beam`` alone.
         track: whether frames of a sequence are tracked; else every one is matched on its own.
+        start: a file of the joint positions in the first frame of a sequence, in the columns
+            `frame` and positions' names; rows of other frames say where the body is after a loss.
         packages: folders of packages that the model's ``package://`` names mean, by name.
 
     Raises:
@@ -78,6 +80,7 @@ class EstimateSettings:
     method: str = "auto"
     angles: str = "continuous"
     track: bool = True
+    start: Path | None = None
     packages: Mapping[str, Path] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -121,6 +124,7 @@ class EstimateSettings:
             values["root_rotation"] = [
                 [axis, lower, upper] for axis, (lower, upper) in self.root_rotation.items()
             ]
+        values["start"] = None if self.start is None else str(self.start)
         values["packages"] = {name: str(folder) for name, folder in self.packages.items()}
         lists = {name: list(getattr(self, name)) for name in ("cameras", "frames", "unseen")}
         return values | lists

@@ -16,7 +16,8 @@ SceneArgument = Annotated[
     Path,
     typer.Argument(
         help="Folder with cameras.yaml and masks/<camera>/<frame>.png; or with masks/<frame>.png "
-        "alone, of a camera without calibration."
+        "alone, of a camera without calibration. A sequence may have images/<camera>/<frame>.png "
+        "or .jpg and a mask of the first frame only."
     ),
 ]
 ModelOption = Annotated[
@@ -187,6 +188,15 @@ TrackOption = Annotated[
         help="Track the body through the frames of a sequence, searching only in the first frame "
         "and after a loss; or search in every frame.",
         rich_help_panel=_SEARCH,
+    ),
+]
+StartOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="Joint positions in the first frame of a sequence: CSV with the columns frame and "
+        "positions' names [rad or m]. Rows of other frames are used after a loss.",
+        rich_help_panel=_MATCHED,
     ),
 ]
 ResumeOption = Annotated[

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +20,7 @@ from drake_pose.apps.estimate.scene_checks import (
     leave_out_unreadable,
     texts_of,
 )
+from drake_pose.apps.estimate.starts import read_starts
 from drake_pose.apps.options import select_frames
 from drake_pose.apps.settings import EstimateSettings, RootTurns
 from drake_pose.body import ArticulatedModel, PoseTree, RootRotation, load_model, model_warnings
@@ -56,6 +57,7 @@ class Inputs:
         root_positions: the root's position (3,) by frame [m], where it differs.
         truth: measured joint positions, where there are some.
         warnings: what the user should know of the input.
+        starts: the plant's positions (nq,) by frame where it is known where the body is.
     """
 
     scene: Scene
@@ -66,6 +68,7 @@ class Inputs:
     root_positions: Mapping[str, np.ndarray] | None
     truth: TrueAngles | None
     warnings: tuple[str, ...] = ()
+    starts: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
 def read_inputs(
@@ -83,7 +86,9 @@ def read_inputs(
     Raises:
         DrakePoseError: names the file, camera, frame, link or joint at fault.
     """
-    checked = check_scene(load_scene(scene_path))
+    scene = load_scene(scene_path)
+    # Of pictures with few masks it is no fault that masks are missing.
+    checked = CheckedScene(scene, ()) if scene.images else check_scene(scene)
     scene = checked.scene
     cameras = select_cameras(scene, settings.cameras)
     frames = select_seen_frames(scene, cameras, settings.frames)
@@ -91,7 +96,8 @@ def read_inputs(
     if settings.unseen:
         model, settings = leave_out_links(model, settings)
     truth = _read_truth(scene_path, truth_path, model)
-    if follows_person(scene, cameras, model, settings):
+    starts = read_starts(scene, cameras, frames, model, settings)
+    if not (scene.images or starts) and follows_person(scene, cameras, model, settings):
         texts = (*texts_of(*checked.warnings, *check_upright(cameras)), *model.warnings)
         return Inputs(scene, model, cameras, frames, None, None, truth, texts)
     root_positions = None
@@ -114,7 +120,7 @@ def read_inputs(
     read = _check_pictures(scene, cameras, frames, search)
     of_model = model_warnings(model, search.tree, settings.hold)
     texts = (*texts_of(*checked.warnings, *read.warnings), *of_model)
-    return Inputs(read.scene, model, cameras, frames, search, root_positions, truth, texts)
+    return Inputs(read.scene, model, cameras, frames, search, root_positions, truth, texts, starts)
 
 
 def leave_out_links(
@@ -151,7 +157,7 @@ def select_cameras(scene: Scene, wanted: Sequence[str]) -> tuple[Camera, ...]:
     for name in wanted:
         if name not in scene.cameras:
             raise UnknownNameError("camera", name, scene.cameras, str(scene.path))
-    used = set(wanted) or {name for name, _ in scene.masks}
+    used = set(wanted) or {name for name, _ in (*scene.masks, *scene.images)}
     names = [name for name in scene.cameras if name in used]
     return tuple(scene.cameras[name] for name in names)
 
@@ -166,10 +172,11 @@ def select_seen_frames(
         UnknownNameError: if there is no such frame.
     """
     names = [camera.name for camera in cameras]
+    seen = (scene.masks, scene.images)
     frames = [
         frame
         for frame in select_frames(scene.frames, wanted, str(scene.path))
-        if any((name, frame) in scene.masks for name in names)
+        if any((name, frame) in pictures for name in names for pictures in seen)
     ]
     if not frames:
         raise SceneError(f"{scene.path}: no mask of camera {', '.join(names)} in those frames")

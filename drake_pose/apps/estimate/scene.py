@@ -124,6 +124,11 @@ class _Matching:
         if not frames:
             return
         inputs = self._inputs
+        if finished and (inputs.scene.images or inputs.starts):
+            raise SettingsError(
+                f"{inputs.scene.path}: a sequence that is tracked by colour, or from --start, goes "
+                "on from its first frame alone: name another folder instead of --resume"
+            )
         matching = build_recorded_matching(
             inputs.scene,
             self._search,
@@ -131,6 +136,7 @@ class _Matching:
             frames,
             inputs.root_positions,
             tracking=self._tracking,
+            starts=inputs.starts,
         )
         period = 1.0 / (inputs.scene.frame_rate_hz or DEFAULT_FRAME_RATE_HZ)
         simulator = Simulator(matching.diagram)
@@ -144,6 +150,8 @@ class _Matching:
     def compare_cameras(self, on_stage: OnStage | None) -> None:
         """Warn of cameras that contradict each other; few frames are matched again for it."""
         scene, root_positions = self._inputs.scene, self._inputs.root_positions or {}
+        if scene.images:
+            return
         search = self._search
         if isinstance(search, MultiStartSearch):
             search = search.without_alternatives()

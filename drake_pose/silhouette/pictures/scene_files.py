@@ -12,6 +12,7 @@ from pathlib import Path
 from drake_pose.errors import SceneError
 
 _SUFFIX = ".png"
+_IMAGES = (".png", ".jpg", ".jpeg")
 _NUMBER = re.compile("([0-9]+)")
 
 
@@ -92,6 +93,22 @@ def find_masks(folder: Path, cameras: Iterable[str]) -> SceneFiles:
     others |= {name: found[name][1] for name in names if name in found}
     kept = {name: files for name, files in others.items() if files}
     return SceneFiles(masks, frames, Leftovers(strangers, doubled, kept))
+
+
+def find_images(folder: Path, cameras: Iterable[str]) -> dict[tuple[str, str], Path]:
+    """Finds images/<camera>/<frame>.png or .jpg by (camera, frame); none where there is no folder.
+
+    Raises:
+        SceneError: a folder that cannot be read.
+    """
+    found: dict[tuple[str, str], Path] = {}
+    for camera in cameras:
+        own = folder / "images" / camera
+        if own.is_dir():
+            names = [entry.name for entry in _visible(own) if not entry.is_dir()]
+            pictures = [Path(name) for name in names if Path(name).suffix.lower() in _IMAGES]
+            found |= {(camera, name.stem): own / name for name in pictures}
+    return found
 
 
 def _no_masks(

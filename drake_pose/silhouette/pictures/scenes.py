@@ -8,12 +8,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from drake_pose.camera import Camera, ParallelCamera, load_cameras
 from drake_pose.errors import SceneError, UnknownNameError
+from drake_pose.regular_files import read_regular
 from drake_pose.silhouette.pictures.masks import read_mask
-from drake_pose.silhouette.pictures.scene_files import Leftovers, SceneFiles, find_masks
+from drake_pose.silhouette.pictures.scene_files import (
+    Leftovers,
+    SceneFiles,
+    find_images,
+    find_masks,
+    natural_key,
+)
 from drake_pose.yaml_files import read_yaml
 
 _FIELDS = ("sequence", "frame_rate_hz")
@@ -40,6 +48,9 @@ class Scene:
         scale_unknown: whether nobody knows the cameras: each is a parallel camera that looks along
             the world's -x, and its pixels_per_metre and what it looks at are to be found.
         leftovers: what lies in the folder and is not used.
+        images: the picture files of (camera, frame) of a sequence that has masks of few frames, or
+            none: where a camera has no mask the body is tracked by its colours. Empty where there
+            is a mask for every picture.
     """
 
     path: Path
@@ -50,6 +61,7 @@ class Scene:
     frame_rate_hz: float | None = None
     scale_unknown: bool = False
     leftovers: Leftovers = field(default_factory=Leftovers)
+    images: Mapping[tuple[str, str], Path] = field(default_factory=dict)
 
     def cameras_of(self, frame: str) -> tuple[str, ...]:
         """Returns the names of the cameras that have a mask of a frame.
@@ -91,15 +103,41 @@ class Scene:
         size = self.cameras[camera]
         return read_mask(path, size.width, size.height, may_be_empty=may_be_empty)
 
+    def read_image(self, camera: str, frame: str) -> np.ndarray:
+        """Returns the picture (H, W, 3), red, green, blue, of a camera's frame.
+
+        Raises:
+            UnknownNameError: when there is no such camera, or it has no such picture.
+            SceneError: when the file is no picture of the camera's size.
+        """
+        if (camera, frame) not in self.images:
+            known = sorted(name for owner, name in self.images if owner == camera)
+            raise UnknownNameError("frame", frame, known, f"{self.path}: camera '{camera}'")
+        file, size = self.images[camera, frame], self.cameras[camera]
+        try:
+            data = np.frombuffer(read_regular(file), np.uint8)
+        except OSError as error:
+            raise SceneError(f"{file}: cannot be read: {error}") from error
+        picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+        if picture is None:
+            raise SceneError(f"{file}: is no picture that can be read")
+        if picture.shape[:2] != (size.height, size.width):
+            raise SceneError(
+                f"{file}: is {picture.shape[1]} x {picture.shape[0]} pixels, but camera "
+                f"'{camera}' has {size.width} x {size.height}"
+            )
+        return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
+
 
 def load_scene(path: str | Path, cameras: Mapping[str, Camera] | None = None) -> Scene:
     """Reads what a scene's folder holds; masks are read when they are asked for.
 
     The folder has `cameras.yaml`, `masks/<camera>/<frame>.png` and perhaps `scene.yaml`
-    (`sequence: true|false`, `frame_rate_hz`). With a single camera the masks may lie in
-    `masks/<frame>.png`. Such masks need no camera file: without one they were taken by a camera
-    that nobody knows, or by several where the pictures' sizes differ. Masks of cameras that are not
-    in the camera file are left over, see `Scene.leftovers`.
+    (`sequence: true|false`, `frame_rate_hz`). A sequence may have pictures
+    `images/<camera>/<frame>.png` or `.jpg` where it has no masks. With a single camera the masks
+    may lie in `masks/<frame>.png`. Such masks need no camera file: without one they were taken by
+    a camera that nobody knows, or by several where the pictures' sizes differ. Masks of cameras
+    that are not in the camera file are left over, see `Scene.leftovers`.
 
     Args:
         path: the folder.
@@ -118,16 +156,25 @@ def load_scene(path: str | Path, cameras: Mapping[str, Camera] | None = None) ->
             cameras, files = _unknown_cameras(folder)
             return Scene(folder, cameras, files.frames, files.masks, sequence, frame_rate_hz, True)
         cameras = load_cameras(folder / "cameras.yaml")
-    files = find_masks(folder, cameras)
+    images = find_images(folder, cameras) if sequence else {}
+    files = SceneFiles({}, ()) if images and not _has_masks(folder) else find_masks(folder, cameras)
+    if all(key in files.masks for key in images):
+        images = {}
+    frames = sorted({*files.frames, *(frame for _, frame in images)}, key=natural_key)
     return Scene(
         folder,
         dict(cameras),
-        files.frames,
+        tuple(frames) if images else files.frames,
         files.masks,
         sequence,
         frame_rate_hz,
         leftovers=files.leftovers,
+        images=images,
     )
+
+
+def _has_masks(folder: Path) -> bool:
+    return (folder / "masks").is_dir()
 
 
 def _unknown_cameras(folder: Path) -> tuple[dict[str, Camera], SceneFiles]:

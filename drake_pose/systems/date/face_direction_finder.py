@@ -9,7 +9,7 @@ from pydrake.systems.sensors import ImageRgba8U
 
 from drake_pose.camera import Camera
 from drake_pose.multiview.date.faces import FaceTemplates, find_face
-from drake_pose.systems.pictures.colour_images import colour_image_to_picture
+from drake_pose.systems.colour_images import colour_image_to_picture
 
 
 class FaceDirectionFinder(LeafSystem):

@@ -14,7 +14,7 @@ from drake_pose.multiview.date.capture import see_person
 from drake_pose.multiview.date.skin_blobs import SkinColour
 from drake_pose.silhouette import label_image_to_mask
 from drake_pose.silhouette.segmentation.background import Background, person_region
-from drake_pose.systems.pictures.colour_images import colour_image_to_picture
+from drake_pose.systems.colour_images import colour_image_to_picture
 
 Picture = NDArray[np.uint8]
 

@@ -1,6 +1,6 @@
 """Ready diagrams: a simulated camera or recorded masks, the matcher, the estimated body, logs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,7 +35,7 @@ from drake_pose.systems.bodies.posed_geometry import pose_plant
 from drake_pose.systems.bodies.skin import add_meshcat_skin, add_skin
 from drake_pose.systems.estimators.mask_player import MaskPlayer
 from drake_pose.systems.estimators.silhouette_matcher import SilhouetteMatcher, label_image_port
-from drake_pose.systems.estimators.silhouette_tracker import SilhouetteTracker
+from drake_pose.systems.estimators.silhouette_tracker import SilhouetteTracker, color_image_port
 
 ESTIMATE_COLOUR = Rgba(0.0, 0.45, 0.70, 0.6)
 _RENDERER = "label_renderer"
@@ -68,6 +68,7 @@ def build_recorded_matching(
     root_positions: Mapping[str, np.ndarray] | None = None,
     meshcat: Meshcat | None = None,
     tracking: TrackingSettings | None = None,
+    starts: Mapping[str, np.ndarray] | None = None,
 ) -> MatchingDiagram:
     """Wire recorded masks to the matcher: MaskPlayer -> SilhouetteMatcher -> logs, Meshcat.
 
@@ -81,17 +82,25 @@ def build_recorded_matching(
         meshcat: where to show the estimated body; nowhere where not given.
         tracking: how the body moves from frame to frame: it is matched in the first one, tracked
             from there, and matched again after a loss. Every frame is matched where not given.
+        starts: (nq,) by frame where the body is known to be: a track begins there, also after a
+            loss, without a search.
 
     Returns:
         The diagram; frame k is matched at time k times the player's period.
     """
     builder = DiagramBuilder()
-    player = builder.AddNamedSystem("mask_player", MaskPlayer(scene, cameras, frames))
+    played = MaskPlayer(scene, cameras, frames, positions=starts)
+    player = builder.AddNamedSystem("mask_player", played)
     matcher = builder.AddNamedSystem(
-        "silhouette_matcher", _make_matcher(search, cameras, player.period, tracking)
+        "silhouette_matcher",
+        _make_matcher(search, cameras, player.period, tracking, player.color_cameras),
     )
-    for camera in cameras:
-        port = label_image_port(camera, cameras)
+    ports = [label_image_port(camera, cameras) for camera in cameras]
+    if tracking is not None:
+        seen = [camera for camera in cameras if camera.name in player.color_cameras]
+        ports += [color_image_port(camera, cameras) for camera in seen]
+        ports += ["measured_positions"] if starts else []
+    for port in ports:
         builder.Connect(player.GetOutputPort(port), matcher.GetInputPort(port))
     if root_positions is not None:
         values = np.array([root_positions[frame] for frame in player.frames], dtype=float)
@@ -200,10 +209,13 @@ def _make_matcher(
     cameras: Sequence[Camera],
     period: float,
     tracking: TrackingSettings | None,
+    color_cameras: Collection[str] = (),
 ) -> SilhouetteMatcher:
     if tracking is None:
         return SilhouetteMatcher(search, cameras, period)
-    return SilhouetteTracker(search, cameras, period, tracking=tracking)
+    return SilhouetteTracker(
+        search, cameras, period, tracking=tracking, color_cameras=color_cameras
+    )
 
 
 def _drake_camera(

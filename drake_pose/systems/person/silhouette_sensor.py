@@ -13,7 +13,7 @@ from drake_pose.multiview.person.silhouette_view import SilhouetteView, see_silh
 from drake_pose.multiview.recordings.person_capture import EDGE_POINTS
 from drake_pose.silhouette import label_image_to_mask
 from drake_pose.silhouette.segmentation.background import Background, person_region
-from drake_pose.systems.pictures.colour_images import colour_image_to_picture
+from drake_pose.systems.colour_images import colour_image_to_picture
 
 # The edge of a person's region is longer than this share of the picture's height.
 _LEAST_EDGE = 0.15

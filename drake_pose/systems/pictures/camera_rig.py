@@ -20,7 +20,7 @@ from drake_pose.camera.drake import camera_to_drake
 from drake_pose.errors import CameraError, UnknownNameError
 from drake_pose.silhouette import label_image_to_mask
 from drake_pose.systems.bodies.posed_geometry import pose_plant
-from drake_pose.systems.pictures.colour_images import colour_image_to_picture
+from drake_pose.systems.colour_images import colour_image_to_picture
 
 _RENDERER = "rig_renderer"
 # What 16 bits of millimetres can hold; nothing of a room is farther away [m].

@@ -25,7 +25,7 @@ from drake_pose.camera.sources.frame_source import Clock, FrameSource, TimedPict
 from drake_pose.camera.sources.synchroniser import CameraChange, Moment, Synchroniser
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.silhouette.pictures.label_images import fill_label_image
-from drake_pose.systems.pictures.colour_images import fill_colour_image
+from drake_pose.systems.colour_images import fill_colour_image
 
 USUAL_RATE_HZ = 30.0
 """Pictures a second where no source says."""

@@ -1,7 +1,5 @@
 """A body before a room of colours, painted over Drake's label images: the truth is known."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -11,7 +9,7 @@ from drake_pose.matching.fit.colour_lines import BESIDE, COLOURS, ON
 from drake_pose.matching.fit.colours import ColourSettings
 from drake_pose.silhouette import LabelRenderer
 from tests.filtering.tracking.test_match_and_track import PERIOD, swings
-from tests.matching.bodies import forked_body, front_camera
+from tests.matching.bodies import forked_body, near_camera
 
 SIDE = 480
 ORANGE, GREEN = np.array([230, 130, 40]), np.array([60, 140, 60])
@@ -24,9 +22,7 @@ def body(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def camera():
-    """Of 300 pixels a metre: segments are 36 to 72 pixels wide and long."""
-    near = front_camera(SIDE, shift=0.2)
-    return replace(near, pixels_per_metre=300.0)
+    return near_camera(SIDE)
 
 
 @pytest.fixture(scope="module")

@@ -21,10 +21,10 @@ from drake_pose.multiview.date.features import find_features
 from drake_pose.multiview.date.recognition import recognise
 from drake_pose.multiview.date.skeleton import LIMBS
 from drake_pose.silhouette.segmentation.background import person_region
+from drake_pose.systems.colour_images import picture_to_colour_image
 from drake_pose.systems.date.capture import build_paper_capture
 from drake_pose.systems.date.pose_estimator import PaperPoseEstimator
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
-from drake_pose.systems.pictures.colour_images import picture_to_colour_image
 from drake_pose.systems.pictures.picture_capture import PictureCapture
 from tests.multiview.studio import shared_studio
 

@@ -10,15 +10,15 @@ from drake_pose.multiview.date.capture import see_person
 from drake_pose.multiview.date.skin_blobs import SkinColour
 from drake_pose.silhouette import mask_to_label_image
 from drake_pose.silhouette.segmentation.background import learn_background, person_region
+from drake_pose.systems.colour_images import (
+    colour_image_to_picture,
+    picture_to_colour_image,
+)
 from drake_pose.systems.date.face_direction_finder import FaceDirectionFinder
 from drake_pose.systems.date.feature_finder import FeatureFinder
 from drake_pose.systems.date.horizontal_image import HorizontalImage
 from drake_pose.systems.date.pose_recogniser import PoseRecogniser
 from drake_pose.systems.date.preparation import prepare_paper_capture
-from drake_pose.systems.pictures.colour_images import (
-    colour_image_to_picture,
-    picture_to_colour_image,
-)
 from tests.multiview.studio import shared_studio
 
 

@@ -21,9 +21,9 @@ from drake_pose.multiview.date.capture import CaptureSetup
 from drake_pose.multiview.date.skeleton import LIMBS
 from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker, TrackState
 from drake_pose.silhouette.segmentation.background import Background
+from drake_pose.systems.colour_images import picture_to_colour_image
 from drake_pose.systems.date.capture import PaperCapture, build_paper_capture
 from drake_pose.systems.person.silhouette_capture import SilhouetteCapture, build_silhouette_capture
-from drake_pose.systems.pictures.colour_images import picture_to_colour_image
 from drake_pose.systems.staged_diagram import StagedDiagram
 
 Array = NDArray[np.float64]

@@ -1,0 +1,130 @@
+"""A sequence of pictures without masks, painted over Drake's label images."""
+
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from drake_pose.apps.estimate.scene import estimate_scene
+from drake_pose.apps.settings import EstimateSettings
+from drake_pose.camera import save_cameras
+from drake_pose.errors import SceneError, SettingsError
+from drake_pose.silhouette import LabelRenderer, load_scene
+from tests.filtering.tracking.test_colours import painted, room
+from tests.filtering.tracking.test_match_and_track import swings
+from tests.matching.bodies import forked_body, near_camera
+
+FRAMES = 8
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """A scene of pictures, the model's file, the true positions, and a file of the first ones."""
+    folder = tmp_path_factory.mktemp("recording")
+    model, camera = forked_body(folder), near_camera()
+    generator = np.random.default_rng(9)
+    background = room(generator)
+    truth = swings(FRAMES, np.array([0.1, 0.9, -0.8]), 0.25, generator)
+    scene = folder / "scene"
+    (scene / "images" / "front").mkdir(parents=True)
+    renderer = LabelRenderer(model, camera)
+    for k, q in enumerate(truth):
+        picture = painted(renderer.mask(q), background, generator)
+        cv2.imwrite(str(scene / "images" / "front" / f"{k:04d}.png"), picture[..., ::-1])
+    save_cameras(scene / "cameras.yaml", [camera])
+    (scene / "scene.yaml").write_text("sequence: true\nframe_rate_hz: 30\n")
+    start = folder / "start.csv"
+    rows = [",".join(["frame", *model.position_names]), ",".join(map(str, [0, *truth[0]]))]
+    start.write_text("\n".join(rows))
+    cv2.imwrite(str(folder / "first.png"), 255 * renderer.mask(truth[0]).astype(np.uint8))
+    return scene, model.path, truth, start
+
+
+def errors(estimate, truth):
+    """(frames,) the greatest error of each frame [deg]."""
+    found = np.array([row.q for row in estimate.rows])
+    return np.degrees(np.abs(found - truth).max(axis=1))
+
+
+def test_pictures_and_a_start_are_enough(recording):
+    scene, model, truth, start = recording
+    estimate = estimate_scene(scene, model, settings=EstimateSettings(start=start))
+    assert estimate.found_count == FRAMES
+    assert np.median(errors(estimate, truth)) < 1.5
+
+
+@pytest.mark.slow
+def test_pictures_and_a_mask_of_the_first_frame_are_enough(recording, tmp_path):
+    scene, model, truth, _ = recording
+    copy = tmp_path / "scene"
+    shutil.copytree(scene, copy)
+    (copy / "masks" / "front").mkdir(parents=True)
+    shutil.copy(scene.parent / "first.png", copy / "masks" / "front" / "0000.png")
+    estimate = estimate_scene(copy, model)
+    assert estimate.found_count == FRAMES
+    assert np.median(errors(estimate, truth)) < 1.5
+
+
+def test_nothing_says_where_the_body_is_at_first(recording):
+    scene, model, _, _ = recording
+    with pytest.raises(SceneError, match=r"'0000'.*masks/front/0000\.png.*--start"):
+        estimate_scene(scene, model)
+
+
+def test_a_start_of_another_frame_is_refused(recording):
+    scene, model, _, start = recording
+    settings = EstimateSettings(start=start, frames=("0003:0005",))
+    with pytest.raises(SceneError, match=r"start\.csv.*'0003'"):
+        estimate_scene(scene, model, settings=settings)
+
+
+def test_pictures_without_masks_are_refused_where_nothing_is_tracked(recording):
+    scene, model, _, start = recording
+    with pytest.raises(SettingsError, match="sequence: true"):
+        estimate_scene(scene, model, settings=EstimateSettings(start=start, track=False))
+    with pytest.raises(SettingsError, match="--no-track"):
+        estimate_scene(scene, model, settings=EstimateSettings(track=False))
+
+
+def test_a_bad_picture_is_met_before_the_work_begins(recording, tmp_path):
+    scene, model, _, start = recording
+    copy = tmp_path / "scene"
+    shutil.copytree(scene, copy)
+    cv2.imwrite(str(copy / "images" / "front" / "0005.png"), np.zeros((10, 20, 3), np.uint8))
+    with pytest.raises(SceneError, match=r"0005\.png.*20 x 10"):
+        estimate_scene(copy, model, tmp_path / "out", EstimateSettings(start=start))
+    (copy / "images" / "front" / "0005.png").write_bytes(b"no picture")
+    with pytest.raises(SceneError, match=r"0005\.png"):
+        estimate_scene(copy, model, tmp_path / "out", EstimateSettings(start=start))
+    assert not (tmp_path / "out" / "poses.csv").exists()
+
+
+def test_an_interrupted_sequence_of_pictures_is_not_resumed_in_the_middle(recording, tmp_path):
+    scene, model, _, start = recording
+    settings = EstimateSettings(start=start)
+
+    def stop(done, total, frame, record):
+        if done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        estimate_scene(scene, model, tmp_path / "out", settings, on_frame=stop, overlay=False)
+    with pytest.raises(SettingsError, match="another folder"):
+        estimate_scene(scene, model, tmp_path / "out", settings, resume=True)
+
+
+def test_stills_have_no_pictures_and_full_masks_need_none(recording, tmp_path):
+    scene, _, _, _ = recording
+    copy = tmp_path / "scene"
+    shutil.copytree(scene, copy)
+    (copy / "masks" / "front").mkdir(parents=True)
+    for k in range(FRAMES):
+        shutil.copy(scene.parent / "first.png", copy / "masks" / "front" / f"{k:04d}.png")
+    assert not load_scene(copy).images
+    (copy / "masks" / "front" / "0007.png").unlink()
+    assert load_scene(copy).images
+    (copy / "scene.yaml").write_text("sequence: false\n")
+    found = load_scene(copy)
+    assert not found.images
+    assert len(found.frames) == FRAMES - 1

@@ -19,10 +19,9 @@ from drake_pose.apps.commands.estimate_options import (
 from drake_pose.apps.commands.register import JointsOption
 from drake_pose.apps.commands.terminal import (
     errors_as_messages,
-    print_json,
+    print_result,
     say,
     usage_errors,
-    warn,
 )
 from drake_pose.apps.options import parse_assignments, parse_packages
 
@@ -72,12 +71,7 @@ def audit(
                 scene, model, joints, out, settings, cameras=cameras, overlay=overlay,
                 on_frame=advance,
             )  # fmt: skip
-        for text in result.warnings:
-            warn(text)
-        if json:
-            print_json(result.summary)
-        else:
-            _print(result)
+        print_result(result, json, _print)
 
 
 def _print(result: SceneAudit) -> None:

@@ -6,7 +6,12 @@ from pathlib import Path
 
 import typer
 
-from drake_pose.apps.commands.terminal import FAILED, errors_as_messages, print_json, say, warn
+from drake_pose.apps.commands.terminal import (
+    FAILED,
+    errors_as_messages,
+    print_result,
+    say,
+)
 from drake_pose.apps.settings import EstimateSettings
 
 
@@ -33,12 +38,7 @@ def run_estimate(
                 scene, model, out, settings, truth=truth, resume=resume, replay=replay,
                 overlay=overlay, on_frame=progress, on_stage=progress.show_stage,
             )  # fmt: skip
-        for text in result.warnings:
-            warn(text)
-        if json:
-            print_json(result.summary)
-        else:
-            print_estimate(result)
+        print_result(result, json, print_estimate)
         if result.found_count == 0:
             say("drake-pose: error: no pose was found in any frame")
             raise typer.Exit(FAILED)

@@ -10,10 +10,9 @@ import typer
 from drake_pose.apps.commands.estimate_options import HoldOption, JsonOption, PackageOption
 from drake_pose.apps.commands.terminal import (
     errors_as_messages,
-    print_json,
+    print_result,
     say,
     usage_errors,
-    warn,
 )
 from drake_pose.apps.options import (
     parse_assignments,
@@ -263,12 +262,7 @@ def _run(
 
     with count_progress("masks", None) as advance:
         result = make_masks(source, out, settings, overlay=overlay, on_mask=advance, on_page=show)
-    for text in result.warnings:
-        warn(text)
-    if json:
-        print_json(result.summary)
-    else:
-        _print(result)
+    print_result(result, json, _print)
 
 
 def _print(result: SceneMasks) -> None:

@@ -17,7 +17,11 @@ from drake_pose.apps.commands.estimate_options import (
     OverlayOption,
     PackageOption,
 )
-from drake_pose.apps.commands.terminal import errors_as_messages, print_json, usage_errors, warn
+from drake_pose.apps.commands.terminal import (
+    errors_as_messages,
+    print_result,
+    usage_errors,
+)
 from drake_pose.apps.options import parse_assignments, parse_box, parse_packages
 
 if TYPE_CHECKING:
@@ -157,12 +161,7 @@ def register(
             result = register_scene(
                 scene, model, joints, out, settings, overlay=overlay, on_camera=advance
             )
-        for text in result.warnings:
-            warn(text)
-        if json:
-            print_json(result.summary)
-        else:
-            _print(result)
+        print_result(result, json, _print)
 
 
 def _print(result: SceneRegistration) -> None:

@@ -4,16 +4,29 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, Protocol, TypeVar
 
 import typer
 
 from drake_pose.errors import DrakePoseError
 
 FAILED = 1
+
+
+class _Result(Protocol):
+    """What a command's work comes to."""
+
+    @property
+    def warnings(self) -> Sequence[str]: ...
+
+    @property
+    def summary(self) -> Mapping[str, Any]: ...
+
+
+_R = TypeVar("_R", bound=_Result)
 
 
 @contextmanager
@@ -69,6 +82,16 @@ def print_json(value: Mapping[str, Any]) -> None:
     from drake_pose.apps.results.folder import without_nan
 
     typer.echo(json.dumps(without_nan(value), indent=2, ensure_ascii=False, allow_nan=False))
+
+
+def print_result(result: _R, json: bool, print_text: Callable[[_R], None]) -> None:
+    """Writes a result's warnings to stderr and, to stdout, its summary as JSON or its text."""
+    for text in result.warnings:
+        warn(text)
+    if json:
+        print_json(result.summary)
+    else:
+        print_text(result)
 
 
 def _fail(message: str) -> NoReturn:

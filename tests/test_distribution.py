@@ -37,7 +37,8 @@ def test_what_is_in_them(built: tuple[Path, Path]) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
     assert {"drake_pose/compiled.py", "drake_pose/urdf/man/man.urdf"} <= names
-    assert "drake_pose/tutorials/data/human/NOTICE" in names
+    for scene in ("human", "experiment_b", "experiment_c"):
+        assert f"drake_pose/tutorials/data/{scene}/NOTICE" in names
     assert not [name for name in names if name.startswith("tests/") or name.endswith(".nbi")]
     with tarfile.open(source) as archive:
         parts = {Path(name).parts[1] for name in archive.getnames()}

@@ -100,7 +100,7 @@ MAY_KNOW_INSIDE = {
         "estimate": {"results"},
         "demo": {"estimate", "results"},
         "registration": {"estimate", "results"},
-        "experiments": {"results"},
+        "experiments": {"demo", "estimate", "results"},
         "live": {"experiments", "estimate", "results"},
         "masks": {"live", "registration", "estimate", "results"},
         "cluster": {"live"},

@@ -16,20 +16,23 @@ ROOT = "right_foot"
 ANKLE = "right_ankle"
 
 
-def demo_scene() -> Path:
-    """Returns the stored scene's folder, in a checkout or inside the installed package.
+def stored_scene(name: str) -> Path:
+    """Returns a stored scene's folder, in a checkout or inside the installed package.
 
     Raises:
         SceneError: if it is in neither place.
     """
     package = Path(__file__).resolve().parents[1]
-    for folder in (
-        package.parent / "tutorials" / "data" / "human",
-        package / "tutorials" / "data" / "human",
-    ):
+    for root in (package.parent, package):
+        folder = root / "tutorials" / "data" / name
         if (folder / "cameras.yaml").is_file():
             return folder
-    raise SceneError("the demonstration's pictures are missing; install drake_pose again")
+    raise SceneError(f"the stored pictures '{name}' are missing; install drake_pose again")
+
+
+def demo_scene() -> Path:
+    """Returns the demonstration's scene."""
+    return stored_scene("human")
 
 
 def demo_settings(scene: Path) -> EstimateSettings:

@@ -235,7 +235,7 @@ An experiment that is finished is kept: after Ctrl-C, --resume goes on with the 
 """)
 
 KAMEDA = _help("""
-Kameda, Minoh and Ikeda, experiment A: random poses of a woman, one silhouette each.
+Kameda, Minoh and Ikeda, experiment A: random poses of a woman, one silhouette each; B and C below.
 
 Every angle is drawn at random inside its limits, the silhouette is rendered (700 x 700 pixels,
 parallel projection, 2.26 pixels a centimetre), and the pose is searched given nothing but the
@@ -260,6 +260,14 @@ the samples; every angle gets a 95 % interval, or is called free. --views N uses
 apply there.
 
     drake-pose reproduce kameda --angles continuous --views 2 --images 20
+
+[bold]Experiments B and C:[/bold] real silhouettes, one camera
+
+B is a man, the position of whose right ankle is known; C a hand, that of whose wrist is known; the
+models are of other people. Both methods search every picture for itself; --out keeps the poses and
+overlays of each.
+
+    drake-pose reproduce kameda --experiment B --out results/experiment_b
 """)
 
 SHIMADA = _help("""

@@ -16,6 +16,7 @@ from drake_pose.apps.commands.terminal import (
     print_json,
     say,
     usage_errors,
+    warn,
 )
 from drake_pose.apps.settings import EstimateSettings
 
@@ -24,13 +25,26 @@ if TYPE_CHECKING:
     from drake_pose.apps.experiments.kameda.experiment import ExperimentResult
     from drake_pose.matching import PoseSearch
 
+# What is about experiment A alone.
+_OF_A = (
+    "seed", "seeds", "method", "angles", "outside_limit", "outside_weight", "candidates",
+    "interval", "views", "mismatch", "edges",
+)  # fmt: skip
 # What is about the grid of angles, which continuous ones have none of.
 _OF_GRID = (
     "seeds", "method", "outside_limit", "outside_weight", "candidates", "interval", "edges", "out",
 )  # fmt: skip
 
 
-ImagesOption = Annotated[int, typer.Option(min=1, help="Number of silhouettes.")]
+ExperimentOption = Annotated[
+    str,
+    typer.Option(
+        help="A: random poses, drawn; B: six pictures of a person; C: two pictures of a hand."
+    ),
+]
+ImagesOption = Annotated[
+    int, typer.Option(min=1, help="Number of silhouettes; of B and C all that there are or fewer.")
+]
 SeedOption = Annotated[int, typer.Option(min=0, help="Seed of the random poses.")]
 SeedsOption = Annotated[
     int, typer.Option(min=1, help="Run this many seeds, and show how far the figures spread.")
@@ -95,6 +109,7 @@ EdgesOption = Annotated[
 
 def kameda(
     context: typer.Context,
+    experiment: ExperimentOption = "A",
     images: ImagesOption = 219,
     seed: SeedOption = 0,
     seeds: SeedsOption = 1,
@@ -111,19 +126,23 @@ def kameda(
     json: JsonOption = False,
 ) -> None:
     """See help_texts.KAMEDA."""
+    if experiment not in ("A", "B", "C"):
+        raise typer.BadParameter("must be A, B or C", param_hint="--experiment")
+    if experiment != "A":
+        _refuse(context, _OF_A, "needs --experiment A")
+        with errors_as_messages(out):
+            _run_on_pictures(experiment, images, out, json)
+        return
     with usage_errors():
         EstimateSettings(method=method)
     if angles not in ("grid", "continuous"):
         raise typer.BadParameter("must be grid or continuous", param_hint="--angles")
     if edges and method != "beam":
         raise typer.BadParameter("needs --method beam", param_hint="--edges")
-    others = _OF_GRID if angles == "continuous" else ("views", "mismatch")
-    for name in others:
-        if str(getattr(context.get_parameter_source(name), "name", "")) == "COMMANDLINE":
-            needed = "grid" if angles == "continuous" else "continuous"
-            raise typer.BadParameter(
-                f"needs --angles {needed}", param_hint=f"--{name.replace('_', '-')}"
-            )
+    if angles == "continuous":
+        _refuse(context, _OF_GRID, "needs --angles grid")
+    else:
+        _refuse(context, ("views", "mismatch"), "needs --angles continuous")
     if angles == "grid":
         with errors_as_messages():
             runs = GridRuns(
@@ -133,6 +152,42 @@ def kameda(
         return
     with errors_as_messages():
         _print_continuous(_run_beside(images, seed, views, mismatch), json)
+
+
+def _refuse(context: typer.Context, names: Sequence[str], why: str) -> None:
+    """Refuses options that were given and mean nothing here."""
+    for name in names:
+        if str(getattr(context.get_parameter_source(name), "name", "")) == "COMMANDLINE":
+            raise typer.BadParameter(why, param_hint=f"--{name.replace('_', '-')}")
+
+
+def _run_on_pictures(experiment: str, images: int, out: Path | None, json: bool) -> None:
+    """Run both methods on the stored pictures, and print what they found; shows progress."""
+    from drake_pose.apps.commands.report import count_progress, output_console
+    from drake_pose.apps.experiments.kameda.real_pictures import (
+        METHODS,
+        picture_names,
+        real_table,
+        run_real_experiment,
+    )
+    from drake_pose.apps.results.folder import require_empty
+
+    if out is not None:
+        require_empty(out)
+    frames = picture_names(experiment)[:images]
+    results = []
+    for method, name in METHODS.items():
+        folder = None if out is None else out / method
+        with count_progress(f"pictures, {name}", len(frames)) as advance:
+            results.append(run_real_experiment(experiment, method, frames, folder, advance))
+    for result in results:
+        for text in result.warnings:
+            warn(f"{METHODS[result.method]}: {text}")
+    if json:
+        paper, ours = (result.as_json() for result in results)
+        print_json({**ours, "paper_method": paper})
+    else:
+        output_console().print(real_table(results))
 
 
 def _run_beside(images: int, seed: int, views: int, mismatch: bool) -> dict[str, ContinuousResult]:

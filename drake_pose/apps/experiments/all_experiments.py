@@ -10,6 +10,7 @@ import os
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,12 @@ from drake_pose.apps.experiments.kameda.experiment import (
 )
 from drake_pose.apps.experiments.kameda.experiment import run_experiment as run_kameda
 from drake_pose.apps.experiments.kameda.pictures import save_pictures as save_kameda
+from drake_pose.apps.experiments.kameda.real_pictures import (
+    METHODS,
+    picture_names,
+    real_table,
+    run_real_experiment,
+)
 from drake_pose.apps.experiments.kameda.table import experiment_table
 from drake_pose.apps.experiments.shimada.experiment import run_experiment as run_shimada
 from drake_pose.apps.experiments.shimada.pictures import save_pictures as save_shimada
@@ -101,6 +108,22 @@ def _kameda_continuous(short: bool, folder: Path, count: Count) -> Outcome:
     return Outcome(result.as_json(), [continuous_table({"one view": result})])
 
 
+def _kameda_pictures(experiment: str, short: bool, folder: Path, count: Count) -> Outcome:
+    frames = picture_names(experiment)[: 1 if short else None]
+    results = [
+        run_real_experiment(
+            experiment,
+            method,
+            frames,
+            folder / method,
+            count(f"Kameda {experiment}, {name}", len(frames)),
+        )
+        for method, name in METHODS.items()
+    ]
+    figures = {result.method: result.as_json() for result in results}
+    return Outcome(figures, [real_table(results)])
+
+
 def _shimada(short: bool, folder: Path, count: Count) -> Outcome:
     runs = 1 if short else 50
     figures, shown = {}, []
@@ -134,6 +157,18 @@ EXPERIMENTS = (
         "Kameda, Minoh, Ikeda: pose from one silhouette, experiment A",
         "drake-pose reproduce kameda --method beam --outside-weight 10",
         _kameda,
+    ),
+    Experiment(
+        "kameda_b",
+        "Kameda's experiment B: a person in real pictures",
+        "drake-pose reproduce kameda --experiment B",
+        partial(_kameda_pictures, "B"),
+    ),
+    Experiment(
+        "kameda_c",
+        "Kameda's experiment C: a hand in real pictures",
+        "drake-pose reproduce kameda --experiment C",
+        partial(_kameda_pictures, "C"),
     ),
     Experiment(
         "kameda_continuous",

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console, RenderableType
+from rich.text import Text
 
 from drake_pose.apps.experiments.date.experiment import run_experiment as run_date
 from drake_pose.apps.experiments.date.pictures import save_pictures as save_date
@@ -121,7 +122,12 @@ def _kameda_pictures(experiment: str, short: bool, folder: Path, count: Count) -
         for method, name in METHODS.items()
     ]
     figures = {result.method: result.as_json() for result in results}
-    return Outcome(figures, [real_table(results)])
+    warnings = [
+        Text(f"Warning: {METHODS[result.method]}: {text}")
+        for result in results
+        for text in result.warnings
+    ]
+    return Outcome(figures, [real_table(results), *warnings])
 
 
 def _shimada(short: bool, folder: Path, count: Count) -> Outcome:

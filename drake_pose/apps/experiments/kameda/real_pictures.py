@@ -93,6 +93,7 @@ class RealResult:
             "seconds_an_image": self.cpu_seconds / len(self.records),
             "paper_images": REAL_EXPERIMENTS[self.experiment].paper_images,
             "paper_mean_e_total": REAL_EXPERIMENTS[self.experiment].paper_E_total,
+            "warnings": list(self.warnings),
         }
 
 

@@ -166,13 +166,13 @@ EXPERIMENTS = (
     ),
     Experiment(
         "kameda_b",
-        "Kameda's experiment B: a person in real pictures",
+        "Kameda, Minoh, Ikeda, experiment B: a person in real pictures",
         "drake-pose reproduce kameda --experiment B",
         partial(_kameda_pictures, "B"),
     ),
     Experiment(
         "kameda_c",
-        "Kameda's experiment C: a hand in real pictures",
+        "Kameda, Minoh, Ikeda, experiment C: a hand in real pictures",
         "drake-pose reproduce kameda --experiment C",
         partial(_kameda_pictures, "C"),
     ),

@@ -29,6 +29,7 @@ from drake_pose.matching.fit.colours import (
     Picture,
     add_pictures,
     check_picture,
+    furthest_part,
     learned,
     no_colours,
 )
@@ -127,6 +128,8 @@ class ContourMeasurement:
         at: (n,) the state.
         share: of the contour that the model shows, what has an edge beside it.
         distance: root mean square of their distances, robustly weighted [pixel].
+        part_distance: that of the part which is furthest off in the pictures [pixel]; 0: none were
+            compared.
     """
 
     names: tuple[str, ...]
@@ -135,6 +138,7 @@ class ContourMeasurement:
     at: Array
     share: float
     distance: float
+    part_distance: float
 
     @property
     def variances(self) -> Array:
@@ -472,7 +476,11 @@ class ContourObservation:
         if distance is not None:
             width = min(width, _ROBUST_WIDTH * max(self.settings.deviation, distance))
         found = self._compare(seen, x, width, number)
-        return None if found is None else self._compress(x, *found)
+        if found is None:
+            return None
+        shown = [picture is not None for picture in seen.pictures]
+        furthest = furthest_part(found[0].sums[shown]) if seen.has_pictures else 0.0
+        return self._compress(x, *found, furthest)
 
     def _compare(
         self, seen: Seen, x: Array, width: float, number: int
@@ -504,7 +512,9 @@ class ContourObservation:
         """X_WN (nodes, 4, 4) at a state (n,), scaled by its growth."""
         return self._body.place(self.parameters(x)).X_WN
 
-    def _compress(self, x: Array, compared: Comparison, distance: float) -> ContourMeasurement:
+    def _compress(
+        self, x: Array, compared: Comparison, distance: float, furthest: float
+    ) -> ContourMeasurement:
         """What the contours say as no more numbers than the state has elements, with noise 1."""
         settings = self.settings
         H, g = project(compared, len(self._body.names))
@@ -528,4 +538,5 @@ class ContourObservation:
             at=x,
             share=float(contour[FITTING] / max(contour[COMPARED], 1e-9)),
             distance=distance,
+            part_distance=furthest,
         )

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,8 +45,9 @@ class TrackingSettings:
         rounds: how often the contour is compared anew in each frame.
         lost_distance: the track is lost when the contour and the masks' edge are further apart
             than this [pixel].
-        lost_colour_distance: and where pictures are compared, further than this [pixel]: lines are
-            looked at so closely that a wrong pose cannot put them much further off.
+        lost_colour_distance: and where pictures are compared, further than this at any part
+            [pixel]: lines are looked at so closely that a wrong pose cannot put them much further
+            off.
         lost_share: and when a smaller share of the contour than this has an edge beside it.
         lost_growth: and when E_total is this many times what it was after the last match ...
         lost_margin: ... and larger than that by this.
@@ -210,6 +211,8 @@ class ContourTracker:
             shown = any(one is not None for one in (*masks, *(pictures or ())))
             return Track(state, None, track.lost or shown, colours)
         lost = self._is_lost(measurement, seen)
+        if lost and seen.has_pictures:
+            state = self._unsure(prediction, state)
         if pictures is not None and colours is not None and not lost:
             colours = observation.learn(pictures, state.best.mean, colours)
         return Track(state, measurement, lost, colours)
@@ -238,8 +241,23 @@ class ContourTracker:
 
     def _is_lost(self, measurement: ContourMeasurement, seen: Seen) -> bool:
         settings = self.settings
-        furthest = settings.lost_colour_distance if seen.has_pictures else settings.lost_distance
-        return measurement.distance > furthest or measurement.share < settings.lost_share
+        distance, furthest = measurement.distance, settings.lost_distance
+        if seen.has_pictures:
+            # A wrist that is off is little of the whole contour.
+            distance = max(distance, measurement.part_distance)
+            furthest = settings.lost_colour_distance
+        return distance > furthest or measurement.share < settings.lost_share
+
+    def _unsure(self, prediction: FilterState, state: FilterState) -> FilterState:
+        """Where lines of a lost track lead to, as unsure as if they had not been seen.
+
+        They may be those of something else, all of them together: by how much they have moved the
+        state is not known of it either.
+        """
+        expected, found = prediction.best, state.best.mean
+        moved = found - expected.mean
+        belief = Belief(found, expected.covariance + np.outer(moved, moved))
+        return replace(self.filter.start(belief), step=state.step)
 
 
 class _Nothing:

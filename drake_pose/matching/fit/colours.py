@@ -16,6 +16,7 @@ from drake_pose.camera import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.matching.fit.colour_lines import COLOURS, compare_lines, learn_colours
 from drake_pose.matching.fit.contour_fit import Comparison, Noise, camera_weights, pack_cameras
+from drake_pose.matching.fit.kernel import COMPARED, SQUARES, WEIGHT
 from drake_pose.matching.fit.levenberg_marquardt import Round
 from drake_pose.matching.fit.parameters import Placement
 
@@ -24,6 +25,9 @@ Histograms = NDArray[np.float32]
 """(cameras, nodes, 3, COLOURS) what is known of a body's colours in each camera's pictures."""
 
 Picture = NDArray[np.uint8]
+
+# A part is no closer to a contour than this [pixel], and is judged by no less of it [pixel].
+_CLOSE, _TELLING = 0.7, 20.0
 
 
 @dataclass(frozen=True)
@@ -119,6 +123,22 @@ def add_pictures(
                 placed.packed, placed.X_WN, (packed[0][c], packed[1][c]), picture, histograms[c],
                 weights[c], pixels, compared.A[c], compared.b[c], compared.sums[c],
             )  # fmt: skip
+
+
+def furthest_part(sums: Array) -> float:
+    """How far the part which is furthest off is from the contour that colours show [pixel].
+
+    What covers a part in one camera says nothing against it where another sees it: the mean over
+    cameras is that of one over the distances' squares. 0: of no part enough is said.
+
+    Args:
+        sums: (cameras, nodes + 1, 6) of pictures, as of `compare_contours`.
+    """
+    squares, weight, length = (sums[:, :-1, k] for k in (SQUARES, WEIGHT, COMPARED))
+    own = np.maximum(_CLOSE**2, squares / np.maximum(weight, 1e-12))
+    told = length.sum(axis=0)
+    distances = np.sqrt(told / np.maximum((length / own).sum(axis=0), 1e-12))
+    return float(np.max(distances, where=told >= _TELLING, initial=0.0))
 
 
 def learned(

@@ -6,7 +6,8 @@ import pytest
 from drake_pose.errors import SettingsError
 from drake_pose.filtering import ContourObservation, ContourTracker
 from drake_pose.matching.fit.colour_lines import BESIDE, COLOURS, ON
-from drake_pose.matching.fit.colours import ColourSettings
+from drake_pose.matching.fit.colours import ColourSettings, furthest_part
+from drake_pose.matching.fit.kernel import COMPARED, SQUARES, WEIGHT
 from drake_pose.silhouette import LabelRenderer
 from tests.filtering.tracking.test_match_and_track import PERIOD, swings
 from tests.matching.bodies import forked_body, near_camera
@@ -173,6 +174,40 @@ def test_a_covered_lens_is_a_loss_that_teaches_nothing(observation, renderer):
     dark = tracker.follow(track, [None], pictures=[np.zeros((SIDE, SIDE, 3), dtype=np.uint8)])
     assert dark.lost
     np.testing.assert_array_equal(dark.colours, track.colours)
+
+
+def test_a_lost_track_is_no_surer_than_its_motion_allows(observation, renderer):
+    """All lines may be those of something else: they tell nothing of where the body is."""
+    generator = np.random.default_rng(7)
+    background, truth = room(generator), np.array([0.2, 0.9, -0.6])
+    picture = painted(renderer.mask(truth), background, generator)
+    tracker = ContourTracker(observation, PERIOD)
+    track = tracker.start(observation.state(truth))
+    for k in range(3):
+        track = tracker.follow(track, [None], k == 0, pictures=[picture])
+    assert not track.lost
+    aside = painted(np.roll(renderer.mask(truth), 9, axis=1), background, generator)
+    expected = tracker.filter.predict(track.state).best
+    lost = tracker.follow(track, [None], pictures=[aside])
+    assert lost.lost
+    now = lost.state.best
+    assert np.all(now.deviations() >= 0.99 * expected.deviations())
+    assert np.all(np.abs(now.mean - expected.mean) <= 1.01 * now.deviations())
+    # Nor does it ever become surer while it is lost.
+    again = tracker.follow(lost, [None], pictures=[aside])
+    assert not again.lost or np.all(again.state.best.deviations() >= 0.99 * now.deviations())
+
+
+def test_a_part_is_as_far_off_as_the_cameras_that_see_it_well_say():
+    sums = np.zeros((2, 5, 6))
+    sums[..., COMPARED], sums[..., WEIGHT] = 50.0, 2.0
+    for node, distances in enumerate([(1.0, 1.0), (1.0, 9.0), (3.0, 4.0), (9.0, 9.0)]):
+        sums[:, node, SQUARES] = 2.0 * np.square(distances)
+    # Of the last part hardly anything is said.
+    sums[:, 3, COMPARED] = 5.0
+    assert furthest_part(sums) == pytest.approx(np.sqrt(2.0 / (1 / 9 + 1 / 16)))
+    assert furthest_part(sums[:, [0, 1, 3, 4]]) == pytest.approx(np.sqrt(2.0 / (1 + 1 / 81)))
+    assert furthest_part(np.zeros((2, 5, 6))) == 0.0
 
 
 @pytest.mark.parametrize(

@@ -241,5 +241,6 @@ SETTINGS: dict[str, Callable[[Any, str, Path], Any]] = {
     "angles": _text,
     "track": _yes_or_no,
     "packages": _packages,
+    "start": _path,
 }
 """How each setting of an estimate is read."""

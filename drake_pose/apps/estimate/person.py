@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from drake_pose.apps.estimate.capture_warnings import describe_faults
 from drake_pose.apps.estimate.inputs import Inputs
-from drake_pose.apps.estimate.mask_agreement import compare_masks
 from drake_pose.apps.estimate.result import OnFrame, OnStage, ResultWriter
 from drake_pose.apps.estimate.scene_checks import (
     SceneWarning,
@@ -26,6 +25,7 @@ from drake_pose.errors import MaskError
 from drake_pose.multiview.recordings.checked_capture import capture_checked
 from drake_pose.multiview.recordings.person_capture import PersonCapture, PersonCaptureSettings
 from drake_pose.silhouette import draw_labels
+from drake_pose.silhouette.pictures.mask_agreement import compare_masks
 
 Mask = NDArray[np.bool_]
 

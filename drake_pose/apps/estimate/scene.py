@@ -13,7 +13,6 @@ from pydrake.systems.analysis import Simulator
 from drake_pose.apps.estimate.body_fit import fit_body
 from drake_pose.apps.estimate.fit_checks import find_contradiction
 from drake_pose.apps.estimate.inputs import Inputs, read_inputs
-from drake_pose.apps.estimate.mask_agreement import compare_masks
 from drake_pose.apps.estimate.person import follow_person
 from drake_pose.apps.estimate.result import OnFrame, OnStage, ResultWriter, SceneEstimate
 from drake_pose.apps.estimate.sequence import sequence_tracking
@@ -26,6 +25,7 @@ from drake_pose.errors import SettingsError
 from drake_pose.matching import MatchResult, MultiStartSearch, PlacedMatch, PoseSearch, View
 from drake_pose.matching.starts.root_placement import scale_camera
 from drake_pose.silhouette import LabelRenderer
+from drake_pose.silhouette.pictures.mask_agreement import compare_masks
 from drake_pose.systems.estimators.diagrams import build_recorded_matching
 from drake_pose.systems.estimators.mask_player import DEFAULT_FRAME_RATE_HZ
 

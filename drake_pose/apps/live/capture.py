@@ -13,7 +13,6 @@ import numpy as np
 
 from drake_pose.apps.estimate.capture import bundled_person
 from drake_pose.apps.estimate.inputs import Inputs
-from drake_pose.apps.estimate.mask_agreement import compare_masks
 from drake_pose.apps.estimate.person import FOLLOWED
 from drake_pose.apps.estimate.result import ResultWriter, SceneEstimate
 from drake_pose.apps.live.run import FrameWatch, LiveFrame, Mask, run_live
@@ -30,6 +29,7 @@ from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker
 from drake_pose.multiview.recordings.known_shape import KnownShape, tracker_of_person
 from drake_pose.multiview.recordings.other_persons import keep_person
 from drake_pose.silhouette import Scene, draw_mask
+from drake_pose.silhouette.pictures.mask_agreement import compare_masks
 from drake_pose.systems.person.live_capture import LiveSensors, build_live_capture
 from drake_pose.systems.person.person_tracker import place_of_person
 from drake_pose.systems.pictures.picture_capture import CameraCount

@@ -25,6 +25,7 @@ from drake_pose.matching.fit.evidence import NO_EDGE, find_edge_points
 from drake_pose.matching.fit.levenberg_marquardt import Round
 from drake_pose.matching.fit.surfaces import VERY_FEW, few_triangles
 from drake_pose.silhouette import Outline, TreeSurfaces, draw_mask
+from drake_pose.silhouette.pictures.mask_agreement import intersection_over_union
 from drake_pose.silhouette.segmentation.background_beside import tell_from_background
 from drake_pose.silhouette.segmentation.grab_cut import cut
 
@@ -288,7 +289,7 @@ class PoseAndMask:
     def _agree(self, drawn: Sequence[Mask], masks: Sequence[Mask | None]) -> tuple[float, ...]:
         """IoU of silhouettes and masks; nan where there is no picture."""
         return tuple(
-            math.nan if mask is None else _iou(own, mask)
+            math.nan if mask is None else intersection_over_union(own, mask)
             for own, mask in zip(drawn, masks, strict=True)
         )
 
@@ -329,12 +330,6 @@ def follow_colours(silhouette: Mask, mask: Mask) -> Mask:
     return np.asarray(inner | (outer & mask))
 
 
-def _iou(one: Mask, other: Mask) -> float:
-    """Intersection over union of two masks."""
-    union = np.count_nonzero(one | other)
-    return np.count_nonzero(one & other) / union if union else 0.0
-
-
 def _narrowed(share: float, agreements: Sequence[float]) -> float:
     """How far off a pose may still be, as a share, after a round that agreed so well."""
     agreed = float(np.nanmin(np.array(agreements)))
@@ -346,7 +341,7 @@ def _narrowed(share: float, agreements: Sequence[float]) -> float:
 def _settled(drawn: Sequence[Sequence[Mask]], last: Sequence[Sequence[Mask]]) -> bool:
     """Whether no silhouette changes any more."""
     return all(
-        _iou(*pair) > _SETTLED
+        intersection_over_union(*pair) > _SETTLED
         for own, other in zip(drawn, last, strict=True)
         for pair in zip(own, other, strict=True)
     )

@@ -1,4 +1,4 @@
-"""How a frame's silhouettes and the body that was found agree, camera by camera."""
+"""How silhouettes agree with the body that was found in them."""
 
 from __future__ import annotations
 
@@ -21,6 +21,12 @@ class MaskAgreement:
     ious: Mapping[str, float]
 
 
+def intersection_over_union(one: np.ndarray, other: np.ndarray) -> float:
+    """Of two masks (H, W) bool; 1 where both are empty."""
+    either = int(np.count_nonzero(one | other))
+    return int(np.count_nonzero(one & other)) / either if either else 1.0
+
+
 def compare_masks(
     masks: Mapping[str, np.ndarray], bodies: Mapping[str, np.ndarray]
 ) -> MaskAgreement:
@@ -28,8 +34,7 @@ def compare_masks(
     wrong, area = 0, 0
     ious: dict[str, float] = {}
     for camera, mask in masks.items():
-        either = int(np.count_nonzero(mask | bodies[camera]))
-        both = int(np.count_nonzero(mask & bodies[camera]))
-        wrong, area = wrong + either - both, area + int(np.count_nonzero(mask))
-        ious[camera] = both / either if either else 1.0
+        wrong += int(np.count_nonzero(mask ^ bodies[camera]))
+        area += int(np.count_nonzero(mask))
+        ious[camera] = intersection_over_union(mask, bodies[camera])
     return MaskAgreement(wrong / area if area else float("nan"), ious)

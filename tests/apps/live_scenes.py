@@ -42,17 +42,22 @@ def absent(person: ArticulatedModel) -> np.ndarray:
 
 
 def write_studio(
-    folder: Path, person: ArticulatedModel, poses: list[np.ndarray], kind: str, cameras: int = 3
+    folder: Path,
+    person: ArticulatedModel,
+    poses: list[np.ndarray],
+    kind: str,
+    cameras: int = 3,
+    size: tuple[int, int] = SIZE,
 ) -> None:
     """Write what the cameras see: kind videos, with noise and backgrounds, or masks in folders."""
-    placed = circle_of_cameras(cameras, size=SIZE, radius=2.6, face_camera=False)
+    placed = circle_of_cameras(cameras, size=size, radius=2.6, face_camera=False)
     save_cameras(folder / "cameras.yaml", placed)
     rig = build_camera_rig(person, placed)
     context = rig.diagram.CreateDefaultContext()
     generator = np.random.default_rng(0)
 
     def picture(name: str) -> np.ndarray:
-        seen = rig.picture(context, name) + generator.normal(0.0, 2.0, (SIZE[1], SIZE[0], 3))
+        seen = rig.picture(context, name) + generator.normal(0.0, 2.0, (size[1], size[0], 3))
         return cv2.cvtColor(np.clip(seen, 0, 255).astype(np.uint8), cv2.COLOR_RGB2BGR)
 
     entries = {}
@@ -70,7 +75,7 @@ def write_studio(
         place = f"{name}.avi"
         entries[name] = {"kind": "video", "location": place, "background": f"empty/{name}"}
         fourcc = cv2.VideoWriter_fourcc(*"MJPG")
-        writers[name] = cv2.VideoWriter(str(folder / place), fourcc, RATE_HZ, SIZE)
+        writers[name] = cv2.VideoWriter(str(folder / place), fourcc, RATE_HZ, size)
     (folder / "sources.yaml").write_text(yaml.safe_dump(entries))
     for k, q in enumerate(poses):
         rig.set_positions(context, q)

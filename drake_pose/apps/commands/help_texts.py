@@ -339,6 +339,14 @@ there are no overlays.
 [bold]Example:[/bold]
 
     drake-pose capture STUDIO --out results/person --seconds 60
+
+[bold]--method paper[/bold] runs the stages of Date, Yoshimatsu, Arita and Taniguchi in a folder
+with sources.yaml whose cameras give colour pictures: skin seen by two cameras or more gives head,
+hands and feet, inverse kinematics the rest, a search elbows and knees. The person must show the
+registered pose once, upright with both arms spread: before that there is no pose. It needs a bare
+face, hands and feet, no other skin, an upright trunk, and a model of the person's measures. It has
+no intervals and does not notice when it loses the person: frames whose silhouettes differ much from
+the body's, and parts that were not seen, are named at the end.
 """)
 
 EMPTY_ROOM = _help("""

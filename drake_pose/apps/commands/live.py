@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from drake_pose.systems.person.live_capture import LiveSensors
 
 _PANEL = "Live capture (sources.yaml)"
+_PAPER_PANEL = "--method paper"
 
 SecondsOption = Annotated[
     float | None,
@@ -56,6 +57,24 @@ ToleranceOption = Annotated[
         help="Largest difference of time stamps of simultaneous pictures. Default: half the time "
         "between two pictures of a camera, or 0.9 of it if cameras are live.",
         rich_help_panel=_PANEL,
+    ),
+]
+
+
+FaceCameraOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        help="The camera before the face, which tells where the person looks; needs --faces.",
+        rich_help_panel=_PAPER_PANEL,
+    ),
+]
+FacesOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FOLDER",
+        help="Pictures of the person's face, and directions.csv: picture,turn,nod [deg].",
+        rich_help_panel=_PAPER_PANEL,
     ),
 ]
 
@@ -97,6 +116,55 @@ def run_live_capture(
                 progress.show_stage("frames", count, None)
 
             result = capture_live(scene, out, model, settings, sensors, warn, show)
+        _print_result(result, json)
+
+
+def run_paper_capture(
+    folder: Path,
+    out: Path,
+    model: Path | None,
+    *,
+    seconds: float | None = None,
+    tolerance: float | None = None,
+    replay: bool = True,
+    json: bool = False,
+    face_camera: str | None = None,
+    faces: Path | None = None,
+    packages: Mapping[str, Path] | None = None,
+) -> None:
+    """Captures by the paper's stages, tells what happens, and prints what came out."""
+    if (face_camera is None) != (faces is None):
+        raise typer.BadParameter("--face-camera and --faces go together")
+    with errors_as_messages():
+        from drake_pose.apps.commands.report import FrameProgress
+        from drake_pose.apps.live.capture import LiveSettings
+        from drake_pose.apps.live.paper_capture import FaceFolder, capture_paper
+        from drake_pose.apps.live.scene import hush_opencv, is_live_scene, load_live_scene
+        from drake_pose.errors import SceneError
+
+        if folder.is_dir() and not is_live_scene(folder):
+            raise SceneError(
+                f"{folder}: has no sources.yaml; the paper's method looks for skin in colour "
+                "pictures, which masks do not show: name the pictures and those of the empty room "
+                "there"
+            )
+        hush_opencv()
+        settings = LiveSettings(seconds, replay=replay, packages=packages or {})
+        scene = load_live_scene(folder)
+        face = None if face_camera is None or faces is None else FaceFolder(face_camera, faces)
+        if any(one.live for one in scene.specifications.values()):
+            say("drake-pose: stand upright before the cameras, both arms spread to the sides")
+        with FrameProgress() as progress:
+            result = capture_paper(
+                scene,
+                out,
+                model,
+                settings,
+                face,
+                lambda: scene.open_sensors(tolerance=tolerance),
+                warn,
+                lambda count, _: progress.show_stage("frames", count, None),
+            )
         _print_result(result, json)
 
 

@@ -11,7 +11,7 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
 from drake_pose.apps.estimate.capture import bundled_person
-from drake_pose.apps.live.capture import camera_troubles
+from drake_pose.apps.live.frame_results import camera_troubles
 from drake_pose.apps.live.run import run_live
 from drake_pose.apps.live.scene import LiveScene
 from drake_pose.apps.live.shape import shape_of_result

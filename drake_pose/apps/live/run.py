@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydrake.systems.analysis import Simulator, SimulatorStatus
 from pydrake.systems.framework import Context, Diagram
 
+from drake_pose.multiview.date.capture import PersonView
 from drake_pose.multiview.person.silhouette_view import SilhouetteView
 from drake_pose.systems.person.live_capture import LiveSensors
 
@@ -29,7 +30,7 @@ class LiveFrame:
     Args:
         time: the pictures' time stamp, from the first ones on [s].
         q: (nq,) estimated positions [rad or m]; nan where nobody was found.
-        share: of the contours, what fits.
+        share: of the contours, what fits; nan where the diagram does not say.
         views: by camera that gave a picture, what it says.
         has_others: whether other persons are in the views, whom the tracker has cut out.
         deviations: (nq,) standard deviations of q [rad or m]; nan where nobody was found, or where
@@ -40,7 +41,7 @@ class LiveFrame:
     time: float
     q: Array
     share: float
-    views: Mapping[str, SilhouetteView]
+    views: Mapping[str, SilhouetteView | PersonView]
     has_others: bool
     deviations: Array
     seconds: float
@@ -103,24 +104,29 @@ def run_live(
 
 
 class FrameWatch:
-    """Notes each new moment of a diagram from build_live_capture.
+    """Notes each new moment of a diagram from build_live_capture or build_paper_capture.
 
     Args:
         diagram: the diagram.
         cameras: the names of its cameras.
         on_frame: hears of each frame.
+        view: before a camera's name, the output with what the camera's picture says.
     """
 
     def __init__(
-        self, diagram: Diagram, cameras: Iterable[str], on_frame: Callable[[LiveFrame], None]
+        self,
+        diagram: Diagram,
+        cameras: Iterable[str],
+        on_frame: Callable[[LiveFrame], None],
+        view: str = "silhouette",
     ) -> None:
-        names = ("time", "estimated_positions", "share", "others")
-        self._time, self._positions, self._share, self._others = (
-            diagram.GetOutputPort(name) for name in names
+        self._time = diagram.GetOutputPort("time")
+        self._positions = diagram.GetOutputPort("estimated_positions")
+        self._share, self._others, self._deviations = (
+            diagram.GetOutputPort(name) if diagram.HasOutputPort(name) else None
+            for name in ("share", "others", "deviations")
         )
-        is_sure = diagram.HasOutputPort("deviations")
-        self._deviations = diagram.GetOutputPort("deviations") if is_sure else None
-        self._views = {name: diagram.GetOutputPort(f"silhouette_{name}") for name in cameras}
+        self._views = {name: diagram.GetOutputPort(f"{view}_{name}") for name in cameras}
         self._on_frame = on_frame
         self._last = math.nan
         self._begin = time.perf_counter()
@@ -133,9 +139,9 @@ class FrameWatch:
         self._last = moment
         views = {name: port.Eval(context) for name, port in self._views.items()}
         seen = {name: view for name, view in views.items() if view is not None}
-        share = float(self._share.Eval(context)[0])
         q = np.array(self._positions.Eval(context))
-        has_others = bool(self._others.Eval(context)[0])
+        share = math.nan if self._share is None else float(self._share.Eval(context)[0])
+        has_others = self._others is not None and bool(self._others.Eval(context)[0])
         deviations = np.full(len(q), np.nan)
         if self._deviations is not None:
             deviations = np.array(self._deviations.Eval(context))

@@ -35,6 +35,7 @@ _METHODS = {
     "beam": "searched by many hypotheses side by side",
     "paper": "searched as published",
     "person": "one person followed by all silhouettes at once",
+    "paper_capture": "one person followed by skin-coloured features, as published",
 }
 _ABOUT = {
     "poses.csv": "every position of every frame [rad or m]",

@@ -53,7 +53,7 @@ class FrameRecord:
         first_E_total: before the re-estimation.
         runs: how often step 3 was run.
         stopped_by: why the search ended: "end", "exact", "run_limit" or "time_limit";
-            "tracked" where the pose was tracked, "followed" by the method person.
+            "tracked" where the pose was tracked, "followed" where a person was.
         outside_limit: r in each view [pixel].
         joint_errors: estimate minus truth by position [deg or m], where the truth is known.
         camera_scale: pixels a metre of a parallel camera whose scale was found.

@@ -69,6 +69,23 @@ def registered_positions(skeleton: Skeleton, spread_deg: float = 80.0) -> Array:
     return skeleton.clip(q)
 
 
+def stand_registered(
+    skeleton: Skeleton, cameras: Sequence[Camera], middles: Sequence[Array]
+) -> Array:
+    """Positions (nq,) of the registered pose, about where the cameras see somebody.
+
+    Args:
+        skeleton: the person.
+        cameras: two or more.
+        middles: (2,) middle of the person's bounding box in each camera's picture [pixel].
+    """
+    q = registered_positions(skeleton)
+    head, _, _, left_foot, right_foot = skeleton.features(q)
+    middle = 0.5 * head + 0.25 * (left_foot + right_foot)
+    q[skeleton.head_positions] += meeting_of_all(cameras, middles) - middle
+    return q
+
+
 def register_pose(
     skeleton: Skeleton,
     q: Array,

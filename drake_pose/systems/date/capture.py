@@ -44,8 +44,9 @@ def build_paper_capture(
 ) -> PaperCapture:
     """Wire images to the paper's stages, these to the pose, and that to the avatar.
 
-    The diagram's outputs are those of ``PaperPoseEstimator``, ``person_view_<camera>`` and, where
-    the setup has what they need, ``face_direction``, ``recognised_positions`` and ``similarity``.
+    The diagram's outputs are those of ``PaperPoseEstimator``, ``person_view_<camera>``, where
+    the setup has what they need ``face_direction``, ``recognised_positions`` and ``similarity``,
+    and where the source has it ``time``.
     The source's inputs are the diagram's, by their names.
 
     Args:
@@ -70,6 +71,8 @@ def build_paper_capture(
     wiring.add_face(estimator)
     if source is not None and source.HasOutputPort("fresh"):
         wiring.builder.Connect(source.GetOutputPort("fresh"), estimator.GetInputPort("fresh"))
+    if source is not None and source.HasOutputPort("time"):
+        wiring.export(source.GetOutputPort("time"))
     for port in range(estimator.num_output_ports()):
         wiring.export(estimator.get_output_port(port))
     if meshcat is not None:

@@ -1,0 +1,107 @@
+"""Date's stages on recorded colour pictures, from the command line."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from drake_pose.apps.live.capture import LiveSettings
+from drake_pose.apps.live.paper_capture import METHOD, capture_paper
+from drake_pose.apps.live.scene import load_live_scene
+from drake_pose.apps.main import app
+from drake_pose.errors import SceneError, SettingsError
+from drake_pose.multiview.date.recognition import registered_positions
+from drake_pose.multiview.date.skeleton import load_skeleton
+from tests.apps.live_scenes import load_person, standing, write_studio
+
+PLACE = (0.12, -0.1, 1.55)
+HEADING = 0.3
+
+
+@pytest.fixture(scope="module")
+def person():
+    return load_person()
+
+
+@pytest.fixture(scope="module")
+def skeleton(person):
+    return load_skeleton(person)
+
+
+@pytest.fixture(scope="module")
+def path(person, skeleton):
+    """A person who raises both arms to the registered pose, then reaches forward."""
+    relaxed, shown = standing(person), registered_positions(skeleton)
+    goal = np.array(shown)
+    for name, degrees in (("left_upper_arm_x", -50), ("left_upper_arm_z", 30)):
+        goal[person.position_index(name)] = np.radians(degrees)
+    goal[person.position_index("left_forearm_x")] = np.radians(-50)
+    for q in (relaxed, shown, goal):
+        q[skeleton.head_positions] = PLACE
+        q[skeleton.head_angles[0]] = HEADING
+    up = [relaxed + share * (shown - relaxed) for share in np.linspace(0.0, 1.0, 5)]
+    return [*up, shown, shown, *(shown + s * (goal - shown) for s in np.linspace(0.1, 1.0, 8))]
+
+
+@pytest.fixture(scope="module")
+def studio(tmp_path_factory, person, path):
+    folder = tmp_path_factory.mktemp("studio")
+    write_studio(folder, person, path, "videos", cameras=6, size=(320, 240))
+    return folder
+
+
+@pytest.mark.slow
+def test_person_is_followed_from_the_registered_pose_on(studio, person, skeleton, path, tmp_path):
+    out = tmp_path / "out"
+    words = ["capture", str(studio), "--method", "paper", "--no-replay", "--json"]
+    done = CliRunner().invoke(app, [*words, "--out", str(out)])
+    assert done.exit_code == 0, done.output
+    summary = json.loads(done.stdout)
+    assert summary["method"] == METHOD
+    assert "before the registered pose" in done.stderr
+    with (out / "poses.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == len(path)
+    assert [row["error"] == "" for row in rows[:4]] == [True] * 4
+    assert all(row["error"] != "" for row in rows[5:])
+    for row, q in zip(rows[5:], path[5:], strict=True):
+        found = np.array([float(row[name]) for name in person.position_names])
+        head, left_hand, right_hand, *feet = np.linalg.norm(
+            skeleton.features(found) - skeleton.features(q), axis=1
+        )
+        # A hand's middle is told by what cameras of 320 x 240 see of its skin.
+        assert max(head, left_hand, right_hand) < 0.06
+        assert max(feet) < 0.08
+        elbow = skeleton.limb_points(found, "left_arm")[1] - skeleton.limb_points(q, "left_arm")[1]
+        assert np.linalg.norm(elbow) < 0.08
+    assert (out / "joint_centres.trc").is_file()
+    assert "as published" in (out / "report.html").read_text()
+
+
+@pytest.mark.slow
+def test_whoever_never_shows_the_registered_pose_is_refused(tmp_path, person):
+    write_studio(tmp_path, person, [standing(person)] * 3, "videos", cameras=3)
+    with pytest.raises(SettingsError, match=r"registered pose.*likest silhouettes"):
+        capture_paper(load_live_scene(tmp_path), tmp_path / "out", person.path)
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_cannot_be_captured_so_is_refused_before(tmp_path, person):
+    write_studio(tmp_path, person, [standing(person)], "masks")
+    with pytest.raises(SceneError, match="'camera_0' delivers masks"):
+        capture_paper(load_live_scene(tmp_path), tmp_path / "out")
+    with pytest.raises(SettingsError, match="give no shape"):
+        capture_paper(
+            load_live_scene(tmp_path), tmp_path / "out", settings=LiveSettings(shape=tmp_path)
+        )
+    words = ["capture", str(tmp_path), "--out", str(tmp_path / "out"), "--method", "paper"]
+    done = CliRunner().invoke(app, [*words, "--no-track"])
+    assert done.exit_code == 2
+    done = CliRunner().invoke(app, [*words, "--face-camera", "camera_0"])
+    assert done.exit_code == 2
+    (tmp_path / "sources.yaml").unlink()
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 1
+    assert "has no sources.yaml" in done.stderr

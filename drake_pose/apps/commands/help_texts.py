@@ -287,6 +287,10 @@ covariance (NEES).
 
     drake-pose reproduce shimada --iterations 1 --truncation sequential
 
+[bold]Several hypotheses, and which inequality rejects the wrong ones (figure 9):[/bold]
+
+    drake-pose reproduce shimada --hypotheses --out results/figure_9
+
 [bold]All truncations on the same sequences:[/bold]
 
     drake-pose reproduce shimada --runs 20 --truncation all

@@ -23,6 +23,7 @@ class Hypothesis:
         log_weight: logarithm of its weight among all.
         log_evidence: the same without what the present limits say of it.
         born: the step it was made at by mirroring; 0 for the first.
+        place: which of those made at that step it is: both tell it from all others.
         active: names of the rows that cut its belief in the last step.
         sites: of the last truncation, where the next one begins; see ``Truncated``.
         tangent: (n,) where the first frame of the present view was linearised.
@@ -34,6 +35,7 @@ class Hypothesis:
     log_weight: float = 0.0
     log_evidence: float = 0.0
     born: int = 0
+    place: int = 0
     active: tuple[str, ...] = ()
     sites: Array = field(default_factory=lambda: np.zeros((0, 2)))
     tangent: Array = field(default_factory=lambda: np.zeros(0))
@@ -51,14 +53,14 @@ class Rejection:
 
     Attributes:
         step: when.
-        born: the step it was made at.
+        hypothesis: as it was then; for a constraint its belief is that without the limits.
         reason: "constraint", "weight", "twin" or "cap".
         row: the violated inequality's name, for a constraint.
         c: its c_k (24), for a constraint.
     """
 
     step: int
-    born: int
+    hypothesis: Hypothesis
     reason: str
     row: str = ""
     c: float = math.nan
@@ -96,7 +98,7 @@ def merge_twins(
                 kept[place] = replace(
                     other, log_weight=both, log_evidence=other.log_evidence + gain
                 )
-                rejected.append(Rejection(step, candidate.born, "twin"))
+                rejected.append(Rejection(step, candidate, "twin"))
                 break
         else:
             kept.append(candidate)
@@ -110,7 +112,7 @@ def prune(
     ordered = normalise(hypotheses)
     kept = [h for h in ordered[1:cap] if h.weight >= smallest_weight]
     rejected = [
-        Rejection(step, h.born, "weight" if h.weight < smallest_weight else "cap")
+        Rejection(step, h, "weight" if h.weight < smallest_weight else "cap")
         for place, h in enumerate(ordered)
         if place and h not in kept
     ]

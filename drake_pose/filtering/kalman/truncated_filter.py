@@ -1,7 +1,8 @@
 """The filter: predict, linearise at every hypothesis, update, truncate, weigh."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import count
 from typing import Literal
 
 import numpy as np
@@ -202,7 +203,10 @@ class TruncatedFilter:
         if view.count > 1:
             branches = [self._repeat(h, y, model) for h in state.hypotheses]
         else:
-            branches = [b for h in state.hypotheses for b in self._branches(h, y, model, step)]
+            places = count()
+            branches = [
+                b for h in state.hypotheses for b in self._branches(h, y, model, step, places)
+            ]
         alive, rejected = self._reject(branches, step)
         finished = [self._weigh(h, result) for h, result in alive]
         leader = max(range(len(finished)), key=lambda i: finished[i].log_weight)
@@ -219,15 +223,20 @@ class TruncatedFilter:
         return Belief(self._A @ belief.mean, 0.5 * (P + P.T))
 
     def _branches(
-        self, hypothesis: Hypothesis, y: Array, model: ObservationModel, step: int
+        self,
+        hypothesis: Hypothesis,
+        y: Array,
+        model: ObservationModel,
+        step: int,
+        places: Iterator[int],
     ) -> list[Branch]:
-        """A hypothesis updated at its prediction, and at each mirrored one."""
+        """A hypothesis updated at its prediction, and at each mirrored one, which are counted."""
         hypothesis = replace(hypothesis, repeated=None)
         found = [(hypothesis, self._update(hypothesis, y, model, hypothesis.belief.mean))]
         if self.settings.hypothesis_cap == 1:
             return found
         for start in model.mirrors(hypothesis.belief):
-            other = replace(hypothesis, born=step)
+            other = replace(hypothesis, born=step, place=next(places))
             found.append((other, self._update(other, y, model, start, heated=False)))
         return found
 
@@ -273,7 +282,8 @@ class TruncatedFilter:
             worst_c.append(c[k])
             if c[k] < self.settings.reject_below:
                 name = self.inequalities.rows[k]
-                rejected.append(Rejection(step, hypothesis.born, "constraint", name, float(c[k])))
+                gone = replace(hypothesis, belief=result.updated.belief)
+                rejected.append(Rejection(step, gone, "constraint", name, float(c[k])))
             else:
                 alive.append((hypothesis, result))
         if not alive:

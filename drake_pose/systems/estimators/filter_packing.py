@@ -16,6 +16,9 @@ from drake_pose.filtering import (
 
 Array = NDArray[np.float64]
 
+HEAD = 5
+"""So many numbers stand before the mean in a belief's row."""
+
 
 def require_time_forward(system: LeafSystem, context: Context, last: float) -> None:
     """Refuse an update that is earlier than the last one, after which a filter knows the future.
@@ -47,13 +50,13 @@ class FilterPacking:
         self.cap = belief_filter.settings.hypothesis_cap
         self._sites = belief_filter.site_count
         n, z = self.n, self.n + measured
-        self.belief_width = 4 + 2 * (n + n * n) + 2 * self._sites + n
+        self.belief_width = HEAD + 2 * (n + n * n) + 2 * self._sites + n
         self._repeated_width = 1 + z + z * z if belief_filter.novelty > 0 else 0
 
     def pack(self, state: FilterState) -> tuple[Array, Array, Array]:
         """Beliefs (cap x belief_width), repeated_views (cap x width), view (1 + m), each flat.
 
-        A belief's row begins with: alive, log weight, log evidence, step of birth, mean.
+        A belief's row begins with: alive, log weight, log evidence, step of birth and place, mean.
         """
         beliefs = np.zeros((self.cap, self.belief_width))
         repeated_views = np.zeros((self.cap, self._repeated_width))
@@ -62,7 +65,7 @@ class FilterPacking:
             sites[: len(h.sites)] = h.sites
             row[:] = np.concatenate(
                 [
-                    [1.0, h.log_weight, h.log_evidence, h.born],
+                    [1.0, h.log_weight, h.log_evidence, h.born, h.place],
                     h.belief.mean,
                     h.belief.covariance.ravel(),
                     h.free.mean,
@@ -90,7 +93,7 @@ class FilterPacking:
     ) -> FilterState:
         """The state that was packed."""
         n, z = self.n, self.n + self.m
-        ends = np.cumsum([4, n, n * n, n, n * n, 2 * self._sites])
+        ends = np.cumsum([HEAD, n, n * n, n, n * n, 2 * self._sites])
         hypotheses = []
         rows = beliefs.reshape(self.cap, -1)
         for row, repeated_row in zip(rows, repeated_views.reshape(self.cap, -1), strict=True):
@@ -110,6 +113,7 @@ class FilterPacking:
                     log_weight=float(head[1]),
                     log_evidence=float(head[2]),
                     born=int(head[3]),
+                    place=int(head[4]),
                     sites=sites.reshape(-1, 2),
                     tangent=tangent,
                     repeated=repeated,

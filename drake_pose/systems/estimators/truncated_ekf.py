@@ -10,7 +10,11 @@ from scipy.special import chdtri
 from drake_pose.errors import SettingsError
 from drake_pose.filtering import Belief, FilterState, ObservationModel, TruncatedFilter, make_belief
 from drake_pose.filtering.kalman.update import with_variances
-from drake_pose.systems.estimators.filter_packing import FilterPacking, require_time_forward
+from drake_pose.systems.estimators.filter_packing import (
+    HEAD,
+    FilterPacking,
+    require_time_forward,
+)
 
 Array = NDArray[np.float64]
 
@@ -192,10 +196,10 @@ class TruncatedEkf(LeafSystem):
         return EventStatus.Succeeded()
 
     def _calc_state(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._rows(context)[0, 4 : 4 + self._n])
+        output.SetFromVector(self._rows(context)[0, HEAD : HEAD + self._n])
 
     def _calc_covariance(self, context: Context, output: BasicVector) -> None:
-        start = 4 + self._n
+        start = HEAD + self._n
         output.SetFromVector(self._rows(context)[0, start : start + self._n**2])
 
     def _calc_weights(self, context: Context, output: BasicVector) -> None:
@@ -204,7 +208,7 @@ class TruncatedEkf(LeafSystem):
 
     def _calc_states(self, context: Context, output: BasicVector) -> None:
         rows = self._rows(context)
-        states = rows[:, 4 : 4 + self._n]
+        states = rows[:, HEAD : HEAD + self._n]
         states[rows[:, 0] == 0] = np.nan
         output.SetFromVector(states.ravel())
 

@@ -55,12 +55,13 @@ def true_lengths(r_13: float) -> Array:
     return np.array([62.0, 41.0, r_13, 60.0, 40.0, 38.0]) / 1000.0
 
 
-def true_states(r_13: float, phase: Array) -> Array:
+def true_states(r_13: float, phase: Array, yaw_middle: float = 0.0) -> Array:
     """(55, n) a hand that moves, turns, flexes and comes closer and goes away.
 
     Args:
         r_13: the length of finger 1's last segment [mm].
         phase: (6,) shifts of the swings [rad], to make another sequence of the same kind.
+        yaw_middle: about what the fingers swing away from the camera [rad]; negative: towards it.
     """
     frames = np.arange(FRAMES)
     turn = 2 * np.pi * frames / FRAMES
@@ -73,7 +74,7 @@ def true_states(r_13: float, phase: Array) -> Array:
     put("wrist_y", 20 * np.sin(1.3 * turn + phase[1]))
     # Starts seen from the back, fingers to the right; rolls about the fingers' axis, pitches, yaws.
     roll = math.radians(65) + math.radians(40) * np.sin(1.1 * turn + phase[2])
-    yaw = math.radians(25) * np.sin(0.9 * turn + phase[3])
+    yaw = yaw_middle + math.radians(25) * np.sin(0.9 * turn + phase[3])
     pitch = math.radians(20) * np.sin(1.2 * turn + phase[4])
     scale = 1.0 + 0.15 * np.sin(turn)
     quaternions = _product(_about("z", pitch), _product(_about("y", yaw), _about("x", roll)))
@@ -96,7 +97,11 @@ def true_states(r_13: float, phase: Array) -> Array:
 
 
 def make_sequence(
-    r_13: float, observed: str, observation: HandObservation, generator: np.random.Generator
+    r_13: float,
+    observed: str,
+    observation: HandObservation,
+    generator: np.random.Generator,
+    yaw_middle: float = 0.0,
 ) -> SyntheticSequence:
     """Draw a sequence: its motion's phases, its noise, and table 2's first guess.
 
@@ -105,8 +110,9 @@ def make_sequence(
         observed: "full", or "lines": the knuckles are hidden.
         observation: gives h and the noise.
         generator: the source of chance.
+        yaw_middle: as for ``true_states`` [rad].
     """
-    states = true_states(r_13, generator.uniform(-0.6, 0.6, 6))
+    states = true_states(r_13, generator.uniform(-0.6, 0.6, 6), yaw_middle)
     deviations = np.sqrt(observation.variances)
     measurements = np.array([observation.predict(x)[0] for x in states])
     measurements += deviations * generator.normal(size=measurements.shape)

@@ -1,4 +1,4 @@
-"""Pictures of Shimada's synthetic experiment in the manner of the paper's figures 10 to 16."""
+"""Pictures of Shimada's synthetic experiment in the manner of the paper's figures 9 to 16."""
 
 from pathlib import Path
 
@@ -13,19 +13,24 @@ from drake_pose.apps.experiments.shimada.experiment import (
     ExperimentResult,
     Trial,
 )
+from drake_pose.apps.experiments.shimada.hypotheses import Fate, HypothesesResult
 from drake_pose.apps.experiments.shimada.motion import FRAMES
 from drake_pose.filtering.hand.observation import (
+    FLEXIONS,
     HAND_STATE,
     LENGTHS,
     PALM,
     QUATERNION,
+    SPREADS,
     HandObservation,
 )
 
 Array = NDArray[np.float64]
 
 _SHOWN_FRAMES = (1, 8, 16, 32, 40, 55)
-_TRUE, _ESTIMATE = "0.35", "#0072b2"
+_TRUE, _ESTIMATE, _REJECTED = "0.35", "#0072b2", "#d55e00"
+# So many frames are drawn after a hypothesis is rejected.
+_AFTERWARDS = 6
 
 
 def save_pictures(result: ExperimentResult, folder: Path) -> list[Path]:
@@ -64,6 +69,84 @@ def save_pictures(result: ExperimentResult, folder: Path) -> list[Path]:
             )
         )
     return files
+
+
+def save_hypotheses(result: HypothesesResult, folder: Path) -> list[Path]:
+    """Draw the hypothesis that an inequality rejected, and the one that it left.
+
+    Args:
+        result: what became of all.
+        folder: where the PNG file goes; made if it is not there.
+
+    Returns:
+        The file written; none where no inequality rejected a wrong one.
+    """
+    shown = result.shown()
+    if shown is None:
+        return []
+    dead, survivor = shown
+    folder.mkdir(parents=True, exist_ok=True)
+    figure = Figure(figsize=(13, 7.5))
+    figure.suptitle(
+        f"sequence {dead.run}: made in frame {dead.frames[0]}, rejected in frame "
+        f"{dead.frames[-1]} by {dead.row} (c = {dead.c:.1f})\ngrey: true, blue: kept, orange: "
+        "rejected",
+        fontsize=10,
+    )
+    grid = figure.subplots(2, 3)
+    _draw_moments(list(grid[0]), result, dead, survivor)
+    states = result.sequences[dead.run].states
+    k = result.inequalities.rows.index(dead.row)
+    phi, b = result.inequalities.phi[k], float(result.inequalities.b[k])
+    last = min(FRAMES, int(dead.frames[-1]) + _AFTERWARDS)
+    ends = int(dead.frames[0]), last
+    both = max(int(dead.frames[0]), int(survivor.frames[0]))
+    apart = np.where(phi != 0, np.abs(dead.at(both) - survivor.at(both)), -1.0)
+    name = HAND_STATE.names[int(np.argmax(apart))]
+    one_element = np.zeros(len(HAND_STATE))
+    one_element[HAND_STATE.index(name)] = 1.0
+    angles = name in (*SPREADS, *FLEXIONS)
+    factor, unit = (180 / np.pi, "deg") if angles else (PIXELS_PER_METRE, "pixel")
+    side = ">=" if ">=" in dead.row else "<="
+    sign = -1.0 if side == ">=" else 1.0
+    row = f"{dead.row.split(side)[0]}{side} {sign * factor * b:.0f} {unit}"
+    curves = ((one_element, f"{name} [{unit}]"), (sign * phi, row))
+    for axes, (direction, label) in zip(grid[1], curves, strict=False):
+        _draw_paths(axes, states, (dead, survivor), factor * direction, ends)
+        axes.set_ylabel(label)
+    grid[1, 1].axhline(sign * factor * b, color="black", linestyle="--")
+    for one, colour in ((survivor, _ESTIMATE), (dead, _REJECTED)):
+        grid[1, 2].semilogy(one.frames, one.weights, "-o", color=colour, ms=4)
+    grid[1, 2].set_xlim(ends[0] - 0.5, ends[1] + 0.5)
+    grid[1, 2].set_ylabel("weight (rejects nothing here)")
+    for axes in grid[1]:
+        axes.set_xlabel("t")
+    return [_finish(figure, folder / "figure_9_hypotheses.png")]
+
+
+def _draw_moments(line: list[Axes], result: HypothesesResult, dead: Fate, survivor: Fate) -> None:
+    """Both hypotheses and the truth: when both are there, before the end, and in the end."""
+    end = int(dead.frames[-1])
+    frames = (max(int(dead.frames[0]), int(survivor.frames[0])), end - 1, end)
+    for axes, frame in zip(line, frames, strict=True):
+        _draw_hand(axes, result.sequences[dead.run].states[frame - 1], _TRUE)
+        _draw_hand(axes, survivor.at(frame), _ESTIMATE)
+        _draw_hand(axes, dead.at(frame), _REJECTED)
+        axes.set_aspect("equal")
+        axes.invert_yaxis()
+        axes.set_title(f"t = {frame}" + (" (rejected)" if frame == end else ""), fontsize=9)
+
+
+def _draw_paths(
+    axes: Axes, states: Array, fates: tuple[Fate, Fate], direction: Array, ends: tuple[int, int]
+) -> None:
+    """What a direction of the state is in truth and to both hypotheses, over the frames."""
+    frames = np.arange(ends[0], ends[1] + 1)
+    axes.plot(frames, states[frames - 1] @ direction, color=_TRUE)
+    for one, colour in zip(fates, (_REJECTED, _ESTIMATE), strict=True):
+        axes.plot(one.frames, one.means @ direction, "-o", color=colour, mfc="white", ms=4)
+    axes.plot(fates[0].frames[-1], fates[0].means[-1] @ direction, "x", color=_REJECTED, ms=12)
+    axes.set_xlim(ends[0] - 0.5, ends[1] + 0.5)
 
 
 def _draw_hand(axes: Axes, state: Array, colour: str) -> None:

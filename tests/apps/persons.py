@@ -23,12 +23,16 @@ class PersonScene:
 
 
 def record_person(
-    folder: Path, frames: int = 3, moved: str | None = None, sequence: bool = True
+    folder: Path,
+    frames: int = 3,
+    moved: str | None = None,
+    sequence: bool = True,
+    size: tuple[int, int] = (160, 120),
 ) -> PersonScene:
     """Records a person who raises an arm; one camera may have moved after its calibration."""
     folder.mkdir(parents=True, exist_ok=True)
     person = load_model(bundled_model("person"), check=False)
-    cameras = circle_of_cameras(4, size=(160, 120), face_camera=False)
+    cameras = circle_of_cameras(4, size=size, face_camera=False)
     save_cameras(folder / "cameras.yaml", cameras)
     rate = "frame_rate_hz: 30\n" if sequence else ""
     (folder / "scene.yaml").write_text(f"sequence: {str(sequence).lower()}\n{rate}")

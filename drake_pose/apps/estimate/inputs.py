@@ -97,9 +97,9 @@ def read_inputs(
         model, settings = leave_out_links(model, settings)
     truth = _read_truth(scene_path, truth_path, model)
     starts = read_starts(scene, cameras, frames, model, settings)
-    if not (scene.images or starts) and follows_person(scene, cameras, model, settings):
+    if (scene.images or not starts) and follows_person(scene, cameras, model, settings):
         texts = (*texts_of(*checked.warnings, *check_upright(cameras)), *model.warnings)
-        return Inputs(scene, model, cameras, frames, None, None, truth, texts)
+        return Inputs(scene, model, cameras, frames, None, None, truth, texts, starts)
     root_positions = None
     position: np.ndarray | None = None
     anywhere = settings.root_position == "unknown" or (

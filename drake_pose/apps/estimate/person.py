@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.apps.estimate.capture_warnings import describe_faults
 from drake_pose.apps.estimate.inputs import Inputs
+from drake_pose.apps.estimate.person_by_colour import (
+    FollowedPerson,
+    follow_by_colour,
+    read_pictures,
+)
 from drake_pose.apps.estimate.result import OnFrame, OnStage, ResultWriter
 from drake_pose.apps.estimate.scene_checks import (
     SceneWarning,
@@ -54,38 +60,41 @@ def follow_person(
 
     Raises:
         ModelError: the model has no landmarks of a person.
-        SceneError: none of the masks can be read.
+        SceneError: none of the masks can be read, or fewer than two are there of the first picture.
         SettingsError: in no frame two cameras see a person.
     """
     inputs = result.inputs_of_all()
     reader = _Reader(inputs, on_stage)
     count = len(inputs.frames)
     begin = time.perf_counter()
+    if inputs.scene.images:
+        followed = follow_by_colour(inputs, reader, reader.count_followed)
+    else:
+        followed = _follow_masks(inputs, reader, track)
+    reader.on_stage = None
+    seconds = (time.perf_counter() - begin) / count
+    result.begin_again(inputs)
+    result.more.update(_describe_shape(followed.captured))
+    if on_frame is not None:
+        on_frame(0, count, "", None)
+    for index, frame in enumerate(inputs.frames):
+        _finish_frame(inputs, result, followed, reader, index, seconds, overlay)
+        if on_frame is not None:
+            on_frame(index + 1, count, frame, result.records[frame])
+    result.warn(texts_of(*reader.warnings(), *followed.faults))
+
+
+def _follow_masks(inputs: Inputs, reader: _Reader, track: bool) -> FollowedPerson:
+    """The person in frames of masks."""
     checked = capture_checked(
         inputs.model.pose_tree(),
         reader.cameras,
         reader,
-        count,
+        len(inputs.frames),
         PersonCaptureSettings(is_sequence=inputs.scene.sequence and track),
         reader.count_followed,
     )
-    captured = checked.captured
-    reader.on_stage = None
-    seconds = (time.perf_counter() - begin) / count
-    result.begin_again(inputs)
-    result.more.update(_describe_shape(captured))
-    if on_frame is not None:
-        on_frame(0, count, "", None)
-    for index, frame in enumerate(inputs.frames):
-        masks = checked.read(index)
-        # A camera that was left out is shown, too, so that one sees why.
-        pictures = masks
-        if len(masks) < len(inputs.scene.cameras_of(frame)):
-            pictures = {**reader(index), **masks}
-        _finish_frame(inputs, result, masks, pictures, captured, index, seconds, overlay)
-        if on_frame is not None:
-            on_frame(index + 1, count, frame, result.records[frame])
-    result.warn(texts_of(*reader.warnings(), *describe_faults(checked, inputs.frames)))
+    return FollowedPerson(checked.captured, checked.read, describe_faults(checked, inputs.frames))
 
 
 class _Reader:
@@ -141,34 +150,30 @@ class _Reader:
 def _finish_frame(
     inputs: Inputs,
     result: ResultWriter,
-    masks: Mapping[str, Mask],
-    pictures: Mapping[str, Mask],
-    captured: PersonCapture,
+    followed: FollowedPerson,
+    reader: _Reader,
     index: int,
     seconds: float,
     overlay: bool,
 ) -> None:
-    """Compares a frame's masks with the captured person, of the girth that was found.
-
-    Pictures hold the masks of cameras that were left out, too.
-    """
-    frame, q = inputs.frames[index], captured.q[index]
+    """Compares a frame's masks with the captured person, of the girth that was found."""
+    frame, captured = inputs.frames[index], followed.captured
+    masks, q = followed.read(index), captured.q[index]
+    shown: Mapping[str, NDArray[Any]] = masks
+    # A camera that was left out is shown, too, so that one sees why.
+    if len(masks) < len(inputs.scene.cameras_of(frame)):
+        shown = {**reader(index), **shown}
+    if overlay and inputs.scene.images:
+        shown = {**read_pictures(inputs, frame), **shown}
     found = bool(np.isfinite(q).all())
-    X_WN = captured.tree.node_poses(captured.tree.values_from_positions(q)) if found else None
-    segments: dict[str, NDArray[np.int16]] = {}
-    labels = range(1, 1 + len(captured.outlines))
-    for camera in inputs.cameras:
-        if camera.name in pictures:
-            segments[camera.name] = np.zeros((camera.height, camera.width), dtype=np.int16)
-            if X_WN is not None:
-                X_CN = camera.X_CW @ X_WN
-                segments[camera.name] = draw_labels(captured.outlines, labels, X_CN, camera)
-    agreement = compare_masks(masks, {name: one > 0 for name, one in segments.items()})
-    error = agreement.E_total if found else float("nan")
-    row = PoseRow(frame, q, None, error, seconds)
+    segments = _draw_parts(inputs, captured, q if found else None, shown)
+    bodies = {name: one > 0 for name, one in segments.items()}
+    agreement = compare_masks(masks, bodies)
+    error = agreement.E_total if masks else followed.error_by_colour(index, inputs.cameras)
+    row = PoseRow(frame, q, None, error if found else float("nan"), seconds)
     record = FrameRecord(
         found=row.found,
-        E_total=error if row.found else None,
+        E_total=row.error if row.found else None,
         seconds=seconds,
         stopped_by=FOLLOWED,
         joint_errors=result.joint_errors(frame, q, row.found),
@@ -177,9 +182,27 @@ def _finish_frame(
         share=float(captured.shares[index]),
     )
     if overlay:
-        for name, mask in pictures.items():
-            result.write_overlay(name, row, mask, segments[name] > 0, segments[name])
+        for name, picture in shown.items():
+            result.write_overlay(name, row, picture, bodies[name], segments[name])
     result.finish_frame(row, record)
+
+
+def _draw_parts(
+    inputs: Inputs, captured: PersonCapture, q: NDArray[np.float64] | None, wanted: Iterable[str]
+) -> dict[str, NDArray[np.int16]]:
+    """Which part of the person each pixel of the wanted cameras shows, from 1 on; 0: none."""
+    X_WN = None
+    if q is not None:
+        X_WN = captured.tree.node_poses(captured.tree.values_from_positions(q))
+    labels = range(1, 1 + len(captured.outlines))
+    segments: dict[str, NDArray[np.int16]] = {}
+    for camera in inputs.cameras:
+        if camera.name in wanted:
+            segments[camera.name] = np.zeros((camera.height, camera.width), dtype=np.int16)
+            if X_WN is not None:
+                X_CN = camera.X_CW @ X_WN
+                segments[camera.name] = draw_labels(captured.outlines, labels, X_CN, camera)
+    return segments
 
 
 def _describe_shape(captured: PersonCapture) -> dict[str, object]:

@@ -29,7 +29,7 @@ from drake_pose.apps.results.folder import (
 )
 from drake_pose.apps.results.joint_tables import family_table, joint_table
 from drake_pose.apps.results.motion_files import write_motion
-from drake_pose.apps.results.overlay import draw_overlay, encode_png
+from drake_pose.apps.results.overlay import draw_over_picture, draw_overlay, encode_png
 from drake_pose.apps.results.replay import make_replay
 from drake_pose.apps.results.report_page import ReportContent, make_report
 from drake_pose.apps.results.summary import FrameRecord, camera_warnings, mask_digests, summarize
@@ -202,15 +202,16 @@ class ResultWriter:
         self,
         camera: str,
         row: PoseRow,
-        mask: np.ndarray,
+        seen: np.ndarray,
         body: np.ndarray,
         segments: np.ndarray | None,
     ) -> None:
-        """Write the overlay of a camera's frame."""
+        """Write the overlay of a camera's frame: over its mask (H, W), or its picture (H, W, 3)."""
         if self._folder is None:
             return
         error = f"E_total {100.0 * row.error:.1f} %" if row.found else "no pose found"
-        picture = draw_overlay(mask, body, segments, [f"{camera}  frame {row.frame}  {error}"])
+        draw = draw_overlay if seen.ndim == 2 else draw_over_picture
+        picture = draw(seen, body, segments, [f"{camera}  frame {row.frame}  {error}"])
         self._folder.write(f"{OVERLAY}/{camera}/{row.frame}.png", encode_png(picture))
 
     def write(self, name: str, data: bytes) -> None:

@@ -124,28 +124,28 @@ class _Matching:
         if not frames:
             return
         inputs = self._inputs
-        if finished and (inputs.scene.images or inputs.starts):
-            raise SettingsError(
-                f"{inputs.scene.path}: a sequence that is tracked by colour, or from --start, goes "
-                "on from its first frame alone: name another folder instead of --resume"
-            )
+        # What colours and starts say of a frame depends on those before: they are followed again.
+        follows = bool(inputs.scene.images or inputs.starts)
+        played = inputs.frames if follows else tuple(frames)
         matching = build_recorded_matching(
             inputs.scene,
             self._search,
             inputs.cameras,
-            frames,
+            played,
             inputs.root_positions,
             tracking=self._tracking,
             starts=inputs.starts,
         )
         period = 1.0 / (inputs.scene.frame_rate_hz or DEFAULT_FRAME_RATE_HZ)
         simulator = Simulator(matching.diagram)
-        for index, frame in enumerate(frames):
+        for index, frame in enumerate(played):
             # The frame is matched at index periods; half a period later the answer surely stands.
             simulator.AdvanceTo((index + 0.5) * period)
-            self._finish_frame(frame, matching.matcher.last_result)
-            if on_frame is not None:
-                on_frame(finished + index + 1, total, frame, self._result.records[frame])
+            if frame not in self._result.records:
+                self._finish_frame(frame, matching.matcher.last_result)
+                finished += 1
+                if on_frame is not None:
+                    on_frame(finished, total, frame, self._result.records[frame])
 
     def compare_cameras(self, on_stage: OnStage | None) -> None:
         """Warn of cameras that contradict each other; few frames are matched again for it."""
@@ -197,20 +197,22 @@ class _Matching:
         self._result.finish_frame(row, record)
 
     def _compare(self, row: PoseRow, match: MatchResult) -> dict[str, float]:
-        """Draws the body beside the masks; returns the intersection over union by camera."""
+        """Draws the body beside masks and over pictures; the masks' IoU by camera."""
         scene = self._inputs.scene
         masks, bodies = {}, {}
         for camera in self._inputs.cameras:
-            if (camera.name, row.frame) not in scene.masks:
+            key = camera.name, row.frame
+            if key not in scene.masks and not (self._overlay and key in scene.images):
                 continue
-            mask = scene.read(camera.name, row.frame)
-            body, segments = np.zeros_like(mask), None
+            seen = scene.read(*key) if key in scene.masks else scene.read_image(*key)
+            body, segments = np.zeros(seen.shape[:2], dtype=np.bool_), None
             if match.found:
                 segments = self._renderer(camera, match).segments(match.q, match.X_WB)
                 body = segments >= 0
-            masks[camera.name], bodies[camera.name] = mask, body
+            if key in scene.masks:
+                masks[camera.name], bodies[camera.name] = seen, body
             if self._overlay:
-                self._result.write_overlay(camera.name, row, mask, body, segments)
+                self._result.write_overlay(camera.name, row, seen, body, segments)
         return dict(compare_masks(masks, bodies).ious) if match.found else {}
 
     def _renderer(self, camera: Camera, match: MatchResult) -> LabelRenderer:

@@ -43,11 +43,10 @@ def read_starts(
     ]
     if not bare:
         return starts
-    if not settings.track or settings.method == "person":
-        way = "--no-track" if not settings.track else "--method person"
+    if not settings.track:
         raise SettingsError(
             f"{scene.path}: frame '{bare[0]}' has pictures but no mask, which can only be tracked "
-            f"by colour: leave {way} out, or make masks (drake-pose masks)"
+            "by colour: leave --no-track out, or make masks (drake-pose masks)"
         )
     first = frames[0]
     if first in bare and first not in starts:

@@ -79,6 +79,29 @@ def draw_overlay(
     )
 
 
+def draw_over_picture(
+    picture: np.ndarray, body: np.ndarray, segments: np.ndarray | None, title: Sequence[str]
+) -> np.ndarray:
+    """Draws the body's contour, and the borders between its parts, over a camera's picture.
+
+    Args:
+        picture: (H, W, 3) uint8, red, green, blue.
+        body, segments, title: as of draw_overlay.
+
+    Returns:
+        (h, w, 3) uint8, red, green, blue: the surroundings of the body; the whole picture where no
+        pose was found.
+    """
+    painted = picture.copy()
+    contours, _ = cv2.findContours(body.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(painted, contours, -1, EXCESS_RGB, max(1, len(picture) // 500))
+    if segments is not None:
+        painted[_inner_borders(body, segments)] = OUTLINE_RGB
+    rows, columns = _surroundings(body)
+    painted = _widen(painted[slice(*rows), slice(*columns)], _LEAST_WIDTH)
+    return np.vstack([_text_band(title, painted.shape[1]), painted])
+
+
 def encode_png(picture: np.ndarray) -> bytes:
     """Returns a picture (H, W, 3) uint8, red, green, blue, as a PNG file's bytes."""
     _, data = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))

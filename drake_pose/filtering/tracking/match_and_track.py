@@ -7,7 +7,6 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,15 +17,12 @@ from drake_pose.filtering.tracking.contour_tracker import ContourTracker, Track,
 from drake_pose.matching import MatchResult, PoseSearch
 from drake_pose.matching.fit.colours import Picture
 from drake_pose.matching.result import UNEXPLAINED, PlacedMatch, View
+from drake_pose.silhouette.pictures.mask_agreement import edge_area
 
 Array = NDArray[np.float64]
 
 TRACKED = "tracked"
 """``MatchResult.stopped_by`` of a pose that no search found."""
-
-
-# A pixel's neighbours: what a mask loses to them is its edge.
-_CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,12 +223,9 @@ class MatchAndTrack:
         if track.measurement is None:
             return math.inf, 1.0
         for camera in observation.cameras:
-            drawn = observation.draw(x, camera).view(np.uint8)
-            size = int(np.count_nonzero(drawn))
-            area += size
-            J += (
-                size - int(np.count_nonzero(cv2.erode(drawn, _CROSS)))
-            ) * track.measurement.distance
+            drawn = observation.draw(x, camera)
+            area += int(np.count_nonzero(drawn))
+            J += edge_area(drawn) * track.measurement.distance
         return J, max(area, 1.0)
 
     def _result(self, track: Track, frame: _Frame) -> MatchResult:

@@ -39,6 +39,7 @@ from drake_pose.silhouette.contours.contour_segments import find_segments
 Array = NDArray[np.float64]
 Histograms = NDArray[np.float32]
 Picture = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
 
 COLOURS = 4096
 """Colours that are told apart: 16 steps of red, green and blue."""
@@ -209,6 +210,8 @@ def learn_colours(
     widths: Array,
     rate: float,
     agreeing: float,
+    step: int,
+    region: Mask,
 ) -> None:
     """Counts the colours on both sides of a body's contour, and forgets old ones.
 
@@ -220,6 +223,10 @@ def learn_colours(
         rate: the new colours' share; of a node of which nothing is known yet they are all.
         agreeing: lines on which the edge seems to be further from the contour than this teach
             nothing [pixel]; inf: all do.
+        step: from offset to offset [pixel] of lines that say where the edge is, on both sides of
+            which colours are then counted; 0: they are counted on both sides of the contour.
+        region: (H, W) where the body is known to be seen: it says what is on the body and what is
+            beside it. (0, 0): that is not known.
     """
     X_CN = seen_from(camera[0], X_WN)
     segments = find_segments(packed, X_CN, camera[1])
@@ -230,24 +237,30 @@ def learn_colours(
     totals = np.zeros((len(histograms), 2))
     blocks, on, beside = _line_arrays()
     for i in range(len(uv)):
-        node = nodes[i]
-        if agreeing < np.inf:
+        node, middle = nodes[i], 0.0
+        if agreeing < np.inf and not len(region):
             edge, variance = _find_edge(
-                picture, histograms[node], uv[i], normals[i], clearances[i], 1,
+                picture, histograms[node], uv[i], normals[i], clearances[i], max(step, 1),
                 (blocks, on, beside),
             )  # fmt: skip
             if variance > 0.0 and abs(edge) > agreeing:
                 continue
+            if variance > 0.0 and step > 0:
+                middle = edge
         for side in range(2):
             sign = -1.0 if side == ON else 1.0
             pixels = int(min(widths[side], clearances[i, side] - 1.0))
-            for r in range(1, pixels):
-                u, v = uv[i, 0] + sign * r * normals[i, 0], uv[i, 1] + sign * r * normals[i, 1]
+            for k in range(1, pixels):
+                r = middle + sign * k
+                u, v = uv[i, 0] + r * normals[i, 0], uv[i, 1] + r * normals[i, 1]
                 colour = _colour(picture, u, v)
                 if colour < 0:
                     break
-                counts[node, side, colour] += 1.0
-                totals[node, side] += 1.0
+                where = side
+                if len(region):
+                    where = ON if region[math.floor(v + 0.5), math.floor(u + 0.5)] else BESIDE
+                counts[node, where, colour] += 1.0
+                totals[node, where] += 1.0
     for node in range(len(histograms)):
         for side in range(2):
             if totals[node, side] >= _FEW:

@@ -26,6 +26,9 @@ Histograms = NDArray[np.float32]
 
 Picture = NDArray[np.uint8]
 
+NO_REGION = np.zeros((0, 0), dtype=np.bool_)
+"""Where nobody knows where the body is seen: as `learn_colours` takes it."""
+
 # A part is no closer to a contour than this [pixel], and is judged by no less of it [pixel].
 _CLOSE, _TELLING = 0.7, 20.0
 
@@ -167,6 +170,6 @@ def learned(
         if picture is not None:
             learn_colours(
                 placed.packed, placed.X_WN, (packed[0][c], packed[1][c]), picture, known[c],
-                settings.spacing, widths, rate, agreeing,
+                settings.spacing, widths, rate, agreeing, 0, NO_REGION,
             )  # fmt: skip
     return known

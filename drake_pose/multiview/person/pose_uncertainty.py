@@ -12,18 +12,14 @@ What the silhouettes do not tell is as unsure as anything inside the limits.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.camera import Camera
 from drake_pose.matching.fit.contour_fit import Comparison, ContourFit
 from drake_pose.matching.fit.covariance import surface_deformations
-from drake_pose.matching.fit.evidence import EdgePoints
-from drake_pose.matching.fit.levenberg_marquardt import Round
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -56,10 +52,7 @@ class PoseUncertainty:
 
 def pose_uncertainty(
     fit: ContourFit,
-    cameras: Sequence[Camera],
-    edges: Sequence[EdgePoints],
-    values: Array,
-    step: Round,
+    compared: Comparison,
     held: Mask | None = None,
     held_covariance: Array | None = None,
 ) -> PoseUncertainty:
@@ -70,18 +63,16 @@ def pose_uncertainty(
 
     Args:
         fit: what fitted it.
-        cameras, edges: as there.
-        values: (m,) the pose.
-        step: the last one of the fit.
+        compared: what the cameras say of the pose at the scale of the last step.
         held: (m,) values that were held, such as lengths; None: none.
         held_covariance: (h, h) of these; None: they are exact.
     """
-    held = np.zeros(len(values), dtype=np.bool_) if held is None else held
+    size = len(fit.lower)
+    held = np.zeros(size, dtype=np.bool_) if held is None else held
     free = np.flatnonzero(~held)
-    compared = fit.compare(cameras, edges, values, step)
     A = np.tril(compared.A) + np.swapaxes(np.tril(compared.A, -1), -1, -2)
     # (nodes, m, 12): what each value does to each node.
-    moves = compared.placement.dense(len(values))
+    moves = compared.placement.dense(size)
     apriori = _limits_information(fit)
     parts = _parts(fit, compared, A)
     between = _noise(A, parts.left, parts.alone)
@@ -96,11 +87,11 @@ def pose_uncertainty(
     Q = np.swapaxes(moves[:, free], 1, 2) @ V @ moves[:, free]
     noise = max(between, _noise(A, compared.b, Q))
     H = _with_surfaces(parts, noise, surface, moves, free, apriori)[1]
-    covariance = np.zeros((len(values), len(values)))
+    covariance = np.zeros((size, size))
     own = np.linalg.inv(H[np.ix_(free, free)] + np.diag(apriori[free]))
     covariance[np.ix_(free, free)] = own
     if held_covariance is not None and held.any():
-        follow = np.eye(len(values))[:, held]
+        follow = np.eye(size)[:, held]
         follow[free] = -own @ H[np.ix_(free, held)]
         covariance += follow @ held_covariance @ follow.T
     return PoseUncertainty(covariance, H, noise, surface)

@@ -216,7 +216,8 @@ def _told(
     apriori = np.eye(len(own)) / settings.pose_deviation**2
     told = np.zeros((int(is_shape.sum()), int(is_shape.sum())))
     for (cameras, edges), pose in zip(frames, poses, strict=True):
-        H = pose_uncertainty(fit, cameras, edges, pose, settings.rounds[-1]).information
+        compared = fit.compare(cameras, edges, pose, settings.rounds[-1])
+        H = pose_uncertainty(fit, compared).information
         cross = H[np.ix_(own, is_shape)]
         follow = np.linalg.solve(H[np.ix_(own, own)] + apriori, cross)
         told += (H[np.ix_(is_shape, is_shape)] - cross.T @ follow) / len(frames)

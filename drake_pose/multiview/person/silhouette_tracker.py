@@ -15,9 +15,12 @@ from numpy.typing import NDArray
 
 from drake_pose.camera import Camera
 from drake_pose.errors import SettingsError
+from drake_pose.matching.fit.camera_sums import AddUp
 from drake_pose.matching.fit.contour_fit import ContourFit, PoseFit, Prior
+from drake_pose.matching.fit.kernel import COMPARED, FITTING, SQUARES, WEIGHT
 from drake_pose.matching.fit.levenberg_marquardt import Round
 from drake_pose.multiview.person.body_plan import BodyPlan
+from drake_pose.multiview.person.colour_views import ColourViews
 from drake_pose.multiview.person.frame_views import FrameViews
 from drake_pose.multiview.person.pose_uncertainty import PoseUncertainty, pose_uncertainty
 from drake_pose.multiview.person.search import PersonSearch, SearchSettings
@@ -26,6 +29,9 @@ from drake_pose.multiview.person.silhouette_view import SilhouetteView
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+
+# Parts of which less contour is seen, in all cameras together [m], do not say that they are off.
+_TELLING = 0.3
 
 # What share of the contours fits where the model is the person, until it is known better.
 _USUAL = 0.95
@@ -41,6 +47,7 @@ class TrackerSettings:
         angle_deviation, length_deviation: how far the expectation is off [rad, m].
         retry_below: where so much less of the contours fits than usual, limbs are searched again.
         lost_below: where less than this share of the usual fits, the whole person is.
+        part_lost_below: who is followed by colour is lost where less of one part's contour fits.
         memory: for how many frames the usual share is remembered.
         search: how limbs and persons are searched.
     """
@@ -55,6 +62,7 @@ class TrackerSettings:
     length_deviation: float = 0.15
     retry_below: float = 0.03
     lost_below: float = 0.75
+    part_lost_below: float = 0.4
     memory: float = 60.0
     search: SearchSettings = field(default_factory=SearchSettings)
 
@@ -74,6 +82,7 @@ class TrackState:
         usual: the share that can be expected.
         troubled: for how many frames too little has fitted; below 0: the person was found anew, and
             in this many frames all directions will have been tried.
+        worst: of the contour of the part that fits worst, what fits, where colours say so.
     """
 
     values: Array
@@ -81,6 +90,7 @@ class TrackState:
     share: float
     usual: float
     troubled: int = 0
+    worst: float = 1.0
 
 
 class SilhouetteTracker:
@@ -161,15 +171,17 @@ class SilhouetteTracker:
             cameras, views: as in follow.
             held_covariance: (h, h) of the held values; None: they are exact.
         """
-        return pose_uncertainty(
-            self.fit,
-            cameras,
-            [view.edge for view in views],
-            values,
-            self.settings.rounds[-1],
-            self._held,
-            held_covariance,
-        )
+        edges = [view.edge for view in views]
+        compared = self.fit.compare(cameras, edges, values, self.settings.rounds[-1])
+        return pose_uncertainty(self.fit, compared, self._held, held_covariance)
+
+    def uncertainty_by_colour(
+        self, values: Array, colours: ColourViews, held_covariance: Array | None = None
+    ) -> PoseUncertainty:
+        """As uncertainty, of a frame that was followed by colour."""
+        placement = self.fit.body.place(values)
+        compared = colours.compare(self.fit, placement, self.settings.rounds[-1])
+        return pose_uncertainty(self.fit, compared, self._held, held_covariance)
 
     def deviations(self, covariance: Array) -> Array:
         """(nq,) standard deviations of the plant's positions [rad or m] of a covariance (m, m).
@@ -203,7 +215,7 @@ class SilhouetteTracker:
             if found is None:
                 return None
             return TrackState(found.values, still, found.share, _USUAL)
-        fitted = self._fitted(last, frame_views)
+        fitted = self._fitted(last, frame_views.add_up(self.fit))
         settings, search = self.settings, self.settings.search
         enough = last.usual - settings.retry_below
         lost = fitted.share < settings.lost_below * last.usual
@@ -227,6 +239,39 @@ class SilhouetteTracker:
         hopeless = due and fitted.share < enough and last.troubled > 0
         return self._restarted(state, last, frame_views) if lost or doubted or hopeless else state
 
+    def follow_by_colour(self, last: TrackState, colours: ColourViews) -> TrackState:
+        """The next frame, where pictures say where the person's edge is.
+
+        No limb is searched again: how lost the person is, `is_lost` says.
+
+        Args:
+            last: the last frame's state.
+            colours: the pictures.
+        """
+        fitted = self._fitted(last, colours.add_up(self.fit))
+        step = fitted.values - last.values
+        lengths, fitting = fitted.sums[:-1, [COMPARED, FITTING]].T
+        worst = np.min(fitting / np.maximum(lengths, 1e-9), where=lengths >= _TELLING, initial=1.0)
+        return TrackState(fitted.values, step, fitted.share, last.usual, worst=float(worst))
+
+    def distance_by_colour(self, values: Array, colours: ColourViews) -> float:
+        """How far the contour at values (m,) is from the one that colours show, typically [pixel].
+
+        nan where colours show none.
+        """
+        placement = self.fit.body.place(values)
+        sums = colours.compare(self.fit, placement, self.settings.rounds[-1]).sums
+        squares, weight = sums[:, :, [SQUARES, WEIGHT]].sum(axis=(0, 1))
+        return float(np.sqrt(squares / weight)) if weight > 0.0 else float("nan")
+
+    def is_lost(self, state: TrackState) -> bool:
+        """Whether too little of the contours fits for the pose to be believed."""
+        settings = self.settings
+        return (
+            state.share < settings.lost_below * state.usual
+            or state.worst < settings.part_lost_below
+        )
+
     def _restarted(
         self, state: TrackState, last: TrackState, frame_views: FrameViews
     ) -> TrackState:
@@ -244,11 +289,11 @@ class SilhouetteTracker:
         still = np.zeros(len(found.values))
         return replace(state, values=found.values, step=still, share=found.share, troubled=left)
 
-    def _fitted(self, last: TrackState, frame_views: FrameViews) -> PoseFit:
+    def _fitted(self, last: TrackState, add_up: AddUp) -> PoseFit:
         """The frame fitted from where the last ones point to."""
         expected = last.values + self.settings.carry * last.step
         return self.fit.fit_sums(
-            frame_views.add_up(self.fit),
+            add_up,
             expected,
             self.settings.rounds,
             Prior(expected, self._information),

@@ -5,7 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
+
+# A pixel's neighbours: what a mask loses to them is its edge.
+_CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 
 
 @dataclass(frozen=True)
@@ -38,3 +42,9 @@ def compare_masks(
         area += int(np.count_nonzero(mask))
         ious[camera] = intersection_over_union(mask, bodies[camera])
     return MaskAgreement(wrong / area if area else float("nan"), ious)
+
+
+def edge_area(mask: np.ndarray) -> int:
+    """How many pixels of a mask (H, W) bool lie on its edge."""
+    inner = cv2.erode(mask.view(np.uint8), _CROSS)
+    return int(np.count_nonzero(mask)) - int(np.count_nonzero(inner))

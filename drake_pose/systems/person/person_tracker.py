@@ -153,10 +153,7 @@ class PersonTracker(LeafSystem):
             person: as known_person or SilhouetteTracker.start gives it.
         """
         state = context.get_mutable_discrete_state(self._state)
-        state.SetFromVector(_pack(person, self._is_lost(person), 0.0, np.nan, 0.0))
-
-    def _is_lost(self, person: TrackState) -> bool:
-        return person.share < self._tracker.settings.lost_below * person.usual
+        state.SetFromVector(_pack(person, self._tracker.is_lost(person), 0.0, np.nan, 0.0))
 
     def _follow(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         vector = context.get_discrete_state(self._state).value()
@@ -186,7 +183,7 @@ class PersonTracker(LeafSystem):
             discrete_state.get_mutable_value(self._state)[_SCALARS - 2] = time
             return EventStatus.Succeeded()
         found = self._judged(found, kept)
-        lost = self._is_lost(found)
+        lost = self._tracker.is_lost(found)
         watched = _REMEMBERED if kept.others else max(vector[_OTHERS] - 1.0, 0.0)
         discrete_state.set_value(self._state, _pack(found, lost, watched, time, elapsed))
         if not lost:

@@ -100,9 +100,9 @@ def test_a_bad_picture_is_met_before_the_work_begins(recording, tmp_path):
     assert not (tmp_path / "out" / "poses.csv").exists()
 
 
-def test_an_interrupted_sequence_of_pictures_is_not_resumed_in_the_middle(recording, tmp_path):
+def test_an_interrupted_sequence_of_pictures_goes_on_as_if_it_had_not_been(recording, tmp_path):
     scene, model, _, start = recording
-    settings = EstimateSettings(start=start)
+    settings, heard = EstimateSettings(start=start), []
 
     def stop(done, total, frame, record):
         if done == 3:
@@ -110,8 +110,28 @@ def test_an_interrupted_sequence_of_pictures_is_not_resumed_in_the_middle(record
 
     with pytest.raises(KeyboardInterrupt):
         estimate_scene(scene, model, tmp_path / "out", settings, on_frame=stop, overlay=False)
-    with pytest.raises(SettingsError, match="another folder"):
-        estimate_scene(scene, model, tmp_path / "out", settings, resume=True)
+    resumed = estimate_scene(
+        scene, model, tmp_path / "out", settings, resume=True, overlay=False,
+        on_frame=lambda done, total, frame, record: heard.append((done, frame)),
+    )  # fmt: skip
+    assert heard == [(3, ""), *((k + 1, f"{k:04d}") for k in range(3, FRAMES))]
+    whole = estimate_scene(scene, model, settings=settings)
+    for one, other in zip(resumed.rows, whole.rows, strict=True):
+        np.testing.assert_allclose(one.q, other.q, atol=1e-6)
+
+
+def test_overlays_show_the_body_over_the_pictures(recording, tmp_path):
+    scene, model, _, start = recording
+    settings = EstimateSettings(start=start, frames=("0000:0001",))
+    estimate_scene(scene, model, tmp_path / "out", settings)
+    shown = cv2.imread(str(tmp_path / "out" / "overlay" / "front" / "0001.png"))
+    picture = cv2.imread(str(scene / "images" / "front" / "0001.png"))
+    # The contour is orange, blue green red; the rest is the picture's.
+    line = np.all(shown == (0, 94, 213), axis=-1)
+    assert 100 < line.sum() < 0.1 * line.size
+    colours = {tuple(one) for one in picture.reshape(-1, 3).tolist()}
+    inside = shown[120:-10, 250:-250].reshape(-1, 3).tolist()
+    assert np.mean([tuple(one) in colours for one in inside]) > 0.9
 
 
 def test_stills_have_no_pictures_and_full_masks_need_none(recording, tmp_path):

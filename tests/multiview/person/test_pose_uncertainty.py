@@ -38,7 +38,7 @@ class World:
 
     def deviations(self, values, edges, cameras=None, **more):
         cameras = self.cameras if cameras is None else cameras
-        found = pose_uncertainty(self.fit, cameras, edges, values, STEP, **more)
+        found = pose_uncertainty(self.fit, self.fit.compare(cameras, edges, values, STEP), **more)
         return dict(zip(self.names, np.sqrt(np.diag(found.covariance)), strict=True))
 
 
@@ -81,7 +81,9 @@ class TestUncertainty:
             true = world.values(**pose, head_y=generator.uniform(-20, 20))
             edges = world.edges(true, misshapen(world.fit.outlines, generator, size))
             values = world.fit.fit(world.cameras, edges, true, [STEP] * 6).values
-            found = pose_uncertainty(world.fit, world.cameras, edges, values, STEP)
+            found = pose_uncertainty(
+                world.fit, world.fit.compare(world.cameras, edges, values, STEP)
+            )
             ratios.append((values - true) / np.sqrt(np.diag(found.covariance)))
             surfaces.append(found.surface)
         inside = (np.abs(ratios) < 2.0).mean()
@@ -134,7 +136,7 @@ class TestUncertainty:
         modest = world.deviations(values, edges)
         noise = replace(world.fit.noise, deviation=2.0 * world.fit.noise.deviation)
         other = ContourFit(world.person.pose_tree(), noise=noise)
-        found = pose_uncertainty(other, world.cameras, edges, values, STEP)
+        found = pose_uncertainty(other, other.compare(world.cameras, edges, values, STEP))
         bold = dict(zip(world.names, np.sqrt(np.diag(found.covariance)), strict=True))
         for name in world.names:
             assert modest[name] / 1.5 < bold[name] < 1.5 * modest[name], name

@@ -77,6 +77,7 @@ class ColourViews:
     Attributes:
         cameras: those that have a picture.
         pictures: (H, W, 3 or 4) of each, red, green, blue.
+        known: what is known of the colours.
 
     Args:
         cameras, pictures: as above.
@@ -100,7 +101,7 @@ class ColourViews:
             check_picture(camera, picture)
             for camera, picture in zip(cameras, pictures, strict=True)
         ]
-        self._known, self._settings = known, settings or PersonColourSettings()
+        self.known, self._settings = known, settings or PersonColourSettings()
         self._packed = pack_cameras(cameras)
 
     def compare(self, fit: ContourFit, placement: Placement, step: Round) -> Comparison:
@@ -112,10 +113,10 @@ class ColourViews:
         A, b = np.zeros((count, nodes, 12, 12)), np.zeros((count, nodes, 12))
         sums = np.zeros((count, nodes + 1, 6))
         for c, camera in enumerate(self.cameras):
-            if camera.name in self._known:
+            if camera.name in self.known:
                 compare_lines(
                     placement.packed, placement.X_WN, self._camera(c), self.pictures[c],
-                    self._known[camera.name], weights[c], max(1, round(_STEP * weights[c, 1])),
+                    self.known[camera.name], weights[c], max(1, round(_STEP * weights[c, 1])),
                     A[c], b[c], sums[c],
                 )  # fmt: skip
         return Comparison(A, b, sums, placement)
@@ -142,7 +143,7 @@ class ColourViews:
         settings, regions = self._settings, regions or {}
         placement = fit.body.place(values)
         scales = pixels_per_metre(self._packed, placement.X_WN[0, :3, 3])
-        learned = dict(self._known)
+        learned = dict(self.known)
         for c, camera in enumerate(self.cameras):
             region = regions.get(camera.name)
             known = learned.get(camera.name)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.geometry import Meshcat
+from pydrake.math import RigidTransform
 from pydrake.systems.framework import (
     BasicVector,
     Context,
@@ -17,14 +18,18 @@ from pydrake.systems.framework import (
     DiscreteStateIndex,
     DiscreteValues,
     EventStatus,
+    InputPort,
     LeafSystem,
 )
+from pydrake.systems.sensors import ImageRgba8U
 from pydrake.trajectories import Trajectory
 
 from drake_pose.body import ArticulatedModel
 from drake_pose.camera import Camera, PinholeCamera
-from drake_pose.errors import SettingsError
+from drake_pose.errors import SettingsError, UnknownNameError
+from drake_pose.matching.fit.colour_lines import COLOURS
 from drake_pose.matching.fit.contour_fit import ContourFit, fitting_share
+from drake_pose.multiview.person.colour_views import ColourViews
 from drake_pose.multiview.person.frame_views import FrameViews
 from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker, TrackState
 from drake_pose.multiview.person.silhouette_view import SilhouetteView
@@ -44,6 +49,8 @@ _SCALARS = 8
 _OTHERS = 5
 # Who was seen beside the person is looked for in this many more frames; to look takes long.
 _REMEMBERED = 15
+# Silhouettes of fewer cameras do not say where the person is.
+_SEERS = 2
 # Cameras in which the person and another are one figure are left out where this many others remain.
 _ENOUGH = 3
 # After a pause a motion is expected to go on for no more than this many frames.
@@ -58,10 +65,12 @@ class PersonTracker(LeafSystem):
         name: PersonTracker
         input_ports:
         - silhouette_<camera>
+        - color_image_<camera> (where asked for)
         - time
         output_ports:
         - estimated_positions
         - last_positions
+        - body_poses
         - share
         - time
         - seen
@@ -82,6 +91,14 @@ class PersonTracker(LeafSystem):
     seen; they are cut out, and a camera in which the person and another are one figure is left out
     where three others see the person alone, else not judged by.
 
+    ``color_image_<camera>`` of each camera named in ``color_cameras`` is an ``ImageRgba8U``. Where
+    fewer than two cameras give a silhouette that shows somebody, a person who is known is followed
+    by colour; the colours are learned from frame to frame. So silhouettes of one moment will do, or
+    ``set_person``. A person who is lost by colour is searched in the next silhouettes.
+
+    ``body_poses`` are the poses of all bodies at the last positions, in the plant's order, as a
+    plant's output of that name gives them.
+
     ``deviations`` is there where it is asked for: (nq,) the positions' standard deviations
     [rad or m], by the pictures and the limits alone; nan where the positions are.
 
@@ -90,8 +107,10 @@ class PersonTracker(LeafSystem):
         cameras: the calibrated cameras, in the order of the input ports.
         period: time between two looks at the inputs [s].
         with_deviations: whether the deviations are an output.
+        color_cameras: names of the cameras that have a port for a colour image.
 
     Raises:
+        UnknownNameError: a name of ``color_cameras`` is no camera's.
         SettingsError: fewer than two cameras, two of one name, or a period that is not positive.
     """
 
@@ -101,6 +120,7 @@ class PersonTracker(LeafSystem):
         cameras: Sequence[Camera],
         period: float,
         with_deviations: bool = False,
+        color_cameras: Collection[str] = (),
     ) -> None:
         super().__init__()
         names = [camera.name for camera in cameras]
@@ -126,6 +146,12 @@ class PersonTracker(LeafSystem):
             "estimated_positions", len(default), self._calc_positions, ticket
         )
         self.DeclareStateOutputPort("last_positions", self._last)
+        self.DeclareAbstractOutputPort(
+            "body_poses",
+            lambda: AbstractValue.Make([RigidTransform()]),
+            self._calc_body_poses,
+            {self.discrete_state_ticket(self._last)},
+        )
         self.DeclareVectorOutputPort("share", 1, self._calc_share, ticket)
         self.DeclareVectorOutputPort("time", 1, self._calc_time, ticket)
         self.DeclareStateOutputPort("seen", self._seen)
@@ -135,7 +161,26 @@ class PersonTracker(LeafSystem):
         if with_deviations:
             self._deviations = self.DeclareDiscreteState(np.full(len(default), np.nan))
             self.DeclareStateOutputPort("deviations", self._deviations)
+        self._color_ports = self._declare_color_ports(color_cameras)
+        # What is known of the person's colours: state, so that a simulation can be replayed.
+        self._colours_shape = (len(color_cameras), len(tracker.fit.outlines), 3, COLOURS)
+        self._colours = self.DeclareDiscreteState(int(np.prod(self._colours_shape)))
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._follow)
+
+    def _declare_color_ports(self, wanted: Collection[str]) -> dict[str, InputPort]:
+        """The ports of colour images by camera."""
+        known = {camera.name: camera for camera in self._cameras}
+        for name in wanted:
+            if name not in known:
+                raise UnknownNameError("camera", name, known, "color_cameras")
+        return {
+            name: self.DeclareAbstractInputPort(
+                f"color_image_{name}",
+                AbstractValue.Make(ImageRgba8U(camera.width, camera.height)),
+            )
+            for name, camera in known.items()
+            if name in wanted
+        }
 
     def known_person(self, context: Context) -> TrackState | None:
         """What is known of the person, lost or not; None: nobody was found yet.
@@ -163,18 +208,18 @@ class PersonTracker(LeafSystem):
             time = float(self._time.Eval(context)[0])
             if np.isnan(time) or time == before:
                 return EventStatus.Succeeded()
-        frame_views = self._frame_views(context)
         elapsed = 0.0 if np.isnan(before) else time - before
         last = _unpack(vector, elapsed)
-        found, kept = self._followed(last, frame_views, vector[_OTHERS] > 0)
-        seers = {*kept.merged} | {
-            camera.name
-            for camera, view in zip(kept.cameras, kept.views, strict=True)
-            if shows_somebody(view)
-        }
-        seen = [float(camera.name in seers) for camera in self._cameras]
-        discrete_state.set_value(self._seen, seen)
-        discrete_state.set_value(self._others, [float(kept.others)])
+        frame_views, colours = self._frame_views(context), self._colour_views(context)
+        is_blind = sum(shows_somebody(view) for view in frame_views.views) < _SEERS
+        found: TrackState | None
+        if is_blind and colours is not None and last is not None:
+            found, colours = self._followed_by_colour(last, colours)
+            kept, by_colour = _FrameViews((), ()), colours
+        else:
+            found, kept = self._followed(last, frame_views, vector[_OTHERS] > 0)
+            by_colour = None
+        self._set_seen(discrete_state, kept, by_colour)
         if self._deviations is not None:
             discrete_state.get_mutable_value(self._deviations)[:] = np.nan
         if found is None and last is not None:
@@ -187,12 +232,83 @@ class PersonTracker(LeafSystem):
         watched = _REMEMBERED if kept.others else max(vector[_OTHERS] - 1.0, 0.0)
         discrete_state.set_value(self._state, _pack(found, lost, watched, time, elapsed))
         if not lost:
-            discrete_state.set_value(self._last, self._tracker.positions(found.values))
-        if not lost and self._deviations is not None:
-            sure = self._tracker.uncertainty(found.values, kept.cameras, kept.views)
-            deviations = self._tracker.deviations(sure.covariance)
-            discrete_state.set_value(self._deviations, deviations)
+            self._note(discrete_state, found.values, kept, colours, by_colour is not None)
         return EventStatus.Succeeded()
+
+    def _note(
+        self,
+        discrete_state: DiscreteValues,
+        values: np.ndarray,
+        kept: _FrameViews,
+        colours: ColourViews | None,
+        by_colour: bool,
+    ) -> None:
+        """Keeps what a frame says in which the person is not lost."""
+        tracker = self._tracker
+        discrete_state.set_value(self._last, tracker.positions(values))
+        if self._deviations is not None:
+            if by_colour and colours is not None:
+                sure = tracker.uncertainty_by_colour(values, colours)
+            else:
+                sure = tracker.uncertainty(values, kept.cameras, kept.views)
+            deviations = tracker.deviations(sure.covariance)
+            discrete_state.set_value(self._deviations, deviations)
+        if colours is not None:
+            regions = {
+                camera.name: view.region
+                for camera, view in zip(kept.cameras, kept.views, strict=True)
+                if camera.name not in kept.merged and shows_somebody(view)
+            }
+            known = colours.learned(tracker.fit, values, regions)
+            packed = discrete_state.get_mutable_value(self._colours).reshape(self._colours_shape)
+            for k, name in enumerate(self._color_ports):
+                if name in known:
+                    packed[k] = known[name]
+
+    def _set_seen(
+        self, discrete_state: DiscreteValues, kept: _FrameViews, by_colour: ColourViews | None
+    ) -> None:
+        """Notes which cameras saw the person, and whether others were there."""
+        seers = {*kept.merged} | {
+            camera.name
+            for camera, view in zip(kept.cameras, kept.views, strict=True)
+            if shows_somebody(view)
+        }
+        if by_colour is not None:
+            seers = {camera.name for camera in by_colour.cameras}
+        seen = [float(camera.name in seers) for camera in self._cameras]
+        discrete_state.set_value(self._seen, seen)
+        discrete_state.set_value(self._others, [float(kept.others)])
+
+    def _colour_views(self, context: Context) -> ColourViews | None:
+        """The pictures that are there, and what is known of the colours; None: no picture."""
+        cameras, pictures = [], []
+        for camera in self._cameras:
+            port = self._color_ports.get(camera.name)
+            image = port.Eval(context) if port is not None and port.HasValue(context) else None
+            # A camera that has nothing to show gives an image of no pixels.
+            if image is not None and image.size():
+                cameras.append(camera)
+                pictures.append(np.array(image.data))
+        if not cameras:
+            return None
+        packed = context.get_discrete_state(self._colours).value().reshape(self._colours_shape)
+        known = {
+            name: packed[k].astype(np.float32)
+            for k, name in enumerate(self._color_ports)
+            if packed[k].any()
+        }
+        return ColourViews(cameras, pictures, known)
+
+    def _followed_by_colour(
+        self, last: TrackState, colours: ColourViews
+    ) -> tuple[TrackState, ColourViews]:
+        """The next state by pictures, and the pictures with what is known of their colours."""
+        if not colours.known and not self._tracker.is_lost(last):
+            # The person was set: these are the first pictures.
+            known = colours.learned(self._tracker.fit, last.values)
+            colours = ColourViews(colours.cameras, colours.pictures, known)
+        return self._tracker.follow_by_colour(last, colours), colours
 
     def _frame_views(self, context: Context) -> _FrameViews:
         """What those cameras say that have a picture."""
@@ -220,7 +336,7 @@ class PersonTracker(LeafSystem):
 
     def _follow_one(self, last: TrackState | None, frame_views: _FrameViews) -> TrackState | None:
         """The next state; None where fewer than two cameras see anybody."""
-        if sum(shows_somebody(view) for view in frame_views.views) < 2:
+        if sum(shows_somebody(view) for view in frame_views.views) < _SEERS:
             return None
         return self._tracker.follow(last, frame_views.cameras, frame_views.views)
 
@@ -254,6 +370,12 @@ class PersonTracker(LeafSystem):
         positions = self._tracker.positions(np.split(vector[_SCALARS:], 2)[0])
         known, lost = vector[0], vector[4]
         output.SetFromVector(positions if known and not lost else np.full(len(positions), np.nan))
+
+    def _calc_body_poses(self, context: Context, output: AbstractValue) -> None:
+        plant = self._tracker.fit.tree.model.plant
+        plant_context = plant.CreateDefaultContext()
+        plant.SetPositions(plant_context, context.get_discrete_state(self._last).value())
+        output.set_value(plant.get_body_poses_output_port().Eval(plant_context))
 
     def _calc_share(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(context.get_discrete_state(self._state).value()[1:2])

@@ -6,11 +6,12 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from drake_pose.body import bundled_model, load_model
 from drake_pose.camera.rigs import circle_of_cameras
-from drake_pose.errors import SettingsError
+from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.matching.fit.contour_fit import ContourFit
 from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker
 from drake_pose.multiview.person.silhouette_view import see_silhouette
 from drake_pose.silhouette import LabelRenderer
+from drake_pose.systems.colour_images import picture_to_colour_image
 from drake_pose.systems.person.person_tracker import PersonTracker, build_person_capture
 from drake_pose.systems.person.silhouette_sensor import edge_spacing
 from tests.multiview.persons_in_view import see, stepping
@@ -189,3 +190,60 @@ def test_arguments_are_checked(person, cameras):
         PersonTracker(tracker, list(cameras.values())[:1], 0.1)
     with pytest.raises(SettingsError, match="period"):
         PersonTracker(tracker, list(cameras.values()), 0.0)
+
+
+def test_a_person_who_is_set_is_followed_by_colour_images(person, cameras):
+    tracker = SilhouetteTracker(ContourFit(person.pose_tree()))
+    names = list(cameras)
+    system = PersonTracker(
+        tracker, list(cameras.values()), 0.1, with_deviations=True, color_cameras=names
+    )
+    simulator = Simulator(system)
+    context = simulator.get_context()
+    q = np.zeros(len(person.position_names))
+    q[person.position_index("position_z")] = 1.55
+    system.set_person(context, tracker.start(tracker.values(q)))
+    renderers = {name: LabelRenderer(person, camera) for name, camera in cameras.items()}
+    patches = np.random.default_rng(4).integers(0, 120, (12, 16, 3))
+    room = patches.repeat(20, axis=0).repeat(20, axis=1)
+
+    def show(is_covered=False):
+        for name, renderer in renderers.items():
+            mask = renderer.mask(q)
+            picture = np.where(mask[..., None], (240, 150, 60), room).astype(np.uint8)
+            if is_covered:
+                picture[:] = 60
+            image = picture_to_colour_image(picture)
+            system.GetInputPort(f"color_image_{name}").FixValue(context, image)
+        simulator.AdvanceTo(context.get_time() + 0.1)
+        return system.GetOutputPort("estimated_positions").Eval(context)
+
+    for k in range(4):
+        q[person.position_index("left_upper_arm_z")] = np.radians(4.0 * k)
+        q[person.position_index("position_x")] = 0.02 * k
+        found = show()
+    assert found[person.position_index("position_x")] == pytest.approx(0.06, abs=0.01)
+    arm = found[person.position_index("left_upper_arm_z")]
+    assert np.degrees(arm) == pytest.approx(12.0, abs=4.0)
+    assert system.GetOutputPort("seen").Eval(context).all()
+    deviations = system.GetOutputPort("deviations").Eval(context)
+    assert np.all((deviations >= 0.0) & (deviations < np.pi))
+    plant = person.plant
+    plant_context = plant.CreateDefaultContext()
+    plant.SetPositions(plant_context, found)
+    expected = plant.get_body_poses_output_port().Eval(plant_context)
+    poses = system.GetOutputPort("body_poses").Eval(context)
+    assert len(poses) == plant.num_bodies()
+    for pose, one in zip(poses, expected, strict=True):
+        assert pose.IsNearlyEqualTo(one, 1e-9)
+    assert np.isnan(show(is_covered=True)).all()
+    # The last poses are still there to be shown.
+    assert system.GetOutputPort("body_poses").Eval(context)[-1].IsNearlyEqualTo(poses[-1], 1e-9)
+    found = show()
+    assert found[person.position_index("position_x")] == pytest.approx(0.06, abs=0.01)
+
+
+def test_a_colour_image_of_no_camera_is_refused(person, cameras):
+    tracker = SilhouetteTracker(ContourFit(person.pose_tree()))
+    with pytest.raises(UnknownNameError, match="elsewhere"):
+        PersonTracker(tracker, list(cameras.values()), 0.1, color_cameras=["elsewhere"])

@@ -14,9 +14,9 @@ from drake_pose.camera.picture_files import SUFFIXES, read_picture
 from drake_pose.camera.sources.frame_source import Picture, SourceSpecification
 from drake_pose.camera.sources.recorded import VideoSource, find_picture_files
 from drake_pose.errors import SceneError
+from drake_pose.silhouette.pictures.video_pictures import VIDEOS
 from drake_pose.silhouette.segmentation.annotations import Annotations, read_annotations
 
-VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg")
 CAMERAS = "cameras.yaml"
 SCENE = "scene.yaml"
 UNNAMED = ""

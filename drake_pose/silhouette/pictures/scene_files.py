@@ -10,6 +10,7 @@ from difflib import get_close_matches
 from pathlib import Path
 
 from drake_pose.errors import SceneError
+from drake_pose.silhouette.pictures.video_pictures import VIDEOS, VideoPictures
 
 _SUFFIX = ".png"
 _IMAGES = (".png", ".jpg", ".jpeg")
@@ -95,20 +96,43 @@ def find_masks(folder: Path, cameras: Iterable[str]) -> SceneFiles:
     return SceneFiles(masks, frames, Leftovers(strangers, doubled, kept))
 
 
-def find_images(folder: Path, cameras: Iterable[str]) -> dict[tuple[str, str], Path]:
+def find_images(
+    folder: Path, cameras: Iterable[str], frames: Iterable[str] = ()
+) -> dict[tuple[str, str], Path]:
     """Finds images/<camera>/<frame>.png or .jpg by (camera, frame); none where there is no folder.
 
+    Of a camera without such a folder the video videos/<camera>.mp4 is each of its frames, which are
+    named 000000, 000001 and so on, or as frames of these numbers are named already.
+
+    Args:
+        folder: the scene's.
+        cameras: the cameras.
+        frames: names of frames that are known.
+
     Raises:
-        SceneError: a folder that cannot be read.
+        SceneError: a folder or video that cannot be read.
     """
     found: dict[tuple[str, str], Path] = {}
+    known = {int(frame): frame for frame in frames if frame.isdecimal()}
     for camera in cameras:
         own = folder / "images" / camera
         if own.is_dir():
             names = [entry.name for entry in _visible(own) if not entry.is_dir()]
             pictures = [Path(name) for name in names if Path(name).suffix.lower() in _IMAGES]
             found |= {(camera, name.stem): own / name for name in pictures}
+            continue
+        video = find_video(folder, camera)
+        if video is not None:
+            count = VideoPictures(video).count
+            names = [known.get(number, f"{number:06d}") for number in range(count)]
+            found |= {(camera, name): video for name in names}
     return found
+
+
+def find_video(folder: Path, camera: str) -> Path | None:
+    """The video of a camera in a scene's folder; None where there is none."""
+    files = [folder / "videos" / f"{camera}{suffix}" for suffix in VIDEOS]
+    return next((file for file in files if file.is_file()), None)
 
 
 def _no_masks(

@@ -22,6 +22,7 @@ from drake_pose.silhouette.pictures.scene_files import (
     find_masks,
     natural_key,
 )
+from drake_pose.silhouette.pictures.video_pictures import VIDEOS, VideoPictures
 from drake_pose.yaml_files import read_yaml
 
 _FIELDS = ("sequence", "frame_rate_hz")
@@ -48,9 +49,9 @@ class Scene:
         scale_unknown: whether nobody knows the cameras: each is a parallel camera that looks along
             the world's -x, and its pixels_per_metre and what it looks at are to be found.
         leftovers: what lies in the folder and is not used.
-        images: the picture files of (camera, frame) of a sequence that has masks of few frames, or
-            none: where a camera has no mask the body is tracked by its colours. Empty where there
-            is a mask for every picture.
+        images: the files, pictures or videos, of (camera, frame) of a sequence that has masks of
+            few frames, or none: where a camera has no mask the body is tracked by its colours.
+            Empty where there is a mask for every picture.
     """
 
     path: Path
@@ -62,6 +63,7 @@ class Scene:
     scale_unknown: bool = False
     leftovers: Leftovers = field(default_factory=Leftovers)
     images: Mapping[tuple[str, str], Path] = field(default_factory=dict)
+    _videos: dict[Path, VideoPictures] = field(default_factory=dict, repr=False, compare=False)
 
     def cameras_of(self, frame: str) -> tuple[str, ...]:
         """Returns the names of the cameras that have a mask of a frame.
@@ -114,19 +116,30 @@ class Scene:
             known = sorted(name for owner, name in self.images if owner == camera)
             raise UnknownNameError("frame", frame, known, f"{self.path}: camera '{camera}'")
         file, size = self.images[camera, frame], self.cameras[camera]
-        try:
-            data = np.frombuffer(read_regular(file), np.uint8)
-        except OSError as error:
-            raise SceneError(f"{file}: cannot be read: {error}") from error
-        picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
-        if picture is None:
-            raise SceneError(f"{file}: is no picture that can be read")
+        if file.suffix.lower() in VIDEOS:
+            if file not in self._videos:
+                self._videos[file] = VideoPictures(file)
+            picture = self._videos[file].read(int(frame))
+        else:
+            picture = _read_picture(file)
         if picture.shape[:2] != (size.height, size.width):
             raise SceneError(
                 f"{file}: is {picture.shape[1]} x {picture.shape[0]} pixels, but camera "
                 f"'{camera}' has {size.width} x {size.height}"
             )
-        return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
+        return picture
+
+
+def _read_picture(file: Path) -> np.ndarray:
+    """A picture (H, W, 3), red, green, blue, of a file."""
+    try:
+        data = np.frombuffer(read_regular(file), np.uint8)
+    except OSError as error:
+        raise SceneError(f"{file}: cannot be read: {error}") from error
+    picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+    if picture is None:
+        raise SceneError(f"{file}: is no picture that can be read")
+    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
 
 
 def load_scene(path: str | Path, cameras: Mapping[str, Camera] | None = None) -> Scene:
@@ -134,7 +147,8 @@ def load_scene(path: str | Path, cameras: Mapping[str, Camera] | None = None) ->
 
     The folder has `cameras.yaml`, `masks/<camera>/<frame>.png` and perhaps `scene.yaml`
     (`sequence: true|false`, `frame_rate_hz`). A sequence may have pictures
-    `images/<camera>/<frame>.png` or `.jpg` where it has no masks. With a single camera the masks
+    `images/<camera>/<frame>.png` or `.jpg`, or a video `videos/<camera>.mp4`, where it has no
+    masks. With a single camera the masks
     may lie in `masks/<frame>.png`. Such masks need no camera file: without one they were taken by
     a camera that nobody knows, or by several where the pictures' sizes differ. Masks of cameras
     that are not in the camera file are left over, see `Scene.leftovers`.
@@ -156,8 +170,13 @@ def load_scene(path: str | Path, cameras: Mapping[str, Camera] | None = None) ->
             cameras, files = _unknown_cameras(folder)
             return Scene(folder, cameras, files.frames, files.masks, sequence, frame_rate_hz, True)
         cameras = load_cameras(folder / "cameras.yaml")
-    images = find_images(folder, cameras) if sequence else {}
-    files = SceneFiles({}, ()) if images and not _has_masks(folder) else find_masks(folder, cameras)
+    files = find_masks(folder, cameras) if _has_masks(folder) else SceneFiles({}, ())
+    images = find_images(folder, cameras, files.frames) if sequence else {}
+    if not (images or _has_masks(folder)):
+        files = find_masks(folder, cameras)
+    videos = [file for file in images.values() if file.suffix.lower() in VIDEOS]
+    if videos and frame_rate_hz is None:
+        frame_rate_hz = VideoPictures(videos[0]).rate_hz
     if all(key in files.masks for key in images):
         images = {}
     frames = sorted({*files.frames, *(frame for _, frame in images)}, key=natural_key)

@@ -66,6 +66,58 @@ def test_pictures_and_a_mask_of_the_first_frame_are_enough(recording, tmp_path):
     assert np.median(errors(estimate, truth)) < 1.5
 
 
+@pytest.fixture(scope="module")
+def filmed(recording, tmp_path_factory):
+    """The same scene with a video in place of the pictures."""
+    scene = recording[0]
+    copy = tmp_path_factory.mktemp("filmed")
+    shutil.copy(scene / "cameras.yaml", copy)
+    (copy / "scene.yaml").write_text("sequence: true\n")
+    (copy / "videos").mkdir()
+    pictures = [cv2.imread(str(file)) for file in sorted(scene.glob("images/front/*.png"))]
+    height, width = pictures[0].shape[:2]
+    kind = cv2.VideoWriter.fourcc(*"MJPG")
+    writer = cv2.VideoWriter(str(copy / "videos" / "front.avi"), kind, 25.0, (width, height))
+    for picture in pictures:
+        writer.write(picture)
+    writer.release()
+    return copy
+
+
+def test_a_video_stands_for_pictures(recording, filmed):
+    scene, model, truth, start = recording
+    loaded = load_scene(filmed)
+    assert loaded.frames == tuple(f"{k:06d}" for k in range(FRAMES))
+    assert loaded.frame_rate_hz == pytest.approx(25.0)
+    # In order, back, and over some: compression changes little.
+    still = load_scene(scene)
+    for k in (0, 1, 5, 2, 7):
+        off = loaded.read_image("front", f"{k:06d}").astype(float)
+        off -= still.read_image("front", f"{k:04d}")
+        assert np.abs(off).mean() < 12.0
+    estimate = estimate_scene(filmed, model, settings=EstimateSettings(start=start))
+    assert estimate.found_count == FRAMES
+    assert np.median(errors(estimate, truth)) < 3.0
+
+
+def test_frames_of_a_video_are_named_as_its_masks_are(recording, filmed, tmp_path):
+    copy = tmp_path / "scene"
+    shutil.copytree(filmed, copy)
+    (copy / "masks" / "front").mkdir(parents=True)
+    shutil.copy(recording[0].parent / "first.png", copy / "masks" / "front" / "0.png")
+    loaded = load_scene(copy)
+    assert loaded.frames == ("0", *(f"{k:06d}" for k in range(1, FRAMES)))
+    assert ("front", "0") in loaded.images
+
+
+def test_what_is_no_video_is_named(filmed, tmp_path):
+    copy = tmp_path / "scene"
+    shutil.copytree(filmed, copy)
+    (copy / "videos" / "front.avi").write_bytes(b"no video")
+    with pytest.raises(SceneError, match=r"front\.avi.*not a video"):
+        load_scene(copy)
+
+
 def test_nothing_says_where_the_body_is_at_first(recording):
     scene, model, _, _ = recording
     with pytest.raises(SceneError, match=r"'0000'.*masks/front/0000\.png.*--start"):

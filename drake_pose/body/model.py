@@ -8,8 +8,17 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import SceneGraph
+from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex
+from pydrake.multibody.tree import (
+    BodyIndex,
+    FixedOffsetFrame,
+    Joint,
+    ModelInstanceIndex,
+    PrismaticJoint,
+    RevoluteJoint,
+    SpatialInertia,
+)
 
 from drake_pose.body.files.parsing import ModelSource, limit_kinds
 from drake_pose.body.files.safety import check_in_child
@@ -24,10 +33,22 @@ from drake_pose.body.parsed_model import ParsedModel, link_names
 from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.body.surfaces.skin_file import SkinBand, load_skin
 from drake_pose.body.surfaces.visual_geometry import body_mesh, make_drawable
+from drake_pose.body.tree.link_graph import PlantKinematics
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.body.tree.tree_builder import build_pose_tree
 from drake_pose.errors import ModelError
+
+OBJECT = "target"
+"""The link of an object that stands in the world beside a robot."""
+
+OBJECT_POSITIONS = tuple(f"{OBJECT}_{move}_{axis}" for move in ("shift", "turn") for axis in "xyz")
+"""The positions that move it: shifts along its axes [m], then turns about them [rad]."""
+
+# An object is moved by no more [m, rad].
+_FARTHEST = 10.0
+# So small is what stands for links without looks where they are needed in a tree [m].
+_DOT = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +129,48 @@ class ArticulatedModel(ParsedModel):
             ModelError: the file is no URDF.
         """
         return self._changed(with_shifted_joints(self._urdf_text(), shifts), self.skin)
+
+    def before_object(
+        self, link: str, mesh: TriangleMesh, X_WO: NDArray[np.float64]
+    ) -> "ArticulatedModel":
+        """The joints between the world and a link, and a rigid object that stands in the world.
+
+        What matters to a camera on the link: only the object has looks, the world and the link are
+        dots. The robot's base stands where it does at the default positions, welded to the world.
+
+        Args:
+            link: the link.
+            mesh: the object's surface in its frame O.
+            X_WO: (4, 4) where it stands at OBJECT_POSITIONS of zero.
+
+        Raises:
+            UnknownNameError: no link has that name.
+            ModelError: the file is refused in another plant.
+        """
+        self.link_index(link)
+        plant, scene_graph = MultibodyPlant(time_step=0.0), SceneGraph()
+        plant.RegisterAsSourceForSceneGraph(scene_graph)
+        # Nothing of the robot is seen, so its meshes are not read again.
+        self._source.parse(plant, None)
+        _weld_bases(self, plant)
+        _add_object(plant, X_WO)
+        plant.Finalize()
+        positions = describe_positions(plant, self._source.limits, str(self.path))
+        dot = TriangleMesh(_DOT * np.eye(3), np.array([[0, 1, 2]]))
+        return replace(
+            self,
+            plant=plant,
+            scene_graph=scene_graph,
+            position_names=positions.names,
+            position_kinds=positions.kinds,
+            lower=positions.lower,
+            upper=positions.upper,
+            default_positions=positions.defaults,
+            periodic=positions.periodic,
+            turns_freely=positions.turns_freely,
+            link_meshes=MappingProxyType({self.link_names[0]: dot, link: dot, OBJECT: mesh}),
+            skin=(),
+        )
 
     @property
     def changes_shape(self) -> bool:
@@ -235,3 +298,28 @@ def _seen_meshes(
             "elements (MJCF: geoms of a group below 3)"
         )
     return meshes
+
+
+def _weld_bases(model: ParsedModel, plant: MultibodyPlant) -> None:
+    """Welds what no joint holds to the world, where it stands at the model's default positions."""
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+    carried = {int(joint.child_body().index()) for joint in joints}
+    kinematics = PlantKinematics(model)
+    for index in range(1, plant.num_bodies()):
+        if index not in carried:
+            frame = plant.get_body(BodyIndex(index)).body_frame()
+            plant.WeldFrames(plant.world_frame(), frame, RigidTransform(kinematics.pose(index)))
+
+
+def _add_object(plant: MultibodyPlant, X_WO: NDArray[np.float64]) -> None:
+    """Six joints, one after another, between the world and a link without looks."""
+    world = plant.world_frame()
+    frame = plant.AddFrame(FixedOffsetFrame(f"{OBJECT}_start", world, RigidTransform(X_WO)))
+    instance = plant.AddModelInstance(OBJECT)
+    for k, name in enumerate(OBJECT_POSITIONS):
+        link = OBJECT if k == len(OBJECT_POSITIONS) - 1 else f"{name}_end"
+        body = plant.AddRigidBody(link, instance, SpatialInertia.Zero())
+        kind, axis = PrismaticJoint if k < 3 else RevoluteJoint, np.eye(3)[k % 3]
+        joint: Joint = kind(name, frame, body.body_frame(), axis, -_FARTHEST, _FARTHEST)
+        plant.AddJoint(joint)
+        frame = body.body_frame()

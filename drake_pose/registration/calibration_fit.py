@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.body.model import OBJECT_POSITIONS
 from drake_pose.matching.fit.contour_fit import Comparison
 from drake_pose.matching.fit.kernel import COST, WEIGHT
 from drake_pose.matching.fit.levenberg_marquardt import Equations, Round, StepSettings, minimise
@@ -21,6 +22,15 @@ from drake_pose.registration.camera_fit import POSE_NAMES, CameraFit
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
+ROUNDS_WITH_CONSTANTS = (
+    *(Round(scale, 0.02) for scale in (0.12, 0.09, 0.07, 0.05, 0.03, 0.02)),
+    Round(0.01, 0.01),
+    # Again and again, for what hardly shows, such as a zero that turns with the camera, gains so
+    # little in a step that a round ends before it is there.
+    *(Round(0.005, 0.005, 6) for _ in range(5)),
+)
+"""Parts of a fit that has constants to find beside cameras."""
+
 _STEPS = StepSettings(longest=0.3, damping=1e-2, even_damping=1e-6)
 # Masks are wider or narrower by no more [pixel], and their width is varied by this.
 _WIDEST, _WIDTH_STEP = 6.0, 0.25
@@ -29,6 +39,8 @@ _POSE = len(POSE_NAMES)
 # What is known beforehand of zeros [rad or m] and the logarithms of lengths, and of the logarithms
 # of focal lengths: deviations.
 CONSTANT_DEVIATION, FOCAL_DEVIATION = 0.2, 0.1
+# And of where an object stands, once it was found [m, rad].
+_OBJECT_DEVIATION = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +113,11 @@ class CalibrationFit:
         cameras = [FOCAL_DEVIATION**-2 * (k == _POSE) for k in range(self.per_camera)] * len(
             self.fits
         )
-        self.information = np.array([*cameras, *[CONSTANT_DEVIATION**-2] * len(self.constants)])
+        known = [
+            _OBJECT_DEVIATION if self.fits[0].names[k] in OBJECT_POSITIONS else CONSTANT_DEVIATION
+            for k in self.constants
+        ]
+        self.information = np.array([*cameras, *(one**-2 for one in known)])
 
     def fit(self, start: Calibration, rounds: Sequence[Round]) -> Calibration:
         """Fits all from where it starts.

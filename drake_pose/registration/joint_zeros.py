@@ -17,14 +17,15 @@ from numpy.typing import NDArray
 from scipy.special import stdtr, stdtrit
 
 from drake_pose.body import PoseTree
+from drake_pose.body.model import OBJECT_POSITIONS
 from drake_pose.body.tree.joint_offsets import joint_offsets
 from drake_pose.camera import PinholeCamera
 from drake_pose.errors import RegistrationError, UnknownNameError
 from drake_pose.matching.fit.lengthened_body import length_name
-from drake_pose.matching.fit.levenberg_marquardt import Round
 from drake_pose.registration.agreement import agreeing, frame_shares
 from drake_pose.registration.calibration_fit import (
     CONSTANT_DEVIATION,
+    ROUNDS_WITH_CONSTANTS,
     Calibration,
     CalibrationFit,
     start_calibration,
@@ -36,13 +37,6 @@ from drake_pose.registration.uncertainty import calibration_uncertainty, pose_co
 
 Array = NDArray[np.float64]
 
-_ROUNDS = (
-    *(Round(scale, 0.02) for scale in (0.12, 0.09, 0.07, 0.05, 0.03, 0.02)),
-    Round(0.01, 0.01),
-    # Again and again, for what hardly shows, such as a zero that turns with the camera, gains so
-    # little in a step that a round ends before it is there.
-    *(Round(0.005, 0.005, 6) for _ in range(5)),
-)
 # So many standard deviations to either side it is looked whether the cost bends as it should.
 _ASIDE = 2.0
 # Less than this share of what it should be is none.
@@ -99,6 +93,9 @@ class JointCalibration:
         focal_deviations: (cameras,) standard deviations of focal lengths, as shares of them; 0
             where they were held.
         gains: (cameras,) by how much the share of the contours that fits grew.
+        object_values: (6,) by how much an object stands elsewhere whose place is not known,
+            OBJECT_POSITIONS; empty where there is none.
+        object_covariance: (6, 6) of these.
     """
 
     zeros: tuple[KinematicParameter, ...]
@@ -107,6 +104,8 @@ class JointCalibration:
     covariances: Array
     focal_deviations: Array
     gains: Array
+    object_values: Array
+    object_covariance: Array
 
 
 def links_with_length(tree: PoseTree) -> tuple[str, ...]:
@@ -120,7 +119,8 @@ def require_known(tree: PoseTree, names: Sequence[str], lengths: Sequence[str]) 
     Raises:
         UnknownNameError: says which there are.
     """
-    positions = [name for node in tree.nodes for name in node.value_names]
+    own = [name for node in tree.nodes for name in node.value_names]
+    positions = [name for name in own if name not in OBJECT_POSITIONS]
     for what, asked, known in (
         ("joint", names, positions),
         ("link with a length", lengths, links_with_length(tree)),
@@ -166,13 +166,14 @@ def calibrate_joints(
     ]
     X_CW = [one.camera.X_CW for one in cameras]
     asked = [*names, *(length_name(link) for link in lengths)]
+    standing = [name for name in body.kinematics.names if name in OBJECT_POSITIONS]
     told: dict[str, KinematicParameter] = {}
     sought = asked
     while True:
-        constants = [fits[0].names.index(name) for name in sought]
+        constants = [fits[0].names.index(name) for name in [*standing, *sought]]
         fit, found, before = _fit(fits, X_CW, constants, focal)
         covariance = _as_the_cost_bends(fit, found, calibration_uncertainty(fit, found).covariance)
-        values = _constants(fit, found, covariance)
+        values = _constants(fit, found, covariance, sought)
         told |= values
         # The cameras shall fit what is answered: nothing is added where it cannot be told.
         sought = [name for name in sought if values[name].determined]
@@ -196,7 +197,7 @@ def _fit(
         if k > 0:
             which = [np.flatnonzero(agreeing(one)) for one in _shares(fit, found)]
             fit = CalibrationFit(fits, which, constants, focal)
-        found = fit.fit(found, _ROUNDS)
+        found = fit.fit(found, ROUNDS_WITH_CONSTANTS)
     return fit, found, before
 
 
@@ -209,7 +210,7 @@ def _as_the_cost_bends(fit: CalibrationFit, found: Calibration, covariance: Arra
     found_covariance = covariance.copy()
     for k in range(len(fit.names) - len(fit.constants), len(fit.names)):
         along = covariance[:, k] / math.sqrt(covariance[k, k])
-        bends, said = fit.bend(found, _ASIDE * along, _ROUNDS[-1])
+        bends, said = fit.bend(found, _ASIDE * along, ROUNDS_WITH_CONSTANTS[-1])
         share = min(1.0, max(_NO_BEND, bends / said))
         found_covariance += (1.0 / share - 1.0) * np.outer(along, along)
     return found_covariance
@@ -238,36 +239,52 @@ def _describe(
             focal[c] = math.sqrt(covariance[c * fit.per_camera + 6, c * fit.per_camera + 6])
     after = _shares(fit, found)
     gains = [b.mean() - a.mean() for a, b in zip(before, after, strict=True)]
+    first = len(fit.names) - len(fit.constants)
+    standing = [k for k, name in enumerate(fit.names[first:]) if name in OBJECT_POSITIONS]
+    places = first + np.array(standing, dtype=np.intp)
     return JointCalibration(
-        tuple(zeros), tuple(lengths), tuple(cameras), np.array(covariances), focal, np.array(gains)
-    )
+        tuple(zeros), tuple(lengths), tuple(cameras), np.array(covariances), focal,
+        np.array(gains), found.constants[standing], covariance[np.ix_(places, places)],
+    )  # fmt: skip
 
 
 def _constants(
-    fit: CalibrationFit, found: Calibration, covariance: Array
+    fit: CalibrationFit, found: Calibration, covariance: Array, names: Sequence[str]
 ) -> dict[str, KinematicParameter]:
-    """All constants by name, each with its interval."""
+    """Some constants by name, each with its interval."""
     pictures = sum(len(which) for which in fit.which)
     freedom = max(1, _PICTURE_MOTIONS * pictures - len(fit.names))
     first = len(fit.names) - len(fit.constants)
     is_length = fit.constants >= len(fit.fits[0].frames.kinematics.names)
-    return {
-        fit.names[first + k]: _constant(fit, covariance, first + k, float(value), freedom, one)
-        for k, (value, one) in enumerate(zip(found.constants, is_length.tolist(), strict=True))
-    }
+    told = {}
+    for k, (value, one) in enumerate(zip(found.constants, is_length.tolist(), strict=True)):
+        if fit.names[first + k] in names:
+            told[fit.names[first + k]] = _constant(
+                fit, covariance, first + k, float(value), freedom, (one, len(names))
+            )
+    return told
 
 
 def _constant(
-    fit: CalibrationFit, covariance: Array, index: int, value: float, freedom: int, is_length: bool
+    fit: CalibrationFit,
+    covariance: Array,
+    index: int,
+    value: float,
+    freedom: int,
+    what: tuple[bool, int],
 ) -> KinematicParameter:
-    """A zero or length with its interval, or what it goes with where that is all."""
+    """A zero or length with its interval, or what it goes with where that is all.
+
+    Whether it is a length is told, and how many constants are asked for.
+    """
+    is_length, count = what
     name, deviation = fit.names[index], math.sqrt(covariance[index, index])
     if deviation > _DETERMINED * CONSTANT_DEVIATION:
         along = covariance[:, index] / np.sqrt(np.diag(covariance)) / deviation
         gauge = [n for j, n in enumerate(fit.names) if j != index and abs(along[j]) > _GOES_WITH]
         return KinematicParameter(name, 0.0, math.inf, -math.inf, math.inf, False, tuple(gauge))
     width = float(stdtrit(freedom, 1.0 - 0.5 * _LEVEL)) * deviation
-    chance = 2.0 * float(stdtr(freedom, -abs(value) / deviation)) * len(fit.constants)
+    chance = 2.0 * float(stdtr(freedom, -abs(value) / deviation)) * count
     low, middle, high = value - width, value, value + width
     if is_length:
         # A length was fitted as a logarithm.

@@ -8,6 +8,7 @@ frame then agrees with the others or contradicts them.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
@@ -42,13 +43,13 @@ from drake_pose.silhouette import Outline, TreeSurfaces, outline_from_mesh
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_COARSE = tuple(Round(s, 0.05) for s in (0.25, 0.2, 0.15, 0.12, 0.09, 0.07, 0.05, 0.04))
-_FINE = (Round(0.05, 0.02), Round(0.03, 0.015), Round(0.02, 0.0125), Round(0.01, 0.0125, 4))
-_LAST = (Round(0.02, 0.01), Round(0.01, 0.005), Round(0.005, 0.005, 6))
+COARSE = tuple(Round(s, 0.05) for s in (0.25, 0.2, 0.15, 0.12, 0.09, 0.07, 0.05, 0.04))
+FINE = (Round(0.05, 0.02), Round(0.03, 0.015), Round(0.02, 0.0125), Round(0.01, 0.0125, 4))
+LAST = (Round(0.02, 0.01), Round(0.01, 0.005), Round(0.005, 0.005, 6))
 # Spacing of silhouettes' edge points in each of these [root of the silhouettes' area].
-_COARSE_SPACING, _FINE_SPACING, _LAST_SPACING = 1.0 / 40.0, 1.0 / 80.0, 1.0 / 300.0
+COARSE_SPACING, FINE_SPACING, LAST_SPACING = 1.0 / 40.0, 1.0 / 80.0, 1.0 / 300.0
 # Sides of silhouettes in the pictures in which poses are compared [pixel].
-_FIRST_SIDE, _SECOND_SIDE = 40.0, 100.0
+FIRST_SIDE, SECOND_SIDE = 40.0, 100.0
 # Poses that show the bodies nearer to each other than this are one [root of the area].
 _APART = 0.03
 # So many poses are fitted finely.
@@ -95,9 +96,12 @@ class RegistrationBody:
     Args:
         tree: the pose tree.
         seen: the nodes that silhouettes show; all where None.
+        fewest: so many triangles a node has where it has very few.
     """
 
-    def __init__(self, tree: PoseTree, seen: Collection[str] | None = None) -> None:
+    def __init__(
+        self, tree: PoseTree, seen: Collection[str] | None = None, fewest: int = VERY_FEW
+    ) -> None:
         self.tree, self.kinematics = tree, TreeKinematics(tree)
         surfaces = TreeSurfaces(tree)
         if seen is not None:
@@ -108,9 +112,15 @@ class RegistrationBody:
                     for node, surface in zip(tree.nodes, surfaces.rigid, strict=True)
                 ]
             )
-        self.very_few = few_triangles(surfaces, VERY_FEW)
+        self.very_few = few_triangles(surfaces, fewest)
         self.few = few_triangles(surfaces, FEW)
         self.all = few_triangles(surfaces, np.iinfo(np.int64).max)
+
+    def with_tree(self, tree: PoseTree) -> RegistrationBody:
+        """The same surfaces on another tree with the same nodes."""
+        other = copy.copy(self)
+        other.tree, other.kinematics = tree, TreeKinematics(tree)
+        return other
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,6 +144,35 @@ class FrameMisfit:
 
 
 @dataclass(frozen=True, eq=False)
+class ObjectPose:
+    """Where an object stands that a camera on a robot's link has seen.
+
+    Args:
+        X_WT: (4, 4) the pose of its frame T in the robot's world.
+        covariance: (6, 6) of the pose's error: a rotation vector [rad] and a shift [m], both along
+            the world's axes.
+        alternatives: (n, 4, 4) other poses X_WT at which it looks alike.
+        round_about: (k, 3) axes through its middle, in its frame T, about which it looks alike at
+            every angle, so that no picture tells how it is turned about them.
+    """
+
+    X_WT: Array
+    covariance: Array
+    alternatives: Array
+    round_about: Array
+
+    @property
+    def rotation_sd(self) -> float:
+        """Standard deviation of the rotation, root mean square over the axes [rad]."""
+        return _root_mean_square(self.covariance[:3, :3])
+
+    @property
+    def translation_sd(self) -> float:
+        """Standard deviation of the place, root mean square over the axes [m]."""
+        return _root_mean_square(self.covariance[3:, 3:])
+
+
+@dataclass(frozen=True, eq=False)
 class RegisteredCamera:
     """Where a camera stands.
 
@@ -143,27 +182,34 @@ class RegisteredCamera:
             turned, and a shift [m], both along the world's axes.
         frames: how well each frame fits.
         alternatives: (n, 4, 4) other poses X_WC that fit no worse, as far as can be told.
+        seen_object: where the object stands that was seen, if its place was not known.
     """
 
     camera: PinholeCamera
     covariance: Array
     frames: tuple[FrameMisfit, ...]
     alternatives: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    seen_object: ObjectPose | None = None
 
     @property
     def rotation_sd(self) -> float:
         """Standard deviation of the rotation, root mean square over the axes [rad]."""
-        return float(np.sqrt(np.trace(self.covariance[:3, :3]) / 3.0))
+        return _root_mean_square(self.covariance[:3, :3])
 
     @property
     def translation_sd(self) -> float:
         """Standard deviation of the place, root mean square over the axes [m]."""
-        return float(np.sqrt(np.trace(self.covariance[3:, 3:]) / 3.0))
+        return _root_mean_square(self.covariance[3:, 3:])
 
     @property
     def contradictions(self) -> tuple[str, ...]:
         """The frames that contradict the others."""
         return tuple(frame.frame for frame in self.frames if not frame.agrees)
+
+
+def _root_mean_square(covariance: Array) -> float:
+    """Of the standard deviations along three axes."""
+    return float(np.sqrt(np.trace(covariance) / 3.0))
 
 
 class CameraSearch:
@@ -196,7 +242,7 @@ class CameraSearch:
                 f"camera '{camera.name}': no frame shows the body; give masks and joint positions "
                 "of one or more frames"
             )
-        return self._fitted(camera, frames, self._search(camera, frames))
+        return self._fitted(camera, frames, self.search(camera, frames))
 
     def refine(self, camera: PinholeCamera, frames: Sequence[PosedFrame]) -> RegisteredCamera:
         """Finds the camera's pose near that which it has; alternatives are not looked for.
@@ -214,67 +260,87 @@ class CameraSearch:
         self, camera: PinholeCamera, frames: Sequence[PosedFrame], looks: Sequence[Array]
     ) -> RegisteredCamera:
         """The best of the poses that are fitted from some X_CW (4, 4), and those as good."""
-        fine = CameraFit(self._posed(self._body.few, camera, frames), _FINE_SPACING)
-        last = CameraFit(self._posed(self._body.all, camera, frames), _LAST_SPACING)
-        fitted = [last.fit(fine.fit(X_CW, _FINE), _LAST) for X_CW in looks]
-        return self._describe(last, _distinct(last.frames, fitted))
+        fine = CameraFit(self._posed(self._body.few, camera, frames), FINE_SPACING)
+        last = CameraFit(self._posed(self._body.all, camera, frames), LAST_SPACING)
+        fitted = [last.fit(fine.fit(X_CW, FINE), LAST) for X_CW in looks]
+        looks = distinct(last.frames, fitted)
+        return describe_fitted([(last, with_widths(last, X_CW)) for X_CW in looks])[0]
 
     def _posed(
         self, outlines: Sequence[Outline], camera: PinholeCamera, frames: Sequence[PosedFrame]
     ) -> PosedFrames:
         return PosedFrames(self._body.kinematics, outlines, camera, frames)
 
-    def _search(self, camera: PinholeCamera, frames: Sequence[PosedFrame]) -> list[Array]:
-        """Poses X_CW (4, 4) near which the best one may be, best first."""
+    def with_settings(self, settings: RegistrationSettings) -> CameraSearch:
+        """The same with other settings."""
+        return CameraSearch(self._body, settings)
+
+    def search(
+        self, camera: PinholeCamera, frames: Sequence[PosedFrame], kept: int = _KEPT
+    ) -> list[Array]:
+        """Poses X_CW (4, 4) near which the best one may be, best first, so many at most."""
         count = min(len(frames), self._settings.searched_frames)
         some = [frames[k] for k in np.linspace(0, len(frames) - 1, count).round().astype(int)]
         posed = self._posed(self._body.very_few, camera, some)
         starts = np.tile(np.eye(4), (len(self._R_CW), 1, 1))
         starts[:, :3, :3] = self._R_CW
         starts[:, :3, 3] = place_by_bounds(posed, self._R_CW)
-        order = np.argsort(_mean_misfit(posed, starts, _FIRST_SIDE), kind="stable")
-        fit = CameraFit(posed, _COARSE_SPACING)
-        found = [fit.fit(starts[k], _COARSE) for k in order[: self._settings.fitted]]
-        off = _mean_misfit(posed, np.array(found), _SECOND_SIDE)
-        return _distinct(posed, [found[k] for k in np.argsort(off, kind="stable")])[:_KEPT]
-
-    def _describe(self, fit: CameraFit, looks: Sequence[Array]) -> RegisteredCamera:
-        """The best of the poses X_CW (4, 4), and those that fit no worse."""
-        fitted = [_with_widths(fit, X_CW) for X_CW in looks]
-        side = max(1.0, _PIECE * fit.frames.size)
-        pieces = [fit.piece_costs(one.X_CW[0], one.widths[0], TOLD_APART, side) for one in fitted]
-        order = np.argsort([one.sum() for one in pieces], kind="stable")
-        best = fitted[order[0]]
-        X_CW = best.X_CW[0]
-        shares = frame_shares(CalibrationFit([fit], []), best)
-        agree = agreeing(shares)
-        found = areas(fit.frames, best.X_CW, np.inf)[0]
-        iou = intersection_over_union(found)
-        rows = zip(fit.frames.frames, E_total(found), iou, shares, agree, strict=True)
-        misfits = [
-            FrameMisfit(frame.name, float(off), float(one), float(share), bool(agrees))
-            for frame, off, one, share, agrees in rows
-        ]
-        # A frame that contradicts fits no pose, so it tells none from another.
-        counted = [one[agree] for one in pieces]
-        as_good = [k for k in order if excess(counted[k], counted[order[0]]) <= _SIGNIFICANCE]
-        # Fits that began apart may have ended in one pose.
-        alike = _distinct(fit.frames, [fitted[k].X_CW[0] for k in as_good])
-        own = CalibrationFit([fit], [np.flatnonzero(agree)])
-        return RegisteredCamera(
-            fit.frames.camera.with_pose(np.linalg.inv(X_CW)),
-            pose_covariance(fit, X_CW, calibration_uncertainty(own, best).covariance),
-            tuple(misfits),
-            np.array([np.linalg.inv(X) for X in alike[1:]]).reshape(-1, 4, 4),
-        )
+        order = np.argsort(mean_misfit(posed, starts, FIRST_SIDE), kind="stable")
+        fit = CameraFit(posed, COARSE_SPACING)
+        found = [fit.fit(starts[k], COARSE) for k in order[: self._settings.fitted]]
+        off = mean_misfit(posed, np.array(found), SECOND_SIDE)
+        return distinct(posed, [found[k] for k in np.argsort(off, kind="stable")])[:kept]
 
 
-def _mean_misfit(frames: PosedFrames, X_CW: Array, side: float) -> Array:
+def describe_fitted(
+    fitted: Sequence[tuple[CameraFit, Calibration]], constants: Sequence[int] = ()
+) -> tuple[RegisteredCamera, Array, list[int]]:
+    """The best of some poses of a camera, and those that fit no worse.
+
+    Args:
+        fitted: each with its fit, which sees the same frames.
+        constants: what was fitted beside the camera, the same parameters of the body in all.
+
+    Returns:
+        the camera; the covariance of its pose and the constants, as they were fitted; and which are
+        as good, the best first.
+    """
+    side = max(1.0, _PIECE * fitted[0][0].frames.size)
+    pieces = [fit.piece_costs(one.X_CW[0], one.widths[0], TOLD_APART, side) for fit, one in fitted]
+    order = np.argsort([one.sum() for one in pieces], kind="stable")
+    fit, best = fitted[order[0]]
+    X_CW = best.X_CW[0]
+    shares = frame_shares(CalibrationFit([fit], [], constants), best)
+    agree = agreeing(shares)
+    found = areas(fit.frames, best.X_CW, np.inf)[0]
+    iou = intersection_over_union(found)
+    rows = zip(fit.frames.frames, E_total(found), iou, shares, agree, strict=True)
+    misfits = [
+        FrameMisfit(frame.name, float(off), float(one), float(share), bool(agrees))
+        for frame, off, one, share, agrees in rows
+    ]
+    # A frame that contradicts fits no pose, so it tells none from another.
+    counted = [one[agree] for one in pieces]
+    as_good = [int(k) for k in order if excess(counted[k], counted[order[0]]) <= _SIGNIFICANCE]
+    # Fits that began apart may have ended in one pose.
+    alike = distinct(fit.frames, [fitted[k][1].X_CW[0] for k in as_good])
+    own = CalibrationFit([fit], [np.flatnonzero(agree)], constants)
+    covariance = calibration_uncertainty(own, best).covariance
+    camera = RegisteredCamera(
+        fit.frames.camera.with_pose(np.linalg.inv(X_CW)),
+        pose_covariance(fit, X_CW, covariance[:6, :6]),
+        tuple(misfits),
+        np.array([np.linalg.inv(X) for X in alike[1:]]).reshape(-1, 4, 4),
+    )
+    return camera, covariance, as_good
+
+
+def mean_misfit(frames: PosedFrames, X_CW: Array, side: float) -> Array:
     """(n,) E_total of poses (n, 4, 4) in the mean; a frame counts one at most."""
     return np.asarray(np.minimum(E_total(areas(frames, X_CW, side)), 1.0).mean(axis=1))
 
 
-def _distinct(frames: PosedFrames, X_CW: Sequence[Array]) -> list[Array]:
+def distinct(frames: PosedFrames, X_CW: Sequence[Array]) -> list[Array]:
     """Those of some poses (4, 4) that show the bodies elsewhere than all before them."""
     points = np.concatenate(frames.points)
     kept: list[Array] = []
@@ -289,10 +355,11 @@ def _distinct(frames: PosedFrames, X_CW: Sequence[Array]) -> list[Array]:
     return kept
 
 
-def _with_widths(fit: CameraFit, X_CW: Array) -> Calibration:
+def with_widths(fit: CameraFit, X_CW: Array, constants: Sequence[int] = ()) -> Calibration:
     """A pose (4, 4) fitted to the frames that agree, and the widths of their silhouettes."""
-    found, every = start_calibration([fit], [X_CW]), CalibrationFit([fit], [])
+    found = start_calibration([fit], [X_CW], len(constants))
+    every = CalibrationFit([fit], [], constants)
     for _ in range(_AGAIN):
         which = np.flatnonzero(agreeing(frame_shares(every, found)))
-        found = CalibrationFit([fit], [which]).fit(found, _LAST)
+        found = CalibrationFit([fit], [which], constants).fit(found, LAST)
     return found

@@ -137,6 +137,9 @@ Files in DIR: cameras.yaml, which estimate reads (copy it into the scene); repor
 all of it; registration.yaml (6 x 6 covariance, other poses); summary.json;
 overlay/<camera>/<frame>.png. Nothing is written where no pose explains the masks (exit status 1).
 
+--on LINK finds cameras that ride on a link, from masks of the robot's base, or of a rigid object
+that stands anywhere in its world (--target FILE); where the object stands is found, too.
+
 [bold]A robot arm whose camera nobody measured:[/bold]
 
     drake-pose register ../shared/data/arm_one_view --out results/camera \

@@ -25,8 +25,6 @@ from drake_pose.apps.commands.terminal import (
 from drake_pose.apps.options import parse_assignments, parse_box, parse_packages
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from drake_pose.apps.registration.register import SceneRegistration
 
 RegisteredSceneArgument = Annotated[
@@ -91,7 +89,18 @@ OnOption = Annotated[
         "--on",
         metavar="LINK",
         help="The cameras to be found ride on this link (eye in hand): their pose X_LC in its "
-        "frame is found, from masks of the robot's base, which is what no joint moves.",
+        "frame is found, from masks of the robot's base, which is what no joint moves, or of a "
+        "--target.",
+        rich_help_panel="Input",
+    ),
+]
+TargetOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--target",
+        metavar="FILE",
+        help="With --on: the masks show another, rigid object (URDF, SDFormat, MJCF), which stands "
+        "anywhere in the world; where is found, too.",
         rich_help_panel="Input",
     ),
 ]
@@ -124,6 +133,7 @@ def register(
     package: PackageOption = None,
     camera: SearchedCameraOption = None,
     on: OnOption = None,
+    target: TargetOption = None,
     frame: FrameOption = None,
     hold: HoldOption = None,
     zeros: ZerosOption = None,
@@ -149,6 +159,7 @@ def register(
             tuple(camera or ()),
             tuple(frame or ()),
             on,
+            target,
             held,
             tuple(zeros or ()),
             tuple(lengths or ()),
@@ -170,6 +181,7 @@ def _print(result: SceneRegistration) -> None:
     from rich.table import Table
 
     from drake_pose.apps.commands.report import output_console
+    from drake_pose.apps.registration.report import PARAMETERS, parameter_rows
     from drake_pose.apps.registration.result import CAMERAS
     from drake_pose.apps.results.folder import REPORT
     from drake_pose.apps.texts import percent
@@ -202,12 +214,14 @@ def _print(result: SceneRegistration) -> None:
     console.print(frames)
     console.print(table)
     first = next(iter(result.summary["cameras"].values()))
-    if first["zeros"]:
-        title = "Zeros, to be added to positions"
-        console.print(_parameters_table(first["zeros"], "joint", "zero", title))
-    if first["lengths"]:
-        title = "Lengths, by how much links are longer"
-        console.print(_parameters_table(first["lengths"], "link", "length", title))
+    for key, title, of, what in PARAMETERS:
+        if first[key]:
+            parameters = Table(of, what, "95 % interval", "", title=title)
+            for row in parameter_rows(first[key]):
+                parameters.add_row(*map(escape, row))
+            console.print(parameters)
+    if "target" in first:
+        console.print(_say_target(first["target"]))
     for name, one in result.summary["cameras"].items():
         if one["suggestion"]:
             values = ", ".join(f"{k}={v:.3f}" for k, v in one["suggestion"]["positions"].items())
@@ -219,22 +233,10 @@ def _print(result: SceneRegistration) -> None:
             console.print(f"{label:<14} {escape(str(result.folder / file))}", soft_wrap=True)
 
 
-def _parameters_table(parameters: Mapping[str, Any], of: str, what: str, title: str) -> Table:
-    """Zeros of joints, or lengths of links."""
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(of, what, "95 % interval", "", title=title)
-    for name, one in parameters.items():
-        if not one["determined"]:
-            table.add_row(escape(name), "", "", "not determined")
-            continue
-        key = next(key for key in one if key.startswith("value_"))
-        unit = key.removeprefix("value_")
-        table.add_row(
-            escape(name),
-            f"{one[key]:.3f} {'%' if unit == 'percent' else unit}",
-            f"{one[f'low_{unit}']:.3f} to {one[f'high_{unit}']:.3f}",
-            "significant" if one["significant"] else "as good as 0",
-        )
-    return table
+def _say_target(target: Mapping[str, Any]) -> str:
+    """Where an object was found."""
+    place = ", ".join(f"{row[3]:.4f}" for row in target["X_WT"][:3])
+    return (
+        f"target at {place} m in the robot's world, sd {target['translation_sd_mm']:.2f} mm, "
+        f"{target['rotation_sd_deg']:.3f} deg; poses that look alike: {len(target['families'])}"
+    )

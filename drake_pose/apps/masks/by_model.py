@@ -51,7 +51,7 @@ def find_by_model(source: Source, model: Path, settings: MaskSettings) -> FoundM
     kinematics = TreeKinematics(make_tree(body, EstimateSettings(hold=settings.hold), None))
     if settings.start is None:
         raise SceneError(f"{model}: needs rough joint positions of each frame (--start FILE.csv)")
-    table = read_known_positions(settings.start, body, kinematics)
+    table = read_known_positions(settings.start, kinematics)
     seen = {
         name: {frame: (where, picture) for frame, where, picture in source.read(name)}
         for name in source.names

@@ -158,7 +158,7 @@ def _read_inputs(
     frames = select_seen_frames(scene, chosen, settings.frames)
     model = load_model(model_path, package_paths=settings.packages)
     tree = make_tree(model, EstimateSettings(hold=settings.hold), None)
-    positions = read_known_positions(joints_path, model, TreeKinematics(tree))
+    positions = read_known_positions(joints_path, TreeKinematics(tree))
     warnings = [*texts_of(*checked.warnings), *model.warnings, *positions.warnings]
     if positions.are_one_pose(positions.of(frame, chosen[0].name) for frame in frames):
         warnings.append(

@@ -15,6 +15,7 @@ from drake_pose.apps.options import select_frames
 from drake_pose.apps.registration.known_positions import KnownPositions, read_known_positions
 from drake_pose.apps.settings import EstimateSettings
 from drake_pose.body import ArticulatedModel, PoseTree, RootRotation, load_model
+from drake_pose.body.model import OBJECT
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera import Camera, PinholeCamera
 from drake_pose.camera.files import load_camera_file
@@ -27,6 +28,7 @@ from drake_pose.errors import (
 )
 from drake_pose.registration.joint_zeros import links_with_length, require_known
 from drake_pose.registration.posed_frames import PosedFrame
+from drake_pose.registration.standing_object import StandingObject, require_turns
 from drake_pose.registration.suggestions import Box
 from drake_pose.silhouette import Scene, load_scene
 
@@ -45,6 +47,8 @@ class RegistrationSettings:
             where empty.
         frames: names, or ranges ``FIRST:LAST``; all where empty.
         on: the link on which the cameras ride that are to be found; None: they stand still.
+        target: the model file of a rigid object that they see from there, which stands somewhere in
+            the world; None: they see the robot's base.
         hold: joints that are not in the table, by name [deg or m].
         zeros: joints whose zeros are asked for, too; "all": those of all that move.
         lengths: links whose lengths are asked for, too; "all": those of all that have one.
@@ -58,6 +62,7 @@ class RegistrationSettings:
     cameras: tuple[str, ...] = ()
     frames: tuple[str, ...] = ()
     on: str | None = None
+    target: Path | None = None
     hold: Mapping[str, float] = field(default_factory=dict)
     zeros: tuple[str, ...] = ()
     lengths: tuple[str, ...] = ()
@@ -71,7 +76,8 @@ class RegistrationSettings:
         packages = {name: str(folder) for name, folder in self.packages.items()}
         names = ("cameras", "frames", "zeros", "lengths")
         lists = {name: list(getattr(self, name)) for name in names}
-        return {**asdict(self), **lists, "packages": packages}
+        target = None if self.target is None else str(self.target)
+        return {**asdict(self), **lists, "packages": packages, "target": target}
 
 
 @dataclass(frozen=True)
@@ -84,6 +90,8 @@ class RegistrationInputs:
         tree: its pose tree, as it stands in the world; or for cameras that ride on a link, as it
             stands in the link's frame, which is the world of all poses then.
         seen: the tree's nodes that the masks show; None: all.
+        standing: the object that the cameras see from their link, whose place is not known; None:
+            they see the robot. Until it is found it is at the world's origin in the tree.
         searched: the cameras that are to be found.
         held: the others that have an X_WC.
         frames: what each of these cameras sees, by name.
@@ -96,6 +104,7 @@ class RegistrationInputs:
     model: ArticulatedModel
     tree: PoseTree
     seen: tuple[str, ...] | None
+    standing: StandingObject | None
     searched: tuple[PinholeCamera, ...]
     held: tuple[PinholeCamera, ...]
     frames: Mapping[str, tuple[PosedFrame, ...]]
@@ -131,10 +140,14 @@ def read_inputs(
     if not settings.cameras:
         searched = [name for name in searched if name not in unseen]
     model = load_model(model_path, package_paths=settings.packages)
-    tree, seen = _make_tree(model, settings)
+    standing = _read_target(model, settings)
+    if standing is None:
+        tree, seen = _make_tree(model, settings)
+    else:
+        tree, seen = standing.tree(np.eye(4)), (OBJECT,)
     kinematics = TreeKinematics(tree)
     zeros, lengths = _select_parameters(model, kinematics, settings)
-    positions = read_known_positions(joints_path, model, kinematics, settings.on is not None)
+    positions = read_known_positions(joints_path, kinematics, settings.on is not None)
     held = [
         camera
         for name, camera in file.cameras.items()
@@ -152,11 +165,10 @@ def read_inputs(
     left_out = [name for name in unplaced if name not in searched]
     warnings = [*texts_of(*checked.warnings), *model.warnings, *positions.warnings]
     warnings += [_say_left_out(name) for name in left_out]
-    warnings += [
-        text for camera in pinholes for text in _check_poses(camera, frames[camera.name], positions)
-    ]
+    for camera in pinholes:
+        warnings += _check_poses(camera, frames[camera.name], positions, standing)
     return RegistrationInputs(
-        scene, model, tree, seen, tuple(pinholes), tuple(held), frames, zeros, lengths,
+        scene, model, tree, seen, standing, tuple(pinholes), tuple(held), frames, zeros, lengths,
         tuple(left_out), tuple(warnings),
     )  # fmt: skip
 
@@ -174,6 +186,21 @@ def _check_links(path: Path, links: Mapping[str, str], settings: RegistrationSet
                 f"{path / _CAMERAS}: camera '{name}' rides on link '{link}': find it with "
                 f"--on {link}, or take it out of the file"
             )
+
+
+def _read_target(model: ArticulatedModel, settings: RegistrationSettings) -> StandingObject | None:
+    """The object that cameras on a link see, before the robot; None: they see the robot."""
+    if settings.target is None:
+        return None
+    if settings.on is None:
+        raise SettingsError(
+            f"{settings.target} stands still, as a camera does that rides on no link, so its masks "
+            "tell nothing of the robot's world: name the link that the camera rides on (--on LINK)"
+        )
+    other = load_model(settings.target, package_paths=settings.packages)
+    held = make_tree(model, EstimateSettings(hold=settings.hold), None).held
+    named = {model.position_names[index]: value for index, value in held.items()}
+    return StandingObject(model, settings.on, named, make_tree(other, EstimateSettings(), None))
 
 
 def _make_tree(
@@ -280,9 +307,14 @@ def _frames_of_held(
 
 
 def _check_poses(
-    camera: PinholeCamera, frames: Sequence[PosedFrame], positions: KnownPositions
+    camera: PinholeCamera,
+    frames: Sequence[PosedFrame],
+    positions: KnownPositions,
+    standing: StandingObject | None,
 ) -> list[str]:
-    """Says so where all frames show one pose of the robot."""
+    """Says so where all frames show one pose of the robot; before an object it is refused."""
+    if standing is not None:
+        require_turns(camera.name, standing, frames)
     if not positions.are_one_pose(frame.values for frame in frames):
         return []
     what = (

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.apps.estimate.measurements import TrueAngles, read_true_angles
-from drake_pose.body import ArticulatedModel
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.errors import SceneError
 
@@ -68,14 +67,13 @@ class KnownPositions:
 
 
 def read_known_positions(
-    path: Path, model: ArticulatedModel, kinematics: TreeKinematics, unobserved: bool = False
+    path: Path, kinematics: TreeKinematics, unobserved: bool = False
 ) -> KnownPositions:
     """Reads a table with the column frame and one for each joint that is not held.
 
     Args:
         path: the table.
-        model: whose positions its columns are.
-        kinematics: of the pose tree.
+        kinematics: of the pose tree, whose model's positions the columns are.
         unobserved: whether there may be columns of joints that move nothing that is seen.
 
     Raises:
@@ -83,6 +81,7 @@ def read_known_positions(
             radians and metres.
         UnknownNameError: the model has no joint of a column's name.
     """
+    model = kinematics.tree.model
     table = read_true_angles(path, model.position_names)
     held = {model.position_names[index] for index in kinematics.tree.held}
     asked = [name for name in kinematics.names if name not in held]

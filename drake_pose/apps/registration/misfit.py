@@ -14,6 +14,7 @@ from drake_pose.apps.texts import percent
 from drake_pose.camera import PinholeCamera
 from drake_pose.errors import RegistrationError
 from drake_pose.registration.joint_zeros import calibrate_joints
+from drake_pose.registration.object_search import ObjectSearch
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import (
     CameraSearch,
@@ -32,10 +33,16 @@ _FOCALS = (0.5, 0.7, 1.4, 2.0)
 # standard deviations; and it is too wrong for a calibration where it differs by more. Published
 # focal lengths of recorded arms differ by 2 % at most.
 _FOCAL_OFF, _FOCAL_DEVIATIONS, _FOCAL_WRONG = 0.03, 4.0, 0.06
+# A camera on a link is not determined that is less sure [rad, m].
+_UNTOLD = 0.04
 # What else may be the case is tried roughly, in so many frames.
 _ROUGH_SEARCH, _ROUGH_FRAMES = RegistrationSettings(rotations=2000, fitted=15), 5
 # Something else explains the masks better that leaves less than this share of what was left.
 _MUCH_BETTER = 0.6
+
+
+Search = CameraSearch | ObjectSearch
+"""What finds a camera, and may find it again with other settings."""
 
 
 @dataclass(frozen=True)
@@ -72,9 +79,14 @@ def find_misfit(found: RegisteredCamera) -> Misfit | None:
 
 
 def require_explained(
-    body: RegistrationBody, found: RegisteredCamera, frames: Sequence[PosedFrame]
+    search: Search, found: RegisteredCamera, frames: Sequence[PosedFrame]
 ) -> None:
     """Refuses a pose that does not explain even those frames that agree best.
+
+    Args:
+        search: what found it.
+        found: the pose.
+        frames: what the camera sees.
 
     Raises:
         RegistrationError: says how much remains, what would fit, and what to look at.
@@ -82,21 +94,40 @@ def require_explained(
     misfit = find_misfit(found)
     if misfit is None:
         return
-    search = CameraSearch(body, _ROUGH_SEARCH)
+    search = search.with_settings(_ROUGH_SEARCH)
     better = [
         text
         for text, other, seen in _others(found.camera, frames)
-        if _explains(search.register(other, seen), misfit.E_total)
+        if _explains(search, other, seen, misfit.E_total)
     ]
     advice = "; ".join(better) or (
-        "are these masks of this robot, are the joint positions those of these frames, in radians "
-        "and with the signs and zeros of the model's file, are focal length and principal point "
-        "the camera's, are the pictures free of distortion?"
+        "are these masks of this robot or object, are the joint positions those of these frames, "
+        "in radians and with the signs and zeros of the model's file, are focal length and "
+        "principal point the camera's, are the pictures free of distortion?"
     )
     raise RegistrationError(
         f"camera '{found.camera.name}': no pose explains its masks: {misfit.reason}; {advice} "
         "Nothing was written"
     )
+
+
+def require_determined(found: RegisteredCamera) -> None:
+    """Refuses a pose on a link that its frames hardly tell.
+
+    Raises:
+        RegistrationError: says how unsure it is.
+    """
+    turn, shift = (
+        math.sqrt(float(np.linalg.eigvalsh(part)[-1]))
+        for part in (found.covariance[:3, :3], found.covariance[3:, 3:])
+    )
+    if turn > _UNTOLD or shift > _UNTOLD:
+        raise RegistrationError(
+            f"camera '{found.camera.name}': its frames do not determine where it is on the link: "
+            f"standard deviations of {math.degrees(turn):.1f} degrees and {1e3 * shift:.0f} mm "
+            "along some axes; add frames between which the link turns by 20 degrees and more about "
+            "at least two axes. Nothing was written"
+        )
 
 
 def check_focal_length(
@@ -159,7 +190,13 @@ def _others(
         yield text, replace(camera, focal_x=focal_x, focal_y=focal_y), some
 
 
-def _explains(found: RegisteredCamera, left: float) -> bool:
+def _explains(
+    search: Search, camera: PinholeCamera, frames: Sequence[PosedFrame], left: float
+) -> bool:
+    try:
+        found = search.register(camera, frames)
+    except RegistrationError:
+        return False
     return find_misfit(found) is None and _left(found) < _MUCH_BETTER * left
 
 

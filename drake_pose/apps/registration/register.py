@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,12 @@ from drake_pose.apps.registration.inputs import (
     RegistrationSettings,
     read_inputs,
 )
-from drake_pose.apps.registration.misfit import check_focal_length, require_explained
+from drake_pose.apps.registration.misfit import (
+    Search,
+    check_focal_length,
+    require_determined,
+    require_explained,
+)
 from drake_pose.apps.registration.result import describe_camera, summarize, write_result
 from drake_pose.apps.registration.zeros import (
     corrected_urdf,
@@ -28,10 +33,17 @@ from drake_pose.apps.registration.zeros import (
 )
 from drake_pose.apps.results.folder import require_empty
 from drake_pose.apps.texts import percent
+from drake_pose.body.model import OBJECT_POSITIONS
 from drake_pose.camera import Camera, PinholeCamera
 from drake_pose.registration.joint_zeros import JointCalibration
+from drake_pose.registration.object_search import ObjectSearch
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
-from drake_pose.registration.register import CameraSearch, RegisteredCamera, RegistrationBody
+from drake_pose.registration.register import (
+    CameraSearch,
+    ObjectPose,
+    RegisteredCamera,
+    RegistrationBody,
+)
 from drake_pose.registration.start_poses import E_total, areas
 from drake_pose.registration.suggestions import suggest_pose
 
@@ -93,9 +105,12 @@ def register_scene(
     inputs = read_inputs(*paths, settings)
     body = RegistrationBody(inputs.tree, inputs.seen)
     warnings = [*inputs.warnings, *_check_held(inputs, body)]
-    registered, described = _search(inputs, body, settings, warnings, on_camera)
+    registered, described, body = _search(inputs, body, settings, warnings, on_camera)
+    inputs = replace(inputs, tree=body.tree)
     urdf = None
-    if settings.zeros or settings.lengths or settings.focal:
+    # Cameras that see one object are found one after another, but it stands in one place.
+    several = inputs.standing is not None and len(registered) > 1
+    if settings.zeros or settings.lengths or settings.focal or several:
         start = time.perf_counter()
         registered, corrected, zeros = find_zeros(inputs, settings, body, registered)
         seconds = (time.perf_counter() - start) / len(registered)
@@ -116,18 +131,28 @@ def _search(
     settings: RegistrationSettings,
     warnings: list[str],
     on_camera: OnCamera | None,
-) -> tuple[dict[str, RegisteredCamera], dict[str, dict[str, Any]]]:
-    """Each camera by itself, and its part of the summary; warnings are added to.
+) -> tuple[dict[str, RegisteredCamera], dict[str, dict[str, Any]], RegistrationBody]:
+    """Each camera by itself, its part of the summary, and the body; warnings are added to.
+
+    An object whose place is not known is found with the first camera, and then stands there.
 
     Raises:
         RegistrationError: no pose of a camera explains its masks.
     """
-    search = CameraSearch(body)
+    standing, seen = inputs.standing, None
+    search: Search = CameraSearch(body) if standing is None else ObjectSearch(standing)
     registered, described = dict[str, RegisteredCamera](), dict[str, dict[str, Any]]()
     for camera in inputs.searched:
         start = time.perf_counter()
         found = search.register(camera, inputs.frames[camera.name])
-        require_explained(body, found, inputs.frames[camera.name])
+        require_explained(search, found, inputs.frames[camera.name])
+        if standing is not None:
+            require_determined(found)
+            if found.seen_object is not None:
+                seen, body = found.seen_object, standing.body(found.seen_object.X_WT)
+                search = CameraSearch(body)
+                warnings += _say_object(seen)
+            found = replace(found, seen_object=seen)
         warnings += check_focal_length(body, found, inputs.frames[camera.name])
         registered[camera.name] = found
         next_pose = _suggestion(body, found, settings)
@@ -137,7 +162,24 @@ def _search(
         if on_camera is not None:
             on_camera(len(registered))
     warnings += say_common(registered.values())
-    return registered, described
+    return registered, described, body
+
+
+def _say_object(seen: ObjectPose) -> list[str]:
+    """What a user should know of an object whose place was found."""
+    texts = []
+    if len(seen.round_about):
+        axes = "; ".join(", ".join(f"{x:.3f}" for x in axis) for axis in seen.round_about)
+        texts.append(
+            f"the target looks alike at every angle about an axis ({axes} in its frame), so how it "
+            "is turned about it is not determined; where the camera is does not depend on it"
+        )
+    if len(seen.alternatives):
+        texts.append(
+            f"the target looks alike in {len(seen.alternatives)} other poses, see families of the "
+            "target in summary.json; where the camera is does not depend on it"
+        )
+    return texts
 
 
 def _suggestion(
@@ -150,9 +192,9 @@ def _suggestion(
     told = suggest_pose(body, found.camera, poses, settings.keep_out)
     if told is None:
         return None
-    names = body.kinematics.names
+    values = zip(body.kinematics.names, told.values.tolist(), strict=True)
     return {
-        "positions": dict(zip(names, told.values.tolist(), strict=True)),
+        "positions": {name: value for name, value in values if name not in OBJECT_POSITIONS},
         "difference": told.difference,
     }
 

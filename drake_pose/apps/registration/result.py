@@ -19,7 +19,7 @@ from drake_pose.apps.texts import percent
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera import Camera
 from drake_pose.camera.files import dump_cameras
-from drake_pose.registration.register import RegisteredCamera
+from drake_pose.registration.register import ObjectPose, RegisteredCamera
 from drake_pose.silhouette import LabelRenderer, draw_mask, outline_from_mesh
 
 Array = NDArray[np.float64]
@@ -55,6 +55,7 @@ def describe_camera(
         "zeros": {},
         "lengths": {},
         "suggestion": suggestion,
+        **({} if found.seen_object is None else {"target": _describe_object(found.seen_object)}),
         "seconds": seconds,
         "contradictions": list(found.contradictions),
         "frames": {
@@ -66,6 +67,19 @@ def describe_camera(
             }
             for frame in found.frames
         },
+    }
+
+
+def _describe_object(seen: ObjectPose) -> dict[str, Any]:
+    """Where an object stands that a camera on a link has seen."""
+    return {
+        "X_WT": seen.X_WT.tolist(),
+        "determined": not len(seen.round_about),
+        "translation_sd_mm": 1e3 * seen.translation_sd,
+        "rotation_sd_deg": float(np.degrees(seen.rotation_sd)),
+        "covariance": seen.covariance.tolist(),
+        "round_about": seen.round_about.tolist(),
+        "families": [{"X_WT": X.tolist()} for X in (seen.X_WT, *seen.alternatives)],
     }
 
 
@@ -152,7 +166,7 @@ def _uncertainty(found: RegisteredCamera, summary: Mapping[str, Any]) -> dict[st
             "covariance": found.covariance,
             "alternatives": [np.asarray(X_WC) for X_WC in found.alternatives],
             "contradictions": list(found.contradictions),
-            **{name: summary[name] for name in ("zeros", "lengths") if summary[name]},
+            **{name: summary[name] for name in ("zeros", "lengths", "target") if summary.get(name)},
         }
     )
     return values

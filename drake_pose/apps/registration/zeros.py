@@ -45,6 +45,11 @@ def find_zeros(
     for zero in found.zeros:
         offsets[names.index(zero.name)] = zero.value
     model, tree, kinematics = inputs.model, inputs.tree, body.kinematics
+    seen = cameras[0].seen_object
+    if inputs.standing is not None and seen is not None:
+        seen = inputs.standing.moved_pose(seen, found.object_values, found.object_covariance)
+        tree = inputs.standing.tree(seen.X_WT)
+        kinematics = TreeKinematics(tree)
     if shifts := joint_shifts(tree, found):
         model = model.with_shifted_joints(shifts)
         tree = make_tree(model, EstimateSettings(hold=settings.hold), None)
@@ -58,7 +63,9 @@ def find_zeros(
         )
         corrected[camera.name] = own
         again = _misfits(PosedFrames(kinematics, body.all, camera, own), before)
-        result[camera.name] = replace(before, camera=camera, covariance=covariance, frames=again)
+        result[camera.name] = replace(
+            before, camera=camera, covariance=covariance, frames=again, seen_object=seen
+        )
     return result, replace(inputs, model=model, tree=tree, frames=corrected), found
 
 

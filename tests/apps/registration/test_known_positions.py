@@ -25,7 +25,7 @@ def read(folder: Path, text: str, held: dict[str, float] | None = None) -> Known
     (folder / "joints.csv").write_text(text)
     model = load_model(folder / "slide.urdf")
     kinematics = TreeKinematics(model.pose_tree(held=held))
-    return read_known_positions(folder / "joints.csv", model, kinematics)
+    return read_known_positions(folder / "joints.csv", kinematics)
 
 
 def test_what_is_held_needs_no_column(tmp_path: Path) -> None:

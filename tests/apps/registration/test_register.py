@@ -91,6 +91,7 @@ class TestRegister:
         assert page.count("data:image/jpeg;base64,") == 5
         assert page.count("<tr><td>000") == 5
         assert "contradicts" not in page
+        assert "Zeros and lengths" not in page
         for name in ("cameras.yaml", "registration.yaml", "summary.json", "overlay/left/0003.png"):
             assert f'href="{name}"' in page
             assert (registered[0] / name).is_file()
@@ -248,6 +249,7 @@ class TestZeros:
         assert zeros["elbow_turn"]["value_deg"] == pytest.approx(3.0, abs=0.3)
         assert zeros["elbow_turn"]["significant"]
         assert not zeros["shoulder_turn"]["significant"]
+        assert "<td>elbow_turn</td><td>3." in (out / "report.html").read_text()
         # Drake poses the corrected robot at the encoders' readings as the right one at the truth.
         right, corrected = load_model(own_arm.model), load_model(out / "arm_calibrated.urdf")
         read = np.array([float(one) for one in rows[1][1:]])
@@ -291,6 +293,14 @@ class TestLengths:
         assert not found["turret"]["significant"]
         assert summary["mean_iou"] > 0.98
         assert yaml.safe_load((out / "registration.yaml").read_text())["left"]["lengths"] == found
+        one = found["shoulder"]
+        row = (
+            f"<td>shoulder</td><td>{one['value_percent']:.3f} %</td>"
+            f"<td>{one['low_percent']:.3f} to {one['high_percent']:.3f}</td><td>significant</td>"
+        )
+        page = (out / "report.html").read_text()
+        assert row in page
+        assert "as good as 0" in page
         # Drake has the elbow where the right arm has it, but for what the two lengths are off.
         places = []
         for model in (right, load_model(out / "short_calibrated.urdf")):

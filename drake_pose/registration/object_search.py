@@ -1,0 +1,240 @@
+"""Where a camera is on a robot's link, told by silhouettes of an object that stands somewhere.
+
+Neither pose need be known nor guessed. The object's poses are searched in each picture by itself;
+threes of pictures, whose object turns as the hand does, say where camera and object may be
+(``hand_eye``); the best of these are fitted to all pictures at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.body.model import OBJECT_POSITIONS
+from drake_pose.body.tree.joint_map import inverse_transforms
+from drake_pose.camera import PinholeCamera
+from drake_pose.errors import RegistrationError
+from drake_pose.matching.fit.levenberg_marquardt import Round
+from drake_pose.registration.calibration_fit import (
+    ROUNDS_WITH_CONSTANTS,
+    Calibration,
+    CalibrationFit,
+    start_calibration,
+)
+from drake_pose.registration.camera_fit import CameraFit
+from drake_pose.registration.hand_eye import HandEye, hand_eye_starts
+from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
+from drake_pose.registration.register import (
+    COARSE,
+    COARSE_SPACING,
+    FINE,
+    FINE_SPACING,
+    FIRST_SIDE,
+    LAST_SPACING,
+    SECOND_SIDE,
+    CameraSearch,
+    ObjectPose,
+    RegisteredCamera,
+    RegistrationSettings,
+    describe_fitted,
+    with_widths,
+)
+from drake_pose.registration.standing_object import StandingObject, require_turns
+from drake_pose.registration.start_poses import E_total, areas
+from drake_pose.silhouette import Outline
+
+Array = NDArray[np.float64]
+Look = tuple[Array, Array]
+"""X_LC and X_WT, (4, 4) each."""
+
+# Of each picture so many poses of the object are kept; and so many starts and looks of all.
+_OF_A_PICTURE, _STARTS, _LOOKS = 8, 12, 4
+# Looks are one whose object is seen nearer to each other than this [its radius].
+_APART = 0.15
+# A look whose mean E_total is larger by so much than so many times the best one's is none.
+_WORSE_BY, _WORSE_TIMES = 0.02, 2.0
+
+
+class ObjectSearch:
+    """Finds where a camera is on a link, and where the object stands that it sees.
+
+    Args:
+        standing: the object, and the robot before which it stands.
+        settings: of the search for the object in each picture.
+    """
+
+    def __init__(
+        self, standing: StandingObject, settings: RegistrationSettings | None = None
+    ) -> None:
+        self._standing = standing
+        self._settings = settings or RegistrationSettings()
+        self._alone = CameraSearch(standing.alone, self._settings)
+
+    def with_settings(self, settings: RegistrationSettings) -> ObjectSearch:
+        """The same with other settings."""
+        return ObjectSearch(self._standing, settings)
+
+    def register(self, camera: PinholeCamera, frames: Sequence[PosedFrame]) -> RegisteredCamera:
+        """Finds the camera's pose in the link's frame, and the object's in the world.
+
+        Args:
+            camera: its intrinsics; the pose that it has is not used.
+            frames: what it sees, at values of the object's tree.
+
+        Raises:
+            MaskError: a mask of another size than the camera's picture, or an empty one.
+            RegistrationError: the frames that agree, or all, turn the link about one axis alone.
+        """
+        require_turns(camera.name, self._standing, frames)
+        looks = self._search(camera, frames)
+        fine = [self._fitted(camera, frames, look, True) for look in looks]
+        last = [self._fitted(camera, frames, look, False) for look in self._distinct(fine, frames)]
+        looks = self._distinct(last, frames)
+        fitted = []
+        for X_LC, X_WT in looks:
+            fit, constants = self._fit(camera, frames, (X_LC, X_WT), LAST_SPACING)
+            now = with_widths(fit, inverse_transforms(X_LC), constants)
+            # Where it stands now is where a last fit finds it.
+            look = self._look(now, X_WT)
+            fit, constants = self._fit(camera, frames, look, LAST_SPACING)
+            fitted.append((look, fit, replace(now, constants=np.zeros(len(constants)))))
+        found, covariance, as_good = describe_fitted([one[1:] for one in fitted], constants)
+        X_LC, X_WT = fitted[as_good[0]][0]
+        others = [X_WT @ turn for turn in self._standing.symmetry.told_apart[1:]]
+        # Where the camera would be elsewhere, too, that is told with the camera.
+        looks = [fitted[k][0] for k in as_good[1:]]
+        others += [X for camera_too, X in looks if not self._differ(camera_too[None], X_LC[None])]
+        seen = ObjectPose(
+            X_WT,
+            self._standing.pose_covariance(X_WT, covariance[6:, 6:]),
+            np.array(self._apart([X_WT, *others])[1:]).reshape(-1, 4, 4),
+            self._standing.symmetry.axes,
+        )
+        agreeing = [one for one, fit in zip(frames, found.frames, strict=True) if fit.agrees]
+        require_turns(camera.name, self._standing, agreeing, "that agree ")
+        return replace(found, seen_object=seen)
+
+    def _search(self, camera: PinholeCamera, frames: Sequence[PosedFrame]) -> list[Look]:
+        """Where the best one may be near, best first."""
+        count = min(len(frames), self._settings.searched_frames)
+        some = [frames[k] for k in np.linspace(0, len(frames) - 1, count).round().astype(int)]
+        alone = [PosedFrame(one.name, np.zeros(0), one.mask) for one in some]
+        X_CT = [
+            np.array(self._apart(self._alone.search(camera, [one], _OF_A_PICTURE), alike=True))
+            for one in alone
+        ]
+        X_WL = self._standing.hand_poses(np.array([one.values for one in some]))
+        found = hand_eye_starts(X_WL, X_CT, self._standing.symmetry.turns)
+        if not len(found.X_LC):
+            raise RegistrationError(
+                f"camera '{camera.name}': in no three of its frames the object turns before the "
+                "camera as the link does: are these masks of this object, did it stand still, are "
+                "the joint positions those of these frames, and is it this link that the camera "
+                "rides on? Nothing was written"
+            )
+        off = self._misfits(camera, alone, X_WL, found, FIRST_SIDE)
+        order = np.argsort(off, kind="stable")
+        starts = self._distinct(
+            [(found.X_LC[k], found.X_WT[k]) for k in order[: 10 * _STARTS]], some
+        )
+        fitted = []
+        for look in starts[:_STARTS]:
+            fit, constants = self._fit(camera, some, look, COARSE_SPACING, "very_few")
+            fitted.append(self._look(self._calibrate(fit, look, constants, COARSE), look[1]))
+        both = HandEye(np.array([one[0] for one in fitted]), np.array([one[1] for one in fitted]))
+        off = self._misfits(camera, alone, X_WL, both, SECOND_SIDE)
+        limit = _WORSE_BY + _WORSE_TIMES * float(off.min())
+        order = np.argsort(off, kind="stable")
+        return self._distinct([fitted[k] for k in order if off[k] <= limit], some)[:_LOOKS]
+
+    def _misfits(
+        self,
+        camera: PinholeCamera,
+        alone: Sequence[PosedFrame],
+        X_WL: Array,
+        looks: HandEye,
+        side: float,
+    ) -> Array:
+        """(n,) E_total in the mean of the frames; one counts one at most."""
+        off = np.zeros(len(looks.X_LC))
+        for frame, X in zip(alone, X_WL, strict=True):
+            body = self._standing.alone
+            posed = PosedFrames(body.kinematics, body.very_few, camera, [frame])
+            X_CT = inverse_transforms(X @ looks.X_LC) @ looks.X_WT
+            off += np.minimum(E_total(areas(posed, X_CT, side))[:, 0], 1.0) / len(alone)
+        return off
+
+    def _fitted(
+        self, camera: PinholeCamera, frames: Sequence[PosedFrame], look: Look, few: bool
+    ) -> Look:
+        """A look, fitted to all frames finely."""
+        if few:
+            fit, constants = self._fit(camera, frames, look, FINE_SPACING, "few")
+            return self._look(self._calibrate(fit, look, constants, FINE), look[1])
+        fit, constants = self._fit(camera, frames, look, LAST_SPACING)
+        return self._look(self._calibrate(fit, look, constants, ROUNDS_WITH_CONSTANTS), look[1])
+
+    def _fit(
+        self,
+        camera: PinholeCamera,
+        frames: Sequence[PosedFrame],
+        look: Look,
+        spacing: float,
+        surfaces: str = "all",
+    ) -> tuple[CameraFit, list[int]]:
+        """A fit with the object where a look has it, and which parameters move it."""
+        body = self._standing.body(look[1])
+        outlines: Sequence[Outline] = getattr(body, surfaces)
+        fit = CameraFit(PosedFrames(body.kinematics, outlines, camera, frames), spacing)
+        return fit, [fit.names.index(name) for name in OBJECT_POSITIONS]
+
+    def _calibrate(
+        self, fit: CameraFit, look: Look, constants: Sequence[int], rounds: Sequence[Round]
+    ) -> Calibration:
+        start = start_calibration([fit], [inverse_transforms(look[0])], len(constants))
+        every = np.arange(len(fit.values))
+        return CalibrationFit([fit], [every], constants).fit(start, rounds)
+
+    def _look(self, found: Calibration, X_WT: Array) -> Look:
+        """What was found, from where the object stood before."""
+        return inverse_transforms(found.X_CW[0]), self._standing.moved(X_WT, found.constants)
+
+    def _distinct(self, looks: Sequence[Look], frames: Sequence[PosedFrame]) -> list[Look]:
+        """Those of some looks that see the object otherwise than all before them.
+
+        An object that looks alike after a turn is the same.
+        """
+        X_WL = self._standing.hand_poses(np.array([one.values for one in frames]))
+        kept: list[Look] = []
+        seen: list[Array] = []
+        for X_LC, X_WT in looks:
+            X_CT = inverse_transforms(X_WL @ X_LC) @ X_WT
+            if all(self._differ(X_CT, one) for one in seen):
+                kept.append((X_LC, X_WT))
+                seen += list(X_CT[None] @ self._standing.symmetry.turns[:, None])
+        return kept
+
+    def _apart(self, poses: Sequence[Array], alike: bool = False) -> list[Array]:
+        """Those of some poses (4, 4) of the object that are apart from all before them.
+
+        Args:
+            poses: in any frame.
+            alike: whether those at which it looks alike are one.
+        """
+        turns = self._standing.symmetry.turns if alike else np.eye(4)[None]
+        kept: list[Array] = []
+        for X in poses:
+            if all(self._differ(X[None], one @ turn) for one in kept for turn in turns):
+                kept.append(X)
+        return kept
+
+    def _differ(self, X: Array, others: Array) -> bool:
+        """Whether poses (n, 4, 4) put the object's ball elsewhere, root mean square."""
+        by = np.asarray(X - others)[:, :3]
+        shift = by[:, :, :3] @ self._standing.middle + by[:, :, 3]
+        turn = (by[:, :, :3] ** 2).sum(axis=(1, 2)) / 3.0 * self._standing.radius**2
+        off = np.sqrt(((shift**2).sum(axis=1) + turn).mean())
+        return bool(off > _APART * self._standing.radius)

@@ -3,7 +3,7 @@
 import copy
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -29,9 +29,10 @@ from drake_pose.matching.fit.colours import (
     Picture,
     add_pictures,
     check_picture,
-    furthest_part,
     learned,
     no_colours,
+    part_distances,
+    weigh_parts,
 )
 from drake_pose.matching.fit.contour_fit import (
     Comparison,
@@ -128,8 +129,7 @@ class ContourMeasurement:
         at: (n,) the state.
         share: of the contour that the model shows, what has an edge beside it.
         distance: root mean square of their distances, robustly weighted [pixel].
-        part_distance: that of the part which is furthest off in the pictures [pixel]; 0: none were
-            compared.
+        part_distances: (nodes,) of each part in the pictures [pixel]; 0 where they say too little.
     """
 
     names: tuple[str, ...]
@@ -138,7 +138,7 @@ class ContourMeasurement:
     at: Array
     share: float
     distance: float
-    part_distance: float
+    part_distances: Array
 
     @property
     def variances(self) -> Array:
@@ -437,6 +437,7 @@ class ContourObservation:
         x: Array,
         colours: Histograms,
         surely: bool = False,
+        without: Mask | None = None,
     ) -> Histograms:
         """What is known of the body's colours after a frame.
 
@@ -445,6 +446,7 @@ class ContourObservation:
             x: (n,) the state in the frame.
             colours: what was known before.
             surely: whether the pose is known, so that old colours are forgotten.
+            without: (nodes,) parts of which nothing is learned.
 
         Raises:
             SettingsError: pictures that do not fit the cameras.
@@ -454,10 +456,18 @@ class ContourObservation:
             for camera, picture in zip(self.cameras, pictures, strict=True)
         ]
         placed = self._body.place(self.parameters(x))
-        return learned(placed, self.cameras, checked, colours, self.colours, surely)
+        known = learned(placed, self.cameras, checked, colours, self.colours, surely)
+        if without is not None:
+            known[:, without] = colours[:, without]
+        return known
 
     def measure(
-        self, seen: Seen, x: Array, distance: float | None = None, number: int = 0
+        self,
+        seen: Seen,
+        x: Array,
+        distance: float | None = None,
+        number: int = 0,
+        without: Mask | None = None,
     ) -> ContourMeasurement | None:
         """Compare the model's contour at a state with a frame.
 
@@ -468,6 +478,7 @@ class ContourObservation:
                 as is looked.
             number: how many measurements of the frame were made before: lines in pictures are
                 looked at more closely from one to the next.
+            without: (nodes,) parts of which the pictures say nothing.
 
         Returns:
             The measurement; None where no edge is near the contour in any mask or picture.
@@ -478,9 +489,11 @@ class ContourObservation:
         found = self._compare(seen, x, width, number)
         if found is None:
             return None
-        shown = [picture is not None for picture in seen.pictures]
-        furthest = furthest_part(found[0].sums[shown]) if seen.has_pictures else 0.0
-        return self._compress(x, *found, furthest)
+        shown = np.array([picture is not None for picture in seen.pictures])
+        if without is not None:
+            off = np.ix_(shown, without)
+            found[0].A[off], found[0].b[off] = 0.0, 0.0
+        return self._compress(x, *found, part_distances(found[0].sums[shown]))
 
     def _compare(
         self, seen: Seen, x: Array, width: float, number: int
@@ -492,7 +505,10 @@ class ContourObservation:
             pixels = self.colours.step(number)
             # Coarse lines are so wide that they would say the same.
             lines = Round(width, self.colours.spacing * min(pixels, 2))
-            add_pictures(compared, self.cameras, seen.pictures, seen.colours, lines, _PLAIN, pixels)
+            correlation = _PLAIN.correlation * self.colours.correlation / self.settings.correlation
+            noise = replace(_PLAIN, correlation=correlation)
+            add_pictures(compared, self.cameras, seen.pictures, seen.colours, lines, noise, pixels)
+            weigh_parts(compared, self.settings.deviation, seen.pictures)
         squares, weight = compared.sums[:, :, [SQUARES, WEIGHT]].sum(axis=(0, 1))
         return None if weight <= 0.0 else (compared, math.sqrt(squares / weight))
 
@@ -513,7 +529,7 @@ class ContourObservation:
         return self._body.place(self.parameters(x)).X_WN
 
     def _compress(
-        self, x: Array, compared: Comparison, distance: float, furthest: float
+        self, x: Array, compared: Comparison, distance: float, parts: Array
     ) -> ContourMeasurement:
         """What the contours say as no more numbers than the state has elements, with noise 1."""
         settings = self.settings
@@ -538,5 +554,5 @@ class ContourObservation:
             at=x,
             share=float(contour[FITTING] / max(contour[COMPARED], 1e-9)),
             distance=distance,
-            part_distance=furthest,
+            part_distances=parts,
         )

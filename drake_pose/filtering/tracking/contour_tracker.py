@@ -47,7 +47,8 @@ class TrackingSettings:
             than this [pixel].
         lost_colour_distance: and where pictures are compared, further than this at any part
             [pixel]: lines are looked at so closely that a wrong pose cannot put them much further
-            off.
+            off. Such a part teaches no colours, and its joints are no surer than other parts and
+            the motion say.
         lost_share: and when a smaller share of the contour than this has an edge beside it.
         lost_growth: and when E_total is this many times what it was after the last match ...
         lost_margin: ... and larger than that by this.
@@ -71,7 +72,7 @@ class TrackingSettings:
     constant_length: float = 0.03
     rounds: int = 4
     lost_distance: float = 12.0
-    lost_colour_distance: float = 2.0
+    lost_colour_distance: float = 1.5
     lost_share: float = 0.6
     lost_growth: float = 1.5
     lost_margin: float = 0.1
@@ -92,7 +93,8 @@ class Track:
     Attributes:
         state: the filter's.
         measurement: of the contour at the end; None where no mask was given.
-        lost: whether the contour is far from the masks' edge, or from that which colours show.
+        lost: whether the contour is far from the masks' edge, or a part's from that which colours
+            show.
         colours: what is known of the body's colours; None: no picture was seen yet.
     """
 
@@ -210,12 +212,12 @@ class ContourTracker:
         if measurement is None:
             shown = any(one is not None for one in (*masks, *(pictures or ())))
             return Track(state, None, track.lost or shown, colours)
-        lost = self._is_lost(measurement, seen)
-        if lost and seen.has_pictures:
-            state = self._unsure(prediction, state)
-        if pictures is not None and colours is not None and not lost:
-            colours = observation.learn(pictures, state.best.mean, colours)
-        return Track(state, measurement, lost, colours)
+        astray = self._astray(measurement)
+        if pictures is not None and colours is not None and not astray.all():
+            colours = observation.learn(pictures, state.best.mean, colours, without=astray)
+        if seen.has_pictures and astray.any():
+            state = self._unsure(observation, seen, prediction, state, measurement, astray)
+        return Track(state, measurement, bool(astray.any()), colours)
 
     def _fit(
         self, observation: ContourObservation, seen: Seen, prediction: FilterState
@@ -239,24 +241,34 @@ class ContourTracker:
             measurement = observation.measure(seen, state.best.mean, last.distance, k + 1)
         return state, measurement
 
-    def _is_lost(self, measurement: ContourMeasurement, seen: Seen) -> bool:
+    def _astray(self, measurement: ContourMeasurement) -> Mask:
+        """(nodes,) parts that are not where pictures show them; all where the whole body is not."""
         settings = self.settings
-        distance, furthest = measurement.distance, settings.lost_distance
-        if seen.has_pictures:
-            # A wrist that is off is little of the whole contour.
-            distance = max(distance, measurement.part_distance)
-            furthest = settings.lost_colour_distance
-        return distance > furthest or measurement.share < settings.lost_share
+        whole = measurement.distance > settings.lost_distance
+        whole |= measurement.share < settings.lost_share
+        return (measurement.part_distances > settings.lost_colour_distance) | whole
 
-    def _unsure(self, prediction: FilterState, state: FilterState) -> FilterState:
-        """Where lines of a lost track lead to, as unsure as if they had not been seen.
+    def _unsure(
+        self,
+        observation: ContourObservation,
+        seen: Seen,
+        prediction: FilterState,
+        state: FilterState,
+        measurement: ContourMeasurement,
+        astray: Mask,
+    ) -> FilterState:
+        """Where all lines lead to, as unsure as if those of parts that are astray were not seen.
 
         They may be those of something else, all of them together: by how much they have moved the
         state is not known of it either.
         """
-        expected, found = prediction.best, state.best.mean
-        moved = found - expected.mean
-        belief = Belief(found, expected.covariance + np.outer(moved, moved))
+        found, rest = state.best.mean, None
+        if not astray.all():
+            rounds = self.settings.rounds
+            rest = observation.measure(seen, found, measurement.distance, rounds, astray)
+        expected = prediction if rest is None else self.filter.update(prediction, rest.y, rest)
+        moved = found - expected.best.mean
+        belief = Belief(found, expected.best.covariance + np.outer(moved, moved))
         return replace(self.filter.start(belief), step=state.step)
 
 

@@ -31,6 +31,9 @@ NO_REGION = np.zeros((0, 0), dtype=np.bool_)
 
 # A part is no closer to a contour than this [pixel], and is judged by no less of it [pixel].
 _CLOSE, _TELLING = 0.7, 20.0
+# What a part's lines say of their own noise is trusted no further than this [pixel]: of a part that
+# is far off they have to say where it is.
+_NOISIEST = 2.0
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,7 @@ class ColourSettings:
         steps: from offset to offset of lines, in one round after the other [pixel]; the last is
             that of all further rounds.
         spacing: of lines along the contour, so many pixels where the step is one.
+        correlation: how much of a contour [pixel] errs together: its lines count as one.
         inside: colours are counted so far inside of the contour [pixel].
         outside: and so far outside of it [pixel].
         rate: the share of a frame's colours in what is known after it, 0 to 1.
@@ -53,6 +57,7 @@ class ColourSettings:
 
     steps: tuple[int, ...] = (4, 2, 1)
     spacing: float = 2.0
+    correlation: float = 5.0
     inside: float = 16.0
     outside: float = 30.0
     rate: float = 0.1
@@ -61,7 +66,7 @@ class ColourSettings:
     def __post_init__(self) -> None:
         if not self.steps or min(self.steps) < 1:
             raise SettingsError(f"steps must be whole pixels, not {self.steps}")
-        for name in ("spacing", "inside", "outside", "rate", "agreeing"):
+        for name in ("spacing", "correlation", "inside", "outside", "rate", "agreeing"):
             if not 0.0 < getattr(self, name) < math.inf:
                 raise SettingsError(f"{name} must be positive, not {getattr(self, name)}")
         if self.rate > 1.0:
@@ -128,11 +133,31 @@ def add_pictures(
             )  # fmt: skip
 
 
-def furthest_part(sums: Array) -> float:
-    """How far the part which is furthest off is from the contour that colours show [pixel].
+def weigh_parts(compared: Comparison, deviation: float, pictures: Sequence[Picture | None]) -> None:
+    """Gives parts whose lines scatter more than those of others less weight, in place.
+
+    A part has few lines that err independently: its variance is taken half way, on a scale of
+    logarithms, between its own and that of all.
+
+    Args:
+        compared: of all cameras.
+        deviation: the least of lines [pixel].
+        pictures: of each camera; None: its silhouettes are not weighed.
+    """
+    shown = [c for c, picture in enumerate(pictures) if picture is not None]
+    squares, weight = (compared.sums[shown, :-1, k] for k in (SQUARES, WEIGHT))
+    overall = max(deviation**2, float(squares.sum() / max(float(weight.sum()), 1e-12)))
+    own = np.clip(squares / np.maximum(weight, 1e-12), deviation**2, _NOISIEST**2)
+    share = np.sqrt(overall / own)
+    compared.A[shown] *= share[..., None, None]
+    compared.b[shown] *= share[..., None]
+
+
+def part_distances(sums: Array) -> Array:
+    """(nodes,) how far each part is from the contour that colours show [pixel].
 
     What covers a part in one camera says nothing against it where another sees it: the mean over
-    cameras is that of one over the distances' squares. 0: of no part enough is said.
+    cameras is that of one over the distances' squares. 0: of the part too little is said.
 
     Args:
         sums: (cameras, nodes + 1, 6) of pictures, as of `compare_contours`.
@@ -141,7 +166,7 @@ def furthest_part(sums: Array) -> float:
     own = np.maximum(_CLOSE**2, squares / np.maximum(weight, 1e-12))
     told = length.sum(axis=0)
     distances = np.sqrt(told / np.maximum((length / own).sum(axis=0), 1e-12))
-    return float(np.max(distances, where=told >= _TELLING, initial=0.0))
+    return np.where(told >= _TELLING, distances, 0.0)
 
 
 def learned(

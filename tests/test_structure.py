@@ -131,7 +131,8 @@ MAY_KNOW_INSIDE = {
         "kameda": set(),
         "shimada": set(),
         "date": set(),
-        "all_experiments": {"kameda", "shimada", "date"},
+        "paper_figures": {"kameda"},
+        "all_experiments": {"kameda", "shimada", "date", "paper_figures"},
     },
 }
 # Drake keeps three plain value types, ImageLabel16I, CameraInfo and CameraConfig, in

@@ -8,6 +8,7 @@ import io
 import json
 import os
 import shutil
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -17,6 +18,7 @@ from typing import Any
 from rich.console import Console, RenderableType
 from rich.text import Text
 
+from drake_pose.apps.experiments import paper_figures
 from drake_pose.apps.experiments.date.experiment import run_experiment as run_date
 from drake_pose.apps.experiments.date.pictures import save_pictures as save_date
 from drake_pose.apps.experiments.kameda.continuous import (
@@ -37,18 +39,24 @@ from drake_pose.apps.experiments.kameda.real_pictures import (
     run_real_experiment,
 )
 from drake_pose.apps.experiments.kameda.table import experiment_table
+from drake_pose.apps.experiments.paper_figures import Beside
 from drake_pose.apps.experiments.shimada.experiment import run_experiment as run_shimada
+from drake_pose.apps.experiments.shimada.hypotheses import run_hypotheses_experiment
+from drake_pose.apps.experiments.shimada.pictures import save_hypotheses
 from drake_pose.apps.experiments.shimada.pictures import save_pictures as save_shimada
 from drake_pose.apps.experiments.shimada.static_view import run_static_experiment
 from drake_pose.apps.results.folder import without_nan
 from drake_pose.errors import OutputError
+from drake_pose.filtering import FilterSettings
 from drake_pose.matching import PoseSearch
 from drake_pose.version import VERSION
 
-REPORT, FIGURES, TABLES = "report.html", "figures.json", "tables.txt"
+REPORT, FIGURES, TABLES, BESIDE = "report.html", "figures.json", "tables.txt", "paper.json"
 _SETTINGS = "settings.json"
 _OUTSIDE_WEIGHT = 10.0
 _COLUMNS = 110
+# The paper's filter and ours, by the names of their figures.
+_FILTERS = (("paper", "sequential", 1), ("ours", "joint", FilterSettings().iterations))
 
 Advance = Callable[[int], None]
 Count = Callable[[str, int], "Advance"]
@@ -60,11 +68,13 @@ class Outcome:
 
     Args:
         figures: as its command prints them with --json.
-        shown: its tables, the paper's figures beside ours where the paper has some.
+        shown: its tables.
+        beside: the paper's figures beside ours; empty where the paper has no such experiment.
     """
 
     figures: Mapping[str, Any]
     shown: Sequence[RenderableType]
+    beside: Sequence[Beside] = ()
 
 
 @dataclass(frozen=True)
@@ -98,7 +108,8 @@ def _kameda(short: bool, folder: Path, count: Count) -> Outcome:
     for name, result in results.items():
         save_kameda(result, folder / name)
     figures = {name: result.as_json() for name, result in results.items()}
-    return Outcome(figures, [experiment_table([[result] for result in results.values()])])
+    shown: list[RenderableType] = [experiment_table([[result] for result in results.values()])]
+    return Outcome(figures, shown, paper_figures.kameda_a(figures))
 
 
 def _kameda_continuous(short: bool, folder: Path, count: Count) -> Outcome:
@@ -127,34 +138,57 @@ def _kameda_pictures(experiment: str, short: bool, folder: Path, count: Count) -
         for result in results
         for text in result.warnings
     ]
-    return Outcome(figures, [real_table(results), *warnings])
+    shown: list[RenderableType] = [real_table(results), *warnings]
+    return Outcome(figures, shown, paper_figures.kameda_pictures(figures))
 
 
 def _shimada(short: bool, folder: Path, count: Count) -> Outcome:
     runs = 1 if short else 50
     figures, shown = {}, []
-    for name, truncation, iterations in (("paper", "sequential", 1), ("ours", "joint", None)):
+    for name, truncation, iterations in _FILTERS:
         advance = count(f"Shimada, {name}", 2 * runs)
         result = run_shimada(runs, 0, truncation, "lines", advance, iterations)
         save_shimada(result, folder / name)
         figures[name] = result.as_json()
         shown.append(result.table())
-    return Outcome(figures, shown)
+    return Outcome(figures, shown, paper_figures.shimada(figures))
+
+
+def _shimada_hypotheses(short: bool, folder: Path, count: Count) -> Outcome:
+    runs = 2 if short else 50
+    figures, shown = {}, []
+    for name, truncation, iterations in _FILTERS:
+        advance = count(f"Shimada's figure 9, {name}", runs)
+        result = run_hypotheses_experiment(runs, 0, truncation, "lines", advance, iterations)
+        save_hypotheses(result, folder / name)
+        figures[name] = result.as_json()
+        shown.append(result.table())
+    return Outcome(figures, shown, paper_figures.shimada_hypotheses(figures))
 
 
 def _shimada_static(short: bool, folder: Path, count: Count) -> Outcome:
     runs, frames = (1, 20) if short else (4, 1000)
-    result = run_static_experiment(
-        runs, marks=(frames // 2, frames), progress=count("Shimada, one view", runs)
-    )
-    return Outcome(result.as_json(), [result.table()])
+    figures: dict[str, Any] = {}
+    shown: list[RenderableType] = []
+    for name, truncation, iterations in _FILTERS:
+        result = run_static_experiment(
+            runs,
+            truncation=truncation,
+            marks=(frames // 2, frames),
+            progress=count(f"Shimada, one view, {name}", runs),
+            iterations=iterations,
+        )
+        figures[name] = result.as_json()
+        shown += [Text(f"{name}:"), result.table()]
+    return Outcome(figures, shown, paper_figures.shimada_static(figures))
 
 
 def _date(short: bool, folder: Path, count: Count) -> Outcome:
     cameras, frames, size = (4, 40, (320, 240)) if short else (9, 240, (640, 480))
     result = run_date(cameras, frames, 0, "silhouette", count("Date", frames), size)
     save_date(result, folder)
-    return Outcome(result.as_json(), [result.table(), result.found_table(), result.costs()])
+    shown: list[RenderableType] = [result.table(), result.found_table(), result.costs()]
+    return Outcome(result.as_json(), shown, paper_figures.date(result.as_json()))
 
 
 EXPERIMENTS = (
@@ -187,6 +221,12 @@ EXPERIMENTS = (
         "Shimada, Shirai, Kuno, Miura: angles and lengths of a hand; the paper's filter, then ours",
         "drake-pose reproduce shimada --iterations 1 --truncation sequential",
         _shimada,
+    ),
+    Experiment(
+        "shimada_hypotheses",
+        "Several hypotheses, and which inequality rejects the wrong ones: its figure 9",
+        "drake-pose reproduce shimada --hypotheses",
+        _shimada_hypotheses,
     ),
     Experiment(
         "shimada_static",
@@ -232,7 +272,9 @@ def reproduce_all(out: Path, short: bool, count: Count, say: Callable[[str], Non
             part = out / f"{experiment.name}.part"
             shutil.rmtree(part, ignore_errors=True)
             part.mkdir()
-            _write_outcome(part, experiment.run(short, part, count))
+            begin = time.process_time()
+            outcome = experiment.run(short, part, count)
+            _write_outcome(part, outcome, time.process_time() - begin)
             os.replace(part, folder)
             _write(out / REPORT, _page(out, short))
         return _write(out / REPORT, _page(out, short))
@@ -251,7 +293,12 @@ def _check_settings(path: Path, settings: Mapping[str, Any]) -> None:
     _write(path, text)
 
 
-def _write_outcome(folder: Path, outcome: Outcome) -> None:
+def _write_outcome(folder: Path, outcome: Outcome, cpu_seconds: float) -> None:
+    beside = {
+        "figures": [one._asdict() for one in outcome.beside],
+        "cpu_seconds": round(cpu_seconds, 1),
+    }
+    (folder / BESIDE).write_text(json.dumps(beside, indent=2))
     (folder / FIGURES).write_text(
         json.dumps(without_nan(outcome.figures), indent=2, allow_nan=False)
     )
@@ -278,12 +325,33 @@ def _page(out: Path, short: bool) -> str:
         notes += "<p><strong>Short: too few images and runs for any conclusion.</strong></p>"
     if left:
         notes += f"<p><strong>Not finished: {html.escape(', '.join(left))}.</strong></p>"
+    notes += _overview(out, finished)
     sections = "".join(_section(out / one.name, one) for one in finished)
     return (
         "<!DOCTYPE html><html lang='en'><head><meta charset='utf-8'>"
         "<title>The papers' experiments</title><style>body{font-family:sans-serif;margin:2em}"
-        "pre{line-height:1.15}img{max-width:48em;margin:.5em;vertical-align:top}</style></head>"
+        "pre{line-height:1.15}td,th{padding:.1em .8em;text-align:left}"
+        "img{max-width:48em;margin:.5em;vertical-align:top}</style></head>"
         f"<body><h1>The papers' experiments</h1>{notes}{sections}</body></html>\n"
+    )
+
+
+def _overview(out: Path, finished: Sequence[Experiment]) -> str:
+    """The papers' figures beside ours, of all experiments, and what they cost."""
+    rows, seconds = "", 0.0
+    for one in finished:
+        beside = json.loads((out / one.name / BESIDE).read_text())
+        seconds += beside["cpu_seconds"]
+        if beside["figures"]:
+            rows += f"<tr><th colspan='4'>{html.escape(one.title)}</th></tr>"
+        for row in beside["figures"]:
+            rows += (
+                "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row.values()) + "</tr>"
+            )
+    return (
+        f"<p>Processor time: {seconds / 60:.1f} minutes.</p><table><tr><th>figure</th>"
+        "<th>the paper</th><th>its method here</th><th>ours</th></tr>"
+        f"{rows}</table>"
     )
 
 

@@ -1,3 +1,4 @@
+import html
 import json
 
 import pytest
@@ -5,6 +6,7 @@ from typer.testing import CliRunner
 
 from drake_pose.apps.experiments import all_experiments
 from drake_pose.apps.experiments.all_experiments import (
+    BESIDE,
     EXPERIMENTS,
     FIGURES,
     REPORT,
@@ -12,6 +14,7 @@ from drake_pose.apps.experiments.all_experiments import (
     Outcome,
     reproduce_all,
 )
+from drake_pose.apps.experiments.paper_figures import Beside
 from drake_pose.apps.main import app
 from drake_pose.errors import OutputError
 
@@ -32,7 +35,8 @@ def two_experiments(monkeypatch):
     def first(_short, folder, _count):
         ran.append("first")
         (folder / "some.png").write_bytes(b"no picture")
-        return Outcome({"value": float("nan")}, ["a <table>"])
+        beside = [Beside("E", "22.3 % < 30 %", "34 %", "15 %")]
+        return Outcome({"value": float("nan")}, ["a <table>"], beside)
 
     def second(_short, folder, _count):
         ran.append("second")
@@ -58,6 +62,7 @@ def test_what_is_finished_is_kept_and_the_rest_made_again(two_experiments, tmp_p
     assert "Not finished" not in page
     assert "A &amp; B" in page
     assert "a &lt;table&gt;" in page
+    assert "<td>E</td><td>22.3 % &lt; 30 %</td><td>34 %</td><td>15 %</td>" in page
     assert "data:image/png" in page
     assert json.loads((tmp_path / "first" / FIGURES).read_text()) == {"value": None}
     assert not list(tmp_path.glob("*.part"))
@@ -83,7 +88,13 @@ def test_all_of_it_short(tmp_path):
     made = CliRunner().invoke(app, ["reproduce", "all", "--short", "--out", str(tmp_path / "all")])
     assert made.exit_code == 0, made.output
     page = (tmp_path / "all" / REPORT).read_text()
+    assert page.count("</tr>") > 25
     for experiment in EXPERIMENTS:
+        beside = json.loads((tmp_path / "all" / experiment.name / BESIDE).read_text())
+        assert beside["cpu_seconds"] > 0
+        assert beside["figures"] or "not in the paper" in experiment.title
+        for row in beside["figures"]:
+            assert html.escape(row["paper"]) in page
         assert json.loads((tmp_path / "all" / experiment.name / FIGURES).read_text())
         assert experiment.title.split(":")[0] in page
     assert "Short" in page

@@ -37,6 +37,7 @@ CASES = {"r13_35": 35.0, "r13_40": 40.0}
 
 PIXELS_PER_METRE = 1000.0
 _LENGTHS = HAND_STATE.indices(LENGTHS)
+_R_13 = HAND_STATE.index("length_13")
 _ANGLES = HAND_STATE.indices((*SPREADS, *FLEXIONS))
 _LOST_LENGTH_ERROR = 5.0
 _LOST_ANGLE_ERROR = 20.0
@@ -329,6 +330,8 @@ def _figures(trials: tuple[Trial, ...]) -> dict[str, float | int]:
     angles = np.array([trial.angle_errors for trial in trials])
     low, high = chdtri(len(LENGTHS), [0.975, 0.025])
     nees = np.array([trial.nees for trial in trials])
+    r_13 = PIXELS_PER_METRE * np.array([trial.means[-1, _R_13] for trial in trials])
+    true_r_13 = PIXELS_PER_METRE * trials[0].sequence.states[-1, _R_13]
     return {
         "length_error_mean": float(errors.mean()),
         "length_error_p95": float(np.percentile(errors, 95)),
@@ -338,5 +341,7 @@ def _figures(trials: tuple[Trial, ...]) -> dict[str, float | int]:
         "ms_per_update": float(np.nanmedian([trial.milliseconds for trial in trials])),
         "lost": sum(trial.lost for trial in trials),
         "angle_rmse_at_end": float(np.sqrt(np.mean(angles[:, -1] ** 2))),
+        "r_13_mean": float(r_13.mean()),
+        "r_13_rmse": float(np.sqrt(np.mean((r_13 - true_r_13) ** 2))),
         "bound_length_error_mean": float(np.mean([t.bound_length_error for t in trials])),
     }

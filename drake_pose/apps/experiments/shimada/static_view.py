@@ -121,17 +121,17 @@ def run_static_experiment(
         sequence = make_sequence((35.0, 40.0)[run % 2], observed, observation, generator)
         state = hand_filter.start(sequence.guess)
         if start == "learned":
-            state = _follow(hand_filter, state, sequence.measurements)
-        x = _at_rest(sequence.states[0 if start == "guess" else -1])
+            state = follow(hand_filter, state, sequence.measurements)
+        x = at_rest(sequence.states[0 if start == "guess" else -1])
         for t in range(max(marks)):
-            y = _see(x, sequence, observation, generator, t == 0 and start == "guess")
+            y = see(x, sequence, observation, generator, t == 0 and start == "guess")
             state = hand_filter.update(hand_filter.predict(state) if state.step else state, y)
             if t + 1 in marks:
                 k = marks.index(t + 1)
-                nees[run, k], errors[run, k] = _compare(state.best, x)
+                nees[run, k], errors[run, k] = compare_lengths(state.best, x)
         if start == "guess":
-            state = _follow(hand_filter, state, sequence.measurements[1:])
-            after.append(_compare(state.best, x))
+            state = follow(hand_filter, state, sequence.measurements[1:])
+            after.append(compare_lengths(state.best, x))
         if progress is not None:
             progress(run + 1)
     later = np.array(after).reshape(-1, 2)
@@ -139,20 +139,22 @@ def run_static_experiment(
     return StaticResult(marks, nees, errors, later[:, 0], later[:, 1], {**made, "start": start})
 
 
-def _follow(hand_filter: TruncatedFilter, state: FilterState, measurements: Array) -> FilterState:
+def follow(hand_filter: TruncatedFilter, state: FilterState, measurements: Array) -> FilterState:
+    """The filter's state after further measurements (frames, m)."""
     for y in measurements:
         state = hand_filter.update(hand_filter.predict(state) if state.step else state, y)
     return state
 
 
-def _at_rest(x: Array) -> Array:
+def at_rest(x: Array) -> Array:
+    """(n,) a state without its rates."""
     still = x.copy()
     moving = len(HAND_STATE.moving)
     still[moving : 2 * moving] = 0.0
     return still
 
 
-def _see(
+def see(
     x: Array,
     sequence: SyntheticSequence,
     observation: HandObservation,
@@ -167,7 +169,7 @@ def _see(
     return y
 
 
-def _compare(belief: Belief, x: Array) -> tuple[float, float]:
+def compare_lengths(belief: Belief, x: Array) -> tuple[float, float]:
     """NEES per degree of freedom and mean absolute error [pixel] of the lengths."""
     error = (belief.mean - x)[_LENGTHS]
     covariance = belief.covariance[np.ix_(_LENGTHS, _LENGTHS)]

@@ -30,9 +30,10 @@ def date(
     waist: Annotated[
         str,
         typer.Option(
-            help="Constants of the waist formula. person: this person's; paper: 0.55, 0.225, 0.225."
+            help="The waist formula's constants. paper: 0.55, 0.225, 0.225; person: this person's; "
+            "reach: as person, lowered until both feet are in the legs' reach."
         ),
-    ] = "person",
+    ] = "reach",
     out: PicturesOption = None,
     json: JsonOption = False,
 ) -> None:

@@ -28,11 +28,12 @@ if TYPE_CHECKING:
 # What is about experiment A alone.
 _OF_A = (
     "seed", "seeds", "method", "angles", "outside_limit", "outside_weight", "candidates",
-    "interval", "views", "mismatch", "edges",
+    "interval", "views", "mismatch", "edges", "edge_noise",
 )  # fmt: skip
 # What is about the grid of angles, which continuous ones have none of.
 _OF_GRID = (
-    "seeds", "method", "outside_limit", "outside_weight", "candidates", "interval", "edges", "out",
+    "seeds", "method", "outside_limit", "outside_weight", "candidates", "interval", "edges",
+    "edge_noise", "out",
 )  # fmt: skip
 
 
@@ -107,6 +108,16 @@ EdgesOption = Annotated[
 ]
 
 
+EdgeNoiseOption = Annotated[
+    float,
+    typer.Option(
+        min=0.0, max=0.9, callback=finite,
+        help="With --edges: this share of them is missing, the others are a pixel off, and a "
+        "quarter as many are wrong.",
+    ),
+]  # fmt: skip
+
+
 def kameda(
     context: typer.Context,
     experiment: ExperimentOption = "A",
@@ -122,6 +133,7 @@ def kameda(
     views: ViewsOption = 1,
     mismatch: MismatchOption = False,
     edges: EdgesOption = False,
+    edge_noise: EdgeNoiseOption = 0.0,
     out: PicturesOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -139,6 +151,8 @@ def kameda(
         raise typer.BadParameter("must be grid or continuous", param_hint="--angles")
     if edges and method != "beam":
         raise typer.BadParameter("needs --method beam", param_hint="--edges")
+    if edge_noise and not edges:
+        raise typer.BadParameter("needs --edges", param_hint="--edge-noise")
     if angles == "continuous":
         _refuse(context, _OF_GRID, "needs --angles grid")
     else:
@@ -148,7 +162,7 @@ def kameda(
             runs = GridRuns(
                 images, seed, seeds, method, interval, outside_limit, candidates, outside_weight
             )
-            _run_on_grid(runs, edges, out, json)
+            _run_on_grid(runs, edge_noise if edges else None, out, json)
         return
     with errors_as_messages():
         _print_continuous(_run_beside(images, seed, views, mismatch), json)
@@ -229,8 +243,11 @@ def _print_continuous(results: Mapping[str, ContinuousResult], json: bool) -> No
         output_console().print(continuous_table(results))
 
 
-def _run_on_grid(runs: GridRuns, edges: bool, out: Path | None, json: bool) -> None:
-    """Run the searches on a grid and print or draw what they found."""
+def _run_on_grid(runs: GridRuns, edges: float | None, out: Path | None, json: bool) -> None:
+    """Run the searches on a grid and print or draw what they found.
+
+    edges: the noise of the edges inside the silhouettes; None: they are not used.
+    """
     from drake_pose.apps.commands.report import count_progress, output_console
     from drake_pose.apps.experiments.kameda.inner_edges import edge_lines, settle_by_edges
     from drake_pose.apps.experiments.kameda.pictures import save_pictures
@@ -242,9 +259,9 @@ def _run_on_grid(runs: GridRuns, edges: bool, out: Path | None, json: bool) -> N
     columns = runs.run()
     leading = columns[-1][0]
     settled: dict[str, int] = {}
-    if edges:
+    if edges is not None:
         with count_progress("silhouettes, edges", runs.images) as advance:
-            settled = settle_by_edges(leading, advance)
+            settled = settle_by_edges(leading, advance, edges)
     if out is not None:
         save_pictures(leading, out)
     if json:

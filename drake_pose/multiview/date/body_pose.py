@@ -17,6 +17,10 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
+# How far a foot is measured off its place [m].
+_FEATURE_ERROR = 0.015
+
+
 @dataclass(frozen=True)
 class Waist:
     """The constants of the waist formula (4.2). They are a person's; the defaults are the paper's.
@@ -24,10 +28,13 @@ class Waist:
     Args:
         head_share: the head's share in the waist's height.
         ahead: how far the waist of a person standing upright is ahead of the head's middle [m].
+        in_reach: whether the waist is lowered until both feet are in the legs' reach. The formula
+            raises it with every foot that is lifted; then no circle is left to search on.
     """
 
     head_share: float = 0.55
     ahead: float = 0.0
+    in_reach: bool = False
 
     def place(self, features: Array, heading: float) -> Array:
         """The waist (3,): at the head's place, at a height between head and feet (z upwards).
@@ -44,7 +51,7 @@ class Waist:
 
 
 def waist_of(skeleton: Skeleton) -> Waist:
-    """The constants that are right for this person standing upright.
+    """The constants that are right for this person standing upright, both feet in reach.
 
     A centimetre of error here makes the knees of a standing person bend by ten.
     """
@@ -52,7 +59,7 @@ def waist_of(skeleton: Skeleton) -> Waist:
     head, _, _, left_foot, right_foot = skeleton.features(q)
     hips = np.mean([skeleton.limb_points(q, name)[0] for name in LIMBS[2:]], axis=0)
     feet = 0.5 * (left_foot[2] + right_foot[2])
-    return Waist(float((hips[2] - feet) / (head[2] - feet)), float(hips[0] - head[0]))
+    return Waist(float((hips[2] - feet) / (head[2] - feet)), float(hips[0] - head[0]), True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +71,7 @@ class PaperPose:
             waist, its limbs go from there to the middle joints and ends below.
         limbs: by name, (3, 3) shoulder, elbow and hand, or hip, knee and foot, as found [m].
         neck: (3,) the neck's base [m].
-        waist: (3,) half-way between the hips, by the paper's formula [m].
+        waist: (3,) half-way between the hips, by the waist formula [m].
         scores: by limb: the correlation C of its middle joint; nan without the search.
     """
 
@@ -102,7 +109,10 @@ def estimate_pose(
     """
     q = _head_and_arms(skeleton, last, features, head_angles)
     R_WT, neck = skeleton.trunk_pose(q)
-    place = (waist or Waist()).place(features, float(q[skeleton.head_angles[0]]))
+    waist = waist or Waist()
+    place = waist.place(features, float(q[skeleton.head_angles[0]]))
+    if waist.in_reach:
+        place = _lowered(skeleton, R_WT, place, features[3:])
     # The model's trunk is one piece: it cannot hold shoulders and waist found apart. For its
     # positions the waist counts; so the neck's base cannot wander off from frame to frame either.
     aimed = aim_trunk(skeleton, q, place)
@@ -130,6 +140,22 @@ def estimate_pose(
         aimed[limb.positions] = move_limb(limb, R_aimed, own_root, angles, end)
         limbs[name] = found
     return PaperPose(skeleton.clip(aimed), limbs, neck, place, scores)
+
+
+def _lowered(skeleton: Skeleton, R_WT: Array, place: Array, feet: Array) -> Array:
+    """The waist (3,) at its place or so far below it that both legs reach their feet (2, 3) [m].
+
+    A stretched leg seems out of reach by what features are off: that alone lowers nothing.
+    """
+    beyond = 0.0
+    for name, foot in zip(LIMBS[2:], feet, strict=True):
+        limb = skeleton.limbs[name]
+        hip = place + R_WT @ (limb.root_T - skeleton.waist_T)
+        across = float(np.linalg.norm(hip[:2] - foot[:2]))
+        above = np.sqrt(max(0.0, sum(limb.lengths) ** 2 - across**2))
+        beyond = max(beyond, float(hip[2] - foot[2] - above))
+    lower = min(beyond, max(0.0, 2.0 * (beyond - _FEATURE_ERROR)))
+    return np.array([*place[:2], place[2] - lower])
 
 
 def _head_and_arms(

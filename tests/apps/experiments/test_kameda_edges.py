@@ -1,9 +1,15 @@
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from drake_pose.apps.experiments.kameda.experiment import beam_experiment_search, run_experiment
-from drake_pose.apps.experiments.kameda.inner_edges import edge_lines, settle_by_edges
+from drake_pose.apps.experiments.kameda.inner_edges import (
+    edge_lines,
+    noisy_edges,
+    settle_by_edges,
+)
+from drake_pose.matching.grid.families.inner_edges import edges_of_labels
 
 
 @pytest.mark.slow
@@ -19,3 +25,18 @@ def test_edges_settle_what_the_silhouette_leaves_open() -> None:
     assert counts["edges_settle_rightly"] == counts["edges_settle"]
     assert counts["edges_keep_truth"] == counts["ambiguous"]
     assert str(counts["edges_keep_truth"]) in edge_lines(counts)
+    noisy = settle_by_edges(replace(result, trials=tuple(few)), noise=0.2)
+    assert noisy["edges_keep_truth"] == noisy["ambiguous"] == len(few)
+    assert noisy["edges_settle"] <= counts["edges_settle"]
+
+
+def test_noise_loses_moves_and_adds_edges() -> None:
+    segments = np.zeros((80, 80), dtype=np.int64)
+    segments[:, 40:] = 1
+    edges = edges_of_labels(segments, np.ones((80, 80), dtype=np.bool_))
+    noisy = noisy_edges(edges, 0.3, np.random.default_rng(0))
+    columns = np.nonzero(noisy.edges)[1]
+    near = np.abs(columns - 39) <= 1
+    assert 0.4 < near.sum() / 80 < 0.9
+    assert (~near).any()
+    assert noisy_edges(edges, 0.9, np.random.default_rng(0)).edges[:, 38:41].sum() < near.sum()

@@ -1,5 +1,7 @@
 """Skeleton, inverse kinematics and the search on circles, against Drake and known poses."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -8,7 +10,7 @@ from drake_pose.body import bundled_model, load_model
 from drake_pose.body.landmarks import landmark_positions, load_landmarks
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.errors import ModelError
-from drake_pose.multiview.date.body_pose import Waist, estimate_pose
+from drake_pose.multiview.date.body_pose import Waist, estimate_pose, waist_of
 from drake_pose.multiview.date.inverse_kinematics import move_limb, reach, upper_body
 from drake_pose.multiview.date.limb_search import (
     correlation,
@@ -262,6 +264,31 @@ class TestPose:
         features = np.array([[0.1, 0.2, 1.6], [0, 0, 0], [0, 0, 0], [0, 0, 0.04], [0, 0, 0.2]])
         expected = [0.1, 0.2, 0.55 * 1.6 + 0.225 * 0.2 + 0.225 * 0.04]
         np.testing.assert_allclose(Waist().place(features, 0.7), expected)
+
+    def test_a_lifted_foot_does_not_lift_the_waist_out_of_the_legs_reach(
+        self, person, skeleton, views
+    ):
+        """The formula takes the mean of both feet; above the legs' reach no circle is left."""
+        cameras, renderers = views
+        true = posed(person, left_thigh_x=-25, left_shin_x=6, right_thigh_x=25, right_shin_x=30)
+        regions = [renderer.mask(true) for renderer in renderers]
+        features, own = skeleton.features(true), waist_of(skeleton)
+        hips = np.mean([skeleton.limb_points(true, name)[0] for name in LIMBS[2:]], axis=0)
+        found = {
+            in_reach: estimate_pose(
+                skeleton, posed(person), features, true[skeleton.head_angles], cameras, regions,
+                waist=replace(own, in_reach=in_reach),
+            )
+            for in_reach in (False, True)
+        }  # fmt: skip
+        assert found[False].waist[2] - hips[2] > 0.02
+        assert abs(found[True].waist[2] - hips[2]) < 0.012
+        knees = np.array([skeleton.limb_points(true, name)[1] for name in LIMBS[2:]])
+        errors = {
+            key: np.linalg.norm([one.limbs[n][1] for n in LIMBS[2:]] - knees, axis=1).mean()
+            for key, one in found.items()
+        }
+        assert errors[True] < 0.6 * errors[False]
 
     def test_search_finds_elbows_that_inverse_kinematics_misses(self, person, skeleton, views):
         cameras, renderers = views

@@ -13,18 +13,21 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from drake_pose.apps.experiments.date.motion import REGISTERED, UPRIGHT, Motion, make_motion
+from drake_pose.apps.experiments.date.stages import FaceTriple, StagesShown
 from drake_pose.apps.experiments.date.studio import Studio
-from drake_pose.apps.experiments.date.tracks import PaperTrack, SilhouetteTrack, see
+from drake_pose.apps.experiments.date.tracks import Images, PaperTrack, SilhouetteTrack, see
 from drake_pose.body.landmarks import landmarks_of_nodes
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.camera import PinholeCamera
 from drake_pose.errors import SettingsError
 from drake_pose.multiview.date.body_pose import Waist
 from drake_pose.multiview.date.skeleton import LIMBS
+from drake_pose.systems.colour_images import colour_image_to_picture
 
 Array = NDArray[np.float64]
 
 METHODS = ("silhouette", "paper")
-WAISTS = ("person", "paper")
+WAISTS = ("reach", "person", "paper")
 FEWEST_CAMERAS = 3
 SHOWN_CAMERA = "camera_0"
 FRAMES = 240
@@ -56,7 +59,7 @@ class DateResult:
         found_errors: of "paper" and "ik_only", elbows and knees as found, before the model with its
             stiff trunk is laid through them: (n, 4) in the order of LIMBS [mm]; nan where the
             registered pose was recognised instead.
-        waist: of WAISTS, whose constants the waist formula had.
+        waist: of WAISTS, how the waist was found.
         face_errors: (n,) angle between true and estimated direction of the head [deg].
         recoveries: frames until a destroyed track was right again, by the motion during which it
             was destroyed; REGISTERED: the registered pose was shown; None: not within _WATCHED.
@@ -65,6 +68,8 @@ class DateResult:
         cameras: how many, the face camera included.
         seed: what the motion was drawn with.
         pictures: by motion: input and all estimates, side by side.
+        stages: by motion: what the paper's stages saw in the same frame.
+        rig: the cameras, by name.
     """
 
     method: str
@@ -80,6 +85,8 @@ class DateResult:
     cameras: int
     seed: int
     pictures: Mapping[str, NDArray[np.uint8]]
+    stages: Mapping[str, StagesShown]
+    rig: Mapping[str, PinholeCamera]
 
     @property
     def motions(self) -> tuple[str, ...]:
@@ -165,7 +172,7 @@ class DateResult:
         """Elbows and knees as found, with the paper's search and without."""
         table = Table(
             "motion", "elbows [mm]", "by IK alone", "knees [mm]", "by IK alone",
-            title=f"Elbows and knees as found, the {self.waist}'s waist",
+            title=f"Elbows and knees as found, --waist {self.waist}",
         )  # fmt: skip
         rows = {motion: (motion,) for motion in self.motions} | {"upright": UPRIGHT}
         for label, motions in rows.items():
@@ -196,7 +203,7 @@ def run_experiment(
     method: str = "silhouette",
     progress: Callable[[int], None] | None = None,
     size: tuple[int, int] = (640, 480),
-    waist: str = "person",
+    waist: str = "reach",
 ) -> DateResult:
     """Captures a simulated person.
 
@@ -207,8 +214,8 @@ def run_experiment(
         method: "silhouette" for all silhouettes at once, "paper" for the paper's way alone.
         progress: called with the number of frames done after each.
         size: width and height of the pictures [pixel].
-        waist: constants of the paper's waist formula: "person" for those of this person, "paper"
-            for 0.55, 0.225, 0.225.
+        waist: of the paper's formula: "person" with this person's constants, "paper" with 0.55,
+            0.225, 0.225; "reach" as "person", then lowered until both feet are in reach.
 
     Raises:
         SettingsError: an argument is out of its range.
@@ -238,14 +245,16 @@ class _Experiment:
         seed: int,
         method: str,
         size: tuple[int, int],
-        waist: str = "person",
+        waist: str,
     ) -> None:
         self.cameras, self.seed, self.method, self.waist = cameras, seed, method, waist
         self.studio = Studio.build(cameras, size, np.random.default_rng([seed, 1]))
         self.motion = make_motion(self.studio.skeleton, frames, seed)
         setup = self.studio.prepare(self.motion.q[0])
-        if waist == "paper":
-            setup = replace(setup, settings=replace(setup.settings, waist=Waist()))
+        if waist != "reach":
+            own = replace(setup.settings.waist, in_reach=False)
+            formula = Waist() if waist == "paper" else own
+            setup = replace(setup, settings=replace(setup.settings, waist=formula))
         model = self.studio.model
         tree = model.pose_tree()
         self.kinematics = TreeKinematics(tree)
@@ -268,7 +277,7 @@ class _Experiment:
         estimates: dict[str, list[Array]] = {way: [] for way in self.tracks}
         found: dict[str, list[Array]] = {way: [] for way in ("paper", "ik_only")}
         watched: list[_Watched] = []
-        pictures = {}
+        pictures, stages = {}, {}
         destroyed_at = frames_of_destruction(motion)
         for k, q in enumerate(motion.q):
             images = see(studio.pictures(q))
@@ -285,6 +294,7 @@ class _Experiment:
             if _is_middle(motion, k):
                 shown = [estimates[way][-1] for way in self.tracks]
                 pictures[motion.names[k]] = studio.side_by_side(q, shown, SHOWN_CAMERA)
+                stages[motion.names[k]] = self._stages(images, estimates["paper"][-1])
             if progress is not None:
                 progress(k + 1)
         errors = {
@@ -312,7 +322,19 @@ class _Experiment:
             cameras=self.cameras,
             seed=self.seed,
             pictures=pictures,
+            stages=stages,
+            rig=studio.cameras,
         )
+
+    def _stages(self, images: Images, estimate: Array) -> StagesShown:
+        """What the paper's stages saw in the frame whose estimate (nq,) this is."""
+        track = self.tracks["paper"]
+        assert isinstance(track, PaperTrack)
+        views, found, face = track.seen()
+        picture = colour_image_to_picture(images[SHOWN_CAMERA]).copy()
+        avatar = None if face is None else self.studio.face_at(estimate)
+        triple = None if face is None or avatar is None else FaceTriple(*face, avatar)
+        return StagesShown(picture, SHOWN_CAMERA, views, found, triple)
 
     def _off(self, found: Array, q: Array) -> Array:
         """(k,) how far the joint centres at found positions (nq,) are off those at q (nq,) [mm]."""

@@ -1,4 +1,4 @@
-"""Pictures of Date's experiment in the manner of the paper's figure 7."""
+"""Pictures of Date's experiment in the manner of the paper's figures 2, 3, 4 and 7."""
 
 from __future__ import annotations
 
@@ -9,10 +9,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from drake_pose.apps.experiments.date.experiment import TITLES, DateResult
+from drake_pose.apps.experiments.date.stages import draw_faces, draw_points, draw_skin
 
 
 def save_pictures(result: DateResult, folder: Path) -> list[Path]:
     """Draw, for each motion, the input and all estimates side by side, and the errors over time.
+
+    For the same frames: skin in a picture, its points in space, and the faces.
 
     Args:
         result: the experiment.
@@ -26,6 +29,7 @@ def save_pictures(result: DateResult, folder: Path) -> list[Path]:
     for motion, picture in result.pictures.items():
         files.append(folder / f"figure_07_{motion}.png")
         cv2.imwrite(str(files[-1]), np.ascontiguousarray(picture[:, :, ::-1]))
+    files += _save_stages(result, folder)
     figure = Figure(figsize=(9.0, 3.5), layout="constrained")
     axes = figure.add_subplot()
     for way, errors in result.errors.items():
@@ -38,4 +42,19 @@ def save_pictures(result: DateResult, folder: Path) -> list[Path]:
     axes.legend()
     files.append(folder / "errors.png")
     figure.savefig(files[-1], dpi=120)
+    return files
+
+
+def _save_stages(result: DateResult, folder: Path) -> list[Path]:
+    """Figures 2 to 4; returns the files written."""
+    files = []
+    for motion, shown in result.stages.items():
+        files.append(folder / f"figure_02_{motion}.png")
+        cv2.imwrite(str(files[-1]), np.ascontiguousarray(draw_skin(shown)[:, :, ::-1]))
+        files.append(folder / f"figure_03_{motion}.png")
+        draw_points(shown, result.rig).savefig(files[-1], dpi=120)
+    faces = draw_faces(result.stages)
+    if faces is not None:
+        files.append(folder / "figure_04.png")
+        faces.savefig(files[-1], dpi=120)
     return files

@@ -14,8 +14,10 @@ from drake_pose.body import ArticulatedModel, bundled_model, load_model
 from drake_pose.body.landmarks import Landmark, load_landmarks
 from drake_pose.camera import PinholeCamera
 from drake_pose.camera.rigs import FACE_CAMERA, circle_of_cameras
-from drake_pose.multiview.date.capture import CaptureSetup
+from drake_pose.multiview.date.capture import CaptureSetup, see_person
+from drake_pose.multiview.date.faces import cut_face
 from drake_pose.multiview.date.skeleton import Skeleton, load_skeleton
+from drake_pose.multiview.date.skin_blobs import SkinColour
 from drake_pose.silhouette.segmentation.background import Background, learn_background
 from drake_pose.systems.date.preparation import prepare_paper_capture
 from drake_pose.systems.pictures.camera_rig import CameraRig, build_camera_rig
@@ -104,6 +106,13 @@ class Studio:
             self.rig.set_positions(self.context, positions)
             shown.append(self.rig.picture(self.context, name))
         return np.hstack(shown)
+
+    def face_at(self, q: Array) -> Picture | None:
+        """The face (130, 80, 3) of a person at q as the face camera sees it; None: no skin."""
+        self.rig.set_positions(self.context, q)
+        picture = self.rig.picture(self.context, FACE_CAMERA)
+        mask = self.rig.mask(self.context, FACE_CAMERA)
+        return cut_face(picture, see_person(picture, mask, SkinColour()).blobs)
 
 
 def noisy(picture: Picture, generator: np.random.Generator) -> Picture:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,15 +14,18 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 from pydrake.systems.sensors import ImageRgba8U
 
+from drake_pose.apps.experiments.date.stages import template_picture
 from drake_pose.body import ArticulatedModel
 from drake_pose.camera import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.matching.fit.contour_fit import ContourFit
-from drake_pose.multiview.date.capture import CaptureSetup
+from drake_pose.multiview.date.capture import CaptureSetup, PersonView
+from drake_pose.multiview.date.faces import cut_face, face_direction
+from drake_pose.multiview.date.features import Features
 from drake_pose.multiview.date.skeleton import LIMBS
 from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker, TrackState
 from drake_pose.silhouette.segmentation.background import Background
-from drake_pose.systems.colour_images import picture_to_colour_image
+from drake_pose.systems.colour_images import colour_image_to_picture, picture_to_colour_image
 from drake_pose.systems.date.capture import PaperCapture, build_paper_capture
 from drake_pose.systems.person.silhouette_capture import SilhouetteCapture, build_silhouette_capture
 from drake_pose.systems.staged_diagram import StagedDiagram
@@ -35,6 +39,13 @@ Images = Mapping[str, ImageRgba8U]
 _EDGE_POINTS = 60.0
 # A power of two: the time from frame to frame is exactly the same, and so is the motion expected.
 _PERIOD = 1.0 / 32.0
+
+
+class FaceSeen(NamedTuple):
+    """A face (130, 80, 3) as the face camera saw it, and the template nearest to it."""
+
+    face: Picture
+    template: Picture
 
 
 class _Clock:
@@ -138,6 +149,34 @@ class PaperTrack:
         """
         port = self._capture.diagram.GetOutputPort("limb_points")
         return np.array(port.Eval(self._run.context)).reshape(len(LIMBS), 3, 3)[:, 1]
+
+    def seen(self) -> tuple[dict[str, PersonView], Features, FaceSeen | None]:
+        """The last frame's person by camera on the circle, features, and face where one was seen.
+
+        None of it changed what was estimated.
+        """
+        setup, diagram, context = self._capture.estimator.setup, self._capture.diagram, self.context
+        ports = {name: diagram.GetOutputPort(f"person_view_{name}") for name in setup.cameras}
+        views = {name: port.Eval(context) for name, port in ports.items()}
+        finder = diagram.GetSubsystemByName("features")
+        found = finder.GetOutputPort("found").Eval(finder.GetMyContextFromRoot(context))
+        if setup.face_camera is None or setup.faces is None:
+            return views, found, None
+        name = setup.face_camera.name
+        picture = colour_image_to_picture(diagram.GetInputPort(f"color_image_{name}").Eval(context))
+        blobs = diagram.GetOutputPort(f"person_view_{name}").Eval(context).blobs
+        face = cut_face(picture, blobs)
+        if face is None:
+            return views, found, None
+        nearest = face_direction(face, setup.faces)
+        if nearest.outside > setup.settings.farthest_face:
+            return views, found, None
+        return views, found, FaceSeen(face, template_picture(setup.faces, nearest.template))
+
+    @property
+    def context(self) -> Context:
+        """The diagram's."""
+        return self._run.context
 
     def destroyed(self, q: Array, _generator: np.random.Generator) -> PaperTrack:
         """A track that is turned around, its left and right exchanged; q (nq,) is where it was."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from drake_pose.apps.experiments.kameda.causes import Causes, causes_of_wrong_angles
 from drake_pose.body import PoseTree, bundled_model, load_model
 from drake_pose.camera import ParallelCamera
 from drake_pose.errors import SettingsError
@@ -30,6 +31,8 @@ PAPER: dict[str, float | int | str] = {
     "mean_e_total": 0.0227,
     "exact": 135,
     "pose_equal": 101,
+    "wrong_hidden": 14,
+    "wrong_inner_edges": 22,
     "improved": 75,
     "mean_runs": 26.2,
     "mean_runs_without_worst_seven": 20.1,
@@ -64,6 +67,7 @@ class Trial:
         examination_seconds: of the processor for proof and families; 0 if there were none.
         truth_in_set: whether the true pose is one of those that the answer names; None if the
             answer is one pose.
+        causes: why angles are wrong where the silhouette is matched exactly; else None.
     """
 
     true_values: tuple[np.ndarray, ...]
@@ -73,6 +77,7 @@ class Trial:
     seconds: float
     examination_seconds: float = 0.0
     truth_in_set: bool | None = None
+    causes: Causes | None = None
 
     @property
     def E_total(self) -> float:
@@ -105,11 +110,15 @@ class ExperimentResult:
         improved = [
             t.result.found and t.result.E_total < t.result.first_E_total for t in self.trials
         ]
+        causes = [trial.causes for trial in self.trials if trial.causes is not None]
         figures: dict[str, float | int | str] = {
             "images": len(self.trials),
             "mean_e_total": float(np.mean(E_total)) if E_total else math.nan,
             "exact": sum(trial.exact for trial in self.trials),
             "pose_equal": sum(trial.pose_equal for trial in self.trials),
+            "wrong_hidden": sum(one.hidden for one in causes),
+            "wrong_inner_edges": sum(one.inner_edges for one in causes),
+            "wrong_alike": sum(not (one.hidden or one.inner_edges) for one in causes),
             "improved": int(sum(improved)),
             "mean_runs": float(np.mean(runs)),
             "mean_runs_without_worst_seven": float(np.mean(runs[:-7] if len(runs) > 7 else runs)),
@@ -290,7 +299,10 @@ def _match_one(search: PoseSearch, camera: ParallelCamera, values: list[np.ndarr
         np.allclose(found, true, atol=math.radians(0.01))
         for found, true in zip(result.node_values, values, strict=True)
     )
-    trial = Trial(tuple(values), inside, result, bool(equal), seconds)
+    causes = None
+    if result.found and result.J == 0 and not equal:
+        causes = causes_of_wrong_angles(search.sampled, camera, values, result.node_values)
+    trial = Trial(tuple(values), inside, result, bool(equal), seconds, causes=causes)
     return _examined(trial, search, view) if isinstance(search, BeamSearch) else trial
 
 

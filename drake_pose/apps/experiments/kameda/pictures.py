@@ -7,6 +7,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from drake_pose.apps.experiments.kameda.chest_candidates import chest_ranks, share_within
 from drake_pose.apps.experiments.kameda.experiment import (
     ExperimentResult,
     Trial,
@@ -67,7 +68,9 @@ def save_pictures(result: ExperimentResult, folder: Path) -> list[Path]:
     if isinstance(result.search, PaperSearch):
         runs = np.array([trial.result.runs for trial in result.trials])
         path = folder / "figure_11_runs_of_step_3.png"
-        return [*files, _save_histogram(path, runs, 100, "runs of step 3")]
+        files.append(_save_histogram(path, runs, 100, "runs of step 3"))
+        K = result.search.settings.candidate_limit
+        return [*files, _save_chest_ranks(folder / "figure_12_chest_candidates.png", result, K)]
     milliseconds = np.array([1e3 * trial.seconds for trial in result.trials])
     path = folder / "figure_11_milliseconds.png"
     files.append(_save_histogram(path, milliseconds, 200, "processor time of the search [ms]"))
@@ -141,6 +144,29 @@ def _compare(true: np.ndarray, estimate: np.ndarray) -> np.ndarray:
     picture[true & ~estimate] = (0.0, 0.45, 0.70)
     picture[~true & estimate] = (0.90, 0.62, 0.0)
     return picture
+
+
+def _save_chest_ranks(path: Path, result: ExperimentResult, limit: int) -> Path:
+    """Draw in how many images the true chest is among the first K of its list, against K."""
+    ranks, lengths = chest_ranks(result)
+    Ks = np.arange(1, max(2, int(lengths.max())) + 1)
+    figure = Figure(figsize=(6, 4))
+    axis = figure.subplots()
+    axis.semilogx(Ks, share_within(ranks, Ks.tolist()), color="0.2")
+    axis.axvline(limit, color="0.6", linestyle="--", label=f"K = {limit}")
+    axis.set_xlabel("K, candidates of the chest that are kept")
+    axis.set_ylabel("share of images with the true chest among them")
+    axis.set_ylim(0.0, 1.0)
+    axis.legend()
+    share = share_within(ranks, [limit])[0]
+    axis.set_title(
+        f"{len(ranks)} images, {np.median(lengths):.0f} candidates (median); "
+        f"among the first {limit}: {share:.0%}",
+        fontsize=10,
+    )
+    figure.tight_layout()
+    figure.savefig(path, dpi=80)
+    return path
 
 
 def _save_histogram(path: Path, values: np.ndarray, end: int, label: str) -> Path:

@@ -9,6 +9,7 @@ the edges between its visible segments agree with those of the picture: the F me
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -25,6 +26,8 @@ RenderSegments = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 _TOLERANCE = 2.0
 _ALIKE = 0.005
+# Of what even the best pose lacks, so much may be chance between it and another.
+_CHANCE = 0.1
 _CANNY = (50, 150)
 # Colours change at the silhouette's edge, too: so near to it no edge counts.
 _RIM = 3
@@ -46,6 +49,18 @@ class InnerEdges:
     mask: np.ndarray
     rim: int
 
+    @cached_property
+    def _seen_distances(self) -> np.ndarray:
+        """The distance of each pixel of the window to the nearest edge [pixel]."""
+        top, bottom, left, right = self.window
+        return _distances(self.edges[top:bottom, left:right])
+
+    @cached_property
+    def _inside(self) -> np.ndarray:
+        """The pixels of the window at which edges count."""
+        top, bottom, left, right = self.window
+        return _interior(self.mask[top:bottom, left:right], self.rim)
+
     def agreement(self, segments: np.ndarray, tolerance: float = _TOLERANCE) -> float:
         """How well the borders between visible segments (H, W) int agree with the edges: 0 to 1.
 
@@ -55,12 +70,12 @@ class InnerEdges:
         """
         top, bottom, left, right = self.window
         window = (slice(top, bottom), slice(left, right))
-        expected = find_borders(segments[window]) & _interior(self.mask[window], self.rim)
+        expected = find_borders(segments[window]) & self._inside
         seen = self.edges[window]
         if not expected.any() or not seen.any():
             return float(not expected.any() and not seen.any())
         found = float((_distances(expected)[seen] <= tolerance).mean())
-        explained = float((_distances(seen)[expected] <= tolerance).mean())
+        explained = float((self._seen_distances[expected] <= tolerance).mean())
         return 2.0 * found * explained / (found + explained) if found + explained else 0.0
 
 
@@ -128,8 +143,15 @@ class EdgeChoice:
 
     @property
     def settled(self) -> bool:
-        """Whether one pose is left."""
-        return self.left == 1
+        """Whether one pose is left, and no other of the set can be as good."""
+        return self.left == 1 and self.exhaustive
+
+    def rules_out(self, samples: np.ndarray) -> bool:
+        """Whether a pose of the set, samples (nodes,), was judged and agrees worse than the best.
+
+        Of a large set not all poses are judged: one that was not is not ruled out.
+        """
+        return bool((self.samples[self.left :] == samples).all(axis=1).any())
 
 
 def rank_families(
@@ -143,7 +165,10 @@ def rank_families(
         renders: one for each camera.
     """
     return np.array(
-        [_mean_agreement(family.q, family.X_WB, edges, renders) for family in answer.families]
+        [
+            _mean_agreement([render(family.q, family.X_WB) for render in renders], edges)
+            for family in answer.families
+        ]
     )
 
 
@@ -162,17 +187,21 @@ def choose_by_edges(
         renders: one for each camera.
         most: a set of more poses is judged by this many random ones; from the best of them, one
             node and all that hangs on it is then turned in as many ways while that helps.
-        alike: poses whose agreement is no more below the best one's count as equally good.
+        alike: poses whose agreement is no more below the best one's count as equally good; where
+            the best one's is below 1, as edges are missing or wrong, a tenth of that more. Where a
+            pose agrees to the pixel, only such poses do.
     """
     tree = answer.sampled.tree
-    known: dict[tuple[int, ...], float] = {}
+    known: dict[tuple[int, ...], tuple[float, float]] = {}
 
     def judge(samples: np.ndarray) -> float:
         key = tuple(samples.tolist())
         if key not in known:
             values = [grid[t] for grid, t in zip(answer.sampled.values, samples, strict=True)]
-            known[key] = _mean_agreement(*tree.positions_from(values), edges, renders)
-        return known[key]
+            q, X_WB = tree.positions_from(values)
+            images = [render(q, X_WB) for render in renders]
+            known[key] = _mean_agreement(images, edges), _mean_agreement(images, edges, 0.0)
+        return known[key][0]
 
     exhaustive = answer.size <= most
     random = np.random.default_rng(0)
@@ -181,10 +210,13 @@ def choose_by_edges(
     if not exhaustive:
         _turn_subtrees(answer, members[int(np.argmax(agreements))], judge, most, random)
     samples = np.array(list(known))
-    found = np.array(list(known.values()))
-    order = np.argsort(-found, kind="stable")
-    samples, found = samples[order], found[order]
-    left = int((found >= found[0] - alike).sum())
+    found, to_the_pixel = np.array(list(known.values())).T
+    is_left = found >= found.max() - alike - _CHANCE * (1.0 - found.max())
+    if to_the_pixel.max() == 1.0:
+        # Edges without any noise: who differs by a pixel is not the one.
+        is_left &= to_the_pixel == 1.0
+    order = np.lexsort((-found, ~is_left))
+    samples, found, left = samples[order], found[order], int(is_left.sum())
     seen = [np.unique(column) for column in samples[:left].T]
     best = [grid[t] for grid, t in zip(answer.sampled.values, samples[0], strict=True)]
     complete = answer.complete and exhaustive
@@ -233,13 +265,11 @@ def _members(graph: PartialPoseGraph, most: int, random: np.random.Generator) ->
 
 
 def _mean_agreement(
-    q: np.ndarray,
-    X_WB: np.ndarray,
-    edges: Sequence[InnerEdges],
-    renders: Sequence[RenderSegments],
+    images: Sequence[np.ndarray], edges: Sequence[InnerEdges], tolerance: float = _TOLERANCE
 ) -> float:
-    pairs = zip(edges, renders, strict=True)
-    return float(np.mean([edge.agreement(render(q, X_WB)) for edge, render in pairs]))
+    """The mean agreement of segments (H, W) in each camera's picture with its edges."""
+    pairs = zip(images, edges, strict=True)
+    return float(np.mean([edge.agreement(image, tolerance) for image, edge in pairs]))
 
 
 def _window(shape: tuple[int, ...], mask: np.ndarray) -> tuple[int, int, int, int]:

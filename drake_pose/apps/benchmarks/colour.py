@@ -1,8 +1,9 @@
 """Benchmark of tracking by colour: an arm that moves before rooms, beside tracking by exact masks.
 
-Run as ``python -m drake_pose.apps.benchmarks.colour MODEL [--seed N] [--frames N]``; MODEL is the
-file of an arm, such as the LBR Med 7's. Drake's renderer draws it before textured walls, in two
-cameras; each row of the table is one run of one motion. The seed is of the motion and of the room.
+Run as ``python -m drake_pose.apps.benchmarks.colour MODEL [--seed N] [--frames N] [--size W H]
+[--easy]``; MODEL is the file of an arm, such as the LBR Med 7's. Drake's renderer draws it before
+textured walls, in two cameras; each row of the table is one run of one motion. The seed is of the
+motion and of the room.
 """
 
 from __future__ import annotations
@@ -49,7 +50,9 @@ Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
-_WIDTH, _HEIGHT, _FOCAL, _RATE = 640, 480, 600.0, 30.0
+_SIZE, _RATE = (640, 480), 30.0
+# The focal length of pictures, over their height.
+_FOCAL = 1.25
 _EYES = ((2.1, -1.4, 1.1), (1.9, 1.7, 1.2))
 _RENDERER = "colour"
 _OTHERS = RenderLabel(2000)
@@ -152,11 +155,19 @@ class ColourScene:
         room: what stands about it.
         seed: of the room and the motion.
         folder: where walls' textures are written.
+        size: of the pictures, width and height [pixel].
     """
 
-    def __init__(self, model: ArticulatedModel, room: Room, seed: int, folder: Path) -> None:
+    def __init__(
+        self,
+        model: ArticulatedModel,
+        room: Room,
+        seed: int,
+        folder: Path,
+        size: tuple[int, int] = _SIZE,
+    ) -> None:
         self._rng, self._room, self._folder = np.random.default_rng(seed), room, folder
-        self.cameras = tuple(_camera(f"camera{k}", eye) for k, eye in enumerate(_EYES))
+        self.cameras = tuple(_camera(f"camera{k}", eye, size) for k, eye in enumerate(_EYES))
         self._joints, self._default = len(model.position_names), model.default_positions
         builder = DiagramBuilder()
         self._plant, self._scene = AddMultibodyPlantSceneGraph(builder, 0.0)
@@ -294,7 +305,7 @@ class ColourScene:
         return body
 
 
-def _camera(name: str, eye: Sequence[float]) -> PinholeCamera:
+def _camera(name: str, eye: Sequence[float], size: tuple[int, int]) -> PinholeCamera:
     """A camera that looks at the arm's middle."""
     ahead = np.array([0.0, 0.0, 0.5]) - eye
     ahead /= np.linalg.norm(ahead)
@@ -303,8 +314,9 @@ def _camera(name: str, eye: Sequence[float]) -> PinholeCamera:
     X_WC = np.eye(4)
     X_WC[:3, :3] = np.column_stack([right, np.cross(ahead, right), ahead])
     X_WC[:3, 3] = eye
-    centre = (_WIDTH / 2 - 0.5, _HEIGHT / 2 - 0.5)
-    return PinholeCamera(name, _WIDTH, _HEIGHT, _FOCAL, _FOCAL, *centre, X_WC)
+    (width, height), focal = size, _FOCAL * size[1]
+    centre = (width / 2 - 0.5, height / 2 - 0.5)
+    return PinholeCamera(name, width, height, focal, focal, *centre, X_WC)
 
 
 def _behind(path: tuple[Array, Array, Array, Array], moment: float) -> Array:
@@ -362,7 +374,11 @@ def follow(
 
 
 def measure_room(
-    model: ArticulatedModel, room: Room, seed: int, count: int
+    model: ArticulatedModel,
+    room: Room,
+    seed: int,
+    count: int,
+    size: tuple[int, int] = _SIZE,
 ) -> tuple[ColourOutcome, ...]:
     """Follows an arm before one room by exact masks and by colour.
 
@@ -371,23 +387,30 @@ def measure_room(
         room: what stands about it.
         seed: of the room and the motion.
         count: how many frames.
+        size: of the pictures, width and height [pixel].
     """
     with tempfile.TemporaryDirectory() as folder:
-        scene = ColourScene(model, room, seed, Path(folder))
+        scene = ColourScene(model, room, seed, Path(folder), size)
         frames = list(scene.frames(count))
     observation = ContourObservation(make_tree(model, EstimateSettings(), None), scene.cameras)
     follow(observation, frames[:2], True)
     return follow(observation, frames, False), follow(observation, frames, True)
 
 
-def colour_table(model: ArticulatedModel, seed: int, count: int) -> Table:
+def colour_table(
+    model: ArticulatedModel,
+    seed: int,
+    count: int,
+    size: tuple[int, int] = _SIZE,
+    rooms: Sequence[Room] = ROOMS,
+) -> Table:
     """Errors of each room's run; arguments as of measure_room."""
     table = Table(title=f"{count - 1} frames, seed {seed}; errors in degrees, median / p95")
     for heading in ("", "masks", "colour", "ratio", "within 2 sd", "not lost", "lost", "wrong",
                     "not said", "CPU ms, masks", "colour"):  # fmt: skip
         table.add_column(heading, justify="right" if heading else "left")
-    for room in ROOMS:
-        masks, colour = measure_room(model, room, seed, count)
+    for room in rooms:
+        masks, colour = measure_room(model, room, seed, count, size)
         medians = [float(np.median(one.errors)) for one in (masks, colour)]
         kept = ~colour.lost
         held = np.mean(colour.errors[kept] < 2.0 * colour.deviations[kept]) if kept.any() else 0.0
@@ -413,9 +436,17 @@ def main() -> None:
     parser.add_argument("model", type=Path, help="the model file of an arm")
     parser.add_argument("--seed", type=int, default=0, help="of the rooms and the motion")
     parser.add_argument("--frames", type=int, default=90, help="of each run")
+    parser.add_argument(
+        "--size", type=int, nargs=2, default=_SIZE, metavar=("WIDTH", "HEIGHT"),
+        help="of the pictures [pixel]",
+    )  # fmt: skip
+    parser.add_argument("--easy", action="store_true", help="the first room alone")
     asked = parser.parse_args()
     model = load_model(asked.model, check=False)
-    Console(width=160).print(colour_table(model, asked.seed, asked.frames))
+    rooms = ROOMS[:1] if asked.easy else ROOMS
+    Console(width=160).print(
+        colour_table(model, asked.seed, asked.frames, tuple(asked.size), rooms)
+    )
 
 
 if __name__ == "__main__":

@@ -266,10 +266,11 @@ def learn_colours(
             if totals[node, side] >= _FEW:
                 _mix(histograms[node, side], counts[node, side], totals[node, side], rate)
         for colour in range(COLOURS):
-            odds = (histograms[node, ON, colour] + _RARE) / (
-                histograms[node, BESIDE, colour] + _RARE
-            )
-            histograms[node, ODDS, colour] = math.log(odds)
+            on_it, beside_it = histograms[node, ON, colour], histograms[node, BESIDE, colour]
+            # Most colours are never seen: a logarithm takes longer than all else here.
+            even = on_it == beside_it
+            odds = 0.0 if even else math.log((on_it + _RARE) / (beside_it + _RARE))
+            histograms[node, ODDS, colour] = odds
 
 
 @compiled

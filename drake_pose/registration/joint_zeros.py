@@ -9,7 +9,7 @@ guessed.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +18,7 @@ from scipy.special import stdtr, stdtrit
 
 from drake_pose.body import PoseTree
 from drake_pose.body.model import OBJECT_POSITIONS
-from drake_pose.body.tree.joint_offsets import joint_offsets
+from drake_pose.body.tree.joint_offsets import JointOffset, joint_offsets
 from drake_pose.camera import PinholeCamera
 from drake_pose.errors import RegistrationError, UnknownNameError
 from drake_pose.matching.fit.lengthened_body import length_name
@@ -108,9 +108,18 @@ class JointCalibration:
     object_covariance: Array
 
 
+def lengthened_joints(tree: PoseTree, links: Collection[str] | None = None) -> list[JointOffset]:
+    """The robot's joints that links, all where None, carry at a distance from their own."""
+    return [
+        one
+        for one in joint_offsets(tree)
+        if (links is None or one.link in links) and one.joint not in OBJECT_POSITIONS
+    ]
+
+
 def links_with_length(tree: PoseTree) -> tuple[str, ...]:
     """The links that carry a joint at a distance from their own."""
-    return tuple(dict.fromkeys(one.link for one in joint_offsets(tree)))
+    return tuple(dict.fromkeys(one.link for one in lengthened_joints(tree)))
 
 
 def require_known(tree: PoseTree, names: Sequence[str], lengths: Sequence[str]) -> None:
@@ -159,7 +168,7 @@ def calibrate_joints(
             f"{len(names)} joints' zeros and {len(lengths)} links' lengths need as many frames of "
             f"differing poses, and two or more; there are {count}: give more frames, or name fewer"
         )
-    moved = [one for one in joint_offsets(body.tree) if one.link in lengths]
+    moved = lengthened_joints(body.tree, lengths)
     fits = [
         CameraFit(PosedFrames(body.kinematics, body.all, one.camera, own), _SPACING, moved)
         for one, own in zip(cameras, frames, strict=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -108,6 +109,12 @@ class StandingObject:
         self._X_TO = np.eye(4)
         self._X_TO[:3, 3] = self.middle
         self._bodies = RegistrationBody(self.tree(np.eye(4)), (OBJECT,), FEW)
+
+    def before(self, robot: ArticulatedModel) -> StandingObject:
+        """The same before the same robot whose joints may stand elsewhere on their links."""
+        other = copy.copy(self)
+        other._robot = robot
+        return other
 
     def tree(self, X_WT: Array) -> PoseTree:
         """The tree from the link to the object, which stands at a pose (4, 4) in the world.

@@ -142,7 +142,7 @@ def read_inputs(
     model = load_model(model_path, package_paths=settings.packages)
     standing = _read_target(model, settings)
     if standing is None:
-        tree, seen = _make_tree(model, settings)
+        tree, seen = make_registration_tree(model, settings)
     else:
         tree, seen = standing.tree(np.eye(4)), (OBJECT,)
     kinematics = TreeKinematics(tree)
@@ -174,12 +174,7 @@ def read_inputs(
 
 
 def _check_links(path: Path, links: Mapping[str, str], settings: RegistrationSettings) -> None:
-    """Refuses a camera that rides on another link than those that are to be found, or lengths."""
-    if settings.on is not None and settings.lengths:
-        raise SettingsError(
-            "lengths of links are not found from a camera that rides on one: leave --on or "
-            "--lengths out"
-        )
+    """Refuses a camera that rides on another link than those that are to be found."""
     for name, link in links.items():
         if link != settings.on:
             raise SceneError(
@@ -203,7 +198,7 @@ def _read_target(model: ArticulatedModel, settings: RegistrationSettings) -> Sta
     return StandingObject(model, settings.on, named, make_tree(other, EstimateSettings(), None))
 
 
-def _make_tree(
+def make_registration_tree(
     model: ArticulatedModel, settings: RegistrationSettings
 ) -> tuple[PoseTree, tuple[str, ...] | None]:
     """The pose tree, and which of its nodes the masks show; None: all.

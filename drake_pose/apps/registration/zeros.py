@@ -11,14 +11,19 @@ from typing import Any
 
 import numpy as np
 
-from drake_pose.apps.estimate.inputs import make_tree
-from drake_pose.apps.registration.inputs import RegistrationInputs, RegistrationSettings
-from drake_pose.apps.settings import EstimateSettings
+from drake_pose.apps.registration.inputs import (
+    RegistrationInputs,
+    RegistrationSettings,
+    make_registration_tree,
+)
 from drake_pose.body import PoseTree
 from drake_pose.body.files.urdf_shape import with_shifted_joints, with_zeros
-from drake_pose.body.tree.joint_offsets import joint_offsets
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.registration.joint_zeros import JointCalibration, calibrate_joints
+from drake_pose.registration.joint_zeros import (
+    JointCalibration,
+    calibrate_joints,
+    lengthened_joints,
+)
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import FrameMisfit, RegisteredCamera, RegistrationBody
 from drake_pose.registration.start_poses import E_total, areas, intersection_over_union
@@ -44,16 +49,18 @@ def find_zeros(
     offsets = np.zeros(len(names))
     for zero in found.zeros:
         offsets[names.index(zero.name)] = zero.value
-    model, tree, kinematics = inputs.model, inputs.tree, body.kinematics
+    model, tree, standing = inputs.model, inputs.tree, inputs.standing
     seen = cameras[0].seen_object
-    if inputs.standing is not None and seen is not None:
-        seen = inputs.standing.moved_pose(seen, found.object_values, found.object_covariance)
-        tree = inputs.standing.tree(seen.X_WT)
-        kinematics = TreeKinematics(tree)
-    if shifts := joint_shifts(tree, found):
+    shifts = joint_shifts(tree, found)
+    if shifts:
         model = model.with_shifted_joints(shifts)
-        tree = make_tree(model, EstimateSettings(hold=settings.hold), None)
-        kinematics = TreeKinematics(tree)
+    if standing is not None and seen is not None:
+        standing = standing.before(model)
+        seen = standing.moved_pose(seen, found.object_values, found.object_covariance)
+        tree = standing.tree(seen.X_WT)
+    elif shifts:
+        tree, _ = make_registration_tree(model, settings)
+    kinematics = TreeKinematics(tree)
     corrected = dict(inputs.frames)
     result = {}
     for camera, covariance, before in zip(found.cameras, found.covariances, cameras, strict=True):
@@ -72,7 +79,7 @@ def find_zeros(
 def joint_shifts(tree: PoseTree, found: JointCalibration) -> dict[str, list[float]]:
     """By how much joints stand elsewhere on their links (3,), by name [m]; empty: none does."""
     longer = {one.name: one.value for one in found.lengths if one.determined}
-    offsets = [one for one in joint_offsets(tree) if one.link in longer]
+    offsets = lengthened_joints(tree, longer)
     return {one.joint: (longer[one.link] * one.p_L).tolist() for one in offsets}
 
 

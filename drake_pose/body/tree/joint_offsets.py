@@ -23,14 +23,17 @@ class JointOffset(NamedTuple):
     """How far a joint's origin is from the joint before it.
 
     joint: its name; link: its parent link's; node: the pose tree's node that it moves; step: its
-    place among that node's joints; p_A: (3,) the offset in frame A of the link, which is the
-    parent node's where step is 0; p_L: (3,) the same in the parent link's frame [m].
+    place among that node's joints; inverted: whether the tree walks it inwards, from its child link
+    to its parent; p_A: (3,) by how far what is behind it in the tree is shifted, in frame A of the
+    parent link, which is the parent node's where step is 0 and it is walked outwards: the offset,
+    or walked inwards its negative; p_L: (3,) the offset in the parent link's frame [m].
     """
 
     joint: str
     link: str
     node: int
     step: int
+    inverted: bool
     p_A: Array
     p_L: Array
 
@@ -39,7 +42,7 @@ def joint_offsets(tree: PoseTree) -> tuple[JointOffset, ...]:
     """Each joint's offset from the origin of the rigid part that carries it.
 
     That origin is where the part's own joint stands, or the world's. Joints without an offset are
-    left out, and so are those that the tree walks inwards.
+    left out.
 
     Args:
         tree: the pose tree.
@@ -61,12 +64,16 @@ def joint_offsets(tree: PoseTree) -> tuple[JointOffset, ...]:
         for k, step in enumerate(placement.steps):
             joint = moving[node.positions[at]]
             p_B = _offset(joint, inboard, pose)
-            if not step.inverted and np.linalg.norm(p_B) > _NO_LENGTH:
-                link = joint.parent_body()
-                p_A, p_L = X_BA[:3, :3].T @ p_B, pose(link)[:3, :3].T @ p_B
-                found.append(JointOffset(joint.name(), link.name(), i, k, p_A, p_L))
             end = at + step.joint_map.position_count
-            X_BA = X_BA @ chain_transforms([step], values[None, at:end])[0]
+            X_BC = X_BA @ chain_transforms([step], values[None, at:end])[0]
+            if np.linalg.norm(p_B) > _NO_LENGTH:
+                link = joint.parent_body()
+                p_A = -X_BC[:3, :3].T @ p_B if step.inverted else X_BA[:3, :3].T @ p_B
+                p_L = pose(link)[:3, :3].T @ p_B
+                found.append(
+                    JointOffset(joint.name(), link.name(), i, k, bool(step.inverted), p_A, p_L)
+                )
+            X_BA = X_BC
             at = end
     return tuple(found)
 

@@ -56,7 +56,8 @@ class LengthenedBody(BodyParameters):
             turned = first + len(nodes[i].value_names)
             for k, step in enumerate(placement.steps):
                 last = first + step.joint_map.position_count
-                before = [one.node != i or one.step <= k for one in offsets]
+                # Walked inwards, a joint comes before its offset.
+                before = [one.node != i or one.step + one.inverted <= k for one in offsets]
                 self._shifted[first:last] = self._behind[i] & before
                 first = last
             first = turned
@@ -91,8 +92,9 @@ class LengthenedBody(BodyParameters):
         for k, one in enumerate(self._offsets):
             placement, parent = tree.placements[one.node], tree.nodes[one.node].parent
             R_WA = placement.X_PA[:3, :3] if parent < 0 else X_WN[parent, :3, :3]
-            if one.step > 0:
-                X = chain_transforms(placement.steps[: one.step], split[one.node][None])[0]
+            if one.step + one.inverted > 0:
+                steps = placement.steps[: one.step + one.inverted]
+                X = chain_transforms(steps, split[one.node][None])[0]
                 R_WA = R_WA @ X[:3, :3]
             found[k] = R_WA @ one.p_A
         return found

@@ -1,6 +1,7 @@
 """`drake-pose register --on LINK`: a camera on a robot's hand, from masks of the robot's base."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import yaml
 from typer.testing import CliRunner
 
 from drake_pose.apps.main import app
+from drake_pose.body import load_model
 from drake_pose.camera.files import load_camera_file, load_cameras
 from drake_pose.errors import CameraError
 from tests.apps.registration.arm_scenes import ArmScene, pose_errors
@@ -53,12 +55,55 @@ def test_the_camera_is_found_on_its_link(
         load_cameras(out / "cameras.yaml")
 
 
+@pytest.mark.slow
+def test_lengths_between_the_base_and_the_camera(
+    hand_camera: ArmScene, runner: CliRunner, tmp_path: Path
+) -> None:
+    right, short = hand_camera.model.read_text(), tmp_path / "short.urdf"
+    assert right.count('"0 0 0.35"') == 1
+    short.write_text(right.replace('"0 0 0.35"', '"0 0 0.34"'))
+    given = ["--on", "flange", "--lengths", "shoulder", "--lengths", "elbow", "--json"]
+    scene, out = replace(hand_camera, model=short), tmp_path / "out"
+    result = runner.invoke(app, arguments(scene, out, *given))
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    off = 100.0 * (0.35 / 0.34 - 1.0)
+    one = found["lengths"]["shoulder"]
+    assert one["low_percent"] < off < one["high_percent"]
+    assert one["value_percent"] == pytest.approx(off, abs=1.0)
+    assert one["significant"]
+    assert not found["lengths"]["elbow"]["significant"]
+    millimetres, degrees = pose_errors(np.array(found["X_LC"]), X_LC)
+    assert millimetres < 3.0
+    assert degrees < 0.3
+    assert found["mean_iou"] > 0.98
+    # Drake has the joint that the link carries where the right arm has it, but for what is left.
+    places = []
+    for path in (hand_camera.model, out / "short_calibrated.urdf"):
+        joint = load_model(path, check=False).plant.GetJointByName("roll_turn")
+        places.append(joint.frame_on_parent().GetFixedPoseInBodyFrame().translation()[2])
+    assert places[1] - places[0] == pytest.approx(0.34e-2 * (one["value_percent"] - off), abs=1e-9)
+
+
+@pytest.mark.slow
+def test_lengths_that_no_picture_tells_apart(
+    hand_camera: ArmScene, runner: CliRunner, tmp_path: Path
+) -> None:
+    # Shoulder and roll are in line, and neither is seen: only their sum is told.
+    given = ["--on", "flange", "--lengths", "shoulder", "--lengths", "roll", "--json"]
+    result = runner.invoke(app, arguments(hand_camera, tmp_path / "out", *given))
+    assert result.exit_code == 0, result.output
+    lengths = json.loads(result.stdout)["lengths"]
+    assert not lengths["shoulder"]["determined"]
+    assert lengths["shoulder"]["gauge"] == ["length of roll"]
+
+
 @pytest.mark.parametrize(
     ("more", "said"),
     [
         (["--on", "paw"], "no link 'paw'"),
         (["--on", "base"], "no joint moves link 'base'"),
-        (["--on", "hand", "--lengths", "all"], "leave --on or --lengths out"),
+        (["--on", "hand", "--lengths", "paw"], "no link with a length 'paw'"),
     ],
 )
 def test_what_is_refused_before_work(

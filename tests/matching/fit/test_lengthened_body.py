@@ -48,15 +48,17 @@ LONGER = {
 VALUES = {"turn": 0.4, "pitch": -0.7, "yaw": 0.9, "slide": 0.05, "wave": 0.6}
 
 
-def kinematics_of(path: Path, text: str) -> TreeKinematics:
+def kinematics_of(path: Path, text: str, root: str) -> TreeKinematics:
     path.write_text(text)
-    fixed = RootRotation.fixed(np.eye(3))
-    return TreeKinematics(load_model(path, check=False).pose_tree(root_rotation=fixed))
+    fixed, place = RootRotation.fixed(np.eye(3)), np.array([0.1, -0.2, 0.3])
+    model = load_model(path, check=False)
+    return TreeKinematics(model.pose_tree(root, root_position=place, root_rotation=fixed))
 
 
-@pytest.fixture
-def body(tmp_path: Path) -> LengthenedBody:
-    kinematics = kinematics_of(tmp_path / "odd.urdf", URDF)
+@pytest.fixture(params=["base", "finger", "flag"])
+def body(tmp_path: Path, request: pytest.FixtureRequest) -> LengthenedBody:
+    """The tree walks joints outwards from the base, inwards from the finger, and both ways."""
+    kinematics = kinematics_of(tmp_path / "odd.urdf", URDF, request.param)
     outlines = [outline_from_mesh(node.mesh) for node in kinematics.tree.nodes]
     return LengthenedBody(kinematics, outlines, joint_offsets(kinematics.tree))
 
@@ -77,7 +79,8 @@ def test_nodes_stand_where_drake_has_them(link: str, body: LengthenedBody, tmp_p
         assert text.count(f'"{origin}"') == 1
         text = text.replace(f'"{origin}"', f'"{longer}"')
     theta = parameters(body, {link: np.log(1.25)})
-    drake = kinematics_of(tmp_path / "longer.urdf", text)
+    root = body.kinematics.tree.root
+    drake = kinematics_of(tmp_path / "longer.urdf", text, root)
     assert drake.names == body.kinematics.names
     expected = drake.poses(theta[: len(drake.names)])
     np.testing.assert_allclose(body.place(theta).X_WN, expected, atol=1e-12)

@@ -150,6 +150,10 @@ class ColourOutcome:
 class ColourScene:
     """An arm that moves before a room, drawn by Drake.
 
+    Attributes:
+        cameras: what is seen by.
+        rng: what room and motion are drawn from.
+
     Args:
         model: the arm.
         room: what stands about it.
@@ -166,8 +170,10 @@ class ColourScene:
         folder: Path,
         size: tuple[int, int] = _SIZE,
     ) -> None:
-        self._rng, self._room, self._folder = np.random.default_rng(seed), room, folder
-        self.cameras = tuple(_camera(f"camera{k}", eye, size) for k, eye in enumerate(_EYES))
+        self.rng, self._room, self._folder = np.random.default_rng(seed), room, folder
+        self.cameras: tuple[PinholeCamera, ...] = tuple(
+            _camera(f"camera{k}", eye, size) for k, eye in enumerate(_EYES)
+        )
         self._joints, self._default = len(model.position_names), model.default_positions
         builder = DiagramBuilder()
         self._plant, self._scene = AddMultibodyPlantSceneGraph(builder, 0.0)
@@ -194,7 +200,7 @@ class ColourScene:
 
     def frames(self, count: int) -> Iterator[Frame]:
         """The frames of the motion, drawn one by one."""
-        swing, paths = self._draw_swing(), self._draw_paths()
+        swing, paths = self.draw_swing(), self._draw_paths()
         context = self._diagram.CreateDefaultContext()
         own = self._plant.GetMyMutableContextFromRoot(context)
         query = self._scene.get_query_output_port()
@@ -221,15 +227,15 @@ class ColourScene:
             picture = query.RenderColorImage(color, world, X_WC).data[..., :3].copy()
             labels = query.RenderLabelImage(color, world, X_WC).data[..., 0]
             if self._room.noise:
-                noisy = picture + self._rng.normal(0.0, self._room.noise, picture.shape)
+                noisy = picture + self.rng.normal(0.0, self._room.noise, picture.shape)
                 picture = noisy.clip(0, 255).astype(np.uint8)
             pictures.append(picture)
             masks.append((labels < int(_OTHERS) // 2) & (labels >= 0))
         return Frame(q, pictures, masks)
 
-    def _draw_swing(self) -> tuple[Array, Array, Array, Array]:
+    def draw_swing(self) -> tuple[Array, Array, Array, Array]:
         """Middles and amplitudes [rad], speeds [rad/s] and phases [rad] of the joints' swings."""
-        rng, n = self._rng, self._joints
+        rng, n = self.rng, self._joints
         low = np.maximum(self._plant.GetPositionLowerLimits()[:n], -2.9)
         high = np.minimum(self._plant.GetPositionUpperLimits()[:n], 2.9)
         amplitude = rng.uniform(0.5, 0.9, n) * np.minimum(0.45 * (high - low), 1.2)
@@ -239,7 +245,7 @@ class ColourScene:
 
     def _draw_paths(self) -> list[tuple[Array, Array, Array, Array]]:
         """Of each box: the middle and the amplitude [m], speed [rad/s] and phase [rad]."""
-        rng = self._rng
+        rng = self.rng
         return [
             (
                 rng.uniform(-2.5, 2.5, 3) + np.array([0.0, 0.0, 1.0]),
@@ -283,7 +289,7 @@ class ColourScene:
     def _add_walls(self) -> None:
         for k, (sides, place) in enumerate(_WALLS):
             path = self._folder / f"wall{k}.png"
-            _write_texture(path, self._rng, self._room.grey)
+            _write_texture(path, self.rng, self._room.grey)
             self._show(
                 self._plant.world_body(), RigidTransform(place), Box(*sides), (1.0,) * 3, path
             )
@@ -294,8 +300,8 @@ class ColourScene:
 
     def _add_box(self, number: int) -> RigidBody:
         body = self._add_body(f"box{number}")
-        shape = Box(*self._rng.uniform(0.3, 0.9, 3))
-        colour = self._rng.random(3)
+        shape = Box(*self.rng.uniform(0.3, 0.9, 3))
+        colour = self.rng.random(3)
         self._show(body, RigidTransform(), shape, tuple(colour))
         return body
 

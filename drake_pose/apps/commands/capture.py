@@ -20,6 +20,7 @@ from drake_pose.apps.commands.estimate_options import (
     ReplayOption,
     ResumeOption,
     SceneArgument,
+    StartOption,
     TrackOption,
     TruthOption,
 )
@@ -65,6 +66,7 @@ def capture(
     camera: CameraOption = None,
     frame: FrameOption = None,
     truth: TruthOption = None,
+    start: StartOption = None,
     track: TrackOption = True,
     resume: ResumeOption = False,
     overlay: OverlayOption = True,
@@ -84,7 +86,7 @@ def capture(
         packages = parse_packages(package or ())
     if workers and scheduler is not None:
         raise typer.BadParameter("give --workers or --scheduler, not both")
-    of_masks = bool(camera or frame or truth or resume or not track)
+    of_masks = bool(camera or frame or truth or start or resume or not track)
     of_person = of_masks or shape or not fit_shape or workers or scheduler
     _check_method(method, bool(of_person), bool(face_camera or faces))
     if method == "paper":
@@ -109,7 +111,7 @@ def capture(
         model = model or bundled_person()
     settings = EstimateSettings(
         cameras=tuple(camera or ()), frames=tuple(frame or ()), method="person", track=track,
-        packages=packages,
+        packages=packages, start=start,
     )  # fmt: skip
     run_estimate(
         scene, model, out, settings, truth=truth, resume=resume, overlay=overlay, replay=replay,
@@ -134,8 +136,8 @@ def _has_sources(scene: Path, of_masks: bool, of_sources: bool) -> bool:
     has_sources = (scene / "sources.yaml").is_file()
     if has_sources and of_masks:
         raise typer.BadParameter(
-            "--camera, --frame, --truth, --no-track and --resume are for a folder of masks; "
-            f"{scene} has a sources.yaml"
+            "--camera, --frame, --truth, --start, --no-track and --resume are for a folder of "
+            f"masks or pictures; {scene} has a sources.yaml"
         )
     if of_sources and not has_sources:
         raise typer.BadParameter(f"{scene} has no sources.yaml, which that option is for")
@@ -148,8 +150,8 @@ def _check_method(method: str, is_of_person: bool, is_of_paper: bool) -> None:
         raise typer.BadParameter("must be person or paper", param_hint="--method")
     if method == "paper" and is_of_person:
         raise typer.BadParameter(
-            "--camera, --frame, --truth, --no-track, --resume, --shape, --no-fit-shape, --workers "
-            "and --scheduler are for --method person"
+            "--camera, --frame, --truth, --start, --no-track, --resume, --shape, --no-fit-shape, "
+            "--workers and --scheduler are for --method person"
         )
     if method == "person" and is_of_paper:
         raise typer.BadParameter("--face-camera and --faces are for --method paper")

@@ -17,7 +17,7 @@ SceneArgument = Annotated[
     typer.Argument(
         help="Folder with cameras.yaml and masks/<camera>/<frame>.png; or with masks/<frame>.png "
         "alone, of a camera without calibration. A sequence may have images/<camera>/<frame>.png "
-        "or .jpg and a mask of the first frame only."
+        "or .jpg, or videos/<camera>.mp4, and a mask of the first frame only."
     ),
 ]
 ModelOption = Annotated[

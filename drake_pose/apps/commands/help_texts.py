@@ -332,6 +332,10 @@ replay.html. A recording is captured as a whole: after Ctrl-C, --resume starts i
 
     drake-pose capture SCENE --out results/person
 
+A sequence of pictures, images/<camera>/<frame>.png or videos/<camera>.mp4, needs masks of its first
+frame alone, in two cameras or more, and is followed by colour. With --start FILE.csv no mask is
+needed: lengths are then those of that row, girths the model's.
+
 If the folder has [bold]sources.yaml[/bold] beside cameras.yaml, frames are captured as they come:
 from live cameras in real time, from videos and folders as fast as possible. A camera that stops is
 left out until it returns. Ctrl-C ends the capture and keeps the result; pictures are not stored, so

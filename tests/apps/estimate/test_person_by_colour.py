@@ -6,8 +6,10 @@ import shutil
 import cv2
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from drake_pose.apps.estimate.scene import estimate_scene
+from drake_pose.apps.main import app
 from drake_pose.apps.settings import EstimateSettings
 from drake_pose.body import bundled_model
 from drake_pose.camera import load_cameras
@@ -90,6 +92,18 @@ def test_one_mask_does_not_say_where_a_person_is(recording, tmp_path):
     shutil.copy(masks / "camera_0" / "0000.png", copy / "masks" / "camera_0" / "0000.png")
     with pytest.raises(SceneError, match=r"two cameras.*'0000'.*--start"):
         estimate_scene(copy, bundled_model("person"))
+
+
+def test_the_command_takes_a_start(recording, tmp_path):
+    scene, _, _, start = recording
+    out = str(tmp_path / "out")
+    words = ["capture", str(scene), "--out", out, "--start", str(start), "--no-replay", "--json"]
+    done = CliRunner().invoke(app, [*words, "--frame", "0000:0002"])
+    assert done.exit_code == 0, done.output
+    with (tmp_path / "out" / "poses.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert [row["frame"] for row in rows] == ["0000", "0001", "0002"]
+    assert all(row["position_z"] for row in rows)
 
 
 @pytest.mark.slow

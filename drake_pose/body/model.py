@@ -19,12 +19,14 @@ from pydrake.multibody.tree import (
     RevoluteJoint,
     SpatialInertia,
 )
+from scipy.spatial.transform import Rotation
 
 from drake_pose.body.files.parsing import ModelSource, limit_kinds
 from drake_pose.body.files.safety import check_in_child
 from drake_pose.body.files.urdf_shape import (
     Factors,
     stretched,
+    with_base_joints,
     with_shifted_joints,
     without_visuals,
 )
@@ -129,6 +131,27 @@ class ArticulatedModel(ParsedModel):
             ModelError: the file is no URDF.
         """
         return self._changed(with_shifted_joints(self._urdf_text(), shifts), self.skin)
+
+    def with_base_joints(self, X_WB: NDArray[np.float64]) -> "ArticulatedModel":
+        """The same on BASE_JOINTS, which move all of it and are 0 where it stands at X_WB (4, 4).
+
+        Raises:
+            ModelError: the file is no URDF.
+        """
+        rpy = Rotation.from_matrix(X_WB[:3, :3]).as_euler("xyz")
+        text = with_base_joints(self._urdf_text(), X_WB[:3, 3].tolist(), rpy.tolist())
+        moved = self._changed(text, self.skin)
+        positions = describe_positions(moved.plant, self._source.limits, str(self.path))
+        return replace(
+            moved,
+            position_names=positions.names,
+            position_kinds=positions.kinds,
+            lower=positions.lower,
+            upper=positions.upper,
+            default_positions=positions.defaults,
+            periodic=positions.periodic,
+            turns_freely=positions.turns_freely,
+        )
 
     def before_object(
         self, link: str, mesh: TriangleMesh, X_WO: NDArray[np.float64]

@@ -140,7 +140,7 @@ class FrameFreer:
     ) -> None:
         reach = reach or Reach()
         self._cameras = tuple(cameras)
-        self.size = _common_size(cameras, frames)
+        self.size = common_size(cameras, frames)
         noise = Noise(deviation=1.0, correlation=0.5 / self.size**3)
         self._few, self.contours = (
             ContourFit(kinematics, one, noise, _STEPS, pixels=self.size) for one in outlines
@@ -293,7 +293,7 @@ class FrameFreer:
         return tuple(pictures), tuple(names)
 
 
-def _common_size(cameras: Sequence[Camera], frames: Sequence[SeenFrame]) -> float:
+def common_size(cameras: Sequence[Camera], frames: Sequence[SeenFrame]) -> float:
     """The root of the silhouettes' median area [pixel]."""
     areas = []
     for frame in frames:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -242,7 +243,8 @@ def _describe(
     cameras, covariances, focal = [], [], np.zeros(len(fit.fits))
     for c, own in enumerate(fit.fits):
         at = slice(c * fit.per_camera, c * fit.per_camera + 6)
-        covariances.append(pose_covariance(own, found.X_CW[c], covariance[at, at]))
+        moved = partial(own.moved, found.X_CW[c])
+        covariances.append(pose_covariance(moved, covariance[at, at]))
         cameras.append(own.placed(found.X_CW[c], float(found.log_focal[c])))
         if fit.per_camera > 6:
             focal[c] = math.sqrt(covariance[c * fit.per_camera + 6, c * fit.per_camera + 6])

@@ -11,6 +11,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from drake_pose.camera import PinholeCamera
 from drake_pose.errors import RegistrationError, SettingsError
 from drake_pose.matching.fit.levenberg_marquardt import Round
 from drake_pose.matching.fit.significance import excess
-from drake_pose.matching.fit.surfaces import FEW, VERY_FEW, few_triangles
+from drake_pose.matching.fit.surfaces import FEW, VERY_FEW, few_triangles, with_girths
 from drake_pose.registration.agreement import TOLD_APART, agreeing, frame_shares
 from drake_pose.registration.calibration_fit import (
     Calibration,
@@ -97,13 +98,21 @@ class RegistrationBody:
         tree: the pose tree.
         seen: the nodes that silhouettes show; all where None.
         fewest: so many triangles a node has where it has very few.
+        girths: (nodes,) how many times as wide nodes are across their y axes as the model's; 1
+            where None.
     """
 
     def __init__(
-        self, tree: PoseTree, seen: Collection[str] | None = None, fewest: int = VERY_FEW
+        self,
+        tree: PoseTree,
+        seen: Collection[str] | None = None,
+        fewest: int = VERY_FEW,
+        girths: Array | None = None,
     ) -> None:
         self.tree, self.kinematics = tree, TreeKinematics(tree)
         surfaces = TreeSurfaces(tree)
+        if girths is not None:
+            surfaces = surfaces.with_rigid(with_girths(surfaces.rigid, girths))
         if seen is not None:
             nothing = outline_from_mesh(TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64)))
             surfaces = surfaces.with_rigid(
@@ -328,7 +337,7 @@ def describe_fitted(
     covariance = calibration_uncertainty(own, best).covariance
     camera = RegisteredCamera(
         fit.frames.camera.with_pose(np.linalg.inv(X_CW)),
-        pose_covariance(fit, X_CW, covariance[:6, :6]),
+        pose_covariance(partial(fit.moved, X_CW), covariance[:6, :6]),
         tuple(misfits),
         np.array([np.linalg.inv(X) for X in alike[1:]]).reshape(-1, 4, 4),
     )

@@ -10,6 +10,7 @@ less. How wide each mask is was fitted, and is as unsure as that.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -29,7 +30,6 @@ from drake_pose.matching.fit.covariance import (
 from drake_pose.matching.fit.levenberg_marquardt import Round
 from drake_pose.registration.agreement import TOLD_APART
 from drake_pose.registration.calibration_fit import Calibration, CalibrationFit
-from drake_pose.registration.camera_fit import CameraFit
 
 Array = NDArray[np.float64]
 
@@ -159,26 +159,20 @@ def _unseen_errors(fit: CalibrationFit, found: Calibration, camera: int, pixels:
     ]
 
 
-def pose_covariance(fit: CameraFit, X_CW: Array, covariance: Array) -> Array:
+def pose_covariance(moved: Callable[[Array], Array], covariance: Array) -> Array:
     """(6, 6) of a camera's error in the world: a rotation vector [rad], a shift [m].
 
     Args:
-        fit: the camera's.
-        X_CW: (4, 4) its pose.
-        covariance: (6, 6) of its turn and shift as they were fitted.
+        moved: gives X_CW (4, 4) after a change by POSE_NAMES (6,) from where it was fitted.
+        covariance: (6, 6) of these as they were fitted.
     """
-    J = _in_world(fit, X_CW)
-    return J @ covariance @ J.T
-
-
-def _in_world(fit: CameraFit, X_CW: Array) -> Array:
-    """(6, 6) how the error of the camera's pose in the world follows POSE_NAMES."""
+    X_CW = moved(np.zeros(6))
     R_WC, p_WC = X_CW[:3, :3].T, -X_CW[:3, :3].T @ X_CW[:3, 3]
     J = np.zeros((6, 6))
     step = 1e-6
     for k in range(6):
-        moved = np.linalg.inv(fit.moved(X_CW, step * np.eye(6)[k]))
-        turn = moved[:3, :3] @ R_WC.T
+        X_WC = np.linalg.inv(moved(step * np.eye(6)[k]))
+        turn = X_WC[:3, :3] @ R_WC.T
         J[:3, k] = np.array([turn[2, 1], turn[0, 2], turn[1, 0]]) / step
-        J[3:, k] = (moved[:3, 3] - p_WC) / step
-    return J
+        J[3:, k] = (X_WC[:3, 3] - p_WC) / step
+    return np.asarray(J @ covariance @ J.T)

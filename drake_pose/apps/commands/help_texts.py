@@ -121,7 +121,7 @@ The pictures written fit the cameras that calibrate wrote together with the lens
 """)
 
 REGISTER = _help(r"""
-Find where cameras stand, from masks of a robot whose joint positions are known: no board, no guess.
+Find where cameras stand, from masks of a robot or a person: no board, no guess.
 
 All rotations of a camera are tried, each with the robot where the silhouettes are; the best are
 fitted by the robot's contour, in the end only to what fits, so that a tool which the model lacks, a
@@ -132,6 +132,10 @@ The focal length and principal point of each camera must be known, and the pictu
 distortion. The world is the model's: the robot's base, in most files. Five poses that differ much
 are enough. Cameras that have an X_WC are held, and compared with the robot; --camera finds one of
 them anew.
+
+Without --joints the body's poses are estimated from the cameras that have an X_WC: one for a robot
+on its base, two for a person; then the poses and the missing cameras are fitted together. --joints
+may also be the poses.csv of an estimate, in which the base may move.
 
 Files in DIR: cameras.yaml, which estimate reads (copy it into the scene); report.html, which shows
 all of it; registration.yaml (6 x 6 covariance, other poses); summary.json;
@@ -151,6 +155,11 @@ that stands anywhere in its world (--target FILE); where the object stands is fo
     drake-pose register ../shared/data/arm_two_views --out results/cameras \
       --model ../shared/data/arm_two_views/med7/med7.urdf --camera left --camera right \
       --joints ../shared/data/arm_two_views/joint_angles.csv
+
+[bold]One camera of four, by a person whom the other three see:[/bold]
+
+    drake-pose register ../shared/data/human_four_views --out results/third \
+      --model urdf/person/person_shape.urdf --camera cam03
 """)
 
 AUDIT = _help(r"""

@@ -34,14 +34,18 @@ RegisteredSceneArgument = Annotated[
         "masks/<camera>/<frame>.png."
     ),
 ]
-JointsOption = Annotated[
-    Path,
+_OF_FRAMES = (
+    r"Joint positions of every frame \[rad or m]: a CSV file with the column frame and one for "
+    "each joint."
+)
+JointsOption = Annotated[Path, typer.Option("--joints", "-j", metavar="FILE", help=_OF_FRAMES)]
+MeasuredJointsOption = Annotated[
+    Path | None,
     typer.Option(
         "--joints",
         "-j",
         metavar="FILE",
-        help=r"Joint positions of every frame \[rad or m]: a CSV file with the column frame and "
-        "one for each joint.",
+        help=f"{_OF_FRAMES} Default: they are estimated from the cameras that have an X_WC.",
     ),
 ]
 SearchedCameraOption = Annotated[
@@ -128,8 +132,8 @@ KeepOutOption = Annotated[
 def register(
     scene: RegisteredSceneArgument,
     model: ModelOption,
-    joints: JointsOption,
     out: OutOption,
+    joints: MeasuredJointsOption = None,
     package: PackageOption = None,
     camera: SearchedCameraOption = None,
     on: OnOption = None,

@@ -25,6 +25,7 @@ from drake_pose.apps.options import select_frames
 from drake_pose.apps.settings import EstimateSettings, RootTurns
 from drake_pose.body import ArticulatedModel, PoseTree, RootRotation, load_model, model_warnings
 from drake_pose.camera import Camera
+from drake_pose.camera.files import load_camera_file
 from drake_pose.errors import SceneError, SettingsError, UnknownNameError
 from drake_pose.matching import (
     BeamSearchSettings,
@@ -40,7 +41,7 @@ from drake_pose.silhouette import Scene, load_scene, require_visible
 
 # Sampling interval of a root that can be turned in all ways, where its position is searched [deg].
 _FREE_ROOT_INTERVAL = 30.0
-TRUTH_FILE = "joint_angles.csv"
+TRUTH_FILE, CAMERA_FILE = "joint_angles.csv", "cameras.yaml"
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ def read_inputs(
     Raises:
         DrakePoseError: names the file, camera, frame, link or joint at fault.
     """
-    scene = load_scene(scene_path)
+    scene = load_scene(scene_path, _named_cameras(scene_path, settings.cameras))
     # Of pictures with few masks it is no fault that masks are missing.
     checked = CheckedScene(scene, ()) if scene.images else check_scene(scene)
     scene = checked.scene
@@ -121,6 +122,19 @@ def read_inputs(
     of_model = model_warnings(model, search.tree, settings.hold)
     texts = (*texts_of(*checked.warnings, *read.warnings), *of_model)
     return Inputs(read.scene, model, cameras, frames, search, root_positions, truth, texts, starts)
+
+
+def _named_cameras(scene_path: Path, wanted: Sequence[str]) -> Mapping[str, Camera] | None:
+    """The scene's cameras where all that are named stand somewhere, though others may not.
+
+    None: the scene is read as ever, and says what is wrong.
+    """
+    path = scene_path / CAMERA_FILE
+    if not wanted or not os.path.lexists(path):
+        return None
+    file = load_camera_file(path)
+    unplaced = {*file.unplaced, *file.links}
+    return file.cameras if unplaced and not unplaced.intersection(wanted) else None
 
 
 def leave_out_links(

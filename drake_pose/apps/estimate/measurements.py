@@ -6,12 +6,13 @@ import csv
 import io
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from drake_pose.apps.options import frame_number
+from drake_pose.apps.results.folder import BASE_COLUMNS, FIT_COLUMNS
 from drake_pose.errors import SceneError, UnknownNameError
 from drake_pose.regular_files import read_regular
 
@@ -26,11 +27,15 @@ class TrueAngles:
         path: the file they are from.
         names: the positions that were measured.
         values: (len(names),) [rad or m] by frame: its number, or its name if that is none.
+        bases: (7,) BASE_COLUMNS by frame, of an estimate whose base moved.
+        is_estimate: whether they are the poses.csv of an estimate.
     """
 
     path: Path
     names: tuple[str, ...]
     values: Mapping[int | str, np.ndarray]
+    bases: Mapping[int | str, np.ndarray] = field(default_factory=dict)
+    is_estimate: bool = False
 
     def of(self, frame: str) -> np.ndarray | None:
         """Returns the values of a frame, or None where nothing was measured."""
@@ -82,7 +87,8 @@ def read_true_angles(path: Path, position_names: Sequence[str]) -> TrueAngles:
     """Reads measured joint positions from a file with the columns `frame` and positions' names.
 
     Frames are compared as numbers where they are numbers: the row of frame 3 is that of
-    ``0003.png``.
+    ``0003.png``. The file may be the poses.csv of an estimate, of which rows without a pose are
+    left out.
 
     Args:
         path: the file, values in rad or m.
@@ -95,7 +101,11 @@ def read_true_angles(path: Path, position_names: Sequence[str]) -> TrueAngles:
     header, rows = _read_csv(path)
     if len(header) < 2 or header[0] != "frame":
         raise SceneError(f"{path}: the first line must be frame, then names of positions")
-    for name in header[1:]:
+    is_estimate = tuple(header[-2:]) == FIT_COLUMNS
+    last = len(header) - len(FIT_COLUMNS) if is_estimate else len(header)
+    with_base = is_estimate and tuple(header[last - len(BASE_COLUMNS) : last]) == BASE_COLUMNS
+    end = last - len(BASE_COLUMNS) if with_base else last
+    for name in header[1:end]:
         if name not in position_names:
             raise UnknownNameError(
                 "position", name, position_names, f"{path} has a column that the model lacks; it"
@@ -103,12 +113,17 @@ def read_true_angles(path: Path, position_names: Sequence[str]) -> TrueAngles:
         if header.count(name) > 1:
             raise SceneError(f"{path}: has the column '{name}' twice")
     values: dict[int | str, np.ndarray] = {}
+    bases: dict[int | str, np.ndarray] = {}
     for line, row in rows:
         frame = _frame_key(row[0])
         if frame in values:
             raise SceneError(f"{path}: line {line}: frame '{row[0]}' is given twice")
-        values[frame] = _numbers(row[1:], path, line)
-    return TrueAngles(path, tuple(header[1:]), values)
+        if is_estimate and row[last] in ("", "nan"):
+            continue
+        values[frame] = _numbers(row[1:end], path, line)
+        if with_base:
+            bases[frame] = _numbers(row[end:last], path, line)
+    return TrueAngles(path, tuple(header[1:end]), values, bases, is_estimate)
 
 
 def _frame_key(cell: str) -> int | str:

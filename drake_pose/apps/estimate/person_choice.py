@@ -45,13 +45,13 @@ def follows_person(
                 + (f"; cameras.yaml lacks {strangers}" if strangers else "")
             )
         return False
-    missing = _missing_for_person(model)
+    missing = missing_for_person(model)
     if missing and wanted:
         raise ModelError(f"{model.path}: a person is captured with a model that has {missing}")
     return not missing
 
 
-def _missing_for_person(model: ArticulatedModel) -> str:
+def missing_for_person(model: ArticulatedModel) -> str:
     """What a model lacks to be a person who can be anywhere; "" where nothing."""
     names = set(load_landmarks(model.path)) if landmarks_file(model.path).is_file() else set()
     absent = sorted(PERSON_LANDMARKS - names)

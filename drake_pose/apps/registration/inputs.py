@@ -8,17 +8,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drake_pose.apps.estimate.inputs import make_tree, select_seen_frames
+from drake_pose.apps.estimate.measurements import read_true_angles
 from drake_pose.apps.estimate.scene_checks import check_scene, texts_of
 from drake_pose.apps.options import select_frames
-from drake_pose.apps.registration.known_positions import KnownPositions, read_known_positions
+from drake_pose.apps.registration.estimated_positions import estimate_positions
+from drake_pose.apps.registration.known_positions import (
+    KnownPositions,
+    put_on_base,
+    read_known_positions,
+)
 from drake_pose.apps.settings import EstimateSettings
 from drake_pose.body import ArticulatedModel, PoseTree, RootRotation, load_model
 from drake_pose.body.model import OBJECT
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera import Camera, PinholeCamera
-from drake_pose.camera.files import load_camera_file
+from drake_pose.camera.files import CameraFile, load_camera_file
 from drake_pose.errors import (
     CameraError,
     MaskError,
@@ -32,7 +39,14 @@ from drake_pose.registration.standing_object import StandingObject, require_turn
 from drake_pose.registration.suggestions import Box
 from drake_pose.silhouette import Scene, load_scene
 
+Array = NDArray[np.float64]
+
 _CAMERAS = "cameras.yaml"
+# With positions that were estimated cameras are found from so many frames: what the model lacks is
+# the same in all of them, so more tell little.
+_MOST_FRAMES = 12
+# And estimated poses differ that do so by more times what measured ones do.
+_ESTIMATES_DIFFER = 5.0
 
 ALL = "all"
 """In place of names: of every joint, or of every link."""
@@ -98,6 +112,8 @@ class RegistrationInputs:
         zeros, lengths: the joints and links whose zeros and lengths are to be found.
         left_out: cameras without X_WC that are not to be found.
         warnings: what the user should know of the input.
+        is_estimate: whether the positions were estimated, so that they are off.
+        girths: (nodes,) how many times as wide as the model's the nodes are; None: as the model's.
     """
 
     scene: Scene
@@ -112,17 +128,20 @@ class RegistrationInputs:
     lengths: tuple[str, ...]
     left_out: tuple[str, ...]
     warnings: tuple[str, ...]
+    is_estimate: bool = False
+    girths: Array | None = None
 
 
 def read_inputs(
-    scene_path: Path, model_path: Path, joints_path: Path, settings: RegistrationSettings
+    scene_path: Path, model_path: Path, joints_path: Path | None, settings: RegistrationSettings
 ) -> RegistrationInputs:
     """Reads and checks everything.
 
     Args:
         scene_path: the scene's folder.
         model_path: the model file.
-        joints_path: the table of joint positions.
+        joints_path: the table of joint positions; None: they are estimated from the cameras
+            whose place is known.
         settings: the settings.
 
     Raises:
@@ -140,28 +159,35 @@ def read_inputs(
     if not settings.cameras:
         searched = [name for name in searched if name not in unseen]
     model = load_model(model_path, package_paths=settings.packages)
+    table = None
     standing = _read_target(model, settings)
+    if joints_path is not None and standing is None:
+        table = read_true_angles(joints_path, model.position_names)
+    if joints_path is None or (table is not None and table.is_estimate):
+        _check_estimable(settings)
+    if table is not None and table.bases:
+        model, table = put_on_base(model, table)
     if standing is None:
         tree, seen = make_registration_tree(model, settings)
     else:
         tree, seen = standing.tree(np.eye(4)), (OBJECT,)
     kinematics = TreeKinematics(tree)
     zeros, lengths = _select_parameters(model, kinematics, settings)
-    positions = read_known_positions(joints_path, kinematics, settings.on is not None)
-    held = [
-        camera
-        for name, camera in file.cameras.items()
-        if name not in searched
-        and name not in unplaced
-        and settings.on is None
-        and isinstance(camera, PinholeCamera)
-    ]
     pinholes = [_require_pinhole(scene_path, file.cameras[name]) for name in searched]
-    frames = {
-        camera.name: _read_frames(scene, camera, positions, settings.frames) for camera in pinholes
-    }
+    held = _select_held(file, searched, settings)
+    if joints_path is None:
+        positions = estimate_positions(scene_path, model, kinematics, held, _of_estimate(settings))
+    else:
+        unobserved = settings.on is not None
+        positions = read_known_positions(joints_path, kinematics, unobserved, table)
+    wanted = settings.frames
+    if positions.is_estimate:
+        wanted = _spread_frames(scene, pinholes, positions, wanted)
+    frames = {camera.name: _read_frames(scene, camera, positions, wanted) for camera in pinholes}
     for camera in held:
-        frames[camera.name] = _frames_of_held(scene, camera, positions, settings.frames)
+        frames[camera.name] = _frames_of_held(scene, camera, positions, wanted)
+    if positions.is_estimate:
+        _require_held(scene_path, held, frames)
     left_out = [name for name in unplaced if name not in searched]
     warnings = [*texts_of(*checked.warnings), *model.warnings, *positions.warnings]
     warnings += [_say_left_out(name) for name in left_out]
@@ -169,8 +195,85 @@ def read_inputs(
         warnings += _check_poses(camera, frames[camera.name], positions, standing)
     return RegistrationInputs(
         scene, model, tree, seen, standing, tuple(pinholes), tuple(held), frames, zeros, lengths,
-        tuple(left_out), tuple(warnings),
+        tuple(left_out), tuple(warnings), positions.is_estimate, positions.girths,
     )  # fmt: skip
+
+
+def _select_held(
+    file: CameraFile, searched: Sequence[str], settings: RegistrationSettings
+) -> list[PinholeCamera]:
+    """The cameras whose place is known and not to be found."""
+    if settings.on is not None:
+        return []
+    others = {*searched, *file.unplaced, *file.links}
+    return [
+        camera
+        for name, camera in file.cameras.items()
+        if name not in others and isinstance(camera, PinholeCamera)
+    ]
+
+
+def _of_estimate(settings: RegistrationSettings) -> EstimateSettings:
+    return EstimateSettings(frames=settings.frames, hold=settings.hold, packages=settings.packages)
+
+
+def _require_held(
+    path: Path,
+    held: Sequence[PinholeCamera],
+    frames: Mapping[str, Sequence[PosedFrame]],
+) -> None:
+    """Refuses estimated positions that no camera whose place is known can hold in the world.
+
+    Raises:
+        SceneError: says what is missing.
+    """
+    if not any(frames[camera.name] for camera in held):
+        raise SceneError(
+            f"{path}: the joint positions were estimated, so they are fitted together with the "
+            "cameras, but no camera with an X_WC has a mask of those frames: leave X_WC of the "
+            "cameras by which they were estimated in the camera file"
+        )
+
+
+def _check_estimable(settings: RegistrationSettings) -> None:
+    """Refuses what only measured joint positions tell."""
+    asked = {
+        "--zeros": settings.zeros, "--lengths": settings.lengths, "--focal": settings.focal,
+        "--on": settings.on, "--suggest": settings.suggest,
+    }  # fmt: skip
+    for name, value in asked.items():
+        if value:
+            raise SettingsError(
+                f"{name} needs measured joint positions (--joints FILE): those that are estimated "
+                "follow what it asks for"
+            )
+
+
+def _spread_frames(
+    scene: Scene,
+    cameras: Sequence[PinholeCamera],
+    positions: KnownPositions,
+    wanted: Sequence[str],
+) -> tuple[str, ...]:
+    """Frames with positions which the cameras see, as many as tell more than the first ones do.
+
+    Raises:
+        SceneError: a camera sees the body in none of them.
+    """
+    asked = select_frames(scene.frames, wanted, str(scene.path))
+    known = [frame for frame in asked if positions.has(frame)]
+    for camera in cameras:
+        if not any((camera.name, frame) in scene.masks for frame in known):
+            raise SceneError(
+                f"{scene.path}: camera '{camera.name}' has no mask of a frame in which the cameras "
+                "whose X_WC is known tell the body's pose; give masks of the same moments"
+            )
+    seen = [frame for frame in known if any((one.name, frame) in scene.masks for one in cameras)]
+    return tuple(
+        dict.fromkeys(
+            seen[k] for k in np.linspace(0, len(seen) - 1, _MOST_FRAMES).round().astype(int)
+        )
+    )
 
 
 def _check_links(path: Path, links: Mapping[str, str], settings: RegistrationSettings) -> None:
@@ -273,18 +376,30 @@ def _require_pinhole(path: Path, camera: Camera) -> PinholeCamera:
 def _read_frames(
     scene: Scene, camera: PinholeCamera, positions: KnownPositions, wanted: Sequence[str]
 ) -> tuple[PosedFrame, ...]:
-    """All frames of a camera that is to be found; a bad one is refused."""
+    """All frames of a camera that is to be found; a bad one is refused.
+
+    Where positions were estimated, a picture without the body is none.
+
+    Raises:
+        MaskError: a mask that cannot be used, or the camera sees the body in none.
+    """
     found = []
     for frame in select_seen_frames(scene, [camera], wanted):
         values = positions.of(frame, camera.name)
         try:
-            mask = scene.read(camera.name, frame)
+            mask = scene.read(camera.name, frame, may_be_empty=positions.is_estimate)
         except MaskError as error:
             raise MaskError(
                 f"{error} (camera '{camera.name}', frame '{frame}'); mend it, or leave the frame "
                 "out (--frame)"
             ) from error
-        found.append(PosedFrame(frame, values, mask))
+        if mask.any():
+            found.append(PosedFrame(frame, values, mask))
+    if not found:
+        raise MaskError(
+            f"camera '{camera.name}': no mask shows the body in the frames in which its pose was "
+            f"estimated: {', '.join(wanted)}"
+        )
     return tuple(found)
 
 
@@ -310,6 +425,8 @@ def _check_poses(
     """Says so where all frames show one pose of the robot; before an object it is refused."""
     if standing is not None:
         require_turns(camera.name, standing, frames)
+    if positions.is_estimate:
+        return _check_estimated_poses(camera, frames, positions)
     if not positions.are_one_pose(frame.values for frame in frames):
         return []
     what = (
@@ -321,6 +438,24 @@ def _check_poses(
         f"camera '{camera.name}': {what}: errors of that mask and of the joints' zeros cannot be "
         "told from a camera elsewhere, no frame can be found to contradict the others, and a "
         "mirrored pose may look alike; take five or more poses that differ much"
+    ]
+
+
+def _check_estimated_poses(
+    camera: PinholeCamera, frames: Sequence[PosedFrame], positions: KnownPositions
+) -> list[str]:
+    """Says so where all frames show one pose of the body, as far as an estimate can tell."""
+    if not positions.are_one_pose((frame.values for frame in frames), _ESTIMATES_DIFFER):
+        return []
+    what = (
+        f"there is one frame, '{frames[0].name}'"
+        if len(frames) == 1
+        else f"the body stands still in all {len(frames)} frames"
+    )
+    return [
+        f"camera '{camera.name}': {what}: what its surface lacks pulls the camera to one side "
+        "unnoticed, about the body above all, and no frame can be found to contradict the others; "
+        "take frames in which it turns, moves its limbs and walks about"
     ]
 
 

@@ -9,8 +9,12 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from drake_pose.apps.estimate.measurements import TrueAngles, read_true_angles
+from drake_pose.apps.results.folder import base_pose
+from drake_pose.body import ArticulatedModel, PoseTree
+from drake_pose.body.files.urdf_shape import BASE_JOINTS
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.errors import SceneError
 
@@ -23,6 +27,8 @@ _OUTSIDE, _OUTSIDE_SHARE = 0.1, 0.1
 _FULL_TURN, _MANY = 2.0 * math.pi, 20.0
 # Poses are one whose joints differ by less [rad or m].
 _SAME_ANGLE, _SAME_LENGTH = math.radians(1.0), 0.005
+# Values are one that differ by less, as written in a table.
+_AS_WRITTEN = 1e-6
 
 
 @dataclass(frozen=True)
@@ -36,6 +42,9 @@ class KnownPositions:
         order: (m,) the column of each value of the pose tree; -1: it is held.
         held: (m,) the values that are held [rad or m]; others are not looked at.
         warnings: what the user should know of it.
+        is_estimate: whether they were estimated, so that they are off.
+        girths: (nodes,) how many times as wide as the model's the nodes were found to be; None: as
+            the model's.
     """
 
     path: Path
@@ -44,6 +53,12 @@ class KnownPositions:
     order: NDArray[np.intp]
     held: Array
     warnings: tuple[str, ...] = ()
+    is_estimate: bool = False
+    girths: Array | None = None
+
+    def has(self, frame: str) -> bool:
+        """Whether there is a row of a frame."""
+        return self.table.of(frame) is not None
 
     def of(self, frame: str, camera: str) -> Array:
         """(m,) values of the pose tree in a frame [rad or m].
@@ -59,15 +74,42 @@ class KnownPositions:
             )
         return np.where(self.order < 0, self.held, values[self.order])
 
-    def are_one_pose(self, rows: Iterable[Array]) -> bool:
-        """Whether the joints are at the same place in all of some rows (m,)."""
+    def are_one_pose(self, rows: Iterable[Array], times: float = 1.0) -> bool:
+        """Whether the joints are at the same place in all of some rows (m,).
+
+        Args:
+            rows: the rows.
+            times: so many times a degree or 5 mm is the same.
+        """
         values = np.array(list(rows))
-        same = np.where(self.kinematics.is_angle, _SAME_ANGLE, _SAME_LENGTH)
+        same = times * np.where(self.kinematics.is_angle, _SAME_ANGLE, _SAME_LENGTH)
         return bool((np.ptp(values, axis=0) < same).all())
 
 
+def put_on_base(model: ArticulatedModel, table: TrueAngles) -> tuple[ArticulatedModel, TrueAngles]:
+    """A model and its positions on BASE_JOINTS that move all of it as the table's bases say.
+
+    Raises:
+        ModelError: the file is no URDF.
+    """
+    X_WB = {frame: base_pose(base) for frame, base in table.bases.items()}
+    first = next(iter(X_WB.values()))
+    moved = model.with_base_joints(first)
+    kept = [k for k, name in enumerate(table.names) if name in moved.position_names]
+    values = {}
+    for frame, X in X_WB.items():
+        turns = Rotation.from_matrix(X[:3, :3] @ first[:3, :3].T).as_euler("ZYX")
+        place = X[:3, 3] - first[:3, 3]
+        values[frame] = np.concatenate([table.values[frame][kept], place, turns])
+    names = (*(table.names[k] for k in kept), *BASE_JOINTS)
+    return moved, TrueAngles(table.path, names, values, is_estimate=table.is_estimate)
+
+
 def read_known_positions(
-    path: Path, kinematics: TreeKinematics, unobserved: bool = False
+    path: Path,
+    kinematics: TreeKinematics,
+    unobserved: bool = False,
+    table: TrueAngles | None = None,
 ) -> KnownPositions:
     """Reads a table with the column frame and one for each joint that is not held.
 
@@ -75,6 +117,7 @@ def read_known_positions(
         path: the table.
         kinematics: of the pose tree, whose model's positions the columns are.
         unobserved: whether there may be columns of joints that move nothing that is seen.
+        table: what was read of it before; None: nothing was.
 
     Raises:
         SceneError: it cannot be read, lacks a joint, has a column that is of no use, or is not in
@@ -82,7 +125,7 @@ def read_known_positions(
         UnknownNameError: the model has no joint of a column's name.
     """
     model = kinematics.tree.model
-    table = read_true_angles(path, model.position_names)
+    table = table or read_true_angles(path, model.position_names)
     held = {model.position_names[index] for index in kinematics.tree.held}
     asked = [name for name in kinematics.names if name not in held]
     missing = [name for name in asked if name not in table.names]
@@ -94,6 +137,8 @@ def read_known_positions(
         )
     # What moves nothing that is seen may be there.
     known = {*asked, *kinematics.tree.unobserved_positions} if unobserved else set(asked)
+    if table.is_estimate:
+        known |= _as_they_are(table, model, kinematics.tree)
     unused = [name for name in table.names if name not in known]
     if unused:
         raise SceneError(
@@ -106,7 +151,20 @@ def read_known_positions(
         dtype=np.intp,
     )
     warnings = _check_units(table, order, kinematics)
-    return KnownPositions(path, kinematics, table, order, kinematics.lower, warnings)
+    return KnownPositions(
+        path, kinematics, table, order, kinematics.lower, warnings, table.is_estimate
+    )
+
+
+def _as_they_are(table: TrueAngles, model: ArticulatedModel, tree: PoseTree) -> set[str]:
+    """The columns that say nothing but that a position was held, or is as in the model's file."""
+    found = set()
+    for column, name in enumerate(table.names):
+        index = model.position_index(name)
+        usual = tree.held.get(index, model.default_positions[index])
+        if all(abs(row[column] - usual) < _AS_WRITTEN for row in table.values.values()):
+            found.add(name)
+    return found
 
 
 def _check_units(

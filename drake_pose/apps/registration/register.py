@@ -12,6 +12,7 @@ import numpy as np
 
 from drake_pose.apps.estimate.fit_checks import BADLY_EXPLAINED
 from drake_pose.apps.estimate.scene_checks import frame_ranges
+from drake_pose.apps.registration.adjustment import adjust_bundle
 from drake_pose.apps.registration.inputs import (
     RegistrationInputs,
     RegistrationSettings,
@@ -73,7 +74,7 @@ class SceneRegistration:
 def register_scene(
     scene: Path | str,
     model: Path | str,
-    joints: Path | str,
+    joints: Path | str | None = None,
     out: Path | str | None = None,
     settings: RegistrationSettings | None = None,
     *,
@@ -87,7 +88,8 @@ def register_scene(
             masks/<camera>/<frame>.png.
         model: the robot's model file. It stands in the world as the file has it.
         joints: joint positions by frame, a CSV file with the column frame and one for each joint
-            [rad or m].
+            [rad or m]. None: they are estimated from the cameras whose X_WC is known, and fitted
+            together with those that are found.
         out: folder for the result, new or empty; None writes nothing.
         settings: which cameras and frames.
         overlay: whether overlays are written.
@@ -98,16 +100,18 @@ def register_scene(
         DrakePoseError: names the file, camera, frame or joint at fault.
     """
     settings = settings or RegistrationSettings()
-    paths = Path(scene), Path(model), Path(joints)
+    paths = Path(scene), Path(model), None if joints is None else Path(joints)
     folder = None if out is None else Path(out)
     if folder is not None:
         require_empty(folder)
     inputs = read_inputs(*paths, settings)
-    body = RegistrationBody(inputs.tree, inputs.seen)
+    body = RegistrationBody(inputs.tree, inputs.seen, girths=inputs.girths)
     warnings = [*inputs.warnings, *_check_held(inputs, body)]
     registered, described, body = _search(inputs, body, settings, warnings, on_camera)
     inputs = replace(inputs, tree=body.tree)
     urdf = None
+    if inputs.is_estimate:
+        registered, described, inputs, body = _adjust(inputs, body, registered, described)
     # Cameras that see one object are found one after another, but it stands in one place.
     several = inputs.standing is not None and len(registered) > 1
     if settings.zeros or settings.lengths or settings.focal or several:
@@ -145,7 +149,8 @@ def _search(
     for camera in inputs.searched:
         start = time.perf_counter()
         found = search.register(camera, inputs.frames[camera.name])
-        require_explained(search, found, inputs.frames[camera.name])
+        if not inputs.is_estimate:
+            require_explained(search, found, inputs.frames[camera.name])
         if standing is not None:
             require_determined(found)
             if found.seen_object is not None:
@@ -153,7 +158,8 @@ def _search(
                 search = CameraSearch(body)
                 warnings += _say_object(seen)
             found = replace(found, seen_object=seen)
-        warnings += check_focal_length(body, found, inputs.frames[camera.name])
+        if not inputs.is_estimate:
+            warnings += check_focal_length(body, found, inputs.frames[camera.name])
         registered[camera.name] = found
         next_pose = _suggestion(body, found, settings)
         seconds = time.perf_counter() - start
@@ -180,6 +186,31 @@ def _say_object(seen: ObjectPose) -> list[str]:
             "target in summary.json; where the camera is does not depend on it"
         )
     return texts
+
+
+def _adjust(
+    inputs: RegistrationInputs,
+    body: RegistrationBody,
+    registered: Mapping[str, RegisteredCamera],
+    described: Mapping[str, dict[str, Any]],
+) -> tuple[
+    dict[str, RegisteredCamera], dict[str, dict[str, Any]], RegistrationInputs, RegistrationBody
+]:
+    """The cameras fitted together with the positions that were estimated, and all that follows.
+
+    Raises:
+        RegistrationError: even so they do not explain their masks.
+    """
+    start = time.perf_counter()
+    adjusted, inputs, body = adjust_bundle(inputs, body, registered)
+    for found in adjusted.values():
+        require_explained(CameraSearch(body), found, inputs.frames[found.camera.name])
+    seconds = (time.perf_counter() - start) / len(adjusted)
+    again = {
+        name: describe_camera(found, described[name]["seconds"] + seconds)
+        for name, found in adjusted.items()
+    }
+    return adjusted, again, inputs, body
 
 
 def _suggestion(

@@ -84,7 +84,7 @@ def _describe_object(seen: ObjectPose) -> dict[str, Any]:
 
 
 def summarize(
-    paths: tuple[Path, Path, Path],
+    paths: tuple[Path, Path, Path | None],
     settings: RegistrationSettings,
     cameras: Mapping[str, dict[str, Any]],
     warnings: Sequence[str],
@@ -92,7 +92,7 @@ def summarize(
     """The content of summary.json: a single camera's part stands at the top as well.
 
     Args:
-        paths: scene, model and table of joint positions.
+        paths: scene, model and table of joint positions, if there is one.
         settings: the settings.
         cameras: by name, from describe_camera.
         warnings: what the user should know.
@@ -106,12 +106,12 @@ def summarize(
         "warnings": list(warnings),
         "scene": str(scene),
         "model": str(model),
-        "joints": str(joints),
+        "joints": None if joints is None else str(joints),
         "settings": settings.as_json(),
         "sha256": {
             "model": file_digest(model),
             "cameras": file_digest(scene / CAMERAS),
-            "joints": file_digest(joints),
+            "joints": None if joints is None else file_digest(joints),
         },
         "versions": versions(),
     }

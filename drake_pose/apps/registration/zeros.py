@@ -69,7 +69,7 @@ def find_zeros(
             for one in inputs.frames[camera.name]
         )
         corrected[camera.name] = own
-        again = _misfits(PosedFrames(kinematics, body.all, camera, own), before)
+        again = misfits_now(PosedFrames(kinematics, body.all, camera, own), before)
         result[camera.name] = replace(
             before, camera=camera, covariance=covariance, frames=again, seen_object=seen
         )
@@ -83,7 +83,7 @@ def joint_shifts(tree: PoseTree, found: JointCalibration) -> dict[str, list[floa
     return {one.joint: (longer[one.link] * one.p_L).tolist() for one in offsets}
 
 
-def _misfits(frames: PosedFrames, before: RegisteredCamera) -> tuple[FrameMisfit, ...]:
+def misfits_now(frames: PosedFrames, before: RegisteredCamera) -> tuple[FrameMisfit, ...]:
     """How well the frames fit now; which of them agree is as it was found."""
     found = areas(frames, frames.camera.X_CW[None], np.inf)[0]
     iou = intersection_over_union(found)

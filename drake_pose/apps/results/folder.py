@@ -38,6 +38,9 @@ RESULT_FILES = (
 BASE_COLUMNS = ("base_x", "base_y", "base_z", "base_qw", "base_qx", "base_qy", "base_qz")
 """Columns of the plant's world in the scene's world: position [m] and unit quaternion."""
 
+FIT_COLUMNS = ("error", "seconds")
+"""The last columns: E_total and the search's wall time [s]."""
+
 
 @dataclass(frozen=True, eq=False)
 class PoseRow:
@@ -111,7 +114,7 @@ class ResultFolder:
     def header(self) -> list[str]:
         """The columns of poses.csv."""
         base = BASE_COLUMNS if self.with_base else ()
-        return ["frame", *self.position_names, *base, "error", "seconds"]
+        return ["frame", *self.position_names, *base, *FIT_COLUMNS]
 
     def open(self) -> None:
         """Begin poses.csv, with the rows that were read for a resumption.

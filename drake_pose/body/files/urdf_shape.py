@@ -100,6 +100,50 @@ def with_shifted_joints(text: str, shifts: Mapping[str, Sequence[float]]) -> str
     return xml_text(root)
 
 
+BASE_JOINTS = ("free_x", "free_y", "free_z", "free_turn_z", "free_turn_y", "free_turn_x")
+"""Joints that move a whole model: along the world's axes, then about them, the last one first."""
+
+
+def with_base_joints(text: str, place: Sequence[float], rpy: Sequence[float]) -> str:
+    """A URDF text whose whole model is moved by BASE_JOINTS.
+
+    Args:
+        text: the URDF.
+        place: (3,) where it stands where they are 0 [m].
+        rpy: (3,) and how it is turned there, as in an origin [rad].
+    """
+    root = ElementTree.fromstring(text)
+    for element in root.iter():
+        for key in ("name", "link"):
+            if element.tag in ("link", "parent", "child") and element.get(key) == "world":
+                element.set(key, "free_base")
+    carried = {child.get("link") for child in root.iterfind("joint/child")}
+    names = [link.get("name") for link in root.iterfind("link")]
+    bases = [name for name in names if name not in carried]
+    ElementTree.SubElement(root, "link", name="world")
+    parent = "world"
+    for k, name in enumerate(BASE_JOINTS):
+        ElementTree.SubElement(root, "link", name=f"{name}_link")
+        slides = k < 3
+        joint = ElementTree.SubElement(
+            root, "joint", name=name, type="prismatic" if slides else "continuous"
+        )
+        ElementTree.SubElement(joint, "parent", link=parent)
+        ElementTree.SubElement(joint, "child", link=f"{name}_link")
+        ElementTree.SubElement(joint, "axis", xyz=_text(np.eye(3)[k if slides else 5 - k]))
+        limit = {"lower": "-100", "upper": "100"} if slides else {}
+        ElementTree.SubElement(joint, "limit", {**limit, "effort": "1", "velocity": "1"})
+        parent = f"{name}_link"
+    # The axes along which it moves are the world's; how it is turned comes after them.
+    _origin(root.findall("joint")[-6]).set("xyz", _text(np.array(place)))
+    for base in bases:
+        joint = ElementTree.SubElement(root, "joint", name=f"free_{base}", type="fixed")
+        ElementTree.SubElement(joint, "parent", link=parent)
+        ElementTree.SubElement(joint, "child", link=str(base))
+        ElementTree.SubElement(joint, "origin", rpy=_text(np.array(rpy)))
+    return xml_text(root)
+
+
 def _origin(element: ElementTree.Element) -> ElementTree.Element:
     """An element's origin, which is made where it has none."""
     origin = element.find("origin")

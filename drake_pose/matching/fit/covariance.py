@@ -125,12 +125,15 @@ def distances(fit: ContourFit, views: Views, compared: Comparison, unit: float) 
     return distances_in_pictures(fit.outlines, pictures)
 
 
-def distances_in_pictures(outlines: Sequence[Outline], pictures: Sequence[Picture]) -> Distances:
+def distances_in_pictures(
+    outlines: Sequence[Outline], pictures: Sequence[Picture], most: int = _MOST_DISTANCES
+) -> Distances:
     """The distances in several pictures, each of which errs as a whole, too.
 
     Args:
         outlines: the nodes' surfaces.
         pictures: each with the same values.
+        most: at most so many distances are looked at, the best known ones.
     """
     found: list[tuple[float, int, int, Array, Array, Array, float]] = []
     mean_size = float(np.mean([picture.size for picture in pictures]))
@@ -148,7 +151,7 @@ def distances_in_pictures(outlines: Sequence[Outline], pictures: Sequence[Pictur
                         (known, c, n, row @ moves[n].T, np.sqrt(known) * turn,
                          row @ shakes, float(along @ b[n]))
                     )  # fmt: skip
-    found = sorted(found, key=lambda one: -one[0])[:_MOST_DISTANCES]
+    found = sorted(found, key=lambda one: -one[0])[:most]
     of = np.array([(one[1], one[2]) for one in found], dtype=np.intp).reshape(-1, 2)
     bends = np.array([one[4] for one in found]).reshape(-1, 12)
     shaken = np.array([one[5] for one in found]).reshape(-1, 6)

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import fast_simplification
 import numpy as np
+from numpy.typing import NDArray
 
 from drake_pose.body import TriangleMesh
 from drake_pose.matching.fit.surface_distance import surface_distance
 from drake_pose.silhouette import Outline, TreeSurfaces, outline_from_mesh
+
+Array = NDArray[np.float64]
 
 MANY, FEW, VERY_FEW = 2500, 400, 80
 """Triangles a node: where a pixel counts, for a still, and for a person in real time."""
@@ -41,6 +46,15 @@ def few_triangles(surfaces: TreeSurfaces, count: int = FEW) -> tuple[Outline, ..
         bending = surfaces.bending[node]
         outlines.append(_simplified(rigid if bending is None else bending.rest, count))
     return tuple(outlines)
+
+
+def with_girths(outlines: Sequence[Outline], girths: Array) -> tuple[Outline, ...]:
+    """Surfaces, each as many times as wide across its y axis as girths (nodes,) say."""
+    wider = []
+    for outline, girth in zip(outlines, girths, strict=True):
+        vertices = outline.vertices * [girth, 1.0, girth]
+        wider.append(outline_from_mesh(TriangleMesh(vertices, outline.triangles)))
+    return tuple(wider)
 
 
 def _simplified(outline: Outline, count: int) -> Outline:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.body import PoseTree, TriangleMesh
+from drake_pose.body import PoseTree
 from drake_pose.camera import Camera
 from drake_pose.errors import ModelError
 from drake_pose.matching.fit.contour_fit import ContourFit, Noise
@@ -20,9 +20,10 @@ from drake_pose.matching.fit.evidence import NO_EDGE, EdgePoints, Evidence, pack
 from drake_pose.matching.fit.frames_fit import FramesFit
 from drake_pose.matching.fit.levenberg_marquardt import Round
 from drake_pose.matching.fit.parameters import GIRTH_PREFIX, BodyParameters
+from drake_pose.matching.fit.surfaces import with_girths
 from drake_pose.matching.fit.unknowns import Unknowns, choose, join
 from drake_pose.multiview.person.pose_uncertainty import pose_uncertainty
-from drake_pose.silhouette import Outline, outline_from_mesh
+from drake_pose.silhouette import Outline
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -132,7 +133,7 @@ def fit_shape(
         shared_information=_sides_information(names, len(parts), settings),
     )
     shape, girths = found.shared[:shape_count], found.shared[shape_count:]
-    worn = ContourFit(fit.tree, widened(fit, np.exp(girths)[groups]), fit.noise)
+    worn = ContourFit(fit.tree, with_girths(fit.outlines, np.exp(girths)[groups]), fit.noise)
     values = np.zeros(len(is_shape))
     values[is_shape] = shape
     poses[:, is_shape] = shape
@@ -222,15 +223,6 @@ def _told(
         follow = np.linalg.solve(H[np.ix_(own, own)] + apriori, cross)
         told += (H[np.ix_(is_shape, is_shape)] - cross.T @ follow) / len(frames)
     return told
-
-
-def widened(fit: ContourFit, girths: Array) -> tuple[Outline, ...]:
-    """The fit's surfaces, each node's as wide across its y axis as girths (nodes,) say."""
-    wider = []
-    for outline, girth in zip(fit.outlines, girths, strict=True):
-        vertices = outline.vertices * [girth, 1.0, girth]
-        wider.append(outline_from_mesh(TriangleMesh(vertices, outline.triangles)))
-    return tuple(wider)
 
 
 def shape_parts(tree: PoseTree) -> tuple[list[str], list[int]]:

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from drake_pose.body import PoseTree
 from drake_pose.errors import UnknownNameError
 from drake_pose.matching.fit.contour_fit import ContourFit
+from drake_pose.matching.fit.surfaces import with_girths
 from drake_pose.multiview.person.shape import (
     PersonShape,
     shape_noise,
     shape_parts,
     shape_values,
-    widened,
 )
 from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker
 from drake_pose.multiview.recordings.person_capture import PersonCaptureSettings
@@ -79,4 +79,4 @@ def _as_wide(fit: ContourFit, girths: Mapping[str, float]) -> tuple[Outline, ...
         if part not in parts:
             raise UnknownNameError("part", part, parts, str(fit.tree.model.path))
     widths = np.array([girths.get(part, 1.0) for part in parts])
-    return widened(fit, widths[groups])
+    return with_girths(fit.outlines, widths[groups])

@@ -4,8 +4,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from drake_pose.apps.registration.known_positions import KnownPositions, read_known_positions
+from drake_pose.apps.estimate.measurements import read_true_angles
+from drake_pose.apps.registration.known_positions import (
+    KnownPositions,
+    put_on_base,
+    read_known_positions,
+)
 from drake_pose.body import load_model
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.errors import SceneError
@@ -44,6 +50,42 @@ def test_columns_are_put_in_the_tree_s_order(tmp_path: Path) -> None:
     assert found.of("3", "left").tolist() == [0.0, 0.0]
     with pytest.raises(SceneError, match=r"joints\.csv: has no row of frame '0008'.*'left'"):
         found.of("0008", "left")
+
+
+def test_the_poses_of_an_estimate(tmp_path: Path) -> None:
+    text = "frame,rail,swing,error,seconds\n0,0.1,0.5,0.02,1\n1,nan,nan,nan,3\n2,0.2,-1,0.03,1\n"
+    found = read(tmp_path, text)
+    assert found.is_estimate
+    assert [found.has(frame) for frame in ("0", "1", "2")] == [True, False, True]
+    assert found.of("2", "left").tolist() == [0.2, -1.0]
+    assert not read(tmp_path, "frame,rail,swing\n0,0.1,0.5\n").is_estimate
+
+
+def test_a_base_that_moves_becomes_joints(tmp_path: Path) -> None:
+    read(tmp_path, "frame,rail,swing\n0,0.1,0.5\n")
+    model, rng = load_model(tmp_path / "slide.urdf"), np.random.default_rng(3)
+    lines, bases = ["frame,rail,swing,base_x,base_y,base_z,base_qw,base_qx,base_qy,base_qz"], []
+    for k in range(3):
+        turn = Rotation.from_rotvec(rng.normal(0.0, 1.0, 3))
+        bases.append(np.eye(4))
+        bases[k][:3, :3], bases[k][:3, 3] = turn.as_matrix(), rng.normal(0.0, 1.0, 3)
+        cells = [k, 0.1 * k, 0.5 - k, *bases[k][:3, 3], *turn.as_quat(scalar_first=True)]
+        lines.append(",".join(map(str, cells)))
+    ends = ["error,seconds", *["0.1,1"] * 3]
+    text = "\n".join(f"{line},{end}" for line, end in zip(lines, ends, strict=True))
+    (tmp_path / "poses.csv").write_text(text)
+    table = read_true_angles(tmp_path / "poses.csv", model.position_names)
+    moved, table = put_on_base(model, table)
+    kinematics = TreeKinematics(moved.pose_tree())
+    found = read_known_positions(table.path, moved, kinematics, table=table)
+    context = model.plant.CreateDefaultContext()
+    for k, X_WB in enumerate(bases):
+        model.plant.SetPositions(context, [0.1 * k, 0.5 - k])
+        X_WN = kinematics.poses(found.of(str(k), "left"))
+        for node, X in zip(kinematics.tree.nodes, X_WN, strict=True):
+            body = model.plant.GetBodyByName(node.name)
+            X_BN = model.plant.EvalBodyPoseInWorld(context, body).GetAsMatrix4()
+            np.testing.assert_allclose(X, X_WB @ X_BN, atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,8 @@ from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.errors import ModelError, SettingsError
 from drake_pose.matching.fit.contour_fit import ContourFit
 from drake_pose.matching.fit.evidence import find_edge_points
-from drake_pose.multiview.person.shape import fit_shape, shape_noise, shape_values, widened
+from drake_pose.matching.fit.surfaces import with_girths
+from drake_pose.multiview.person.shape import fit_shape, shape_noise, shape_values
 from drake_pose.multiview.recordings.person_capture import PersonCaptureSettings, capture_person
 from drake_pose.silhouette import LabelRenderer, draw_mask, load_scene
 
@@ -90,7 +91,7 @@ class TestShape:
             for part, factor in factors.items():
                 if part in node.name:
                     girths[k] = factor
-        outlines = widened(fit, girths)
+        outlines = with_girths(fit.outlines, girths)
         frames, starts = [], []
         for phase in np.linspace(0.0, 2 * np.pi, 4, endpoint=False):
             values = stepping(person, phase)[order]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from drake_pose.apps.estimate.inputs import make_tree, select_seen_frames
 from drake_pose.apps.estimate.measurements import read_true_angles
+from drake_pose.apps.estimate.person_choice import missing_for_person
 from drake_pose.apps.estimate.scene_checks import check_scene, texts_of
 from drake_pose.apps.options import select_frames
 from drake_pose.apps.registration.estimated_positions import estimate_positions
@@ -47,6 +48,10 @@ _CAMERAS = "cameras.yaml"
 _MOST_FRAMES = 12
 # And estimated poses differ that do so by more times what measured ones do.
 _ESTIMATES_DIFFER = 5.0
+_OF_A_PERSON = (
+    "a person's clothes and hair are not the model's surface, which turns a camera about the "
+    "person: on a real recording cameras were off by up to three of their standard deviations"
+)
 
 ALL = "all"
 """In place of names: of every joint, or of every link."""
@@ -167,10 +172,7 @@ def read_inputs(
         _check_estimable(settings)
     if table is not None and table.bases:
         model, table = put_on_base(model, table)
-    if standing is None:
-        tree, seen = make_registration_tree(model, settings)
-    else:
-        tree, seen = standing.tree(np.eye(4)), (OBJECT,)
+    tree, seen = make_registration_tree(model, settings, standing)
     kinematics = TreeKinematics(tree)
     zeros, lengths = _select_parameters(model, kinematics, settings)
     pinholes = [_require_pinhole(scene_path, file.cameras[name]) for name in searched]
@@ -191,8 +193,7 @@ def read_inputs(
     left_out = [name for name in unplaced if name not in searched]
     warnings = [*texts_of(*checked.warnings), *model.warnings, *positions.warnings]
     warnings += [_say_left_out(name) for name in left_out]
-    for camera in pinholes:
-        warnings += _check_poses(camera, frames[camera.name], positions, standing)
+    warnings += _say_of_body(model, pinholes, frames, positions, standing)
     return RegistrationInputs(
         scene, model, tree, seen, standing, tuple(pinholes), tuple(held), frames, zeros, lengths,
         tuple(left_out), tuple(warnings), positions.is_estimate, positions.girths,
@@ -302,12 +303,16 @@ def _read_target(model: ArticulatedModel, settings: RegistrationSettings) -> Sta
 
 
 def make_registration_tree(
-    model: ArticulatedModel, settings: RegistrationSettings
+    model: ArticulatedModel,
+    settings: RegistrationSettings,
+    standing: StandingObject | None = None,
 ) -> tuple[PoseTree, tuple[str, ...] | None]:
     """The pose tree, and which of its nodes the masks show; None: all.
 
     From a link on which a camera rides, the masks show what no joint moves.
     """
+    if standing is not None:
+        return standing.tree(np.eye(4)), (OBJECT,)
     tree = make_tree(model, EstimateSettings(hold=settings.hold), None)
     link = settings.on
     if link is None:
@@ -456,6 +461,25 @@ def _check_estimated_poses(
         f"camera '{camera.name}': {what}: what its surface lacks pulls the camera to one side "
         "unnoticed, about the body above all, and no frame can be found to contradict the others; "
         "take frames in which it turns, moves its limbs and walks about"
+    ]
+
+
+def _say_of_body(
+    model: ArticulatedModel,
+    cameras: Sequence[PinholeCamera],
+    frames: Mapping[str, Sequence[PosedFrame]],
+    positions: KnownPositions,
+    standing: StandingObject | None,
+) -> list[str]:
+    """What about the body, and how it moves, makes cameras less sure than they seem."""
+    is_person = positions.is_estimate and not missing_for_person(model)
+    return [
+        *([_OF_A_PERSON] if is_person else []),
+        *(
+            text
+            for camera in cameras
+            for text in _check_poses(camera, frames[camera.name], positions, standing)
+        ),
     ]
 
 

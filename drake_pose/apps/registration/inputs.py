@@ -164,8 +164,7 @@ def read_inputs(
     if not settings.cameras:
         searched = [name for name in searched if name not in unseen]
     model = load_model(model_path, package_paths=settings.packages)
-    table = None
-    standing = _read_target(model, settings)
+    table, standing = None, _read_target(model, settings)
     if joints_path is not None and standing is None:
         table = read_true_angles(joints_path, model.position_names)
     if joints_path is None or (table is not None and table.is_estimate):
@@ -180,8 +179,8 @@ def read_inputs(
     if joints_path is None:
         positions = estimate_positions(scene_path, model, kinematics, held, _of_estimate(settings))
     else:
-        unobserved = settings.on is not None
-        positions = read_known_positions(joints_path, kinematics, unobserved, table)
+        on_link = settings.on is not None
+        positions = read_known_positions(joints_path, kinematics, on_link, table)
     wanted = settings.frames
     if positions.is_estimate:
         wanted = _spread_frames(scene, pinholes, positions, wanted)

@@ -138,7 +138,7 @@ def read_known_positions(
     # What moves nothing that is seen may be there.
     known = {*asked, *kinematics.tree.unobserved_positions} if unobserved else set(asked)
     if table.is_estimate:
-        known |= _as_they_are(table, model, kinematics.tree)
+        known |= _as_they_are(table, kinematics.tree)
     unused = [name for name in table.names if name not in known]
     if unused:
         raise SceneError(
@@ -156,9 +156,9 @@ def read_known_positions(
     )
 
 
-def _as_they_are(table: TrueAngles, model: ArticulatedModel, tree: PoseTree) -> set[str]:
+def _as_they_are(table: TrueAngles, tree: PoseTree) -> set[str]:
     """The columns that say nothing but that a position was held, or is as in the model's file."""
-    found = set()
+    found, model = set(), tree.model
     for column, name in enumerate(table.names):
         index = model.position_index(name)
         usual = tree.held.get(index, model.default_positions[index])

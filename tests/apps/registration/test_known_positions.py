@@ -77,7 +77,7 @@ def test_a_base_that_moves_becomes_joints(tmp_path: Path) -> None:
     table = read_true_angles(tmp_path / "poses.csv", model.position_names)
     moved, table = put_on_base(model, table)
     kinematics = TreeKinematics(moved.pose_tree())
-    found = read_known_positions(table.path, moved, kinematics, table=table)
+    found = read_known_positions(table.path, kinematics, table=table)
     context = model.plant.CreateDefaultContext()
     for k, X_WB in enumerate(bases):
         model.plant.SetPositions(context, [0.1 * k, 0.5 - k])

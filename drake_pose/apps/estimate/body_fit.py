@@ -12,13 +12,14 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from drake_pose.apps.estimate.inputs import Inputs, leave_out_links, make_placement_search
 from drake_pose.apps.estimate.result import OnStage
 from drake_pose.apps.estimate.sequence import sequence_tracking
+from drake_pose.apps.results.overlay import draw_shapes
 from drake_pose.apps.settings import EstimateSettings
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.filtering.measurements.contour import ContourObservation
@@ -43,6 +44,21 @@ _FRAMES, _TRIANGLES = 10, 160
 _SPACING = 2.0
 
 
+class FittedBody(NamedTuple):
+    """What is found out about a body.
+
+    Attributes:
+        inputs: with the fitted model, and a search that knows the first frame's pose.
+        summary: what the summary says of it.
+        shapes: (h, w, 3) uint8, red, green, blue: the corrected shape drawn over the file's in the
+            first frame (Shimada's figure 18); None where the shape was left as it is.
+    """
+
+    inputs: Inputs
+    summary: dict[str, Any]
+    shapes: np.ndarray | None
+
+
 class _StartedSearch(RootPlacementSearch):
     """A search whose answer for one silhouette is known."""
 
@@ -58,19 +74,13 @@ class _StartedSearch(RootPlacementSearch):
         return super().match(views, root_position)
 
 
-def fit_body(
-    inputs: Inputs, settings: EstimateSettings, on_stage: OnStage | None
-) -> tuple[Inputs, dict[str, Any]]:
+def fit_body(inputs: Inputs, settings: EstimateSettings, on_stage: OnStage | None) -> FittedBody:
     """Find out about the body, where it is followed through a sequence of an unknown camera.
 
     Args:
         inputs: what is estimated.
         settings: the estimate's.
         on_stage: hears that it is done.
-
-    Returns:
-        The inputs with the fitted model and a search that knows the first frame's pose, and what
-        the summary says of it.
 
     Raises:
         DrakePoseError: as for an estimate.
@@ -85,7 +95,7 @@ def fit_body(
         or not search.tree.turns_root_freely
         or len(inputs.frames) < 2
     ):
-        return inputs, {}
+        return FittedBody(inputs, {}, None)
     if on_stage is not None:
         on_stage("fitting the body to the sequence", 0, None)
     return _BodyFit(inputs, settings, tracking).run(search)
@@ -104,12 +114,13 @@ class _BodyFit:
         self._more: dict[str, Any] = {}
         self._period = 1.0 / (inputs.scene.frame_rate_hz or DEFAULT_FRAME_RATE_HZ)
 
-    def run(self, search: RootPlacementSearch) -> tuple[Inputs, dict[str, Any]]:
-        """The inputs with what is found out, and what the summary says of it."""
+    def run(self, search: RootPlacementSearch) -> FittedBody:
+        """All of it."""
         begin = time.perf_counter()
         first = search.match([View(self._camera, self._masks[0])])
         if not first.found:
-            return self._inputs, {}
+            return FittedBody(self._inputs, {}, None)
+        shapes = None
         search, first = self._without_hidden(search, first)
         tracker = self._tracker(search)
         frames = [[mask] for mask in self._masks]
@@ -126,6 +137,7 @@ class _BodyFit:
         other = self._tracker(stretched)
         followed = follow_start(other, start, frames)
         if np.mean(followed.errors) < np.mean(best.errors):
+            shapes = self._draw_shapes((tracker, best.x), (other, followed.x))
             self._inputs = replace(self._inputs, model=model)
             search, tracker, best = stretched, other, followed
             self._more["proportions"] = {
@@ -136,7 +148,18 @@ class _BodyFit:
         answer = self._answer(tracker.observation, best.x, best.errors[0], seconds)
         started.start_with(self._masks[0], answer)
         self._more["body_fit_seconds"] = round(seconds, 3)
-        return replace(self._inputs, search=started), self._more
+        return FittedBody(replace(self._inputs, search=started), self._more, shapes)
+
+    def _draw_shapes(self, *bodies: tuple[ContourTracker, np.ndarray]) -> np.ndarray:
+        """The file's body and the corrected one, each where it is in the first frame."""
+        shapes = []
+        for tracker, x in bodies:
+            observation = tracker.observation
+            outlines = TreeSurfaces(observation.tree).at(observation.node_values(x))
+            X_CN = self._camera.X_CW @ observation.node_poses(x)
+            shapes.append(draw_mask(outlines, X_CN, self._camera))
+        title = f"frame {self._inputs.frames[0]}: the shape that explains the sequence"
+        return draw_shapes(self._masks[0], shapes, ("the file's", "corrected"), [title])
 
     def _without_hidden(
         self, search: RootPlacementSearch, first: PlacedMatch

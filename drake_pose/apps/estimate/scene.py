@@ -16,8 +16,9 @@ from drake_pose.apps.estimate.inputs import Inputs, read_inputs
 from drake_pose.apps.estimate.person import follow_person
 from drake_pose.apps.estimate.result import OnFrame, OnStage, ResultWriter, SceneEstimate
 from drake_pose.apps.estimate.sequence import sequence_tracking
-from drake_pose.apps.results.folder import PoseRow, base_cells, read_summary, require_empty
+from drake_pose.apps.results.folder import SHAPES, PoseRow, base_cells, read_summary, require_empty
 from drake_pose.apps.results.joint_tables import record_pose_set
+from drake_pose.apps.results.overlay import encode_png
 from drake_pose.apps.results.summary import FrameRecord, check_same_job, describe_job
 from drake_pose.apps.settings import EstimateSettings
 from drake_pose.camera import Camera, ParallelCamera
@@ -72,13 +73,13 @@ def estimate_scene(
     job = describe_job(Path(scene), Path(model), settings)
     if recorded is not None and folder_path is not None:
         check_same_job(job, recorded, folder_path)
-    inputs, of_body = fit_body(inputs, settings, on_stage)
+    inputs, of_body, shapes = fit_body(inputs, settings, on_stage)
     search = inputs.search
     with_base = search is not None and _base_moves(search)
     result = ResultWriter(inputs, job, folder_path, recorded, with_base)
     by_search = "paper" if settings.method == "paper" else "beam"
-    result.more = result.more | {"method": "person" if search is None else by_search} | of_body
-    result.open()
+    result.more |= {"method": "person" if search is None else by_search} | of_body
+    _open_result(result, shapes)
     try:
         if search is not None:
             matching = _Matching(inputs, search, result, settings.track, overlay)
@@ -90,6 +91,13 @@ def estimate_scene(
     finally:
         result.close()
     return result.result()
+
+
+def _open_result(result: ResultWriter, shapes: np.ndarray | None) -> None:
+    """Begin the result, with the picture (h, w, 3) of a body's corrected shape if there is one."""
+    result.open()
+    if shapes is not None:
+        result.write(SHAPES, encode_png(shapes))
 
 
 def _recorded_summary(folder: Path | None, resume: bool) -> Mapping[str, Any] | None:

@@ -28,10 +28,10 @@ SUMMARY = "summary.json"
 REPLAY, REPORT = "replay.html", "report.html"
 JOINT_CENTRES = "joint_centres.csv"
 TRC, MOT, BVH = "joint_centres.trc", "positions.mot", "motion.bvh"
-OVERLAY = "overlay"
+OVERLAY, SHAPES = "overlay", "shapes.png"
 
 RESULT_FILES = (
-    POSES, JOINTS, FAMILIES, SUMMARY, REPLAY, REPORT, JOINT_CENTRES, TRC, MOT, BVH
+    POSES, JOINTS, FAMILIES, SUMMARY, REPLAY, REPORT, JOINT_CENTRES, TRC, MOT, BVH, SHAPES
 )  # fmt: skip
 """Every file that a result may have beside its overlays."""
 

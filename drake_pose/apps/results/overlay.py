@@ -65,7 +65,7 @@ def draw_overlay(
     window = (slice(*rows), slice(*columns))
     picture = paint_agreement(mask, body, segments)[window]
     height, width = picture.shape[:2]
-    scale = max(1, min(_LEAST_HEIGHT // height, 2 * _LEAST_WIDTH // width, 8))
+    scale = _enlargement(height, width)
     picture = np.repeat(np.repeat(picture, scale, axis=0), scale, axis=1)
     picture = _widen(picture, _LEAST_WIDTH)
     area = max(1, int(mask.sum()))
@@ -102,6 +102,40 @@ def draw_over_picture(
     return np.vstack([_text_band(title, painted.shape[1]), painted])
 
 
+def draw_shapes(
+    mask: np.ndarray, shapes: Sequence[np.ndarray], names: Sequence[str], title: Sequence[str]
+) -> np.ndarray:
+    """Draws the contours of one or two bodies over a silhouette, one over the other.
+
+    Args:
+        mask: (H, W) bool, the silhouette.
+        shapes: (H, W) bool each, where a body is seen.
+        names: of the shapes, for the legend.
+        title: lines of text above the picture.
+
+    Returns:
+        (h, w, 3) uint8, red, green, blue: the surroundings of all, enlarged as by draw_overlay.
+    """
+    colours = (MISSING_RGB, EXCESS_RGB)[: len(shapes)]
+    rows, columns = _surroundings(np.logical_or.reduce([mask, *shapes]))
+    window = (slice(*rows), slice(*columns))
+    scale = _enlargement(rows[1] - rows[0], columns[1] - columns[0])
+    grown = [
+        np.repeat(np.repeat(one[window], scale, axis=0), scale, axis=1) for one in (mask, *shapes)
+    ]
+    picture = np.empty((*grown[0].shape, 3), dtype=np.uint8)
+    picture[:] = BACKGROUND_RGB
+    picture[grown[0]] = AGREEMENT_RGB
+    for shape, colour in zip(grown[1:], colours, strict=True):
+        contours, _ = cv2.findContours(shape.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+        cv2.drawContours(picture, contours, -1, colour, 2)
+    picture = _widen(picture, _LEAST_WIDTH)
+    legend = [(AGREEMENT_RGB, "silhouette"), *zip(colours, names, strict=True)]
+    return np.vstack(
+        [_text_band(title, picture.shape[1]), picture, _legend_band(legend, picture.shape[1])]
+    )
+
+
 def encode_png(picture: np.ndarray) -> bytes:
     """Returns a picture (H, W, 3) uint8, red, green, blue, as a PNG file's bytes."""
     _, data = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
@@ -129,6 +163,11 @@ def _surroundings(shown: np.ndarray) -> tuple[tuple[int, int], tuple[int, int]]:
         for span, size in zip(spans, shown.shape, strict=True)
     )
     return first, second
+
+
+def _enlargement(height: int, width: int) -> int:
+    """By how much a small picture is enlarged."""
+    return max(1, min(_LEAST_HEIGHT // height, 2 * _LEAST_WIDTH // width, 8))
 
 
 def _widen(picture: np.ndarray, width: int) -> np.ndarray:

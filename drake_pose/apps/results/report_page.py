@@ -45,6 +45,7 @@ _ABOUT = {
     "joint_centres.trc": "the same as markers [mm], for motion analysis",
     "positions.mot": "every position over time [deg or m], for motion analysis",
     "motion.bvh": "skeleton and motion [cm], for animation",
+    "shapes.png": "the corrected shape of the body over that of the model's file",
     "replay.html": "plays the estimate in three dimensions",
     "summary.json": "settings, versions, and all figures of this page",
 }

@@ -9,6 +9,7 @@ from drake_pose.apps.results.overlay import (
     MISSING_RGB,
     OUTLINE_RGB,
     draw_overlay,
+    draw_shapes,
     encode_png,
     paint_agreement,
 )
@@ -81,6 +82,20 @@ def test_a_large_picture_is_cut_to_the_surroundings_of_the_body() -> None:
     assert count(picture, MISSING_RGB) >= 600 * 10
     assert count(picture, EXCESS_RGB) >= 600 * 10
     assert count(picture, AGREEMENT_RGB) >= 600 * 290
+
+
+def test_shapes_are_drawn_as_contours_over_the_silhouette() -> None:
+    mask = rectangle((600, 600), slice(100, 500), slice(100, 500))
+    first = rectangle((600, 600), slice(100, 500), slice(150, 450))
+    corrected = rectangle((600, 600), slice(100, 500), slice(200, 400))
+    names = ("the file's", "corrected")
+    picture = draw_shapes(mask, [first, corrected], names, ["title"])
+    legend = draw_shapes(mask, [np.zeros_like(mask)] * 2, names, ["title"])
+    # Their upper and lower sides lie upon each other, where the corrected one is drawn last.
+    for colour, own in ((MISSING_RGB, 2 * 400 + 2 * 100), (EXCESS_RGB, 2 * 400 + 2 * 200)):
+        shown = count(picture, colour) - count(legend, colour)
+        assert own < shown < 4 * own
+    assert count(picture, AGREEMENT_RGB) > 0.95 * 400 * 400
 
 
 def test_a_small_picture_is_enlarged_by_whole_pixels() -> None:

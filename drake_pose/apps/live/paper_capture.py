@@ -83,9 +83,7 @@ def capture_paper(
     settings, opener = settings or LiveSettings(), open_sensors or scene.open_sensors
     if settings.shape is not None:
         raise SettingsError("the paper's method takes the model's measures: give no shape")
-    model = load_model(
-        model_path or bundled_model("person"), check=False, package_paths=settings.packages
-    )
+    model = load_model(model_path or bundled_model("person"), package_paths=settings.packages)
     require_empty(out)
     templates = None if face is None else learn_recorded_faces(face.templates)
     search = RegisteredPoseSearch(scene, model, None if face is None else face.camera, templates)

@@ -4,6 +4,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +31,7 @@ from drake_pose.body.files.urdf_shape import (
     with_shifted_joints,
     without_visuals,
 )
-from drake_pose.body.limits import describe_positions
+from drake_pose.body.limits import Positions, describe_positions
 from drake_pose.body.parsed_model import ParsedModel, link_names
 from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.body.surfaces.skin_file import SkinBand, load_skin
@@ -144,13 +145,7 @@ class ArticulatedModel(ParsedModel):
         positions = describe_positions(moved.plant, self._source.limits, str(self.path))
         return replace(
             moved,
-            position_names=positions.names,
-            position_kinds=positions.kinds,
-            lower=positions.lower,
-            upper=positions.upper,
-            default_positions=positions.defaults,
-            periodic=positions.periodic,
-            turns_freely=positions.turns_freely,
+            **_position_fields(positions),
         )
 
     def before_object(
@@ -184,13 +179,7 @@ class ArticulatedModel(ParsedModel):
             self,
             plant=plant,
             scene_graph=scene_graph,
-            position_names=positions.names,
-            position_kinds=positions.kinds,
-            lower=positions.lower,
-            upper=positions.upper,
-            default_positions=positions.defaults,
-            periodic=positions.periodic,
-            turns_freely=positions.turns_freely,
+            **_position_fields(positions),
             link_meshes=MappingProxyType({self.link_names[0]: dot, link: dot, OBJECT: mesh}),
             skin=(),
         )
@@ -270,18 +259,25 @@ def read_model(
         name=plant.GetModelInstanceName(instances[0]),
         plant=plant,
         scene_graph=scene_graph,
-        position_names=positions.names,
-        position_kinds=positions.kinds,
-        lower=positions.lower,
-        upper=positions.upper,
-        default_positions=positions.defaults,
-        periodic=positions.periodic,
-        turns_freely=positions.turns_freely,
+        **_position_fields(positions),
         link_meshes=MappingProxyType(meshes),
         skin=load_skin(path, link_names(plant)),
         warnings=tuple(limit_kinds([*warnings, *positions.warnings])),
         _source=source,
     )
+
+
+def _position_fields(positions: Positions) -> dict[str, Any]:
+    """What a model says of its plant's positions, by the names of its fields."""
+    return {
+        "position_names": positions.names,
+        "position_kinds": positions.kinds,
+        "lower": positions.lower,
+        "upper": positions.upper,
+        "default_positions": positions.defaults,
+        "periodic": positions.periodic,
+        "turns_freely": positions.turns_freely,
+    }
 
 
 def _parse(

@@ -89,9 +89,7 @@ def _of_three(X_WL: Array, X_CT: Sequence[Array]) -> HandEye:
     B = np.stack([poses[:, j] @ inverse_transforms(poses[:, i]) for i, j in pairs], axis=1)
     b = Rotation.from_matrix(B[:, :, :3, :3].reshape(-1, 3, 3)).as_rotvec().reshape(-1, 3, 3)
     # Rotations R with a = R b in least squares.
-    U, _, V = np.linalg.svd(np.einsum("pi,npj->nij", a, b))
-    U[:, :, 2] *= np.sign(np.linalg.det(U @ V))[:, None]
-    R_LC = U @ V
+    R_LC = _nearest_rotations(np.einsum("pi,npj->nij", a, b))
     M = np.broadcast_to((A[:, :3, :3] - np.eye(3)).reshape(9, 3), (len(kept), 9, 3))
     t = (np.einsum("nij,npj->npi", R_LC, B[:, :, :3, 3]) - A[:, :3, 3]).reshape(-1, 9)
     X_LC = np.tile(np.eye(4), (len(kept), 1, 1))
@@ -109,7 +107,12 @@ def _angles(X: Array, others: Array) -> Array:
 def _mean_poses(X: Array) -> Array:
     """(n, 4, 4) the means of poses (n, k, 4, 4): places, and rotations nearest to the mean's."""
     mean = X.mean(axis=1)
-    U, _, V = np.linalg.svd(mean[:, :3, :3])
-    U[:, :, 2] *= np.sign(np.linalg.det(U @ V))[:, None]
-    mean[:, :3, :3] = U @ V
+    mean[:, :3, :3] = _nearest_rotations(mean[:, :3, :3])
     return np.asarray(mean)
+
+
+def _nearest_rotations(M: Array) -> Array:
+    """(n, 3, 3) the rotations nearest to matrices (n, 3, 3)."""
+    U, _, V = np.linalg.svd(M)
+    U[:, :, 2] *= np.sign(np.linalg.det(U @ V))[:, None]
+    return np.asarray(U @ V)

@@ -152,8 +152,24 @@ class FrameMisfit:
     agrees: bool
 
 
+class _UncertainPose:
+    """How sure a pose is whose errors' covariance is known."""
+
+    covariance: Array
+
+    @property
+    def rotation_sd(self) -> float:
+        """Standard deviation of the rotation, root mean square over the axes [rad]."""
+        return _root_mean_square(self.covariance[:3, :3])
+
+    @property
+    def translation_sd(self) -> float:
+        """Standard deviation of the place, root mean square over the axes [m]."""
+        return _root_mean_square(self.covariance[3:, 3:])
+
+
 @dataclass(frozen=True, eq=False)
-class ObjectPose:
+class ObjectPose(_UncertainPose):
     """Where an object stands that a camera on a robot's link has seen.
 
     Args:
@@ -170,19 +186,9 @@ class ObjectPose:
     alternatives: Array
     round_about: Array
 
-    @property
-    def rotation_sd(self) -> float:
-        """Standard deviation of the rotation, root mean square over the axes [rad]."""
-        return _root_mean_square(self.covariance[:3, :3])
-
-    @property
-    def translation_sd(self) -> float:
-        """Standard deviation of the place, root mean square over the axes [m]."""
-        return _root_mean_square(self.covariance[3:, 3:])
-
 
 @dataclass(frozen=True, eq=False)
-class RegisteredCamera:
+class RegisteredCamera(_UncertainPose):
     """Where a camera stands.
 
     Args:
@@ -199,16 +205,6 @@ class RegisteredCamera:
     frames: tuple[FrameMisfit, ...]
     alternatives: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
     seen_object: ObjectPose | None = None
-
-    @property
-    def rotation_sd(self) -> float:
-        """Standard deviation of the rotation, root mean square over the axes [rad]."""
-        return _root_mean_square(self.covariance[:3, :3])
-
-    @property
-    def translation_sd(self) -> float:
-        """Standard deviation of the place, root mean square over the axes [m]."""
-        return _root_mean_square(self.covariance[3:, 3:])
 
     @property
     def contradictions(self) -> tuple[str, ...]:

@@ -14,9 +14,9 @@ from scipy.special import chdtri
 from drake_pose.apps.experiments.shimada.motion import (
     ACCELERATIONS,
     FRAMES,
-    OBSERVED,
     SyntheticSequence,
     make_sequence,
+    require_observed,
 )
 from drake_pose.body import bundled_model, load_model
 from drake_pose.errors import SettingsError
@@ -180,8 +180,7 @@ def run_experiment(
     """
     if runs < 1:
         raise SettingsError(f"runs must be 1 or more, not {runs}")
-    if observed not in OBSERVED:
-        raise SettingsError(f"observed must be one of {', '.join(OBSERVED)}, not '{observed}'")
+    require_observed(observed)
     settings = experiment_settings(truncation, iterations)
     hand_filter, observation = experiment_filter(settings)
     # The first call of compiled code loads it, which belongs to no update.

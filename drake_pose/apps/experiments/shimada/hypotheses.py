@@ -10,7 +10,11 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from drake_pose.apps.experiments.shimada.experiment import experiment_filter, experiment_settings
-from drake_pose.apps.experiments.shimada.motion import OBSERVED, SyntheticSequence, make_sequence
+from drake_pose.apps.experiments.shimada.motion import (
+    SyntheticSequence,
+    make_sequence,
+    require_observed,
+)
 from drake_pose.errors import SettingsError
 from drake_pose.filtering import FilterState, Inequalities
 from drake_pose.filtering.hand.observation import FLEXIONS, HAND_STATE, SPREADS
@@ -194,8 +198,7 @@ def run_hypotheses_experiment(
     """
     if runs < 1:
         raise SettingsError(f"runs must be 1 or more, not {runs}")
-    if observed not in OBSERVED:
-        raise SettingsError(f"observed must be one of {', '.join(OBSERVED)}, not '{observed}'")
+    require_observed(observed)
     settings = replace(
         experiment_settings(truncation, iterations), hypothesis_cap=_CAP, smallest_weight=0.0
     )

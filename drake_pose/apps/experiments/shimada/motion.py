@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.errors import SettingsError
 from drake_pose.filtering.hand.observation import (
     FLEXIONS,
     HAND_STATE,
@@ -33,6 +34,16 @@ ACCELERATIONS = {
     **dict.fromkeys((*SPREADS, *FLEXIONS), math.radians(0.8)),
 }
 """Standard deviations of the accelerations per frame^2: [pixel], -, [rad]."""
+
+
+def require_observed(observed: str) -> None:
+    """Refuses what is none of OBSERVED.
+
+    Raises:
+        SettingsError: it is none.
+    """
+    if observed not in OBSERVED:
+        raise SettingsError(f"observed must be one of {', '.join(OBSERVED)}, not '{observed}'")
 
 
 @dataclass(frozen=True, eq=False)

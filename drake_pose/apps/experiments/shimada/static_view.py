@@ -12,7 +12,11 @@ from drake_pose.apps.experiments.shimada.experiment import (
     experiment_filter,
     experiment_settings,
 )
-from drake_pose.apps.experiments.shimada.motion import OBSERVED, SyntheticSequence, make_sequence
+from drake_pose.apps.experiments.shimada.motion import (
+    SyntheticSequence,
+    make_sequence,
+    require_observed,
+)
 from drake_pose.errors import SettingsError
 from drake_pose.filtering import Belief, FilterState, TruncatedFilter
 from drake_pose.filtering.hand.observation import HAND_STATE, LENGTHS, MEASURED, HandObservation
@@ -109,8 +113,7 @@ def run_static_experiment(
     """
     if runs < 1 or not marks or min(marks) < 1:
         raise SettingsError(f"runs and marks must be 1 or more, not {runs} and {marks}")
-    if observed not in OBSERVED:
-        raise SettingsError(f"observed must be one of {', '.join(OBSERVED)}, not '{observed}'")
+    require_observed(observed)
     if start not in STARTS:
         raise SettingsError(f"start must be one of {', '.join(STARTS)}, not '{start}'")
     hand_filter, observation = experiment_filter(experiment_settings(truncation, iterations))

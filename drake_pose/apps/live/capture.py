@@ -10,7 +10,7 @@ import numpy as np
 
 from drake_pose.apps.estimate.capture import bundled_person
 from drake_pose.apps.live.frame_results import LiveResult, LiveWriter
-from drake_pose.apps.live.run import FrameWatch, LiveFrame, run_live
+from drake_pose.apps.live.run import FrameWatch, run_live
 from drake_pose.apps.live.scene import LiveScene
 from drake_pose.apps.live.shape import fit_first_frames, shape_of_result
 from drake_pose.apps.results.folder import require_empty
@@ -85,20 +85,12 @@ def capture_live(
     sensors = opener()
     try:
         diagram = build_live_capture(tracker, scene.cameras, sensors, with_deviations=True)
-        result = LiveWriter(scene, model, tracker, out, sensors.period, settings.packages)
+        period, packages = sensors.period, settings.packages
+        result = LiveWriter(scene, model, tracker, out, period, packages, on_report, on_frame)
         result.open("person", shape)
         try:
-
-            def note(frame: LiveFrame) -> None:
-                found = result.add(frame)
-                on_frame(result.count, found)
-
-            def report(text: str) -> None:
-                result.tell(text)
-                on_report(text)
-
-            watch = FrameWatch(diagram, scene.cameras, note)
-            interrupted = run_live(diagram, sensors, settings.seconds, report, monitor=watch)
+            watch = FrameWatch(diagram, scene.cameras, result.add)
+            interrupted = run_live(diagram, sensors, settings.seconds, result.tell, monitor=watch)
             result.finish(sensors, settings.replay)
         finally:
             result.writer.close()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -60,6 +60,8 @@ class LiveWriter:
         out: the result's folder, empty or not there.
         period: time between two frames [s].
         packages: folders of packages that the model's ``package://`` names mean, by name.
+        on_report: hears what the user is told.
+        on_frame: hears of each frame: how many there are, and whether a person was found.
 
     Raises:
         OutputError: the folder is not empty, or cannot be written.
@@ -73,9 +75,12 @@ class LiveWriter:
         out: Path,
         period: float,
         packages: Mapping[str, Path],
+        on_report: Callable[[str], None],
+        on_frame: Callable[[int, bool], None],
     ) -> None:
         self._scene, self._model, self._tracker = scene, model, tracker
         self._period = period
+        self._on_report, self._on_frame = on_report, on_frame
         self._times: dict[str, float] = {}
         self._seen: dict[tuple[str, str], Path] = {}
         self._told: list[str] = []
@@ -92,9 +97,10 @@ class LiveWriter:
         return len(self._times)
 
     def tell(self, text: str) -> None:
-        """Notes what the user was told while the capture ran."""
+        """Tells the user while the capture runs, and notes it."""
         self._told.append(text)
         self.writer.warn([text])
+        self._on_report(text)
 
     def result(self, interrupted: bool) -> LiveResult:
         """What came out, when the folder is closed."""
@@ -102,8 +108,8 @@ class LiveWriter:
         troubles = tuple(text for text in estimate.warnings if text not in self._told)
         return LiveResult(estimate, interrupted, troubles)
 
-    def add(self, frame: LiveFrame) -> bool:
-        """Writes a frame, which is named after the periods since the first; whether found."""
+    def add(self, frame: LiveFrame) -> None:
+        """Writes a frame, which is named after the periods since the first."""
         self._last = max(self._last + 1, round(frame.time / self._period))
         name = f"{self._last:06d}"
         self._times[name] = frame.time
@@ -122,7 +128,7 @@ class LiveWriter:
             share=frame.share if np.isfinite(frame.share) else None,
         )
         self.writer.finish_frame(row, record)
-        return row.found
+        self._on_frame(self.count, row.found)
 
     def open(self, method: str, shape: KnownShape | None = None) -> None:
         """Opens the files; shape: the person's lengths and girths, None: the model's."""

@@ -95,10 +95,11 @@ def capture_paper(
     sensors = opener()
     try:
         tracker = tracker_of_person(model.pose_tree(), None)
-        result = LiveWriter(scene, model, tracker, out, sensors.period, settings.packages)
+        period, packages = sensors.period, settings.packages
+        result = LiveWriter(scene, model, tracker, out, period, packages, on_report, on_frame)
         result.open(METHOD)
         try:
-            interrupted = _follow(setup, sensors, result, settings.seconds, on_report, on_frame)
+            interrupted = _follow(setup, sensors, result, settings.seconds)
             result.finish(sensors, settings.replay)
         finally:
             result.writer.close()
@@ -112,21 +113,14 @@ def _follow(
     sensors: LocalSensors,
     result: LiveWriter,
     seconds: float | None,
-    on_report: Callable[[str], None],
-    on_frame: Callable[[int, bool], None],
 ) -> bool:
     """Follows the person and writes all frames; whether Ctrl-C ended it."""
     diagram = build_paper_capture(setup, sensors.capture, sensors.period).diagram
     doubts = _Doubts(diagram)
 
     def note(frame: LiveFrame) -> None:
-        found = result.add(frame)
+        result.add(frame)
         doubts.add(*next(reversed(result.writer.records.items())))
-        on_frame(result.count, found)
-
-    def report(text: str) -> None:
-        result.tell(text)
-        on_report(text)
 
     frames = FrameWatch(diagram, setup.cameras, note, "person_view")
 
@@ -134,7 +128,7 @@ def _follow(
         doubts.look(context)
         frames(context)
 
-    interrupted = run_live(diagram, sensors, seconds, report, monitor=watch)
+    interrupted = run_live(diagram, sensors, seconds, result.tell, monitor=watch)
     result.writer.warn(doubts.texts())
     return interrupted
 

@@ -96,8 +96,12 @@ def find_edge_points(region: Mask, spacing: float) -> EdgePoints:
     uv, normals, lengths = _sample(
         np.concatenate(chains), starts, spacing, region.shape[1], region.shape[0]
     )
+    order = np.argsort(uv[:, 1])
     return EdgePoints(
-        uv, normals, lengths, np.array([largest["m10"] / area, largest["m01"] / area])
+        uv[order],
+        normals[order],
+        lengths[order],
+        np.array([largest["m10"] / area, largest["m01"] / area]),
     )
 
 
@@ -132,5 +136,4 @@ def _sample(
             uv[found, 0], uv[found, 1] = x + inside * n0, y + inside * n1
             lengths[found] = size / (2 * _CHORD) * count / points
             found += 1
-    order = np.argsort(uv[:found, 1])
-    return uv[order], normals[order], lengths[order]
+    return uv[:found], normals[:found], lengths[:found]

@@ -21,8 +21,8 @@ def surface_distance(one: Outline, other: Outline) -> float:
     """
     if len(one.triangles) == 0 or len(other.triangles) == 0:
         return np.inf
-    there = _nearest(_spread(one), other.vertices, other.triangles)
-    back = _nearest(_spread(other), one.vertices, one.triangles)
+    there = _nearest(_spread(one), other.vertices, other.triangles, *_balls(other))
+    back = _nearest(_spread(other), one.vertices, one.triangles, *_balls(one))
     return float(np.sqrt(0.5 * (there.mean() + back.mean())))
 
 
@@ -36,24 +36,25 @@ def _spread(outline: Outline) -> Array:
     return a + np.sqrt(across) * ((b - a) + along * (c - b))
 
 
+def _balls(outline: Outline) -> tuple[Array, Array]:
+    """Centres (m, 3) and radii (m,) of balls around a surface's triangles."""
+    corners = outline.vertices[outline.triangles]
+    centers = corners.mean(axis=1)
+    return centers, np.linalg.norm(corners - centers[:, None], axis=2).max(axis=1)
+
+
 @compiled
-def _nearest(points: Array, vertices: Array, triangles: NDArray[np.int32]) -> Array:
+def _nearest(
+    points: Array, vertices: Array, triangles: NDArray[np.int32], centers: Array, radii: Array
+) -> Array:
     """The squared distance of each point (n, 3) to a surface (n,)."""
-    count = len(triangles)
-    centers, radii = np.zeros((count, 3)), np.zeros(count)
-    for t in range(count):
-        for corner in triangles[t]:
-            centers[t] += vertices[corner] / 3.0
-        for corner in triangles[t]:
-            radii[t] = max(radii[t], _squared(vertices[corner], centers[t]))
-        radii[t] = np.sqrt(radii[t])
     result = np.empty(len(points))
     for i in range(len(points)):
         nearest = np.inf
         for vertex in range(len(vertices)):
             nearest = min(nearest, _squared(points[i], vertices[vertex]))
         reach = np.sqrt(nearest)
-        for t in range(count):
+        for t in range(len(triangles)):
             # Nothing in the ball around a triangle is nearer than what was found.
             if _squared(points[i], centers[t]) < (reach + radii[t]) ** 2:
                 distance = _to_triangle(points[i], vertices, triangles[t])

@@ -24,10 +24,14 @@ def test_edges_settle_what_the_silhouette_leaves_open() -> None:
     assert counts["edges_settle"] <= counts["edges_narrow"]
     assert counts["edges_settle_rightly"] == counts["edges_settle"]
     assert counts["edges_keep_truth"] == counts["ambiguous"]
+    # With edges to the pixel nothing that can be settled is left open.
+    assert counts["edges_settle"] + counts["edges_undecidable"] == counts["ambiguous"]
     assert str(counts["edges_keep_truth"]) in edge_lines(counts)
     noisy = settle_by_edges(replace(result, trials=tuple(few)), noise=0.2)
     assert noisy["edges_keep_truth"] == noisy["ambiguous"] == len(few)
-    assert noisy["edges_settle"] <= counts["edges_settle"]
+    assert 0 < noisy["edges_settle"] <= counts["edges_settle"]
+    assert noisy["edges_settle_rightly"] == noisy["edges_settle"]
+    assert noisy["edges_undecidable"] == counts["edges_undecidable"]
 
 
 def test_noise_loses_moves_and_adds_edges() -> None:
@@ -39,4 +43,5 @@ def test_noise_loses_moves_and_adds_edges() -> None:
     near = np.abs(columns - 39) <= 1
     assert 0.4 < near.sum() / 80 < 0.9
     assert (~near).any()
+    assert (noisy.errors.missing, noisy.errors.wrong) == (0.3, 0.075)
     assert noisy_edges(edges, 0.9, np.random.default_rng(0)).edges[:, 38:41].sum() < near.sum()

@@ -13,9 +13,11 @@ import numpy as np
 from drake_pose.apps.experiments.kameda.experiment import ExperimentResult, Trial
 from drake_pose.matching.grid.families.inner_edges import (
     EdgeChoice,
+    EdgeErrors,
     InnerEdges,
     choose_by_edges,
     edges_of_labels,
+    find_borders,
 )
 from drake_pose.matching.grid.families.search import GridPoseSet, samples_at
 from drake_pose.silhouette import LabelRenderer
@@ -26,11 +28,13 @@ COUNTS = (
     "edges_settle",
     "edges_settle_rightly",
     "edges_keep_truth",
+    "edges_undecidable",
 )
 
 # Edges are lost in squares of so many pixels, as they are where colours are alike, not singly.
 _SQUARE = 5
-_STROKE = 5
+# So long are the wrong ones of what is lost.
+_WRONG = 0.25
 
 
 def settle_by_edges(
@@ -48,8 +52,9 @@ def settle_by_edges(
     Returns:
         How many silhouettes are ``ambiguous``: more than one pose is as good; in how many of them
         the edges leave fewer poses (``edges_narrow``) and one (``edges_settle``), in how many that
-        one is the true pose (``edges_settle_rightly``), and in how many the true pose is not ruled
-        out (``edges_keep_truth``).
+        one is the true pose (``edges_settle_rightly``), in how many the true pose is not ruled out
+        (``edges_keep_truth``), and in how many another pose has the true one's edges to the pixel
+        (``edges_undecidable``): these cannot be settled.
     """
     renderer = LabelRenderer(result.search.tree.model, result.camera)
     counts = dict.fromkeys(COUNTS, 0)
@@ -68,6 +73,7 @@ def noisy_edges(edges: InnerEdges, share: float, generator: np.random.Generator)
     """Edges as a picture's may be: this share is missing, the others are a pixel off, some wrong.
 
     Wrong ones are short strokes anywhere inside the silhouette, a quarter as long as what is lost.
+    The edges that are returned are judged by the rates of these errors.
 
     Args:
         edges: the true ones.
@@ -83,12 +89,13 @@ def noisy_edges(edges: InnerEdges, share: float, generator: np.random.Generator)
     drawn = np.zeros(shape, dtype=np.uint8)
     drawn[tuple(places.T)] = 1
     inside = np.argwhere(edges.mask)
-    count = round(0.25 * share * float(edges.edges.sum()) / _STROKE)
+    count = round(_WRONG * share * float(edges.edges.sum()) / _SQUARE)
     for row, column in inside[generator.integers(len(inside), size=count)]:
         angle = generator.uniform(0.0, 2.0 * np.pi)
-        end = np.rint([column + _STROKE * np.cos(angle), row + _STROKE * np.sin(angle)])
+        end = np.rint([column + _SQUARE * np.cos(angle), row + _SQUARE * np.sin(angle)])
         cv2.line(drawn, (int(column), int(row)), (int(end[0]), int(end[1])), 1)
-    return replace(edges, edges=(drawn > 0) & edges.mask)
+    errors = EdgeErrors(share, _WRONG * share, _SQUARE)
+    return replace(edges, edges=(drawn > 0) & edges.mask, errors=errors)
 
 
 def _judge(
@@ -99,12 +106,21 @@ def _judge(
     generator: np.random.Generator,
 ) -> dict[str, bool]:
     """What the edges of one silhouette's true pose settle."""
-    q_true, X_WB = answer.sampled.tree.positions_from(trial.true_values)
-    seen = renderer.segments(q_true, X_WB)
-    edges = edges_of_labels(seen, seen >= 0)
-    if noise:
-        edges = noisy_edges(edges, noise, generator)
-    choice = choose_by_edges(answer, [edges], [renderer.segments])
+    q_true, X_WB_true = answer.sampled.tree.positions_from(trial.true_values)
+    seen = renderer.segments(q_true, X_WB_true)
+    exact = edges_of_labels(seen, seen >= 0)
+    edges = noisy_edges(exact, noise, generator) if noise else exact
+    alike = 0
+
+    def render(q: np.ndarray, X_WB: np.ndarray) -> np.ndarray:
+        nonlocal alike
+        segments = renderer.segments(q, X_WB)
+        if not (np.array_equal(q, q_true) and np.array_equal(X_WB, X_WB_true)):
+            borders = find_borders(np.where(exact.mask, segments, -1))
+            alike += np.array_equal(borders, exact.edges)
+        return segments
+
+    choice = choose_by_edges(answer, [edges], [render])
     true = samples_at(answer.sampled, trial.true_values)
     assert true is not None, "drawn from the grid"
     return {
@@ -113,6 +129,7 @@ def _judge(
         "edges_settle": choice.settled,
         "edges_settle_rightly": choice.settled and _is_only(choice, true),
         "edges_keep_truth": not choice.rules_out(true),
+        "edges_undecidable": alike > 0,
     }
 
 
@@ -127,5 +144,6 @@ def edge_lines(counts: dict[str, int]) -> str:
         f"Of {counts['ambiguous']} ambiguous silhouettes, edges inside them narrow the poses in "
         f"{counts['edges_narrow']}, leave one in {counts['edges_settle']} (the true one in "
         f"{counts['edges_settle_rightly']}), and do not rule out the true one in "
-        f"{counts['edges_keep_truth']}."
+        f"{counts['edges_keep_truth']}. In {counts['edges_undecidable']} another pose has the true "
+        "one's edges to the pixel: no edges can settle these."
     )

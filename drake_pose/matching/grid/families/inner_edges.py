@@ -1,9 +1,9 @@
 """Edges inside the silhouette choose among poses that the silhouette cannot tell apart.
 
 Where one limb passes in front of another, a label or colour image shows an edge that the silhouette
-does not (Kameda, Minoh, Ikeda, section 7, name this as future work). A pose is judged by how well
-the edges between its visible segments agree with those of the picture: the F measure of boundaries
-(Martin, Fowlkes, Malik 2004), edges matched within a few pixels.
+does not (Kameda, Minoh, Ikeda, section 7, name this as future work). How likely the edges are if a
+pose is the true one follows from how often edges are missed, displaced or wrong; poses under which
+they are far too unlikely are ruled out, so that the true one seldom is (``choose_by_edges``).
 """
 
 import itertools
@@ -13,24 +13,81 @@ from functools import cached_property
 
 import cv2
 import numpy as np
+from scipy.special import logsumexp
 
 from drake_pose.errors import SettingsError
 from drake_pose.matching.grid.branch_and_bound.partial_pose_graph import PartialPoseGraph
 from drake_pose.matching.grid.families.joint_estimates import estimate_joints
 from drake_pose.matching.grid.families.search import GridPoseSet
-from drake_pose.matching.pose_families import JointEstimate, PoseSet
+from drake_pose.matching.pose_families import JointEstimate
 
 RenderSegments = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Draws a pose, q (nq,) and X_WB (4, 4): (H, W) int the segment seen at each pixel, -1 for none.
 ``LabelRenderer.segments`` is one."""
 
-_TOLERANCE = 2.0
-_ALIKE = 0.005
-# Of what even the best pose lacks, so much may be chance between it and another.
-_CHANCE = 0.1
 _CANNY = (50, 150)
 # Colours change at the silhouette's edge, too: so near to it no edge counts.
 _RIM = 3
+# Where no wrong edge passes, so few pixels are wrong nevertheless.
+_WRONG_PIXEL = 1e-3
+# Errors reach beyond a patch into its neighbours, but seldom farther. In each of four classes of
+# patches none touches another: by Hoelder's inequality the fourth root of the product over all
+# patches exaggerates nothing, as if each class alone had been looked at.
+_CLASSES = 4
+
+
+@dataclass(frozen=True)
+class EdgeErrors:
+    """How the edges of a picture may be wrong; all of them are up to a pixel off besides.
+
+    Args:
+        missing: the share that is not seen.
+        wrong: the length of those that are none, as a share of the true ones'.
+        patch: edges are missing in squares of this side, and so long is a wrong one [pixel].
+
+    Raises:
+        SettingsError: if a value is out of its range.
+    """
+
+    missing: float = 0.2
+    wrong: float = 0.05
+    patch: int = 5
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.missing < 1.0:
+            raise SettingsError(f"missing must be above 0 and below 1, not {self.missing}")
+        if not 0.0 < self.wrong < np.inf:
+            raise SettingsError(f"wrong must be above 0 and finite, not {self.wrong}")
+        if self.patch < 1:
+            raise SettingsError(f"patch must be 1 pixel or more, not {self.patch}")
+
+    @cached_property
+    def log_pixel(self) -> np.ndarray:
+        """The log probability (4, 2, 10) of a pixel.
+
+        By what its patch holds (0: nothing, 1: the true edges, 2: a wrong one, 3: both), by whether
+        an edge is seen there, and by how many of it and its neighbours the pose expects one at.
+        """
+        expected = np.arange(10)
+        table = np.empty((4, 2, 10))
+        for state in range(4):
+            unexplained = 1.0 / (1 + self.patch) if state >= 2 else _WRONG_PIXEL
+            # Each expected pixel is displaced to any of the nine around it.
+            missed = (1.0 - unexplained) * (8.0 / 9.0) ** (expected * (state % 2))
+            table[state] = np.log([missed, 1.0 - missed])
+        return table
+
+    def log_patch(self, seen: int, patches: float) -> np.ndarray:
+        """The log probability (4,) of what a patch holds, as in ``log_pixel``.
+
+        Args:
+            seen: how many pixels of the picture are edges.
+            patches: how many patches there are.
+        """
+        # A line as long as a patch is wide lies in two of them, mostly.
+        wrong = np.clip(2.0 * self.wrong * seen / (self.patch * patches), _WRONG_PIXEL, 0.5)
+        missing = self.missing
+        return np.log(np.outer([1.0 - wrong, wrong], [missing, 1.0 - missing]).ravel())
 
 
 @dataclass(frozen=True)
@@ -41,19 +98,16 @@ class InnerEdges:
         edges: (H, W) bool.
         window: first row, row after the last, first column and column after the last of the
             silhouette's surroundings.
+        mask: (H, W) bool, the silhouette.
         rim: so near to the silhouette's edge no edge counts [pixel].
+        errors: how they may be wrong.
     """
 
     edges: np.ndarray
     window: tuple[int, int, int, int]
     mask: np.ndarray
     rim: int
-
-    @cached_property
-    def _seen_distances(self) -> np.ndarray:
-        """The distance of each pixel of the window to the nearest edge [pixel]."""
-        top, bottom, left, right = self.window
-        return _distances(self.edges[top:bottom, left:right])
+    errors: EdgeErrors = EdgeErrors()
 
     @cached_property
     def _inside(self) -> np.ndarray:
@@ -61,22 +115,44 @@ class InnerEdges:
         top, bottom, left, right = self.window
         return _interior(self.mask[top:bottom, left:right], self.rim)
 
-    def agreement(self, segments: np.ndarray, tolerance: float = _TOLERANCE) -> float:
-        """How well the borders between visible segments (H, W) int agree with the edges: 0 to 1.
+    @cached_property
+    def _seen(self) -> np.ndarray:
+        """(pixels inside,) int: 1 where an edge is seen."""
+        top, bottom, left, right = self.window
+        return self.edges[top:bottom, left:right][self._inside].astype(np.int64)
+
+    @cached_property
+    def _patches(self) -> np.ndarray:
+        """(pixels inside,) int: the patch that each lies in."""
+        rows, columns = (places // self.errors.patch for places in np.nonzero(self._inside))
+        across = 1 + int(columns.max(initial=0))
+        return np.unique(rows * across + columns, return_inverse=True)[1]
+
+    def log_likelihood(self, segments: np.ndarray) -> float:
+        """The log probability of the edges if a pose's picture is segments (H, W) int.
+
+        That the edges are without any error counts as likely beforehand as that they have the
+        errors which ``errors`` describes.
 
         Args:
             segments: the segment seen at each pixel, -1 where none is.
-            tolerance: edges so near to each other match [pixel].
         """
         top, bottom, left, right = self.window
         window = (slice(top, bottom), slice(left, right))
-        expected = find_borders(segments[window]) & self._inside
-        seen = self.edges[window]
-        if not expected.any() or not seen.any():
-            return float(not expected.any() and not seen.any())
-        found = float((_distances(expected)[seen] <= tolerance).mean())
-        explained = float((self._seen_distances[expected] <= tolerance).mean())
-        return 2.0 * found * explained / (found + explained) if found + explained else 0.0
+        borders = find_borders(np.where(self.mask[window], segments[window], -1))
+        near = cv2.boxFilter(
+            borders.astype(np.float32), -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT
+        )
+        expected = np.rint(near[self._inside]).astype(np.int64)
+        sums = [
+            np.bincount(self._patches, table[self._seen, expected])
+            for table in self.errors.log_pixel
+        ]
+        seen = int(self._seen.sum())
+        weights = self.errors.log_patch(seen, max(1.0, len(expected) / self.errors.patch**2))
+        damaged = float(logsumexp(np.array(sums) + weights[:, None], axis=0).sum()) / _CLASSES
+        flawless = 0.0 if np.array_equal(borders[self._inside], self._seen > 0) else -np.inf
+        return float(np.logaddexp(flawless, damaged) + np.log(0.5))
 
 
 def edges_of_labels(labels: np.ndarray, mask: np.ndarray) -> InnerEdges:
@@ -129,14 +205,15 @@ class EdgeChoice:
 
     Attributes:
         samples: (n, nodes) the poses judged, best first.
-        agreements: (n,) their agreement, 0 to 1, the mean over the cameras.
-        left: how many of the first agree as well as the best.
+        probabilities: (n,) of each, if one of these is the true one and all are as likely
+            beforehand.
+        left: how many of the first are not ruled out.
         joints: each value of the pose tree, over those left.
         exhaustive: whether all poses of the set were judged.
     """
 
     samples: np.ndarray
-    agreements: np.ndarray
+    probabilities: np.ndarray
     left: int
     joints: tuple[JointEstimate, ...]
     exhaustive: bool
@@ -147,81 +224,72 @@ class EdgeChoice:
         return self.left == 1 and self.exhaustive
 
     def rules_out(self, samples: np.ndarray) -> bool:
-        """Whether a pose of the set, samples (nodes,), was judged and agrees worse than the best.
+        """Whether a pose of the set, samples (nodes,), was judged and is ruled out.
 
         Of a large set not all poses are judged: one that was not is not ruled out.
         """
         return bool((self.samples[self.left :] == samples).all(axis=1).any())
 
 
-def rank_families(
-    answer: PoseSet, edges: Sequence[InnerEdges], renders: Sequence[RenderSegments]
-) -> np.ndarray:
-    """The agreement (families,), 0 to 1, of each family's representative.
-
-    Args:
-        answer: the families.
-        edges: of each camera.
-        renders: one for each camera.
-    """
-    return np.array(
-        [
-            _mean_agreement([render(family.q, family.X_WB) for render in renders], edges)
-            for family in answer.families
-        ]
-    )
-
-
 def choose_by_edges(
     answer: GridPoseSet,
     edges: Sequence[InnerEdges],
     renders: Sequence[RenderSegments],
-    most: int = 300,
-    alike: float = _ALIKE,
+    most: int = 1000,
+    risk: float = 1e-3,
 ) -> EdgeChoice:
     """Judge the poses of a set by inner edges.
+
+    A pose is ruled out where the edges are far less likely under it than under the mean of all.
+    That ratio's expectation is 1 under the true pose, so that by Markov's inequality the true one
+    is ruled out with probability ``risk`` at most, however many poses there are and whatever they
+    look like, as long as the edges are no worse than their ``errors`` say.
 
     Args:
         answer: the set.
         edges: of each camera.
         renders: one for each camera.
         most: a set of more poses is judged by this many random ones; from the best of them, one
-            node and all that hangs on it is then turned in as many ways while that helps.
-        alike: poses whose agreement is no more below the best one's count as equally good; where
-            the best one's is below 1, as edges are missing or wrong, a tenth of that more. Where a
-            pose agrees to the pixel, only such poses do.
+            node and all that hangs on it is then turned in a tenth as many ways while that helps.
+        risk: the probability that the true pose may be ruled out with.
+
+    Raises:
+        SettingsError: if the risk is not above 0 and below 1.
     """
+    if not 0.0 < risk < 1.0:
+        raise SettingsError(f"risk must be above 0 and below 1, not {risk}")
     tree = answer.sampled.tree
-    known: dict[tuple[int, ...], tuple[float, float]] = {}
+    known: dict[tuple[int, ...], float] = {}
 
     def judge(samples: np.ndarray) -> float:
         key = tuple(samples.tolist())
         if key not in known:
             values = [grid[t] for grid, t in zip(answer.sampled.values, samples, strict=True)]
             q, X_WB = tree.positions_from(values)
-            images = [render(q, X_WB) for render in renders]
-            known[key] = _mean_agreement(images, edges), _mean_agreement(images, edges, 0.0)
-        return known[key][0]
+            known[key] = sum(
+                edge.log_likelihood(render(q, X_WB))
+                for edge, render in zip(edges, renders, strict=True)
+            )
+        return known[key]
 
     exhaustive = answer.size <= most
     random = np.random.default_rng(0)
     members = _members(answer.graph, most, random)
-    agreements = [judge(samples) for samples in members]
+    found = [judge(samples) for samples in members]
     if not exhaustive:
-        _turn_subtrees(answer, members[int(np.argmax(agreements))], judge, most, random)
-    samples = np.array(list(known))
-    found, to_the_pixel = np.array(list(known.values())).T
-    is_left = found >= found.max() - alike - _CHANCE * (1.0 - found.max())
-    if to_the_pixel.max() == 1.0:
-        # Edges without any noise: who differs by a pixel is not the one.
-        is_left &= to_the_pixel == 1.0
-    order = np.lexsort((-found, ~is_left))
-    samples, found, left = samples[order], found[order], int(is_left.sum())
+        _turn_subtrees(answer, members[int(np.argmax(found))], judge, 1 + most // 10, random)
+    log_likelihoods = np.array(list(known.values()))
+    log_probabilities = log_likelihoods - logsumexp(log_likelihoods)
+    order = np.argsort(-log_probabilities, kind="stable")
+    samples, log_probabilities = np.array(list(known))[order], log_probabilities[order]
+    # Half of the probability beforehand is that of edges without error, in each camera's picture.
+    allowed = np.log(risk) - len(edges) * np.log(2.0) - np.log(answer.size)
+    left = max(1, int((log_probabilities >= allowed).sum()))
     seen = [np.unique(column) for column in samples[:left].T]
     best = [grid[t] for grid, t in zip(answer.sampled.values, samples[0], strict=True)]
     complete = answer.complete and exhaustive
     joints = estimate_joints(answer.sampled, seen, best, complete=complete)
-    return EdgeChoice(samples, found, left, joints, exhaustive)
+    return EdgeChoice(samples, np.exp(log_probabilities), left, joints, exhaustive)
 
 
 def _turn_subtrees(
@@ -248,11 +316,11 @@ def _turn_subtrees(
             for node, grid in enumerate(answer.sampled.values)
         ]
         members = _members(answer.graph.restricted(allowed), most, random)
-        agreements = [judge(member) for member in members]
+        found = [judge(member) for member in members]
         unchanged += 1
-        if max(agreements) > best:
-            place = int(np.argmax(agreements))
-            best, samples, unchanged = agreements[place], members[place], 0
+        if max(found) > best:
+            place = int(np.argmax(found))
+            best, samples, unchanged = found[place], members[place], 0
         if unchanged >= len(order):
             return
 
@@ -262,14 +330,6 @@ def _members(graph: PartialPoseGraph, most: int, random: np.random.Generator) ->
     if graph.size <= most:
         return graph.members()
     return graph.draw(most, random)
-
-
-def _mean_agreement(
-    images: Sequence[np.ndarray], edges: Sequence[InnerEdges], tolerance: float = _TOLERANCE
-) -> float:
-    """The mean agreement of segments (H, W) in each camera's picture with its edges."""
-    pairs = zip(images, edges, strict=True)
-    return float(np.mean([edge.agreement(image, tolerance) for image, edge in pairs]))
 
 
 def _window(shape: tuple[int, ...], mask: np.ndarray) -> tuple[int, int, int, int]:
@@ -292,9 +352,3 @@ def _interior(mask: np.ndarray, rim: int) -> np.ndarray:
     padded = np.pad(mask.astype(np.uint8), 1)
     distances = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return np.asarray(distances[1:-1, 1:-1] > rim)
-
-
-def _distances(edges: np.ndarray) -> np.ndarray:
-    """The distance (H, W) of each pixel to the nearest edge [pixel]."""
-    away = (~edges).astype(np.uint8)
-    return np.asarray(cv2.distanceTransform(away, cv2.DIST_L2, cv2.DIST_MASK_PRECISE))

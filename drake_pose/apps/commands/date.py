@@ -34,6 +34,13 @@ def date(
             "reach: as person, lowered until both feet are in the legs' reach."
         ),
     ] = "reach",
+    search: Annotated[
+        str,
+        typer.Option(
+            help="Of elbows and knees. rectangles: the paper's, on one circle; surfaces: points of "
+            "the limbs' surfaces, on the circles of hands and feet up to 1.5 cm nearer or farther."
+        ),
+    ] = "surfaces",
     out: PicturesOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -47,7 +54,9 @@ def date(
         if out is not None:
             require_empty(out)
         with count_progress("frames", frames) as advance:
-            result = run_experiment(cameras, frames, seed, method, advance, waist=waist)
+            result = run_experiment(
+                cameras, frames, seed, method, advance, waist=waist, search=search
+            )
         if out is not None:
             save_pictures(result, out)
         if json:

@@ -326,7 +326,8 @@ counted. Times are those of one core, without rendering.
     drake-pose reproduce date --cameras 5 --frames 120 --out results/date
 
 Elbows and knees are also compared as found, before the model with its stiff trunk is laid through
-them. The waist formula has this person's constants, or with --waist paper those of the paper.
+them. The waist formula has this person's constants, or with --waist paper those of the paper; with
+--search rectangles they are searched as the paper has it.
 """)
 
 CAPTURE = _help("""

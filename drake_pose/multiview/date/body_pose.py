@@ -10,15 +10,16 @@ from numpy.typing import NDArray
 
 from drake_pose.camera import Camera
 from drake_pose.multiview.date.inverse_kinematics import aim_trunk, move_limb, upper_body
-from drake_pose.multiview.date.limb_search import joint_circle, limb_angles, search_circle
+from drake_pose.multiview.date.limb_search import (
+    FEATURE_ERROR,
+    Search,
+    limb_angles,
+    search_limb,
+)
 from drake_pose.multiview.date.skeleton import LIMBS, Limb, Skeleton, rotation
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
-
-# How far a foot is measured off its place [m].
-_FEATURE_ERROR = 0.015
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ class PaperPose:
         limbs: by name, (3, 3) shoulder, elbow and hand, or hip, knee and foot, as found [m].
         neck: (3,) the neck's base [m].
         waist: (3,) half-way between the hips, by the waist formula [m].
-        scores: by limb: the correlation C of its middle joint; nan without the search.
+        scores: by limb: the correlation C of its middle joint; nan without a search.
     """
 
     q: Array
@@ -90,7 +91,7 @@ def estimate_pose(
     cameras: Sequence[Camera],
     regions: Sequence[Mask],
     *,
-    search: bool = True,
+    search: Search = "surfaces",
     waist: Waist | None = None,
 ) -> PaperPose:
     """Estimates a frame's pose.
@@ -103,8 +104,9 @@ def estimate_pose(
             which inverse kinematics may then move.
         cameras: the cameras on the circle.
         regions: (H, W) the person in each of their pictures.
-        search: whether elbows and knees are searched on their circles; otherwise they stay where
-            inverse kinematics puts them.
+        search: how elbows and knees are searched: "surfaces" by points of the limbs' surfaces, on
+            the circles of all ends within what hands and feet are measured off; "rectangles" as in
+            the paper, on one circle; "none": they stay where inverse kinematics puts them.
         waist: the constants of the waist formula; the paper's where not given.
     """
     q = _head_and_arms(skeleton, last, features, head_angles)
@@ -129,11 +131,12 @@ def estimate_pose(
             angles = move_limb(limb, R_aimed, root, q[limb.positions], end)
             found = np.array([root, _middle(limb, R_aimed, root, angles), end])
         scores[name] = float("nan")
-        if search:
-            circle = joint_circle(limb, root, end, outward)
-            found[1], _, scores[name] = search_circle(
-                limb, circle, root, end, cameras, regions, found[1], R, q[limb.positions]
+        if search != "none":
+            last_angles = q[limb.positions]
+            found[1], end, scores[name] = search_limb(
+                limb, R, root, end, outward, found[1], last_angles, cameras, regions, search
             )
+            found[2] = end
         own_root = neck + R_aimed @ limb.root_T
         angles = limb_angles(limb, R_aimed, own_root, found[1], end, q[limb.positions])
         # Where limits forbid that, the hand or foot counts more than the elbow or knee.
@@ -154,7 +157,7 @@ def _lowered(skeleton: Skeleton, R_WT: Array, place: Array, feet: Array) -> Arra
         across = float(np.linalg.norm(hip[:2] - foot[:2]))
         above = np.sqrt(max(0.0, sum(limb.lengths) ** 2 - across**2))
         beyond = max(beyond, float(hip[2] - foot[2] - above))
-    lower = min(beyond, max(0.0, 2.0 * (beyond - _FEATURE_ERROR)))
+    lower = min(beyond, max(0.0, 2.0 * (beyond - FEATURE_ERROR)))
     return np.array([*place[:2], place[2] - lower])
 
 

@@ -18,6 +18,7 @@ from drake_pose.multiview.date.body_pose import Waist
 from drake_pose.multiview.date.contours import Contour, measure_contour
 from drake_pose.multiview.date.faces import FaceTemplates
 from drake_pose.multiview.date.features import FeatureSettings
+from drake_pose.multiview.date.limb_search import Search
 from drake_pose.multiview.date.recognition import RegisteredPose
 from drake_pose.multiview.date.skeleton import Skeleton
 from drake_pose.multiview.date.skin_blobs import Blobs, SkinColour, skin_blobs
@@ -34,7 +35,7 @@ class CaptureSettings:
     Args:
         skin: which colours are skin.
         features: how 3-D points become features.
-        search: whether elbows and knees are searched on their circles.
+        search: how elbows and knees are searched on their circles; see estimate_pose.
         recognition: similarity from which the registered pose overwrites the state.
         waist: the constants of the waist formula.
         farthest_face: how far from the eigenspace a face may be [grey levels].
@@ -42,7 +43,7 @@ class CaptureSettings:
 
     skin: SkinColour = field(default_factory=SkinColour)
     features: FeatureSettings = field(default_factory=FeatureSettings)
-    search: bool = True
+    search: Search = "surfaces"
     recognition: float = 0.93
     waist: Waist = field(default_factory=Waist)
     farthest_face: float = 30.0

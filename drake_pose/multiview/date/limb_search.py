@@ -1,13 +1,15 @@
-"""Elbows and knees on their circles, by back-projected rectangles (Date et al., 4.1.2 and 4.2)."""
+"""Elbows and knees on their circles, by back-projection (Date et al., 4.1.2 and 4.2)."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from drake_pose.camera import Camera
 from drake_pose.compiled import compiled
@@ -23,12 +25,22 @@ KNEE_RANGE = (-180.0, 175.0)
 """Where a knee may be on its circle [deg], as far as the hip can turn; 0 is in front, positive
 outwards. Behind it lies where the leg is straight, as it ends at the foot's middle."""
 
+FEATURE_ERROR = 0.015
+"""How far hands and feet are measured off their places [m]."""
+
+Search = Literal["surfaces", "rectangles", "none"]
+# rectangles: the paper's way, a rectangle from root to middle joint and one from there to the end,
+# on the one circle that the measured end gives. surfaces: points of the segments' surfaces, on the
+# circles of all ends within FEATURE_ERROR along the limb: the radius of a nearly straight limb's
+# circle is 2 cm where its end is measured 1 mm too near.
+
 # A straight knee's angle is at its limit: how far beyond it may be measured.
 _BEND_TOLERANCE = math.radians(3.0)
 
 # The trunk's direction is measured, too: how far beyond its limits a hip may seem to be.
 _HIP_TOLERANCE = math.radians(10.0)
 _STEP_DEG = 5.0
+_END_STEP = 0.005
 _SAMPLES_ALONG = 12
 _SAMPLES_ACROSS = 5
 _STRAIGHT = 1e-9
@@ -85,45 +97,101 @@ def joint_circle(limb: Limb, root: Array, end: Array, outward: Array) -> Circle:
     return Circle(center, radius, i, -j if limb.name.endswith("leg") else j)
 
 
-def search_circle(
+class FoundLimb(NamedTuple):
+    """A limb whose elbow or knee was searched.
+
+    Attributes:
+        middle, end: (3,) elbow and hand, or knee and foot [m].
+        score: the correlation C there.
+    """
+
+    middle: Array
+    end: Array
+    score: float
+
+
+def search_limb(
     limb: Limb,
-    circle: Circle,
+    R_WT: Array,
     root: Array,
     end: Array,
+    outward: Array,
+    near: Array,
+    last: Array,
     cameras: Sequence[Camera],
     regions: Sequence[Mask],
-    near: Array,
-    R_WT: Array,
-    last: Array,
-) -> tuple[Array, float, float]:
-    """The place of an elbow or knee whose rectangles agree best with the silhouettes.
+    search: Search = "surfaces",
+) -> FoundLimb:
+    """The place of an elbow or knee at which the limb agrees best with the silhouettes.
 
     Args:
         limb: the limb.
-        circle: where its middle joint can be.
+        R_WT: (3, 3) the trunk's axes in the world: a knee is only where the hip can turn it.
         root, end: (3,) shoulder and hand, or hip and foot [m].
+        outward: (3,) from the neck's base to the shoulder, or from the waist to the hip.
+        near: (3,) of equally good places, the one nearest to this is taken: inverse kinematics's.
+        last: (4,) the limb's angles in the last frame [rad].
         cameras: the cameras.
         regions: (H, W) the person in each camera's picture.
-        near: (3,) of equally good places, the one nearest to this is taken: inverse kinematics's.
-        R_WT: (3, 3) the trunk's axes in the world: a knee is only where the hip can turn it.
-        last: (4,) the limb's angles in the last frame [rad].
-
-    Returns:
-        The joint (3,) [m], its angle on the circle [deg], and the correlation C there.
+        search: "surfaces" or "rectangles".
     """
-    is_leg = limb.name.endswith("leg")
-    low, high = KNEE_RANGE if is_leg else ELBOW_RANGE
-    degrees = np.arange(low, high + 0.5 * _STEP_DEG, _STEP_DEG)
-    middles = circle.points(degrees)
-    if is_leg:
-        _, beyond = place_limb(limb, R_WT, root, middles, end, last)
-        possible = beyond <= max(_HIP_TOLERANCE, float(beyond.min()))
-        degrees, middles = degrees[possible], middles[possible]
-    samples = rectangles(root, middles, end, limb.half_widths)
+    ends = [end] if search == "rectangles" else _possible_ends(limb, root, end)
+    found = [_places(limb, R_WT, root, one, outward, last) for one in ends]
+    middles, angles = (np.concatenate(values) for values in zip(*found, strict=True))
+    if search == "rectangles":
+        samples = rectangles(root, middles, end, limb.half_widths)
+    else:
+        samples = _points_of_segments(limb, R_WT, root, middles, angles)
     scores = correlation(samples, cameras, regions)
     best = np.flatnonzero(scores >= scores.max() - 1e-9)
     chosen = best[np.argmin(np.linalg.norm(middles[best] - near, axis=1))]
-    return middles[chosen], float(degrees[chosen]), float(scores[chosen])
+    counts = [len(places) for places, _ in found]
+    return FoundLimb(
+        middles[chosen], np.repeat(ends, counts, axis=0)[chosen], float(scores[chosen])
+    )
+
+
+def _possible_ends(limb: Limb, root: Array, end: Array) -> list[Array]:
+    """Where the end may be in truth, (3,) each: on its line from the root, and in reach."""
+    across = end - root
+    distance = float(np.linalg.norm(across))
+    direction = across / distance if distance > _STRAIGHT else np.array([0.0, 0.0, -1.0])
+    count = round(FEATURE_ERROR / _END_STEP)
+    steps = _END_STEP * np.arange(-count, count + 1)
+    distances = np.unique(np.clip(distance + steps, *_reach(limb)))
+    return [root + one * direction for one in distances]
+
+
+def _places(
+    limb: Limb, R_WT: Array, root: Array, end: Array, outward: Array, last: Array
+) -> tuple[Array, Array]:
+    """Where the middle joint may be (n, 3) for an end, and the limb's angles there (n, 4)."""
+    is_leg = limb.name.endswith("leg")
+    low, high = KNEE_RANGE if is_leg else ELBOW_RANGE
+    degrees = np.arange(low, high + 0.5 * _STEP_DEG, _STEP_DEG)
+    middles = joint_circle(limb, root, end, outward).points(degrees)
+    angles, beyond = place_limb(limb, R_WT, root, middles, end, last)
+    if is_leg:
+        possible = beyond <= max(_HIP_TOLERANCE, float(beyond.min()))
+        middles, angles = middles[possible], angles[possible]
+    return middles, angles
+
+
+def _points_of_segments(
+    limb: Limb, R_WT: Array, root: Array, middles: Array, angles: Array
+) -> Array:
+    """Points (n, m, 3) of both segments' surfaces for places (n, 3) and angles (n, 4)."""
+    letters = ["XYZ"[axis] for axis in limb.axes]
+    R_WU = R_WT @ Rotation.from_euler("".join(letters[:3]), angles[:, :3]).as_matrix()
+    R_WL = R_WU @ Rotation.from_euler(letters[3], angles[:, 3:]).as_matrix()
+    upper, lower = limb.surfaces
+    return np.concatenate(
+        [
+            root + upper @ R_WU.transpose(0, 2, 1),
+            middles[:, None] + lower @ R_WL.transpose(0, 2, 1),
+        ],
+        axis=1,
+    )
 
 
 def rectangles(root: Array, middles: Array, end: Array, half_widths: Array) -> Array:
@@ -276,21 +344,39 @@ def _middle_angles(limb: Limb, distance: float) -> list[float]:
 
     One or two inside its limits; where there is none, the limit that is nearest.
     """
-    axis = np.zeros(3)
-    axis[limb.axes[3]] = 1.0
-    along = (limb.middle_U @ axis) * (limb.end_L @ axis)
-    cosine = limb.middle_U @ limb.end_L - along
-    sine = limb.middle_U @ np.cross(axis, limb.end_L)
-    a, b = limb.lengths
-    wanted = float(0.5 * (distance**2 - a**2 - b**2) - along)
-    turn = math.acos(min(1.0, max(-1.0, wanted / math.hypot(cosine, sine))))
-    start = math.atan2(sine, cosine)
+    base, swing, start = _bending(limb)
+    turn = math.acos(min(1.0, max(-1.0, (distance**2 - base) / swing)))
     options = [math.remainder(start + sign * turn, 2.0 * math.pi) for sign in (-1.0, 1.0)]
     clipped = [min(max(option, limb.lower[3]), limb.upper[3]) for option in options]
     beyond = np.abs(np.subtract(options, clipped))
     return [
         c for c, off in zip(clipped, beyond, strict=True) if off <= beyond.min() + _BEND_TOLERANCE
     ]
+
+
+def _reach(limb: Limb) -> tuple[float, float]:
+    """The least and the largest distance of root and end inside the middle joint's limits [m]."""
+    base, swing, start = _bending(limb)
+    straight = min(max(start, limb.lower[3]), limb.upper[3])
+    squares = base + swing * np.cos(np.array([limb.lower[3], limb.upper[3], straight]) - start)
+    low, high = np.sqrt(np.maximum([squares.min(), squares.max()], 0.0))
+    return float(low), float(high)
+
+
+def _bending(limb: Limb) -> tuple[float, float, float]:
+    """How far apart root and end are: their squared distance is base + swing cos(bend - start).
+
+    Returns:
+        base and swing [m^2], and start [rad].
+    """
+    axis = np.zeros(3)
+    axis[limb.axes[3]] = 1.0
+    along = (limb.middle_U @ axis) * (limb.end_L @ axis)
+    cosine = limb.middle_U @ limb.end_L - along
+    sine = limb.middle_U @ np.cross(axis, limb.end_L)
+    a, b = limb.lengths
+    base, swing = a * a + b * b + 2.0 * along, 2.0 * math.hypot(cosine, sine)
+    return float(base), swing, math.atan2(sine, cosine)
 
 
 def _root_angles(limb: Limb, R_TU: Array, last: Array) -> tuple[Array, Array]:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.body import ArticulatedModel, ParsedModel, PoseTree
+from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.errors import ModelError
 
 Array = NDArray[np.float64]
@@ -26,6 +27,7 @@ FEATURES = ("head", "left_hand", "right_hand", "left_foot", "right_foot")
 
 _SEGMENTS = {"arm": ("upper_arm", "forearm", "hand"), "leg": ("thigh", "shin", "foot")}
 _FARTHEST_FEATURE = 0.05
+_POINTS_ON_SURFACE = 60
 _AXES = {"x": 0, "y": 1, "z": 2}
 
 
@@ -43,6 +45,8 @@ class Limb:
         lower, upper: (4,) their limits [rad].
         half_widths: (2,) mean distance of the upper and the lower segment's surface from the line
             through its joints [m].
+        surfaces: (m, 3) points all over the upper and the lower segment's surface, each in the
+            segment's frame [m].
     """
 
     name: str
@@ -54,6 +58,7 @@ class Limb:
     lower: Array
     upper: Array
     half_widths: Array
+    surfaces: tuple[Array, Array]
 
     @property
     def lengths(self) -> tuple[float, float]:
@@ -235,6 +240,10 @@ def _limb(tree: PoseTree, nodes: Mapping[str, int], X_WN: Array, name: str) -> L
                 _half_width(tree.model.link_meshes[lower].vertices, end_L),
             ]
         ),
+        surfaces=(
+            _surface_points(tree.model.link_meshes[upper]),
+            _surface_points(tree.model.link_meshes[lower]),
+        ),
     )
 
 
@@ -282,8 +291,20 @@ def _half_width(vertices: Array, along: Array) -> float:
     return float(np.linalg.norm(np.cross(vertices, direction), axis=1).mean())
 
 
+def _surface_points(mesh: TriangleMesh) -> Array:
+    """(m, 3) middles of triangles, one for each of m equal parts of the surface's area."""
+    middles, area = _triangle_middles(mesh.vertices, mesh.triangles)
+    parts = (np.arange(_POINTS_ON_SURFACE) + 0.5) / _POINTS_ON_SURFACE * area.sum()
+    return middles[np.minimum(np.searchsorted(np.cumsum(area), parts), len(area) - 1)]
+
+
 def _area_middle(vertices: Array, triangles: NDArray[np.int32]) -> Array:
     """(3,) the middle of a surface, weighed by area."""
+    middles, area = _triangle_middles(vertices, triangles)
+    return np.asarray((area[:, None] * middles).sum(axis=0) / area.sum())
+
+
+def _triangle_middles(vertices: Array, triangles: NDArray[np.int32]) -> tuple[Array, Array]:
+    """(n, 3) middles of triangles, and what is proportional to their areas (n,)."""
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    return np.asarray((area[:, None] * (a + b + c) / 3.0).sum(axis=0) / area.sum())
+    return (a + b + c) / 3.0, np.linalg.norm(np.cross(b - a, c - a), axis=1)

@@ -18,7 +18,7 @@ from drake_pose.multiview.date.limb_search import (
     limb_angles,
     place_limb,
     rectangles,
-    search_circle,
+    search_limb,
 )
 from drake_pose.multiview.date.skeleton import LIMBS, load_skeleton, rotation
 from drake_pose.silhouette import LabelRenderer
@@ -300,7 +300,7 @@ class TestPose:
         last = posed(person, left_upper_arm_z=15, right_upper_arm_z=-15)
         features = skeleton.features(true)
         errors = {}
-        for search in (True, False):
+        for search in ("surfaces", "rectangles", "none"):
             found = estimate_pose(
                 skeleton, last, features, true[skeleton.head_angles], cameras, regions,
                 search=search,
@@ -309,26 +309,38 @@ class TestPose:
                 np.linalg.norm(found.limbs[name][1] - skeleton.limb_points(true, name)[1])
                 for name in ("left_arm", "right_arm")
             )
-        assert errors[True] < 0.07
-        assert errors[True] < 0.6 * errors[False]
+        assert errors["rectangles"] < 0.07
+        assert errors["rectangles"] < 0.6 * errors["none"]
+        assert errors["surfaces"] < 0.02
 
-    def test_search_finds_a_knee(self, person, skeleton, views):
+    @pytest.mark.parametrize(("search", "off"), [("surfaces", 0.015), ("rectangles", 0.05)])
+    def test_search_finds_a_knee(self, person, skeleton, views, search, off):
         cameras, renderers = views
         true = posed(person, left_thigh_x=-60, left_thigh_z=30, left_shin_x=70)
         regions = [renderer.mask(true) for renderer in renderers]
         limb = skeleton.limbs["left_leg"]
         root, middle, end = skeleton.limb_points(true, "left_leg")
         R_WT, _ = skeleton.trunk_pose(true)
-        circle = joint_circle(limb, root, end, np.array([0.0, 1.0, 0.0]))
-        found, _, score = search_circle(
-            limb, circle, root, end, cameras, regions, root, R_WT, true[limb.positions]
+        last = true[limb.positions]
+        found = search_limb(
+            limb, R_WT, root, end, np.array([0.0, 1.0, 0.0]), root, last, cameras, regions, search
         )
-        assert np.linalg.norm(found - middle) < 0.05
-        assert score > 0.85
+        assert np.linalg.norm(found.middle - middle) < off
+        assert found.score > 0.85
 
-    @pytest.mark.parametrize(("bend", "off"), [(0.0, 0.01), (15.0, 0.04), (100.0, 0.06)])
+    @pytest.mark.parametrize(
+        ("bend", "search", "off"),
+        [
+            (0.0, "rectangles", 0.01),
+            (15.0, "rectangles", 0.04),
+            (100.0, "rectangles", 0.06),
+            (0.0, "surfaces", 0.01),
+            (15.0, "surfaces", 0.015),
+            (100.0, "surfaces", 0.015),
+        ],
+    )
     def test_search_finds_the_knees_of_straight_and_bent_legs(
-        self, person, skeleton, views, bend, off
+        self, person, skeleton, views, bend, search, off
     ):
         """Of a straight leg the knee lies behind the line from the hip to the foot's middle."""
         cameras, renderers = views
@@ -337,10 +349,34 @@ class TestPose:
         limb = skeleton.limbs["left_leg"]
         root, middle, end = skeleton.limb_points(true, "left_leg")
         R_WT, _ = skeleton.trunk_pose(true)
-        circle = joint_circle(limb, root, end, np.array([0.0, 1.0, 0.0]))
-        last = np.radians([0.0, 0.0, 0.0, 20.0])
-        found, _, _ = search_circle(limb, circle, root, end, cameras, regions, root, R_WT, last)
-        assert np.linalg.norm(found - middle) < off
+        last, outward = np.radians([0.0, 0.0, 0.0, 20.0]), np.array([0.0, 1.0, 0.0])
+        found = search_limb(limb, R_WT, root, end, outward, root, last, cameras, regions, search)
+        assert np.linalg.norm(found.middle - middle) < off
+
+    @pytest.mark.parametrize("along", [-0.012, -0.004, 0.004, 0.012])
+    def test_an_end_measured_a_little_off_hardly_moves_the_knee(
+        self, person, skeleton, views, along
+    ):
+        """A nearly straight leg's circle is 2 cm wider where the foot is 1 mm too near."""
+        cameras, renderers = views
+        true = posed(person, left_thigh_x=-12, left_shin_x=15)
+        regions = [renderer.mask(true) for renderer in renderers]
+        limb = skeleton.limbs["left_leg"]
+        root, middle, end = skeleton.limb_points(true, "left_leg")
+        R_WT, _ = skeleton.trunk_pose(true)
+        measured = end + along * (end - root) / np.linalg.norm(end - root)
+        last, outward = true[limb.positions], np.array([0.0, 1.0, 0.0])
+        off = {
+            search: np.linalg.norm(
+                search_limb(
+                    limb, R_WT, root, measured, outward, middle, last, cameras, regions, search
+                ).middle
+                - middle
+            )
+            for search in ("surfaces", "rectangles")
+        }
+        assert off["surfaces"] < 0.02
+        assert off["surfaces"] < off["rectangles"]
 
     @pytest.mark.parametrize("name", LIMBS)
     def test_a_limb_is_placed_where_its_limits_allow_it(self, skeleton, name):

@@ -21,6 +21,7 @@ from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera import PinholeCamera
 from drake_pose.errors import SettingsError
 from drake_pose.multiview.date.body_pose import Waist
+from drake_pose.multiview.date.limb_search import Search
 from drake_pose.multiview.date.skeleton import LIMBS
 from drake_pose.systems.colour_images import colour_image_to_picture
 
@@ -28,6 +29,7 @@ Array = NDArray[np.float64]
 
 METHODS = ("silhouette", "paper")
 WAISTS = ("reach", "person", "paper")
+SEARCHES: tuple[Search, ...] = ("surfaces", "rectangles")
 FEWEST_CAMERAS = 3
 SHOWN_CAMERA = "camera_0"
 FRAMES = 240
@@ -60,6 +62,7 @@ class DateResult:
             stiff trunk is laid through them: (n, 4) in the order of LIMBS [mm]; nan where the
             registered pose was recognised instead.
         waist: of WAISTS, how the waist was found.
+        search: of SEARCHES, how elbows and knees were searched.
         face_errors: (n,) angle between true and estimated direction of the head [deg].
         recoveries: frames until a destroyed track was right again, by the motion during which it
             was destroyed; REGISTERED: the registered pose was shown; None: not within _WATCHED.
@@ -78,6 +81,7 @@ class DateResult:
     errors: Mapping[str, Array]
     found_errors: Mapping[str, Array]
     waist: str
+    search: str
     face_errors: Array
     recoveries: Mapping[str, int | None]
     search_ms: float
@@ -122,6 +126,7 @@ class DateResult:
             "seed": self.seed,
             "method": self.method,
             "waist": self.waist,
+            "search": self.search,
         }
 
     def _as_found(self, motions: Sequence[str]) -> dict[str, float]:
@@ -172,7 +177,7 @@ class DateResult:
         """Elbows and knees as found, with the paper's search and without."""
         table = Table(
             "motion", "elbows [mm]", "by IK alone", "knees [mm]", "by IK alone",
-            title=f"Elbows and knees as found, --waist {self.waist}",
+            title=f"Elbows and knees as found, --waist {self.waist} --search {self.search}",
         )  # fmt: skip
         rows = {motion: (motion,) for motion in self.motions} | {"upright": UPRIGHT}
         for label, motions in rows.items():
@@ -204,6 +209,7 @@ def run_experiment(
     progress: Callable[[int], None] | None = None,
     size: tuple[int, int] = (640, 480),
     waist: str = "reach",
+    search: str = "surfaces",
 ) -> DateResult:
     """Captures a simulated person.
 
@@ -216,6 +222,7 @@ def run_experiment(
         size: width and height of the pictures [pixel].
         waist: of the paper's formula: "person" with this person's constants, "paper" with 0.55,
             0.225, 0.225; "reach" as "person", then lowered until both feet are in reach.
+        search: of elbows and knees: "rectangles" as in the paper, or "surfaces".
 
     Raises:
         SettingsError: an argument is out of its range.
@@ -224,13 +231,16 @@ def run_experiment(
         raise SettingsError(f"method must be one of {', '.join(METHODS)}, not '{method}'")
     if waist not in WAISTS:
         raise SettingsError(f"waist must be one of {', '.join(WAISTS)}, not '{waist}'")
+    way = next((one for one in SEARCHES if one == search), None)
+    if way is None:
+        raise SettingsError(f"search must be one of {', '.join(SEARCHES)}, not '{search}'")
     if cameras < FEWEST_CAMERAS:
         raise SettingsError(f"cameras must be {FEWEST_CAMERAS} or more, not {cameras}")
     # What is measured is one core's work.
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        return _Experiment(cameras, frames, seed, method, size, waist).run(progress)
+        return _Experiment(cameras, frames, seed, method, size, waist, way).run(progress)
     finally:
         cv2.setNumThreads(threads)
 
@@ -246,11 +256,14 @@ class _Experiment:
         method: str,
         size: tuple[int, int],
         waist: str,
+        search: Search,
     ) -> None:
-        self.cameras, self.seed, self.method, self.waist = cameras, seed, method, waist
+        self.cameras, self.seed, self.method = cameras, seed, method
+        self.waist, self.search = waist, search
         self.studio = Studio.build(cameras, size, np.random.default_rng([seed, 1]))
         self.motion = make_motion(self.studio.skeleton, frames, seed)
         setup = self.studio.prepare(self.motion.q[0])
+        setup = replace(setup, settings=replace(setup.settings, search=search))
         if waist != "reach":
             own = replace(setup.settings.waist, in_reach=False)
             formula = Waist() if waist == "paper" else own
@@ -260,7 +273,7 @@ class _Experiment:
         self.kinematics = TreeKinematics(tree)
         self.landmarks = landmarks_of_nodes(tree, self.studio.landmarks)
         self.order = np.array([model.position_index(name) for name in self.kinematics.names])
-        alone = replace(setup, settings=replace(setup.settings, search=False))
+        alone = replace(setup, settings=replace(setup.settings, search="none"))
         self.tracks: dict[str, PaperTrack | SilhouetteTrack] = {
             "ik_only": PaperTrack.build(alone),
             "paper": PaperTrack.build(setup),
@@ -310,6 +323,7 @@ class _Experiment:
             errors=errors,
             found_errors={way: np.array(values) for way, values in found.items()},
             waist=self.waist,
+            search=self.search,
             face_errors=np.array(
                 [
                     _angle_between(rotation(estimate), rotation(q))

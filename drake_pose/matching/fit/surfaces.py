@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import fast_simplification
 import numpy as np
@@ -32,6 +33,8 @@ _UNITS_A_TRIANGLE = 25.0
 # so wide in the same units.
 _ENOUGH = 1.1
 _GRIDS = 10.0, 20.0, 40.0
+# A process that estimates or audits many scenes of a body simplifies its surfaces once.
+_REMEMBERED = 256
 
 
 def few_rigid_triangles(surfaces: TreeSurfaces, count: int) -> TreeSurfaces:
@@ -67,6 +70,20 @@ def _simplified(outline: Outline, count: int) -> Outline:
     """
     if len(outline.triangles) <= count:
         return outline
+    vertices = np.ascontiguousarray(outline.vertices, np.float64)
+    triangles = np.ascontiguousarray(outline.triangles, np.int32)
+    return _simplify(vertices.tobytes(), triangles.tobytes(), count)
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def _simplify(vertices: bytes, triangles: bytes, count: int) -> Outline:
+    """A surface of more triangles, by its vertices and triangles."""
+    outline = outline_from_mesh(
+        TriangleMesh(
+            np.frombuffer(vertices, np.float64).reshape(-1, 3),
+            np.frombuffer(triangles, np.int32).reshape(-1, 3),
+        )
+    )
     simplified = _collapsed(outline, count, 1.0)
     too_far = _FAR / count * _size(outline)
     distance = surface_distance(outline, simplified)

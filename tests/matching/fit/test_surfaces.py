@@ -92,3 +92,14 @@ def test_distance_of_surfaces():
     empty = outline_from_mesh(TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32)))
     assert surface_distance(one, empty) == np.inf
     assert surface_distance(one, one) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_body_loaded_again_is_not_simplified_again_but_a_changed_one_is():
+    once, again = (few_triangles(Rigid(ball_and_tube(40)))[0] for _ in range(2))
+    given = ball_and_tube(40)
+    wider = outline_from_mesh(TriangleMesh(1.1 * given.vertices, given.triangles))
+    (other,) = few_triangles(Rigid(wider))
+    (coarser,) = few_triangles(Rigid(given), VERY_FEW)
+    assert again is once
+    np.testing.assert_allclose(np.ptp(other.vertices, axis=0), np.ptp(wider.vertices, axis=0), 0.02)
+    assert len(coarser.triangles) < len(once.triangles)

@@ -9,10 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.camera import Camera
+from drake_pose.multiview.date.skeleton import FEATURES
 from drake_pose.multiview.rays import meeting_points
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+
+_FIRST_FOOT = FEATURES.index("left_foot")
 
 
 @dataclass(frozen=True)
@@ -21,7 +24,7 @@ class FeatureSettings:
 
     Args:
         threshold: largest distance of two rays that show the same skin [m].
-        reach: points farther than this from every feature of the last frame belong to none [m];
+        reach: points farther than this from where every feature is expected belong to none [m];
             infinite in the paper.
         dense: radius of the dense part of a feature's points [m].
         margin: how far outside a silhouette a point may be seen [pixel].
@@ -90,11 +93,32 @@ def _near_region(
     return found
 
 
-def assign(points: Array, last: Array, reach: float) -> NDArray[np.int64]:
-    """The nearest of the last frame's features (k, 3) for each point (m, 3); -1 beyond `reach`."""
+def expect_features(
+    places: Array, support: NDArray[np.int64], last: Array, last_support: NDArray[np.int64]
+) -> Array:
+    """Where FEATURES are expected in the next frame (5, 3) [m]: feet a step on, the others here.
+
+    In a frame a walker's feet may move by more than they are apart when they pass each other; then
+    the nearest of the last frame's is the wrong one. Hands that meet stop: a step on they would be
+    taken for each other.
+
+    Args:
+        places: (5, 3) the features in this frame [m].
+        support: (5,) how many 3-D points each was taken from.
+        last: (5, 3) the same in the frame before.
+        last_support: (5,) likewise.
+    """
+    measured = (np.asarray(support) > 0) & (np.asarray(last_support) > 0)
+    step = np.where(measured[:, None], places - last, 0.0)
+    step[:_FIRST_FOOT] = 0.0
+    return np.asarray(places + step)
+
+
+def assign(points: Array, expected: Array, reach: float) -> NDArray[np.int64]:
+    """The nearest of the expected features (k, 3) for each point (m, 3); -1 beyond `reach`."""
     if not len(points):
         return np.empty(0, dtype=np.int64)
-    distances = np.linalg.norm(points[:, None] - last[None], axis=2)
+    distances = np.linalg.norm(points[:, None] - expected[None], axis=2)
     owners = distances.argmin(axis=1)
     owners[distances[np.arange(len(points)), owners] > reach] = -1
     return owners.astype(np.int64)
@@ -121,6 +145,7 @@ def find_features(
     regions: Sequence[Mask],
     last: Array,
     settings: FeatureSettings | None = None,
+    expected: Array | None = None,
 ) -> Features:
     """The features' places in a frame.
 
@@ -130,11 +155,13 @@ def find_features(
         regions: (H, W) the person in each camera's picture.
         last: (k, 3) the last frame's features [m].
         settings: how; the defaults where not given.
+        expected: (k, 3) where they are expected in this frame [m]; the last frame's places where
+            not given, as in the paper.
     """
     settings = settings or FeatureSettings()
     points = meeting_points(cameras, centroids, settings.threshold)
     points = points[inside_silhouettes(points, cameras, regions, settings.margin)]
-    owners = assign(points, last, settings.reach)
+    owners = assign(points, last if expected is None else expected, settings.reach)
     places, support = np.array(last, dtype=np.float64), np.zeros(len(last), dtype=np.int64)
     for k in range(len(last)):
         mine = points[owners == k]

@@ -170,9 +170,8 @@ class _Wiring:
         finder = FeatureFinder(cameras, self.setup.settings.features)
         self.add("features", finder)
         self.watch(finder)
-        self.builder.Connect(
-            estimator.GetOutputPort("last_features"), finder.GetInputPort("last_features")
-        )
+        for name in ("last_features", "expected_features"):
+            self.builder.Connect(estimator.GetOutputPort(name), finder.GetInputPort(name))
         self._finish("features", finder, "features", estimator)
         self.builder.Connect(finder.GetOutputPort("support"), estimator.GetInputPort("support"))
 

@@ -23,6 +23,7 @@ class FeatureFinder(LeafSystem):
         input_ports:
         - person_view_<camera>
         - last_features
+        - expected_features (optional)
         output_ports:
         - found
         - features
@@ -30,9 +31,11 @@ class FeatureFinder(LeafSystem):
 
     The first part of the paper's 3-D module. A camera that is unconnected or gives None is left
     out. ``last_features`` (15) are the last frame's: head, left hand, right hand, left foot, right
-    foot [m]; while they are nan nothing is found. Outputs: ``features`` (15), the last frame's
-    where nothing was measured [m]; ``support`` (5), from how many 3-D points each was taken, 0: not
-    measured; and both with all 3-D points as ``found``, a ``multiview.features.Features`` or None.
+    foot [m]; while they are nan nothing is found. ``expected_features`` (15) are where they are
+    expected in this frame [m]; the last frame's places where unconnected. Outputs: ``features``
+    (15), the last frame's where nothing was measured [m]; ``support`` (5), from how many 3-D points
+    each was taken, 0: not measured; and both with all 3-D points as ``found``, a
+    ``multiview.features.Features`` or None.
 
     Args:
         cameras: the cameras on the circle, in the order of the input ports.
@@ -47,7 +50,8 @@ class FeatureFinder(LeafSystem):
         self._settings = settings or FeatureSettings()
         self._views = ViewPorts(self, cameras)
         self._last = self.DeclareVectorInputPort("last_features", 3 * len(FEATURES))
-        tickets = {*self._views.tickets, self._last.ticket()}
+        self._expected = self.DeclareVectorInputPort("expected_features", 3 * len(FEATURES))
+        tickets = {*self._views.tickets, self._last.ticket(), self._expected.ticket()}
         self._found = self.DeclareAbstractOutputPort(
             "found", lambda: AbstractValue.Make(None), self._find, tickets
         )
@@ -62,7 +66,9 @@ class FeatureFinder(LeafSystem):
         cameras, views = self._views.evaluate(context)
         centroids = [view.blobs.centroids for view in views]
         regions = [view.region for view in views]
-        output.set_value(find_features(cameras, centroids, regions, last, self._settings))
+        is_given = self._expected.HasValue(context)
+        expected = self._expected.Eval(context).reshape(-1, 3) if is_given else None
+        output.set_value(find_features(cameras, centroids, regions, last, self._settings, expected))
 
     def _calc_features(self, context: Context, output: BasicVector) -> None:
         found = self._found.Eval(context)

@@ -15,6 +15,7 @@ from drake_pose.errors import SettingsError
 from drake_pose.multiview.date.body_pose import estimate_pose
 from drake_pose.multiview.date.capture import CaptureSetup
 from drake_pose.multiview.date.faces import head_angles
+from drake_pose.multiview.date.features import expect_features
 from drake_pose.multiview.date.skeleton import FEATURES, LIMBS
 from drake_pose.systems.date.view_ports import ViewPorts
 
@@ -39,6 +40,7 @@ class PaperPoseEstimator(LeafSystem):
         - last_features
         - last_support
         - limb_points
+        - expected_features
 
     Stepwise inverse kinematics of the upper body, the search for elbows and knees on their circles,
     waist and legs; where ``recognised_positions`` are not nan they overwrite all that was known,
@@ -49,7 +51,8 @@ class PaperPoseEstimator(LeafSystem):
     m]; ``last_features`` (15), where head, hands and feet were [m], and ``last_support`` (5), from
     how many 3-D points (``FeatureFinder`` needs them in the next frame); and ``limb_points`` (36),
     root, middle joint and end of left arm, right arm, left leg and right leg as found [m], nan
-    where the pose was recognised: no limb was searched then.
+    where the pose was recognised: no limb was searched then; ``expected_features`` (15), where
+    head, hands and feet are expected in the next frame [m], for ``FeatureFinder``, too.
 
     Args:
         setup: the person, the cameras, and how to capture.
@@ -81,6 +84,7 @@ class PaperPoseEstimator(LeafSystem):
             "last_features": 3 * len(FEATURES),
             "last_support": len(FEATURES),
             "limb_points": 9 * len(LIMBS),
+            "expected_features": 3 * len(FEATURES),
         }
         self._states = {
             name: self.DeclareDiscreteState(np.full(size, np.nan)) for name, size in unknown.items()
@@ -107,7 +111,8 @@ class PaperPoseEstimator(LeafSystem):
 
     def _overwrite(self, state: DiscreteValues, q: Array, features: Array | None) -> None:
         places = self.setup.skeleton.features(q) if features is None else features
-        self._write(state, q, places, np.zeros(len(FEATURES)), np.full(9 * len(LIMBS), np.nan))
+        limbs = np.full(9 * len(LIMBS), np.nan)
+        self._write(state, q, places, np.zeros(len(FEATURES)), limbs, places)
 
     def _write(self, state: DiscreteValues, *values: Array) -> None:
         for index, value in zip(self._states.values(), values, strict=True):
@@ -145,7 +150,12 @@ class PaperPoseEstimator(LeafSystem):
         )
         support = self._ports["support"].Eval(context)
         limbs = np.array([pose.limbs[name] for name in LIMBS])
-        self._write(state, pose.q, features, support, limbs)
+        before, support_before = (
+            context.get_discrete_state(self._states[name]).value()
+            for name in ("last_features", "last_support")
+        )
+        expected = expect_features(features, support, before.reshape(-1, 3), support_before)
+        self._write(state, pose.q, features, support, limbs, expected)
         return EventStatus.Succeeded()
 
     def _head_angles(self, context: Context, head: Array) -> Array | None:

@@ -11,6 +11,7 @@ from drake_pose.multiview.date.features import (
     FeatureSettings,
     assign,
     dense_mean,
+    expect_features,
     find_features,
     inside_silhouettes,
 )
@@ -223,6 +224,45 @@ class TestFeatures:
         cameras, centroids, regions = self.seen(self.places)
         found = find_features(cameras[:1], centroids[:1], regions[:1], self.places)
         assert not found.support.any()
+
+    def walked(self, is_expecting):
+        """The largest errors [m] of hands that meet, and of feet that pass each other.
+
+        Each foot moves by 20 cm a frame, and they pass 13 cm from each other.
+        """
+        last, support = self.places, np.zeros(5, int)
+        off = []
+        for share in np.linspace(0.0, 1.0, 8):
+            true = np.array(self.places)
+            true[3:, 0] += np.array([1.4, -1.4]) * (share - 0.5)
+            true[3:, 1] = 0.065, -0.065
+            # They come to a rest beside each other.
+            true[1:3, 1] = np.array([1, -1]) * max(0.06, 0.6 - 1.2 * share)
+            if not len(off):
+                last = expected = true
+            cameras, centroids, regions = self.seen(true)
+            given = expected if is_expecting else None
+            found = find_features(cameras, centroids, regions, last, None, given)
+            expected = expect_features(found.places, found.support, last, support)
+            last, support = found.places, found.support
+            off.append(np.linalg.norm(found.places - true, axis=1))
+        hands, feet = np.max(off, axis=0)[1:3].max(), np.max(off, axis=0)[3:].max()
+        return hands, feet
+
+    def test_feet_that_pass_each_other_are_not_exchanged(self):
+        assert self.walked(is_expecting=False)[1] > 0.5
+        hands, feet = self.walked(is_expecting=True)
+        assert feet < 0.03
+        assert hands < 0.05
+
+    def test_who_was_not_measured_is_expected_where_he_was(self):
+        moved = self.places + 0.1
+        seen, hidden = np.full(5, 9), np.zeros(5, int)
+        both = expect_features(moved, seen, self.places, seen)
+        np.testing.assert_allclose(both[3:], moved[3:] + 0.1)
+        np.testing.assert_array_equal(both[:3], moved[:3])
+        for now, before in ((seen, hidden), (hidden, seen)):
+            np.testing.assert_array_equal(expect_features(moved, now, self.places, before), moved)
 
     def test_dense_part(self):
         generator = np.random.default_rng(0)

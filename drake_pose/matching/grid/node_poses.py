@@ -142,6 +142,12 @@ class PoseStore:
         self.reach_runs = np.empty((0, len(pictures.views), 3), dtype=np.int64)
         self.reach_words = np.empty(0, dtype=np.uint64)
 
+    @property
+    def nbytes(self) -> int:
+        """The memory that poses and what can be reached from them take [byte]."""
+        reaches = self.reach_runs.nbytes + self.reach_words.nbytes
+        return reaches + sum(poses.nbytes for poses in self.nodes)
+
     def groups(self, node: int, parents: np.ndarray, hidden: np.ndarray) -> np.ndarray:
         """Where the node's poses begin and end (n, 2), for poses (n,) of its parent; 0 for a root.
 

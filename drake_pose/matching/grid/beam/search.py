@@ -6,6 +6,7 @@ alternatives, and needs no threshold r: its first stages let nothing lie outside
 end at J = 0, which certifies itself; later ones let more and more, weighed against what is covered.
 """
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -27,6 +28,9 @@ from drake_pose.matching.grid.sampled_body import SampledBody
 from drake_pose.matching.grid.settings import BeamSearchSettings, Stage
 from drake_pose.matching.result import MatchResult, View
 from drake_pose.matching.scoring import Scoring
+
+# A body that is the object itself needs far less.
+_MOST_BYTES = 1_000_000_000
 
 
 class BeamSearch:
@@ -82,6 +86,9 @@ class BeamSearch:
     ) -> MatchResult | None:
         """Run the stages that let nothing lie outside; they end at once where nothing fits.
 
+        Where so much fits roughly that its poses fill a gigabyte, as in a picture of another body
+        that may be turned anyhow, they end, too.
+
         Args:
             views: one or several silhouettes of the same instant.
             root_position: as in match.
@@ -95,6 +102,7 @@ class BeamSearch:
         start = time.perf_counter()
         exact = tuple(stage for stage in self.settings.stages if stage.outside_share == 0.0)
         run = self._prepare(views, root_position, None)
+        run.most_bytes = _MOST_BYTES
         run.run_stages(exact)
         if run.J > 0:
             return None
@@ -180,6 +188,8 @@ class _Run:
         self.runs = 0
         self.hypotheses = 0
         self.stopped_by = ""
+        self.most_bytes = math.inf
+        self._stores: dict[float, PoseStore] = {}
 
     def search(self) -> None:
         """Run stage after stage until J = 0 or a limit is reached; then polish the answer."""
@@ -196,7 +206,7 @@ class _Run:
     def run_stages(self, stages: Sequence[Stage]) -> None:
         """Run stage after stage until J = 0 or a limit is reached."""
         skip_exact = False
-        stores: dict[float, PoseStore] = {}
+        stores = self._stores
         for stage in stages:
             exact = stage.outside_share == 0.0
             if exact and skip_exact:
@@ -229,6 +239,8 @@ class _Run:
             self.stopped_by = "hypothesis_limit"
         elif time.perf_counter() >= self.deadline:
             self.stopped_by = "time_limit"
+        elif sum(store.nbytes for store in self._stores.values()) > self.most_bytes:
+            self.stopped_by = "memory_limit"
         return not self.stopped_by
 
     def _run_stage(self, beam: Beam, stage: Stage) -> bool:

@@ -6,6 +6,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
 
 from drake_pose.apps.experiments.kameda.chest_candidates import chest_ranks, share_within
 from drake_pose.apps.experiments.kameda.experiment import (
@@ -101,7 +102,10 @@ def _save_examples(
 ) -> Path:
     """Draw true poses and estimates as the camera sees them, their silhouettes, and the side."""
     tree = result.search.tree
-    colours = matplotlib.colormaps["tab20"](np.arange(64) % 20)[:, :3]
+    names = [node.name for node in tree.nodes]
+    # Links without a surface would use up colours.
+    order = [names.index(name) if name in names else 0 for name in renderers[0].link_names.values()]
+    colours = matplotlib.colormaps["tab20"](np.array(order) % 20)[:, :3]
     figure = Figure(figsize=(3 * len(trials), 15))
     axes = figure.subplots(5, len(trials), squeeze=False)
     for column, trial in zip(axes.T, trials, strict=True):
@@ -155,9 +159,11 @@ def _save_chest_ranks(path: Path, result: ExperimentResult, limit: int) -> Path:
     axis.semilogx(Ks, share_within(ranks, Ks.tolist()), color="0.2")
     axis.axvline(limit, color="0.6", linestyle="--", label=f"K = {limit}")
     axis.set_xlabel("K, candidates of the chest that are kept")
-    axis.set_ylabel("share of images with the true chest among them")
-    axis.set_ylim(0.0, 1.0)
-    axis.legend()
+    axis.set_ylabel("images with the true chest among them")
+    axis.set_ylim(0.0, 1.03)
+    axis.xaxis.set_major_formatter("{x:g}")
+    axis.yaxis.set_major_formatter(PercentFormatter(1.0))
+    axis.legend(loc="lower right")
     share = share_within(ranks, [limit])[0]
     axis.set_title(
         f"{len(ranks)} images, {np.median(lengths):.0f} candidates (median); "

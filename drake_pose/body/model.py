@@ -28,6 +28,7 @@ from drake_pose.body.files.urdf_shape import (
     Factors,
     stretched,
     with_base_joints,
+    with_moved_looks,
     with_shifted_joints,
     without_visuals,
 )
@@ -132,6 +133,22 @@ class ArticulatedModel(ParsedModel):
             ModelError: the file is no URDF.
         """
         return self._changed(with_shifted_joints(self._urdf_text(), shifts), self.skin)
+
+    def with_moved_looks(self, moves: Mapping[str, Sequence[float]]) -> "ArticulatedModel":
+        """The same with some links' looks, and the joints they carry, elsewhere in their frames.
+
+        Bands of skin stay at their joints.
+
+        Args:
+            moves: (3,) by link, along the axes of its frame [m].
+
+        Raises:
+            UnknownNameError: no link has that name.
+            ModelError: the file is no URDF.
+        """
+        for name in moves:
+            self.link_index(name)
+        return self._changed(with_moved_looks(self._urdf_text(), moves), self.skin)
 
     def with_base_joints(self, X_WB: NDArray[np.float64]) -> "ArticulatedModel":
         """The same on BASE_JOINTS, which move all of it and are 0 where it stands at X_WB (4, 4).

@@ -3,6 +3,7 @@
 import argparse
 import sys
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -62,6 +63,11 @@ rows:
 BAND_LENGTHS = {"wrist": 0.17, "finger": 0.055}
 BAND_REACHES = {"wrist": 0.42, "finger": 0.15}
 DISTAL_BAND = 30.0  # |DIP - 2/3 PIP| [deg]
+# How fingers are usually held, mean and deviation [deg]; the README tells whose.
+USUAL_FLEXION = {"mcp": (32, 25), "pip": (45, 26)}
+USUAL_DISTAL = 10.0  # of DIP - 2/3 PIP
+USUAL_CURL = (10, 30)  # PIP - MCP
+USUAL_NEIGHBOURS = 25.0  # between the flexions of neighbouring fingers
 GAPS = (("index", "middle", 30.0), ("middle", "ring", 28.0), ("ring", "little", 50.0))
 LEAST_GAP = -8.0  # fingers may lean on one another, but not cross [deg]
 
@@ -280,7 +286,35 @@ def couplings_text() -> str:
             f"  - {{name: {first}_to_{second}, terms: {{{terms}}},"
             f" lower: {LEAST_GAP:g}, upper: {most:g}, unit: deg}}"
         )
-    return COUPLINGS + "\n".join(rows) + "\n"
+    rows += [
+        f"  - {{name: {finger}_{joint}_forwards, terms: {{{finger}_{joint}_flexion: 1}},"
+        " lower: 0, unit: deg}"
+        for finger in ABDUCTION_LIMITS
+        for joint in FLEXION_LIMITS
+    ]
+    return COUPLINGS + "\n".join([*rows, "usual:", *usual_rows()]) + "\n"
+
+
+def usual_rows() -> list[str]:
+    """Return how fingers are usually held, as rows of the couplings."""
+    rows = []
+
+    def add(name: str, terms: str, mean: float, deviation: float) -> None:
+        """Add a row."""
+        moments = f"mean: {mean:g}, deviation: {deviation:g}"
+        rows.append(f"  - {{name: {name}, terms: {{{terms}}}, {moments}, unit: deg}}")
+
+    for finger in ABDUCTION_LIMITS:
+        mcp, pip, dip = (f"{finger}_{joint}_flexion" for joint in FLEXION_LIMITS)
+        add(mcp, f"{mcp}: 1", *USUAL_FLEXION["mcp"])
+        add(pip, f"{pip}: 1", *USUAL_FLEXION["pip"])
+        add(f"{finger}_curl", f"{pip}: 1, {mcp}: -1", *USUAL_CURL)
+        add(f"{finger}_tip", f"{dip}: 1, {pip}: {-2 / 3:.6f}", 0.0, USUAL_DISTAL)
+    for first, second in pairwise(ABDUCTION_LIMITS):
+        for joint in ("mcp", "pip"):
+            terms = f"{first}_{joint}_flexion: 1, {second}_{joint}_flexion: -1"
+            add(f"{first}_as_{second}_{joint}", terms, 0.0, USUAL_NEIGHBOURS)
+    return rows
 
 
 if __name__ == "__main__":

@@ -29,6 +29,7 @@ from drake_pose.camera.files import load_camera_file
 from drake_pose.errors import SceneError, SettingsError, UnknownNameError
 from drake_pose.matching import (
     BeamSearchSettings,
+    MatchResult,
     PaperSearch,
     PaperSearchSettings,
     PoseSearch,
@@ -59,6 +60,7 @@ class Inputs:
         truth: measured joint positions, where there are some.
         warnings: what the user should know of the input.
         starts: the plant's positions (nq,) by frame where it is known where the body is.
+        known: answers of the first frames that are known before the search is asked, by frame.
     """
 
     scene: Scene
@@ -70,6 +72,7 @@ class Inputs:
     truth: TrueAngles | None
     warnings: tuple[str, ...] = ()
     starts: Mapping[str, np.ndarray] = field(default_factory=dict)
+    known: Mapping[str, MatchResult] = field(default_factory=dict)
 
 
 def read_inputs(

@@ -132,9 +132,21 @@ class _Matching:
         if not frames:
             return
         inputs = self._inputs
+        for frame, match in inputs.known.items():
+            if frame in frames:
+                self._finish_frame(frame, match)
+                finished += 1
+                if on_frame is not None:
+                    on_frame(finished, total, frame, self._result.records[frame])
+        frames = self._result.missing
+        if not frames:
+            return
         # What colours and starts say of a frame depends on those before: they are followed again.
         follows = bool(inputs.scene.images or inputs.starts)
         played = inputs.frames if follows else tuple(frames)
+        if inputs.known:
+            # The track begins in the last frame that is known.
+            played = inputs.frames[len(inputs.known) - 1 :]
         matching = build_recorded_matching(
             inputs.scene,
             self._search,

@@ -100,6 +100,29 @@ def with_shifted_joints(text: str, shifts: Mapping[str, Sequence[float]]) -> str
     return xml_text(root)
 
 
+def with_moved_looks(text: str, moves: Mapping[str, Sequence[float]]) -> str:
+    """A URDF text in which links look as if they were elsewhere, the joints they carry with them.
+
+    Args:
+        text: the URDF.
+        moves: (3,) by link, along the axes of its frame [m].
+    """
+    root = ElementTree.fromstring(text)
+    moved = [
+        (visual, moves.get(link.get("name", "")))
+        for link in root.iterfind("link")
+        for visual in link.iterfind("visual")
+    ]
+    for joint in root.iterfind("joint"):
+        parent = joint.find("parent")
+        moved.append((joint, None if parent is None else moves.get(parent.get("link", ""))))
+    for element, move in moved:
+        if move is not None:
+            origin = _origin(element)
+            origin.set("xyz", _text(np.array(_numbers(origin.get("xyz", "0 0 0"))) + move))
+    return xml_text(root)
+
+
 BASE_JOINTS = ("free_x", "free_y", "free_z", "free_turn_z", "free_turn_y", "free_turn_x")
 """Joints that move a whole model: along the world's axes, then about them, the last one first."""
 

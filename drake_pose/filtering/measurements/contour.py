@@ -15,7 +15,12 @@ from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera import Camera, ParallelCamera
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.filtering.state import Belief, StateLayout
-from drake_pose.filtering.truncation.couplings import couplings_file, load_couplings
+from drake_pose.filtering.truncation.couplings import (
+    UsualPose,
+    couplings_file,
+    load_couplings,
+    load_usual_pose,
+)
 from drake_pose.filtering.truncation.inequalities import (
     Inequalities,
     from_bounds,
@@ -169,13 +174,16 @@ class ContourObservation:
         grows: whether the scale of the one parallel camera is unknown.
         constant: names of values that never change, such as shape joints.
         settings: how the contour is measured.
-        rest: each measurement also says, with so much weight, that joints are about the middle of
-            their limits, as evenly spread as these are wide; 0: nothing is said.
+        rest: each measurement also says, with so much weight, that joints are held as usual; 0:
+            nothing is said.
         colours: how pictures are compared.
 
     Attributes:
         layout: the state: the tree's values that are free to move, then ROOT_SHIFT and GROWTH,
             their rates, and the constants.
+        usual: how joints are usually held, about the state's moving elements, then its constants:
+            what the model's couplings file says, and about the middle of their limits, as evenly
+            spread as these are wide, where it says nothing.
 
     Raises:
         SettingsError: no camera; the tree has no value to estimate; or a scale is unknown and there
@@ -224,22 +232,30 @@ class ContourObservation:
         self._parameter_index = np.array([known.index(name) for name in seen], dtype=np.intp)
         self._values = self._kinematics.flatten(tree.default_values())
         self._known_shift = np.zeros(3)
-        self._middles = self._find_middles()
-        self._rest = self._middles[0], rest * self._middles[1]
+        self.usual = self._find_usual()
+        phi, information = self.usual.phi, rest / self.usual.deviation**2
+        self._rest = phi.T @ (information[:, None] * phi), phi.T @ (information * self.usual.mean)
 
-    def _find_middles(self) -> tuple[Array, Array]:
-        """For each value of the state the middle of its limits, and one over their variance."""
+    def _find_usual(self) -> UsualPose:
         kinematics = self._kinematics
         lower, upper = kinematics.lower, kinematics.upper
         limited = kinematics.is_angle & ~kinematics.turns_around & (lower < upper)
         if self.tree.placements[0].rotation is not None:
             # How the root is turned is no joint's.
             limited &= kinematics.value_nodes > 0
-        middle, information = np.zeros((2, len(lower) + len(_ROOT)))
-        at = np.flatnonzero(limited)
-        middle[at] = 0.5 * (lower[at] + upper[at])
-        information[at] = 12.0 / (upper[at] - lower[at]) ** 2
-        return middle[self._parameter_index], information[self._parameter_index]
+        names, index = [*self.layout.moving, *self.layout.constant], self._parameter_index
+        file = couplings_file(self.tree.model.path)
+        told = UsualPose(np.zeros((0, len(names))), np.zeros(0), np.zeros(0))
+        if file.is_file():
+            told = load_usual_pose(file, names)
+        valued = np.flatnonzero((index < len(lower)) & ~told.phi.any(axis=0))
+        at = valued[limited[index[valued]]]
+        low, high = lower[index[at]], upper[index[at]]
+        return UsualPose(
+            np.vstack([told.phi, np.eye(len(names))[at]]),
+            np.r_[told.mean, 0.5 * (low + high)],
+            np.r_[told.deviation, (high - low) / math.sqrt(12.0)],
+        )
 
     def is_angle(self, name: str) -> bool:
         """Whether an element is an angle [rad], else it is a length [m]."""
@@ -364,12 +380,9 @@ class ContourObservation:
         return other
 
     def strain(self, x: Array) -> float:
-        """How far joints are from the middle of their limits, in all [deviations^2].
-
-        The deviation is that of positions spread evenly between the limits.
-        """
-        middle, spread = self._middles
-        return float(np.sum(spread * (x[self._state_index] - middle) ** 2))
+        """How far joints are from how they are usually held, in all [deviations^2]."""
+        off = self.usual.phi @ x[self._state_index] - self.usual.mean
+        return float(np.sum((off / self.usual.deviation) ** 2))
 
     def continued(self, x: Array, last: Array) -> Array:
         """The same pose (n,), angles that turn around in the turns nearest to the last state's."""
@@ -538,9 +551,9 @@ class ContourObservation:
         scale = max(settings.deviation, distance)
         # Both contours say the same: together they count as one.
         worth = 0.5 / (scale**2 * settings.correlation)
-        middle, information = self._rest
-        slopes = worth * g[index] + information * (x[self._state_index] - middle)
-        curvature = worth * H[np.ix_(index, index)] + np.diag(information)
+        rest_curvature, rest_slope = self._rest
+        slopes = worth * g[index] + rest_curvature @ x[self._state_index] - rest_slope
+        curvature = worth * H[np.ix_(index, index)] + rest_curvature
         size, turns = np.linalg.eigh(curvature)
         told = size > _NOTHING * max(float(size[-1]), 1e-300)
         root, turns = np.sqrt(size[told]), turns[:, told]

@@ -129,7 +129,7 @@ class ContourTracker:
             raise SettingsError(f"the tracker's period must be positive, not {period}")
         self.observation, self.settings = observation, settings or TrackingSettings()
         layout = observation.layout
-        scale = {name: period**2 * self._acceleration(name) for name in layout.moving}
+        scale = {name: period**2 * self.acceleration(name) for name in layout.moving}
         self.filter = TruncatedFilter(
             layout,
             _Nothing(len(layout)),
@@ -141,7 +141,7 @@ class ContourTracker:
         )
         self._period = period
 
-    def _acceleration(self, name: str) -> float:
+    def acceleration(self, name: str) -> float:
         """Of what moves [rad/s^2, m/s^2 or 1/s^2]."""
         if name == GROWTH:
             return self.settings.growth_acceleration
@@ -170,7 +170,7 @@ class ContourTracker:
             elif name in layout.moving:
                 deviations[index] = self._start_deviation(name)
             else:
-                acceleration = self._acceleration(name.removeprefix("rate_"))
+                acceleration = self.acceleration(name.removeprefix("rate_"))
                 # What a limb picks up while its rate is remembered.
                 deviations[index] = acceleration * settings.memory * self._period
         return Belief(x, np.diag(deviations**2))

@@ -1,4 +1,7 @@
-"""Couplings of joints, from a YAML file beside the model: (15) and (17) of Shimada et al."""
+"""Couplings of joints, from a YAML file beside the model: (15) and (17) of Shimada et al.
+
+Beside inequalities the file may say how joints are usually held, which excludes nothing.
+"""
 
 import math
 from collections.abc import Sequence
@@ -7,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 from pydrake.common.yaml import yaml_load_typed
 
 from drake_pose.body import ParsedModel
@@ -62,18 +66,52 @@ class GeneralRow:
 
 
 @dataclass
+class UsualRow:
+    """The sum of factor x joint is usually about mean.
+
+    Attributes:
+        name: for messages.
+        terms: a factor for each joint.
+        mean, deviation: its mean and standard deviation in ``unit``.
+        unit: as in ``Difference``.
+    """
+
+    name: str = ""
+    terms: dict[str, float] = field(default_factory=dict)
+    mean: float = math.nan
+    deviation: float = math.nan
+    unit: str = ""
+
+
+@dataclass
 class Couplings:
     """The content of a couplings file."""
 
     differences: list[Difference] = field(default_factory=list)
     rows: list[GeneralRow] = field(default_factory=list)
+    usual: list[UsualRow] = field(default_factory=list)
+
+
+@dataclass(frozen=True, eq=False)
+class UsualPose:
+    """How a body is usually held, as independent normal distributions.
+
+    Attributes:
+        phi: (k, n) the factors of the elements of a state x.
+        mean: (k,) of phi x.
+        deviation: (k,) its standard deviation.
+    """
+
+    phi: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    deviation: NDArray[np.float64]
 
 
 def load_couplings(path: Path | str, columns: Sequence[str]) -> Inequalities:
     """Read the couplings of a YAML file.
 
     The file has a list ``differences`` (fields of ``Difference``), a list ``rows`` (fields of
-    ``GeneralRow``), or both::
+    ``GeneralRow``), or both; and it may have a list ``usual``, see ``load_usual_pose``::
 
         differences:
           - {first: flexion_12, second: flexion_13, within: 10, unit: deg}
@@ -109,6 +147,37 @@ def load_couplings(path: Path | str, columns: Sequence[str]) -> Inequalities:
     return stack(parts, columns)
 
 
+def load_usual_pose(path: Path | str, columns: Sequence[str]) -> UsualPose:
+    """Read how a body is usually held from its couplings file.
+
+    The file may have a list ``usual`` (fields of ``UsualRow``)::
+
+        usual:
+          - {name: knuckle, terms: {flexion_11: 1}, mean: 30, deviation: 25, unit: deg}
+
+    Args:
+        path: the file.
+        columns: (n) the names of the elements of the state. Rows about others are left out.
+
+    Raises:
+        ModelError: the file cannot be read; the message names it and what is wrong.
+    """
+    file = Path(path)
+    phi, moments = [], []
+    for row in _read(file).usual:
+        where = f"{file}: usual '{row.name}'"
+        unit = _unit(row.unit, where)
+        if not (math.isfinite(row.mean) and 0 < row.deviation < math.inf):
+            raise ModelError(f"{where}: give a mean, and a deviation that is positive")
+        if not any(row.terms.values()):
+            raise ModelError(f"{where}: its terms name no joint with a factor")
+        if set(row.terms) <= set(columns):
+            phi.append(row_from_terms(columns, row.terms, where))
+            moments.append((unit * row.mean, unit * row.deviation))
+    mean, deviation = np.reshape(moments, (-1, 2)).T
+    return UsualPose(np.reshape(phi, (-1, len(columns))), mean, deviation)
+
+
 def couplings_file(model_file: Path) -> Path:
     """Where a model's couplings are looked for: ``hand.couplings.yaml`` beside ``hand.urdf``."""
     return model_file.with_name(f"{model_file.name.split('.')[0]}.couplings.yaml")
@@ -141,9 +210,16 @@ def _read(file: Path) -> Couplings:
     except (yaml.YAMLError, RuntimeError, ValueError, TypeError, AttributeError) as error:
         raise ModelError(
             f"{file}: not a couplings file ({' '.join(str(error).split())}); it has lists "
-            "'differences' and 'rows'"
+            "'differences', 'rows' and 'usual'"
         ) from error
     return content
+
+
+def _unit(unit: str, where: str) -> float:
+    if unit not in _UNITS:
+        known = ", ".join(key for key in _UNITS if key)
+        raise ModelError(f"{where}: unit '{unit}' is unknown; use one of {known}")
+    return _UNITS[unit]
 
 
 def _row(
@@ -154,12 +230,10 @@ def _row(
     unit: str,
     where: str,
 ) -> Inequalities:
-    if unit not in _UNITS:
-        known = ", ".join(key for key in _UNITS if key)
-        raise ModelError(f"{where}: unit '{unit}' is unknown; use one of {known}")
+    factor = _unit(unit, where)
     if not np.isfinite(bounds).any():
         raise ModelError(f"{where}: nothing is bounded; give within, lower or upper")
-    lower, upper = (bound * _UNITS[unit] for bound in bounds)
+    lower, upper = (bound * factor for bound in bounds)
     row = row_from_terms(columns, terms, where)
     try:
         return two_sided(columns, name, row, lower, upper)

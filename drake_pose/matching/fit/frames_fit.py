@@ -15,6 +15,7 @@ from drake_pose.matching.fit.contour_fit import Noise, compare_views, project
 from drake_pose.matching.fit.evidence import Evidence
 from drake_pose.matching.fit.kernel import COMPARED, COST, FITTING
 from drake_pose.matching.fit.levenberg_marquardt import (
+    Coupling,
     Equations,
     Round,
     StepSettings,
@@ -24,6 +25,10 @@ from drake_pose.matching.fit.parameters import CAMERA_NAMES, BodyParameters, Cam
 from drake_pose.matching.fit.unknowns import Unknowns
 
 Array = NDArray[np.float64]
+
+
+# Of an unknown of which nothing is told: one over the variance.
+_LEAST_INFORMATION = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +41,9 @@ class FittedFrames:
         parameters: (frames, n) all parameters of the frames.
         costs: (frames, cameras) what does not fit.
         shares: (frames, cameras) of both contours' lengths, what fits.
-        equations: the normal equations at the end, priors included.
+        cost: of all frames at the end, with what is known without pictures.
+        equations: the normal equations at the end, priors included but for the coupling.
+        coupling: what was known of the frames' own unknowns together.
     """
 
     own: Array
@@ -44,7 +51,9 @@ class FittedFrames:
     parameters: Array
     costs: Array
     shares: Array
+    cost: float
     equations: Equations
+    coupling: Coupling | None = None
 
     @property
     def shared_covariance(self) -> Array:
@@ -60,6 +69,26 @@ class FittedFrames:
         if not len(S):
             return own
         return np.asarray(own + gains[frame] @ np.linalg.inv(S) @ gains[frame].T)
+
+    def own_deviations(self) -> Array:
+        """(frames, p) standard deviations, with the coupling and what shared unknowns may be.
+
+        With a coupling they are 100 [of the unknown's unit] at most, where nothing tells.
+        """
+        frames, p = self.own.shape
+        if self.coupling is None:
+            variances = [np.diag(self.frame_covariance(k)) for k in range(frames)]
+            return np.sqrt(np.array(variances))
+        H = self.equations.H
+        whole = self.coupling.curvature().toarray() + _LEAST_INFORMATION * np.eye(frames * p)
+        for k in range(frames):
+            whole[k * p : (k + 1) * p, k * p : (k + 1) * p] += H[k, :p, :p]
+        covariance = np.linalg.inv(whole)
+        mixed = H[:, :p, p:].reshape(frames * p, -1)
+        gains = covariance @ mixed
+        S = H[:, p:, p:].sum(axis=0) - mixed.T @ gains
+        variances = np.diag(covariance) + np.einsum("ij,ji->i", gains, np.linalg.solve(S, gains.T))
+        return np.sqrt(np.maximum(variances, 0.0)).reshape(frames, p)
 
 
 class FramesFit:
@@ -108,6 +137,7 @@ class FramesFit:
         *,
         expected: tuple[Array, Array] | None = None,
         shared_information: Array | None = None,
+        coupling: Coupling | None = None,
     ) -> FittedFrames:
         """Fits the unknowns.
 
@@ -120,6 +150,7 @@ class FramesFit:
             expected: own and shared unknowns that what is known without pictures is about; None:
                 where the fit starts.
             shared_information: (q, q) what else is known of the shared unknowns.
+            coupling: what is known of all frames' own unknowns together.
 
         Raises:
             SettingsError: shapes that do not fit each other.
@@ -138,7 +169,7 @@ class FramesFit:
             return self._equations(frames, base, (own, shared), about, step, shared_information)[0]
 
         limits = self.unknowns.lower, self.unknowns.upper
-        found = minimise(evaluate, own, shared, limits, rounds, self._steps)
+        found = minimise(evaluate, own, shared, limits, rounds, self._steps, coupling)
         equations, costs, shares = self._equations(
             frames, base, (found.own, found.shared), about, rounds[-1], shared_information
         )
@@ -146,7 +177,16 @@ class FramesFit:
             self.unknowns.parameters(one, x, found.shared)
             for one, x in zip(base, found.own, strict=True)
         ]
-        return FittedFrames(found.own, found.shared, np.array(parameters), costs, shares, equations)
+        return FittedFrames(
+            found.own,
+            found.shared,
+            np.array(parameters),
+            costs,
+            shares,
+            found.cost,
+            equations,
+            coupling,
+        )
 
     def equations(
         self, frames: Sequence[Evidence], held: Array, own: Array, shared: Array, step: Round

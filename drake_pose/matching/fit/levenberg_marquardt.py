@@ -2,7 +2,8 @@
 
 The scale of the cost shrinks from round to round, so first everything within reach pulls and in the
 end only what fits (graduated non-convexity, Blake and Zisserman 1987). Frames couple through what
-they share alone: each frame's own unknowns are eliminated first (Schur complement).
+they share: each frame's own unknowns are eliminated first (Schur complement). Those of frames that
+follow one another may also couple by a motion, which is linear in them.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import block_diag, csc_array, csr_array, diags_array
+from scipy.sparse.linalg import splu
 
 from drake_pose.compiled import compiled
 from drake_pose.errors import SettingsError
@@ -79,6 +82,31 @@ class Equations:
 
 
 @dataclass(frozen=True, eq=False)
+class Coupling:
+    """Linear combinations of all frames' own unknowns x (frames p,), and what is known of them.
+
+    Attributes:
+        rows: (k, frames p).
+        mean: (k,) of what they amount to.
+        information: (k,) one over the variance.
+    """
+
+    rows: csr_array
+    mean: Array
+    information: Array
+
+    def slope_and_cost(self, own: Array) -> tuple[Array, float]:
+        """(frames, p) half the slope at own unknowns (frames, p), and the cost."""
+        off = self.rows @ own.ravel() - self.mean
+        slope = self.rows.T @ (self.information * off)
+        return slope.reshape(own.shape), float(self.information @ off**2)
+
+    def curvature(self) -> csc_array:
+        """(frames p, frames p)."""
+        return csc_array(self.rows.T @ diags_array(self.information) @ self.rows)
+
+
+@dataclass(frozen=True, eq=False)
 class Minimum:
     """Where a minimisation ended.
 
@@ -102,17 +130,23 @@ def minimise(
     limits: tuple[Array, Array],
     rounds: Sequence[Round],
     settings: StepSettings | None = None,
+    coupling: Coupling | None = None,
 ) -> Minimum:
     """The unknowns with the least cost near where they start, inside their limits.
 
     Args:
-        evaluate: the equations at own (frames, p) and shared (q,) unknowns.
+        evaluate: the equations at own (frames, p) and shared (q,) unknowns; what a coupling says is
+            added to them.
         own, shared: to start from.
         limits: lower and upper (p + q,), own unknowns first.
         rounds: one after another.
         settings: how steps are made.
+        coupling: what is known of the own unknowns of several frames together.
     """
     settings = settings or StepSettings()
+    if coupling is not None:
+        evaluate = _coupled(evaluate, coupling)
+    curvature = None if coupling is None else coupling.curvature()
     lower, upper = limits
     p = own.shape[1]
     own, shared = np.clip(own, lower[:p], upper[:p]), np.clip(shared, lower[p:], upper[p:])
@@ -121,7 +155,7 @@ def minimise(
         equations = evaluate(own, shared, part)
         evaluations, cost = evaluations + 1, equations.cost
         for _ in range(part.iterations):
-            trial = _stepped(equations, own, shared, limits, damping, settings)
+            trial = _stepped(equations, own, shared, limits, damping, settings, curvature)
             if part.iterations == 1:
                 own, shared = trial
                 break
@@ -141,6 +175,21 @@ def minimise(
     return Minimum(own, shared, float(cost), evaluations)
 
 
+def _coupled(
+    evaluate: Callable[[Array, Array, Round], Equations], coupling: Coupling
+) -> Callable[[Array, Array, Round], Equations]:
+    """The same equations with a coupling's slope and cost; its curvature is no frame's own."""
+
+    def evaluate_coupled(own: Array, shared: Array, step: Round) -> Equations:
+        found = evaluate(own, shared, step)
+        slope, cost = coupling.slope_and_cost(own)
+        g = found.g.copy()
+        g[:, : own.shape[1]] += slope
+        return Equations(found.H, g, found.cost + cost)
+
+    return evaluate_coupled
+
+
 def _stepped(
     equations: Equations,
     own: Array,
@@ -148,12 +197,16 @@ def _stepped(
     limits: tuple[Array, Array],
     damping: float,
     settings: StepSettings,
+    curvature: csc_array | None,
 ) -> tuple[Array, Array]:
     """Own and shared unknowns after a damped step that stays inside the limits."""
     lower, upper = limits
     p = own.shape[1]
     shares = damping, settings.even_damping
-    steps, change = _solved(equations.H, equations.g, own, shared, lower, upper, shares)
+    if curvature is None:
+        steps, change = _solved(equations.H, equations.g, own, shared, lower, upper, shares)
+    else:
+        steps, change = _solved_together(equations, own, shared, limits, shares, curvature)
     # Shared unknowns are held back with the frames that they move.
     longest = max(float(np.abs(steps).max(initial=0.0)), float(np.abs(change).max(initial=0.0)))
     share = min(1.0, settings.longest / max(longest, 1e-300))
@@ -161,6 +214,37 @@ def _stepped(
         np.clip(own + share * steps, lower[:p], upper[:p]),
         np.clip(shared + share * change, lower[p:], upper[p:]),
     )
+
+
+def _solved_together(
+    equations: Equations,
+    own: Array,
+    shared: Array,
+    limits: tuple[Array, Array],
+    shares: tuple[float, float],
+    curvature: csc_array,
+) -> tuple[Array, Array]:
+    """As _solved, of frames whose own unknowns couple by a curvature."""
+    lower, upper = limits
+    frames, p = own.shape
+    H, g = equations.H, equations.g
+    whole = csc_array(block_diag(list(H[:, :p, :p])) + curvature)
+    diagonal = whole.diagonal()
+    damped = shares[0] * diagonal + shares[1] * diagonal.mean() + 1e-9
+    ends = np.tile(lower[:p], frames), np.tile(upper[:p], frames)
+    free = _free(own.ravel(), g[:, :p].ravel(), *ends)
+    loose = _free(shared, g[:, p:].sum(axis=0), lower[p:], upper[p:])
+    mixed = H[:, :p, p:].reshape(frames * p, -1)[np.ix_(free, loose)]
+    factors = splu(csc_array((whole + diags_array(damped))[free][:, free]))
+    solved = factors.solve(np.column_stack([-g[:, :p].ravel()[free], mixed]))
+    S = H[:, p:, p:].sum(axis=0)[np.ix_(loose, loose)]
+    if len(loose):
+        S[np.diag_indices(len(loose))] += shares[0] * np.diag(S) + shares[1] * np.diag(S).mean()
+    change, steps = np.zeros(len(shared)), np.zeros(frames * p)
+    slope = g[:, p:].sum(axis=0)[loose] + mixed.T @ solved[:, 0]
+    change[loose] = np.linalg.solve(S - mixed.T @ solved[:, 1:], -slope)
+    steps[free] = solved[:, 0] - solved[:, 1:] @ change[loose]
+    return steps.reshape(frames, p), change
 
 
 @compiled

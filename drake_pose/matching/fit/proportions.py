@@ -2,7 +2,9 @@
 
 Each part is stretched along one axis of its frame, that along which it carries what hangs on it,
 and widened across it. So bones get their own lengths and flesh its own girth, which silhouettes of
-somebody else than the model's measures show. The model's joints keep their meaning.
+somebody else than the model's measures show. Where a limb begins, its joint may lie further out in
+the flesh than the model's: at rest nothing changes, but the limb bends elsewhere. The model's
+joints keep their meaning.
 """
 
 from __future__ import annotations
@@ -12,28 +14,31 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array, diags_array, eye_array, kron, vstack
 
+from drake_pose.body import ArticulatedModel
+from drake_pose.body.tree.joint_offsets import joint_offsets
 from drake_pose.body.tree.tree_kinematics import Motions, TreeKinematics
 from drake_pose.camera import Camera
 from drake_pose.matching.fit.contour_fit import Noise
 from drake_pose.matching.fit.evidence import EdgePoints, pack_evidence
 from drake_pose.matching.fit.frames_fit import FramesFit
-from drake_pose.matching.fit.levenberg_marquardt import Round
+from drake_pose.matching.fit.levenberg_marquardt import Coupling, Round
 from drake_pose.matching.fit.parameters import (
     ROOT_NAMES,
     BodyParameters,
     Placement,
     affine_motions,
 )
-from drake_pose.matching.fit.unknowns import choose, join
+from drake_pose.matching.fit.unknowns import Unknowns, choose, join
 from drake_pose.silhouette import TreeSurfaces
 from drake_pose.silhouette.areas.outline import PackedOutlines
 
 Array = NDArray[np.float64]
 
-LENGTH_PREFIX, WIDTH_PREFIX = "log_length_", "log_width_"
+LENGTH_PREFIX, WIDTH_PREFIX, PLACE_PREFIX = "log_length_", "log_width_", "joint_place_"
 """Begin the names of the logarithms of how much longer a part is, and of how much wider a part or
-all parts of a limb are."""
+all parts of a limb are; and of how far along a part its own joint lies, over the part's length."""
 
 
 class _MotionList:
@@ -67,13 +72,15 @@ class _MotionList:
 
 
 class ProportionedBody(BodyParameters):
-    """A body's parameters: its tree's values, ROOT_NAMES, then lengths of nodes, widths of limbs.
+    """A body's parameters: its tree's values, ROOT_NAMES, lengths, widths, places of joints.
 
-    A limb is a chain of nodes of which each carries the next alone.
+    A limb is a chain of nodes of which each carries the next alone. Lengths are those of nodes,
+    widths those of limbs, and places those of the joints with which limbs begin.
 
     Attributes:
         axes: (nodes,) the axis 0, 1 or 2 of its frame along which each node is long.
         limbs: (nodes,) the limb that each node belongs to.
+        placed: the nodes whose joints, with which limbs begin, may lie elsewhere in the flesh.
 
     Args:
         kinematics: the pose tree's.
@@ -93,44 +100,97 @@ class ProportionedBody(BodyParameters):
                 firsts.append(node.name)
         self.length_names = tuple(f"{LENGTH_PREFIX}{node.name}" for node in nodes)
         self.width_names = tuple(f"{WIDTH_PREFIX}{name}" for name in firsts)
-        self.names = (*kinematics.names, *ROOT_NAMES, *self.length_names, *self.width_names)
-        self.axes = self._find_axes()
+        self._joints = {
+            offset.node: offset.joint
+            for offset in joint_offsets(kinematics.tree)
+            if offset.step == 0
+            and not offset.inverted
+            and offset.link == nodes[nodes[offset.node].parent].name
+            and nodes[offset.node].name in firsts
+        }
+        self.placed = np.array(sorted(self._joints), dtype=np.intp)
+        self.place_names = tuple(f"{PLACE_PREFIX}{nodes[i].name}" for i in self.placed)
+        self.names = (
+            *kinematics.names,
+            *ROOT_NAMES,
+            *self.length_names,
+            *self.width_names,
+            *self.place_names,
+        )
+        self.axes, self._along, self._rest = self._find_axes()
 
-    def _find_axes(self) -> NDArray[np.int64]:
-        X_WN = self.kinematics.poses(self.kinematics.flatten(self.kinematics.tree.default_values()))
+    def _find_axes(self) -> tuple[NDArray[np.int64], Array, Array]:
+        """(nodes,) axes; (nodes, 3) [m] along them how long, and the same at rest in the parent."""
+        kinematics = self.kinematics
+        X_WN = kinematics.poses(kinematics.flatten(kinematics.tree.default_values()))
         axes = np.zeros(len(X_WN), dtype=np.int64)
-        for i, node in enumerate(self.kinematics.tree.nodes):
-            places = X_WN[list(node.children), :3, 3] - X_WN[i, :3, 3]
-            along = np.abs(places @ X_WN[i, :3, :3]).sum(axis=0)
+        lengths, rest = np.zeros((2, len(X_WN), 3))
+        for i, node in enumerate(kinematics.tree.nodes):
+            carried = (X_WN[list(node.children), :3, 3] - X_WN[i, :3, 3]) @ X_WN[i, :3, :3]
+            along = np.abs(carried).sum(axis=0)
+            vertices = node.mesh.vertices
+            middle = vertices.mean(axis=0) if len(vertices) else np.ones(3)
             if not np.any(along > 0.0):
-                vertices = node.mesh.vertices
-                along = np.abs(vertices.mean(axis=0)) if len(vertices) else np.ones(3)
-            axes[i] = int(np.argmax(along))
-        return axes
+                along = np.abs(middle)
+            axis = axes[i] = int(np.argmax(along))
+            ends = carried[:, axis] if len(carried) else middle[[axis]]
+            lengths[i, axis] = ends[np.argmax(np.abs(ends))]
+            rest[i] = X_WN[i, :3, :3] @ lengths[i]
+            if node.parent >= 0:
+                rest[i] = X_WN[node.parent, :3, :3].T @ rest[i]
+        return axes, lengths, rest
 
     def factors(self, theta: Array) -> Array:
         """(nodes, 3) so many times its size each node has along its frame's axes."""
         count = len(self.kinematics.names) + len(ROOT_NAMES)
         nodes = len(self.limbs)
-        lengths, widths = theta[count : count + nodes], theta[count + nodes :]
+        lengths = theta[count : count + nodes]
+        widths = theta[count + nodes :][: len(self.width_names)]
         logs = np.repeat(widths[self.limbs][:, None], 3, axis=1)
         logs[np.arange(nodes), self.axes] = lengths
         return np.asarray(np.exp(logs))
+
+    def applied_to(self, model: ArticulatedModel, theta: Array) -> ArticulatedModel:
+        """A model, the tree's or one like it, with the proportions of all parameters (n,).
+
+        Raises:
+            ModelError: its file is no URDF.
+        """
+        nodes, shares = self.kinematics.tree.nodes, self.joint_places(theta)
+        factors = zip(nodes, self.factors(theta).tolist(), strict=True)
+        stretched = model.stretched({node.name: tuple(row) for node, row in factors})
+        shifted = stretched.with_shifted_joints(
+            {joint: tuple(shares[i] * self._rest[i]) for i, joint in self._joints.items()}
+        )
+        return shifted.with_moved_looks(
+            {nodes[i].name: tuple(-shares[i] * self._along[i]) for i in self._joints}
+        )
+
+    def joint_places(self, theta: Array) -> Array:
+        """(nodes,) how far along each part its joint is moved, over the part's length."""
+        shares = np.zeros(len(self.limbs))
+        shares[self.placed] = theta[len(self.names) - len(self.placed) :]
+        return shares
 
     def place(self, theta: Array) -> Placement:
         """The body at all parameters (n,)."""
         kinematics = self.kinematics
         count = len(kinematics.names)
         at_rest = kinematics.motions(theta[:count], translation=True, scale=True)
-        scale = self.factors(theta)
+        scale, shares = self.factors(theta), self.joint_places(theta)
         R = at_rest.X_WN[:, :3, :3]
         # How a node's frame, stretched, maps a vector in the world.
         maps = np.einsum("nik,nk,njk->nij", R, scale, R)
         places = at_rest.X_WN[:, :3, 3].copy()
+        # Where a part's flesh is beside its joint, and where the joint is beside the file's.
+        back = -np.einsum("nik,nk,n->ni", R, self._along, shares)
+        carried = np.zeros_like(places)
         for i, node in enumerate(kinematics.tree.nodes):
             if node.parent >= 0:
-                carried = at_rest.X_WN[i, :3, 3] - at_rest.X_WN[node.parent, :3, 3]
-                places[i] = places[node.parent] + maps[node.parent] @ carried
+                apart = at_rest.X_WN[i, :3, 3] - at_rest.X_WN[node.parent, :3, 3]
+                carried[i] = maps[node.parent] @ apart
+                places[i] = places[node.parent] + back[node.parent] + carried[i]
+                places[i] += shares[i] * (R[node.parent] @ self._rest[i])
         shift, growth = theta[count : count + 3], float(np.exp(theta[count + 3]))
         moved = places[0] + shift - growth * places[0]
         motions = _MotionList(len(places), growth, moved)
@@ -139,11 +199,23 @@ class ProportionedBody(BodyParameters):
         for k in range(3):
             motions.add(count + k, everything, np.zeros((3, 3)), np.eye(3)[k] / growth)
         motions.add(count + 3, everything, np.eye(3), -places[0])
-        self._add_proportions(motions, R, places)
+        self._add_proportions(motions, R, places + back, carried)
         X_WN = at_rest.X_WN.copy()
         X_WN[:, :3, :3] *= growth
         X_WN[:, :3, 3] = moved + growth * places
-        return motions.placement(_stretched(self._at(theta[:count]), scale), X_WN)
+        packed = _stretched(self._at(theta[:count]), scale)
+        self._move_flesh(packed, -self._along * shares[:, None])
+        return motions.placement(packed, X_WN)
+
+    def _move_flesh(self, packed: PackedOutlines, moved: Array) -> None:
+        """Moves each node's rigid part in its frame by (nodes, 3) [m]; bands stay at the joints."""
+        for i in self.placed.tolist():
+            vertices = packed.starts[i, 0] + np.arange(len(self.outlines[i].vertices))
+            triangles = packed.starts[i, 1] + np.arange(len(self.outlines[i].triangles))
+            packed.points[:, vertices] += moved[i][:, None]
+            packed.planes[3, triangles] += moved[i] @ packed.planes[:3, triangles]
+            packed.balls[i, :3] += moved[i]
+            packed.balls[i, 3] += np.linalg.norm(moved[i])
 
     def _add_values(
         self, motions: _MotionList, at_rest: Motions, maps: Array, places: Array, growth: float
@@ -162,18 +234,30 @@ class ProportionedBody(BodyParameters):
                 v = v + (1.0 / growth - 1.0) * velocity
             motions.add(k, np.flatnonzero(at_rest.moves[:, k]).tolist(), cross[k], v)
 
-    def _add_proportions(self, motions: _MotionList, R: Array, places: Array) -> None:
-        """The motions that lengths and widths make: of each node, and of what hangs on it."""
+    def _add_proportions(
+        self, motions: _MotionList, R: Array, flesh: Array, carried: Array
+    ) -> None:
+        """The motions that lengths, widths and places make: of a node, and of what hangs on it.
+
+        Args:
+            motions: to add to.
+            R: (nodes, 3, 3) how nodes are turned.
+            flesh: (nodes, 3) where the origins of their rigid parts are.
+            carried: (nodes, 3) from those to what they carry, the stretched part of it.
+        """
         first, nodes = len(self.kinematics.names) + len(ROOT_NAMES), self.kinematics.tree.nodes
         for i, node in enumerate(nodes):
             axis = R[i][:, self.axes[i]]
             long = np.outer(axis, axis)
             width = first + len(nodes) + int(self.limbs[i])
             for parameter, M in ((first + i, long), (width, np.eye(3) - long)):
-                motions.add(parameter, [i], M, -M @ places[i])
+                motions.add(parameter, [i], M, -M @ flesh[i])
                 for child in node.children:
-                    carried = M @ (places[child] - places[i])
-                    motions.add(parameter, self._below(child), np.zeros((3, 3)), carried)
+                    motions.add(parameter, self._below(child), np.zeros((3, 3)), M @ carried[child])
+        for k, i in enumerate(self.placed.tolist()):
+            moved = R[nodes[i].parent] @ self._rest[i] - R[i] @ self._along[i]
+            parameter = len(self.names) - len(self.placed) + k
+            motions.add(parameter, self._below(i), np.zeros((3, 3)), moved)
 
     def _below(self, node: int) -> list[int]:
         """A node and all that hang on it."""
@@ -188,12 +272,47 @@ class FittedProportions:
     """A body's proportions and its pose in the frames that they were fitted to.
 
     Args:
-        factors: (nodes, 3) so many times its size each node has along its frame's axes.
-        parameters: (frames, k) the tree's values and ROOT_NAMES.
+        parameters: (frames, n) all parameters.
+        deviations: (frames, k) of the tree's values and ROOT_NAMES, 0 where they were held.
+        cost: what tells the better of two fits to the same frames.
     """
 
-    factors: Array
     parameters: Array
+    deviations: Array
+    cost: float
+
+
+@dataclass(frozen=True, eq=False)
+class SequencePrior:
+    """What is known without pictures of p unknowns of frames that follow one another.
+
+    The unknowns are the tree's values that are free, then ROOT_NAMES.
+
+    Args:
+        phi: (k, p) what is usually about mean, mean: (k,), information: (k,) one over the variance.
+        acceleration: (p,) standard deviation of what an unknown is further on than the two frames
+            before it say.
+        lower, upper: (p,) limits.
+    """
+
+    phi: Array
+    mean: Array
+    information: Array
+    acceleration: Array
+    lower: Array
+    upper: Array
+
+    def coupling(self, frames: int) -> Coupling:
+        """The same of so many frames' unknowns together."""
+        p = len(self.acceleration)
+        motion = diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(frames - 2, frames))
+        rows = vstack([kron(eye_array(frames), self.phi), kron(motion, eye_array(p))])
+        still = np.tile(self.acceleration**-2.0, frames - 2)
+        return Coupling(
+            csr_array(rows),
+            np.r_[np.tile(self.mean, frames), np.zeros(len(still))],
+            np.r_[np.tile(self.information, frames), still],
+        )
 
 
 @dataclass(frozen=True)
@@ -203,6 +322,7 @@ class ProportionSettings:
     Args:
         length_deviation, width_deviation: standard deviations of the logarithms of lengths and
             widths, as people differ.
+        place_deviation: of where a joint lies along its part, over the part's length.
         angle_deviation, shift_deviation, growth_deviation: how far each frame's angles [rad], other
             values and root [m] and the logarithm of its scale may be off where the fit starts.
         rounds: the parts of the fit [pixel].
@@ -211,6 +331,7 @@ class ProportionSettings:
 
     length_deviation: float = 0.15
     width_deviation: float = 0.1
+    place_deviation: float = 0.15
     angle_deviation: float = 0.3
     shift_deviation: float = 0.03
     growth_deviation: float = 0.02
@@ -224,6 +345,7 @@ def fit_proportions(
     frames: Sequence[EdgePoints],
     starts: Array,
     settings: ProportionSettings | None = None,
+    sequence: SequencePrior | None = None,
 ) -> FittedProportions:
     """The proportions of a body that several frames of one camera show, its pose near in each.
 
@@ -231,10 +353,41 @@ def fit_proportions(
         body: the body.
         camera: the camera.
         frames: the edges that it sees.
-        starts: (frames, k) about what the tree's values and ROOT_NAMES are.
+        starts: (frames, k) about what the tree's values and ROOT_NAMES are; or (frames, n) all
+            parameters, those of proportions as in the first frame.
         settings: how.
+        sequence: what is known of three frames or more that follow one another; None: each pose is
+            about where the fit starts.
     """
     settings = settings or ProportionSettings()
+    unknowns = _unknowns(body, settings, sequence)
+    fit = FramesFit(body, [camera], unknowns, noise=settings.noise, pixels=1.0)
+    held = np.zeros((len(frames), len(body.names)))
+    held[:, : starts.shape[1]] = starts
+    own, common = np.split(unknowns.entries, [unknowns.own_count])
+    first = held[:, own].copy()
+    held[:, own] = 0.0
+    shared, nothing = held[0, common].copy(), np.zeros(len(common))
+    held[:, common] = 0.0
+    evidence = [pack_evidence([edge]) for edge in frames]
+    found = fit.fit(
+        evidence,
+        held,
+        first,
+        shared,
+        settings.rounds,
+        expected=(first, nothing),
+        coupling=None if sequence is None else sequence.coupling(len(frames)),
+    )
+    off = np.zeros((len(frames), len(body.kinematics.names) + len(ROOT_NAMES)))
+    off[:, own] = found.own_deviations()
+    return FittedProportions(found.parameters[:, : len(body.names)], off, found.cost)
+
+
+def _unknowns(
+    body: ProportionedBody, settings: ProportionSettings, sequence: SequencePrior | None
+) -> Unknowns:
+    """The pose of each frame, then lengths, widths and places that all share."""
     kinematics = body.kinematics
     free = kinematics.lower < kinematics.upper
     values = [name for name, is_free in zip(kinematics.names, free, strict=True) if is_free]
@@ -245,23 +398,17 @@ def fit_proportions(
     moving = np.array([*[settings.shift_deviation] * 3, settings.growth_deviation])
     lower = np.r_[kinematics.lower[free], np.full(4, -np.inf)]
     upper = np.r_[kinematics.upper[free], np.full(4, np.inf)]
+    if sequence is not None:
+        deviations, moving = np.full(len(values), np.inf), np.full(4, np.inf)
+        lower, upper = sequence.lower, sequence.upper
     names = [*values, *ROOT_NAMES]
     own = choose(body.names, names, lower=lower, upper=upper, deviation=np.r_[deviations, moving])
     lengths = choose(
         body.names, body.length_names, shared=True, deviation=settings.length_deviation
     )
     widths = choose(body.names, body.width_names, shared=True, deviation=settings.width_deviation)
-    unknowns = join(own, lengths, widths)
-    fit = FramesFit(body, [camera], unknowns, noise=settings.noise, pixels=1.0)
-    held = np.zeros((len(frames), len(body.names)))
-    held[:, : starts.shape[1]] = starts
-    first = held[:, own.entries].copy()
-    held[:, own.entries] = 0.0
-    shared = np.zeros(len(unknowns.names) - len(names))
-    evidence = [pack_evidence([edge]) for edge in frames]
-    found = fit.fit(evidence, held, first, shared, settings.rounds)
-    parameters = found.parameters[:, : starts.shape[1]]
-    return FittedProportions(body.factors(found.parameters[0][: len(body.names)]), parameters)
+    places = choose(body.names, body.place_names, shared=True, deviation=settings.place_deviation)
+    return join(own, lengths, widths, places)
 
 
 def _stretched(packed: PackedOutlines, scale: Array) -> PackedOutlines:

@@ -22,6 +22,7 @@ from drake_pose.filtering import (
     stack,
     two_sided,
 )
+from drake_pose.filtering.truncation.couplings import load_usual_pose
 from tests.written_files import assert_same_files
 
 HAND = bundled_model("two_finger_hand")
@@ -206,6 +207,39 @@ def test_units_of_couplings(tmp_path):
     rows = load_couplings(file, ["a", "b"])
     np.testing.assert_allclose(rows.phi, [[-2, -1]])
     np.testing.assert_allclose(rows.b, [np.pi / 2])
+
+
+def test_how_joints_are_usually_held_in_units_and_about_what_is_estimated(tmp_path):
+    file = tmp_path / "c.yaml"
+    file.write_text(
+        "usual: [{name: r, terms: {b: 2, a: -1}, mean: 90, deviation: 45, unit: deg},"
+        " {name: other, terms: {c: 1}, mean: 1, deviation: 1}]"
+    )
+    usual = load_usual_pose(file, ["a", "b"])
+    np.testing.assert_allclose(usual.phi, [[-1, 2]])
+    np.testing.assert_allclose(usual.mean, [np.pi / 2])
+    np.testing.assert_allclose(usual.deviation, [np.pi / 4])
+    assert len(load_couplings(file, ["a", "b"])) == 0
+
+
+@pytest.mark.parametrize(
+    ("row", "word"),
+    [
+        ("terms: {a: 1}, mean: 1", "deviation"),
+        ("terms: {a: 1}, mean: 1, deviation: -2", "positive"),
+        ("terms: {a: 1}, mean: .nan, deviation: 2", "mean"),
+        ("terms: {a: 1}, mean: 1, deviation: 2, unit: ft", "'ft'"),
+        ("terms: {a: 0}, mean: 1, deviation: 2", "terms"),
+        ("terms: {}, mean: 1, deviation: 2", "terms"),
+        ("terms: {a: 1}, about: 1, deviation: 2", "not a couplings file"),
+    ],
+)
+def test_bad_rows_of_how_joints_are_held_are_named(tmp_path, row, word):
+    file = tmp_path / "bad.couplings.yaml"
+    file.write_text(f"usual: [{{name: knuckle, {row}}}]")
+    with pytest.raises(ModelError, match=word) as caught:
+        load_usual_pose(file, ["a", "b"])
+    assert "bad.couplings.yaml" in str(caught.value)
 
 
 def test_crossed_couplings_of_a_model_are_refused(tmp_path):

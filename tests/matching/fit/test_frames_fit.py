@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.sparse import csr_array
 
 from drake_pose.body import TriangleMesh, bundled_model, load_model
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
@@ -9,8 +10,8 @@ from drake_pose.camera import ParallelCamera, PinholeCamera
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.matching.fit.evidence import find_edge_points, pack_evidence
-from drake_pose.matching.fit.frames_fit import FramesFit
-from drake_pose.matching.fit.levenberg_marquardt import Round
+from drake_pose.matching.fit.frames_fit import FittedFrames, FramesFit
+from drake_pose.matching.fit.levenberg_marquardt import Coupling, Equations, Round
 from drake_pose.matching.fit.parameters import (
     CAMERA_NAMES,
     GIRTH_PREFIX,
@@ -244,3 +245,43 @@ def test_what_does_not_fit_is_refused(body, rig):
     nothing = draw(body, rig, poses(body, 1, 1)[0])
     with pytest.raises(SettingsError, match="1 frames with 4 own and 0 shared"):
         fit.fit([nothing], np.zeros((1, 3)), np.zeros((1, 3)), np.zeros(0), ROUNDS)
+
+
+@pytest.mark.parametrize("couples", [False, True])
+def test_deviations_of_frames_are_those_of_the_whole_system(couples):
+    generator = np.random.default_rng(4)
+    frames, p, q = 4, 3, 2
+    J = generator.normal(size=(frames, 9, p + q))
+    H = np.einsum("fij,fik->fjk", J, J)
+    rows, information = generator.normal(size=(5, frames * p)), generator.uniform(1.0, 9.0, 5)
+    coupling = Coupling(csr_array(rows), np.zeros(5), information) if couples else None
+    equations = Equations(H, np.zeros((frames, p + q)), 0.0)
+    nothing = np.zeros((frames, p))
+    fitted = FittedFrames(nothing, np.zeros(q), nothing, nothing, nothing, 0.0, equations, coupling)
+    whole = np.zeros((frames * p + q, frames * p + q))
+    for k in range(frames):
+        at = np.r_[k * p : (k + 1) * p, frames * p : frames * p + q]
+        whole[np.ix_(at, at)] += H[k]
+    if couples:
+        whole[: frames * p, : frames * p] += rows.T @ np.diag(information) @ rows
+    expected = np.sqrt(np.diag(np.linalg.inv(whole))[: frames * p]).reshape(frames, p)
+    np.testing.assert_allclose(fitted.own_deviations(), expected, rtol=1e-3)
+
+
+def test_what_nothing_tells_has_a_large_deviation():
+    rows = csr_array(np.array([[1.0, -1.0]]))
+    coupling = Coupling(rows, np.zeros(1), np.array([1e6]))
+    H = np.zeros((2, 2, 2))
+    H[:, 1, 1] = 1.0
+    nothing = np.zeros((2, 1))
+    fitted = FittedFrames(
+        nothing,
+        np.zeros(1),
+        nothing,
+        nothing,
+        nothing,
+        0.0,
+        Equations(H, np.zeros((2, 2)), 0.0),
+        coupling,
+    )
+    assert (fitted.own_deviations() > 50.0).all()

@@ -3,8 +3,15 @@
 import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
+from scipy.sparse import csr_array
 
-from drake_pose.matching.fit.levenberg_marquardt import Equations, Round, StepSettings, minimise
+from drake_pose.matching.fit.levenberg_marquardt import (
+    Coupling,
+    Equations,
+    Round,
+    StepSettings,
+    minimise,
+)
 
 LIMIT = 0.05
 
@@ -73,3 +80,36 @@ def test_step_of_all_frames_is_that_of_the_whole_system(frames, p, q):
     step = np.linalg.solve(H + np.diag(share * np.diag(H) + 1e-9), matrix.T @ right)
     np.testing.assert_allclose(found.own.reshape(-1), step[: frames * p], atol=1e-12)
     np.testing.assert_allclose(found.shared, step[frames * p :], atol=1e-12)
+
+
+@pytest.mark.parametrize("bound", [np.inf, LIMIT])
+@pytest.mark.parametrize("q", [0, 2])
+def test_minimum_of_frames_whose_own_unknowns_couple(q, bound):
+    generator = np.random.default_rng(8)
+    frames, p = 5, 3
+    A, b = random_frames(generator, frames, p, q)
+    rows, mean = generator.normal(size=(7, frames * p)), generator.normal(size=7)
+    information = generator.uniform(0.5, 20.0, 7)
+
+    def evaluate(own, shared, _):
+        found = equations_at(A, b, own, shared)
+        # The cost of which g is half the slope.
+        return Equations(found.H, found.g, 2.0 * found.cost)
+
+    limits = np.full(p + q, -bound), np.full(p + q, bound)
+    found = minimise(
+        evaluate,
+        np.zeros((frames, p)),
+        np.zeros(q),
+        limits,
+        [Round(1.0, 1.0, 40)] * 20,
+        StepSettings(longest=10.0, damping=1e-4, even_damping=0.0),
+        Coupling(csr_array(rows), mean, information),
+    )
+    matrix, right = whole(A, b)(p)
+    root = np.sqrt(information)
+    matrix = np.vstack([matrix, np.column_stack([root[:, None] * rows, np.zeros((7, q))])])
+    expected = lsq_linear(matrix, np.r_[right, root * mean], (-bound, bound), tol=1e-14)
+    np.testing.assert_allclose(found.cost, 2.0 * expected.cost, rtol=1e-4)
+    if bound == np.inf:
+        np.testing.assert_allclose(np.r_[found.own.ravel(), found.shared], expected.x, atol=1e-5)

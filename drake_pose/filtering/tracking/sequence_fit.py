@@ -1,0 +1,229 @@
+"""A recorded sequence fitted as a whole: proportions and all poses at once, with how sure they are.
+
+A filter knows of each frame what came before. Of a recording all frames are at hand: poses that
+follow one another smoothly, the proportions that they share and what is usual are fitted together
+by Levenberg and Marquardt's method (a smoother, linearised anew until it stands still). Several
+starts are fitted, as one parallel view cannot tell them apart, and those that explain the sequence
+about as well as the best are all kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.filtering.measurements.contour import Mask
+from drake_pose.filtering.tracking.contour_tracker import ContourTracker
+from drake_pose.matching.fit.contour_fit import Noise
+from drake_pose.matching.fit.evidence import find_edge_points
+from drake_pose.matching.fit.levenberg_marquardt import Round
+from drake_pose.matching.fit.proportions import (
+    FittedProportions,
+    ProportionedBody,
+    ProportionSettings,
+    SequencePrior,
+    fit_proportions,
+)
+from drake_pose.matching.fit.surfaces import few_rigid_triangles
+from drake_pose.matching.pose_families import JointEstimate, PoseFamily, PoseSet
+from drake_pose.silhouette import TreeSurfaces
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+# Of a normal distribution, 95 % lie within this many standard deviations.
+_NORMAL_95 = 1.96
+# Angles that differ by less in the root mean square of all frames are the same [rad].
+_SAME = 0.1
+# Triangles of each rigid part, and the distance of the silhouettes' points [pixel].
+_TRIANGLES, _SPACING = 160, 2.0
+# The parts of a fit [pixel].
+_ROUNDS = (Round(15.0, 3.0, 6), Round(6.0, 3.0, 8), Round(3.0, 3.0, 20))
+
+
+@dataclass(frozen=True)
+class SequenceFitSettings:
+    """How a sequence is fitted.
+
+    Args:
+        memory: pictures closer in time than this say the same: they are worth one together [s].
+        deviation: how far the body's contour is from a mask's edge, where its proportions are
+            fitted and its flesh is still not that of who is seen [pixel].
+        correlation: so much of a contour errs together [pixel]: that of a finger's bone.
+        starts: so many starts are fitted at most.
+        worse: fits whose cost is so many times the best one's are given up.
+    """
+
+    memory: float = 0.15
+    deviation: float = 2.0
+    correlation: float = 75.0
+    starts: int = 3
+    worse: float = 1.1
+
+
+@dataclass(frozen=True, eq=False)
+class FittedSequence:
+    """One explanation of a sequence.
+
+    Args:
+        body: what was fitted.
+        fitted: its proportions, and its pose in every frame.
+    """
+
+    body: ProportionedBody
+    fitted: FittedProportions
+
+    def estimates(self, frame: int) -> tuple[JointEstimate, ...]:
+        """What is known of each of the tree's values in a frame."""
+        kinematics = self.body.kinematics
+        found = []
+        for k, name in enumerate(kinematics.names):
+            value = float(self.fitted.parameters[frame, k])
+            half = _NORMAL_95 * float(self.fitted.deviations[frame, k])
+            turns = bool(kinematics.turns_around[k])
+            lower, upper = float(kinematics.lower[k]), float(kinematics.upper[k])
+            low = value - min(half, np.pi) if turns else max(value - half, lower)
+            high = value + min(half, np.pi) if turns else min(value + half, upper)
+            node = int(kinematics.value_nodes[k])
+            determined = _is_determined(low, high, lower, upper)
+            found.append(JointEstimate(name, node, determined, low, high, np.array([value]), turns))
+        return tuple(found)
+
+
+def fit_sequence(
+    tracker: ContourTracker,
+    masks: Sequence[Mask],
+    starts: Sequence[Sequence[Array]],
+    period: float,
+    settings: SequenceFitSettings | None = None,
+) -> list[FittedSequence]:
+    """The explanations of a sequence of one camera's masks, best first.
+
+    Args:
+        tracker: says what is unknown, how it moves, its limits, and what is usual.
+        masks: of the frames, three or more.
+        starts: for each start the states (n,) in all frames.
+        period: time between two frames [s].
+        settings: how.
+    """
+    settings = settings or SequenceFitSettings()
+    observation = tracker.observation
+    surfaces = few_rigid_triangles(TreeSurfaces(observation.tree), _TRIANGLES)
+    body = ProportionedBody(TreeKinematics(observation.tree), surfaces)
+    edges = [find_edge_points(mask, _SPACING) for mask in masks]
+    step = max(1, min(int(settings.memory / period + 1e-9), (len(masks) - 1) // 2))
+    picked = np.arange(0, len(masks), step, dtype=np.intp)
+    camera = observation.cameras[0]
+
+    def fit(frames: Indices, begin: Array, last: bool) -> FittedProportions:
+        apart = period * float(frames[1] - frames[0])
+        worth = min(1.0, apart / settings.memory)
+        noise = Noise(settings.deviation, settings.correlation / worth)
+        plan = ProportionSettings(noise=noise, rounds=_ROUNDS[-1:] if last else _ROUNDS)
+        prior = _sequence_prior(tracker, apart)
+        return fit_proportions(
+            body, camera, [edges[k] for k in frames.tolist()], begin, plan, prior
+        )
+
+    coarse = []
+    for states in starts[: settings.starts]:
+        begin = np.array([observation.parameters(states[k]) for k in picked.tolist()])
+        coarse.append(fit(picked, begin, False))
+    coarse.sort(key=lambda one: one.cost)
+    kept: list[FittedProportions] = []
+    for one in coarse:
+        near = one.cost <= settings.worse * coarse[0].cost
+        if near and not any(_are_same(body, one, other) for other in kept):
+            kept.append(one)
+    if step == 1:
+        return [FittedSequence(body, one) for one in kept]
+    every = np.arange(len(masks), dtype=np.intp)
+    return [
+        FittedSequence(body, fit(every, _interpolated(every, picked, one.parameters), True))
+        for one in kept
+    ]
+
+
+def pose_set(
+    explanations: Sequence[FittedSequence],
+    poses: Sequence[tuple[Array, Array]],
+    frame: int,
+    J: float,
+) -> PoseSet:
+    """What all explanations of a sequence say of a frame.
+
+    Args:
+        explanations: best first.
+        poses: q (nq,) and X_WB (4, 4) of each in the frame.
+        frame: the frame's number.
+        J: the best one's objective (1) [pixel].
+    """
+    families = []
+    for one, (q, X_WB) in zip(explanations, poses, strict=True):
+        kinematics = one.body.kinematics
+        values = kinematics.split(one.fitted.parameters[frame, : len(kinematics.names)])
+        families.append(PoseFamily(q, X_WB, values, J, one.estimates(frame), 1.0))
+    kinematics = explanations[0].body.kinematics
+    joints = []
+    for k, same in enumerate(zip(*(family.joints for family in families), strict=True)):
+        low, high = min(one.low for one in same), max(one.high for one in same)
+        limits = float(kinematics.lower[k]), float(kinematics.upper[k])
+        joints.append(
+            replace(
+                same[0],
+                determined=_is_determined(low, high, *limits),
+                low=low,
+                high=high,
+                values=np.unique(np.concatenate([one.values for one in same])),
+            )
+        )
+    return PoseSet(tuple(families), tuple(joints), 0.0, False, len(families))
+
+
+def _are_same(body: ProportionedBody, one: FittedProportions, other: FittedProportions) -> bool:
+    """Whether two fits are the same explanation: no value is far off in all frames together."""
+    kinematics = body.kinematics
+    values = np.flatnonzero(kinematics.is_angle)
+    off = (one.parameters - other.parameters)[:, values]
+    turns = kinematics.turns_around[values]
+    off[:, turns] = np.angle(np.exp(1j * off[:, turns]))
+    return bool(np.sqrt(np.square(off).mean(axis=0)).max(initial=0.0) < _SAME)
+
+
+def _is_determined(low: float, high: float, lower: float, upper: float) -> bool:
+    """Whether an interval is shorter than half a value's range, that of an angle a turn at most."""
+    return high - low < 0.5 * min(upper - lower, 2.0 * np.pi)
+
+
+def _sequence_prior(tracker: ContourTracker, period: float) -> SequencePrior:
+    """What a tracker knows of frames that are a time apart [s]."""
+    observation, rest_time = tracker.observation, tracker.settings.rest_time
+    names = list(observation.layout.moving)
+    usual, limits = observation.usual, observation.inequalities()
+    worth = 0.0 if rest_time is None else period / rest_time
+    lower, upper = np.full(len(names), -np.inf), np.full(len(names), np.inf)
+    for phi, b in zip(limits.for_columns(names).phi, limits.b, strict=True):
+        if np.count_nonzero(phi) == 1:
+            k = int(np.flatnonzero(phi)[0])
+            if phi[k] > 0:
+                upper[k] = min(upper[k], b / phi[k])
+            else:
+                lower[k] = max(lower[k], b / phi[k])
+    accelerations = np.array([tracker.acceleration(name) for name in names])
+    return SequencePrior(
+        phi=usual.phi,
+        mean=usual.mean,
+        information=worth / usual.deviation**2,
+        acceleration=accelerations * period**2,
+        lower=lower,
+        upper=upper,
+    )
+
+
+def _interpolated(every: Indices, picked: Indices, parameters: Array) -> Array:
+    """(frames, n) parameters between those of some frames, and beyond as in the last of them."""
+    return np.column_stack([np.interp(every, picked, column) for column in parameters.T])

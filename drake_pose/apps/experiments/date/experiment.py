@@ -43,7 +43,7 @@ _FEWEST_WATCHED = 10
 
 TITLES = {
     "ik_only": "inverse kinematics alone",
-    "paper": "with the paper's search",
+    "paper": "with the search",
     "silhouette": "all silhouettes",
 }
 """What the ways of capturing are called."""
@@ -149,7 +149,7 @@ class DateResult:
     def _of_joints(self, errors: Mapping[str, Array], ends: tuple[str, ...]) -> Mapping[str, float]:
         """Mean errors of the joints whose names end so, by way of capturing.
 
-        Elbows and knees are what the paper's search is for.
+        Elbows and knees are what the search on circles is for.
         """
         chosen = [i for i, name in enumerate(self.joint_names) if name.endswith(ends)]
         return {f"{way}_mm": _mean(values[:, chosen]) for way, values in errors.items()}
@@ -174,7 +174,7 @@ class DateResult:
         return table
 
     def found_table(self) -> Table:
-        """Elbows and knees as found, with the paper's search and without."""
+        """Elbows and knees as found, with the search and without."""
         table = Table(
             "motion", "elbows [mm]", "by IK alone", "knees [mm]", "by IK alone",
             title=f"Elbows and knees as found, --waist {self.waist} --search {self.search}",

@@ -6,6 +6,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from drake_pose.body.files.xml_files import xml_text
@@ -71,8 +72,7 @@ def with_zeros(text: str, zeros: Mapping[str, float]) -> str:
         origin = _origin(joint)
         R = Rotation.from_euler("xyz", _numbers(origin.get("rpy", "0 0 0")))
         if joint.get("type") == "prismatic":
-            place = np.array(_numbers(origin.get("xyz", "0 0 0"))) + R.apply(zero * axis)
-            origin.set("xyz", _text(place))
+            _move(origin, R.apply(zero * axis))
         else:
             turned = R * Rotation.from_rotvec(zero * axis)
             origin.set("rpy", _text(turned.as_euler("xyz")))
@@ -94,9 +94,7 @@ def with_shifted_joints(text: str, shifts: Mapping[str, Sequence[float]]) -> str
     for joint in root.iterfind("joint"):
         shift = shifts.get(joint.get("name", ""))
         if shift is not None:
-            origin = _origin(joint)
-            place = np.array(_numbers(origin.get("xyz", "0 0 0"))) + shift
-            origin.set("xyz", _text(place))
+            _move(_origin(joint), shift)
     return xml_text(root)
 
 
@@ -118,8 +116,7 @@ def with_moved_looks(text: str, moves: Mapping[str, Sequence[float]]) -> str:
         moved.append((joint, None if parent is None else moves.get(parent.get("link", ""))))
     for element, move in moved:
         if move is not None:
-            origin = _origin(element)
-            origin.set("xyz", _text(np.array(_numbers(origin.get("xyz", "0 0 0"))) + move))
+            _move(_origin(element), move)
     return xml_text(root)
 
 
@@ -165,6 +162,11 @@ def with_base_joints(text: str, place: Sequence[float], rpy: Sequence[float]) ->
         ElementTree.SubElement(joint, "child", link=str(base))
         ElementTree.SubElement(joint, "origin", rpy=_text(np.array(rpy)))
     return xml_text(root)
+
+
+def _move(origin: ElementTree.Element, move: Sequence[float] | NDArray[np.float64]) -> None:
+    """Moves an origin by (3,) [m]."""
+    origin.set("xyz", _text(np.array(_numbers(origin.get("xyz", "0 0 0"))) + move))
 
 
 def _origin(element: ElementTree.Element) -> ElementTree.Element:

@@ -2,7 +2,7 @@
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -391,6 +391,14 @@ class ContourObservation:
         turned = x.copy()
         turned[self._state_index] += np.r_[turns, np.zeros(len(_ROOT))][self._parameter_index]
         return turned
+
+    def difference(self, x: Array, seen: Iterable[tuple[Camera, Mask]]) -> tuple[int, int]:
+        """How many pixels differ between a state's body (n,) and masks, and how many these have."""
+        wrong, area = 0, 0
+        for camera, mask in seen:
+            wrong += int(np.count_nonzero(self.draw(x, camera) != mask))
+            area += int(np.count_nonzero(mask))
+        return wrong, area
 
     def draw(self, x: Array, camera: Camera) -> Mask:
         """(H, W) what a camera would see of the body at a state (n,)."""

@@ -214,12 +214,9 @@ class MatchAndTrack:
         show: its length times their distance.
         """
         observation, x = self._observation(frame.root_position), track.state.best.mean
-        J, area = 0.0, 0.0
-        for view in frame.views:
-            J += int(np.count_nonzero(observation.draw(x, view.camera) != view.mask))
-            area += int(np.count_nonzero(view.mask))
         if frame.views:
-            return J, area
+            return observation.difference(x, [(view.camera, view.mask) for view in frame.views])
+        J, area = 0.0, 0.0
         if track.measurement is None:
             return math.inf, 1.0
         for camera in observation.cameras:

@@ -187,10 +187,9 @@ def pose_set(
 def _are_same(body: ProportionedBody, one: FittedProportions, other: FittedProportions) -> bool:
     """Whether two fits are the same explanation: no value is far off in all frames together."""
     kinematics = body.kinematics
-    values = np.flatnonzero(kinematics.is_angle)
-    off = (one.parameters - other.parameters)[:, values]
-    turns = kinematics.turns_around[values]
-    off[:, turns] = np.angle(np.exp(1j * off[:, turns]))
+    count = len(kinematics.names)
+    values, others = one.parameters[:, :count], other.parameters[:, :count]
+    off = (kinematics.nearest_turns(values, others) - others)[:, kinematics.is_angle]
     return bool(np.sqrt(np.square(off).mean(axis=0)).max(initial=0.0) < _SAME)
 
 

@@ -140,11 +140,9 @@ def _judged(
 ) -> FollowedStart:
     """A start and what it has explained, one frame more."""
     x = track.state.best.mean
-    wrong, area = 0, 0
-    for camera, mask in zip(observation.cameras, masks, strict=True):
-        if mask is not None:
-            wrong += int(np.count_nonzero(observation.draw(x, camera) != mask))
-            area += int(np.count_nonzero(mask))
+    pairs = zip(observation.cameras, masks, strict=True)
+    seen = [(camera, mask) for camera, mask in pairs if mask is not None]
+    wrong, area = observation.difference(x, seen)
     error, strain = wrong / max(area, 1), observation.strain(x)
     if before is None:
         return FollowedStart((x,), track, (error,), (strain,))

@@ -206,16 +206,15 @@ class _Run:
     def run_stages(self, stages: Sequence[Stage]) -> None:
         """Run stage after stage until J = 0 or a limit is reached."""
         skip_exact = False
-        stores = self._stores
         for stage in stages:
             exact = stage.outside_share == 0.0
             if exact and skip_exact:
                 continue
-            if stage.outside_share not in stores:
-                stores[stage.outside_share] = PoseStore(
+            if stage.outside_share not in self._stores:
+                self._stores[stage.outside_share] = PoseStore(
                     self.body, self.pictures(exact), stage.outside_share
                 )
-            complete = self._run_stage(Beam(stores[stage.outside_share]), stage)
+            complete = self._run_stage(Beam(self._stores[stage.outside_share]), stage)
             if self.stopped_by or (self.J == 0 and (self.gathering is None or not exact)):
                 break
             skip_exact = skip_exact or complete or self.J == 0

@@ -148,7 +148,7 @@ class _BodyFit:
         starts = find_start(
             tracker, tracker.observation.state(first.q, first.X_WB, first.scale), frames
         )
-        known = {0: self._answer(tracker.observation, starts[0].x, starts[0].errors[0])}
+        known = {0: self._answer(tracker.observation, starts[0].x, 0)}
         fitted = self._fit(tracker, starts) if len(frames) >= _FEWEST else None
         if fitted is not None:
             search, known, model, other, x = fitted
@@ -184,20 +184,16 @@ class _BodyFit:
             [other.state_of(theta[:count]) for theta in one.fitted.parameters]
             for other, one in zip(observations, explanations, strict=True)
         ]
-        errors = [
-            float(np.count_nonzero(observations[0].draw(x, self._camera) != mask))
-            / max(int(np.count_nonzero(mask)), 1)
-            for x, mask in zip(states[0], self._masks, strict=True)
+        answers = [
+            [self._answer(other, x, k) for k, x in enumerate(path)]
+            for other, path in zip(observations, states, strict=True)
         ]
-        if np.mean(errors) >= np.mean(starts[0].errors):
+        if np.mean([one.E_total for one in answers[0]]) >= np.mean(starts[0].errors):
             return None
         known = {}
-        for k, error in enumerate(errors):
-            answer = self._answer(observations[0], states[0][k], error)
-            poses = [
-                other.positions(path[k]) for other, path in zip(observations, states, strict=True)
-            ]
-            known[k] = replace(answer, pose_set=pose_set(explanations, poses, k, answer.J))
+        for k, answer in enumerate(answers[0]):
+            poses = [(path[k].q, path[k].X_WB, path[k].J) for path in answers]
+            known[k] = replace(answer, pose_set=pose_set(explanations, poses, k))
         self._tell(explanations)
         return _Fitted(searches[0], known, models[0], observations[0], states[0][0])
 
@@ -283,17 +279,17 @@ class _BodyFit:
     def _pixels_per_metre(self) -> float:
         return float(getattr(self._camera, "pixels_per_metre", 1.0))
 
-    def _answer(
-        self, observation: ContourObservation, x: np.ndarray, E_total: float
-    ) -> PlacedMatch:
-        """A state in a frame as a search would give it."""
+    def _answer(self, observation: ContourObservation, x: np.ndarray, frame: int) -> PlacedMatch:
+        """A state in a frame, by its number, as a search would give it."""
         q, X_WB = observation.positions(x)
+        wrong, area = observation.difference(x, [(self._camera, self._masks[frame])])
+        E_total = wrong / max(area, 1)
         return PlacedMatch(
             found=True,
             q=q,
             X_WB=X_WB,
             node_values=observation.node_values(x),
-            J=E_total * float(np.count_nonzero(self._masks[0])),
+            J=float(wrong),
             E_total=E_total,
             first_E_total=E_total,
             runs=0,

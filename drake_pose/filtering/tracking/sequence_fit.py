@@ -150,20 +150,18 @@ def fit_sequence(
 
 def pose_set(
     explanations: Sequence[FittedSequence],
-    poses: Sequence[tuple[Array, Array]],
+    poses: Sequence[tuple[Array, Array, float]],
     frame: int,
-    J: float,
 ) -> PoseSet:
     """What all explanations of a sequence say of a frame.
 
     Args:
         explanations: best first.
-        poses: q (nq,) and X_WB (4, 4) of each in the frame.
+        poses: q (nq,), X_WB (4, 4) and the objective (1) J [pixel] of each in the frame.
         frame: the frame's number.
-        J: the best one's objective (1) [pixel].
     """
     families = []
-    for one, (q, X_WB) in zip(explanations, poses, strict=True):
+    for one, (q, X_WB, J) in zip(explanations, poses, strict=True):
         kinematics = one.body.kinematics
         values = kinematics.split(one.fitted.parameters[frame, : len(kinematics.names)])
         families.append(PoseFamily(q, X_WB, values, J, one.estimates(frame), 1.0))

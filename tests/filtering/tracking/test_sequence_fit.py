@@ -53,10 +53,11 @@ def test_what_an_explanation_says_of_a_frame_is_its_pose_and_its_intervals(fitte
         x = observation.state_of(
             explanations[0].fitted.parameters[frame][: len(observation.parameters(states[0]))]
         )
-        poses = [observation.positions(x)]
-        told = pose_set(explanations, poses, frame, 0.5)
-        assert len(told.families) == 1
-        values = np.concatenate(tree.values_from_positions(*poses[0]))
+        q, X_WB = observation.positions(x)
+        told = pose_set(explanations, [(q, X_WB, 7.0)], frame)
+        (family,) = told.families
+        assert family.J == 7.0
+        values = np.concatenate(tree.values_from_positions(q, X_WB))
         for joint in told.joints:
             assert joint.low <= joint.values[0] <= joint.high
             np.testing.assert_allclose(joint.values[0], values[names.index(joint.name)], atol=1e-9)

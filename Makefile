@@ -41,12 +41,12 @@ docs: $(VENV)/ready-docs
 # DATA: a folder of recorded scenes; without it only the demonstration's is estimated.
 DATA ?= $(wildcard ../shared/data)
 bench: $(VENV)/ready-cluster
-	$(PYTHON) -m drake_pose.apps.benchmarks.speed
-	$(PYTHON) -m drake_pose.apps.benchmarks.silhouette_camera
-	$(PYTHON) -m drake_pose.apps.benchmarks.estimates $(DATA)
-	$(PYTHON) -m drake_pose.apps.benchmarks.registration $(DATA) --cases 1 --zeros 0
-	$(PYTHON) -m drake_pose.apps.benchmarks.memory
-	$(PYTHON) -m drake_pose.apps.benchmarks.cluster
+	$(PYTHON) -m tests.benchmarks.speed
+	$(PYTHON) -m tests.benchmarks.silhouette_camera
+	$(PYTHON) -m tests.benchmarks.estimates $(DATA)
+	$(PYTHON) -m tests.benchmarks.registration $(DATA) --cases 1 --zeros 0
+	$(PYTHON) -m tests.benchmarks.memory
+	$(PYTHON) -m tests.benchmarks.cluster
 
 clean:
 	rm -rf $(VENV) results build

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import sys
 from importlib import import_module
 from pkgutil import walk_packages
 from typing import Any
@@ -15,8 +14,6 @@ from docutils import nodes
 from sphinx.addnodes import pending_xref
 from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
-from sphinx.errors import PycodeError
-from sphinx.pycode import ModuleAnalyzer
 from sphinx.util.docutils import SphinxDirective
 
 
@@ -31,7 +28,7 @@ class Array:
 # Before drake_pose is imported.
 numpy.typing.NDArray = Array  # type: ignore[misc]
 
-from drake_pose import __version__, errors  # noqa: E402
+from drake_pose import __version__  # noqa: E402
 
 project = "drake_pose"
 copyright = "the authors of drake_pose"
@@ -53,7 +50,10 @@ python_maximum_signature_line_length = 80
 
 # Other projects' pages are in the net, which a build does not need.
 nitpick_ignore_regex = [
-    ("py:.*", r"(np|numpy|pydrake|rich|typer|distributed|pathlib|collections|enum)\..*"),
+    (
+        "py:.*",
+        r"(np|numpy|pydrake|rich|typer|distributed|pathlib|collections|enum|jinja2|numba|cv2|scipy|trimesh|asyncio|http|socketserver|PIL)\..*",
+    ),
     # Drake's classes that are imported for type checkers alone.
     ("py:class", "ColorRenderCamera|DepthRenderCamera|RenderCameraCore|CameraInfo"),
     ("py:class", "RigidTransform|Diagram|OutputPort|Meshcat"),
@@ -61,41 +61,26 @@ nitpick_ignore_regex = [
     ("py:class", "Array|Turning|Motions|PackedBand"),
 ]
 
-# The packages that export names, and where each exported object is documented.
-EXPORTING = ("drake_pose", "body", "camera", "silhouette", "matching", "filtering", "systems")
-PUBLIC: dict[str, str] = {name: f"drake_pose.errors.{name}" for name in vars(errors)}
-CONSTANTS: set[str] = set()
-for _name in EXPORTING:
-    _path = _name if _name == "drake_pose" else f"drake_pose.{_name}"
-    _package = import_module(_path)
-    for _public in _package.__all__:
-        _object = getattr(_package, _public)
-        # Names that are loaded when they are first used are not there yet.
-        setattr(_package, _public, _object)
-        if hasattr(_object, "__qualname__"):
-            PUBLIC[f"{_object.__module__}.{_object.__qualname__}"] = f"{_path}.{_public}"
-        else:
-            CONSTANTS.add(_public)
-
 
 class PublicNames(SphinxDirective):
-    """`.. public-names:: PACKAGE`: what a package exports, as a table and one by one."""
+    """`.. public-names:: PACKAGE`: the names of a package, linked to their modules."""
 
     required_arguments = 1
 
     def run(self) -> list[nodes.Node]:
-        """Returns the table and the entries."""
+        """Returns a list."""
         package = import_module(self.arguments[0])
-        text = [f".. automodule:: {package.__name__}", "   :no-members:", ""]
-        text += [".. autosummary::", "   :nosignatures:", ""]
-        text += [*(f"   {name}" for name in package.__all__), ""]
+        text = []
         for name in package.__all__:
-            text += _documenting(name, getattr(package, name))
+            public = getattr(package, name)
+            sentence = str(public.__doc__).strip().split("\n\n")[0].replace("\n", " ")
+            home = f"{public.__module__}.{public.__qualname__}"
+            text += [f":py:obj:`{name} <{home}>`", f"   {' '.join(sentence.split())}", ""]
         return self.parse_text_to_nodes("\n".join(text))
 
 
 class Modules(SphinxDirective):
-    """`.. modules:: PACKAGE`: the modules of a package that exports no names, kernels left out."""
+    """`.. modules:: PACKAGE`: the modules of a package, kernels left out."""
 
     required_arguments = 1
 
@@ -104,7 +89,7 @@ class Modules(SphinxDirective):
         package = import_module(self.arguments[0])
         found = walk_packages(package.__path__, f"{package.__name__}.")
         text = [f".. automodule:: {package.__name__}", "   :no-members:", ""]
-        for module in sorted(one.name for one in found if not one.name.endswith("_kernel")):
+        for module in sorted(one.name for one in found if not one.name.endswith("kernel")):
             title = module.removeprefix("drake_pose.")
             text += [title, "-" * len(title), "", f".. automodule:: {module}", "   :members:", ""]
         return self.parse_text_to_nodes("\n".join(text), allow_section_headings=True)
@@ -125,28 +110,14 @@ class PydrakeSystem(SphinxDirective):
         return self.parse_text_to_nodes("\n".join(lines))
 
 
-def _documenting(name: str, documented: Any) -> list[str]:
-    """What documents an object of the current module."""
-    if isinstance(documented, type):
-        bases = [] if documented.__bases__ == (object,) else ["   :show-inheritance:"]
-        return [f".. autoclass:: {name}", "   :members:", *bases, ""]
-    kind = "autofunction" if hasattr(documented, "__qualname__") else "autodata"
-    return [f".. {kind}:: {name}", ""]
-
-
-def resolve_public(
+def resolve_known(
     app: Sphinx, env: BuildEnvironment, node: pending_xref, content: nodes.Element
 ) -> nodes.Element | None:
-    """Finds a name where its package exports it; what is not exported exists, but has no entry."""
+    """Accepts names that exist and have no entry; a name that does not exist is an error."""
     target = node.get("reftarget", "")
-    if node.get("refdomain") != "py":
+    if node.get("refdomain") != "py" or not target.startswith("drake_pose."):
         return None
-    if target not in PUBLIC:
-        return content if target.startswith("drake_pose.") and _exists(target) else None
-    python = env.get_domain("py")
-    return python.resolve_xref(
-        env, node["refdoc"], app.builder, "obj", PUBLIC[target], node, content
-    )
+    return content if _exists(target) else None
 
 
 def _exists(target: str) -> bool:
@@ -161,9 +132,7 @@ def _exists(target: str) -> bool:
 def prepare_docstring(
     app: Sphinx, what: str, name: str, value: Any, options: Any, lines: list[str]
 ) -> None:
-    """Before napoleon: names that share a line are parted; constants get their docstrings."""
-    if what == "data" and name.rpartition(".")[2] in CONSTANTS:
-        lines[:] = _constant_docstring(name, value) or lines
+    """Before napoleon: names that share a line are parted."""
     for k, line in enumerate(lines):
         # Those of errors are parted by Sphinx itself.
         if (names := re.match(r"\s+\w+(, \w+)+: ", line)) and "Error" not in names.group():
@@ -177,25 +146,12 @@ def shorten_signature(
     return None if signature is None else (re.sub(r"<\w[^<>]*>", "...", signature), returns)
 
 
-def _constant_docstring(name: str, value: Any) -> list[str]:
-    """A constant's docstring, from the module below its package that defines it."""
-    package, _, constant = name.rpartition(".")
-    for module in [one for one in sys.modules if one.startswith(f"{package}.")]:
-        if getattr(sys.modules[module], constant, None) is value:
-            try:
-                documented = ModuleAnalyzer.for_module(module).find_attr_docs()
-            except PycodeError:
-                continue
-            if ("", constant) in documented:
-                return documented["", constant]
-    return []
-
-
 def skip_fields(
     app: Sphinx, what: str, name: str, value: Any, skip: bool, options: Any
 ) -> bool | None:
-    """Leaves out what Python itself says of a named tuple's fields."""
-    return True if str(value.__doc__).startswith("Alias for field number") else None
+    """Leaves out what Python itself says of a named tuple's fields, and modules' constants."""
+    constant = what == "module" and not hasattr(value, "__qualname__")
+    return True if constant or str(value.__doc__).startswith("Alias for field number") else None
 
 
 def setup(app: Sphinx) -> None:
@@ -203,7 +159,7 @@ def setup(app: Sphinx) -> None:
     app.add_directive("public-names", PublicNames)
     app.add_directive("modules", Modules)
     app.add_directive("pydrake_system", PydrakeSystem)
-    app.connect("missing-reference", resolve_public)
+    app.connect("missing-reference", resolve_known)
     # Napoleon's own is at 500.
     app.connect("autodoc-process-docstring", prepare_docstring, priority=400)
     app.connect("autodoc-process-signature", shorten_signature)

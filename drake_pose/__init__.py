@@ -1,8 +1,9 @@
 """Pose estimation of articulated objects from silhouettes, as Drake systems.
 
-The names that most programs need are here; each is loaded when it is first used. The packages are
-``drake_pose.body``, ``camera``, ``silhouette``, ``matching``, ``filtering``, ``multiview``,
-``systems`` and ``apps``.
+The names that programs need are here; each is loaded when it is first used. Everything else is in
+the rooms, in the order in which they build on each other: ``body``, ``camera``, ``silhouette``,
+``fit``, ``search``, ``registration``, ``filtering``, ``person``, ``systems``, ``results``,
+``jobs``, ``papers`` and ``commands``.
 """
 
 from __future__ import annotations
@@ -14,41 +15,67 @@ from typing import TYPE_CHECKING, Any
 from drake_pose.version import VERSION
 
 if TYPE_CHECKING:
-    from drake_pose.apps.estimate.scene import SceneEstimate, estimate_scene
-    from drake_pose.apps.masks.masks import SceneMasks, make_masks
-    from drake_pose.apps.masks.settings import MaskSettings
-    from drake_pose.apps.settings import EstimateSettings
-    from drake_pose.body import bundled_model, load_model
-    from drake_pose.camera import load_cameras
-    from drake_pose.silhouette import load_scene
+    from drake_pose.body.files.packages import bundled_model
+    from drake_pose.body.model import ArticulatedModel, load_model
+    from drake_pose.body.tree.tree_builder import build_pose_tree
+    from drake_pose.camera.drake import camera_from_drake
+    from drake_pose.camera.files import load_cameras, save_cameras
+    from drake_pose.camera.models import ParallelCamera, PinholeCamera
+    from drake_pose.jobs.estimate.scene import SceneEstimate, estimate_scene
+    from drake_pose.jobs.masks.masks import SceneMasks, make_masks
+    from drake_pose.jobs.masks.settings import MaskSettings
+    from drake_pose.jobs.registration.audit import SceneAudit, audit_scene
+    from drake_pose.jobs.registration.inputs import RegistrationSettings
+    from drake_pose.jobs.registration.register import SceneRegistration, register_scene
+    from drake_pose.results.settings import EstimateSettings
+    from drake_pose.search.continuous.multi_start import MultiStartSearch
+    from drake_pose.search.grid.beam.search import BeamSearch
+    from drake_pose.search.pose_search import View
+    from drake_pose.silhouette.pictures.scenes import Scene, load_scene
+    from drake_pose.systems.estimators.camera_registration import CameraRegistration
+    from drake_pose.systems.estimators.silhouette_matcher import SilhouetteMatcher
+    from drake_pose.systems.estimators.silhouette_tracker import SilhouetteTracker
+    from drake_pose.systems.estimators.truncated_ekf import TruncatedEkf
+    from drake_pose.systems.person.person_tracker import PersonTracker
+    from drake_pose.systems.pictures.silhouette_camera import SilhouetteCamera
 
 __version__ = VERSION
 
 _HOMES = {
-    "EstimateSettings": "apps.settings",
-    "MaskSettings": "apps.masks.settings",
-    "SceneEstimate": "apps.estimate.scene",
-    "SceneMasks": "apps.masks.masks",
-    "bundled_model": "body",
-    "estimate_scene": "apps.estimate.scene",
-    "load_cameras": "camera",
-    "load_model": "body",
-    "load_scene": "silhouette",
-    "make_masks": "apps.masks.masks",
+    "ArticulatedModel": "body.model",
+    "BeamSearch": "search.grid.beam.search",
+    "CameraRegistration": "systems.estimators.camera_registration",
+    "EstimateSettings": "results.settings",
+    "MaskSettings": "jobs.masks.settings",
+    "MultiStartSearch": "search.continuous.multi_start",
+    "ParallelCamera": "camera.models",
+    "PersonTracker": "systems.person.person_tracker",
+    "PinholeCamera": "camera.models",
+    "RegistrationSettings": "jobs.registration.inputs",
+    "Scene": "silhouette.pictures.scenes",
+    "SceneAudit": "jobs.registration.audit",
+    "SceneEstimate": "jobs.estimate.scene",
+    "SceneMasks": "jobs.masks.masks",
+    "SceneRegistration": "jobs.registration.register",
+    "SilhouetteCamera": "systems.pictures.silhouette_camera",
+    "SilhouetteMatcher": "systems.estimators.silhouette_matcher",
+    "SilhouetteTracker": "systems.estimators.silhouette_tracker",
+    "TruncatedEkf": "systems.estimators.truncated_ekf",
+    "View": "search.pose_search",
+    "audit_scene": "jobs.registration.audit",
+    "build_pose_tree": "body.tree.tree_builder",
+    "bundled_model": "body.files.packages",
+    "camera_from_drake": "camera.drake",
+    "estimate_scene": "jobs.estimate.scene",
+    "load_cameras": "camera.files",
+    "load_model": "body.model",
+    "load_scene": "silhouette.pictures.scenes",
+    "make_masks": "jobs.masks.masks",
+    "register_scene": "jobs.registration.register",
+    "save_cameras": "camera.files",
 }
 
-__all__ = [
-    "EstimateSettings",
-    "MaskSettings",
-    "SceneEstimate",
-    "SceneMasks",
-    "bundled_model",
-    "estimate_scene",
-    "load_cameras",
-    "load_model",
-    "load_scene",
-    "make_masks",
-]
+__all__ = list(_HOMES)
 
 # Read by Drake's renderer when pydrake is first imported: without it a process that forks after a
 # render hangs for ever, and processes that render side by side fight for the cores.
@@ -60,3 +87,8 @@ def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    """The public names, loaded or not."""
+    return sorted({*globals(), *__all__})

@@ -5,9 +5,13 @@ import os
 # Before pydrake is imported: without it a process that forks after a render hangs.
 os.environ.setdefault("LP_NUM_THREADS", "0")
 
+import shutil
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
+
+from tests.jobs.scenes import TinyScene, write_scene
 
 
 @pytest.fixture(scope="session")
@@ -17,3 +21,21 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip("no ../shared/data beside this checkout")
     return folder
+
+
+@pytest.fixture(scope="session")
+def tiny_scene(tmp_path_factory: pytest.TempPathFactory) -> TinyScene:
+    """Three frames of one camera; shared, so do not change it."""
+    return write_scene(tmp_path_factory.mktemp("tiny") / "scene")
+
+
+@pytest.fixture
+def own_scene(tiny_scene: TinyScene, tmp_path: Path) -> TinyScene:
+    """A copy to be spoilt."""
+    shutil.copytree(tiny_scene.folder, tmp_path / "scene")
+    return TinyScene(tmp_path / "scene", tiny_scene.model, tiny_scene.truth)
+
+
+@pytest.fixture(scope="session")
+def runner() -> CliRunner:
+    return CliRunner()

@@ -8,133 +8,24 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "drake_pose"
 
-MAY_KNOW = {
-    "body": set(),
-    "camera": set(),
-    "silhouette": {"body", "camera"},
-    "matching": {"silhouette", "body", "camera"},
-    "registration": {"matching", "silhouette", "body", "camera"},
-    "filtering": {"matching", "silhouette", "body", "camera"},
-    "multiview": {"filtering", "matching", "silhouette", "body", "camera"},
-    "systems": {
-        "multiview",
-        "registration",
-        "filtering",
-        "matching",
-        "silhouette",
-        "body",
-        "camera",
-    },
-    "apps": {
-        "systems",
-        "multiview",
-        "registration",
-        "filtering",
-        "matching",
-        "silhouette",
-        "body",
-        "camera",
-    },
-}
-# Inside a room: which folder may know which, and which module that stands beside the folders.
-# "." are all other modules beside the folders; everybody in the room may know them.
-MAY_KNOW_INSIDE = {
-    "body": {
-        "surfaces": set(),
-        "files": {"surfaces"},
-        ".": set(),
-        "parsed_model": {"files", "surfaces"},
-        "tree": {"parsed_model", "surfaces"},
-        "model": {"tree", "parsed_model", "files", "surfaces"},
-        "landmarks": {"tree", "parsed_model"},
-        "report": {"tree", "model", "parsed_model", "files", "surfaces"},
-        "check_child": {"model", "files"},
-    },
-    "camera": {".": set(), "calibration": set(), "sources": set()},
-    "silhouette": {
-        "pictures": set(),
-        "areas": {"pictures"},
-        "contours": {"areas"},
-        "bits": {"areas", "contours"},
-        "segmentation": set(),
-    },
-    "matching": {
-        ".": set(),
-        "kameda": set(),
-        "grid": set(),
-        "fit": set(),
-        "raster_fit": {"fit"},
-        "segmentation": {"fit"},
-        "starts": {"raster_fit", "fit", "grid"},
-        "continuous": {"starts", "raster_fit", "fit", "grid"},
-    },
-    "matching/grid": {
-        ".": set(),
-        "branch_and_bound": set(),
-        "families": {"branch_and_bound"},
-        "beam": {"families"},
-    },
-    "filtering": {
-        ".": set(),
-        "truncation": set(),
-        "kalman": {"truncation"},
-        "measurements": {"truncation"},
-        "hand": set(),
-        "tracking": {"measurements", "kalman"},
-    },
-    "multiview": {".": set(), "date": set(), "person": set(), "recordings": {"person"}},
-    "systems": {
-        ".": set(),
-        "bodies": set(),
-        "pictures": {"bodies"},
-        "estimators": {"bodies"},
-        "date": {"bodies", "pictures"},
-        "person": {"bodies", "pictures"},
-        "walk": {"bodies"},
-    },
-    "apps": {
-        ".": set(),
-        "calibrate": set(),
-        "results": set(),
-        "check": {"results"},
-        "estimate": {"results"},
-        "demo": {"estimate", "results"},
-        "registration": {"estimate", "results"},
-        "experiments": {"demo", "estimate", "results"},
-        "live": {"experiments", "estimate", "results"},
-        "masks": {"live", "registration", "estimate", "results"},
-        "cluster": {"live"},
-        "batch": {"cluster", "registration", "estimate", "results"},
-        "benchmarks": {
-            "batch",
-            "cluster",
-            "live",
-            "experiments",
-            "registration",
-            "estimate",
-            "results",
-            "demo",
-        },
-        "commands": {
-            "batch",
-            "cluster",
-            "live",
-            "experiments",
-            "masks",
-            "registration",
-            "estimate",
-            "results",
-        },
-        "main": {"commands", "calibrate", "check", "demo", "estimate"},
-    },
-    "apps/experiments": {
-        "kameda": set(),
-        "shimada": set(),
-        "date": set(),
-        "paper_figures": {"kameda"},
-        "all_experiments": {"kameda", "shimada", "date", "paper_figures"},
-    },
-}
+# A room may know those before it in this order; `body` and `camera` neither of each other.
+ROOMS = (
+    "body",
+    "camera",
+    "silhouette",
+    "fit",
+    "search",
+    "registration",
+    "filtering",
+    "person",
+    "systems",
+    "results",
+    "jobs",
+    "papers",
+    "commands",
+)
+APART = {("camera", "body"), ("filtering", "registration"), ("person", "registration")}
+WITH_SYSTEMS = {"systems", "results", "jobs", "papers", "commands"}
 # Drake keeps three plain value types, ImageLabel16I, CameraInfo and CameraConfig, in
 # pydrake.systems.sensors.
 VALUE_TYPES = {
@@ -178,12 +69,6 @@ def modules_imported(path: Path) -> set[str]:
     return found & set(MODULES)
 
 
-def place_in(folder: str, path: Path) -> str:
-    """Which of a folder's entries in MAY_KNOW_INSIDE a file belongs to."""
-    entry = path.relative_to(PACKAGE / folder).parts[0].removesuffix(".py")
-    return entry if entry in MAY_KNOW_INSIDE[folder] else "."
-
-
 def circles(arrows: dict[str, set[str]]) -> list[set[str]]:
     """Groups of modules that reach each other."""
     reached: dict[str, set[str]] = {}
@@ -206,18 +91,7 @@ def circles(arrows: dict[str, set[str]]) -> list[set[str]]:
 
 def test_every_folder_is_a_known_room():
     rooms = {p.name for p in PACKAGE.iterdir() if p.is_dir() and (p / "__init__.py").exists()}
-    assert rooms == set(MAY_KNOW)
-
-
-def test_every_folder_of_a_room_is_known():
-    for folder, known in MAY_KNOW_INSIDE.items():
-        found = {path.parent.name for path in (PACKAGE / folder).glob("*/__init__.py")}
-        assert found <= set(known), folder
-        names = found | {path.stem for path in (PACKAGE / folder).glob("*.py")} | {"."}
-        assert set(known) <= names, folder
-    deeper = {p.parent.parent.relative_to(PACKAGE).as_posix() for p in FILES if p.stem == "__init__"
-              and len(p.relative_to(PACKAGE).parts) > 2}  # fmt: skip
-    assert deeper == set(MAY_KNOW_INSIDE)
+    assert rooms == set(ROOMS)
 
 
 def test_no_folder_is_too_full():
@@ -243,13 +117,14 @@ def test_no_function_is_too_long():
 def test_imports_point_left_only(path):
     relative = path.relative_to(PACKAGE)
     room = relative.parts[0]
-    if room not in MAY_KNOW:
+    if room not in ROOMS:
         return
+    may_know = set(ROOMS[: ROOMS.index(room) + 1]) - {one for here, one in APART if here == room}
     for module, names in imports_of(path):
         parts = module.split(".")
         if parts[0] == "drake_pose" and len(parts) > 1 and parts[1] not in FOR_ALL:
-            assert parts[1] in MAY_KNOW[room] | {room}, f"{relative} imports {module}"
-        if module.startswith("pydrake.systems") and room not in ("systems", "apps"):
+            assert parts[1] in may_know, f"{relative} imports {module}"
+        if module.startswith("pydrake.systems") and room not in WITH_SYSTEMS:
             allowed = set(names) <= {"ImageLabel16I", "CameraInfo", "CameraConfig"}
             assert str(relative) in VALUE_TYPES, f"{relative} imports {module}"
             assert allowed, f"{relative} imports {names} from {module}"
@@ -258,20 +133,23 @@ def test_imports_point_left_only(path):
         assert module != "pydrake.all", relative
 
 
-@pytest.mark.parametrize("folder", MAY_KNOW_INSIDE)
-def test_imports_inside_a_room_point_one_way(folder):
-    may_know = MAY_KNOW_INSIDE[folder]
-    # What a package's face hands on makes no arrow.
-    for path in (p for p in (PACKAGE / folder).rglob("*.py") if p.parent != PACKAGE / folder
-                 or p.stem != "__init__"):  # fmt: skip
-        here = place_in(folder, path)
-        for module in modules_imported(path):
-            other = MODULES[module]
-            if not other.is_relative_to(PACKAGE / folder):
-                continue
-            assert other != PACKAGE / folder / "__init__.py", f"{path} imports its room's face"
-            there = place_in(folder, other)
-            assert there in may_know[here] | {here, "."}, f"{path} imports {module}"
+@pytest.mark.parametrize("room", ROOMS)
+def test_folders_of_a_room_import_each_other_in_no_circle(room):
+    arrows: dict[str, set[str]] = {}
+    for path in (PACKAGE / room).rglob("*.py"):
+        here = path.parent.relative_to(PACKAGE).as_posix()
+        there = {MODULES[m].parent for m in modules_imported(path)}
+        inside = {
+            f.relative_to(PACKAGE).as_posix() for f in there if f.is_relative_to(PACKAGE / room)
+        }
+        arrows.setdefault(here, set()).update(inside - {here})
+    # What stands beside a room's folders may know them, and be known by them.
+    folders = {
+        here: {one for one in known if one != room}
+        for here, known in arrows.items()
+        if here != room
+    }
+    assert circles(folders) == []
 
 
 def test_no_modules_import_each_other_in_a_circle():

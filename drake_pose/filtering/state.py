@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drake_pose.body import ArticulatedModel
+from drake_pose.body.model import ArticulatedModel
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.filtering.factors import check_moments, factor_of
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.matching.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import Round
 from drake_pose.registration.calibration_fit import Calibration, CalibrationFit
 
 Array = NDArray[np.float64]

@@ -14,29 +14,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.camera import PinholeCamera
-from drake_pose.matching.fit.camera_sums import Views
-from drake_pose.matching.fit.contour_fit import Noise, compare_views, pixels_per_metre
-from drake_pose.matching.fit.covariance import (
+from drake_pose.camera.models import PinholeCamera
+from drake_pose.fit.camera_sums import Views
+from drake_pose.fit.contour_fit import Noise, compare_views, pixels_per_metre
+from drake_pose.fit.covariance import (
     Picture,
     distances_in_pictures,
     estimate_sizes,
     values_covariance,
 )
-from drake_pose.matching.fit.evidence import NO_EDGE, Evidence, find_edge_points, pack_evidence
-from drake_pose.matching.fit.frames_fit import FittedFrames, FramesFit
-from drake_pose.matching.fit.levenberg_marquardt import Round, StepSettings
-from drake_pose.matching.fit.parameters import (
+from drake_pose.fit.evidence import NO_EDGE, Evidence, find_edge_points, pack_evidence
+from drake_pose.fit.frames_fit import FittedFrames, FramesFit
+from drake_pose.fit.levenberg_marquardt import Round, StepSettings
+from drake_pose.fit.parameters import (
     CAMERA_NAMES,
     GIRTH_PREFIX,
     BodyParameters,
     CameraParameters,
 )
-from drake_pose.matching.fit.unknowns import Unknowns, choose, join
+from drake_pose.fit.unknowns import Unknowns, choose, join
 from drake_pose.registration.camera_fit import POSE_NAMES
 from drake_pose.registration.freed_frames import SeenFrame, common_size
 from drake_pose.registration.uncertainty import pose_covariance
-from drake_pose.silhouette import Outline
+from drake_pose.silhouette.areas.outline import Outline
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.body.model import OBJECT_POSITIONS
-from drake_pose.matching.fit.contour_fit import Comparison
-from drake_pose.matching.fit.kernel import COST, WEIGHT
-from drake_pose.matching.fit.levenberg_marquardt import Equations, Round, StepSettings, minimise
-from drake_pose.matching.fit.parameters import CAMERA_NAMES
+from drake_pose.fit.contour_fit import Comparison
+from drake_pose.fit.kernel import COST, WEIGHT
+from drake_pose.fit.levenberg_marquardt import Equations, Round, StepSettings, minimise
+from drake_pose.fit.parameters import CAMERA_NAMES
 from drake_pose.registration.camera_fit import POSE_NAMES, CameraFit
 
 Array = NDArray[np.float64]

@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.body.tree.joint_offsets import JointOffset
-from drake_pose.camera import PinholeCamera
-from drake_pose.matching.fit.camera_sums import Views
-from drake_pose.matching.fit.contour_fit import Comparison, ContourFit, Noise, pack_cameras
-from drake_pose.matching.fit.evidence import widened
-from drake_pose.matching.fit.frames_fit import FramesFit
-from drake_pose.matching.fit.lengthened_body import LengthenedBody
-from drake_pose.matching.fit.levenberg_marquardt import Round, StepSettings
-from drake_pose.matching.fit.parameters import CAMERA_NAMES, CameraParameters
-from drake_pose.matching.fit.unknowns import choose
+from drake_pose.camera.models import PinholeCamera
+from drake_pose.fit.camera_sums import Views
+from drake_pose.fit.contour_fit import Comparison, ContourFit, Noise, pack_cameras
+from drake_pose.fit.evidence import widened
+from drake_pose.fit.frames_fit import FramesFit
+from drake_pose.fit.lengthened_body import LengthenedBody
+from drake_pose.fit.levenberg_marquardt import Round, StepSettings
+from drake_pose.fit.parameters import CAMERA_NAMES, CameraParameters
+from drake_pose.fit.unknowns import choose
 from drake_pose.registration.posed_frames import PosedFrames
 
 Array = NDArray[np.float64]

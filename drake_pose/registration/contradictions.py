@@ -2,7 +2,7 @@
 
 Masks, cameras and encoders are given. Each frame is fitted by itself, all that is given free to
 move (``freed_frames``), and so tells by how much what is given is off; its covariance counts what
-errs together in contours (``matching.fit.covariance``). What all frames are off alike is estimated
+errs together in contours (``fit.covariance``). What all frames are off alike is estimated
 from those that agree. It is no frame's fault but that of a joint's zero, a camera or the base,
 where it is significant and shows. A frame is at fault that is significantly off from the others.
 """
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.stats import f as fisher
 
 from drake_pose.errors import SettingsError
-from drake_pose.matching.fit.covariance import (
+from drake_pose.fit.covariance import (
     Distances,
     ErrorSizes,
     Picture,

@@ -13,32 +13,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.camera import Camera
+from drake_pose.camera.models import Camera
 from drake_pose.errors import MaskError
-from drake_pose.matching.fit.camera_sums import Views
-from drake_pose.matching.fit.contour_fit import (
+from drake_pose.fit.camera_sums import Views
+from drake_pose.fit.contour_fit import (
     Comparison,
     ContourFit,
     Noise,
     fitting_share,
     pixels_per_metre,
 )
-from drake_pose.matching.fit.covariance import Picture
-from drake_pose.matching.fit.evidence import (
+from drake_pose.fit.covariance import Picture
+from drake_pose.fit.evidence import (
     NO_EDGE,
     Evidence,
     find_edge_points,
     pack_evidence,
     widened,
 )
-from drake_pose.matching.fit.frames_fit import FramesFit
-from drake_pose.matching.fit.kernel import COST, WEIGHT
-from drake_pose.matching.fit.levenberg_marquardt import Round, StepSettings
-from drake_pose.matching.fit.parameters import CAMERA_NAMES, CameraParameters
-from drake_pose.matching.fit.unknowns import choose
+from drake_pose.fit.frames_fit import FramesFit
+from drake_pose.fit.kernel import COST, WEIGHT
+from drake_pose.fit.levenberg_marquardt import Round, StepSettings
+from drake_pose.fit.parameters import CAMERA_NAMES, CameraParameters
+from drake_pose.fit.unknowns import choose
 from drake_pose.registration.agreement import TOLD_APART
 from drake_pose.registration.camera_fit import POSE_NAMES
-from drake_pose.silhouette import Outline
+from drake_pose.silhouette.areas.outline import Outline
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtr, stdtrit
 
-from drake_pose.body import PoseTree
 from drake_pose.body.model import OBJECT_POSITIONS
 from drake_pose.body.tree.joint_offsets import JointOffset, joint_offsets
-from drake_pose.camera import PinholeCamera
+from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, UnknownNameError
-from drake_pose.matching.fit.lengthened_body import length_name
+from drake_pose.fit.lengthened_body import length_name
 from drake_pose.registration.agreement import agreeing, frame_shares
 from drake_pose.registration.calibration_fit import (
     CONSTANT_DEVIATION,

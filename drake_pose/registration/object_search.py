@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from drake_pose.body.model import OBJECT_POSITIONS
 from drake_pose.body.tree.joint_map import inverse_transforms
-from drake_pose.camera import PinholeCamera
+from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
-from drake_pose.matching.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import Round
 from drake_pose.registration.calibration_fit import (
     ROUNDS_WITH_CONSTANTS,
     Calibration,
@@ -44,7 +44,7 @@ from drake_pose.registration.register import (
 )
 from drake_pose.registration.standing_object import StandingObject, require_turns
 from drake_pose.registration.start_poses import E_total, areas
-from drake_pose.silhouette import Outline
+from drake_pose.silhouette.areas.outline import Outline
 
 Array = NDArray[np.float64]
 Look = tuple[Array, Array]

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.camera import PinholeCamera
+from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import MaskError
-from drake_pose.matching.fit.evidence import Evidence, find_edge_points, pack_evidence
-from drake_pose.silhouette import Outline, prefix_sums
+from drake_pose.fit.evidence import Evidence, find_edge_points, pack_evidence
+from drake_pose.silhouette.areas.outline import Outline
+from drake_pose.silhouette.areas.scoring import prefix_sums
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

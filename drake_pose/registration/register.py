@@ -16,13 +16,14 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.body import PoseTree, TriangleMesh
+from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.camera import PinholeCamera
+from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, SettingsError
-from drake_pose.matching.fit.levenberg_marquardt import Round
-from drake_pose.matching.fit.significance import excess
-from drake_pose.matching.fit.surfaces import FEW, VERY_FEW, few_triangles, with_girths
+from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.significance import excess
+from drake_pose.fit.surfaces import FEW, VERY_FEW, few_triangles, with_girths
 from drake_pose.registration.agreement import TOLD_APART, agreeing, frame_shares
 from drake_pose.registration.calibration_fit import (
     Calibration,
@@ -39,7 +40,8 @@ from drake_pose.registration.start_poses import (
     spread_rotations,
 )
 from drake_pose.registration.uncertainty import calibration_uncertainty, pose_covariance
-from drake_pose.silhouette import Outline, TreeSurfaces, outline_from_mesh
+from drake_pose.silhouette.areas.bending import TreeSurfaces
+from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -12,18 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body import ArticulatedModel, PoseTree, RootRotation
-from drake_pose.body.model import OBJECT, OBJECT_POSITIONS
+from drake_pose.body.model import OBJECT, OBJECT_POSITIONS, ArticulatedModel
 from drake_pose.body.surfaces.mesh import TriangleMesh, join_meshes
 from drake_pose.body.tree.joint_map import inverse_transforms
+from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body.tree.root import RootRotation
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.errors import RegistrationError, SettingsError
-from drake_pose.matching.fit.surface_distance import surface_distance
-from drake_pose.matching.fit.surfaces import FEW, few_triangles
+from drake_pose.fit.surface_distance import surface_distance
+from drake_pose.fit.surfaces import FEW, few_triangles
 from drake_pose.registration.hand_eye import turns_between
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import ObjectPose, RegistrationBody
-from drake_pose.silhouette import TreeSurfaces, outline_from_mesh
+from drake_pose.silhouette.areas.bending import TreeSurfaces
+from drake_pose.silhouette.areas.outline import outline_from_mesh
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.registration.posed_frames import PosedFrames
-from drake_pose.silhouette import score_bodies
+from drake_pose.silhouette.areas.scoring import score_bodies
 
 Array = NDArray[np.float64]
 

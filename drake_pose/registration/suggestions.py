@@ -9,9 +9,9 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.camera import PinholeCamera
+from drake_pose.camera.models import PinholeCamera
 from drake_pose.registration.register import RegistrationBody
-from drake_pose.silhouette import draw_mask
+from drake_pose.silhouette.areas.scoring import draw_mask
 
 Array = NDArray[np.float64]
 

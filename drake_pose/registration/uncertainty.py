@@ -1,6 +1,6 @@
 """How sure a camera's pose is, where contours do not err point by point.
 
-As for a pose of the body (``matching.fit.covariance``) there are the noise of points, the surface
+As for a pose of the body (``fit.covariance``) there are the noise of points, the surface
 of a part in all frames alike, its edge in one mask, and each frame as a whole, whose joint
 positions or picture may be a little off. How large these are is told by what is left of the
 distances, at the scale at which the pose was fitted, and how far they reach by what each frame
@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.matching.fit.contour_fit import pack_cameras, pixels_per_metre
-from drake_pose.matching.fit.covariance import (
+from drake_pose.fit.contour_fit import pack_cameras, pixels_per_metre
+from drake_pose.fit.covariance import (
     Distances,
     ErrorSizes,
     Picture,
@@ -27,7 +27,7 @@ from drake_pose.matching.fit.covariance import (
     values_covariance,
     widening,
 )
-from drake_pose.matching.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import Round
 from drake_pose.registration.agreement import TOLD_APART
 from drake_pose.registration.calibration_fit import Calibration, CalibrationFit
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from drake_pose.body import load_model
-from drake_pose.camera import ParallelCamera
+from drake_pose.body.model import load_model
+from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import ModelError, UnknownNameError
-from drake_pose.silhouette import LabelRenderer
-from tests.matching.bodies import forked_body, front_camera
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from tests.search.bodies import forked_body, front_camera
 
 
 def area(model, q, scale=1.0):

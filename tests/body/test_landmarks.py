@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drake_pose.body import bundled_model, load_model
+from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.landmarks import (
     Landmark,
     landmark_positions,
@@ -14,6 +14,7 @@ from drake_pose.body.landmarks import (
     landmarks_of_nodes,
     load_landmarks,
 )
+from drake_pose.body.model import load_model
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
 from tests.body.models import FLOATING_URDF, write
 

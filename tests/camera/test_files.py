@@ -3,7 +3,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drake_pose.camera import ParallelCamera, PinholeCamera, load_cameras, save_cameras
+from drake_pose.camera.files import load_cameras, save_cameras
+from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.errors import CameraError
 
 EYE = "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"

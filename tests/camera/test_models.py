@@ -6,8 +6,8 @@ from pydrake.geometry import ClippingRange, RenderCameraCore
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.sensors import CameraInfo
 
-from drake_pose.camera import Camera, ParallelCamera, PinholeCamera
 from drake_pose.camera.drake import camera_from_drake, camera_to_drake
+from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
 from drake_pose.errors import CameraError
 
 

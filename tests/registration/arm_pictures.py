@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from drake_pose.body import ArticulatedModel
-from drake_pose.camera import PinholeCamera
+from drake_pose.body.model import ArticulatedModel
+from drake_pose.camera.models import PinholeCamera
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import RegistrationBody
-from drake_pose.silhouette import LabelRenderer
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
 
 def looking_at(place: np.ndarray, middle: np.ndarray, roll: float) -> PinholeCamera:

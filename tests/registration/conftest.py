@@ -2,9 +2,9 @@
 
 import pytest
 
-from drake_pose.body import ArticulatedModel, load_model
+from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.registration.register import RegistrationBody
-from tests.matching.arms import arm_urdf
+from tests.search.arms import arm_urdf
 
 
 @pytest.fixture(scope="module")

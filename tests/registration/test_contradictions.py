@@ -6,14 +6,14 @@ import cv2
 import numpy as np
 import pytest
 
-from drake_pose.body import ArticulatedModel
-from drake_pose.camera import PinholeCamera
+from drake_pose.body.model import ArticulatedModel
+from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import MaskError, SettingsError
 from drake_pose.registration.contradictions import Audit, AuditSettings, Finding, audit_frames
 from drake_pose.registration.freed_frames import FrameFreer, SeenFrame
 from drake_pose.registration.register import RegistrationBody
-from drake_pose.silhouette import LabelRenderer
-from tests.matching.arms import arm_cameras
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from tests.search.arms import arm_cameras
 
 COUNT = 8
 WRONG = 3

@@ -5,16 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drake_pose.body import ArticulatedModel, load_model
+from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.errors import RegistrationError, UnknownNameError
-from drake_pose.matching.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import Round
 from drake_pose.registration.calibration_fit import CalibrationFit, start_calibration
 from drake_pose.registration.camera_fit import CameraFit
 from drake_pose.registration.joint_zeros import calibrate_joints
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import CameraSearch, RegistrationBody
-from tests.matching.arms import arm_urdf
 from tests.registration.arm_pictures import errors, looking_at, see
+from tests.search.arms import arm_urdf
 
 MIDDLE = np.array([0.0, 0.0, 0.4])
 NAMES = ("shoulder_turn", "roll_turn", "elbow_turn")

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body import ArticulatedModel, load_model
-from drake_pose.camera import PinholeCamera
+from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, SettingsError
 from drake_pose.registration.online_registration import (
     CameraStatus,
@@ -20,9 +20,9 @@ from drake_pose.registration.online_registration import (
 )
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import FrameMisfit, RegisteredCamera, RegistrationBody
-from drake_pose.silhouette import LabelRenderer
-from tests.matching.arms import arm_urdf
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.registration.test_register import looking_at
+from tests.search.arms import arm_urdf
 
 NOT_REGISTERED, REGISTERED, CONTRADICTED = CameraStatus
 SEEN = np.ones((480, 640), dtype=bool)

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from drake_pose.body import ArticulatedModel
+from drake_pose.body.model import ArticulatedModel
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.registration.suggestions import Box, suggest_pose
-from drake_pose.silhouette import LabelRenderer
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.registration.arm_pictures import looking_at
 
 MIDDLE = np.array([0.0, 0.0, 0.4])

@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body import TriangleMesh
-from drake_pose.camera import Camera
+from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.camera.models import Camera
 
 
 def random_pose(rng: np.random.Generator, position: tuple[float, float, float]) -> np.ndarray:

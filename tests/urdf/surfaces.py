@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 import trimesh
 
-from drake_pose.body import ArticulatedModel
-from drake_pose.camera import ParallelCamera
-from drake_pose.silhouette import draw_mask, outline_from_mesh
+from drake_pose.body.model import ArticulatedModel
+from drake_pose.camera.models import ParallelCamera
+from drake_pose.silhouette.areas.outline import outline_from_mesh
+from drake_pose.silhouette.areas.scoring import draw_mask
 
 URDF = Path(__file__).resolve().parents[2] / "urdf"
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drake_pose.body import ArticulatedModel, load_model
+from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.filtering.truncation.couplings import model_inequalities
 from tests.urdf.surfaces import (
     URDF,

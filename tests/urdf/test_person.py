@@ -16,8 +16,8 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
-from drake_pose.body import ArticulatedModel, load_model
 from drake_pose.body.landmarks import landmark_positions, load_landmarks
+from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.filtering.truncation.couplings import model_inequalities
 from tests.urdf.surfaces import (
     URDF,

@@ -12,13 +12,16 @@ import numpy as np
 from pydrake.geometry import LightParameter, MakeRenderEngineVtk, RenderEngineVtkParams, SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_pose.apps.demo import run_demo
-from drake_pose.apps.results.overlay import paint_agreement
-from drake_pose.body import ArticulatedModel, bundled_model, load_model
-from drake_pose.camera import PinholeCamera
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.camera.drake import camera_to_drake
-from drake_pose.matching import PaperSearch, PaperSearchSettings, View
-from drake_pose.silhouette import LabelRenderer
+from drake_pose.camera.models import PinholeCamera
+from drake_pose.jobs.demo import run_demo
+from drake_pose.results.overlay import paint_agreement
+from drake_pose.search.kameda.search import PaperSearch
+from drake_pose.search.result import View
+from drake_pose.search.settings import PaperSearchSettings
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
 FOLDER = Path(__file__).resolve().parent
 ROOT_POSITION = np.array([0.0, 0.0, 1.49])

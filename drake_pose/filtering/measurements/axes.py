@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.camera import Camera
+from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.measurements.segment_axes import Axis, AxisObserver, AxisSettings, Ends

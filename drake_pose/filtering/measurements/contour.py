@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.body import PoseTree
 from drake_pose.body.tree.link_graph import PlantKinematics
+from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.camera import Camera, ParallelCamera
+from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.filtering.state import Belief, StateLayout
 from drake_pose.filtering.truncation.couplings import (
@@ -27,8 +27,8 @@ from drake_pose.filtering.truncation.inequalities import (
     say_if_unlimited,
     stack,
 )
-from drake_pose.matching.fit.camera_sums import REACH, Views
-from drake_pose.matching.fit.colours import (
+from drake_pose.fit.camera_sums import REACH, Views
+from drake_pose.fit.colours import (
     ColourSettings,
     Histograms,
     Picture,
@@ -39,21 +39,20 @@ from drake_pose.matching.fit.colours import (
     part_distances,
     weigh_parts,
 )
-from drake_pose.matching.fit.contour_fit import (
+from drake_pose.fit.contour_fit import (
     Comparison,
     Noise,
     compare_views,
     pack_views,
     project,
 )
-from drake_pose.matching.fit.evidence import NO_EDGE, find_edge_points
-from drake_pose.matching.fit.kernel import COMPARED, FITTING, SQUARES, WEIGHT
-from drake_pose.matching.fit.levenberg_marquardt import Round
-from drake_pose.matching.fit.parameters import BodyParameters
-from drake_pose.matching.fit.surfaces import MANY, few_rigid_triangles
-from drake_pose.matching.starts.root_placement import slide_root
-from drake_pose.silhouette import TreeSurfaces
-from drake_pose.silhouette.areas.bending import PackedSurfaces
+from drake_pose.fit.evidence import NO_EDGE, find_edge_points
+from drake_pose.fit.kernel import COMPARED, FITTING, SQUARES, WEIGHT
+from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.parameters import BodyParameters
+from drake_pose.fit.surfaces import MANY, few_rigid_triangles
+from drake_pose.search.starts.root_placement import slide_root
+from drake_pose.silhouette.areas.bending import PackedSurfaces, TreeSurfaces
 from drake_pose.silhouette.areas.scoring import draw_packed
 
 Array = NDArray[np.float64]

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from drake_pose.body import ParsedModel
-from drake_pose.camera import Camera
+from drake_pose.body.parsed_model import ParsedModel
+from drake_pose.camera.models import Camera
 from drake_pose.errors import MaskError, SettingsError
-from drake_pose.silhouette import LabelRenderer
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int16]

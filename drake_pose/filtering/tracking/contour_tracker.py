@@ -21,7 +21,7 @@ from drake_pose.filtering.measurements.contour import (
     Seen,
 )
 from drake_pose.filtering.state import Belief
-from drake_pose.matching.fit.colours import Histograms, Picture
+from drake_pose.fit.colours import Histograms, Picture
 
 Array = NDArray[np.float64]
 

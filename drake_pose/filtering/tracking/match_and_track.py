@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.body import PoseTree
-from drake_pose.camera import Camera
+from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.camera.models import Camera
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.tracking.contour_tracker import ContourTracker, Track, TrackingSettings
-from drake_pose.matching import MatchResult, PoseSearch
-from drake_pose.matching.fit.colours import Picture
-from drake_pose.matching.result import UNEXPLAINED, PlacedMatch, View
+from drake_pose.fit.colours import Picture
+from drake_pose.search.pose_search import PoseSearch
+from drake_pose.search.result import UNEXPLAINED, MatchResult, PlacedMatch, View
 from drake_pose.silhouette.pictures.mask_agreement import edge_area
 
 Array = NDArray[np.float64]

@@ -18,19 +18,19 @@ from numpy.typing import NDArray
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.filtering.measurements.contour import Mask
 from drake_pose.filtering.tracking.contour_tracker import ContourTracker
-from drake_pose.matching.fit.contour_fit import Noise
-from drake_pose.matching.fit.evidence import find_edge_points
-from drake_pose.matching.fit.levenberg_marquardt import Round
-from drake_pose.matching.fit.proportions import (
+from drake_pose.fit.contour_fit import Noise
+from drake_pose.fit.evidence import find_edge_points
+from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.proportions import (
     FittedProportions,
     ProportionedBody,
     ProportionSettings,
     SequencePrior,
     fit_proportions,
 )
-from drake_pose.matching.fit.surfaces import few_rigid_triangles
-from drake_pose.matching.pose_families import JointEstimate, PoseFamily, PoseSet
-from drake_pose.silhouette import TreeSurfaces
+from drake_pose.fit.surfaces import few_rigid_triangles
+from drake_pose.search.pose_families import JointEstimate, PoseFamily, PoseSet
+from drake_pose.silhouette.areas.bending import TreeSurfaces
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -13,7 +13,7 @@ import yaml
 from numpy.typing import NDArray
 from pydrake.common.yaml import yaml_load_typed
 
-from drake_pose.body import ParsedModel
+from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.errors import ModelError, SettingsError
 from drake_pose.filtering.truncation.inequalities import (
     Inequalities,

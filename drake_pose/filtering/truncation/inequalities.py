@@ -10,7 +10,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.solvers import Binding, MathematicalProgram
 from scipy.optimize import linprog
 
-from drake_pose.body import ParsedModel
+from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.errors import SettingsError, UnknownNameError
 
 # Rows are scaled to unit length, so this is a length in the space of states.

@@ -8,15 +8,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drake_pose.body import ModelSkin, TriangleMesh
-from drake_pose.camera import Camera
+from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.body.tree.node_skin import ModelSkin
+from drake_pose.camera.models import Camera
 from drake_pose.silhouette.areas.bending import BendingOutline
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
 if TYPE_CHECKING:
-    from drake_pose.body import ArticulatedModel
+    from drake_pose.body.model import ArticulatedModel
 
 LARGEST_SHARE = 0.002
 """The largest part of a mask that may differ."""

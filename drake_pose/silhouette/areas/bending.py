@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drake_pose.camera import Camera
+from drake_pose.camera.models import Camera
 from drake_pose.silhouette.areas.bending_kernel import bend, score_bent
 from drake_pose.silhouette.areas.outline import (
     Outline,
@@ -21,7 +21,8 @@ from drake_pose.silhouette.areas.outline import (
 from drake_pose.silhouette.areas.scoring import check_body, check_prefixes
 
 if TYPE_CHECKING:
-    from drake_pose.body import PoseTree, TriangleMesh
+    from drake_pose.body.surfaces.mesh import TriangleMesh
+    from drake_pose.body.tree.pose_tree import PoseTree
 
 
 class BendingOutline:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from drake_pose.camera import Camera
+from drake_pose.camera.models import Camera
 from drake_pose.silhouette.areas.label_kernel import paint_labels
 from drake_pose.silhouette.areas.outline import Outline, PackedOutlines, pack
 from drake_pose.silhouette.areas.prefix_sums import sum_rows

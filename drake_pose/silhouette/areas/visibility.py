@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from drake_pose.camera import Camera, PinholeCamera
+from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError
 from drake_pose.silhouette.areas.outline import Outline
 from drake_pose.silhouette.areas.scoring import draw_mask

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_pose.camera import Camera, ParallelCamera
+from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.compiled import compiled, copy_into, with_room
 from drake_pose.silhouette.areas.outline import Outline
 from drake_pose.silhouette.contours.contour_segments import Segments

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_pose.camera import Camera
+from drake_pose.camera.models import Camera
 from drake_pose.compiled import compiled
 from drake_pose.errors import SettingsError
 from drake_pose.silhouette.areas.outline import Outline, PackedOutlines, pack

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_pose.body import TriangleMesh
+from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.compiled import compiled, with_room
 from drake_pose.silhouette.areas.bending import BendingOutline
 from drake_pose.silhouette.areas.outline import Outline, PackedOutlines, outline_from_mesh, pack

@@ -24,7 +24,8 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform
 
-from drake_pose.body import ModelSkin, TriangleMesh
+from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.body.tree.node_skin import ModelSkin
 
 # The apex's depth as a share of a triangle's size (the root of twice its area): deep enough to be
 # hidden, flat enough to stay inside thin bands.

@@ -19,15 +19,15 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
 
-from drake_pose.body import ModelSkin
 from drake_pose.body.parsed_model import link_names
-from drake_pose.camera import Camera, ParallelCamera
+from drake_pose.body.tree.node_skin import ModelSkin
 from drake_pose.camera.drake import camera_to_drake
+from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.silhouette.pictures.drake_skin import DeformableSkin
 from drake_pose.silhouette.pictures.label_images import EMPTY, label_data
 
 if TYPE_CHECKING:
-    from drake_pose.body import ParsedModel
+    from drake_pose.body.parsed_model import ParsedModel
 
 _RENDERER = "silhouette"
 _DEPTH_MARGIN = 0.01

@@ -11,7 +11,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from drake_pose.camera import Camera, ParallelCamera, load_cameras
+from drake_pose.camera.files import load_cameras
+from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.errors import SceneError, UnknownNameError
 from drake_pose.regular_files import read_regular
 from drake_pose.silhouette.pictures.masks import read_mask

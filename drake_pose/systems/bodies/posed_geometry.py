@@ -13,7 +13,7 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
-from drake_pose.body import ParsedModel
+from drake_pose.body.parsed_model import ParsedModel
 
 
 class KnownPositions(LeafSystem):

@@ -13,7 +13,8 @@ from pydrake.systems.framework import (
     OutputPort,
 )
 
-from drake_pose.body import ModelSkin, ParsedModel
+from drake_pose.body.parsed_model import ParsedModel
+from drake_pose.body.tree.node_skin import ModelSkin
 from drake_pose.silhouette.pictures.drake_skin import DeformableSkin
 
 MESHCAT_PERIOD = 1.0 / 64.0

@@ -13,9 +13,9 @@ from pydrake.systems.framework import (
     System,
 )
 
-from drake_pose.camera import Camera
+from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
-from drake_pose.multiview.date.capture import CaptureSetup
+from drake_pose.person.date.capture import CaptureSetup
 from drake_pose.systems.bodies.posed_geometry import add_avatar
 from drake_pose.systems.date.face_direction_finder import FaceDirectionFinder
 from drake_pose.systems.date.feature_finder import FeatureFinder

@@ -7,8 +7,8 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from pydrake.systems.sensors import ImageRgba8U
 
-from drake_pose.camera import Camera
-from drake_pose.multiview.date.faces import FaceTemplates, find_face
+from drake_pose.camera.models import Camera
+from drake_pose.person.date.faces import FaceTemplates, find_face
 from drake_pose.systems.colour_images import colour_image_to_picture
 
 

@@ -8,9 +8,9 @@ import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from drake_pose.camera import Camera
-from drake_pose.multiview.date.features import FeatureSettings, find_features
-from drake_pose.multiview.date.skeleton import FEATURES
+from drake_pose.camera.models import Camera
+from drake_pose.person.date.features import FeatureSettings, find_features
+from drake_pose.person.date.skeleton import FEATURES
 from drake_pose.systems.date.view_ports import ViewPorts
 
 
@@ -35,7 +35,7 @@ class FeatureFinder(LeafSystem):
     expected in this frame [m]; the last frame's places where unconnected. Outputs: ``features``
     (15), the last frame's where nothing was measured [m]; ``support`` (5), from how many 3-D points
     each was taken, 0: not measured; and both with all 3-D points as ``found``, a
-    ``multiview.features.Features`` or None.
+    ``person.date.features.Features`` or None.
 
     Args:
         cameras: the cameras on the circle, in the order of the input ports.

@@ -8,11 +8,11 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, LeafSystem, ValueProducer
 from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 
-from drake_pose.camera import Camera
+from drake_pose.camera.models import Camera
 from drake_pose.errors import CameraError, SettingsError
-from drake_pose.multiview.date.capture import see_person
-from drake_pose.multiview.date.skin_blobs import SkinColour
-from drake_pose.silhouette import label_image_to_mask
+from drake_pose.person.date.capture import see_person
+from drake_pose.person.date.skin_blobs import SkinColour
+from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 from drake_pose.silhouette.segmentation.background import Background, person_region
 from drake_pose.systems.colour_images import colour_image_to_picture
 
@@ -34,7 +34,7 @@ class HorizontalImage(LeafSystem):
 
     The paper's horizontal image processing module. Where ``label_image`` is connected it gives the
     person's region; otherwise the background model does. Outputs: ``region``, a mask (H, W), and
-    ``person_view``, a ``multiview.capture.PersonView``; both are None while the camera has stopped:
+    ``person_view``, a ``person.date.capture.PersonView``; both are None while the camera is lost:
     ``color_image`` is unconnected, or an image of no pixels.
 
     Args:

@@ -12,11 +12,11 @@ from pydrake.systems.framework import (
 )
 
 from drake_pose.errors import SettingsError
-from drake_pose.multiview.date.body_pose import estimate_pose
-from drake_pose.multiview.date.capture import CaptureSetup
-from drake_pose.multiview.date.faces import head_angles
-from drake_pose.multiview.date.features import expect_features
-from drake_pose.multiview.date.skeleton import FEATURES, LIMBS
+from drake_pose.person.date.body_pose import estimate_pose
+from drake_pose.person.date.capture import CaptureSetup
+from drake_pose.person.date.faces import head_angles
+from drake_pose.person.date.features import expect_features
+from drake_pose.person.date.skeleton import FEATURES, LIMBS
 from drake_pose.systems.date.view_ports import ViewPorts
 
 Array = NDArray[np.float64]

@@ -8,9 +8,9 @@ import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from drake_pose.camera import Camera
-from drake_pose.multiview.date.recognition import RegisteredPose, recognise
-from drake_pose.multiview.date.skeleton import Skeleton
+from drake_pose.camera.models import Camera
+from drake_pose.person.date.recognition import RegisteredPose, recognise
+from drake_pose.person.date.skeleton import Skeleton
 from drake_pose.systems.date.view_ports import ViewPorts
 
 
@@ -30,7 +30,7 @@ class PoseRecogniser(LeafSystem):
     A camera that is unconnected or gives None is left out. Outputs: ``recognised_positions`` (nq)
     of the person in the registered pose [rad or m], nan where it is not recognised;
     ``similarity`` of the contours, 0 where not recognised; and both as ``recognition``, a
-    ``multiview.recognition.Recognition`` or None.
+    ``person.date.recognition.Recognition`` or None.
 
     Args:
         skeleton: the person.

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, LeafSystem
 
-from drake_pose.camera import Camera
+from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
-from drake_pose.multiview.date.capture import PersonView
+from drake_pose.person.date.capture import PersonView
 
 
 class ViewPorts:

@@ -8,7 +8,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
 from pydrake.systems.sensors import ImageLabel16I
 
-from drake_pose.camera import PinholeCamera
+from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import SettingsError
 from drake_pose.registration.online_registration import (
     CameraStatus,
@@ -17,7 +17,7 @@ from drake_pose.registration.online_registration import (
 )
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import RegisteredCamera
-from drake_pose.silhouette import label_image_to_mask
+from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 
 REGISTRATION = ("keyframes", "contradictions", "moves", "mean_iou")
 """What the elements of the output ``registration`` of CameraRegistration are."""

@@ -5,14 +5,10 @@ from numpy.typing import NDArray
 from pydrake.systems.framework import Context, LeafSystem
 
 from drake_pose.errors import SettingsError
-from drake_pose.filtering import (
-    Belief,
-    FilterState,
-    Hypothesis,
-    RepeatedView,
-    TruncatedFilter,
-    View,
-)
+from drake_pose.filtering.kalman.hypotheses import Hypothesis
+from drake_pose.filtering.kalman.repeated_views import RepeatedView, View
+from drake_pose.filtering.kalman.truncated_filter import FilterState, TruncatedFilter
+from drake_pose.filtering.state import Belief
 
 Array = NDArray[np.float64]
 

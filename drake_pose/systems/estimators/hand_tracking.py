@@ -13,20 +13,15 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
 from pydrake.trajectories import Trajectory
 
-from drake_pose.camera import Camera
-from drake_pose.filtering import (
-    AxisSettings,
-    Belief,
-    ContourObservation,
-    ContourTracker,
-    FilterSettings,
-    TrackingSettings,
-    TruncatedFilter,
-    model_inequalities,
-)
+from drake_pose.camera.models import Camera
+from drake_pose.filtering.kalman.truncated_filter import FilterSettings, TruncatedFilter
 from drake_pose.filtering.measurements.axes import AxisObservation
-from drake_pose.filtering.measurements.segment_axes import Ends
-from drake_pose.matching import PoseSearch
+from drake_pose.filtering.measurements.contour import ContourObservation
+from drake_pose.filtering.measurements.segment_axes import AxisSettings, Ends
+from drake_pose.filtering.state import Belief
+from drake_pose.filtering.tracking.contour_tracker import ContourTracker, TrackingSettings
+from drake_pose.filtering.truncation.couplings import model_inequalities
+from drake_pose.search.pose_search import PoseSearch
 from drake_pose.systems.estimators.axis_sensor import AxisSensor, BodyBelief, StateMatcher
 from drake_pose.systems.estimators.diagrams import (
     ESTIMATE_COLOUR,

@@ -8,8 +8,9 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 
-from drake_pose.camera import Camera
-from drake_pose.silhouette import Scene, mask_to_label_image
+from drake_pose.camera.models import Camera
+from drake_pose.silhouette.pictures.label_images import mask_to_label_image
+from drake_pose.silhouette.pictures.scenes import Scene
 from drake_pose.systems.colour_images import picture_to_colour_image
 from drake_pose.systems.estimators.silhouette_matcher import label_image_port
 from drake_pose.systems.estimators.silhouette_tracker import color_image_port

@@ -11,7 +11,7 @@ from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
 from pydrake.systems.sensors import RgbdSensor
 from pydrake.trajectories import Trajectory
 
-from drake_pose.camera import PinholeCamera
+from drake_pose.camera.models import PinholeCamera
 from drake_pose.registration.online_registration import OnlineRegistration
 from drake_pose.systems.estimators.camera_registration import CameraRegistration
 from drake_pose.systems.estimators.diagrams import add_simulated_cameras

@@ -15,10 +15,11 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.sensors import ImageLabel16I
 
-from drake_pose.camera import Camera
+from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
-from drake_pose.matching import MatchResult, PoseSearch, View
-from drake_pose.silhouette import label_image_to_mask
+from drake_pose.search.pose_search import PoseSearch
+from drake_pose.search.result import MatchResult, View
+from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 
 STATISTICS = ("found", "J", "E_total", "first_E_total", "runs", "outside_limit", "seconds")
 """What the elements of the output ``statistics`` are."""

@@ -8,13 +8,13 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, InputPort
 from pydrake.systems.sensors import ImageRgba8U
 
-from drake_pose.camera import Camera
+from drake_pose.camera.models import Camera
 from drake_pose.errors import UnknownNameError
 from drake_pose.filtering.tracking.contour_tracker import Track, TrackingSettings
 from drake_pose.filtering.tracking.match_and_track import TRACKED, Followed, MatchAndTrack
-from drake_pose.matching import MatchResult, PoseSearch
-from drake_pose.matching.fit.colours import Picture
-from drake_pose.matching.result import View
+from drake_pose.fit.colours import Picture
+from drake_pose.search.pose_search import PoseSearch
+from drake_pose.search.result import MatchResult, View
 from drake_pose.systems.estimators.filter_packing import FilterPacking, require_time_forward
 from drake_pose.systems.estimators.silhouette_matcher import SilhouetteMatcher
 

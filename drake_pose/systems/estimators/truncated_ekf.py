@@ -8,8 +8,9 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Even
 from scipy.special import chdtri
 
 from drake_pose.errors import SettingsError
-from drake_pose.filtering import Belief, FilterState, ObservationModel, TruncatedFilter, make_belief
-from drake_pose.filtering.kalman.update import with_variances
+from drake_pose.filtering.kalman.truncated_filter import FilterState, TruncatedFilter
+from drake_pose.filtering.kalman.update import ObservationModel, with_variances
+from drake_pose.filtering.state import Belief, make_belief
 from drake_pose.systems.estimators.filter_packing import (
     HEAD,
     FilterPacking,

@@ -8,9 +8,9 @@ from typing import NamedTuple, Protocol
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
 
-from drake_pose.camera import Camera
-from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker
-from drake_pose.multiview.recordings.person_capture import EDGE_POINTS
+from drake_pose.camera.models import Camera
+from drake_pose.person.recordings.person_capture import EDGE_POINTS
+from drake_pose.person.silhouette_tracker import SilhouetteTracker
 from drake_pose.silhouette.segmentation.background import Background
 from drake_pose.systems.bodies.posed_geometry import add_avatar
 from drake_pose.systems.person.person_tracker import PersonTracker

@@ -24,16 +24,16 @@ from pydrake.systems.framework import (
 from pydrake.systems.sensors import ImageRgba8U
 from pydrake.trajectories import Trajectory
 
-from drake_pose.body import ArticulatedModel
-from drake_pose.camera import Camera, PinholeCamera
+from drake_pose.body.model import ArticulatedModel
+from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import SettingsError, UnknownNameError
-from drake_pose.matching.fit.colour_lines import COLOURS
-from drake_pose.matching.fit.contour_fit import ContourFit, fitting_share
-from drake_pose.multiview.person.colour_views import ColourViews
-from drake_pose.multiview.person.frame_views import FrameViews
-from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker, TrackState
-from drake_pose.multiview.person.silhouette_view import SilhouetteView
-from drake_pose.multiview.recordings.other_persons import keep_views
+from drake_pose.fit.colour_lines import COLOURS
+from drake_pose.fit.contour_fit import ContourFit, fitting_share
+from drake_pose.person.colour_views import ColourViews
+from drake_pose.person.frame_views import FrameViews
+from drake_pose.person.recordings.other_persons import keep_views
+from drake_pose.person.silhouette_tracker import SilhouetteTracker, TrackState
+from drake_pose.person.silhouette_view import SilhouetteView
 from drake_pose.systems.bodies.posed_geometry import add_avatar
 from drake_pose.systems.person.silhouette_sensor import (
     SilhouetteSensor,

@@ -9,11 +9,11 @@ import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DependencyTicket
 
-from drake_pose.camera import Camera
+from drake_pose.camera.models import Camera
 from drake_pose.camera.sources.frame_source import FrameSource
-from drake_pose.matching.fit.camera_sums import EdgeKeeper
-from drake_pose.multiview.person.silhouette_view import KeptEdge
-from drake_pose.multiview.person.view_packing import unpack_view
+from drake_pose.fit.camera_sums import EdgeKeeper
+from drake_pose.person.silhouette_view import KeptEdge
+from drake_pose.person.view_packing import unpack_view
 from drake_pose.systems.pictures.picture_capture import PictureCapture
 
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 from pydrake.systems.framework import DiagramBuilder, OutputPort
 
-from drake_pose.camera import Camera
+from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
-from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker
-from drake_pose.multiview.recordings.person_capture import EDGE_POINTS
+from drake_pose.person.recordings.person_capture import EDGE_POINTS
+from drake_pose.person.silhouette_tracker import SilhouetteTracker
 from drake_pose.silhouette.segmentation.background import Background
 from drake_pose.systems.person.person_tracker import PersonTracker
 from drake_pose.systems.person.silhouette_sensor import SilhouetteSensor

@@ -8,10 +8,10 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, LeafSystem
 from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 
-from drake_pose.camera import Camera
-from drake_pose.multiview.person.silhouette_view import SilhouetteView, see_silhouette
-from drake_pose.multiview.recordings.person_capture import EDGE_POINTS
-from drake_pose.silhouette import label_image_to_mask
+from drake_pose.camera.models import Camera
+from drake_pose.person.recordings.person_capture import EDGE_POINTS
+from drake_pose.person.silhouette_view import SilhouetteView, see_silhouette
+from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 from drake_pose.silhouette.segmentation.background import Background, person_region
 from drake_pose.systems.colour_images import colour_image_to_picture
 

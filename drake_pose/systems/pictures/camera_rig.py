@@ -14,11 +14,11 @@ from pydrake.systems.primitives import PassThrough, TrajectorySource
 from pydrake.systems.sensors import RgbdSensor
 from pydrake.trajectories import Trajectory
 
-from drake_pose.body import ParsedModel
-from drake_pose.camera import PinholeCamera
+from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.camera.drake import camera_to_drake
+from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import CameraError, UnknownNameError
-from drake_pose.silhouette import label_image_to_mask
+from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 from drake_pose.systems.bodies.posed_geometry import pose_plant
 from drake_pose.systems.colour_images import colour_image_to_picture
 

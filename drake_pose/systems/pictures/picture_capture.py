@@ -20,7 +20,7 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 
-from drake_pose.camera import Camera
+from drake_pose.camera.models import Camera
 from drake_pose.camera.sources.frame_source import Clock, FrameSource, TimedPicture
 from drake_pose.camera.sources.synchroniser import CameraChange, Moment, Synchroniser
 from drake_pose.errors import SettingsError, UnknownNameError

@@ -12,7 +12,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from pydrake.systems.sensors import ImageLabel16I
 
 from drake_pose.body.surfaces.visual_geometry import labelled_meshes
-from drake_pose.camera import Camera
+from drake_pose.camera.models import Camera
 from drake_pose.errors import ModelError
 from drake_pose.silhouette.areas.label_kernel import paint_labels
 from drake_pose.silhouette.areas.outline import outline_from_mesh, pack

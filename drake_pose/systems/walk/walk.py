@@ -21,9 +21,9 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import Trajectory
 
-from drake_pose.body import ArticulatedModel
+from drake_pose.body.model import ArticulatedModel
 from drake_pose.errors import SettingsError, UnknownNameError
-from drake_pose.multiview.date.walk_commands import (
+from drake_pose.person.date.walk_commands import (
     NO_COMMAND,
     NO_STEPS,
     WalkSettings,

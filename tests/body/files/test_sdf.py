@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from drake_pose.body import load_model
+from drake_pose.body.model import load_model
 from drake_pose.errors import ModelError
 from tests.body.models import BOX, JOINTS_SDF, WELDED_URDF, write
 from tests.body.models import link as urdf_link

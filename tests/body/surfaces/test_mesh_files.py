@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from pydrake.geometry import ReadObjToTriangleSurfaceMesh
 
-from drake_pose.body import load_model
+from drake_pose.body.model import load_model
 from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.body.surfaces.mesh_files import drawable_file, read_mesh_file, write_obj
 from drake_pose.errors import ModelError

@@ -3,8 +3,11 @@ import pytest
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_pose.body import ArticulatedModel, PoseTree, RootRotation, bundled_model, load_model
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.body.tree.joint_map import JointMap
+from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body.tree.root import RootRotation
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
 from tests.body.models import (
     FLOATING_URDF,

@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body import RootRotation, bundled_model, load_model
-from drake_pose.body.tree.root import even_rotations
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import load_model
+from drake_pose.body.tree.root import RootRotation, even_rotations
 from drake_pose.body.tree.sampling import axis_samples, product_grid
 from drake_pose.errors import SettingsError
 

@@ -7,7 +7,10 @@ import pytest
 from pydrake.multibody.tree import BodyIndex
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body import ModelSkin, RootRotation, describe_model, load_model
+from drake_pose.body.model import load_model
+from drake_pose.body.report import describe_model
+from drake_pose.body.tree.node_skin import ModelSkin
+from drake_pose.body.tree.root import RootRotation
 from drake_pose.errors import DrakePoseError, ModelError, UnknownNameError
 from tests.body.skins import (
     LIMB_URDF,

@@ -2,7 +2,9 @@ import numpy as np
 import pytest
 from pydrake.multibody.tree import JacobianWrtVariable
 
-from drake_pose.body import RootRotation, bundled_model, load_model
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import load_model
+from drake_pose.body.tree.root import RootRotation
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.errors import SettingsError
 from tests.body.models import FLOATING_URDF, JOINTED_BASE_URDF, JOINTS_SDF, WELDED_URDF, write

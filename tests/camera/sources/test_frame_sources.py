@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import yaml
 
-from drake_pose.camera import save_cameras
+from drake_pose.camera.files import save_cameras
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.camera.sources.files import load_background_pictures, load_sources
 from drake_pose.camera.sources.frame_source import SourceSpecification

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from drake_pose.apps.experiments.shimada.motion import ACCELERATIONS
-from drake_pose.body import bundled_model, load_model
-from drake_pose.filtering import Belief, FilterSettings, TruncatedFilter, model_inequalities
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import load_model
 from drake_pose.filtering.hand.observation import (
     FLEXIONS,
     HAND_STATE,
@@ -15,6 +14,10 @@ from drake_pose.filtering.hand.observation import (
     SPREADS,
     HandObservation,
 )
+from drake_pose.filtering.kalman.truncated_filter import FilterSettings, TruncatedFilter
+from drake_pose.filtering.state import Belief
+from drake_pose.filtering.truncation.couplings import model_inequalities
+from drake_pose.papers.shimada.motion import ACCELERATIONS
 
 TIP = HAND_STATE.index("flexion_13")
 

@@ -1,10 +1,7 @@
 import numpy as np
 import pytest
 
-from drake_pose.apps.experiments.shimada.experiment import experiment_filter
-from drake_pose.apps.experiments.shimada.motion import make_sequence
 from drake_pose.errors import SettingsError
-from drake_pose.filtering import Belief, FilterSettings, update
 from drake_pose.filtering.hand.observation import HAND_STATE
 from drake_pose.filtering.kalman.repeated_views import (
     AnchoredObservation,
@@ -13,6 +10,11 @@ from drake_pose.filtering.kalman.repeated_views import (
     measure_curvature,
     next_view,
 )
+from drake_pose.filtering.kalman.truncated_filter import FilterSettings
+from drake_pose.filtering.kalman.update import update
+from drake_pose.filtering.state import Belief
+from drake_pose.papers.shimada.experiment import experiment_filter
+from drake_pose.papers.shimada.motion import make_sequence
 
 CHANCE = 1e-9
 

@@ -1,20 +1,14 @@
 import numpy as np
 import pytest
 
-from drake_pose.body import bundled_model, load_model
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import load_model
 from drake_pose.errors import SettingsError, UnknownNameError
-from drake_pose.filtering import (
-    Belief,
-    FilterSettings,
-    StateLayout,
-    TruncatedFilter,
-    from_bounds,
-    make_belief,
-    stack,
-    truncate_joint,
-    two_sided,
-    update,
-)
+from drake_pose.filtering.kalman.truncated_filter import FilterSettings, TruncatedFilter
+from drake_pose.filtering.kalman.update import update
+from drake_pose.filtering.state import Belief, StateLayout, make_belief
+from drake_pose.filtering.truncation.inequalities import from_bounds, stack, two_sided
+from drake_pose.filtering.truncation.truncated_normal import truncate_joint
 
 LAYOUT = StateLayout(("angle",), ("length",))
 NAMES = LAYOUT.names  # angle, rate_angle, length

@@ -3,9 +3,8 @@ import math
 import numpy as np
 import pytest
 
-from drake_pose.body import RootRotation
+from drake_pose.body.tree.root import RootRotation
 from drake_pose.errors import SettingsError, UnknownNameError
-from drake_pose.filtering import Axis, Belief, ContourObservation
 from drake_pose.filtering.hand.observation import (
     HAND_STATE,
     MEASURED,
@@ -14,7 +13,10 @@ from drake_pose.filtering.hand.observation import (
 )
 from drake_pose.filtering.kalman.update import update, with_variances
 from drake_pose.filtering.measurements.axes import AxisObservation, _independent
-from drake_pose.silhouette import LabelRenderer
+from drake_pose.filtering.measurements.contour import ContourObservation
+from drake_pose.filtering.measurements.segment_axes import Axis
+from drake_pose.filtering.state import Belief
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.filtering.measurements.test_segment_axes import (
     CENTRE,
     ROUGH,

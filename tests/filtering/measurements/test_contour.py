@@ -1,13 +1,17 @@
 import numpy as np
 import pytest
 
-from drake_pose.body import bundled_model, load_model
-from drake_pose.camera import PinholeCamera
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import load_model
+from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import SettingsError, UnknownNameError
-from drake_pose.filtering import ContourObservation, ContourSettings
-from drake_pose.filtering.measurements.contour import ROOT_SHIFT
-from drake_pose.silhouette import LabelRenderer
-from tests.matching.bodies import forked_body, front_camera
+from drake_pose.filtering.measurements.contour import (
+    ROOT_SHIFT,
+    ContourObservation,
+    ContourSettings,
+)
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from tests.search.bodies import forked_body, front_camera
 
 
 def pinhole(name, turn_deg, side=260, focal=330.0, distance=2.9, height=0.9):

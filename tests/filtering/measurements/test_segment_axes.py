@@ -3,8 +3,9 @@ import math
 import numpy as np
 import pytest
 
-from drake_pose.body import bundled_model, load_model
-from drake_pose.camera import ParallelCamera
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import load_model
+from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import MaskError, SettingsError, UnknownNameError
 from drake_pose.filtering.hand.observation import (
     FLEXIONS,
@@ -14,7 +15,7 @@ from drake_pose.filtering.hand.observation import (
     plant_positions,
 )
 from drake_pose.filtering.measurements.segment_axes import AxisObserver, AxisSettings
-from drake_pose.silhouette import LabelRenderer
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
 SIDE = 400
 CENTRE = 199.5

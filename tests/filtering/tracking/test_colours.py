@@ -4,14 +4,15 @@ import numpy as np
 import pytest
 
 from drake_pose.errors import SettingsError
-from drake_pose.filtering import ContourObservation, ContourTracker
-from drake_pose.matching.fit.colour_lines import BESIDE, COLOURS, ON
-from drake_pose.matching.fit.colours import ColourSettings, part_distances, weigh_parts
-from drake_pose.matching.fit.contour_fit import Comparison
-from drake_pose.matching.fit.kernel import COMPARED, SQUARES, WEIGHT
-from drake_pose.silhouette import LabelRenderer
+from drake_pose.filtering.measurements.contour import ContourObservation
+from drake_pose.filtering.tracking.contour_tracker import ContourTracker
+from drake_pose.fit.colour_lines import BESIDE, COLOURS, ON
+from drake_pose.fit.colours import ColourSettings, part_distances, weigh_parts
+from drake_pose.fit.contour_fit import Comparison
+from drake_pose.fit.kernel import COMPARED, SQUARES, WEIGHT
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.filtering.tracking.test_match_and_track import PERIOD, swings
-from tests.matching.bodies import forked_body, near_camera
+from tests.search.bodies import forked_body, near_camera
 
 SIDE = 480
 ORANGE, GREEN = np.array([230, 130, 40]), np.array([60, 140, 60])

@@ -3,20 +3,18 @@ import math
 import numpy as np
 import pytest
 
-from drake_pose.body import bundled_model, load_model
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import load_model
 from drake_pose.errors import SettingsError
-from drake_pose.filtering import (
-    TRACKED,
-    ContourObservation,
-    ContourTracker,
-    Followed,
-    MatchAndTrack,
-    TrackingSettings,
-)
-from drake_pose.matching import PaperSearch, PaperSearchSettings, View
-from drake_pose.silhouette import LabelRenderer
+from drake_pose.filtering.measurements.contour import ContourObservation
+from drake_pose.filtering.tracking.contour_tracker import ContourTracker, TrackingSettings
+from drake_pose.filtering.tracking.match_and_track import TRACKED, Followed, MatchAndTrack
+from drake_pose.search.kameda.search import PaperSearch
+from drake_pose.search.result import View
+from drake_pose.search.settings import PaperSearchSettings
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.filtering.measurements.test_contour import pinhole
-from tests.matching.bodies import forked_body, front_camera
+from tests.search.bodies import forked_body, front_camera
 
 PERIOD = 1 / 30
 

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
-from drake_pose.filtering import ContourObservation, ContourTracker, TrackingSettings
+from drake_pose.filtering.measurements.contour import ContourObservation
+from drake_pose.filtering.tracking.contour_tracker import ContourTracker, TrackingSettings
 from drake_pose.filtering.tracking.sequence_fit import fit_sequence, pose_set
 from tests.filtering.tracking.test_match_and_track import PERIOD
 from tests.filtering.tracking.test_unknown_scale import drawn, moving_states
-from tests.matching.bodies import forked_body, front_camera
+from tests.search.bodies import forked_body, front_camera
 
 SETTINGS = TrackingSettings(root_moves=True, scale_unknown=True, rest_time=1.0)
 FRAMES = 16

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from drake_pose.body import RootRotation
+from drake_pose.body.tree.root import RootRotation
 from drake_pose.errors import SettingsError
-from drake_pose.filtering import ContourObservation, ContourTracker
+from drake_pose.filtering.measurements.contour import ContourObservation
+from drake_pose.filtering.tracking.contour_tracker import ContourTracker
 from drake_pose.filtering.tracking.start_poses import (
     StartSettings,
     find_start,
@@ -14,7 +15,7 @@ from drake_pose.filtering.tracking.start_poses import (
 )
 from tests.filtering.tracking.test_match_and_track import PERIOD
 from tests.filtering.tracking.test_unknown_scale import SETTINGS
-from tests.matching.bodies import forked_body, front_camera
+from tests.search.bodies import forked_body, front_camera
 
 
 @pytest.fixture

@@ -3,17 +3,14 @@
 import numpy as np
 import pytest
 
-from drake_pose.filtering import (
-    TRACKED,
-    ContourObservation,
-    Followed,
-    MatchAndTrack,
-    from_model,
-)
-from drake_pose.matching import ContinuousSearch, View
-from drake_pose.silhouette import LabelRenderer
-from tests.apps.scenes import camera
-from tests.matching.turning import crane
+from drake_pose.filtering.measurements.contour import ContourObservation
+from drake_pose.filtering.tracking.match_and_track import TRACKED, Followed, MatchAndTrack
+from drake_pose.filtering.truncation.inequalities import from_model
+from drake_pose.search.continuous.search import ContinuousSearch
+from drake_pose.search.result import View
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from tests.jobs.scenes import camera
+from tests.search.turning import crane
 
 PERIOD = 1 / 30
 

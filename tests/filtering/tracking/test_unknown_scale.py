@@ -4,18 +4,13 @@ import numpy as np
 import pytest
 
 from drake_pose.errors import SettingsError
-from drake_pose.filtering import (
-    TRACKED,
-    ContourObservation,
-    ContourTracker,
-    Followed,
-    MatchAndTrack,
-    TrackingSettings,
-)
-from drake_pose.matching import PlacedMatch, View
+from drake_pose.filtering.measurements.contour import ContourObservation
+from drake_pose.filtering.tracking.contour_tracker import ContourTracker, TrackingSettings
+from drake_pose.filtering.tracking.match_and_track import TRACKED, Followed, MatchAndTrack
+from drake_pose.search.result import PlacedMatch, View
 from tests.filtering.measurements.test_contour import pinhole
 from tests.filtering.tracking.test_match_and_track import PERIOD, swings
-from tests.matching.bodies import forked_body, front_camera
+from tests.search.bodies import forked_body, front_camera
 
 SETTINGS = TrackingSettings(root_moves=True, scale_unknown=True)
 

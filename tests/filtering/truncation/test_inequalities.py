@@ -7,22 +7,25 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.solvers import MathematicalProgram
 
-from drake_pose.body import bundled_model, load_model
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import load_model
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
-from drake_pose.filtering import (
+from drake_pose.filtering.truncation.couplings import (
     couplings_file,
+    load_couplings,
+    load_usual_pose,
+    model_inequalities,
+)
+from drake_pose.filtering.truncation.inequalities import (
     from_bounds,
     from_model,
     from_plant,
     from_program,
     inner_point,
-    load_couplings,
     make_inequalities,
-    model_inequalities,
     stack,
     two_sided,
 )
-from drake_pose.filtering.truncation.couplings import load_usual_pose
 from tests.written_files import assert_same_files
 
 HAND = bundled_model("two_finger_hand")

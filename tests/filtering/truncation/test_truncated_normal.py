@@ -5,19 +5,22 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import multivariate_normal, truncnorm
 
-from drake_pose.body import bundled_model, load_model
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import load_model
 from drake_pose.errors import SettingsError
-from drake_pose.filtering import (
-    clip,
+from drake_pose.filtering.truncation.couplings import model_inequalities
+from drake_pose.filtering.truncation.inequalities import (
     from_bounds,
-    interval_moments,
-    join_rows,
     make_inequalities,
-    model_inequalities,
     stack,
+    two_sided,
+)
+from drake_pose.filtering.truncation.normal_moments import interval_moments
+from drake_pose.filtering.truncation.truncated_normal import (
+    clip,
+    join_rows,
     truncate_joint,
     truncate_sequential,
-    two_sided,
 )
 from tests.filtering.sampling import sample_truncated
 

@@ -7,9 +7,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body import ArticulatedModel, bundled_model, load_model
-from drake_pose.camera import Camera, ParallelCamera, PinholeCamera, load_cameras
-from drake_pose.silhouette import LabelRenderer, draw_mask, measure_agreement, outline_from_mesh
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.camera.files import load_cameras
+from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
+from drake_pose.silhouette.areas.agreement import measure_agreement
+from drake_pose.silhouette.areas.outline import outline_from_mesh
+from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
 SHAPES = {
     "box": '<box size="0.3 0.2 0.5"/>',

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body import TriangleMesh
-from drake_pose.camera import Camera, PinholeCamera
-from drake_pose.silhouette import draw_labels, draw_mask, outline_from_mesh
+from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.camera.models import Camera, PinholeCamera
+from drake_pose.silhouette.areas.outline import outline_from_mesh
+from drake_pose.silhouette.areas.scoring import draw_labels, draw_mask
 from tests.silhouette.areas.test_span_kernel import CAMERAS, name_of
 from tests.silhouette.shapes import box, brute_force_depth, random_pose, soup
 

@@ -1,7 +1,7 @@
 import numpy as np
 
-from drake_pose.body import TriangleMesh
-from drake_pose.silhouette import outline_from_mesh
+from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.silhouette.areas.outline import outline_from_mesh
 from tests.silhouette.shapes import box, soup
 
 

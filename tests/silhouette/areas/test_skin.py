@@ -6,24 +6,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body import ArticulatedModel, TriangleMesh, bundled_model, load_model
-from drake_pose.camera import Camera, ParallelCamera, PinholeCamera
-from drake_pose.silhouette import (
-    BendingOutline,
-    LabelRenderer,
-    TreeSurfaces,
-    draw_mask,
-    measure_agreement,
-    outline_from_mesh,
-    prefix_sums,
-    require_visible,
-    score_bending,
-    score_bodies,
-    subtract_body,
-)
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
+from drake_pose.silhouette.areas.agreement import measure_agreement
+from drake_pose.silhouette.areas.bending import BendingOutline, TreeSurfaces, score_bending
+from drake_pose.silhouette.areas.outline import outline_from_mesh
+from drake_pose.silhouette.areas.scoring import draw_mask, prefix_sums, score_bodies, subtract_body
+from drake_pose.silhouette.areas.visibility import require_visible
 from drake_pose.silhouette.bits.bit_kernel import draw_bits
 from drake_pose.silhouette.bits.bit_view import make_bit_view
 from drake_pose.silhouette.contours.direction_cells import divide_outline
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.body.skins import HALF, load_limb
 from tests.silhouette.shapes import brute_force_mask
 

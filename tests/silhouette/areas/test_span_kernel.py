@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from drake_pose.body import TriangleMesh
-from drake_pose.camera import Camera, ParallelCamera, PinholeCamera
-from drake_pose.silhouette import (
+from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
+from drake_pose.silhouette.areas.outline import outline_from_mesh
+from drake_pose.silhouette.areas.scoring import (
     draw_mask,
-    outline_from_mesh,
     prefix_sums,
     score_bodies,
     score_candidates,

@@ -5,10 +5,11 @@ import pytest
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body import TriangleMesh
-from drake_pose.camera import Camera, ParallelCamera, PinholeCamera
-from drake_pose.silhouette import Outline, draw_mask, outline_from_mesh
+from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
 from drake_pose.silhouette.areas.inscribed_balls import VisualHull
+from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
+from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.bits.bit_kernel import draw_bits
 from drake_pose.silhouette.bits.bit_view import BitView, make_bit_view
 from drake_pose.silhouette.bits.bounding_balls import draw_discs, sift_by_balls

@@ -1,10 +1,11 @@
 import numpy as np
 import pytest
 
-from drake_pose.body import TriangleMesh
-from drake_pose.camera import ParallelCamera, PinholeCamera
+from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.errors import SettingsError
-from drake_pose.silhouette import draw_mask, outline_from_mesh
+from drake_pose.silhouette.areas.outline import outline_from_mesh
+from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.contours.contour_points import find_contour_points
 from tests.silhouette.shapes import box, random_pose, soup
 

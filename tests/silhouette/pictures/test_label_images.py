@@ -5,7 +5,7 @@ import numpy as np
 from pydrake.geometry import RenderLabel
 from pydrake.systems.sensors import ImageLabel16I
 
-from drake_pose.silhouette import label_image_to_mask, mask_to_label_image
+from drake_pose.silhouette.pictures.label_images import label_image_to_mask, mask_to_label_image
 
 MASK = np.random.default_rng(0).random((20, 30)) < 0.3
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from drake_pose.errors import MaskError
-from drake_pose.silhouette import read_mask, write_mask
+from drake_pose.silhouette.pictures.masks import read_mask, write_mask
 
 MASK = np.zeros((20, 30), dtype=bool)
 MASK[4:9, 3:20] = True

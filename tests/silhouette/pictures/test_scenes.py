@@ -3,9 +3,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drake_pose.camera import ParallelCamera, save_cameras
+from drake_pose.camera.files import save_cameras
+from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import CameraError, MaskError, SceneError, UnknownNameError
-from drake_pose.silhouette import load_scene, write_mask
+from drake_pose.silhouette.pictures.masks import write_mask
+from drake_pose.silhouette.pictures.scenes import load_scene
 
 MASK = np.zeros((20, 30), dtype=bool)
 MASK[4:9, 3:20] = True

@@ -10,12 +10,15 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from drake_pose.apps.results.replay import make_replay
-from drake_pose.body import ArticulatedModel, ModelSkin
-from drake_pose.camera import ParallelCamera
-from drake_pose.matching import PaperSearch, PaperSearchSettings
-from drake_pose.silhouette import LabelRenderer
-from drake_pose.systems import MeshcatSkin, add_meshcat_skin, build_simulated_matching
+from drake_pose.body.model import ArticulatedModel
+from drake_pose.body.tree.node_skin import ModelSkin
+from drake_pose.camera.models import ParallelCamera
+from drake_pose.results.replay import make_replay
+from drake_pose.search.kameda.search import PaperSearch
+from drake_pose.search.settings import PaperSearchSettings
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from drake_pose.systems.bodies.skin import MeshcatSkin, add_meshcat_skin
+from drake_pose.systems.estimators.diagrams import build_simulated_matching
 from tests.body.skins import load_limb
 
 

@@ -14,19 +14,19 @@ from drake_pose.camera.rigs import FACE_CAMERA
 from drake_pose.camera.sources.frame_source import SourceSpecification
 from drake_pose.camera.sources.opening import open_source
 from drake_pose.errors import SettingsError
-from drake_pose.multiview.date.body_pose import estimate_pose, waist_of
-from drake_pose.multiview.date.capture import CaptureSettings, CaptureSetup, see_person
-from drake_pose.multiview.date.faces import find_face, head_angles
-from drake_pose.multiview.date.features import find_features
-from drake_pose.multiview.date.recognition import recognise
-from drake_pose.multiview.date.skeleton import LIMBS
+from drake_pose.person.date.body_pose import estimate_pose, waist_of
+from drake_pose.person.date.capture import CaptureSettings, CaptureSetup, see_person
+from drake_pose.person.date.faces import find_face, head_angles
+from drake_pose.person.date.features import find_features
+from drake_pose.person.date.recognition import recognise
+from drake_pose.person.date.skeleton import LIMBS
 from drake_pose.silhouette.segmentation.background import person_region
 from drake_pose.systems.colour_images import picture_to_colour_image
 from drake_pose.systems.date.capture import build_paper_capture
 from drake_pose.systems.date.pose_estimator import PaperPoseEstimator
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
 from drake_pose.systems.pictures.picture_capture import PictureCapture
-from tests.multiview.studio import shared_studio
+from tests.person.studio import shared_studio
 
 PERIOD = 0.1
 

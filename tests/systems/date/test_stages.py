@@ -6,9 +6,9 @@ from pydrake.common.value import AbstractValue
 
 from drake_pose.camera.rigs import FACE_CAMERA
 from drake_pose.errors import CameraError, SettingsError, UnknownNameError
-from drake_pose.multiview.date.capture import see_person
-from drake_pose.multiview.date.skin_blobs import SkinColour
-from drake_pose.silhouette import mask_to_label_image
+from drake_pose.person.date.capture import see_person
+from drake_pose.person.date.skin_blobs import SkinColour
+from drake_pose.silhouette.pictures.label_images import mask_to_label_image
 from drake_pose.silhouette.segmentation.background import learn_background, person_region
 from drake_pose.systems.colour_images import (
     colour_image_to_picture,
@@ -19,7 +19,7 @@ from drake_pose.systems.date.feature_finder import FeatureFinder
 from drake_pose.systems.date.horizontal_image import HorizontalImage
 from drake_pose.systems.date.pose_recogniser import PoseRecogniser
 from drake_pose.systems.date.preparation import prepare_paper_capture
-from tests.multiview.studio import shared_studio
+from tests.person.studio import shared_studio
 
 
 @pytest.fixture(scope="module")

@@ -9,14 +9,15 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, System
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_pose.body import ArticulatedModel, load_model
+from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.errors import SettingsError
 from drake_pose.registration.online_registration import OnlineRegistration, pose_difference
 from drake_pose.registration.register import RegistrationBody
-from drake_pose.silhouette import mask_to_label_image
-from drake_pose.systems import REGISTRATION, CameraRegistration, build_simulated_registration
-from tests.matching.arms import arm_urdf
+from drake_pose.silhouette.pictures.label_images import mask_to_label_image
+from drake_pose.systems.estimators.camera_registration import REGISTRATION, CameraRegistration
+from drake_pose.systems.estimators.registration_diagram import build_simulated_registration
 from tests.registration.test_register import looking_at
+from tests.search.arms import arm_urdf
 
 PERIOD = 0.5
 CAMERA = looking_at(np.array([1.6, 0.4, 0.5]), np.array([0.0, 0.0, 0.4]), 0.1)

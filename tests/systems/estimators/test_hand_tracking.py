@@ -12,15 +12,20 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.sensors import ImageLabel16I
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_pose.body import RootRotation, bundled_model, load_model
-from drake_pose.camera import ParallelCamera
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import load_model
+from drake_pose.body.tree.root import RootRotation
+from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import SettingsError
-from drake_pose.filtering import ContourObservation, model_inequalities
 from drake_pose.filtering.measurements.axes import AxisObservation
-from drake_pose.matching import BeamSearch, BeamSearchSettings
-from drake_pose.silhouette import LabelRenderer
+from drake_pose.filtering.measurements.contour import ContourObservation
+from drake_pose.filtering.truncation.couplings import model_inequalities
+from drake_pose.search.grid.beam.search import BeamSearch
+from drake_pose.search.grid.settings import BeamSearchSettings
 from drake_pose.silhouette.pictures.label_images import EMPTY
-from drake_pose.systems import AxisSensor, StateMatcher, add_hand_tracking, build_hand_tracking
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from drake_pose.systems.estimators.axis_sensor import AxisSensor, StateMatcher
+from drake_pose.systems.estimators.hand_tracking import add_hand_tracking, build_hand_tracking
 from drake_pose.systems.estimators.truncated_ekf import STATISTICS
 
 PERIOD = 1 / 30

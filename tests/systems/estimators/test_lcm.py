@@ -11,10 +11,13 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.lcm import LcmInterfaceSystem, LcmPublisherSystem, LcmSubscriberSystem
 from pydrake.systems.sensors import ImageToLcmImageArrayT, LcmImageArrayToImages, PixelType
 
-from drake_pose.matching import PaperSearch, PaperSearchSettings
-from drake_pose.silhouette import LabelRenderer, mask_to_label_image
-from drake_pose.systems import RobotStateMessage, SilhouetteTracker
-from tests.matching.bodies import forked_body, front_camera
+from drake_pose.search.kameda.search import PaperSearch
+from drake_pose.search.settings import PaperSearchSettings
+from drake_pose.silhouette.pictures.label_images import mask_to_label_image
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from drake_pose.systems.estimators.robot_state import RobotStateMessage
+from drake_pose.systems.estimators.silhouette_tracker import SilhouetteTracker
+from tests.search.bodies import forked_body, front_camera
 
 PERIOD = 1 / 30
 

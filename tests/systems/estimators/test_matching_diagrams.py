@@ -8,24 +8,22 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_pose.camera import PinholeCamera, save_cameras
+from drake_pose.camera.files import save_cameras
+from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import SettingsError
-from drake_pose.matching import (
-    BeamSearch,
-    BeamSearchSettings,
-    ExaminationSettings,
-    PaperSearch,
-    PaperSearchSettings,
-)
-from drake_pose.silhouette import LabelRenderer, load_scene, mask_to_label_image, write_mask
-from drake_pose.systems import (
-    STATISTICS,
-    MaskPlayer,
-    SilhouetteMatcher,
-    build_recorded_matching,
-    build_simulated_matching,
-)
-from tests.matching.bodies import box_link, front_camera, joint, load_body, swinging_chain
+from drake_pose.search.grid.beam.search import BeamSearch
+from drake_pose.search.grid.families.examination import ExaminationSettings
+from drake_pose.search.grid.settings import BeamSearchSettings
+from drake_pose.search.kameda.search import PaperSearch
+from drake_pose.search.settings import PaperSearchSettings
+from drake_pose.silhouette.pictures.label_images import mask_to_label_image
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from drake_pose.silhouette.pictures.masks import write_mask
+from drake_pose.silhouette.pictures.scenes import load_scene
+from drake_pose.systems.estimators.diagrams import build_recorded_matching, build_simulated_matching
+from drake_pose.systems.estimators.mask_player import MaskPlayer
+from drake_pose.systems.estimators.silhouette_matcher import STATISTICS, SilhouetteMatcher
+from tests.search.bodies import box_link, front_camera, joint, load_body, swinging_chain
 
 PERIOD = 0.1
 

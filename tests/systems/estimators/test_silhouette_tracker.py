@@ -12,19 +12,17 @@ from pydrake.systems.sensors import ImageRgba8U
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_pose.errors import SettingsError, UnknownNameError
-from drake_pose.filtering import TrackingSettings
-from drake_pose.matching import PaperSearch, PaperSearchSettings
-from drake_pose.silhouette import LabelRenderer, label_image_to_mask, mask_to_label_image
-from drake_pose.systems import (
-    TRACK,
-    SilhouetteCamera,
-    SilhouetteMatcher,
-    SilhouetteTracker,
-    build_simulated_matching,
-)
-from drake_pose.systems.estimators.diagrams import add_simulated_cameras
+from drake_pose.filtering.tracking.contour_tracker import TrackingSettings
+from drake_pose.search.kameda.search import PaperSearch
+from drake_pose.search.settings import PaperSearchSettings
+from drake_pose.silhouette.pictures.label_images import label_image_to_mask, mask_to_label_image
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from drake_pose.systems.estimators.diagrams import add_simulated_cameras, build_simulated_matching
+from drake_pose.systems.estimators.silhouette_matcher import SilhouetteMatcher
+from drake_pose.systems.estimators.silhouette_tracker import TRACK, SilhouetteTracker
+from drake_pose.systems.pictures.silhouette_camera import SilhouetteCamera
 from tests.filtering.measurements.test_contour import pinhole
-from tests.matching.bodies import forked_body, front_camera
+from tests.search.bodies import forked_body, front_camera
 
 PERIOD = 1 / 30
 

@@ -4,11 +4,11 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import VectorLogSink
 
-from drake_pose.apps.experiments.shimada.experiment import experiment_filter
-from drake_pose.apps.experiments.shimada.motion import make_sequence
 from drake_pose.errors import SettingsError
-from drake_pose.filtering import Belief
 from drake_pose.filtering.hand.observation import HAND_STATE
+from drake_pose.filtering.state import Belief
+from drake_pose.papers.shimada.experiment import experiment_filter
+from drake_pose.papers.shimada.motion import make_sequence
 from drake_pose.systems.estimators.truncated_ekf import STATISTICS, TruncatedEkf
 
 PERIOD = 1 / 30

@@ -4,17 +4,18 @@ from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.systems.analysis import Simulator
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_pose.body import bundled_model, load_model
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import load_model
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.errors import SettingsError, UnknownNameError
-from drake_pose.matching.fit.contour_fit import ContourFit
-from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker
-from drake_pose.multiview.person.silhouette_view import see_silhouette
-from drake_pose.silhouette import LabelRenderer
+from drake_pose.fit.contour_fit import ContourFit
+from drake_pose.person.silhouette_tracker import SilhouetteTracker
+from drake_pose.person.silhouette_view import see_silhouette
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.systems.colour_images import picture_to_colour_image
 from drake_pose.systems.person.person_tracker import PersonTracker, build_person_capture
 from drake_pose.systems.person.silhouette_sensor import edge_spacing
-from tests.multiview.persons_in_view import see, stepping
+from tests.person.persons_in_view import see, stepping
 
 # Who is followed walks; in this frame another one comes into view, and stays.
 OTHER_COMES = 5

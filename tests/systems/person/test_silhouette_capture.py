@@ -6,14 +6,14 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.analysis import Simulator
 
 from drake_pose.errors import SettingsError
-from drake_pose.matching.fit.contour_fit import ContourFit
-from drake_pose.multiview.person.silhouette_tracker import SilhouetteTracker
-from drake_pose.multiview.person.silhouette_view import see_silhouette
+from drake_pose.fit.contour_fit import ContourFit
+from drake_pose.person.silhouette_tracker import SilhouetteTracker
+from drake_pose.person.silhouette_view import see_silhouette
 from drake_pose.silhouette.segmentation.background import person_region
 from drake_pose.systems.colour_images import picture_to_colour_image
 from drake_pose.systems.person.silhouette_capture import build_silhouette_capture
 from drake_pose.systems.person.silhouette_sensor import edge_spacing
-from tests.multiview.studio import Studio
+from tests.person.studio import Studio
 
 # A power of two, for times between frames that are all exactly the same.
 PERIOD = 1.0 / 32.0

@@ -5,11 +5,12 @@ import numpy as np
 import pytest
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_pose.body import bundled_model, load_model
-from drake_pose.camera import load_cameras, save_cameras
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import load_model
+from drake_pose.camera.files import load_cameras, save_cameras
 from drake_pose.camera.rigs import FACE_CAMERA, circle_of_cameras, look_at
 from drake_pose.errors import CameraError, UnknownNameError
-from drake_pose.silhouette import LabelRenderer
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
 
 SIZE = (160, 120)

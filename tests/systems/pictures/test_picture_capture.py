@@ -4,12 +4,13 @@ import pytest
 from pydrake.systems.analysis import Simulator, SimulatorStatus
 from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 
-from drake_pose.body import bundled_model, load_model
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import load_model
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecification, TimedPicture
 from drake_pose.errors import SettingsError, UnknownNameError
-from drake_pose.multiview.person.silhouette_view import see_silhouette
-from drake_pose.silhouette import label_image_to_mask, mask_to_label_image
+from drake_pose.person.silhouette_view import see_silhouette
+from drake_pose.silhouette.pictures.label_images import label_image_to_mask, mask_to_label_image
 from drake_pose.silhouette.segmentation.background import learn_background, person_region
 from drake_pose.systems.person.silhouette_sensor import (
     SilhouetteSensor,

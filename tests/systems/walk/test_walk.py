@@ -6,9 +6,10 @@ from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.systems.analysis import Simulator
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_pose.body import bundled_model, load_model
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import load_model
 from drake_pose.errors import SettingsError, UnknownNameError
-from drake_pose.multiview.date.walk_commands import WalkSettings
+from drake_pose.person.date.walk_commands import WalkSettings
 from drake_pose.systems.walk.garden import (
     HALF_SIZE,
     START,

@@ -1,1 +1,0 @@
-"""The command line, and whole jobs in one call. Nothing heavy is imported here."""

@@ -1,1 +1,0 @@
-"""Benchmarks: ratios of time, memory, and workers (`make bench`)."""

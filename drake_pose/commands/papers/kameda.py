@@ -1,0 +1,344 @@
+"""The command `drake-pose reproduce kameda`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from drake_pose.commands.estimate_options import JsonOption, PicturesOption
+from drake_pose.commands.terminal import (
+    errors_as_messages,
+    finite,
+    print_json,
+    say,
+    usage_errors,
+    warn,
+)
+from drake_pose.results.settings import EstimateSettings
+
+if TYPE_CHECKING:
+    from drake_pose.papers.kameda.continuous import ContinuousResult
+    from drake_pose.papers.kameda.experiment import ExperimentResult
+    from drake_pose.search.pose_search import PoseSearch
+
+# What is about experiment A alone.
+_OF_A = (
+    "seed", "seeds", "method", "angles", "outside_limit", "outside_weight", "candidates",
+    "interval", "views", "mismatch", "edges", "edge_noise",
+)  # fmt: skip
+# What is about the grid of angles, which continuous ones have none of.
+_OF_GRID = (
+    "seeds", "method", "outside_limit", "outside_weight", "candidates", "interval", "edges",
+    "edge_noise", "out",
+)  # fmt: skip
+
+
+ExperimentOption = Annotated[
+    str,
+    typer.Option(
+        help="A: random poses, drawn; B: six pictures of a person; C: two pictures of a hand."
+    ),
+]
+ImagesOption = Annotated[
+    int, typer.Option(min=1, help="Number of silhouettes; of B and C all that there are or fewer.")
+]
+SeedOption = Annotated[int, typer.Option(min=0, help="Seed of the random poses.")]
+SeedsOption = Annotated[
+    int, typer.Option(min=1, help="Run this many seeds, and show how far the figures spread.")
+]
+MethodOption = Annotated[
+    str, typer.Option(help="paper: the paper's alone; beam: beam search beside it.")
+]
+AnglesOption = Annotated[
+    str,
+    typer.Option(
+        help="grid: true angles and samples are multiples of 20 degrees, as in the paper; "
+        "continuous: any true angles, and poses are refined between the samples."
+    ),
+]
+OutsideLimitOption = Annotated[
+    float,
+    typer.Option(
+        min=0.0,
+        callback=finite,
+        help=r"The paper's r: area of a segment that may lie outside \[pixel].",
+        metavar="R",
+    ),
+]
+OutsideWeightOption = Annotated[
+    float,
+    typer.Option(
+        min=0.0,
+        callback=finite,
+        help="Run the paper's method once more, its lists ordered by e - W * (area outside): not "
+        "in the paper, but 10 meets most of its figures.",
+        metavar="W",
+    ),
+]
+CandidatesOption = Annotated[
+    int,
+    typer.Option(min=1, help="The paper's K: candidates kept for each segment.", metavar="K"),
+]
+IntervalOption = Annotated[
+    float,
+    typer.Option(min=1.0, max=90.0, callback=finite, help=r"Sampling interval \[deg]."),
+]
+ViewsOption = Annotated[
+    int, typer.Option(min=1, help="With --angles continuous: number of cameras.")
+]
+MismatchOption = Annotated[
+    bool,
+    typer.Option(
+        "--mismatch",
+        help="With --angles continuous: also a body whose widths and joints differ from the "
+        "model's.",
+    ),
+]
+EdgesOption = Annotated[
+    bool,
+    typer.Option(
+        "--edges",
+        help="With --method beam: resolve ambiguous silhouettes by the edges inside them (some "
+        "seconds for each).",
+    ),
+]
+
+
+EdgeNoiseOption = Annotated[
+    float,
+    typer.Option(
+        min=0.0, max=0.9, callback=finite,
+        help="With --edges: this share of them is missing, the others are a pixel off, and a "
+        "quarter as many are wrong.",
+    ),
+]  # fmt: skip
+
+
+def kameda(
+    context: typer.Context,
+    experiment: ExperimentOption = "A",
+    images: ImagesOption = 219,
+    seed: SeedOption = 0,
+    seeds: SeedsOption = 1,
+    method: MethodOption = "paper",
+    angles: AnglesOption = "grid",
+    outside_limit: OutsideLimitOption = 200.0,
+    outside_weight: OutsideWeightOption = 0.0,
+    candidates: CandidatesOption = 5,
+    interval: IntervalOption = 20.0,
+    views: ViewsOption = 1,
+    mismatch: MismatchOption = False,
+    edges: EdgesOption = False,
+    edge_noise: EdgeNoiseOption = 0.0,
+    out: PicturesOption = None,
+    json: JsonOption = False,
+) -> None:
+    """See help_texts.KAMEDA."""
+    if experiment not in ("A", "B", "C"):
+        raise typer.BadParameter("must be A, B or C", param_hint="--experiment")
+    if experiment != "A":
+        _refuse(context, _OF_A, "needs --experiment A")
+        with errors_as_messages(out):
+            _run_on_pictures(experiment, images, out, json)
+        return
+    with usage_errors():
+        EstimateSettings(method=method)
+    if angles not in ("grid", "continuous"):
+        raise typer.BadParameter("must be grid or continuous", param_hint="--angles")
+    if edges and method != "beam":
+        raise typer.BadParameter("needs --method beam", param_hint="--edges")
+    if edge_noise and not edges:
+        raise typer.BadParameter("needs --edges", param_hint="--edge-noise")
+    if angles == "continuous":
+        _refuse(context, _OF_GRID, "needs --angles grid")
+    else:
+        _refuse(context, ("views", "mismatch"), "needs --angles continuous")
+    if angles == "grid":
+        with errors_as_messages():
+            runs = GridRuns(
+                images, seed, seeds, method, interval, outside_limit, candidates, outside_weight
+            )
+            _run_on_grid(runs, edge_noise if edges else None, out, json)
+        return
+    with errors_as_messages():
+        _print_continuous(_run_beside(images, seed, views, mismatch), json)
+
+
+def _refuse(context: typer.Context, names: Sequence[str], why: str) -> None:
+    """Refuses options that were given and mean nothing here."""
+    for name in names:
+        if str(getattr(context.get_parameter_source(name), "name", "")) == "COMMANDLINE":
+            raise typer.BadParameter(why, param_hint=f"--{name.replace('_', '-')}")
+
+
+def _run_on_pictures(experiment: str, images: int, out: Path | None, json: bool) -> None:
+    """Run both methods on the stored pictures, and print what they found; shows progress."""
+    from drake_pose.commands.report import count_progress, output_console
+    from drake_pose.papers.kameda.real_pictures import (
+        METHODS,
+        picture_names,
+        real_table,
+        run_real_experiment,
+    )
+    from drake_pose.results.folder import require_empty
+
+    if out is not None:
+        require_empty(out)
+    frames = picture_names(experiment)[:images]
+    results = []
+    for method, name in METHODS.items():
+        folder = None if out is None else out / method
+        with count_progress(f"pictures, {name}", len(frames)) as advance:
+            results.append(run_real_experiment(experiment, method, frames, folder, advance))
+    for result in results:
+        for text in result.warnings:
+            warn(f"{METHODS[result.method]}: {text}")
+    if json:
+        paper, ours = (result.as_json() for result in results)
+        print_json({**ours, "paper_method": paper})
+    else:
+        output_console().print(real_table(results))
+
+
+def _run_beside(images: int, seed: int, views: int, mismatch: bool) -> dict[str, ContinuousResult]:
+    """Run the experiment, and with a mismatch a second time with another body; shows progress.
+
+    Args:
+        images, seed, views: as in ``run_continuous_experiment``.
+        mismatch: whether to run the second.
+
+    Returns:
+        The figures, by what was in the pictures.
+    """
+    from drake_pose.commands.report import count_progress
+    from drake_pose.papers.kameda.continuous import (
+        continuous_search,
+        run_continuous_experiment,
+    )
+
+    search = continuous_search()
+    results = {}
+    for heading, other in {"the model itself": False, "another body": True}.items():
+        if mismatch or not other:
+            with count_progress(f"silhouettes of {heading}", images) as advance:
+                results[heading] = run_continuous_experiment(
+                    search, images, seed, views, other, advance
+                )
+    return results
+
+
+def _print_continuous(results: Mapping[str, ContinuousResult], json: bool) -> None:
+    """Print the figures of ``_run_beside`` as a table or as JSON."""
+    from drake_pose.commands.report import output_console
+    from drake_pose.papers.kameda.continuous import continuous_table
+
+    if json:
+        first, *others = (result.as_json() for result in results.values())
+        print_json({**first, "another_body": others[0]} if others else first)
+    else:
+        output_console().print(continuous_table(results))
+
+
+def _run_on_grid(runs: GridRuns, edges: float | None, out: Path | None, json: bool) -> None:
+    """Run the searches on a grid and print or draw what they found.
+
+    edges: the noise of the edges inside the silhouettes; None: they are not used.
+    """
+    from drake_pose.commands.report import count_progress, output_console
+    from drake_pose.papers.kameda.inner_edges import edge_lines, settle_by_edges
+    from drake_pose.papers.kameda.pictures import save_pictures
+    from drake_pose.papers.kameda.table import experiment_table
+    from drake_pose.results.folder import require_empty
+
+    if out is not None:
+        require_empty(out)
+    columns = runs.run()
+    leading = columns[-1][0]
+    settled: dict[str, int] = {}
+    if edges is not None:
+        with count_progress("silhouettes, edges", runs.images) as advance:
+            settled = settle_by_edges(leading, advance, edges)
+    if out is not None:
+        save_pictures(leading, out)
+    if json:
+        print_json({**_figures(columns[-1]), **settled, **_beside(columns[:-1])})
+        return
+    output_console().print(experiment_table(columns))
+    if settled:
+        say(edge_lines(settled))
+
+
+def _figures(results: Sequence[ExperimentResult]) -> dict[str, object]:
+    """The figures of the first seed, and of several the spread."""
+    from drake_pose.papers.kameda.table import spread_over_seeds
+
+    figures: dict[str, object] = dict(results[0].as_json())
+    return {**figures, "spread": spread_over_seeds(results)} if len(results) > 1 else figures
+
+
+def _beside(columns: Sequence[Sequence[ExperimentResult]]) -> dict[str, object]:
+    """The figures of the searches beside the one that was asked for."""
+    names = ("paper_method", "outside_weight_method")
+    return {name: _figures(column) for name, column in zip(names, columns, strict=False)}
+
+
+@dataclass(frozen=True)
+class GridRuns:
+    """What is run on the grid of angles: every search with every seed.
+
+    Args:
+        images: silhouettes for each seed.
+        seed: the first.
+        seeds: how many.
+        method: "paper", or "beam" for the beam search as well.
+        interval: [deg].
+        outside_limit: the paper's r [pixel].
+        candidates: the paper's K.
+        outside_weight: above 0 the paper's method is run once more with it.
+    """
+
+    images: int
+    seed: int
+    seeds: int
+    method: str
+    interval: float
+    outside_limit: float
+    candidates: int
+    outside_weight: float
+
+    def run(self) -> list[list[ExperimentResult]]:
+        """The runs of each search, the one that was asked for last; shows progress."""
+        from drake_pose.papers.kameda import experiment
+
+        paper = (self.outside_limit, self.candidates, self.interval)
+        searches = {"the paper's method": experiment.experiment_search(*paper)}
+        if self.outside_weight > 0.0:
+            weighted = experiment.experiment_search(*paper, self.outside_weight)
+            searches[f"outside weight {self.outside_weight:g}"] = weighted
+        images = self.images
+        if self.method == "beam":
+            images = min(images, experiment.PAPER_IMAGES)
+        columns = [self._run_seeds(name, one, images) for name, one in searches.items()]
+        if self.method == "beam":
+            beam = experiment.beam_experiment_search(self.interval)
+            columns.append(self._run_seeds("beam search", beam, self.images))
+        return columns
+
+    def _run_seeds(self, name: str, search: PoseSearch, images: int) -> list[ExperimentResult]:
+        from drake_pose.commands.report import count_progress
+        from drake_pose.papers.kameda.experiment import run_experiment
+
+        results: list[ExperimentResult] = []
+        with count_progress(f"silhouettes, {name}", images * self.seeds) as advance:
+            for seed in range(self.seed, self.seed + self.seeds):
+                before = len(results) * images
+
+                def count(done: int, before: int = before) -> None:
+                    advance(before + done)
+
+                results.append(run_experiment(search, images, seed, count))
+        return results

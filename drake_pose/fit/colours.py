@@ -1,0 +1,200 @@
+"""Pictures as evidence of a body's pose: what is known of its colours, and how lines are looked at.
+
+Nothing is kept here between frames: who follows a body keeps the histograms, and gets new ones.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.camera.models import Camera
+from drake_pose.errors import SettingsError
+from drake_pose.fit.colour_lines import COLOURS, compare_lines, learn_colours
+from drake_pose.fit.contour_fit import Comparison, Noise, camera_weights, pack_cameras
+from drake_pose.fit.kernel import COMPARED, SQUARES, WEIGHT
+from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.parameters import Placement
+
+Array = NDArray[np.float64]
+Histograms = NDArray[np.float32]
+"""(cameras, nodes, 3, COLOURS) what is known of a body's colours in each camera's pictures."""
+
+Picture = NDArray[np.uint8]
+
+NO_REGION = np.zeros((0, 0), dtype=np.bool_)
+"""Where nobody knows where the body is seen: as `learn_colours` takes it."""
+
+# A part is no closer to a contour than this [pixel], and is judged by no less of it [pixel].
+_CLOSE, _TELLING = 0.7, 20.0
+# What a part's lines say of their own noise is trusted no further than this [pixel]: of a part that
+# is far off they have to say where it is.
+_NOISIEST = 2.0
+
+
+@dataclass(frozen=True)
+class ColourSettings:
+    """How pictures are compared with a body.
+
+    Args:
+        steps: from offset to offset of lines, in one round after the other [pixel]; the last is
+            that of all further rounds.
+        spacing: of lines along the contour, so many pixels where the step is one.
+        correlation: how much of a contour [pixel] errs together: its lines count as one.
+        inside: colours are counted so far inside of the contour [pixel].
+        outside: and so far outside of it [pixel].
+        rate: the share of a frame's colours in what is known after it, 0 to 1.
+        agreeing: lines on which the edge seems to be further from the contour than this teach
+            nothing [pixel]: something else is there.
+
+    Raises:
+        SettingsError: a number that is not positive, or a rate above 1.
+    """
+
+    steps: tuple[int, ...] = (4, 2, 1)
+    spacing: float = 2.0
+    correlation: float = 5.0
+    inside: float = 16.0
+    outside: float = 30.0
+    rate: float = 0.1
+    agreeing: float = 2.5
+
+    def __post_init__(self) -> None:
+        if not self.steps or min(self.steps) < 1:
+            raise SettingsError(f"steps must be whole pixels, not {self.steps}")
+        for name in ("spacing", "correlation", "inside", "outside", "rate", "agreeing"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise SettingsError(f"{name} must be positive, not {getattr(self, name)}")
+        if self.rate > 1.0:
+            raise SettingsError(f"the rate of colours must be at most 1, not {self.rate}")
+
+    def step(self, number: int) -> int:
+        """From offset to offset of lines in a round, counted from 0 [pixel]."""
+        return self.steps[min(number, len(self.steps) - 1)]
+
+
+def no_colours(cameras: int, nodes: int) -> Histograms:
+    """What is known of a body that was never seen: nothing."""
+    return np.zeros((cameras, nodes, 3, COLOURS), dtype=np.float32)
+
+
+def check_picture(camera: Camera, picture: Picture) -> Picture:
+    """A picture as kernels take it: a copy where it cannot be written or lies in pieces.
+
+    Raises:
+        SettingsError: it is not (H, W, 3) or (H, W, 4) bytes of the camera's size.
+    """
+    shape = (camera.height, camera.width)
+    if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] not in (3, 4):
+        raise SettingsError(
+            f"camera '{camera.name}': a picture of red, green and blue bytes expected, got "
+            f"{picture.shape} {picture.dtype}"
+        )
+    if picture.shape[:2] != shape:
+        raise SettingsError(
+            f"camera '{camera.name}': picture of {picture.shape[1]} x {picture.shape[0]} pixels, "
+            f"{camera.width} x {camera.height} expected"
+        )
+    return np.require(picture, requirements=["C", "W"])
+
+
+def add_pictures(
+    compared: Comparison,
+    cameras: Sequence[Camera],
+    pictures: Sequence[Picture | None],
+    histograms: Histograms,
+    step: Round,
+    noise: Noise,
+    pixels: int,
+) -> None:
+    """Adds what pictures say to what silhouettes say, in place.
+
+    Args:
+        compared: of all cameras.
+        cameras: the cameras.
+        pictures: of each; None: no lines are looked at in it.
+        histograms: what is known of the colours.
+        step: the scale of the residuals, and the spacing of lines [pixel].
+        noise: what a pixel of contour is worth [pixel].
+        pixels: from offset to offset along lines.
+    """
+    placed = compared.placement
+    packed = pack_cameras(cameras)
+    weights = camera_weights(packed, placed, step, noise, 1.0)
+    for c, picture in enumerate(pictures):
+        if picture is not None:
+            compare_lines(
+                placed.packed, placed.X_WN, (packed[0][c], packed[1][c]), picture, histograms[c],
+                weights[c], pixels, compared.A[c], compared.b[c], compared.sums[c],
+            )  # fmt: skip
+
+
+def weigh_parts(compared: Comparison, deviation: float, pictures: Sequence[Picture | None]) -> None:
+    """Gives parts whose lines scatter more than those of others less weight, in place.
+
+    A part has few lines that err independently: its variance is taken half way, on a scale of
+    logarithms, between its own and that of all.
+
+    Args:
+        compared: of all cameras.
+        deviation: the least of lines [pixel].
+        pictures: of each camera; None: its silhouettes are not weighed.
+    """
+    shown = [c for c, picture in enumerate(pictures) if picture is not None]
+    squares, weight = (compared.sums[shown, :-1, k] for k in (SQUARES, WEIGHT))
+    overall = max(deviation**2, float(squares.sum() / max(float(weight.sum()), 1e-12)))
+    own = np.clip(squares / np.maximum(weight, 1e-12), deviation**2, _NOISIEST**2)
+    share = np.sqrt(overall / own)
+    compared.A[shown] *= share[..., None, None]
+    compared.b[shown] *= share[..., None]
+
+
+def part_distances(sums: Array) -> Array:
+    """(nodes,) how far each part is from the contour that colours show [pixel].
+
+    What covers a part in one camera says nothing against it where another sees it: the mean over
+    cameras is that of one over the distances' squares. 0: of the part too little is said.
+
+    Args:
+        sums: (cameras, nodes + 1, 6) of pictures, as of `compare_contours`.
+    """
+    squares, weight, length = (sums[:, :-1, k] for k in (SQUARES, WEIGHT, COMPARED))
+    own = np.maximum(_CLOSE**2, squares / np.maximum(weight, 1e-12))
+    told = length.sum(axis=0)
+    distances = np.sqrt(told / np.maximum((length / own).sum(axis=0), 1e-12))
+    return np.where(told >= _TELLING, distances, 0.0)
+
+
+def learned(
+    placed: Placement,
+    cameras: Sequence[Camera],
+    pictures: Sequence[Picture | None],
+    histograms: Histograms,
+    settings: ColourSettings,
+    surely: bool = False,
+) -> Histograms:
+    """What is known of the colours after a frame.
+
+    Args:
+        placed: the body where it stands.
+        cameras: the cameras.
+        pictures: of each; None: it teaches nothing.
+        histograms: what was known before.
+        settings: how colours are counted.
+        surely: whether the pose is known, so that all lines teach and old colours are forgotten.
+    """
+    known = histograms.copy()
+    packed = pack_cameras(cameras)
+    widths = np.array([settings.inside, settings.outside])
+    rate, agreeing = (1.0, math.inf) if surely else (settings.rate, settings.agreeing)
+    for c, picture in enumerate(pictures):
+        if picture is not None:
+            learn_colours(
+                placed.packed, placed.X_WN, (packed[0][c], packed[1][c]), picture, known[c],
+                settings.spacing, widths, rate, agreeing, 0, NO_REGION,
+            )  # fmt: skip
+    return known

@@ -1,0 +1,378 @@
+"""One pose from all silhouettes at once: the contours of body and silhouettes drawn together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.camera.models import Camera
+from drake_pose.fit.camera_sums import (
+    AddUp,
+    CameraSum,
+    Views,
+    add_cameras,
+    compare_placed,
+)
+from drake_pose.fit.evidence import EdgePoints, pack_evidence
+from drake_pose.fit.kernel import CLOSE, COMPARED, COST, FITTING, collect
+from drake_pose.fit.levenberg_marquardt import (
+    Equations,
+    Round,
+    StepSettings,
+    minimise,
+)
+from drake_pose.fit.parameters import BodyParameters, Placement
+from drake_pose.fit.surfaces import VERY_FEW, few_triangles
+from drake_pose.silhouette.areas.bending import TreeSurfaces
+from drake_pose.silhouette.areas.outline import Outline
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# Finer than this [pixel] silhouettes cannot tell.
+FINEST_SCALE, FINEST_SPACING = 1.5, 1.0
+# So many squares of a picture's rows and columns are told apart.
+_SQUARES = 64
+
+
+@dataclass(frozen=True)
+class Noise:
+    """How far silhouettes are off the body's: what a point of contour is worth.
+
+    Args:
+        deviation: of the distance of the contours [m].
+        correlation: so much of a contour errs together [m].
+    """
+
+    deviation: float = 0.006
+    correlation: float = 0.06
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What is known of the values without pictures.
+
+    Args:
+        mean: (m,) [rad or m].
+        information: (m,) one over the variance; 0: nothing is known.
+    """
+
+    mean: Array
+    information: Array
+
+
+class Comparison(NamedTuple):
+    """What each camera says of each node's affine motion x (12,): x^T A x - 2 b^T x.
+
+    A: (cameras, nodes, 12, 12), lower triangles; b: (cameras, nodes, 12); sums: (cameras,
+    nodes + 1, 6) as of `compare_contours`; placement: of the body.
+    """
+
+    A: Array
+    b: Array
+    sums: Array
+    placement: Placement
+
+    @property
+    def total(self) -> CameraSum:
+        """What all cameras say together."""
+        return add_cameras(self.A, self.b, self.sums)
+
+    @property
+    def share(self) -> float:
+        """Of both contours' lengths, what fits, 0 to 1."""
+        return fitting_share(self.sums)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseFit:
+    """A fitted pose.
+
+    Args:
+        values: (m,) of the pose tree [rad or m].
+        sums: (nodes + 1, 6) before the last step, of all cameras, as of `compare_contours`.
+        cost: of the last comparison, all told.
+        evaluations: how often contours were compared.
+    """
+
+    values: Array
+    sums: Array
+    cost: float
+    evaluations: int
+
+    @property
+    def share(self) -> float:
+        """Of both contours' lengths, what fits, 0 to 1."""
+        return fitting_share(self.sums)
+
+    @property
+    def closeness(self) -> float:
+        """How well both contours fit, 0 to 1: what tells the better one of two fits."""
+        total = self.sums.sum(axis=0)
+        return float(total[CLOSE] / max(total[COMPARED], 1e-9))
+
+
+def fitting_share(sums: Array) -> float:
+    """Of both contours' lengths, what fits, 0 to 1; sums (..., 6) of `compare_contours`."""
+    total = sums.reshape(-1, sums.shape[-1]).sum(axis=0)
+    return float(total[FITTING] / max(total[COMPARED], 1e-9))
+
+
+def pack_views(cameras: Sequence[Camera], edges: Sequence[EdgePoints]) -> Views:
+    """Cameras and the edges of their silhouettes; without points where nothing is seen."""
+    return Views(pack_cameras(cameras), pack_evidence(edges))
+
+
+def pack_cameras(cameras: Sequence[Camera]) -> tuple[Array, Array]:
+    """X_CW (c, 4, 4) and kernel parameters (c, 8) of cameras."""
+    return (
+        np.array([camera.X_CW for camera in cameras]).reshape(-1, 4, 4),
+        np.array([camera.kernel_parameters() for camera in cameras]).reshape(-1, 8),
+    )
+
+
+class ContourFit:
+    """Fits the values of a body's pose tree to the silhouettes of several cameras.
+
+    Attributes:
+        tree: the pose tree.
+        kinematics: its kinematics; `names` are the values'.
+        outlines: a surface for each node.
+        lower, upper: (m,) limits; infinite for angles that turn freely.
+        noise: what a point of contour is worth.
+        steps: how steps are made.
+
+    Args:
+        tree: the body's pose tree, or its kinematics.
+        outlines: a surface for each node; few triangles will do. The tree's own where not given.
+        noise: what a point of contour is worth.
+        steps: how steps are made.
+        pixels: so many pixels are the unit of length of rounds and noise in every camera; None:
+            that unit is the metre, as large as it is seen at the body's root.
+        body: what else may be unknown of it; None: the tree's values, ROOT_NAMES and no more.
+    """
+
+    def __init__(
+        self,
+        tree: PoseTree | TreeKinematics,
+        outlines: Sequence[Outline] | None = None,
+        noise: Noise | None = None,
+        steps: StepSettings | None = None,
+        pixels: float | None = None,
+        body: BodyParameters | None = None,
+    ) -> None:
+        self.kinematics = tree if isinstance(tree, TreeKinematics) else TreeKinematics(tree)
+        self.tree = self.kinematics.tree
+        self.outlines = tuple(
+            few_triangles(TreeSurfaces(self.tree), VERY_FEW) if outlines is None else outlines
+        )
+        self.noise, self.steps = noise or Noise(), steps or StepSettings()
+        self.body = body or BodyParameters(self.kinematics, self.outlines)
+        self.lower, self.upper = self.kinematics.lower, self.kinematics.upper
+        self._pixels = pixels
+
+    def fit(
+        self,
+        cameras: Sequence[Camera],
+        edges: Sequence[EdgePoints],
+        values: Array,
+        rounds: Sequence[Round],
+        prior: Prior | None = None,
+        held: Mask | None = None,
+    ) -> PoseFit:
+        """Fits a pose.
+
+        Args:
+            cameras: the cameras.
+            edges: of each camera's silhouette; without points where nothing is seen.
+            values: (m,) where to start.
+            rounds: the parts of the fit.
+            prior: what else is known.
+            held: (m,) which values stay.
+        """
+        return self.fit_views(pack_views(cameras, edges), values, rounds, prior, held)
+
+    def fit_views(
+        self,
+        views: Views,
+        values: Array,
+        rounds: Sequence[Round],
+        prior: Prior | None = None,
+        held: Mask | None = None,
+    ) -> PoseFit:
+        """As fit, of views that are packed."""
+
+        def add_up(placement: Placement, step: Round) -> CameraSum:
+            return add_cameras(*self.compare_placed(views, placement, step))
+
+        return self.fit_sums(add_up, values, rounds, prior, held)
+
+    def fit_sums(
+        self,
+        add_up: AddUp,
+        values: Array,
+        rounds: Sequence[Round],
+        prior: Prior | None = None,
+        held: Mask | None = None,
+    ) -> PoseFit:
+        """As fit, of cameras whose edges may be elsewhere: add_up says what all of them say."""
+        index = np.flatnonzero(np.ones(len(values), bool) if held is None else ~held)
+        current = np.array(values, dtype=np.float64)
+        current[index] = np.clip(values, self.lower, self.upper)[index]
+        sums = np.zeros((len(self.outlines) + 1, 6))
+
+        def evaluate(own: Array, _: Array, step: Round) -> Equations:
+            nonlocal sums
+            theta = current.copy()
+            theta[index] = own[0]
+            placement = self.body.place(theta)
+            total = add_up(placement, step)
+            H, g = normal_equations(total, placement, len(theta))
+            sums = total.sums
+            cost = float(sums[:, COST].sum())
+            if prior is not None:
+                off = theta - prior.mean
+                H, g = H + np.diag(prior.information), g + prior.information * off
+                cost += float(prior.information @ off**2)
+            return Equations(H[np.ix_(index, index)][None], g[index][None], cost)
+
+        limits = self.lower[index], self.upper[index]
+        found = minimise(evaluate, current[index][None], np.zeros(0), limits, rounds, self.steps)
+        fitted = current.copy()
+        fitted[index] = found.own[0]
+        return PoseFit(fitted, sums, found.cost, found.evaluations)
+
+    def compare(
+        self, cameras: Sequence[Camera], edges: Sequence[EdgePoints], theta: Array, step: Round
+    ) -> Comparison:
+        """The contours at values (m,) compared with all cameras' edges; arguments as in fit."""
+        return self.compare_views(pack_views(cameras, edges), theta, step)
+
+    def compare_views(self, views: Views, theta: Array, step: Round) -> Comparison:
+        """The contours at values (m,), or at all parameters, compared with all cameras' edges."""
+        return compare_views(self.body, views, theta, step, self.noise, self._pixels)
+
+    def compare_placed(
+        self, views: Views, placement: Placement, step: Round
+    ) -> tuple[Array, Array, Array]:
+        """A, b and sums of each camera, as of `compare_contours`, where the body stands."""
+        weights = self.weights(views.cameras, placement, step)
+        return compare_placed(placement.packed, placement.X_WN, views, weights)
+
+    def piece_costs(self, views: Views, theta: Array, step: Round, side: float) -> Array:
+        """(cameras, k, k) the cost at values (m,) by squares of the pictures of a side [pixel]."""
+        placement = self.body.place(theta)
+        weights = self.weights(views.cameras, placement, step)
+        pieces = np.zeros((len(weights), _SQUARES, _SQUARES))
+        compare_placed(placement.packed, placement.X_WN, views, weights, pieces, side)
+        return pieces
+
+    def weights(self, cameras: tuple[Array, Array], placement: Placement, step: Round) -> Array:
+        """(c, 4) of cameras, as `compare_contours` takes them."""
+        return camera_weights(cameras, placement, step, self.noise, self._pixels)
+
+
+def compare_views(
+    body: BodyParameters,
+    views: Views,
+    theta: Array,
+    step: Round,
+    noise: Noise,
+    pixels: float | None = None,
+) -> Comparison:
+    """A body's contours compared with all cameras' edges.
+
+    Args:
+        body: the body.
+        views: what all cameras say.
+        theta: (m,) its tree's values, or all its parameters (n,).
+        step: scale and spacing.
+        noise: what a point of contour is worth.
+        pixels: of the unit of length; None: the metre's at the root.
+    """
+    placement = body.place(theta)
+    weights = camera_weights(views.cameras, placement, step, noise, pixels)
+    return Comparison(*compare_placed(placement.packed, placement.X_WN, views, weights), placement)
+
+
+def camera_weights(
+    cameras: tuple[Array, Array],
+    placement: Placement,
+    step: Round,
+    noise: Noise,
+    pixels: float | None = None,
+) -> Array:
+    """(c, 4) of cameras, as `compare_contours` takes them; arguments as of compare_views."""
+    if pixels is None:
+        size = pixels_per_metre(cameras, placement.X_WN[0, :3, 3])
+    else:
+        size = np.full(len(cameras[0]), pixels)
+    return np.column_stack(
+        [
+            1.0 / size,
+            np.maximum(FINEST_SCALE, step.scale * size),
+            np.maximum(FINEST_SPACING, step.spacing * size),
+            # Both contours say the same: together they count as one.
+            0.5 / (size * noise.correlation * (size * noise.deviation) ** 2),
+        ]
+    )
+
+
+def project(
+    compared: Comparison, size: int, camera_motions: Array | None = None
+) -> tuple[Array, Array]:
+    """The normal equations H dx = -g of a frame's parameters, by the chain rule.
+
+    Args:
+        compared: what the cameras say.
+        size: how many parameters the body has.
+        camera_motions: (cameras, k, 12) as of `CameraParameters.place`, whose parameters follow the
+            body's; None: the cameras stay.
+    """
+    placement = compared.placement
+    if camera_motions is None:
+        return normal_equations(compared.total, placement, size)
+    cameras, count = camera_motions.shape[:2]
+    nodes, moved = len(placement.X_WN), len(placement.motions)
+    total = size + cameras * count
+    H, g = np.zeros((total, total)), np.zeros(total)
+    # A camera moves every node.
+    ends = placement.starts[1:]
+    places = np.repeat(ends, count)
+    more = np.tile(np.arange(count), nodes)
+    owners = np.insert(placement.owners, places, moved + more)
+    starts = placement.starts + count * np.arange(nodes + 1)
+    for c in range(cameras):
+        parameters = np.insert(placement.parameters, places, size + c * count + more)
+        motions = np.vstack([placement.motions, camera_motions[c]])
+        part = collect(compared.A[c], compared.b[c], motions, starts, owners, parameters, total)
+        H += part[0]
+        g += part[1]
+    return H, g
+
+
+def normal_equations(total: CameraSum, placement: Placement, size: int) -> tuple[Array, Array]:
+    """As project, of what cameras that stay say together."""
+    return collect(
+        total.A,
+        total.b,
+        placement.motions,
+        placement.starts,
+        placement.owners,
+        placement.parameters,
+        size,
+    )
+
+
+def pixels_per_metre(cameras: tuple[Array, Array], place: Array) -> Array:
+    """(c,) how large a metre at a place (3,) is in each picture [pixel/m]."""
+    X_CW, parameters = cameras
+    kind, focal, near = parameters[:, 0], parameters[:, 1], parameters[:, 5]
+    depth = np.maximum(X_CW[:, 2, :3] @ place + X_CW[:, 2, 3], near)
+    return np.asarray(np.where(kind == 0.0, focal / depth, focal))

@@ -1,0 +1,316 @@
+"""How sure fitted values are where contours do not err point by point.
+
+Five things make the contours of a body and of its silhouettes differ: the noise of their points; so
+much of it as comes again in all pictures of a part that stands still before a camera; the surface
+of a part, which all cameras see shifted, turned and stretched alike; a part's edge in one camera's
+mask, so too; and a camera, which stands or looks a little elsewhere than its calibration says. How
+large they are is estimated from what is left of the distances once the values are fitted: variance
+components by restricted maximum likelihood (Patterson and Thompson 1971) in steps of Fisher's
+scoring, each with a prior of about a pixel, for a single instant tells little of them.
+
+A camera's error hardly shows in what is left, for the joints follow it. So a calibration is not
+trusted beyond a pixel, however well everything fits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.fit.contour_fit import Comparison, ContourFit, Views, pixels_per_metre
+from drake_pose.silhouette.areas.outline import Outline
+
+Array = NDArray[np.float64]
+
+# A camera's picture is off by no less [of the unit].
+_LEAST_CAMERA = 1.0
+# Standard deviation of the logarithms of sizes about the unit, of what a single instant shows.
+_PRIOR_DEVIATION = 1.0
+# A motion by a unit that is seen along less contour than this is as noise [units].
+_LEAST_INFORMATION = 1.0
+# At most so many independent distances are looked at, the best known ones.
+_MOST_DISTANCES = 400
+# A part stands still from one picture to another that moves by less [of the unit].
+_STILL = 0.5
+_ITERATIONS, _SETTLED = 20, 0.03
+# A place is known to about as much, and an angle to a full turn [m, rad].
+_PLACE = 10.0
+
+
+class ErrorSizes(NamedTuple):
+    """Standard deviations of what makes contours differ.
+
+    Attributes:
+        noise: of a point of contour, as the fit weights it.
+        repeated: the same of what noise repeats in all pictures of a part that stands still before
+            a camera; 0 where no part does.
+        surface, mask, camera: how far they move contours [the unit of the distances].
+    """
+
+    noise: float
+    repeated: float
+    surface: float
+    mask: float
+    camera: float
+
+
+class ErrorEffects(NamedTuple):
+    """(n, n) covariances of distances that what ``ErrorSizes`` names makes where it errs by one."""
+
+    noise: Array
+    repeated: Array
+    surface: Array
+    mask: Array
+    camera: Array
+
+
+class Distances(NamedTuple):
+    """What is left of the contours' distances, in independent combinations.
+
+    Attributes:
+        y: (n,) the distances.
+        X: (n, m) how they follow the values.
+        effects: (n, n) covariances of what errs by a unit, as of ``ErrorSizes``.
+        information: (m, m) what all distances tell of the values where each errs by itself.
+        bends: (n, 12 nodes) how they follow the parts' surfaces, which all pictures see alike.
+        pictures: (n,) which of the pictures each is of.
+    """
+
+    y: Array
+    X: Array
+    effects: ErrorEffects
+    information: Array
+    bends: Array
+    pictures: NDArray[np.intp]
+
+
+class Picture(NamedTuple):
+    """A body's contours compared with one silhouette.
+
+    Attributes:
+        A: (nodes, 12, 12), lower triangles, and b: (nodes, 12), as of ``Comparison``.
+        X_WN: (nodes, 4, 4) where the body stands.
+        X_CW: (4, 4) the world's pose in the camera.
+        moves: (nodes, m, 12) the affine motions that the m values give to the nodes.
+        size: how far the unit of errors is at the body [m].
+    """
+
+    A: Array
+    b: Array
+    X_WN: Array
+    X_CW: Array
+    moves: Array
+    size: float
+
+
+def distances(fit: ContourFit, views: Views, compared: Comparison, unit: float) -> Distances:
+    """The distances at a pose that was fitted.
+
+    Args:
+        fit: what fitted it.
+        views: what the cameras say.
+        compared: the comparison at the pose.
+        unit: in which errors are measured [pixel].
+    """
+    X_WN = compared.placement.X_WN
+    moves = compared.placement.dense(len(fit.kinematics.names))
+    size = unit / pixels_per_metre(views.cameras, X_WN[:, :3, 3].mean(axis=0))
+    pictures = [
+        Picture(A, b, X_WN, X_CW, moves, float(one))
+        for A, b, X_CW, one in zip(compared.A, compared.b, views.cameras[0], size, strict=True)
+    ]
+    return distances_in_pictures(fit.outlines, pictures)
+
+
+def distances_in_pictures(
+    outlines: Sequence[Outline], pictures: Sequence[Picture], most: int = _MOST_DISTANCES
+) -> Distances:
+    """The distances in several pictures, each of which errs as a whole, too.
+
+    Args:
+        outlines: the nodes' surfaces.
+        pictures: each with the same values.
+        most: at most so many distances are looked at, the best known ones.
+    """
+    found: list[tuple[float, int, int, Array, Array, Array, float]] = []
+    mean_size = float(np.mean([picture.size for picture in pictures]))
+    for c, (A_lower, b, X_WN, X_CW, moves, size) in enumerate(pictures):
+        A = np.tril(A_lower) + np.swapaxes(np.tril(A_lower, -1), -1, -2)
+        shakes = _camera_motions(outlines, X_CW, X_WN, size)
+        for n in np.flatnonzero(np.einsum("nii->n", A) > 0.0).tolist():
+            D = surface_deformations(outlines[n].vertices, X_WN[n]) * mean_size
+            share, turns = np.linalg.eigh(D.T @ A[n] @ D)
+            for known, turn in zip(share, turns.T, strict=True):
+                if known >= _LEAST_INFORMATION:
+                    along = D @ turn / np.sqrt(known)
+                    row = along @ A[n]
+                    found.append(
+                        (known, c, n, row @ moves[n].T, np.sqrt(known) * turn,
+                         row @ shakes, float(along @ b[n]))
+                    )  # fmt: skip
+    found = sorted(found, key=lambda one: -one[0])[:most]
+    of = np.array([(one[1], one[2]) for one in found], dtype=np.intp).reshape(-1, 2)
+    bends = np.array([one[4] for one in found]).reshape(-1, 12)
+    shaken = np.array([one[5] for one in found]).reshape(-1, 6)
+    same_picture, same_part = (of[:, None, k] == of[None, :, k] for k in range(2))
+    alike = bends @ bends.T * same_part
+    view = _views(outlines, pictures)[of[:, 0], of[:, 1]]
+    turns = bends / np.linalg.norm(bends, axis=1, keepdims=True)
+    repeated = turns @ turns.T * same_part * (view[:, None] == view)
+    of_part = of[:, 1, None] == np.arange(len(outlines))
+    count = pictures[0].moves.shape[1]
+    information = np.zeros((count, count))
+    for A_lower, _, _, _, moves, _ in pictures:
+        A = np.tril(A_lower) + np.swapaxes(np.tril(A_lower, -1), -1, -2)
+        information += (moves @ A @ np.swapaxes(moves, 1, 2)).sum(axis=0)
+    return Distances(
+        y=np.array([one[6] for one in found]),
+        X=np.array([one[3] for one in found]).reshape(-1, count),
+        effects=ErrorEffects(
+            np.eye(len(found)),
+            repeated,
+            alike,
+            alike * same_picture,
+            shaken @ shaken.T * same_picture,
+        ),
+        information=information,
+        bends=(of_part[:, :, None] * bends[:, None]).reshape(len(found), 12 * len(outlines)),
+        pictures=of[:, 0],
+    )
+
+
+def _views(outlines: Sequence[Outline], pictures: Sequence[Picture]) -> NDArray[np.intp]:
+    """(pictures, nodes) which picture was the first that showed a part where this one does."""
+    X_CN = np.array([one.X_CW @ one.X_WN for one in pictures])[:, :, :3]
+    found = np.tile(np.arange(len(pictures))[:, None], len(outlines))
+    for n, outline in enumerate(outlines):
+        if not len(outline.vertices):
+            continue
+        points = np.column_stack([outline.vertices, np.ones(len(outline.vertices))])
+        moments = points.T @ points / len(points)
+        for c, one in enumerate(pictures):
+            by = X_CN[: c + 1, n] - X_CN[c, n]
+            still = np.einsum("kij,jl,kil->k", by, moments, by) < (_STILL * one.size) ** 2
+            found[c, n] = found[np.flatnonzero(still)[0], n]
+    return found
+
+
+def surface_deformations(vertices: Array, X_WN: Array) -> Array:
+    """(12, 12) affine motions, in columns, that each move a part's surface by about one metre."""
+    R = X_WN[:3, :3]
+    middle = vertices.mean(axis=0)
+    sizes = np.maximum(np.sqrt(((vertices - middle) ** 2).mean(axis=0)), 1e-3)
+    K = np.zeros((12, 12))
+    for i in range(3):
+        K[[3, 7, 11], i] = R[:, i]
+        for j in range(3):
+            M = np.outer(R[:, i], R[:, j]) / sizes[j]
+            v = -M @ (X_WN[:3, 3] + R @ middle)
+            K[:, 3 + 3 * i + j] = np.column_stack([M, v]).ravel()
+    return K
+
+
+def widening(vertices: Array, X_WN: Array) -> Array:
+    """(12,) an affine motion that makes a part's surface about a metre wider on all sides."""
+    return np.asarray(surface_deformations(vertices, X_WN)[:, [3, 7, 11]].sum(axis=1))
+
+
+def _camera_motions(outlines: Sequence[Outline], X_CW: Array, X_WN: Array, size: float) -> Array:
+    """(12, 6) the body's shifts along and turns about a camera's axes, by about a size [m]."""
+    placed = zip(outlines, X_WN, strict=True)
+    points = np.vstack([one.vertices @ X[:3, :3].T + X[:3, 3] for one, X in placed])
+    middle = points.mean(axis=0)
+    extent = max(float(np.sqrt(((points - middle) ** 2).sum(axis=1).mean())), 1e-9)
+    motions = np.zeros((12, 6))
+    for k, axis in enumerate(X_CW[:3, :3]):
+        M = np.cross(np.eye(3), axis).T / extent
+        motions[[3, 7, 11], k] = axis
+        motions[:, 3 + k] = np.column_stack([M, -M @ middle]).ravel()
+    return motions * size
+
+
+def estimate_sizes(
+    seen: Distances,
+    is_angle: NDArray[np.bool_],
+    least_camera: float = _LEAST_CAMERA,
+    prior_deviation: float = _PRIOR_DEVIATION,
+) -> ErrorSizes:
+    """How large the errors are: the likeliest, given what is left and the prior.
+
+    Args:
+        seen: the distances.
+        is_angle: (m,) which values are angles.
+        least_camera: a picture errs as a whole by no less [of the unit].
+        prior_deviation: of the logarithms of sizes about the unit, before anything is seen.
+    """
+    n = len(seen.y)
+    stands_still = np.abs(seen.effects.repeated - seen.effects.noise).max(initial=0.0) > _SETTLED
+    # Of parts that move, noise is noise.
+    told = [k for k, name in enumerate(ErrorSizes._fields) if name != "repeated" or stands_still]
+    effects = [seen.effects[k] for k in told]
+    apriori = _apriori(is_angle)
+
+    def likelihood(t: Array) -> tuple[float, Array, Array]:
+        V = sum((np.exp(2.0 * a) * W for a, W in zip(t, effects, strict=True)), np.zeros((n, n)))
+        inverse = np.linalg.inv(V)
+        VX = inverse @ seen.X
+        H = seen.X.T @ VX + apriori
+        P = inverse - VX @ np.linalg.solve(H, VX.T)
+        Py = P @ seen.y
+        freedom = np.linalg.slogdet(V)[1] + np.linalg.slogdet(H)[1]
+        return -0.5 * float(freedom + seen.y @ Py + (t @ t) / prior_deviation**2), P, Py
+
+    t = np.zeros(len(effects))
+    value, P, Py = likelihood(t)
+    for _ in range(_ITERATIONS):
+        shares = [2.0 * np.exp(2.0 * a) * (P @ W) for a, W in zip(t, effects, strict=True)]
+        pulls = [2.0 * np.exp(2.0 * a) * (Py @ W @ Py) for a, W in zip(t, effects, strict=True)]
+        g = 0.5 * (np.array(pulls) - [np.trace(one) for one in shares]) - t / prior_deviation**2
+        fisher = np.array([[0.5 * np.sum(one * other.T) for one in shares] for other in shares])
+        step = np.linalg.solve(fisher + np.eye(len(t)) / prior_deviation**2, g)
+        step /= max(1.0, np.abs(step).max())
+        trial = likelihood(t + step)
+        while trial[0] < value and np.abs(step).max() > _SETTLED:
+            step *= 0.5
+            trial = likelihood(t + step)
+        if trial[0] < value:
+            break
+        t, (value, P, Py) = t + step, trial
+        if np.abs(step).max() < _SETTLED:
+            break
+    sizes = np.zeros(len(ErrorSizes._fields))
+    sizes[told] = np.exp(t)
+    found = ErrorSizes(*sizes.tolist())
+    return found._replace(camera=max(found.camera, least_camera))
+
+
+def values_covariance(
+    seen: Distances, sizes: ErrorSizes, free: NDArray[np.intp], is_angle: NDArray[np.bool_]
+) -> Array:
+    """(f, f) covariance of the free values, fitted as if each distance erred by itself.
+
+    That is no better than the fit: H^-1 J^T V J H^-1 (the sandwich of Huber 1967), where V is the
+    covariance of the distances.
+    """
+    white = sizes.noise**2 + sizes.repeated**2
+    own = seen.X[:, free]
+    V = distances_covariance(seen, sizes)
+    apriori = white * _apriori(is_angle)[np.ix_(free, free)]
+    H = seen.information[np.ix_(free, free)] + apriori
+    # What is not among the distances, and what is known beforehand, is as noise.
+    inverse = np.linalg.inv(H)
+    return np.asarray(inverse @ (own.T @ V @ own + white * (H - own.T @ own)) @ inverse)
+
+
+def distances_covariance(seen: Distances, sizes: ErrorSizes) -> Array:
+    """(n, n) of the distances."""
+    parts = zip(sizes, seen.effects, strict=True)
+    return sum((size**2 * W for size, W in parts), np.zeros((len(seen.y), len(seen.y))))
+
+
+def _apriori(is_angle: NDArray[np.bool_]) -> Array:
+    """(m, m) information: as much as an even distribution over its range has variance."""
+    return np.diag(12.0 / np.where(is_angle, 2.0 * np.pi, _PLACE) ** 2)

@@ -1,0 +1,426 @@
+"""A body whose parts may be longer and wider than its model's: unknowns of its proportions.
+
+Each part is stretched along one axis of its frame, that along which it carries what hangs on it,
+and widened across it. So bones get their own lengths and flesh its own girth, which silhouettes of
+somebody else than the model's measures show. Where a limb begins, its joint may lie further out in
+the flesh than the model's: at rest nothing changes, but the limb bends elsewhere. The model's
+joints keep their meaning.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, diags_array, eye_array, kron, vstack
+
+from drake_pose.body.model import ArticulatedModel
+from drake_pose.body.tree.joint_offsets import joint_offsets
+from drake_pose.body.tree.tree_kinematics import Motions, TreeKinematics
+from drake_pose.camera.models import Camera
+from drake_pose.fit.contour_fit import Noise
+from drake_pose.fit.evidence import EdgePoints, pack_evidence
+from drake_pose.fit.frames_fit import FramesFit
+from drake_pose.fit.levenberg_marquardt import Coupling, Round
+from drake_pose.fit.parameters import (
+    ROOT_NAMES,
+    BodyParameters,
+    Placement,
+    affine_motions,
+)
+from drake_pose.fit.unknowns import Unknowns, choose, join
+from drake_pose.silhouette.areas.bending import TreeSurfaces
+from drake_pose.silhouette.areas.outline import PackedOutlines
+
+Array = NDArray[np.float64]
+
+LENGTH_PREFIX, WIDTH_PREFIX, PLACE_PREFIX = "log_length_", "log_width_", "joint_place_"
+"""Begin the names of the logarithms of how much longer a part is, and of how much wider a part or
+all parts of a limb are; and of how far along a part its own joint lies, over the part's length."""
+
+
+class _MotionList:
+    """Affine motions of nodes, collected; the whole body has grown about its root and is shifted.
+
+    Args:
+        nodes: how many there are.
+        growth: of the whole.
+        moved: (3,) where the world's origin comes to lie by growth and shift [m].
+    """
+
+    def __init__(self, nodes: int, growth: float, moved: Array) -> None:
+        self._growth, self._moved = growth, moved
+        self._motions: list[Array] = []
+        self._parameters: list[int] = []
+        self._owners: list[list[int]] = [[] for _ in range(nodes)]
+
+    def add(self, parameter: int, nodes: Sequence[int], M: Array, v: Array) -> None:
+        """A parameter moves some nodes by M (3, 3) p + v (3,) before the whole grows."""
+        for node in nodes:
+            self._owners[node].append(len(self._motions))
+        self._parameters.append(parameter)
+        self._motions.append(np.column_stack([M, self._growth * v - M @ self._moved]).reshape(12))
+
+    def placement(self, packed: PackedOutlines, X_WN: Array) -> Placement:
+        """The body with these motions."""
+        starts = np.cumsum([0, *(len(owned) for owned in self._owners)])
+        owners = np.array([one for owned in self._owners for one in owned], dtype=np.int64)
+        parameters = np.array(self._parameters, dtype=np.int64)[owners]
+        return Placement(packed, X_WN, np.array(self._motions), starts, owners, parameters)
+
+
+class ProportionedBody(BodyParameters):
+    """A body's parameters: its tree's values, ROOT_NAMES, lengths, widths, places of joints.
+
+    A limb is a chain of nodes of which each carries the next alone. Lengths are those of nodes,
+    widths those of limbs, and places those of the joints with which limbs begin.
+
+    Attributes:
+        axes: (nodes,) the axis 0, 1 or 2 of its frame along which each node is long.
+        limbs: (nodes,) the limb that each node belongs to.
+        placed: the nodes whose joints, with which limbs begin, may lie elsewhere in the flesh.
+
+    Args:
+        kinematics: the pose tree's.
+        surfaces: the pose tree's.
+    """
+
+    def __init__(self, kinematics: TreeKinematics, surfaces: TreeSurfaces) -> None:
+        super().__init__(kinematics, surfaces.rigid, surfaces=surfaces)
+        nodes = kinematics.tree.nodes
+        self.limbs = np.zeros(len(nodes), dtype=np.int64)
+        firsts: list[str] = []
+        for i, node in enumerate(nodes):
+            if node.parent >= 0 and len(nodes[node.parent].children) == 1:
+                self.limbs[i] = self.limbs[node.parent]
+            else:
+                self.limbs[i] = len(firsts)
+                firsts.append(node.name)
+        self.length_names = tuple(f"{LENGTH_PREFIX}{node.name}" for node in nodes)
+        self.width_names = tuple(f"{WIDTH_PREFIX}{name}" for name in firsts)
+        self._joints = {
+            offset.node: offset.joint
+            for offset in joint_offsets(kinematics.tree)
+            if offset.step == 0
+            and not offset.inverted
+            and offset.link == nodes[nodes[offset.node].parent].name
+            and nodes[offset.node].name in firsts
+        }
+        self.placed = np.array(sorted(self._joints), dtype=np.intp)
+        self.place_names = tuple(f"{PLACE_PREFIX}{nodes[i].name}" for i in self.placed)
+        self.names = (
+            *kinematics.names,
+            *ROOT_NAMES,
+            *self.length_names,
+            *self.width_names,
+            *self.place_names,
+        )
+        self.axes, self._along, self._rest = self._find_axes()
+
+    def _find_axes(self) -> tuple[NDArray[np.int64], Array, Array]:
+        """(nodes,) axes; (nodes, 3) [m] along them how long, and the same at rest in the parent."""
+        kinematics = self.kinematics
+        X_WN = kinematics.poses(kinematics.flatten(kinematics.tree.default_values()))
+        axes = np.zeros(len(X_WN), dtype=np.int64)
+        lengths, rest = np.zeros((2, len(X_WN), 3))
+        for i, node in enumerate(kinematics.tree.nodes):
+            carried = (X_WN[list(node.children), :3, 3] - X_WN[i, :3, 3]) @ X_WN[i, :3, :3]
+            along = np.abs(carried).sum(axis=0)
+            vertices = node.mesh.vertices
+            middle = vertices.mean(axis=0) if len(vertices) else np.ones(3)
+            if not np.any(along > 0.0):
+                along = np.abs(middle)
+            axis = axes[i] = int(np.argmax(along))
+            ends = carried[:, axis] if len(carried) else middle[[axis]]
+            lengths[i, axis] = ends[np.argmax(np.abs(ends))]
+            rest[i] = X_WN[i, :3, :3] @ lengths[i]
+            if node.parent >= 0:
+                rest[i] = X_WN[node.parent, :3, :3].T @ rest[i]
+        return axes, lengths, rest
+
+    def factors(self, theta: Array) -> Array:
+        """(nodes, 3) so many times its size each node has along its frame's axes."""
+        count = len(self.kinematics.names) + len(ROOT_NAMES)
+        nodes = len(self.limbs)
+        lengths = theta[count : count + nodes]
+        widths = theta[count + nodes :][: len(self.width_names)]
+        logs = np.repeat(widths[self.limbs][:, None], 3, axis=1)
+        logs[np.arange(nodes), self.axes] = lengths
+        return np.asarray(np.exp(logs))
+
+    def applied_to(self, model: ArticulatedModel, theta: Array) -> ArticulatedModel:
+        """A model, the tree's or one like it, with the proportions of all parameters (n,).
+
+        Raises:
+            ModelError: its file is no URDF.
+        """
+        nodes, shares = self.kinematics.tree.nodes, self.joint_places(theta)
+        factors = zip(nodes, self.factors(theta).tolist(), strict=True)
+        stretched = model.stretched({node.name: tuple(row) for node, row in factors})
+        shifted = stretched.with_shifted_joints(
+            {joint: tuple(shares[i] * self._rest[i]) for i, joint in self._joints.items()}
+        )
+        return shifted.with_moved_looks(
+            {nodes[i].name: tuple(-shares[i] * self._along[i]) for i in self._joints}
+        )
+
+    def joint_places(self, theta: Array) -> Array:
+        """(nodes,) how far along each part its joint is moved, over the part's length."""
+        shares = np.zeros(len(self.limbs))
+        shares[self.placed] = theta[len(self.names) - len(self.placed) :]
+        return shares
+
+    def place(self, theta: Array) -> Placement:
+        """The body at all parameters (n,)."""
+        kinematics = self.kinematics
+        count = len(kinematics.names)
+        at_rest = kinematics.motions(theta[:count], translation=True, scale=True)
+        scale, shares = self.factors(theta), self.joint_places(theta)
+        R = at_rest.X_WN[:, :3, :3]
+        # How a node's frame, stretched, maps a vector in the world.
+        maps = np.einsum("nik,nk,njk->nij", R, scale, R)
+        places = at_rest.X_WN[:, :3, 3].copy()
+        # Where a part's flesh is beside its joint, and where the joint is beside the file's.
+        back = -np.einsum("nik,nk,n->ni", R, self._along, shares)
+        carried = np.zeros_like(places)
+        for i, node in enumerate(kinematics.tree.nodes):
+            if node.parent >= 0:
+                apart = at_rest.X_WN[i, :3, 3] - at_rest.X_WN[node.parent, :3, 3]
+                carried[i] = maps[node.parent] @ apart
+                places[i] = places[node.parent] + back[node.parent] + carried[i]
+                places[i] += shares[i] * (R[node.parent] @ self._rest[i])
+        shift, growth = theta[count : count + 3], float(np.exp(theta[count + 3]))
+        moved = places[0] + shift - growth * places[0]
+        motions = _MotionList(len(places), growth, moved)
+        self._add_values(motions, at_rest, maps, places, growth)
+        everything = list(range(len(places)))
+        for k in range(3):
+            motions.add(count + k, everything, np.zeros((3, 3)), np.eye(3)[k] / growth)
+        motions.add(count + 3, everything, np.eye(3), -places[0])
+        self._add_proportions(motions, R, places + back, carried)
+        X_WN = at_rest.X_WN.copy()
+        X_WN[:, :3, :3] *= growth
+        X_WN[:, :3, 3] = moved + growth * places
+        packed = _stretched(self._at(theta[:count]), scale)
+        self._move_flesh(packed, -self._along * shares[:, None])
+        return motions.placement(packed, X_WN)
+
+    def _move_flesh(self, packed: PackedOutlines, moved: Array) -> None:
+        """Moves each node's rigid part in its frame by (nodes, 3) [m]; bands stay at the joints."""
+        for i in self.placed.tolist():
+            vertices = packed.starts[i, 0] + np.arange(len(self.outlines[i].vertices))
+            triangles = packed.starts[i, 1] + np.arange(len(self.outlines[i].triangles))
+            packed.points[:, vertices] += moved[i][:, None]
+            packed.planes[3, triangles] += moved[i] @ packed.planes[:3, triangles]
+            packed.balls[i, :3] += moved[i]
+            packed.balls[i, 3] += np.linalg.norm(moved[i])
+
+    def _add_values(
+        self, motions: _MotionList, at_rest: Motions, maps: Array, places: Array, growth: float
+    ) -> None:
+        """The motions that the tree's values make."""
+        X0, twists = at_rest.X_WN, at_rest.twists
+        cross = affine_motions(np.pad(twists[:, :3], ((0, 0), (0, 4)))).reshape(-1, 3, 4)[:, :, :3]
+        for k, i in enumerate(self.kinematics.value_nodes.tolist()):
+            velocity = cross[k] @ X0[i, :3, 3] + twists[k, 3:6]
+            parent = self.kinematics.tree.nodes[i].parent
+            if parent >= 0:
+                velocity = maps[parent] @ velocity
+            v = velocity - cross[k] @ places[i]
+            if i == 0:
+                # What moves the root moves the point about which the body has grown.
+                v = v + (1.0 / growth - 1.0) * velocity
+            motions.add(k, np.flatnonzero(at_rest.moves[:, k]).tolist(), cross[k], v)
+
+    def _add_proportions(
+        self, motions: _MotionList, R: Array, flesh: Array, carried: Array
+    ) -> None:
+        """The motions that lengths, widths and places make: of a node, and of what hangs on it.
+
+        Args:
+            motions: to add to.
+            R: (nodes, 3, 3) how nodes are turned.
+            flesh: (nodes, 3) where the origins of their rigid parts are.
+            carried: (nodes, 3) from those to what they carry, the stretched part of it.
+        """
+        first, nodes = len(self.kinematics.names) + len(ROOT_NAMES), self.kinematics.tree.nodes
+        for i, node in enumerate(nodes):
+            axis = R[i][:, self.axes[i]]
+            long = np.outer(axis, axis)
+            width = first + len(nodes) + int(self.limbs[i])
+            for parameter, M in ((first + i, long), (width, np.eye(3) - long)):
+                motions.add(parameter, [i], M, -M @ flesh[i])
+                for child in node.children:
+                    motions.add(parameter, self._below(child), np.zeros((3, 3)), M @ carried[child])
+        for k, i in enumerate(self.placed.tolist()):
+            moved = R[nodes[i].parent] @ self._rest[i] - R[i] @ self._along[i]
+            parameter = len(self.names) - len(self.placed) + k
+            motions.add(parameter, self._below(i), np.zeros((3, 3)), moved)
+
+    def _below(self, node: int) -> list[int]:
+        """A node and all that hang on it."""
+        found = [node]
+        for one in found:
+            found.extend(self.kinematics.tree.nodes[one].children)
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class FittedProportions:
+    """A body's proportions and its pose in the frames that they were fitted to.
+
+    Args:
+        parameters: (frames, n) all parameters.
+        deviations: (frames, k) of the tree's values and ROOT_NAMES, 0 where they were held.
+        cost: what tells the better of two fits to the same frames.
+    """
+
+    parameters: Array
+    deviations: Array
+    cost: float
+
+
+@dataclass(frozen=True, eq=False)
+class SequencePrior:
+    """What is known without pictures of p unknowns of frames that follow one another.
+
+    The unknowns are the tree's values that are free, then ROOT_NAMES.
+
+    Args:
+        phi: (k, p) what is usually about mean, mean: (k,), information: (k,) one over the variance.
+        acceleration: (p,) standard deviation of what an unknown is further on than the two frames
+            before it say.
+        lower, upper: (p,) limits.
+    """
+
+    phi: Array
+    mean: Array
+    information: Array
+    acceleration: Array
+    lower: Array
+    upper: Array
+
+    def coupling(self, frames: int) -> Coupling:
+        """The same of so many frames' unknowns together."""
+        p = len(self.acceleration)
+        motion = diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(frames - 2, frames))
+        rows = vstack([kron(eye_array(frames), self.phi), kron(motion, eye_array(p))])
+        still = np.tile(self.acceleration**-2.0, frames - 2)
+        return Coupling(
+            csr_array(rows),
+            np.r_[np.tile(self.mean, frames), np.zeros(len(still))],
+            np.r_[np.tile(self.information, frames), still],
+        )
+
+
+@dataclass(frozen=True)
+class ProportionSettings:
+    """How proportions are fitted.
+
+    Args:
+        length_deviation, width_deviation: standard deviations of the logarithms of lengths and
+            widths, as people differ.
+        place_deviation: of where a joint lies along its part, over the part's length.
+        angle_deviation, shift_deviation, growth_deviation: how far each frame's angles [rad], other
+            values and root [m] and the logarithm of its scale may be off where the fit starts.
+        rounds: the parts of the fit [pixel].
+        noise: what a point of contour is worth [pixel].
+    """
+
+    length_deviation: float = 0.15
+    width_deviation: float = 0.1
+    place_deviation: float = 0.15
+    angle_deviation: float = 0.3
+    shift_deviation: float = 0.03
+    growth_deviation: float = 0.02
+    rounds: tuple[Round, ...] = (Round(15.0, 3.0, 6), Round(6.0, 3.0, 6), Round(3.0, 3.0, 8))
+    noise: Noise = field(default_factory=lambda: Noise(2.0, 12.0))
+
+
+def fit_proportions(
+    body: ProportionedBody,
+    camera: Camera,
+    frames: Sequence[EdgePoints],
+    starts: Array,
+    settings: ProportionSettings | None = None,
+    sequence: SequencePrior | None = None,
+) -> FittedProportions:
+    """The proportions of a body that several frames of one camera show, its pose near in each.
+
+    Args:
+        body: the body.
+        camera: the camera.
+        frames: the edges that it sees.
+        starts: (frames, k) about what the tree's values and ROOT_NAMES are; or (frames, n) all
+            parameters, those of proportions as in the first frame.
+        settings: how.
+        sequence: what is known of three frames or more that follow one another; None: each pose is
+            about where the fit starts.
+    """
+    settings = settings or ProportionSettings()
+    unknowns = _unknowns(body, settings, sequence)
+    fit = FramesFit(body, [camera], unknowns, noise=settings.noise, pixels=1.0)
+    held = np.zeros((len(frames), len(body.names)))
+    held[:, : starts.shape[1]] = starts
+    own, common = np.split(unknowns.entries, [unknowns.own_count])
+    first = held[:, own].copy()
+    held[:, own] = 0.0
+    shared, nothing = held[0, common].copy(), np.zeros(len(common))
+    held[:, common] = 0.0
+    evidence = [pack_evidence([edge]) for edge in frames]
+    found = fit.fit(
+        evidence,
+        held,
+        first,
+        shared,
+        settings.rounds,
+        expected=(first, nothing),
+        coupling=None if sequence is None else sequence.coupling(len(frames)),
+    )
+    off = np.zeros((len(frames), len(body.kinematics.names) + len(ROOT_NAMES)))
+    off[:, own] = found.own_deviations()
+    return FittedProportions(found.parameters[:, : len(body.names)], off, found.cost)
+
+
+def _unknowns(
+    body: ProportionedBody, settings: ProportionSettings, sequence: SequencePrior | None
+) -> Unknowns:
+    """The pose of each frame, then lengths, widths and places that all share."""
+    kinematics = body.kinematics
+    free = kinematics.lower < kinematics.upper
+    values = [name for name, is_free in zip(kinematics.names, free, strict=True) if is_free]
+    # A fit's unknown is what is added; limits are those of the values, about each frame's start.
+    deviations = np.where(
+        kinematics.is_angle[free], settings.angle_deviation, settings.shift_deviation
+    )
+    moving = np.array([*[settings.shift_deviation] * 3, settings.growth_deviation])
+    lower = np.r_[kinematics.lower[free], np.full(4, -np.inf)]
+    upper = np.r_[kinematics.upper[free], np.full(4, np.inf)]
+    if sequence is not None:
+        deviations, moving = np.full(len(values), np.inf), np.full(4, np.inf)
+        lower, upper = sequence.lower, sequence.upper
+    names = [*values, *ROOT_NAMES]
+    own = choose(body.names, names, lower=lower, upper=upper, deviation=np.r_[deviations, moving])
+    lengths = choose(
+        body.names, body.length_names, shared=True, deviation=settings.length_deviation
+    )
+    widths = choose(body.names, body.width_names, shared=True, deviation=settings.width_deviation)
+    places = choose(body.names, body.place_names, shared=True, deviation=settings.place_deviation)
+    return join(own, lengths, widths, places)
+
+
+def _stretched(packed: PackedOutlines, scale: Array) -> PackedOutlines:
+    """Surfaces, each node's so many times (nodes, 3) as large along its frame's axes."""
+    points, planes, balls = packed.points.copy(), packed.planes.copy(), packed.balls.copy()
+    for node, s in enumerate(scale):
+        vertices = slice(packed.starts[node, 0], packed.starts[node + 1, 0])
+        triangles = slice(packed.starts[node, 1], packed.starts[node + 1, 1])
+        points[:, vertices] *= s[:, None]
+        volume = float(np.prod(s))
+        planes[:3, triangles] *= (volume / s)[:, None]
+        planes[3, triangles] *= volume
+    balls[:, :3] *= scale
+    balls[:, 3] *= scale.max(axis=1)
+    return packed._replace(points=points, planes=planes, balls=balls)

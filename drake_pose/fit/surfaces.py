@@ -1,0 +1,130 @@
+"""Surfaces of few triangles: what a fit needs of a body shows with them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import fast_simplification
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.fit.surface_distance import surface_distance
+from drake_pose.silhouette.areas.bending import TreeSurfaces
+from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
+
+Array = NDArray[np.float64]
+
+MANY, FEW, VERY_FEW = 2500, 400, 80
+"""Triangles a node: where a pixel counts, for a still, and for a person in real time."""
+
+# A surface is simplified another way where it is farther from the original than its size times this
+# over the triangles wanted, as the distance of a smooth surface falls with them: 0.4 to 1.4 on all
+# parts of the bundled bodies, from 80 triangles to 400.
+_FAR = 2.0
+# Or where it has so many times the triangles wanted.
+_MANY_TIMES = 3.0
+# The other surface is kept where its distance is less than so many times the first one's.
+_NEARER = 0.75
+# The other way: so many times as large as triangles are wanted the simplifier gets a surface, whose
+# errors grow no further than a few hundred units.
+_UNITS_A_TRIANGLE = 25.0
+# It goes on while there are more than this many times the triangles wanted, with vertices on a grid
+# so wide in the same units.
+_ENOUGH = 1.1
+_GRIDS = 10.0, 20.0, 40.0
+# A process that estimates or audits many scenes of a body simplifies its surfaces once.
+_REMEMBERED = 256
+
+
+def few_rigid_triangles(surfaces: TreeSurfaces, count: int) -> TreeSurfaces:
+    """The surfaces with few triangles in each rigid part; bands of skin stay and bend."""
+    return surfaces.with_rigid([_simplified(rigid, count) for rigid in surfaces.rigid])
+
+
+def few_triangles(surfaces: TreeSurfaces, count: int = FEW) -> tuple[Outline, ...]:
+    """The nodes' surfaces, skin at rest, with few triangles (Garland and Heckbert's metric)."""
+    outlines = []
+    for node, rigid in enumerate(surfaces.rigid):
+        bending = surfaces.bending[node]
+        outlines.append(_simplified(rigid if bending is None else bending.rest, count))
+    return tuple(outlines)
+
+
+def with_girths(outlines: Sequence[Outline], girths: Array) -> tuple[Outline, ...]:
+    """Surfaces, each as many times as wide across its y axis as girths (nodes,) say."""
+    wider = []
+    for outline, girth in zip(outlines, girths, strict=True):
+        vertices = outline.vertices * [girth, 1.0, girth]
+        wider.append(outline_from_mesh(TriangleMesh(vertices, outline.triangles)))
+    return tuple(wider)
+
+
+def _simplified(outline: Outline, count: int) -> Outline:
+    """A surface with at most about so many triangles.
+
+    From pass to pass the simplifier allows larger errors, which are lengths and no shares of the
+    surface's, until triangles are few enough. Slivers it never merges, so with many of those it
+    folds everything else, and may have many triangles left. Such a surface is simplified another
+    way, which is kept where it is nearer to what was given.
+    """
+    if len(outline.triangles) <= count:
+        return outline
+    vertices = np.ascontiguousarray(outline.vertices, np.float64)
+    triangles = np.ascontiguousarray(outline.triangles, np.int32)
+    return _simplify(vertices.tobytes(), triangles.tobytes(), count)
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def _simplify(vertices: bytes, triangles: bytes, count: int) -> Outline:
+    """A surface of more triangles, by its vertices and triangles."""
+    outline = outline_from_mesh(
+        TriangleMesh(
+            np.frombuffer(vertices, np.float64).reshape(-1, 3),
+            np.frombuffer(triangles, np.int32).reshape(-1, 3),
+        )
+    )
+    simplified = _collapsed(outline, count, 1.0)
+    too_far = _FAR / count * _size(outline)
+    distance = surface_distance(outline, simplified)
+    too_many = len(simplified.triangles) > _MANY_TIMES * count
+    if distance <= too_far and not too_many:
+        return simplified
+    merged = _merged(outline, count)
+    merged_distance = surface_distance(outline, merged)
+    if merged_distance < _NEARER * distance or (too_many and merged_distance <= too_far):
+        return merged
+    return simplified
+
+
+def _merged(outline: Outline, count: int) -> Outline:
+    """A surface simplified where it has slivers.
+
+    The simplifier gets it in a unit in which its largest errors are small, and vertices that are
+    close together are merged before the next time.
+    """
+    unit = _size(outline) / (_UNITS_A_TRIANGLE * count)
+    outline = _collapsed(outline, count, unit)
+    for grid in _GRIDS:
+        if len(outline.triangles) <= _ENOUGH * count:
+            break
+        places = np.round(outline.vertices / (grid * unit)) * (grid * unit)
+        outline = outline_from_mesh(TriangleMesh(places, outline.triangles))
+        outline = _collapsed(outline, count, unit)
+    return outline
+
+
+def _collapsed(outline: Outline, count: int, unit: float) -> Outline:
+    """A surface whose edges are collapsed till triangles are few, in a unit of length [m]."""
+    if len(outline.triangles) <= count:
+        return outline
+    points, triangles = fast_simplification.simplify(
+        outline.vertices / unit, outline.triangles, target_count=count
+    )
+    return outline_from_mesh(TriangleMesh(np.asarray(points, np.float64) * unit, triangles))
+
+
+def _size(outline: Outline) -> float:
+    """The diagonal of the box around a surface [m]."""
+    return float(np.linalg.norm(np.ptp(outline.vertices, axis=0)))

@@ -1,0 +1,1 @@
+"""What a command does: estimate, capture, register, audit, masks, batch, walk."""

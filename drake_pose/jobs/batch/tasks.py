@@ -1,0 +1,311 @@
+"""What the workers of `drake-pose batch` do: a chunk of frames, a capture, a scene put together.
+
+A task finds its input and leaves its result on the disk that all machines share; only names go to
+a worker, and a few numbers come back. Whatever it makes lies beside its place until it is whole,
+and is then moved there in one step. So a task that is done twice does no harm, and one that was
+done is not done again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import shutil
+import time
+import uuid
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from drake_pose.body.landmarks import landmarks_file
+from drake_pose.body.model import load_model
+from drake_pose.camera.files import load_cameras
+from drake_pose.errors import DrakePoseError, OutputError
+from drake_pose.jobs.batch.job import SceneJob
+from drake_pose.jobs.estimate.inputs import select_cameras, select_seen_frames
+from drake_pose.jobs.estimate.person_choice import follows_person
+from drake_pose.jobs.estimate.scene import estimate_scene
+from drake_pose.jobs.estimate.scene_checks import frame_ranges
+from drake_pose.jobs.registration.audit import audit_scene
+from drake_pose.jobs.registration.inputs import RegistrationSettings
+from drake_pose.results.folder import (
+    OVERLAY,
+    POSES,
+    SUMMARY,
+    read_summary,
+    without_nan,
+)
+from drake_pose.results.summary import FrameRecord, describe_job, mask_digests, summarize
+from drake_pose.silhouette.pictures.scenes import Scene, load_scene
+
+WORK = ".chunks"
+_ATTEMPTS = "attempts.txt"
+_PART = ".part-"
+
+# What bad input can raise where nobody foresaw it; Drake's failed demands raise SystemExit, which
+# would end a worker.
+_FAILURES = (
+    DrakePoseError,
+    ArithmeticError,
+    LookupError,
+    MemoryError,
+    OSError,
+    RuntimeError,
+    SystemExit,
+    ValueError,
+)
+
+
+@dataclass(frozen=True)
+class Task:
+    """A piece of work.
+
+    Args:
+        job: the scene it is a piece of.
+        out: the batch's folder.
+        index: of the chunk; None: the whole scene, put together from its chunks if it has any.
+        frames: the chunk's frames; all of the scene's where index is None.
+        chunks: where the chunks lie of which a scene is put together.
+    """
+
+    job: SceneJob
+    out: Path
+    index: int | None
+    frames: tuple[str, ...]
+    chunks: tuple[Path, ...] = ()
+
+    @property
+    def extent(self) -> str:
+        """Which frames, for messages; "" where it is the whole scene."""
+        return "" if self.index is None else f"frames {self.frames[0]} to {self.frames[-1]}"
+
+    @property
+    def place(self) -> Path:
+        """Where the result will lie."""
+        if self.index is None:
+            return self.out / self.job.name
+        # A scene to which frames were added has other chunks.
+        frames = hashlib.sha256("\n".join(self.frames).encode()).hexdigest()
+        return work_folder(self.out, self.job) / f"{self.index:06d}-{frames[:8]}"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a task.
+
+    Args:
+        error: why it failed; None where it did not.
+        seconds: how long it took [s]; 0 where its result lay there already.
+        totals: frame_count, found_count and mean_E_total of a whole scene; of an audit
+            frame_count, agreeing_count and contradictions.
+    """
+
+    error: str | None
+    seconds: float = 0.0
+    totals: Mapping[str, Any] | None = None
+
+
+def work_folder(out: Path, job: SceneJob) -> Path:
+    """Where a scene's finished chunks lie until all are there."""
+    return out / WORK / job.name
+
+
+def plan_scene(job: SceneJob, out: Path) -> tuple[Task, ...]:
+    """Cuts a scene into tasks, which depend on nothing but the job.
+
+    Returns:
+        The chunks in order, or one task where a person is followed or the scene is audited, which
+        is not cut.
+
+    Raises:
+        DrakePoseError: the scene cannot be read.
+    """
+    scene = _load(job)
+    cameras = select_cameras(scene, job.settings.cameras)
+    frames = select_seen_frames(scene, cameras, job.settings.frames)
+    if job.audit is not None:
+        return (Task(job, out, None, frames),)
+    # A model is read only where it may be a person's: that takes seconds.
+    maybe = landmarks_file(job.model).is_file() or job.settings.method == "person"
+    if maybe:
+        model = load_model(job.model, package_paths=job.settings.packages)
+        if follows_person(scene, cameras, model, job.settings):
+            return (Task(job, out, None, frames),)
+    cuts = range(0, len(frames), job.chunk)
+    return tuple(
+        Task(job, out, index, frames[cut : cut + job.chunk]) for index, cut in enumerate(cuts)
+    )
+
+
+def finishing_task(tasks: Sequence[Task]) -> Task:
+    """The task that puts a scene together from its chunks; a scene that is not cut has one task."""
+    if tasks[0].index is None:
+        return tasks[0]
+    frames = tuple(frame for task in tasks for frame in task.frames)
+    return Task(tasks[0].job, tasks[0].out, None, frames, tuple(task.place for task in tasks))
+
+
+def perform(task: Task) -> Outcome:
+    """Does a task; a failure is part of the outcome."""
+    begin = time.perf_counter()
+    try:
+        if task.place.is_dir():
+            _require_same_masks(task)
+            return Outcome(None, 0.0, _totals(task))
+        _note_attempt(task)
+        _make(task)
+        return Outcome(None, time.perf_counter() - begin, _totals(task))
+    except _FAILURES as error:
+        return Outcome(describe_failure(error), time.perf_counter() - begin)
+
+
+def describe_failure(error: BaseException) -> str:
+    """A failure in words: our own errors speak for themselves."""
+    if isinstance(error, DrakePoseError):
+        return str(error)
+    if isinstance(error, SystemExit):
+        return f"Drake stopped with a failed demand: {error}"
+    return f"{type(error).__name__}: {error}"
+
+
+def count_attempts(folder: Path) -> int:
+    """How often tasks were begun whose scene's work folder this is."""
+    try:
+        return len((folder / _ATTEMPTS).read_text(encoding="utf-8").splitlines())
+    except FileNotFoundError:
+        return 0
+
+
+def remove_parts(out: Path) -> None:
+    """Removes what interrupted tasks have left."""
+    for folder in (out / WORK).glob(f"*/*{_PART}*"):
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _require_same_masks(task: Task) -> None:
+    """Refuses a finished scene whose masks were replaced; a chunk's are seen to when it is joined.
+
+    Raises:
+        OutputError: names the frames.
+    """
+    if task.index is not None:
+        return
+    scene = _load(task.job)
+    gone = []
+    for frame, record in read_summary(task.place)["frames"].items():
+        known = record.get("masks", {})
+        if frame in task.frames and mask_digests(scene, known, frame) != known:
+            gone.append(frame)
+    if gone:
+        raise OutputError(
+            f"{task.place}: the masks of frame {frame_ranges(gone, scene.frames)} were replaced "
+            "since; remove that folder to have it done again"
+        )
+
+
+def _load(job: SceneJob) -> Scene:
+    """A job's scene."""
+    cameras = None if job.camera_file is None else load_cameras(job.camera_file)
+    return load_scene(job.scene, cameras)
+
+
+def _note_attempt(task: Task) -> None:
+    """A line that is appended at once, so that workers do not disturb each other."""
+    folder = work_folder(task.out, task.job)
+    folder.mkdir(parents=True, exist_ok=True)
+    index = "" if task.index is None else str(task.index)
+    with (folder / _ATTEMPTS).open("a", encoding="utf-8") as file:
+        file.write(f"{index}\t{platform.node()}\t{os.getpid()}\n")
+
+
+def _make(task: Task) -> None:
+    """Makes a task's result beside its place and moves it there."""
+    job = task.job
+    part = work_folder(task.out, job) / f"{task.place.name}{_PART}{uuid.uuid4().hex[:12]}"
+    work = _audit if job.audit is not None else _join_chunks if task.chunks else _estimate
+    try:
+        work(task, part)
+        try:
+            os.replace(part, task.place)
+        except OSError as error:
+            # Another worker, taken for dead, may have finished the same task.
+            if not task.place.is_dir():
+                raise OutputError(f"{task.place}: cannot be written: {error.strerror}") from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def _estimate(task: Task, part: Path) -> None:
+    """Estimates a chunk, or the whole recording of a person who is followed."""
+    job, settings = task.job, task.job.settings
+    if task.index is not None:
+        settings = replace(settings, frames=task.frames)
+    replay = job.replay and task.index is None
+    estimate_scene(
+        job.scene, job.model, part, settings, truth=job.truth, replay=replay, overlay=job.overlay
+    )
+
+
+def _audit(task: Task, part: Path) -> None:
+    """Audits a scene."""
+    job, given = task.job, task.job.settings
+    assert job.audit is not None
+    settings = RegistrationSettings(
+        given.cameras, given.frames, hold=given.hold, packages=given.packages
+    )
+    audit_scene(
+        job.scene, job.model, job.audit, part, settings, cameras=job.camera_file,
+        overlay=job.overlay,
+    )  # fmt: skip
+
+
+def _join_chunks(task: Task, part: Path) -> None:
+    """Puts a scene together as a result that lacks no frame; resuming it makes the rest."""
+    job = task.job
+    header, rows, records = "", [], {}
+    part.mkdir(parents=True)
+    for chunk in task.chunks:
+        header, *lines = (chunk / POSES).read_text(encoding="utf-8").splitlines(keepends=True)
+        rows += lines
+        records.update(read_summary(chunk)["frames"])
+        if (chunk / OVERLAY).is_dir():
+            shutil.copytree(
+                chunk / OVERLAY, part / OVERLAY, copy_function=_link, dirs_exist_ok=True
+            )
+    (part / POSES).write_text("".join([header, *rows]), encoding="utf-8")
+    described = describe_job(job.scene, job.model, job.settings)
+    known = {name: FrameRecord.from_json(record) for name, record in records.items()}
+    summary = without_nan(summarize(described, known, False))
+    (part / SUMMARY).write_text(json.dumps(summary), encoding="utf-8")
+    estimate_scene(
+        job.scene, job.model, part, job.settings, truth=job.truth, resume=True, replay=job.replay,
+        overlay=job.overlay,
+    )  # fmt: skip
+
+
+def _link(source: str, target: str) -> None:
+    """A second name for a file, or a copy where the disk knows no such thing."""
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)
+
+
+def _totals(task: Task) -> Mapping[str, Any] | None:
+    """What a whole scene's summary says."""
+    if task.index is not None:
+        return None
+    summary = read_summary(task.place)
+    if task.job.audit is not None:
+        return {
+            "frame_count": summary["frame_count"] + len(summary["unseen"]),
+            "agreeing_count": summary["agreeing_count"],
+            "contradictions": [
+                {name: one[name] for name in ("what", "name", "text")}
+                for one in summary["contradictions"]
+            ],
+        }
+    return {name: summary.get(name) for name in ("frame_count", "found_count", "mean_E_total")}

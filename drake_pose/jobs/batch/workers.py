@@ -1,0 +1,68 @@
+"""The workers of a cluster as the pool of a batch."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from drake_pose.errors import ClusterError
+from drake_pose.jobs.batch.tasks import Outcome, Task, describe_failure, perform
+from drake_pose.jobs.cluster.scheduler import TRIES, address_of
+from drake_pose.jobs.cluster.worker import call_in_child
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+
+class ClusterPool:
+    """The workers of a cluster, as a batch needs them.
+
+    At most one task a thread is under way, so that none waits at a worker that may die.
+
+    Args:
+        client: of the cluster.
+        work: what does a task.
+    """
+
+    def __init__(self, client: Client, work: Callable[[Task], Outcome] = perform) -> None:
+        from distributed import as_completed
+
+        self._client, self._work = client, work
+        self._completed = as_completed(loop=client.loop)
+        self._tasks: dict[object, Task] = {}
+
+    @property
+    def size(self) -> int:
+        """How many threads the workers have now; a worker that died is being started again."""
+        return max(1, sum(self._client.nthreads().values()))
+
+    def start(self, task: Task) -> None:
+        """Sends a task to a worker."""
+        # A worker that knows neither side of the pickle need not import Drake.
+        payload = pickle.dumps((self._work, task))
+        future = self._client.submit(call_in_child, payload, TRIES, pure=False)
+        self._tasks[future.key] = task
+        self._completed.add(future)
+
+    def next(self) -> tuple[Task, Outcome]:
+        """Waits for a task.
+
+        Raises:
+            ClusterError: the scheduler has gone.
+        """
+        from distributed import KilledWorker
+
+        future = next(self._completed)
+        task = self._tasks.pop(future.key)
+        if future.status == "finished":
+            return task, pickle.loads(future.result())
+        if future.status != "error":
+            raise ClusterError(
+                f"the scheduler at {address_of(self._client)} has gone; finished chunks are in "
+                f"{task.out}; go on with --resume"
+            )
+        error = future.exception()
+        if isinstance(error, KilledWorker):
+            return task, Outcome("given up: it has killed its worker again and again")
+        return task, Outcome(describe_failure(error))

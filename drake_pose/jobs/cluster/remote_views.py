@@ -1,0 +1,105 @@
+"""The sensors of a live capture on workers: each opens the sources of its cameras itself."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_pose.camera.sources.frame_source import Clock
+from drake_pose.jobs.cluster.camera_groups import WatchedSource, Watchers
+from drake_pose.jobs.live.scene import LiveScene
+from drake_pose.systems.person.live_capture import SensorPorts
+from drake_pose.systems.person.remote_sensors import RemoteSensors
+from drake_pose.systems.person.silhouette_sensor import edge_spacing
+from drake_pose.systems.pictures.picture_capture import CameraCount
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+
+def opener(client: Client, tolerance: float | None = None) -> Callable[[LiveScene], ClusterSensors]:
+    """What opens the sensors of a scene on the workers of a cluster."""
+    return lambda scene: ClusterSensors(client, scene, tolerance=tolerance)
+
+
+class ClusterSensors:
+    """Sensors on the workers of a cluster, one worker for each group of cameras; see LiveSensors.
+
+    Pictures stay where they are: a worker says in a few kilobytes what its cameras see, and adds up
+    what they say of a pose, as often as a fit asks. A worker that dies costs the others nothing;
+    another one, or itself when it was started again, goes on with its cameras.
+
+    Attributes:
+        watchers: the workers.
+        capture: what brings the views together.
+
+    Args:
+        client: of the cluster.
+        scene: the cameras and where their pictures come from.
+        live: whether the computer's clock decides; where not given, if a camera is live.
+        tolerance: how far apart the pictures of one moment may be [s].
+        clock: the one of live cameras' time stamps; machines share none but that of the day.
+
+    Raises:
+        SceneError: a source cannot be opened.
+        SettingsError: the tolerance cannot be.
+        ClusterError: there is no worker, or they do not get ready.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        scene: LiveScene,
+        live: bool | None = None,
+        tolerance: float | None = None,
+        clock: Clock = time.time,
+    ) -> None:
+        specifications = list(scene.specifications.values())
+        devices = any(one.live for one in specifications)
+        spacings = {name: edge_spacing(camera) for name, camera in scene.cameras.items()}
+        by_clock = devices if live is None else live
+        self.watchers = Watchers(client, specifications, spacings, waits=not by_clock)
+        sources = {
+            name: WatchedSource(one, group, self.watchers)
+            for group in self.watchers.groups
+            for name, one in group.specifications.items()
+        }
+        ordered = {one.camera: sources[one.camera] for one in specifications}
+        keepers = {name: one.keeper for name, one in sources.items()}
+        self.capture = RemoteSensors(
+            ordered, scene.cameras, keepers=keepers, live=live, tolerance=tolerance, clock=clock
+        )
+        if self.capture.live:
+            self.watchers.overdue = self.capture.overdue
+        self.period, self.live = self.capture.period, self.capture.live
+
+    @property
+    def skipped(self) -> int:
+        """How many moments were not shown, as newer ones had come."""
+        return self.capture.skipped
+
+    def add(self, builder: DiagramBuilder) -> SensorPorts:
+        """Adds the systems that see to a diagram under construction."""
+        builder.AddNamedSystem("remote_sensors", self.capture)
+        silhouettes = {
+            name: self.capture.GetOutputPort(f"silhouette_{name}")
+            for group in self.watchers.groups
+            for name in group.specifications
+        }
+        return SensorPorts(silhouettes, self.capture.GetOutputPort("time"))
+
+    def take_reports(self) -> list[str]:
+        """What the user should know and was not told yet."""
+        reports, self.watchers.reports = self.watchers.reports, []
+        return reports + self.capture.take_reports()
+
+    def counts(self) -> dict[str, CameraCount]:
+        """How each camera did so far."""
+        return self.capture.counts()
+
+    def close(self) -> None:
+        """Lets go of the cameras."""
+        self.watchers.close()

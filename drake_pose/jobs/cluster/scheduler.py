@@ -1,0 +1,223 @@
+"""Workers on this machine or on others, by Dask distributed (the extra `cluster`)."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from drake_pose.errors import ClusterError
+from drake_pose.jobs.cluster.worker import WorkerFacts, worker_facts
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+_TIMEOUT = 5.0
+"""How long a scheduler and its workers may take to answer [s]."""
+
+# More than that, for the connection to say by itself what is wrong [s].
+_GRACE = 0.5
+
+TRIES = 3
+"""A task that has killed its process or its worker this often is given up."""
+
+# Nothing but this machine can talk to an embedded cluster, and it says nothing of its own.
+_LOOPBACK = "127.0.0.1"
+_CONFIGURATION = {
+    "distributed.worker.multiprocessing-method": "spawn",
+    "distributed.scheduler.allowed-failures": TRIES - 1,
+    # A task that waits at a worker that is killed would be suspected with the one that killed it.
+    "distributed.scheduler.worker-saturation": 1.0,
+    "distributed.logging.distributed": "critical",
+    "distributed.admin.low-level-log-length": 0,
+}
+
+
+def require_distributed() -> None:
+    """Refuses to go on without Dask distributed.
+
+    Raises:
+        ClusterError: says how to install it.
+    """
+    if find_spec("distributed") is None:
+        raise ClusterError(
+            'workers need Dask distributed: pip install "drake_pose[cluster]"; or do without them: '
+            "--workers 0"
+        )
+
+
+@contextmanager
+def open_cluster(workers: int | None = None, scheduler: str | None = None) -> Iterator[Client]:
+    """Workers, for as long as the context lasts.
+
+    Args:
+        workers: how many processes on this machine, of one thread each, that talk over its loopback
+            address alone; None: one for each core.
+        scheduler: address of a Dask scheduler whose workers are used instead.
+
+    Raises:
+        ClusterError: distributed is not installed, or the scheduler cannot be reached or has no
+            workers, or these have another drake_pose.
+    """
+    require_distributed()
+    with _quiet():
+        if scheduler is not None:
+            with _connected(scheduler) as client:
+                yield client
+            return
+        with _embedded(workers) as client:
+            yield client
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """What Dask says of workers that die is for its developers; users hear it in other words."""
+    import distributed
+
+    loggers = [logging.getLogger(name) for name in (distributed.__name__, "asyncio")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
+
+
+@contextmanager
+def _embedded(workers: int | None) -> Iterator[Client]:
+    """A client of workers on this machine."""
+    from dask import config
+    from distributed import Client, LocalCluster
+
+    count = len(os.sched_getaffinity(0)) if workers is None else workers
+    if count < 1:
+        raise ClusterError(f"a cluster has one worker or more, not {count}")
+    scratch = tempfile.mkdtemp(prefix="drake_pose_")
+    try:
+        with config.set(_CONFIGURATION):
+            cluster = LocalCluster(
+                n_workers=count,
+                threads_per_worker=1,
+                processes=True,
+                host=_LOOPBACK,
+                dashboard_address=None,
+                scheduler_kwargs={"dashboard_address": f"{_LOOPBACK}:0"},
+                local_directory=scratch,
+                silence_logs=logging.CRITICAL,
+            )
+            with cluster, Client(cluster, set_as_default=False) as client:
+                yield client
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+@contextmanager
+def _connected(address: str) -> Iterator[Client]:
+    """A client of a scheduler that runs elsewhere."""
+    from distributed import Client
+    from distributed.comm import get_address_host_port
+
+    try:
+        get_address_host_port(address, strict=True)
+    except ValueError as error:
+        raise ClusterError(
+            f"'{address}' is no scheduler's address; give one like tcp://10.0.0.7:8786"
+        ) from error
+    try:
+        # A client that finds nobody would be left half made, and complain when it is destroyed.
+        asyncio.run(_shake_hands(address))
+        client = Client(address, timeout=_TIMEOUT, set_as_default=False)
+    except (OSError, ValueError, TypeError, EOFError, MemoryError, asyncio.TimeoutError) as error:
+        # Whoever listens there may say anything: a web server's words are taken for a size of
+        # exabytes.
+        raise ClusterError(
+            f"no scheduler answers at {address} within {_TIMEOUT:g} s; start one with "
+            "'dask scheduler --host 127.0.0.1' and workers with 'dask worker ADDRESS --nthreads 1'"
+        ) from error
+    with client:
+        yield client
+
+
+async def _shake_hands(address: str) -> None:
+    """Connects to a scheduler once; raises what the connection raises, in time."""
+    from distributed.comm import connect
+
+    # Its own timeout does not hold where somebody listens and says nothing.
+    comm = await asyncio.wait_for(connect(address, timeout=_TIMEOUT), _TIMEOUT + _GRACE)
+    await comm.close()
+
+
+def require_fit_workers(client: Client, out: Path | None = None) -> None:
+    """Looks whether the workers have this drake_pose, and see the folder of the result.
+
+    Args:
+        client: of the cluster.
+        out: the result's folder, which all machines must share; None: there is none.
+
+    Raises:
+        ClusterError: there is no worker, or one is not fit.
+    """
+    with suppress(asyncio.TimeoutError):
+        client.wait_for_workers(1, timeout=_TIMEOUT)
+    if not client.nthreads():
+        raise ClusterError(
+            f"the scheduler at {address_of(client)} has no workers; start some with "
+            "'dask worker ADDRESS --nthreads 1'"
+        )
+    with _shown_file(out) as file:
+        here = worker_facts(file)
+        try:
+            there = client.run(worker_facts, file)
+        except (ImportError, AttributeError) as error:
+            raise ClusterError(
+                f"a worker cannot use drake_pose ({error}); install the same version there as "
+                f"here, {here.version}"
+            ) from error
+    for address, facts in there.items():
+        _require_same(address, here, facts, out)
+
+
+def address_of(client: Client) -> str:
+    """A client's scheduler, for messages."""
+    return "its address" if client.scheduler is None else str(client.scheduler.address)
+
+
+@contextmanager
+def _shown_file(out: Path | None) -> Iterator[Path | None]:
+    """A file in the folder, for others to look whether they see it."""
+    if out is None:
+        yield None
+        return
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(prefix=".seen_", dir=out) as file:
+            yield Path(file.name).absolute()
+    except OSError as error:
+        raise ClusterError(f"{out}: cannot be written: {error.strerror}") from error
+
+
+def _require_same(address: str, here: WorkerFacts, there: WorkerFacts, out: Path | None) -> None:
+    if there.version != here.version:
+        raise ClusterError(
+            f"the worker {address} has drake_pose {there.version}, but here is {here.version}; "
+            "install the same version on both"
+        )
+    if there.code != here.code:
+        raise ClusterError(
+            f"the worker {address} has another development version of drake_pose "
+            f"{there.version}; install the same one on both, and start the worker again"
+        )
+    if not there.sees:
+        raise ClusterError(
+            f"the worker {address} does not see the folder {out}; scenes, models and results must "
+            "lie where all machines find them under the same path"
+        )

@@ -1,0 +1,83 @@
+"""The demonstration: a real person's joint angles from one real silhouette."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.errors import OutputError, SceneError
+from drake_pose.jobs.estimate.scene import OnFrame, SceneEstimate, estimate_scene
+from drake_pose.results.folder import OVERLAY, RESULT_FILES, SUMMARY, require_empty
+from drake_pose.results.settings import EstimateSettings
+
+MODEL = "man"
+ROOT = "right_foot"
+ANKLE = "right_ankle"
+
+
+def stored_scene(name: str) -> Path:
+    """Returns a stored scene's folder, in a checkout or inside the installed package.
+
+    Raises:
+        SceneError: if it is in neither place.
+    """
+    package = Path(__file__).resolve().parents[1]
+    for root in (package.parent, package):
+        folder = root / "tutorials" / "data" / name
+        if (folder / "cameras.yaml").is_file():
+            return folder
+    raise SceneError(f"the stored pictures '{name}' are missing; install drake_pose again")
+
+
+def demo_scene() -> Path:
+    """Returns the demonstration's scene."""
+    return stored_scene("human")
+
+
+def demo_settings(scene: Path) -> EstimateSettings:
+    """Returns the recipe of Kameda, Minoh and Ikeda (experiment B) for a person who stands.
+
+    One camera; the root is a foot whose position is known. The foot may point anywhere, and be
+    tilted by 20 degrees. The search is the multi-start search, at continuous angles.
+    """
+    return EstimateSettings(
+        root=ROOT,
+        root_position=(scene / "root_position.csv", ANKLE),
+        root_rotation={"y": (-180.0, 180.0), "x": (-20.0, 20.0), "z": (-20.0, 20.0)},
+    )
+
+
+def run_demo(out: Path, on_frame: OnFrame | None = None) -> SceneEstimate:
+    """Estimates the stored scene.
+
+    Args:
+        out: folder for the result; what an earlier demonstration left there is replaced.
+        on_frame: hears of the finished frame.
+
+    Raises:
+        OutputError: if the folder holds something else.
+    """
+    scene = demo_scene()
+    _clear_earlier_demo(out, scene)
+    return estimate_scene(scene, bundled_model(MODEL), out, demo_settings(scene), on_frame=on_frame)
+
+
+def _clear_earlier_demo(out: Path, scene: Path) -> None:
+    """Removes the files of an earlier demonstration, and nothing else."""
+    try:
+        summary = json.loads((out / SUMMARY).read_text(encoding="utf-8"))
+        is_demo = Path(summary["scene"]).resolve() == scene.resolve()
+    except (OSError, ValueError, TypeError, KeyError):
+        is_demo = False
+    if not is_demo or {file.name for file in out.iterdir()} - {*RESULT_FILES, OVERLAY}:
+        require_empty(out)
+        return
+    try:
+        for file in (*(out / name for name in RESULT_FILES), *(out / OVERLAY).glob("*/*.png")):
+            file.unlink(missing_ok=True)
+        for folder in (*(out / OVERLAY).glob("*"), out / OVERLAY):
+            if folder.is_dir():
+                folder.rmdir()
+    except OSError as error:
+        raise OutputError(f"{error.filename}: cannot be removed: {error.strerror}") from error

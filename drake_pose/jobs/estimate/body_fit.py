@@ -1,0 +1,309 @@
+"""The body in a sequence of one unknown camera: which of its parts, how long, how tilted.
+
+Nobody has measured such a body, and one parallel silhouette tells neither which way it is tilted
+nor whether a part that should be there is hidden or cut off. The sequence tells: parts without
+which the first frame is explained better are left out, poses of the first frame that look alike are
+followed through the sequence, and lengths, widths and all poses are fitted to it together. What
+comes out is a model as others are, its poses, and where it is tracked from if the sequence goes on.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from drake_pose.body.model import ArticulatedModel
+from drake_pose.filtering.measurements.contour import ContourObservation
+from drake_pose.filtering.tracking.contour_tracker import ContourTracker, TrackingSettings
+from drake_pose.filtering.tracking.match_and_track import TRACKED, make_tracker
+from drake_pose.filtering.tracking.sequence_fit import FittedSequence, fit_sequence, pose_set
+from drake_pose.filtering.tracking.start_poses import FollowedStart, StartSettings, find_start
+from drake_pose.jobs.estimate.inputs import Inputs, leave_out_links, make_placement_search
+from drake_pose.jobs.estimate.result import OnStage
+from drake_pose.jobs.estimate.sequence import sequence_tracking
+from drake_pose.results.overlay import draw_shapes
+from drake_pose.results.settings import EstimateSettings
+from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
+from drake_pose.search.result import PlacedMatch, View
+from drake_pose.silhouette.areas.bending import TreeSurfaces
+from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.systems.estimators.mask_player import DEFAULT_FRAME_RATE_HZ
+
+# A part that shows by itself with less than this share of its own area may not be there.
+_HIDDEN = 0.1
+# It is left out where E_total without it is less than so many times what it was.
+_BETTER = 0.9
+# As measured (tutorials/figures.md): what the model's flesh lacks is not in the intervals.
+_INTERVALS = (
+    "the body, its lengths and all poses were fitted to the sequence together: of four hands that "
+    "were measured, 49 to 100 % of the joints lay in these 95 % intervals, and lengths were off by "
+    "a fifth to a quarter"
+)
+# A sequence of fewer frames is not fitted as a whole.
+_FEWEST = 3
+
+
+class FittedBody(NamedTuple):
+    """What is found out about a body.
+
+    Attributes:
+        inputs: with the fitted model, and a search that knows the first frame's pose.
+        summary: what the summary says of it.
+        shapes: (h, w, 3) uint8, red, green, blue: the corrected shape drawn over the file's in the
+            first frame (Shimada's figure 18); None where the shape was left as it is.
+    """
+
+    inputs: Inputs
+    summary: dict[str, Any]
+    shapes: np.ndarray | None
+
+
+class _Fitted(NamedTuple):
+    """A sequence fitted as a whole.
+
+    Attributes:
+        search: for the fitted body.
+        known: the answer for each frame, by its number.
+        model: the fitted body.
+        observation: of it.
+        x: (n,) its state in the first frame.
+    """
+
+    search: RootPlacementSearch
+    known: dict[int, PlacedMatch]
+    model: ArticulatedModel
+    observation: ContourObservation
+    x: np.ndarray
+
+
+class _StartedSearch(RootPlacementSearch):
+    """A search whose answer for one silhouette is known."""
+
+    def start_with(self, mask: np.ndarray, answer: PlacedMatch) -> None:
+        """Remember an answer."""
+        self._known = mask, answer
+
+    def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PlacedMatch:
+        """As RootPlacementSearch."""
+        mask, answer = self._known
+        if len(views) == 1 and np.array_equal(views[0].mask, mask):
+            return answer
+        return super().match(views, root_position)
+
+
+def fit_body(inputs: Inputs, settings: EstimateSettings, on_stage: OnStage | None) -> FittedBody:
+    """Find out about the body, where it is followed through a sequence of an unknown camera.
+
+    Args:
+        inputs: what is estimated.
+        settings: the estimate's.
+        on_stage: hears that it is done.
+
+    Raises:
+        DrakePoseError: as for an estimate.
+    """
+    scene, search = inputs.scene, inputs.search
+    tracking = None if search is None else sequence_tracking(scene, search, settings.track)
+    if (
+        tracking is None
+        or not tracking.scale_unknown
+        or not isinstance(search, RootPlacementSearch)
+        or not inputs.model.changes_shape
+        or not search.tree.turns_root_freely
+        or len(inputs.frames) < 2
+    ):
+        return FittedBody(inputs, {}, None)
+    if on_stage is not None:
+        on_stage("fitting the body to the sequence", 0, None)
+    return _BodyFit(inputs, settings, tracking).run(search)
+
+
+class _BodyFit:
+    """One fit of a body."""
+
+    def __init__(
+        self, inputs: Inputs, settings: EstimateSettings, tracking: TrackingSettings
+    ) -> None:
+        self._inputs, self._settings, self._tracking = inputs, settings, tracking
+        self._camera = inputs.cameras[0]
+        frames = inputs.frames[: StartSettings().frames]
+        self._masks = [inputs.scene.read(self._camera.name, frame) for frame in frames]
+        self._more: dict[str, Any] = {}
+        self._period = 1.0 / (inputs.scene.frame_rate_hz or DEFAULT_FRAME_RATE_HZ)
+
+    def run(self, search: RootPlacementSearch) -> FittedBody:
+        """All of it."""
+        begin = time.perf_counter()
+        first = search.match([View(self._camera, self._masks[0])])
+        if not first.found:
+            return FittedBody(self._inputs, {}, None)
+        shapes = None
+        search, first = self._without_hidden(search, first)
+        tracker = self._tracker(search)
+        frames = [[mask] for mask in self._masks]
+        starts = find_start(
+            tracker, tracker.observation.state(first.q, first.X_WB, first.scale), frames
+        )
+        known = {0: self._answer(tracker.observation, starts[0].x, 0)}
+        fitted = self._fit(tracker, starts) if len(frames) >= _FEWEST else None
+        if fitted is not None:
+            search, known, model, other, x = fitted
+            shapes = self._draw_shapes((tracker.observation, starts[0].x), (other, x))
+            warnings = (*self._inputs.warnings, _INTERVALS)
+            self._inputs = replace(self._inputs, model=model, warnings=warnings)
+        seconds = time.perf_counter() - begin
+        self._more["body_fit_seconds"] = round(seconds, 3)
+        known = {k: replace(one, seconds=seconds / len(known)) for k, one in known.items()}
+        started = _StartedSearch(search.tree, search.settings, search.placement)
+        last = max(known)
+        started.start_with(self._masks[last], known[last])
+        by_frame = {self._inputs.frames[k]: one for k, one in known.items()}
+        inputs = replace(self._inputs, search=started, known=by_frame)
+        return FittedBody(inputs, self._more, shapes)
+
+    def _fit(self, tracker: ContourTracker, starts: Sequence[FollowedStart]) -> _Fitted | None:
+        """The sequence fitted as a whole; None where that explains it no better."""
+        begin = [start.states for start in starts]
+        explanations = fit_sequence(tracker, self._masks, begin, self._period)
+        models = [
+            one.body.applied_to(self._inputs.model, one.fitted.parameters[0])
+            for one in explanations
+        ]
+        model, tree = self._inputs.model, tracker.observation.tree
+        units = [math.degrees(1.0) if kind == "angle" else 1.0 for kind in model.position_kinds]
+        held = {model.position_names[i]: units[i] * value for i, value in tree.held.items()}
+        settings = replace(self._settings, hold=held)
+        searches = [make_placement_search(one, settings, None, True) for one in models]
+        observations = [self._tracker(search).observation for search in searches]
+        count = len(tracker.observation.parameters(starts[0].x))
+        states = [
+            [other.state_of(theta[:count]) for theta in one.fitted.parameters]
+            for other, one in zip(observations, explanations, strict=True)
+        ]
+        answers = [
+            [self._answer(other, x, k) for k, x in enumerate(path)]
+            for other, path in zip(observations, states, strict=True)
+        ]
+        if np.mean([one.E_total for one in answers[0]]) >= np.mean(starts[0].errors):
+            return None
+        known = {}
+        for k, answer in enumerate(answers[0]):
+            poses = [(path[k].q, path[k].X_WB, path[k].J) for path in answers]
+            known[k] = replace(answer, pose_set=pose_set(explanations, poses, k))
+        self._tell(explanations)
+        return _Fitted(searches[0], known, models[0], observations[0], states[0][0])
+
+    def _tell(self, explanations: Sequence[FittedSequence]) -> None:
+        """What the summary says of the fitted body, and of explanations that look alike."""
+        body, theta = explanations[0].body, explanations[0].fitted.parameters[0]
+        nodes = body.kinematics.tree.nodes
+        self._more["proportions"] = {
+            node.name: [round(one, 4) for one in row]
+            for node, row in zip(nodes, body.factors(theta).tolist(), strict=True)
+        }
+        X_WN = body.place(theta).X_WN
+        apart = np.linalg.norm(X_WN[:, :3, 3] - X_WN[[n.parent for n in nodes], :3, 3], axis=1)
+        apart /= np.linalg.norm(X_WN[0, :3, 0])
+        self._more["lengths"] = {
+            node.name: round(length, 5)
+            for node, length in zip(nodes, apart.tolist(), strict=True)
+            if node.parent >= 0
+        }
+        places = body.joint_places(theta)
+        self._more["joint_places"] = {nodes[i].name: round(places[i], 4) for i in body.placed}
+        costs = [one.fitted.cost / explanations[0].fitted.cost for one in explanations]
+        self._more["explanations"] = [round(cost, 4) for cost in costs]
+
+    def _draw_shapes(self, *bodies: tuple[ContourObservation, np.ndarray]) -> np.ndarray:
+        """The file's body and the corrected one, each where it is in the first frame."""
+        shapes = []
+        for observation, x in bodies:
+            outlines = TreeSurfaces(observation.tree).at(observation.node_values(x))
+            X_CN = self._camera.X_CW @ observation.node_poses(x)
+            shapes.append(draw_mask(outlines, X_CN, self._camera))
+        title = f"frame {self._inputs.frames[0]}: the shape that explains the sequence"
+        return draw_shapes(self._masks[0], shapes, ("the file's", "corrected"), [title])
+
+    def _without_hidden(
+        self, search: RootPlacementSearch, first: PlacedMatch
+    ) -> tuple[RootPlacementSearch, PlacedMatch]:
+        """The search and its answer, without parts that are not there where that is better."""
+        hidden = () if self._settings.unseen else self._hidden_parts(search, first)
+        if not hidden:
+            return search, first
+        settings = replace(self._settings, unseen=hidden)
+        model, settings = leave_out_links(self._inputs.model, settings)
+        other = make_placement_search(model, settings, None, True)
+        better = other.match([View(self._camera, self._masks[0])])
+        if not better.found or better.E_total >= _BETTER * first.E_total:
+            return search, first
+        warning = (
+            f"{', '.join(hidden)}: not in the pictures, it seems, and left out, its joints held: "
+            f"E_total of frame '{self._inputs.frames[0]}' is {better.E_total:.1%} without and "
+            f"{first.E_total:.1%} with it; unseen (--unseen) names links that are not seen"
+        )
+        warnings = (*self._inputs.warnings, warning)
+        self._inputs = replace(self._inputs, model=model, warnings=warnings)
+        self._settings = settings
+        self._more["unseen"] = list(hidden)
+        return other, better
+
+    def _tracker(self, search: RootPlacementSearch) -> ContourTracker:
+        return make_tracker(search.tree, [self._camera], self._period, self._tracking)
+
+    def _hidden_parts(self, search: RootPlacementSearch, match: PlacedMatch) -> tuple[str, ...]:
+        """Parts that end at the root, and of which next to nothing shows."""
+        observation = self._tracker(search).observation
+        x = observation.state(match.q, match.X_WB, match.scale)
+        outlines = TreeSurfaces(search.tree).at(match.node_values)
+        X_CN = self._camera.X_CW @ observation.node_poses(x)
+        hidden = []
+        for i, node in enumerate(search.tree.nodes):
+            if node.parent != 0 or node.children or i == 0:
+                continue
+            others = [k for k in range(len(outlines)) if k != i]
+            own = draw_mask([outlines[i]], X_CN[[i]], self._camera)
+            rest = draw_mask([outlines[k] for k in others], X_CN[others], self._camera)
+            shows = np.count_nonzero(own & ~rest & self._masks[0])
+            # As large as it is, turned to the viewer, it has this area at least.
+            whole = _area(outlines[i].vertices) * match.scale**2 * self._pixels_per_metre**2
+            if shows < _HIDDEN * whole:
+                hidden.append(node.name)
+        return tuple(hidden)
+
+    @property
+    def _pixels_per_metre(self) -> float:
+        return float(getattr(self._camera, "pixels_per_metre", 1.0))
+
+    def _answer(self, observation: ContourObservation, x: np.ndarray, frame: int) -> PlacedMatch:
+        """A state in a frame, by its number, as a search would give it."""
+        q, X_WB = observation.positions(x)
+        wrong, area = observation.difference(x, [(self._camera, self._masks[frame])])
+        E_total = wrong / max(area, 1)
+        return PlacedMatch(
+            found=True,
+            q=q,
+            X_WB=X_WB,
+            node_values=observation.node_values(x),
+            J=float(wrong),
+            E_total=E_total,
+            first_E_total=E_total,
+            runs=0,
+            outside_limit=(),
+            untried={},
+            stopped_by=TRACKED,
+            seconds=0.0,
+            root_position=observation.root_position(x),
+            scale=observation.scale(x),
+        )
+
+
+def _area(points: np.ndarray) -> float:
+    """Area of the box about points (n, 3) across its shortest side."""
+    size = np.sort(np.ptp(points, axis=0))
+    return float(size[1] * size[2])

@@ -1,0 +1,71 @@
+"""Whether a scene is that of a person who is followed by all silhouettes at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from drake_pose.body.landmarks import landmarks_file, load_landmarks
+from drake_pose.body.model import ArticulatedModel
+from drake_pose.camera.models import Camera
+from drake_pose.errors import ModelError, SceneError
+from drake_pose.person.body_plan import PERSON_LANDMARKS
+from drake_pose.results.settings import EstimateSettings
+from drake_pose.silhouette.pictures.scenes import Scene
+
+
+def follows_person(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    model: ArticulatedModel,
+    settings: EstimateSettings,
+) -> bool:
+    """Whether the method is ``person``, by name or because ``auto`` chooses it.
+
+    Args:
+        scene: the scene.
+        cameras: those of its cameras that are used.
+        model: the body.
+        settings: what the user asks for.
+
+    Raises:
+        SceneError, ModelError: the method is asked for, but scene or model does not allow it.
+    """
+    if settings.method not in ("auto", "person"):
+        return False
+    wanted = settings.method == "person"
+    if not wanted and settings.search_settings:
+        return False
+    if len(cameras) < 2 or scene.scale_unknown:
+        if wanted:
+            names = [camera.name for camera in cameras]
+            strangers = ", ".join(scene.leftovers.uncalibrated)
+            raise SceneError(
+                f"{scene.path}: a person is captured by two calibrated cameras or more, but masks "
+                f"are there of {', '.join(names)} alone"
+                + (f"; cameras.yaml lacks {strangers}" if strangers else "")
+            )
+        return False
+    missing = missing_for_person(model)
+    if missing and wanted:
+        raise ModelError(f"{model.path}: a person is captured with a model that has {missing}")
+    return not missing
+
+
+def missing_for_person(model: ArticulatedModel) -> str:
+    """What a model lacks to be a person who can be anywhere; "" where nothing."""
+    names = set(load_landmarks(model.path)) if landmarks_file(model.path).is_file() else set()
+    absent = sorted(PERSON_LANDMARKS - names)
+    if absent:
+        return f"the landmarks {', '.join(absent)} in {landmarks_file(model.path).name} beside it"
+    tree = model.pose_tree()
+    roots = [node for node in tree.nodes if node.parent < 0]
+    lengths = [
+        position
+        for node in roots
+        for position in node.positions
+        if model.position_kinds[position] == "length"
+    ]
+    by_joints = all(node.value_names == node.position_names for node in tree.nodes)
+    if len(roots) != 1 or len(lengths) < 3 or not by_joints:
+        return "one root that joints of its own move to any place"
+    return ""

@@ -1,0 +1,207 @@
+"""The moment in which a person shows the registered pose, and what the paper's capture learns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.systems.framework import Context, DiagramBuilder
+
+from drake_pose.body.model import ArticulatedModel
+from drake_pose.camera.models import Camera, PinholeCamera
+from drake_pose.errors import CameraError, SceneError, SettingsError, UnknownNameError
+from drake_pose.jobs.live.run import run_live
+from drake_pose.jobs.live.scene import LiveScene
+from drake_pose.person.date.capture import CaptureSettings, CaptureSetup, PersonView
+from drake_pose.person.date.faces import FaceTemplates
+from drake_pose.person.date.recognition import (
+    Recognition,
+    RegisteredPose,
+    recognise,
+    register_pose,
+    stand_registered,
+)
+from drake_pose.person.date.skeleton import load_skeleton
+from drake_pose.systems.colour_images import colour_image_to_picture
+from drake_pose.systems.date.horizontal_image import HorizontalImage
+from drake_pose.systems.date.preparation import prepare_paper_capture
+from drake_pose.systems.person.live_capture import LocalSensors
+from drake_pose.systems.pictures.camera_rig import build_camera_rig
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+
+PATIENCE = 60.0
+"""How long it is waited for the registered pose before live cameras [s]."""
+
+# The arms may still be on their way up: so many more moments are looked at for a better one.
+_MORE_MOMENTS = 10
+
+
+class RegisteredPoseSearch:
+    """Looks for the registered pose in a scene's pictures: upright, both arms spread.
+
+    Attributes:
+        setup: what is known without the person: skeleton and cameras.
+
+    Args:
+        scene: the cameras and where their pictures come from.
+        model: the person.
+        face_camera: which camera sees the face; None: there is none.
+        faces: templates of the person's face; needed where there is a face camera.
+
+    Raises:
+        SceneError: a camera delivers masks.
+        CameraError: a camera of parallel rays.
+        UnknownNameError: there is no such face camera.
+        SettingsError: fewer than two other cameras, or a face camera without templates.
+        ModelError: the model is not made like the bundled person.
+    """
+
+    def __init__(
+        self,
+        scene: LiveScene,
+        model: ArticulatedModel,
+        face_camera: str | None = None,
+        faces: FaceTemplates | None = None,
+    ) -> None:
+        self._cameras = require_colour(scene)
+        if face_camera is not None and face_camera not in scene.cameras:
+            raise UnknownNameError("camera", face_camera, scene.cameras, str(scene.path))
+        if (face_camera is None) != (faces is None):
+            raise SettingsError("a face camera needs templates of the face, and these a camera")
+        self._scene, self._model = scene, model
+        self._face_camera, self._faces = face_camera, faces
+        ring = {name: one for name, one in self._cameras.items() if name != face_camera}
+        self._settings = CaptureSettings()
+        self.setup = CaptureSetup(load_skeleton(model), ring, settings=self._settings)
+        self._rig = build_camera_rig(model, ring)
+        self._context = self._rig.diagram.CreateDefaultContext()
+        self._registered: RegisteredPose | None = None
+        self._best: Recognition | None = None
+        self._shown: dict[str, Picture] = {}
+        self._since = 0
+
+    def run(self, sensors: LocalSensors, on_report: Callable[[str], None]) -> CaptureSetup:
+        """What the capture needs, from the pictures of the registered pose.
+
+        Args:
+            sensors: are used up.
+            on_report: hears of cameras that stop, and of bad pictures.
+
+        Raises:
+            SettingsError: nobody showed the registered pose.
+            KeyboardInterrupt: the user gave up.
+        """
+        builder = DiagramBuilder()
+        capture = builder.AddNamedSystem("picture_capture", sensors.capture)
+        ports = {}
+        for name, camera in self.setup.cameras.items():
+            image = HorizontalImage(camera, self._scene.backgrounds[name], self._settings.skin)
+            builder.AddNamedSystem(f"horizontal_image_{name}", image)
+            port = capture.GetOutputPort(f"color_image_{name}")
+            builder.Connect(port, image.GetInputPort("color_image"))
+            builder.ExportOutput(port, f"color_image_{name}")
+            ports[name] = image.GetOutputPort("person_view")
+            builder.ExportOutput(ports[name], f"person_view_{name}")
+        builder.ExportOutput(capture.GetOutputPort("fresh"), "fresh")
+        diagram = builder.Build()
+
+        def look(context: Context) -> None:
+            if diagram.GetOutputPort("fresh").Eval(context)[0]:
+                views = {n: diagram.GetOutputPort(f"person_view_{n}").Eval(context) for n in ports}
+                if self._look({n: view for n, view in views.items() if view is not None}):
+                    images = {n: diagram.GetOutputPort(f"color_image_{n}") for n in views}
+                    self._shown = {
+                        n: colour_image_to_picture(images[n].Eval(context)).copy()
+                        for n, view in views.items()
+                        if view is not None
+                    }
+
+        # What is wrong with recorded pictures is said when they are captured.
+        report = on_report if sensors.live else lambda _: None
+        waited = PATIENCE if sensors.live else None
+        if run_live(diagram, sensors, waited, report, self._is_done, look):
+            raise KeyboardInterrupt
+        return self._prepared(on_report)
+
+    def _is_done(self) -> bool:
+        return self._is_recognised() and self._since >= _MORE_MOMENTS
+
+    def _is_recognised(self) -> bool:
+        best = self._best
+        return best is not None and best.similarity >= self._settings.recognition
+
+    def _look(self, views: Mapping[str, PersonView]) -> bool:
+        """Whether a moment's views are the most like the registered pose."""
+        whole = {name: view for name, view in views.items() if view.contour is not None}
+        cameras = [self.setup.cameras[name] for name in whole]
+        self._since += 1
+        if len(whole) < 2:
+            return False
+        contours = [view.contour for view in whole.values()]
+        if self._registered is None:
+            middles = [one.middle for one in contours if one is not None]
+            q = stand_registered(self.setup.skeleton, cameras, middles)
+            ring = list(self.setup.cameras.values())
+            self._registered = register_pose(self.setup.skeleton, q, ring, self._draw)
+        found = recognise(self.setup.skeleton, self._registered, cameras, contours, threshold=0.0)
+        if found is None or (self._best and found.similarity <= self._best.similarity):
+            return False
+        self._best, self._since = found, 0
+        return True
+
+    def _draw(self, camera: Camera, q: Array) -> NDArray[np.bool_]:
+        self._rig.set_positions(self._context, q)
+        return self._rig.mask(self._context, camera.name)
+
+    def _prepared(self, on_report: Callable[[str], None]) -> CaptureSetup:
+        path, needed = self._scene.path, self._settings.recognition
+        if self._best is None:
+            raise SettingsError(
+                f"{path}: two cameras never saw a person whole at the same time: compare the "
+                "pictures with those of the empty room"
+            )
+        if not self._is_recognised():
+            raise SettingsError(
+                f"{path}: nobody showed the registered pose, upright with both arms spread: the "
+                f"likest silhouettes agree with it by {self._best.similarity:.2f}, "
+                f"{needed:.2f} are needed; show it once, give a model of the person's measures "
+                "(urdf/person/make_person.py makes one), or capture by all silhouettes "
+                "(--method person)"
+            )
+        known = [self._face_camera, *self._shown]
+        for name in self._cameras:
+            if name not in known:
+                on_report(f"camera '{name}' gave no picture of the registered pose: left out")
+        return prepare_paper_capture(
+            self._model,
+            {name: one for name, one in self._cameras.items() if name in known},
+            self._face_camera,
+            self._best.q,
+            self._shown,
+            self._scene.backgrounds,
+            self._settings,
+            self._faces,
+        )
+
+
+def require_colour(scene: LiveScene) -> dict[str, PinholeCamera]:
+    """The cameras of a scene whose colour pictures show skin.
+
+    Raises:
+        SceneError: a camera delivers masks.
+        CameraError: a camera of parallel rays.
+    """
+    cameras = {}
+    for name, camera in scene.cameras.items():
+        if scene.specifications[name].gives_masks:
+            raise SceneError(
+                f"{scene.path}: camera '{name}' delivers masks; the paper's method looks for skin "
+                "in colour pictures: give these, and a background of the empty room"
+            )
+        if not isinstance(camera, PinholeCamera):
+            raise CameraError(f"camera '{name}': the paper's method needs a pinhole camera")
+        cameras[name] = camera
+    return cameras

@@ -1,0 +1,326 @@
+"""A walk through a garden in the browser: what moves the avatar, the page, and the run."""
+
+from __future__ import annotations
+
+import csv
+import ipaddress
+import logging
+import math
+import secrets
+import time
+import weakref
+import webbrowser
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import Meshcat, MeshcatParams
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Diagram
+from pydrake.trajectories import PiecewisePolynomial
+
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.errors import OutputError, SettingsError
+from drake_pose.jobs.live.local_proxy import PORTS, listen, serve
+from drake_pose.person.date.skeleton import load_skeleton
+from drake_pose.person.date.walk_commands import WalkSettings
+from drake_pose.person.date.walking_motion import make_motion
+from drake_pose.results.folder import POSES, read_summary
+from drake_pose.systems.walk.walk import KEYS, build_walk
+
+Array = NDArray[np.float64]
+
+RATE_HZ = 30.0
+"""Frames a second where a recording does not say."""
+
+REPLAY, _REPLAY_KEY = "play again", "Space"
+"""The page's button at the end of a recording, and the key that presses it."""
+
+COMMANDS = ("turn left", "turn right", "walk ahead", "walk behind")
+
+_SIMULATED_FRAMES = 1200
+# How often it is looked whether the walk has ended [s].
+_LOOK = 0.5
+# Between two looks at browser and button [s].
+_POLL_PAUSE = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Player:
+    """What moves the avatar.
+
+    Args:
+        model: the person.
+        q: (n, nq) positions [rad or m], nan where the person was not found; None: keys alone.
+        rate_hz: frames a second.
+    """
+
+    model: ArticulatedModel
+    q: Array | None = None
+    rate_hz: float = RATE_HZ
+
+
+def recorded_player(
+    result: Path,
+    model_path: Path | None,
+    rate_hz: float | None,
+    packages: Mapping[str, Path] | None = None,
+) -> Player:
+    """Plays the poses of a result folder, as `drake-pose capture` writes it.
+
+    Args:
+        result: the folder.
+        model_path: the model it was captured with; the bundled one that its summary names where
+            not given.
+        rate_hz: its frames a second; those in its summary where not given.
+        packages: folders of packages that the model's ``package://`` names mean, by name.
+
+    Raises:
+        OutputError: there is no such result, or it is one of another model.
+        SettingsError: the rate is not positive.
+    """
+    if rate_hz is None:
+        rate_hz = float(read_summary(result).get("frame_rate_hz") or RATE_HZ)
+    if not (math.isfinite(rate_hz) and rate_hz > 0):
+        raise SettingsError(f"frames a second must be a positive number, not {rate_hz}")
+    if model_path is None:
+        name = str(read_summary(result).get("model", ""))
+        model_path = bundled_model("person").with_name(Path(name).name)
+        if not model_path.is_file():
+            raise OutputError(f"{result}: its model '{name}' is not a bundled one; give --model")
+    model = load_model(model_path, package_paths=packages)
+    path, columns = result / POSES, list(model.position_names)
+    try:
+        with path.open(newline="", encoding="utf-8") as stream:
+            reader = csv.DictReader(stream)
+            missing = [name for name in columns if name not in (reader.fieldnames or ())]
+            if missing:
+                raise OutputError(
+                    f"{path}: has no column '{missing[0]}', which {model.path.name} needs; give "
+                    "the model it was captured with"
+                )
+            q = np.array([[float(row[name] or "nan") for name in columns] for row in reader])
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be read: {error.strerror}") from error
+    except (ValueError, TypeError):
+        raise OutputError(f"{path}: is damaged: there is a cell that is no number") from None
+    if not np.isfinite(q).all(axis=-1).any():
+        raise OutputError(f"{path}: nobody was found in any frame, so nobody can walk")
+    return Player(model, q, rate_hz)
+
+
+def simulated_player(seed: int = 0) -> Player:
+    """Plays the known motion of Date's experiment."""
+    model = load_model(bundled_model("person"), check=False)
+    return Player(model, make_motion(load_skeleton(model), _SIMULATED_FRAMES, seed).q)
+
+
+def key_player() -> Player:
+    """Leaves the walk to the keys."""
+    return Player(load_model(bundled_model("person"), check=False))
+
+
+def stride_positions(model: ArticulatedModel) -> Array:
+    """(n, nq) one stride on the spot, standing at its end; joints of other names rest."""
+    person = load_model(bundled_model("person"), check=False)
+    motion = make_motion(load_skeleton(person), 5 * int(RATE_HZ), 0)
+    walking = motion.q[[name == "walk" for name in motion.names]]
+    walking[:, [person.position_index(f"position_{axis}") for axis in "xy"]] = 0.0
+    stride = np.tile(model.default_positions, (len(walking), 1))
+    for index, name in enumerate(person.position_names):
+        if name in model.position_names:
+            stride[:, model.position_index(name)] = walking[:, index]
+    return stride
+
+
+def open_page(port: int | None = None) -> Meshcat:
+    """A Meshcat page for this machine's browsers, without Drake's own message.
+
+    Meshcat itself would send what it shows to any web page that asks for it, so that a proxy stands
+    before it, at the page's address. Meshcat listens at one of 2^24 loopback addresses, which no
+    web page can find by trying; where the system has but one of them (macOS), at a port that one
+    could find among 2^16.
+
+    Args:
+        port: where it listens; a free one where not given.
+
+    Raises:
+        SettingsError: no page can be opened at the port.
+    """
+    logger = logging.getLogger("drake")
+    level = logger.level
+    logger.setLevel(logging.WARNING)
+    try:
+        listening = listen(port)
+        url = f"http://localhost:{listening.getsockname()[1]}"
+        page, host = _hidden_meshcat(url)
+    except (OSError, RuntimeError) as error:
+        where = f"port {port}" if port is not None else f"ports {PORTS[0]} to {PORTS[-1]}"
+        raise SettingsError(f"no page can be opened at {where}: {error}") from error
+    finally:
+        logger.setLevel(level)
+    weakref.finalize(page, serve(listening, (host, page.port())))
+    return page
+
+
+def _hidden_meshcat(url: str) -> tuple[Meshcat, str]:
+    """A Meshcat that says it is at a URL, and the loopback address at which it is."""
+    # Neither the network's own address, nor its last one, which is for broadcasts.
+    hidden = ipaddress.ip_address((127 << 24) + 1 + secrets.randbelow((1 << 24) - 2))
+    for host in (str(hidden), "127.0.0.1"):
+        with suppress(RuntimeError):
+            params = MeshcatParams(host=host, port=0, show_stats_plot=False, web_url_pattern=url)
+            return Meshcat(params), host
+    raise RuntimeError("Meshcat cannot listen at any loopback address")
+
+
+def walk(
+    player: Player,
+    meshcat: Meshcat,
+    seconds: float | None = None,
+    speed: float = 1.0,
+    on_command: Callable[[str], None] | None = None,
+    again: Callable[[], bool] | None = None,
+    settings: WalkSettings | None = None,
+) -> dict[str, Any]:
+    """Lets the avatar walk until its recording, the given time, or the user (Ctrl-C) ends it.
+
+    Args:
+        player: what moves it.
+        meshcat: the page.
+        seconds: how long; the recording's length where not given, without end for keys alone.
+        speed: seconds walked a second; 0: as fast as the machine can.
+        on_command: called when the command changes, with its words, "" for none.
+        again: asked at the end whether to walk once more from the start; not at all where not
+            given.
+        settings: what is a command.
+
+    Returns:
+        Of the last walk: seconds walked; x, y [m] and heading_deg where it ended; and by command
+        how many seconds it was followed.
+
+    Raises:
+        SettingsError: a time or a speed that cannot be.
+    """
+    if seconds is not None and not (math.isfinite(seconds) and seconds > 0):
+        raise SettingsError(f"the walk's length must be a positive number, not {seconds} s")
+    if not (math.isfinite(speed) and speed >= 0):
+        raise SettingsError(f"the speed must be 0 or a positive number, not {speed}")
+    period = 1.0 / player.rate_hz
+    positions = None
+    if player.q is not None:
+        times = period * np.arange(len(player.q) + 1)
+        positions = PiecewisePolynomial.ZeroOrderHold(
+            times, player.q[[*range(len(player.q)), -1]].T
+        )
+        seconds = min(seconds or times[-1], times[-1])
+    stride = stride_positions(player.model)
+    diagram = build_walk(player.model, meshcat, positions, stride, period, settings)
+    end = math.inf if seconds is None else seconds
+    while True:
+        walked, reached = _walk_once(diagram, end, speed, CommandLog(on_command))
+        if not reached or again is None or not again():
+            return walked
+        # What was pressed before does not move the next walker.
+        for name, key in KEYS.items():
+            meshcat.AddButton(name, key)
+
+
+def _walk_once(
+    diagram: Diagram, end: float, speed: float, log: CommandLog
+) -> tuple[dict[str, Any], bool]:
+    """Walks up to a time [s] or Ctrl-C; what ``walk`` returns, and whether it came to the time."""
+    simulator = Simulator(diagram)
+    simulator.set_target_realtime_rate(speed)
+    command, pose = (diagram.GetOutputPort(name) for name in ("command", "walker_pose"))
+    simulator.set_monitor(lambda context: log.add(context.get_time(), command.Eval(context)))
+    context = simulator.get_context()
+    reached = True
+    try:
+        simulator.Initialize()
+        while context.get_time() < end:
+            simulator.AdvanceTo(min(context.get_time() + _LOOK, end))
+    except KeyboardInterrupt:
+        reached = False
+    x, y, heading = pose.Eval(context)
+    walked = {
+        "seconds": context.get_time(),
+        "x": float(x),
+        "y": float(y),
+        "heading_deg": math.degrees(heading),
+        "commands": log.seconds,
+    }
+    return walked, reached
+
+
+def show(page: Meshcat, patience: float = 10.0) -> bool:
+    """Opens a page in the user's browser, where there is one, and waits until it is there.
+
+    Args:
+        page: to be opened.
+        patience: how long it is waited for [s].
+
+    Returns:
+        Whether a browser shows it.
+    """
+    if webbrowser.open(page.web_url()):
+        wait_for_browser(page, patience)
+    return page.GetNumActiveConnections() > 0
+
+
+def wait_for_browser(page: Meshcat, patience: float = math.inf) -> None:
+    """Waits until a browser shows a page, for this long at most [s]."""
+    end = time.monotonic() + patience
+    while page.GetNumActiveConnections() == 0 and time.monotonic() < end:
+        time.sleep(_POLL_PAUSE)
+
+
+def wait_for_replay(page: Meshcat) -> bool:
+    """Waits until the page's button to play again is pressed; False: Ctrl-C was, instead."""
+    page.AddButton(REPLAY, _REPLAY_KEY)
+    try:
+        while page.GetButtonClicks(REPLAY) == 0:
+            time.sleep(_POLL_PAUSE)
+    except KeyboardInterrupt:
+        return False
+    finally:
+        page.DeleteButton(REPLAY)
+    return True
+
+
+class CommandLog:
+    """Which commands were followed for how long."""
+
+    def __init__(self, on_command: Callable[[str], None] | None) -> None:
+        self.seconds: dict[str, float] = dict.fromkeys(COMMANDS, 0.0)
+        self._on_command = on_command
+        self._time = 0.0
+        self._words: tuple[str, ...] = ()
+
+    def add(self, time: float, command: Array) -> None:
+        """Takes the command (2,) that holds from a time on."""
+        for word in self._words:
+            self.seconds[word] += time - self._time
+        turn, walk = (int(value) for value in command)
+        words = []
+        if turn:
+            words.append(COMMANDS[0 if turn > 0 else 1])
+        if walk:
+            words.append(COMMANDS[2 if walk > 0 else 3])
+        if tuple(words) != self._words and self._on_command is not None:
+            self._on_command(" and ".join(words))
+        self._time, self._words = time, tuple(words)
+
+
+def summary_line(walked: Mapping[str, Any]) -> str:
+    """A walk's result in a line."""
+    followed = [f"{name} {value:.1f} s" for name, value in walked["commands"].items() if value]
+    return (
+        f"walked {walked['seconds']:.1f} s to x = {walked['x']:.2f} m, y = {walked['y']:.2f} m, "
+        f"heading {walked['heading_deg']:.0f} degrees; commands: {', '.join(followed) or 'none'}"
+    )

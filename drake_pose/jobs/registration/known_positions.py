@@ -1,0 +1,213 @@
+"""Joint positions of every frame, from a table, checked before anything is made of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from drake_pose.body.files.urdf_shape import BASE_JOINTS
+from drake_pose.body.model import ArticulatedModel
+from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.errors import SceneError
+from drake_pose.jobs.estimate.measurements import TrueAngles, read_true_angles
+from drake_pose.results.folder import base_pose
+
+Array = NDArray[np.float64]
+
+# A value is outside its limits from so much on [rad], or from this share of a length's range.
+_OUTSIDE, _OUTSIDE_SHARE = 0.1, 0.1
+# An angle of more than a full turn, of a joint whose limits allow none, is one in degrees; a length
+# of so many times what its limits allow is one in millimetres.
+_FULL_TURN, _MANY = 2.0 * math.pi, 20.0
+# Poses are one whose joints differ by less [rad or m].
+_SAME_ANGLE, _SAME_LENGTH = math.radians(1.0), 0.005
+# Values are one that differ by less, as written in a table.
+_AS_WRITTEN = 1e-6
+
+
+@dataclass(frozen=True)
+class KnownPositions:
+    """Where all joints are in each frame.
+
+    Args:
+        path: the table.
+        kinematics: of the pose tree.
+        table: its columns and rows.
+        order: (m,) the column of each value of the pose tree; -1: it is held.
+        held: (m,) the values that are held [rad or m]; others are not looked at.
+        warnings: what the user should know of it.
+        is_estimate: whether they were estimated, so that they are off.
+        girths: (nodes,) how many times as wide as the model's the nodes were found to be; None: as
+            the model's.
+    """
+
+    path: Path
+    kinematics: TreeKinematics
+    table: TrueAngles
+    order: NDArray[np.intp]
+    held: Array
+    warnings: tuple[str, ...] = ()
+    is_estimate: bool = False
+    girths: Array | None = None
+
+    def has(self, frame: str) -> bool:
+        """Whether there is a row of a frame."""
+        return self.table.of(frame) is not None
+
+    def of(self, frame: str, camera: str) -> Array:
+        """(m,) values of the pose tree in a frame [rad or m].
+
+        Raises:
+            SceneError: the table has no row of it.
+        """
+        values = self.table.of(frame)
+        if values is None:
+            raise SceneError(
+                f"{self.path}: has no row of frame '{frame}', which camera '{camera}' has a mask "
+                "of; add the joint positions of that moment, or leave the frame out (--frame)"
+            )
+        return np.where(self.order < 0, self.held, values[self.order])
+
+    def are_one_pose(self, rows: Iterable[Array], times: float = 1.0) -> bool:
+        """Whether the joints are at the same place in all of some rows (m,).
+
+        Args:
+            rows: the rows.
+            times: so many times a degree or 5 mm is the same.
+        """
+        values = np.array(list(rows))
+        same = times * np.where(self.kinematics.is_angle, _SAME_ANGLE, _SAME_LENGTH)
+        return bool((np.ptp(values, axis=0) < same).all())
+
+
+def put_on_base(model: ArticulatedModel, table: TrueAngles) -> tuple[ArticulatedModel, TrueAngles]:
+    """A model and its positions on BASE_JOINTS that move all of it as the table's bases say.
+
+    Raises:
+        ModelError: the file is no URDF.
+    """
+    X_WB = {frame: base_pose(base) for frame, base in table.bases.items()}
+    first = next(iter(X_WB.values()))
+    moved = model.with_base_joints(first)
+    kept = [k for k, name in enumerate(table.names) if name in moved.position_names]
+    values = {}
+    for frame, X in X_WB.items():
+        turns = Rotation.from_matrix(X[:3, :3] @ first[:3, :3].T).as_euler("ZYX")
+        place = X[:3, 3] - first[:3, 3]
+        values[frame] = np.concatenate([table.values[frame][kept], place, turns])
+    names = (*(table.names[k] for k in kept), *BASE_JOINTS)
+    return moved, TrueAngles(table.path, names, values, is_estimate=table.is_estimate)
+
+
+def read_known_positions(
+    path: Path,
+    kinematics: TreeKinematics,
+    unobserved: bool = False,
+    table: TrueAngles | None = None,
+) -> KnownPositions:
+    """Reads a table with the column frame and one for each joint that is not held.
+
+    Args:
+        path: the table.
+        kinematics: of the pose tree, whose model's positions the columns are.
+        unobserved: whether there may be columns of joints that move nothing that is seen.
+        table: what was read of it before; None: nothing was.
+
+    Raises:
+        SceneError: it cannot be read, lacks a joint, has a column that is of no use, or is not in
+            radians and metres.
+        UnknownNameError: the model has no joint of a column's name.
+    """
+    model = kinematics.tree.model
+    table = table or read_true_angles(path, model.position_names)
+    held = {model.position_names[index] for index in kinematics.tree.held}
+    asked = [name for name in kinematics.names if name not in held]
+    missing = [name for name in asked if name not in table.names]
+    if missing:
+        raise SceneError(
+            f"{path}: has no column for {_joints(missing)} of {model.path.name}; give the position "
+            "of every joint in every frame [rad or m], or hold those that did not move: "
+            f"--hold {missing[0]}=VALUE [deg or m]"
+        )
+    # What moves nothing that is seen may be there.
+    known = {*asked, *kinematics.tree.unobserved_positions} if unobserved else set(asked)
+    if table.is_estimate:
+        known |= _as_they_are(table, kinematics.tree)
+    unused = [name for name in table.names if name not in known]
+    if unused:
+        raise SceneError(
+            f"{path}: column '{unused[0]}' is a position that is held, or that places the whole "
+            "robot in the world; the cameras are found in the world in which the robot stands as "
+            "its model's file has it: leave the column out"
+        )
+    order = np.array(
+        [table.names.index(name) if name in asked else -1 for name in kinematics.names],
+        dtype=np.intp,
+    )
+    warnings = _check_units(table, order, kinematics)
+    return KnownPositions(
+        path, kinematics, table, order, kinematics.lower, warnings, table.is_estimate
+    )
+
+
+def _as_they_are(table: TrueAngles, tree: PoseTree) -> set[str]:
+    """The columns that say nothing but that a position was held, or is as in the model's file."""
+    found, model = set(), tree.model
+    for column, name in enumerate(table.names):
+        index = model.position_index(name)
+        usual = tree.held.get(index, model.default_positions[index])
+        if all(abs(row[column] - usual) < _AS_WRITTEN for row in table.values.values()):
+            found.add(name)
+    return found
+
+
+def _check_units(
+    table: TrueAngles, order: NDArray[np.intp], kinematics: TreeKinematics
+) -> tuple[str, ...]:
+    """Refuses degrees and millimetres; warns of values outside the limits."""
+    warnings = []
+    frames = list(table.values)
+    for column, name, is_angle, lower, upper in zip(
+        order, kinematics.names, kinematics.is_angle, kinematics.lower, kinematics.upper,
+        strict=True,
+    ):  # fmt: skip
+        if column < 0 or not frames or not np.isfinite([lower, upper]).all():
+            continue
+        values = np.array([table.values[frame][column] for frame in frames])
+        slack = _OUTSIDE if is_angle else _OUTSIDE_SHARE * (upper - lower)
+        off = np.maximum(lower - values, values - upper)
+        worst = int(np.argmax(off))
+        if off[worst] <= slack:
+            continue
+        what, unit = ("angle", "rad") if is_angle else ("length", "m")
+        text = (
+            f"{table.path}: column '{name}', frame {frames[worst]}: {values[worst]:g} {unit} lies "
+            f"outside the joint's limits, {lower:.4g} to {upper:.4g} {unit}"
+        )
+        scale, other, most = (
+            (math.pi / 180.0, "degrees", _FULL_TURN)
+            if is_angle
+            else (1e-3, "millimetres", _MANY * max(abs(lower), abs(upper)))
+        )
+        scaled = scale * values
+        inside = (lower - slack <= scaled) & (scaled <= upper + slack)
+        if np.abs(values).max() > most and inside.all():
+            raise SceneError(
+                f"{text}, but not in {other}: the file seems to be in {other}; write every {what} "
+                f"in {'radians' if is_angle else 'metres'}"
+            )
+        warnings.append(
+            f"{text}: is its column another joint's, its zero or sign another, its unit another?"
+        )
+    return tuple(warnings)
+
+
+def _joints(names: list[str]) -> str:
+    return f"joint{'s' if len(names) > 1 else ''} {', '.join(names)}"

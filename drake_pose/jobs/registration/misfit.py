@@ -1,0 +1,205 @@
+"""Whether a camera's pose explains its masks, and what would, where it does not."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from drake_pose.camera.models import PinholeCamera
+from drake_pose.errors import RegistrationError
+from drake_pose.jobs.estimate.fit_checks import BADLY_EXPLAINED
+from drake_pose.registration.joint_zeros import calibrate_joints
+from drake_pose.registration.object_search import ObjectSearch
+from drake_pose.registration.posed_frames import PosedFrame
+from drake_pose.registration.register import (
+    CameraSearch,
+    RegisteredCamera,
+    RegistrationBody,
+    RegistrationSettings,
+)
+from drake_pose.results.texts import percent
+
+# Of the contours in the two frames that fit best, this share fits at least. A robot that is the
+# masks' leaves 0.83 and more, with holes and tools; mirrored masks, another robot's or exchanged
+# frames 0.6 at most.
+_LEAST_SHARE = 0.65
+# Focal lengths that are tried where nothing fits, over the camera's.
+_FOCALS = (0.5, 0.7, 1.4, 2.0)
+# A focal length is wrong that differs from the one which the masks tell by so much, and by so many
+# standard deviations; and it is too wrong for a calibration where it differs by more. Published
+# focal lengths of recorded arms differ by 2 % at most.
+_FOCAL_OFF, _FOCAL_DEVIATIONS, _FOCAL_WRONG = 0.03, 4.0, 0.06
+# A camera on a link is not determined that is less sure [rad, m].
+_UNTOLD = 0.04
+# What else may be the case is tried roughly, in so many frames.
+_ROUGH_SEARCH, _ROUGH_FRAMES = RegistrationSettings(rotations=2000, fitted=15), 5
+# Something else explains the masks better that leaves less than this share of what was left.
+_MUCH_BETTER = 0.6
+
+
+Search = CameraSearch | ObjectSearch
+"""What finds a camera, and may find it again with other settings."""
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """What a camera's pose leaves, where it explains too little.
+
+    Args:
+        E_total: in the median of the frames that agree.
+        reason: what is too little.
+    """
+
+    E_total: float
+    reason: str
+
+
+def find_misfit(found: RegisteredCamera) -> Misfit | None:
+    """What is wrong with a pose that does not explain the masks; None where it does."""
+    agreeing = [frame for frame in found.frames if frame.agrees]
+    left = _left(found)
+    share = float(np.mean(np.sort([frame.share for frame in found.frames])[-2:]))
+    if len(found.frames) > 1 and len(agreeing) < 2:
+        return Misfit(
+            left,
+            f"no two of its {len(found.frames)} frames agree on one; at best frame "
+            f"'{agreeing[0].frame}' fits alone",
+        )
+    if left < BADLY_EXPLAINED and share >= _LEAST_SHARE:
+        return None
+    return Misfit(
+        left,
+        f"body and silhouettes differ by {percent(left)} of the silhouettes' area at best, and of "
+        f"the contours {percent(share)} fit",
+    )
+
+
+def require_explained(
+    search: Search, found: RegisteredCamera, frames: Sequence[PosedFrame]
+) -> None:
+    """Refuses a pose that does not explain even those frames that agree best.
+
+    Args:
+        search: what found it.
+        found: the pose.
+        frames: what the camera sees.
+
+    Raises:
+        RegistrationError: says how much remains, what would fit, and what to look at.
+    """
+    misfit = find_misfit(found)
+    if misfit is None:
+        return
+    search = search.with_settings(_ROUGH_SEARCH)
+    better = [
+        text
+        for text, other, seen in _others(found.camera, frames)
+        if _explains(search, other, seen, misfit.E_total)
+    ]
+    advice = "; ".join(better) or (
+        "are these masks of this robot or object, are the joint positions those of these frames, "
+        "in radians and with the signs and zeros of the model's file, are focal length and "
+        "principal point the camera's, are the pictures free of distortion?"
+    )
+    raise RegistrationError(
+        f"camera '{found.camera.name}': no pose explains its masks: {misfit.reason}; {advice} "
+        "Nothing was written"
+    )
+
+
+def require_determined(found: RegisteredCamera) -> None:
+    """Refuses a pose on a link that its frames hardly tell.
+
+    Raises:
+        RegistrationError: says how unsure it is.
+    """
+    turn, shift = (
+        math.sqrt(float(np.linalg.eigvalsh(part)[-1]))
+        for part in (found.covariance[:3, :3], found.covariance[3:, 3:])
+    )
+    if turn > _UNTOLD or shift > _UNTOLD:
+        raise RegistrationError(
+            f"camera '{found.camera.name}': its frames do not determine where it is on the link: "
+            f"standard deviations of {math.degrees(turn):.1f} degrees and {1e3 * shift:.0f} mm "
+            "along some axes; add frames between which the link turns by 20 degrees and more about "
+            "at least two axes. Nothing was written"
+        )
+
+
+def check_focal_length(
+    body: RegistrationBody, found: RegisteredCamera, frames: Sequence[PosedFrame]
+) -> tuple[str, ...]:
+    """Compares a camera's focal length with that which the masks themselves tell.
+
+    Returns:
+        A warning where it may be a little off.
+
+    Raises:
+        RegistrationError: it is wrong, and with it the camera's distance.
+    """
+    counted = [frame for frame, fit in zip(frames, found.frames, strict=True) if fit.agrees]
+    if len(counted) < 2:
+        return ()
+    told = calibrate_joints(body, [found], [counted], (), focal=True)
+    camera, deviation = told.cameras[0], float(told.focal_deviations[0])
+    off = math.log(camera.focal_x / found.camera.focal_x)
+    if abs(off) < max(_FOCAL_OFF, _FOCAL_DEVIATIONS * deviation):
+        return ()
+    text = (
+        f"camera '{found.camera.name}': its masks tell a focal length of {camera.focal_x:.0f} "
+        f"pixels (standard deviation {deviation * camera.focal_x:.0f}), but it is given as "
+        f"{found.camera.focal_x:.0f}; is it that of this camera, and of pictures of this size? "
+        "With a wrong one the camera stands at a wrong distance; calibrate it"
+    )
+    if abs(off) > _FOCAL_WRONG:
+        raise RegistrationError(f"{text}. Nothing was written")
+    return (text,)
+
+
+def _others(
+    camera: PinholeCamera, frames: Sequence[PosedFrame]
+) -> Iterator[tuple[str, PinholeCamera, list[PosedFrame]]]:
+    """What else may be the case: a text, and the camera and frames as they would be then."""
+    count = min(len(frames), _ROUGH_FRAMES)
+    some = [frames[k] for k in np.linspace(0, len(frames) - 1, count).round().astype(int)]
+    turned = [
+        PosedFrame(frame.name, frame.values, np.ascontiguousarray(frame.mask[:, ::-1]))
+        for frame in some
+    ]
+    text = (
+        "they fit when they are mirrored: turn the pictures back, or change the sign of all joint "
+        "positions."
+    )
+    yield text, replace(camera, center_x=camera.width - 1 - camera.center_x), turned
+    if len(frames) > 2:
+        pairs = list(pairwise(frames))[:_ROUGH_FRAMES]
+        for which, moved in (
+            ("next", [PosedFrame(a.name, b.values, a.mask) for a, b in pairs]),
+            ("previous", [PosedFrame(b.name, a.values, b.mask) for a, b in pairs]),
+        ):
+            yield f"they fit with the joint positions of the {which} frame.", camera, moved
+    for factor in _FOCALS:
+        focal_x, focal_y = factor * camera.focal_x, factor * camera.focal_y
+        text = (
+            f"they fit with focal lengths near {focal_x:.0f}, {focal_y:.0f} pixels: calibrate it."
+        )
+        yield text, replace(camera, focal_x=focal_x, focal_y=focal_y), some
+
+
+def _explains(
+    search: Search, camera: PinholeCamera, frames: Sequence[PosedFrame], left: float
+) -> bool:
+    try:
+        found = search.register(camera, frames)
+    except RegistrationError:
+        return False
+    return find_misfit(found) is None and _left(found) < _MUCH_BETTER * left
+
+
+def _left(found: RegisteredCamera) -> float:
+    """E_total in the median of the frames that agree."""
+    return float(np.median([frame.E_total for frame in found.frames if frame.agrees]))

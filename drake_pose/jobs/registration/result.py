@@ -1,0 +1,211 @@
+"""What a registration writes: the cameras, how sure they are, pictures, a summary."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.camera.files import dump_cameras
+from drake_pose.camera.models import Camera
+from drake_pose.jobs.registration.inputs import RegistrationInputs, RegistrationSettings
+from drake_pose.jobs.registration.report import make_registration_report
+from drake_pose.registration.register import ObjectPose, RegisteredCamera
+from drake_pose.results.folder import OVERLAY, REPORT, ResultFolder, without_nan
+from drake_pose.results.overlay import draw_overlay, encode_png
+from drake_pose.results.summary import file_digest, versions
+from drake_pose.results.texts import percent
+from drake_pose.silhouette.areas.outline import outline_from_mesh
+from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+
+Array = NDArray[np.float64]
+
+CAMERAS, REGISTRATION = "cameras.yaml", "registration.yaml"
+
+_ERROR_NAMES = ("turn_x", "turn_y", "turn_z", "x", "y", "z")
+
+
+def describe_camera(
+    found: RegisteredCamera,
+    seconds: float,
+    suggestion: dict[str, Any] | None = None,
+    link: str | None = None,
+) -> dict[str, Any]:
+    """A camera's part of summary.json: lengths in m, but for `_mm`; angles in `_deg`.
+
+    Args:
+        found: the camera.
+        seconds: how long it took [s].
+        suggestion: a pose of the robot that would tell poses apart.
+        link: on which the camera rides, in whose frame its pose is then.
+    """
+    poses = [found.camera.X_WC, *found.alternatives]
+    pose, on = ("X_WC", {}) if link is None else ("X_LC", {"link": link})
+    return {
+        **on,
+        pose: found.camera.X_WC.tolist(),
+        "translation_sd_mm": 1e3 * found.translation_sd,
+        "rotation_sd_deg": float(np.degrees(found.rotation_sd)),
+        "families": [{pose: np.asarray(X).tolist()} for X in poses],
+        "mean_iou": float(np.mean([frame.iou for frame in found.frames])),
+        "zeros": {},
+        "lengths": {},
+        "suggestion": suggestion,
+        **({} if found.seen_object is None else {"target": _describe_object(found.seen_object)}),
+        "seconds": seconds,
+        "contradictions": list(found.contradictions),
+        "frames": {
+            frame.frame: {
+                "agrees": frame.agrees,
+                "E_total": frame.E_total,
+                "iou": frame.iou,
+                "share": frame.share,
+            }
+            for frame in found.frames
+        },
+    }
+
+
+def _describe_object(seen: ObjectPose) -> dict[str, Any]:
+    """Where an object stands that a camera on a link has seen."""
+    return {
+        "X_WT": seen.X_WT.tolist(),
+        "determined": not len(seen.round_about),
+        "translation_sd_mm": 1e3 * seen.translation_sd,
+        "rotation_sd_deg": float(np.degrees(seen.rotation_sd)),
+        "covariance": seen.covariance.tolist(),
+        "round_about": seen.round_about.tolist(),
+        "families": [{"X_WT": X.tolist()} for X in (seen.X_WT, *seen.alternatives)],
+    }
+
+
+def summarize(
+    paths: tuple[Path, Path, Path | None],
+    settings: RegistrationSettings,
+    cameras: Mapping[str, dict[str, Any]],
+    warnings: Sequence[str],
+) -> dict[str, Any]:
+    """The content of summary.json: a single camera's part stands at the top as well.
+
+    Args:
+        paths: scene, model and table of joint positions, if there is one.
+        settings: the settings.
+        cameras: by name, from describe_camera.
+        warnings: what the user should know.
+    """
+    scene, model, joints = paths
+    top = next(iter(cameras.values())) if len(cameras) == 1 else {}
+    return {
+        **top,
+        "seconds": sum(camera["seconds"] for camera in cameras.values()),
+        "cameras": dict(cameras),
+        "warnings": list(warnings),
+        "scene": str(scene),
+        "model": str(model),
+        "joints": None if joints is None else str(joints),
+        "settings": settings.as_json(),
+        "sha256": {
+            "model": file_digest(model),
+            "cameras": file_digest(scene / CAMERAS),
+            "joints": None if joints is None else file_digest(joints),
+        },
+        "versions": versions(),
+    }
+
+
+def write_result(
+    path: Path,
+    inputs: RegistrationInputs,
+    cameras: Mapping[str, Camera],
+    registered: Mapping[str, RegisteredCamera],
+    summary: Mapping[str, Any],
+    overlay: bool,
+    urdf: bytes | None = None,
+) -> None:
+    """Writes the result folder; the camera file comes last, when all else is there.
+
+    Args:
+        path: the folder.
+        inputs: what was registered.
+        cameras: all that the camera file is to hold.
+        registered: the cameras that were found, by name.
+        summary: from summarize.
+        overlay: whether overlays are written.
+        urdf: the robot with the zeros and lengths that were found.
+
+    Raises:
+        OutputError: the folder is not empty, or cannot be written.
+    """
+    folder = ResultFolder(path, (), False)
+    if overlay:
+        for found in registered.values():
+            _write_overlays(folder, inputs, found)
+    if urdf is not None:
+        folder.write(f"{inputs.model.path.stem}_calibrated.urdf", urdf)
+    text = yaml.safe_dump(
+        {name: _uncertainty(found, summary["cameras"][name]) for name, found in registered.items()},
+        sort_keys=False,
+    )
+    folder.write(REGISTRATION, text.encode())
+    folder.write_summary(summary)
+    folder.write(REPORT, make_registration_report(path, summary).encode())
+    links = {name: one["link"] for name, one in summary["cameras"].items() if "link" in one}
+    folder.write(CAMERAS, dump_cameras(cameras, links).encode())
+
+
+def _uncertainty(found: RegisteredCamera, summary: Mapping[str, Any]) -> dict[str, Any]:
+    """A camera's part of registration.yaml, given its part of summary.json."""
+    values: dict[str, Any] = without_nan(
+        {
+            **{name: summary[name] for name in ("link", "X_LC", "X_WC") if name in summary},
+            "errors": list(_ERROR_NAMES),
+            "covariance": found.covariance,
+            "alternatives": [np.asarray(X_WC) for X_WC in found.alternatives],
+            "contradictions": list(found.contradictions),
+            **{name: summary[name] for name in ("zeros", "lengths", "target") if summary.get(name)},
+        }
+    )
+    return values
+
+
+def _write_overlays(
+    folder: ResultFolder, inputs: RegistrationInputs, found: RegisteredCamera
+) -> None:
+    """Draws the robot over each mask."""
+    camera, draw = found.camera, _drawn(inputs, found.camera)
+    for frame, misfit in zip(inputs.frames[camera.name], found.frames, strict=True):
+        segments = draw(frame.values)
+        word = "agrees" if misfit.agrees else "CONTRADICTS the others"
+        title = (
+            f"{camera.name}  frame {frame.name}  E_total {percent(misfit.E_total)}  "
+            f"IoU {misfit.iou:.2f}  {word}"
+        )
+        picture = draw_overlay(frame.mask, segments >= 0, segments, [title])
+        folder.write(f"{OVERLAY}/{camera.name}/{frame.name}.png", encode_png(picture))
+
+
+def _drawn(inputs: RegistrationInputs, camera: Camera) -> Callable[[Array], NDArray[np.int64]]:
+    """What draws the segments (H, W) at a tree's values (m,), -1 where there is none."""
+    kinematics = TreeKinematics(inputs.tree)
+    if inputs.seen is None:
+        renderer = LabelRenderer(inputs.model, camera)
+
+        def render(values: Array) -> NDArray[np.int64]:
+            q, X_WB = inputs.tree.positions_from(kinematics.split(values))
+            return np.asarray(renderer.segments(q, X_WB), np.int64)
+
+        return render
+    shown = [i for i, node in enumerate(inputs.tree.nodes) if node.name in inputs.seen]
+    outlines = [outline_from_mesh(inputs.tree.nodes[i].mesh) for i in shown]
+
+    def draw(values: Array) -> NDArray[np.int64]:
+        mask = draw_mask(outlines, camera.X_CW @ kinematics.poses(values)[shown], camera)
+        return np.where(mask, 0, -1)
+
+    return draw

@@ -1,0 +1,115 @@
+"""What the paper's capture must know beforehand, and one camera's share of it (Date, figure 1).
+
+`see_person` is one camera's share: a function of its picture alone, so it can run elsewhere. The
+stages are wired in `systems/date/capture.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.camera.models import Camera
+from drake_pose.errors import SettingsError
+from drake_pose.person.date.body_pose import Waist
+from drake_pose.person.date.contours import Contour, measure_contour
+from drake_pose.person.date.faces import FaceTemplates
+from drake_pose.person.date.features import FeatureSettings
+from drake_pose.person.date.limb_search import Search
+from drake_pose.person.date.recognition import RegisteredPose
+from drake_pose.person.date.skeleton import Skeleton
+from drake_pose.person.date.skin_blobs import Blobs, SkinColour, skin_blobs
+from drake_pose.silhouette.segmentation.background import Background
+
+Picture = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class CaptureSettings:
+    """How the paper's system captures.
+
+    Args:
+        skin: which colours are skin.
+        features: how 3-D points become features.
+        search: how elbows and knees are searched on their circles; see estimate_pose.
+        recognition: similarity from which the registered pose overwrites the state.
+        waist: the constants of the waist formula.
+        farthest_face: how far from the eigenspace a face may be [grey levels].
+    """
+
+    skin: SkinColour = field(default_factory=SkinColour)
+    features: FeatureSettings = field(default_factory=FeatureSettings)
+    search: Search = "surfaces"
+    recognition: float = 0.93
+    waist: Waist = field(default_factory=Waist)
+    farthest_face: float = 30.0
+
+
+@dataclass(frozen=True, eq=False)
+class PersonView:
+    """What one camera's picture says (the paper's horizontal image processing module).
+
+    Args:
+        region: (H, W) the person.
+        blobs: the skin in it.
+        contour: None where the person is not seen whole.
+    """
+
+    region: Mask
+    blobs: Blobs
+    contour: Contour | None
+
+
+@dataclass(frozen=True, eq=False)
+class CaptureSetup:
+    """What stays the same from frame to frame.
+
+    Args:
+        skeleton: the person.
+        cameras: the cameras on the circle, by name.
+        face_camera: the face camera, where there is one.
+        faces: the templates of the face's direction, where there are some.
+        registered: the registered pose, where it is to be recognised.
+        backgrounds: by camera, the face camera's among them; a camera without one needs masks.
+        settings: how to capture.
+
+    Raises:
+        SettingsError: fewer than two cameras, or the face camera has the name of another.
+    """
+
+    skeleton: Skeleton
+    cameras: Mapping[str, Camera]
+    face_camera: Camera | None = None
+    faces: FaceTemplates | None = None
+    registered: RegisteredPose | None = None
+    backgrounds: Mapping[str, Background] = field(default_factory=dict)
+    settings: CaptureSettings = field(default_factory=CaptureSettings)
+
+    def __post_init__(self) -> None:
+        if len(self.cameras) < 2:
+            raise SettingsError("3-D points need two cameras or more besides the face camera")
+        if self.face_camera is not None and self.face_camera.name in self.cameras:
+            raise SettingsError(
+                f"the face camera '{self.face_camera.name}' is also one of the cameras on the "
+                "circle; it must be another one"
+            )
+
+
+def see_person(picture: Picture, region: Mask, skin: SkinColour) -> PersonView:
+    """One camera's share: the skin in the person's region, and the region's contour.
+
+    Args:
+        picture: (H, W, 3) red, green, blue.
+        region: (H, W) the person, a given mask or from person_region.
+        skin: which colours are skin.
+
+    Raises:
+        SettingsError: a region of another size than the picture's.
+    """
+    if region.shape != picture.shape[:2]:
+        raise SettingsError(f"the region is {region.shape}, but the picture {picture.shape}")
+    return PersonView(region, skin_blobs(picture, region, skin), measure_contour(region))

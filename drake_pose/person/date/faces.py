@@ -1,0 +1,175 @@
+"""Where the face looks: eigenspace templates (Date et al., 3.2; Murase and Nayar 1995).
+
+Pictures of the face, 80 x 130 x 3, are projected to the 60 leading eigenvectors of 300 templates of
+known directions; the nearest template's direction is the answer.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.camera.models import Camera
+from drake_pose.errors import SettingsError
+from drake_pose.person.date.skin_blobs import Blobs
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+
+FACE_WIDTH, FACE_HEIGHT = 80, 130
+"""What a face is scaled to [pixel]."""
+
+DIMENSIONS = 60
+"""How many eigenvectors span the space of faces."""
+
+
+@dataclass(frozen=True, eq=False)
+class FaceTemplates:
+    """Faces of known directions in their eigenspace.
+
+    Args:
+        mean: (d,) the mean face, d = 80 x 130 x 3.
+        basis: (k, d) float32, the leading eigenvectors, orthonormal.
+        coordinates: (n, k) the templates in the eigenspace.
+        directions: (n, 2) turn to the person's left and nod downwards, away from facing the camera
+            [rad].
+    """
+
+    mean: NDArray[np.float32]
+    basis: NDArray[np.float32]
+    coordinates: NDArray[np.float32]
+    directions: Array
+
+
+@dataclass(frozen=True, eq=False)
+class FaceDirection:
+    """The direction of a face.
+
+    Args:
+        direction: (2,) turn to the person's left and nod downwards, away from facing the camera
+            [rad].
+        template: which template is nearest.
+        distance: in the eigenspace, over the square root of the pixels' number [grey levels].
+        outside: how far the picture is from the eigenspace [grey levels]; large: it is no face.
+    """
+
+    direction: Array
+    template: int
+    distance: float
+    outside: float
+
+
+def cut_face(picture: Picture, blobs: Blobs) -> Picture | None:
+    """The largest skin-coloured blob of a picture, scaled to 80 x 130.
+
+    Args:
+        picture: (H, W, 3).
+        blobs: its skin.
+
+    Returns:
+        (130, 80, 3); None where there is no skin, or it touches the picture's edge.
+    """
+    if not len(blobs.areas):
+        return None
+    left, top, width, height = (int(side) for side in blobs.boxes[0])
+    full_height, full_width = picture.shape[:2]
+    if left == 0 or top == 0 or left + width == full_width or top + height == full_height:
+        return None
+    cut = picture[top : top + height, left : left + width].copy()
+    # What is behind the head must not matter.
+    cut[~blobs.mask[top : top + height, left : left + width]] = 0
+    # Averaged where the picture is larger: so the noise does not depend on the distance.
+    how = cv2.INTER_AREA if height >= FACE_HEIGHT else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(cut, (FACE_WIDTH, FACE_HEIGHT), interpolation=how))
+
+
+def learn_faces(
+    faces: Sequence[Picture], directions: Array, dimensions: int = DIMENSIONS
+) -> FaceTemplates:
+    """The eigenspace of faces of known directions.
+
+    Args:
+        faces: (130, 80, 3) each, from cut_face.
+        directions: (n, 2) their directions, see FaceTemplates [rad].
+        dimensions: how many eigenvectors are kept; fewer where there are fewer faces.
+
+    Raises:
+        SettingsError: fewer than three faces, or not one direction for each.
+    """
+    known = np.asarray(directions, dtype=np.float64).reshape(-1, 2)
+    if len(faces) < 3 or len(known) != len(faces):
+        raise SettingsError(
+            f"an eigenspace needs three faces or more, and a direction of each, not {len(faces)} "
+            f"faces and {len(known)} directions"
+        )
+    data = np.stack([face.reshape(-1) for face in faces]).astype(np.float32)
+    mean = data.mean(axis=0)
+    data -= mean
+    # The eigenvectors of d x d pixels from those of n x n faces (Murakami and Kumar's trick).
+    values, vectors = np.linalg.eigh((data @ data.T).astype(np.float64))
+    order = np.argsort(-values)[: min(dimensions, len(faces) - 1)]
+    order = order[values[order] > 1e-6 * values.max()]
+    basis = (vectors[:, order] / np.sqrt(values[order])).T.astype(np.float32) @ data
+    return FaceTemplates(mean, basis, data @ basis.T, known)
+
+
+def head_angles(direction: Array, head: Array, camera: Camera) -> Array:
+    """The head's turn and nod in the world (2,) [rad] of a face seen by a camera.
+
+    Args:
+        direction: (2,) turn and nod away from facing the camera, from face_direction [rad].
+        head: (3,) where the head is [m].
+        camera: the face camera.
+
+    Returns:
+        Turn about the vertical, 0 where the face looks along the world's x, and nod downwards.
+    """
+    towards = camera.X_WC[:3, 3] - head
+    level = math.hypot(towards[0], towards[1])
+    azimuth, elevation = math.atan2(towards[1], towards[0]), math.atan2(towards[2], level)
+    turn, nod = direction
+    # The face's direction where the camera stands straight ahead, then tilted up to the camera.
+    ahead = np.array([math.cos(nod) * math.cos(turn), math.cos(nod) * math.sin(turn)])
+    up = -math.sin(nod)
+    c, s = math.cos(elevation), math.sin(elevation)
+    x, y, z = c * ahead[0] - s * up, ahead[1], s * ahead[0] + c * up
+    heading = math.remainder(azimuth + math.atan2(y, x), 2.0 * math.pi)
+    return np.array([heading, -math.asin(min(1.0, max(-1.0, z)))])
+
+
+def face_direction(face: Picture, templates: FaceTemplates) -> FaceDirection:
+    """The direction of a face (130, 80, 3) by the nearest template."""
+    off = face.reshape(-1).astype(np.float32) - templates.mean
+    place = templates.basis @ off
+    distances = np.linalg.norm(templates.coordinates - place, axis=1)
+    nearest = int(np.argmin(distances))
+    scale = np.sqrt(len(off))
+    left = max(0.0, float(off @ off) - float(place @ place))
+    return FaceDirection(
+        templates.directions[nearest].copy(),
+        nearest,
+        float(distances[nearest] / scale),
+        float(np.sqrt(left) / scale),
+    )
+
+
+def find_face(picture: Picture, blobs: Blobs, templates: FaceTemplates, farthest: float) -> Array:
+    """The direction (2,) of the face in a picture [rad]; nan where no face is seen.
+
+    Args:
+        picture: (H, W, 3) red, green, blue.
+        blobs: its skin.
+        templates: what faces look like.
+        farthest: how far from the eigenspace a face may be [grey levels].
+    """
+    face = cut_face(picture, blobs)
+    if face is not None:
+        found = face_direction(face, templates)
+        if found.outside <= farthest:
+            return found.direction
+    return np.full(2, np.nan)

@@ -1,0 +1,170 @@
+"""From 3-D points to the places of head, hands and feet (Date et al., 3.1.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.camera.models import Camera
+from drake_pose.person.date.skeleton import FEATURES
+from drake_pose.person.rays import meeting_points
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_FIRST_FOOT = FEATURES.index("left_foot")
+
+
+@dataclass(frozen=True)
+class FeatureSettings:
+    """How features are found.
+
+    Args:
+        threshold: largest distance of two rays that show the same skin [m].
+        reach: points farther than this from where every feature is expected belong to none [m];
+            infinite in the paper.
+        dense: radius of the dense part of a feature's points [m].
+        margin: how far outside a silhouette a point may be seen [pixel].
+    """
+
+    threshold: float = 0.05
+    reach: float = float("inf")
+    dense: float = 0.08
+    margin: int = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """The features of a frame.
+
+    Args:
+        places: (k, 3) [m]; the last frame's where nothing was measured.
+        support: (k,) how many 3-D points the place was taken from; 0: not measured.
+        points: (m, 3) all points inside every silhouette [m].
+        owners: (m,) which feature each was given to; -1: none.
+    """
+
+    places: Array
+    support: NDArray[np.int64]
+    points: Array
+    owners: NDArray[np.int64]
+
+
+def inside_silhouettes(
+    points: Array, cameras: Sequence[Camera], regions: Sequence[Mask], margin: int = 0
+) -> Mask:
+    """Which points (m, 3) every camera sees inside its silhouette.
+
+    A camera has no say about points outside its picture, nor where it sees nobody at all.
+
+    Args:
+        points: in the world [m].
+        cameras: the cameras.
+        regions: (H, W) the person in each camera's picture.
+        margin: how far outside its silhouette a point may be seen [pixel].
+    """
+    kept = np.ones(len(points), dtype=bool)
+    for camera, region in zip(cameras, regions, strict=True):
+        if not region.any():
+            continue
+        uv, depth = camera.project(points)
+        with np.errstate(invalid="ignore"):
+            pixels = np.rint(uv)
+            visible = (depth > 0.0) & (pixels >= 0).all(axis=1)
+            visible &= (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
+        column, row = pixels[visible].astype(np.int64).T
+        kept[visible] &= _near_region(region, row, column, margin)
+    return kept
+
+
+def _near_region(
+    region: Mask, row: NDArray[np.int64], column: NDArray[np.int64], margin: int
+) -> Mask:
+    """Whether the region holds a pixel within `margin` of each given one, along or across."""
+    found = region[row, column].copy()
+    height, width = region.shape
+    for step in range(1, margin + 1):
+        for down, right in ((step, 0), (-step, 0), (0, step), (0, -step)):
+            r, c = np.clip(row + down, 0, height - 1), np.clip(column + right, 0, width - 1)
+            found |= region[r, c]
+    return found
+
+
+def expect_features(
+    places: Array, support: NDArray[np.int64], last: Array, last_support: NDArray[np.int64]
+) -> Array:
+    """Where FEATURES are expected in the next frame (5, 3) [m]: feet a step on, the others here.
+
+    In a frame a walker's feet may move by more than they are apart when they pass each other; then
+    the nearest of the last frame's is the wrong one. Hands that meet stop: a step on they would be
+    taken for each other.
+
+    Args:
+        places: (5, 3) the features in this frame [m].
+        support: (5,) how many 3-D points each was taken from.
+        last: (5, 3) the same in the frame before.
+        last_support: (5,) likewise.
+    """
+    measured = (np.asarray(support) > 0) & (np.asarray(last_support) > 0)
+    step = np.where(measured[:, None], places - last, 0.0)
+    step[:_FIRST_FOOT] = 0.0
+    return np.asarray(places + step)
+
+
+def assign(points: Array, expected: Array, reach: float) -> NDArray[np.int64]:
+    """The nearest of the expected features (k, 3) for each point (m, 3); -1 beyond `reach`."""
+    if not len(points):
+        return np.empty(0, dtype=np.int64)
+    distances = np.linalg.norm(points[:, None] - expected[None], axis=2)
+    owners = distances.argmin(axis=1)
+    owners[distances[np.arange(len(points)), owners] > reach] = -1
+    return owners.astype(np.int64)
+
+
+def dense_mean(points: Array, radius: float) -> tuple[Array, int]:
+    """The mean of the dense part of points (m, 3), and how many points it has.
+
+    The dense part is what lies within `radius` of the point that has most others there; of equals,
+    the one whose others are nearest.
+    """
+    distances = np.linalg.norm(points[:, None] - points[None], axis=2)
+    near = distances <= radius
+    spread = np.where(near, distances, 0.0).sum(axis=1)
+    counts = near.sum(axis=1)
+    center = np.lexsort((spread, -counts))[0]
+    part = points[near[center]]
+    return part.mean(axis=0), len(part)
+
+
+def find_features(
+    cameras: Sequence[Camera],
+    centroids: Sequence[Array],
+    regions: Sequence[Mask],
+    last: Array,
+    settings: FeatureSettings | None = None,
+    expected: Array | None = None,
+) -> Features:
+    """The features' places in a frame.
+
+    Args:
+        cameras: the cameras.
+        centroids: (n_k, 2) the skin blobs' centroids in each camera [pixel].
+        regions: (H, W) the person in each camera's picture.
+        last: (k, 3) the last frame's features [m].
+        settings: how; the defaults where not given.
+        expected: (k, 3) where they are expected in this frame [m]; the last frame's places where
+            not given, as in the paper.
+    """
+    settings = settings or FeatureSettings()
+    points = meeting_points(cameras, centroids, settings.threshold)
+    points = points[inside_silhouettes(points, cameras, regions, settings.margin)]
+    owners = assign(points, last if expected is None else expected, settings.reach)
+    places, support = np.array(last, dtype=np.float64), np.zeros(len(last), dtype=np.int64)
+    for k in range(len(last)):
+        mine = points[owners == k]
+        if len(mine):
+            places[k], support[k] = dense_mean(mine, settings.dense)
+    return Features(places, support, points, owners)

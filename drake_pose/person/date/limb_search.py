@@ -1,0 +1,418 @@
+"""Elbows and knees on their circles, by back-projection (Date et al., 4.1.2 and 4.2)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from drake_pose.camera.models import Camera
+from drake_pose.compiled import compiled
+from drake_pose.person.date.skeleton import Limb, rotation
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+ELBOW_RANGE = (0.0, 120.0)
+"""Where an elbow may be on its circle [deg], from behind, over outwards, to a little in front."""
+
+KNEE_RANGE = (-180.0, 175.0)
+"""Where a knee may be on its circle [deg], as far as the hip can turn; 0 is in front, positive
+outwards. Behind it lies where the leg is straight, as it ends at the foot's middle."""
+
+FEATURE_ERROR = 0.015
+"""How far hands and feet are measured off their places [m]."""
+
+Search = Literal["surfaces", "rectangles", "none"]
+# rectangles: the paper's way, a rectangle from root to middle joint and one from there to the end,
+# on the one circle that the measured end gives. surfaces: points of the segments' surfaces, on the
+# circles of all ends within FEATURE_ERROR along the limb: the radius of a nearly straight limb's
+# circle is 2 cm where its end is measured 1 mm too near.
+
+# A straight knee's angle is at its limit: how far beyond it may be measured.
+_BEND_TOLERANCE = math.radians(3.0)
+
+# The trunk's direction is measured, too: how far beyond its limits a hip may seem to be.
+_HIP_TOLERANCE = math.radians(10.0)
+_STEP_DEG = 5.0
+_END_STEP = 0.005
+_SAMPLES_ALONG = 12
+_SAMPLES_ACROSS = 5
+_STRAIGHT = 1e-9
+_STRETCHED = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Circle:
+    """Where a middle joint can be: center + radius (sin(theta) i + cos(theta) j).
+
+    Args:
+        center: (3,) [m].
+        radius: [m]; 0 where the limb is stretched out.
+        i, j: (3,) orthogonal directions of length 1: outwards; and behind (arm) or in front (leg).
+    """
+
+    center: Array
+    radius: float
+    i: Array
+    j: Array
+
+    def points(self, degrees: Array) -> Array:
+        """(n, 3) the circle's points at angles (n,) [deg]."""
+        theta = np.radians(np.asarray(degrees, dtype=np.float64))[:, None]
+        return np.asarray(
+            self.center + self.radius * (np.sin(theta) * self.i + np.cos(theta) * self.j)
+        )
+
+
+def joint_circle(limb: Limb, root: Array, end: Array, outward: Array) -> Circle:
+    """The circle of an elbow or knee.
+
+    i is the direction in the circle's plane that agrees best with the horizontal part of `outward`;
+    j = i x z for the left arm, z from shoulder to hand (for the right arm and for legs mirrored, so
+    that it points behind the arm and in front of the leg).
+
+    Args:
+        limb: the limb.
+        root: (3,) shoulder or hip [m].
+        end: (3,) hand or foot [m].
+        outward: (3,) from the neck's base to the shoulder, or from the waist to the hip.
+    """
+    a, b = limb.lengths
+    across = end - root
+    distance = float(np.linalg.norm(across))
+    z = across / distance if distance > _STRAIGHT else np.array([0.0, 0.0, -1.0])
+    # Beyond the limb's reach it is stretched out (or folded), in proportion.
+    reach = min(max(distance, abs(a - b)), a + b)
+    along = (a * a - b * b + reach * reach) / (2.0 * reach) if reach > _STRAIGHT else 0.0
+    radius = math.sqrt(max(0.0, a * a - along * along))
+    center = root + z * along * (distance / reach if reach > _STRAIGHT else 1.0)
+    i = _unit_across(np.array([outward[0], outward[1], 0.0]), z)
+    j = limb.side * np.cross(i, z)
+    return Circle(center, radius, i, -j if limb.name.endswith("leg") else j)
+
+
+class FoundLimb(NamedTuple):
+    """A limb whose elbow or knee was searched.
+
+    Attributes:
+        middle, end: (3,) elbow and hand, or knee and foot [m].
+        score: the correlation C there.
+    """
+
+    middle: Array
+    end: Array
+    score: float
+
+
+def search_limb(
+    limb: Limb,
+    R_WT: Array,
+    root: Array,
+    end: Array,
+    outward: Array,
+    near: Array,
+    last: Array,
+    cameras: Sequence[Camera],
+    regions: Sequence[Mask],
+    search: Search = "surfaces",
+) -> FoundLimb:
+    """The place of an elbow or knee at which the limb agrees best with the silhouettes.
+
+    Args:
+        limb: the limb.
+        R_WT: (3, 3) the trunk's axes in the world: a knee is only where the hip can turn it.
+        root, end: (3,) shoulder and hand, or hip and foot [m].
+        outward: (3,) from the neck's base to the shoulder, or from the waist to the hip.
+        near: (3,) of equally good places, the one nearest to this is taken: inverse kinematics's.
+        last: (4,) the limb's angles in the last frame [rad].
+        cameras: the cameras.
+        regions: (H, W) the person in each camera's picture.
+        search: "surfaces" or "rectangles".
+    """
+    ends = [end] if search == "rectangles" else _possible_ends(limb, root, end)
+    found = [_places(limb, R_WT, root, one, outward, last) for one in ends]
+    middles, angles = (np.concatenate(values) for values in zip(*found, strict=True))
+    if search == "rectangles":
+        samples = rectangles(root, middles, end, limb.half_widths)
+    else:
+        samples = _points_of_segments(limb, R_WT, root, middles, angles)
+    scores = correlation(samples, cameras, regions)
+    best = np.flatnonzero(scores >= scores.max() - 1e-9)
+    chosen = best[np.argmin(np.linalg.norm(middles[best] - near, axis=1))]
+    counts = [len(places) for places, _ in found]
+    return FoundLimb(
+        middles[chosen], np.repeat(ends, counts, axis=0)[chosen], float(scores[chosen])
+    )
+
+
+def _possible_ends(limb: Limb, root: Array, end: Array) -> list[Array]:
+    """Where the end may be in truth, (3,) each: on its line from the root, and in reach."""
+    across = end - root
+    distance = float(np.linalg.norm(across))
+    direction = across / distance if distance > _STRAIGHT else np.array([0.0, 0.0, -1.0])
+    count = round(FEATURE_ERROR / _END_STEP)
+    steps = _END_STEP * np.arange(-count, count + 1)
+    distances = np.unique(np.clip(distance + steps, *_reach(limb)))
+    return [root + one * direction for one in distances]
+
+
+def _places(
+    limb: Limb, R_WT: Array, root: Array, end: Array, outward: Array, last: Array
+) -> tuple[Array, Array]:
+    """Where the middle joint may be (n, 3) for an end, and the limb's angles there (n, 4)."""
+    is_leg = limb.name.endswith("leg")
+    low, high = KNEE_RANGE if is_leg else ELBOW_RANGE
+    degrees = np.arange(low, high + 0.5 * _STEP_DEG, _STEP_DEG)
+    middles = joint_circle(limb, root, end, outward).points(degrees)
+    angles, beyond = place_limb(limb, R_WT, root, middles, end, last)
+    if is_leg:
+        possible = beyond <= max(_HIP_TOLERANCE, float(beyond.min()))
+        middles, angles = middles[possible], angles[possible]
+    return middles, angles
+
+
+def _points_of_segments(
+    limb: Limb, R_WT: Array, root: Array, middles: Array, angles: Array
+) -> Array:
+    """Points (n, m, 3) of both segments' surfaces for places (n, 3) and angles (n, 4)."""
+    letters = ["XYZ"[axis] for axis in limb.axes]
+    R_WU = R_WT @ Rotation.from_euler("".join(letters[:3]), angles[:, :3]).as_matrix()
+    R_WL = R_WU @ Rotation.from_euler(letters[3], angles[:, 3:]).as_matrix()
+    upper, lower = limb.surfaces
+    return np.concatenate(
+        [
+            root + upper @ R_WU.transpose(0, 2, 1),
+            middles[:, None] + lower @ R_WL.transpose(0, 2, 1),
+        ],
+        axis=1,
+    )
+
+
+def rectangles(root: Array, middles: Array, end: Array, half_widths: Array) -> Array:
+    """Points all over the two rectangles of a limb, for several places of its middle joint.
+
+    They lie in the plane of root, middle joint and end, one from the root to the middle joint, one
+    from there to the end.
+
+    Args:
+        root, end: (3,) [m].
+        middles: (n, 3) [m].
+        half_widths: (2,) of the rectangles [m].
+
+    Returns:
+        (n, m, 3) points.
+    """
+    normal = np.cross(middles - root, end - root)
+    along = ((np.arange(_SAMPLES_ALONG) + 0.5) / _SAMPLES_ALONG)[:, None, None]
+    across = np.linspace(-1.0, 1.0, _SAMPLES_ACROSS)[:, None]
+    parts = []
+    for start, stop, half in ((root, middles, half_widths[0]), (middles, end, half_widths[1])):
+        sideways = np.cross(normal, stop - start)
+        length = np.linalg.norm(sideways, axis=1, keepdims=True)
+        sideways = half * sideways / np.maximum(length, _STRAIGHT**2)
+        start_each = np.broadcast_to(start, middles.shape)[:, None, None]
+        step_each = (stop - start)[:, None, None]
+        points = start_each + along * step_each + across * sideways[:, None, None]
+        parts.append(points.reshape(len(middles), -1, 3))
+    return np.concatenate(parts, axis=1)
+
+
+def correlation(samples: Array, cameras: Sequence[Camera], regions: Sequence[Mask]) -> Array:
+    """C: how well rectangles agree with the silhouettes, mean over the cameras.
+
+    Args:
+        samples: (n, m, 3) points all over each candidate's rectangles [m].
+        cameras: the cameras; those that see nobody have no say.
+        regions: (H, W) the person in each camera's picture.
+
+    Returns:
+        (n,) mean share of the points, as far as they are in the picture, inside the silhouette.
+    """
+    total, seers = np.zeros(len(samples)), 0
+    for camera, region in zip(cameras, regions, strict=True):
+        if not region.any():
+            continue
+        total += _inside_share(
+            samples, camera.kernel_parameters(), np.ascontiguousarray(camera.X_CW), region
+        )
+        seers += 1
+    return total / max(1, seers)
+
+
+@compiled(error_model="python")
+def _inside_share(samples: Array, camera: Array, X_CW: Array, region: Mask) -> Array:
+    """(n,) share of points (n, m, 3) in the picture that lie inside the region (H, W)."""
+    shares = np.zeros(samples.shape[0])
+    height, width = region.shape
+    for n in range(samples.shape[0]):
+        seen, inside = 0, 0
+        for m in range(samples.shape[1]):
+            x, y, z = samples[n, m]
+            x_C = X_CW[0, 0] * x + X_CW[0, 1] * y + X_CW[0, 2] * z + X_CW[0, 3]
+            y_C = X_CW[1, 0] * x + X_CW[1, 1] * y + X_CW[1, 2] * z + X_CW[1, 3]
+            z_C = X_CW[2, 0] * x + X_CW[2, 1] * y + X_CW[2, 2] * z + X_CW[2, 3]
+            if camera[0] == 0.0:
+                if z_C <= camera[5]:
+                    continue
+                x_C, y_C = x_C / z_C, y_C / z_C
+            column = math.floor(camera[1] * x_C + camera[3] + 0.5)
+            row = math.floor(camera[2] * y_C + camera[4] + 0.5)
+            if 0 <= column < width and 0 <= row < height:
+                seen += 1
+                inside += region[row, column]
+        if seen > 0:
+            shares[n] = inside / seen
+    return shares
+
+
+def limb_angles(
+    limb: Limb, R_WT: Array, root: Array, middle: Array, end: Array, last: Array
+) -> Array:
+    """The joint angles (4,) that put a limb's joints where they were found, inside its limits.
+
+    Where the limits do not allow it, what is clipped goes at the end's expense.
+
+    Args:
+        limb: the limb.
+        R_WT: (3, 3) the trunk's axes in the world.
+        root, middle, end: (3,) [m].
+        last: (4,) angles to stay near where several sets do the same [rad].
+    """
+    angles, _ = place_limb(limb, R_WT, root, middle[None], end, last)
+    return np.clip(angles[0], limb.lower, limb.upper)
+
+
+def place_limb(
+    limb: Limb, R_WT: Array, root: Array, middles: Array, end: Array, last: Array
+) -> tuple[Array, Array]:
+    """The joint angles that put a limb's joints where they are, for several places of the middle.
+
+    A limb that is nearly straight is as long when it is bent a little: of both the one that the
+    limits allow is taken.
+
+    Args:
+        limb: the limb.
+        R_WT: (3, 3) the trunk's axes in the world.
+        root, end: (3,) [m].
+        middles: (n, 3) [m].
+        last: (4,) angles to stay near where several sets do the same [rad].
+
+    Returns:
+        (n, 4) angles, and (n,) by how much the worst of its root's lies beyond its limits [rad].
+    """
+    towards, uppers = end - root, middles - root
+    frames = _triads(towards, uppers)
+    off_line = np.linalg.norm(np.cross(towards, uppers), axis=1)
+    stretched = off_line < _STRETCHED * (uppers**2).sum(axis=1)
+    options = []
+    for bend in _middle_angles(limb, float(np.linalg.norm(end - root))):
+        end_U = limb.middle_U + rotation(limb.axes[3:], np.array([bend])) @ limb.end_L
+        R_last = R_WT @ rotation(limb.axes[:3], last[:3])
+        # Stretched it does not tell how it is turned about itself: as in the last frame.
+        as_last = _shortest_turn(R_last @ end_U, towards) @ R_last
+        own = _triads(end_U, limb.middle_U[None])[0].T
+        R_TU = R_WT.T @ np.where(stretched[:, None, None], as_last, frames @ own)
+        angles, beyond = _root_angles(limb, R_TU, last[:3])
+        whole = np.column_stack([angles, np.full(len(middles), bend)])
+        options.append((beyond + 1e-3 * abs(bend - last[3]), beyond, whole))
+    costs, beyonds, wholes = (np.array(values) for values in zip(*options, strict=True))
+    chosen, each = np.argmin(costs, axis=0), np.arange(len(middles))
+    return wholes[chosen, each], beyonds[chosen, each]
+
+
+def _shortest_turn(old: Array, new: Array) -> Array:
+    """(3, 3) the smallest rotation that brings one direction (3,) to another."""
+    a = old / max(float(np.linalg.norm(old)), _STRAIGHT)
+    b = new / max(float(np.linalg.norm(new)), _STRAIGHT)
+    axis, cosine = np.cross(a, b), float(a @ b)
+    if cosine < -1.0 + 1e-9:
+        half_turn = _unit_across(np.zeros(3), a)
+        return np.asarray(2.0 * np.outer(half_turn, half_turn) - np.eye(3))
+    x, y, z = axis
+    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(np.eye(3) + skew + skew @ skew / (1.0 + cosine))
+
+
+def _middle_angles(limb: Limb, distance: float) -> list[float]:
+    """The middle joint's angles at which root and end are a distance apart [rad].
+
+    One or two inside its limits; where there is none, the limit that is nearest.
+    """
+    base, swing, start = _bending(limb)
+    turn = math.acos(min(1.0, max(-1.0, (distance**2 - base) / swing)))
+    options = [math.remainder(start + sign * turn, 2.0 * math.pi) for sign in (-1.0, 1.0)]
+    clipped = [min(max(option, limb.lower[3]), limb.upper[3]) for option in options]
+    beyond = np.abs(np.subtract(options, clipped))
+    return [
+        c for c, off in zip(clipped, beyond, strict=True) if off <= beyond.min() + _BEND_TOLERANCE
+    ]
+
+
+def _reach(limb: Limb) -> tuple[float, float]:
+    """The least and the largest distance of root and end inside the middle joint's limits [m]."""
+    base, swing, start = _bending(limb)
+    straight = min(max(start, limb.lower[3]), limb.upper[3])
+    squares = base + swing * np.cos(np.array([limb.lower[3], limb.upper[3], straight]) - start)
+    low, high = np.sqrt(np.maximum([squares.min(), squares.max()], 0.0))
+    return float(low), float(high)
+
+
+def _bending(limb: Limb) -> tuple[float, float, float]:
+    """How far apart root and end are: their squared distance is base + swing cos(bend - start).
+
+    Returns:
+        base and swing [m^2], and start [rad].
+    """
+    axis = np.zeros(3)
+    axis[limb.axes[3]] = 1.0
+    along = (limb.middle_U @ axis) * (limb.end_L @ axis)
+    cosine = limb.middle_U @ limb.end_L - along
+    sine = limb.middle_U @ np.cross(axis, limb.end_L)
+    a, b = limb.lengths
+    base, swing = a * a + b * b + 2.0 * along, 2.0 * math.hypot(cosine, sine)
+    return float(base), swing, math.atan2(sine, cosine)
+
+
+def _root_angles(limb: Limb, R_TU: Array, last: Array) -> tuple[Array, Array]:
+    """Angles (n, 3) about the limb's axes of rotations (n, 3, 3), inside the limits if possible.
+
+    Second: (n,) by how much the worst of each three lies beyond its limits [rad].
+    """
+    i, j, k = (int(axis) for axis in limb.axes[:3])
+    sign = 1.0 if (j - i) % 3 == 1 else -1.0
+    second = np.arcsin(np.clip(sign * R_TU[:, i, k], -1.0, 1.0))
+    first = np.arctan2(-sign * R_TU[:, j, k], R_TU[:, k, k])
+    third = np.arctan2(-sign * R_TU[:, i, j], R_TU[:, i, i])
+    options = np.array(
+        [[first, second, third], [first + math.pi, math.pi - second, third + math.pi]]
+    ).transpose(0, 2, 1)
+    options = np.remainder(options + math.pi, 2.0 * math.pi) - math.pi
+    beyond = np.abs(options - np.clip(options, limb.lower[:3], limb.upper[:3]))
+    cost = beyond.sum(axis=2) + 1e-3 * np.abs(options - last).sum(axis=2)
+    chosen, each = np.argmin(cost, axis=0), np.arange(len(R_TU))
+    return options[chosen, each], beyond[chosen, each].max(axis=1)
+
+
+def _triads(first: Array, others: Array) -> Array:
+    """(n, 3, 3) axes: along a vector (3,), then what of the others (n, 3) is across it."""
+    x = first / max(float(np.linalg.norm(first)), _STRAIGHT)
+    across = others - np.outer(others @ x, x)
+    length = np.linalg.norm(across, axis=1, keepdims=True)
+    y = np.where(
+        length < _STRAIGHT, _unit_across(np.zeros(3), x), across / np.maximum(length, _STRAIGHT)
+    )
+    return np.stack([np.broadcast_to(x, y.shape), y, np.cross(x, y)], axis=2)
+
+
+def _unit_across(vector: Array, axis: Array) -> Array:
+    """The direction of a vector (3,) across an axis of length 1; any where there is none."""
+    across = vector - (vector @ axis) * axis
+    if np.linalg.norm(across) < _STRAIGHT:
+        across = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+    return np.asarray(across / np.linalg.norm(across))

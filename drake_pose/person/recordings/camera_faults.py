@@ -1,0 +1,304 @@
+"""Cameras that have moved since they were calibrated, found by their residual.
+
+Each camera in turn is left out: the others' silhouettes give the pose, and the pose predicts this
+camera's silhouette. Where the prediction is off in the same way in many frames, so that one rigid
+motion of the camera explains it, the camera has moved; poor masks are off in another way each time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.camera.models import Camera
+from drake_pose.fit.contour_fit import ContourFit, Prior
+from drake_pose.fit.evidence import EdgePoints, pack_evidence
+from drake_pose.fit.frames_fit import FramesFit
+from drake_pose.fit.levenberg_marquardt import Round, StepSettings
+from drake_pose.fit.parameters import CAMERA_NAMES, CameraParameters
+from drake_pose.fit.unknowns import choose
+from drake_pose.person.rays import viewing_rays
+from drake_pose.person.recordings.figures import pixels_per_metre
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# A camera that was pushed has turned and shifted by about this much [rad, m].
+_TURN, _SHIFT = 0.15, 0.3
+_POSE_ROUNDS = tuple(Round(scale, 0.05) for scale in (0.15, 0.12, 0.10, 0.08, 0.06, 0.05, 0.04))
+_CAMERA_ROUNDS = tuple(Round(scale, 0.05) for scale in (0.4, 0.3, 0.2, 0.15, 0.1, 0.07, 0.05, 0.05))
+_CAMERA_STEPS = StepSettings(longest=2.0, damping=1e-6, even_damping=1e-9)
+_TOLD_APART = Round(0.05, 0.05)
+_ANGLE_DEVIATION = 0.5
+# A camera is at fault where leaving it out lowers the others' misfit to so little of what it was,
+# and nobody else's leaving does as much.
+_LOWERED = 0.8
+_ALIKE = 1.1
+# A surface is known to 2 cm, and an edge to a pixel: what is off by more is off [m, pixel].
+_LEAST_METRES, _LEAST_PIXELS = 0.035, 2.0
+# One motion explains a camera's silhouettes where they fit nearly as well as the others'.
+_EXPLAINED = 0.9
+
+
+@dataclass(frozen=True, eq=False)
+class FrameView:
+    """A frame: the cameras that see the person, their regions' edges, and about the pose.
+
+    Args:
+        edges: by camera.
+        values: (m,) of the pose tree.
+    """
+
+    edges: Mapping[str, EdgePoints]
+    values: Array
+
+
+@dataclass(frozen=True, eq=False)
+class CameraMotion:
+    """How a camera seems to have moved.
+
+    Args:
+        X_WC: (4, 4) where it would have to be.
+        shift: (2,) by how much the person is off in its pictures [pixel], right and down.
+        pixels: how far the person's joints are off in its pictures, root mean square [pixel].
+        metres: the same at the person's place [m].
+        turn: by how much the pictures are turned, clockwise [rad].
+        share_before, share_after: of the contours' lengths, what fits with the calibration, and
+            with the motion.
+    """
+
+    X_WC: Array
+    shift: Array
+    pixels: float
+    metres: float
+    turn: float
+    share_before: float
+    share_after: float
+
+
+def fit_without(
+    fit: ContourFit,
+    cameras: Mapping[str, Camera],
+    frame: FrameView,
+    left_out: str,
+    held: Mask | None = None,
+) -> tuple[Array, float]:
+    """A frame's pose (m,) by all cameras but one, and what share of their contours fits."""
+    names = [name for name in frame.edges if name != left_out]
+    angle = fit.kinematics.is_angle
+    information = np.where(angle, 1.0, 4.0) / _ANGLE_DEVIATION**2
+    found = fit.fit(
+        [cameras[name] for name in names],
+        [frame.edges[name] for name in names],
+        frame.values,
+        _POSE_ROUNDS,
+        Prior(frame.values, information),
+        held,
+    )
+    return found.values, found.share
+
+
+def camera_motion(
+    fit: ContourFit, camera: Camera, edges: Sequence[EdgePoints], poses: Sequence[Array]
+) -> CameraMotion:
+    """The motion of a camera that explains its silhouettes of given poses best.
+
+    Args:
+        fit: compares poses with regions.
+        camera: as calibrated.
+        edges: of its region in each frame.
+        poses: (m,) of the pose tree, for each frame; found without this camera.
+    """
+    places = np.array([fit.kinematics.poses(values)[:, :3, 3] for values in poses])
+    pairs = list(zip(edges, poses, strict=True))
+    found = []
+    for start in (np.zeros(3), _way_to_regions(camera, edges, places)):
+        moved = _moved_camera(fit, camera, pairs, places.reshape(-1, 3).mean(axis=0), start)
+        found.append(_describe(fit, camera, moved, pairs, places))
+        # What is far off may be drawn to the wrong side of the body; else one start is enough.
+        if found[0].share_after > _EXPLAINED:
+            break
+    return max(found, key=lambda one: one.share_after)
+
+
+def _way_to_regions(camera: Camera, edges: Sequence[EdgePoints], places: Array) -> Array:
+    """The mean way (3,) from the bodies' middles to the rays of their regions' middles [m]."""
+    ways = [np.zeros(3)]
+    for edge, own in zip(edges, places, strict=True):
+        if not len(edge.uv):
+            continue
+        middle = own.mean(axis=0)
+        origin, direction = viewing_rays(camera, edge.middle[None])
+        across = origin[0] - middle
+        ways.append(across - (across @ direction[0]) * direction[0])
+    return np.asarray(np.sum(ways, axis=0) / max(len(ways) - 1, 1))
+
+
+def _moved_camera(
+    fit: ContourFit,
+    camera: Camera,
+    pairs: Sequence[tuple[EdgePoints, Array]],
+    middle: Array,
+    start: Array,
+) -> Camera:
+    """A camera moved so that its regions fit the poses.
+
+    Seen from the camera, the bodies (about middle (3,)) move, at first by a shift start (3,) [m].
+    """
+    reach = float(np.linalg.norm(camera.X_WC[:3, 3] - middle))
+    names = [f"{camera.name}.{name}" for name in CAMERA_NAMES]
+    # What the pictures see of a turn about the camera is the person's way about it.
+    deviations = np.array([_TURN] * 3 + [_SHIFT + _TURN * reach] * 3)
+    unknowns = choose([*fit.body.names, *names], names[:6], shared=True, deviation=deviations)
+    frames = FramesFit(
+        fit.body, [camera], unknowns, pivot=middle, noise=fit.noise, steps=_CAMERA_STEPS
+    )
+    found = frames.fit(
+        [pack_evidence([edge]) for edge, _ in pairs],
+        np.array([values for _, values in pairs]),
+        np.zeros((len(pairs), 0)),
+        np.concatenate([np.zeros(3), camera.X_CW[:3, :3] @ start]),
+        _CAMERA_ROUNDS,
+        expected=(np.zeros((len(pairs), 0)), np.zeros(6)),
+    )
+    X_CW = CameraParameters([camera], middle).place(np.append(found.shared, 0.0))[0][0]
+    return camera.with_pose(np.linalg.inv(X_CW))
+
+
+def share_of(fit: ContourFit, camera: Camera, edge: EdgePoints, values: Array) -> float:
+    """What share of the contours' lengths fits in one picture."""
+    return fit.compare([camera], [edge], values, _TOLD_APART).share
+
+
+def _describe(
+    fit: ContourFit,
+    camera: Camera,
+    moved: Camera,
+    pairs: Sequence[tuple[EdgePoints, Array]],
+    places: Array,
+) -> CameraMotion:
+    """What a camera's motion does to its pictures."""
+    points = places.reshape(-1, 3)
+    before, _ = camera.project(points)
+    after, _ = moved.project(points)
+    off = after - before
+    shift = off.mean(axis=0)
+    pixels = float(np.sqrt((off**2).sum(axis=1).mean()))
+    middle = before.mean(axis=0)
+    arms, ends = before - middle, after - after.mean(axis=0)
+    turn = np.arctan2(
+        (arms[:, 0] * ends[:, 1] - arms[:, 1] * ends[:, 0]).sum(), (arms * ends).sum()
+    )
+    shares = [np.mean([share_of(fit, one, e, q) for e, q in pairs]) for one in (camera, moved)]
+    return CameraMotion(
+        moved.X_WC,
+        shift,
+        pixels,
+        pixels / pixels_per_metre(camera, points.mean(axis=0)),
+        float(turn),
+        float(shares[0]),
+        float(shares[1]),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class CameraFault:
+    """A camera that contradicts the others.
+
+    Args:
+        name: the camera.
+        motion: how it has moved; it may also have turned further than can be told.
+        is_explained: whether its having moved explains all: else its masks may be poor, mirrored,
+            or another camera's.
+        rivals: cameras that may be at fault in its stead: who it is, cannot be told.
+        others_share: of the other cameras' contours, what fits without it.
+    """
+
+    name: str
+    motion: CameraMotion
+    is_explained: bool
+    rivals: tuple[str, ...]
+    others_share: float
+
+    def with_motion(self, motion: CameraMotion) -> CameraFault:
+        """The fault with a motion that was measured anew."""
+        explained = motion.share_after > _EXPLAINED * self.others_share
+        return replace(self, motion=motion, is_explained=explained)
+
+
+def find_fault(
+    fit: ContourFit,
+    cameras: Mapping[str, Camera],
+    frames: Sequence[FrameView],
+    held: Mask | None = None,
+) -> CameraFault | None:
+    """The camera that contradicts the others most, if one does.
+
+    Args:
+        fit: compares poses with regions.
+        cameras: by name.
+        frames: some frames, of which those count that three cameras see or more.
+        held: (m,) which values of the pose tree stay, such as lengths.
+    """
+    frames = [frame for frame in frames if len(frame.edges) >= 3]
+    names = [name for name in cameras if any(name in frame.edges for frame in frames)]
+    with_all = [fit_without(fit, cameras, frame, "", held)[1] for frame in frames]
+    misfits, found = {}, {}
+    for name in names:
+        own = [frame for frame in frames if name in frame.edges]
+        together = np.mean([s for s, f in zip(with_all, frames, strict=True) if name in f.edges])
+        without = [fit_without(fit, cameras, frame, name, held) for frame in own]
+        motion = camera_motion(
+            fit,
+            cameras[name],
+            [frame.edges[name] for frame in own],
+            [values for values, _ in without],
+        )
+        share = float(np.mean([others for _, others in without]))
+        count = float(np.mean([len(frame.edges) for frame in own]))
+        best = ((count - 1.0) * share + max(motion.share_after, motion.share_before)) / count
+        misfits[name] = (1.0 - best) / max(1.0 - float(together), 1e-3)
+        found[name] = motion, share
+    suspects = sorted(misfits, key=lambda one: misfits[one])
+    if not suspects or misfits[suspects[0]] > _LOWERED:
+        return None
+    # Any two cameras agree more or less: two alone predict a third one's picture half as well, and
+    # of three nobody can tell which one contradicts the others.
+    few = len(names) <= 3
+    metres = (2.0 if few else 1.0) * _LEAST_METRES
+    # Of those that lower the misfit alike, one that has not moved is not at fault.
+    moved = [
+        one
+        for one in suspects
+        if misfits[one] <= _ALIKE * misfits[suspects[0]]
+        and found[one][0].metres >= metres
+        and found[one][0].pixels >= _LEAST_PIXELS
+    ]
+    if not moved:
+        return None
+    first = moved[0]
+    motion, share = found[first]
+    alike = np.inf if few else _ALIKE * misfits[first]
+    rivals = [
+        one
+        for one in suspects
+        if one != first and misfits[one] < alike and found[one][0].metres > _LEAST_METRES
+    ]
+    explained = not few and motion.share_after > _EXPLAINED * share
+    return CameraFault(first, motion, explained, tuple(rivals), share)
+
+
+def moved_since(before: Sequence[float], after: Sequence[float]) -> int:
+    """From which of some frames on a camera has moved; their count where in none.
+
+    Args:
+        before: in each frame, what share of the contours fits where the camera was calibrated.
+        after: and where it has moved to.
+    """
+    gain = np.asarray(after) - np.asarray(before)
+    # What speaks for the motion from each frame on, less what speaks for it before that.
+    later = np.concatenate([np.cumsum(gain[::-1])[::-1], [0.0]])
+    return int(np.argmax(2.0 * later - later[0]))

@@ -1,0 +1,280 @@
+"""A recording captured in spite of its faults: others in view, nobody in view, a moved camera.
+
+All masks are looked at once before the capture: where fewer than two cameras see anybody, no pose
+can be had, and others in view are cut out of the masks. After the capture each camera is compared
+with what the others say. One that contradicts them is left out, and all is captured once more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.camera.models import Camera
+from drake_pose.errors import CameraError, MaskError, SettingsError
+from drake_pose.fit.contour_fit import ContourFit
+from drake_pose.fit.evidence import EdgePoints, find_edge_points
+from drake_pose.person.recordings.camera_faults import (
+    CameraFault,
+    FrameView,
+    camera_motion,
+    find_fault,
+    fit_without,
+    moved_since,
+    share_of,
+)
+from drake_pose.person.recordings.person_capture import (
+    EDGE_POINTS,
+    PersonCapture,
+    PersonCaptureSettings,
+    ReadFrame,
+    capture_person,
+)
+from drake_pose.person.recordings.person_recording import PersonRecording, ViewFaults
+from drake_pose.person.recordings.rig_faults import RigFault, find_rig_fault
+from drake_pose.person.shape import shape_noise, shape_values
+from drake_pose.person.silhouette_tracker import SilhouetteTracker
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# Cameras are compared in this many frames.
+_COMPARED = 10
+# And carved out of their silhouettes in this many.
+_CARVED = 3
+# Pictures of which less fits than this share of the others' do not agree.
+_AGREES = 0.7
+# Nobody is seen as small or as tall [m], not even in part; else lengths are in another unit.
+_SMALLEST, _TALLEST = 0.1, 3.0
+# In more of the masks nobody fills the whole picture; it is the background that does.
+_INVERTED = 0.5
+# A person is followed by this many cameras or more after one was left out.
+_LEAST_LEFT = 3
+
+
+@dataclass(frozen=True, eq=False)
+class MovedCamera:
+    """A camera that contradicts the others.
+
+    Args:
+        fault: what is wrong with it.
+        first: the frame, counted from 0, from which on it is so.
+        is_left_out: whether it was left out from there on.
+    """
+
+    fault: CameraFault
+    first: int
+    is_left_out: bool
+
+
+@dataclass(frozen=True, eq=False)
+class CheckedCapture:
+    """A captured recording.
+
+    Args:
+        captured: the capture of all frames; nan where fewer than two cameras see the person.
+        views: what was in view or was not.
+        cameras: those that contradict the others.
+        rig: what the silhouettes say against the calibration as a whole, if no single camera
+            explains it; undone where it can be.
+        read: gives the masks that were used, by camera.
+    """
+
+    captured: PersonCapture
+    views: ViewFaults
+    cameras: tuple[MovedCamera, ...]
+    rig: RigFault | None
+    read: ReadFrame
+
+
+def capture_checked(
+    tree: PoseTree,
+    cameras: Mapping[str, Camera],
+    read: ReadFrame,
+    count: int,
+    settings: PersonCaptureSettings | None = None,
+    on_frame: Callable[[int], None] | None = None,
+) -> CheckedCapture:
+    """Captures a recording like `capture_person`, whose arguments it has, and finds its faults.
+
+    Raises:
+        CameraError: the person is as tall as nobody is.
+        MaskError: the masks show the background.
+        ModelError: the model has no landmarks of trunk, arms and legs.
+        SettingsError: there is no frame in which two cameras see a person.
+    """
+    settings = settings or PersonCaptureSettings()
+    recording = _record(cameras, read, count, settings.is_sequence)
+    rig = find_rig_fault(
+        cameras, [recording.read(k) for k in _spread_over(recording.seen, _CARVED)]
+    )
+    if rig is not None and (rig.mirrored or rig.exchanged):
+        undo = rig.undo
+        recording = _record(cameras, lambda k: undo(read(k)), count, settings.is_sequence)
+    found: list[MovedCamera] = []
+    while True:
+        # All frames are finished once only, as those hear of it who count them.
+        captured = _capture_seen(tree, cameras, recording, settings, None if found else on_frame)
+        judge = _Judge(tree, cameras, recording, captured)
+        found = [judge.dated(one) for one in found]
+        fault, first = judge.find()
+        if fault is None:
+            break
+        left = len(recording.cameras_at(first)) - 1
+        is_left_out = left >= _LEAST_LEFT and not fault.rivals
+        found.append(MovedCamera(fault, first, is_left_out))
+        if not is_left_out:
+            break
+        recording.leave_out(fault.name, first)
+    seen = recording.seen
+    if found and rig is not None and not (rig.mirrored or rig.exchanged):
+        rig = None
+    return CheckedCapture(
+        _spread(captured, seen, count), recording.faults(), tuple(found), rig, recording.read
+    )
+
+
+def _record(
+    cameras: Mapping[str, Camera], read: ReadFrame, count: int, is_sequence: bool
+) -> PersonRecording:
+    """A recording in which somebody is seen who may be a person."""
+    recording = PersonRecording(cameras, read, count, is_sequence)
+    if not recording.seen:
+        raise SettingsError(
+            f"in none of {count} frames two cameras see a person: give masks that show one"
+        )
+    if recording.covering > _INVERTED:
+        raise MaskError(
+            f"in {100.0 * recording.covering:.0f} % of the masks the largest figure reaches all "
+            "four sides of the picture: the person must be white before a black background"
+        )
+    if not _SMALLEST < recording.height < _TALLEST:
+        raise CameraError(
+            f"a person {recording.height:.3g} m tall by the cameras' calibration: X_WC must be in "
+            "metres and the camera's pose in the world, not its inverse; focal lengths in pixels"
+        )
+    return recording
+
+
+def _capture_seen(
+    tree: PoseTree,
+    cameras: Mapping[str, Camera],
+    recording: PersonRecording,
+    settings: PersonCaptureSettings,
+    on_frame: Callable[[int], None] | None,
+) -> PersonCapture:
+    """The capture of those frames alone in which two cameras see the person."""
+    seen = recording.seen
+    return capture_person(
+        tree,
+        cameras,
+        lambda index: recording.read(seen[index]),
+        len(seen),
+        settings,
+        on_frame,
+        [k for k in range(1, len(seen)) if seen[k] > seen[k - 1] + 1],
+    )
+
+
+def _spread_over(frames: Sequence[int], count: int) -> list[int]:
+    """This many frames of all, evenly."""
+    picked = np.linspace(0, len(frames) - 1, min(count, len(frames)))
+    return [frames[int(k)] for k in picked]
+
+
+class _Judge:
+    """Compares the cameras with each other by what was captured."""
+
+    def __init__(
+        self,
+        tree: PoseTree,
+        cameras: Mapping[str, Camera],
+        recording: PersonRecording,
+        captured: PersonCapture,
+    ) -> None:
+        self._cameras, self._recording = cameras, recording
+        self._held = shape_values(tree)
+        noise = None if captured.shape is None else shape_noise()
+        self._fit = ContourFit(tree, captured.outlines, noise)
+        tracker = SilhouetteTracker(self._fit, held=self._held)
+        poses = zip(recording.seen, captured.q, strict=True)
+        self._values = {k: tracker.values(q) for k, q in poses if np.isfinite(q).all()}
+
+    def find(self) -> tuple[CameraFault | None, int]:
+        """The camera that contradicts the others in all frames or in the last, and since when."""
+        picked = _spread_over(list(self._values), _COMPARED)
+        views = [self._view(frame) for frame in picked]
+        fault = find_fault(self._fit, self._cameras, views, self._held)
+        if fault is None or not fault.is_explained:
+            # A camera that moved in the middle is another one before and after that.
+            latest = find_fault(
+                self._fit, self._cameras, views[-(len(views) + 2) // 3 :], self._held
+            )
+            fault = latest or fault
+        if fault is None:
+            return None, 0
+        own = [k for k, view in enumerate(views) if fault.name in view.edges]
+        poses = [
+            fit_without(self._fit, self._cameras, views[k], fault.name, self._held)[0] for k in own
+        ]
+        since = self._since(fault, [views[k].edges[fault.name] for k in own], poses)
+        # Between two compared frames it may have moved at any time.
+        return fault, 0 if since == 0 else picked[own[min(since, len(own)) - 1]] + 1
+
+    def dated(self, moved: MovedCamera) -> MovedCamera:
+        """A camera that was left out, measured once more by what the others captured without it."""
+        name = moved.fault.name
+        edges, poses, frames = [], [], []
+        for frame, values in self._values.items():
+            mask = self._recording.read(frame, with_all=True).get(name)
+            if mask is not None:
+                edges.append(self._edge(name, mask))
+                poses.append(values)
+                frames.append(frame)
+        first = moved.first
+        # The first guess may be some frames too early, which blurs the motion.
+        for _ in range(2):
+            late = [k for k, frame in enumerate(frames) if frame >= first]
+            if not late:
+                return moved
+            motion = camera_motion(
+                self._fit, self._cameras[name], [edges[k] for k in late], [poses[k] for k in late]
+            )
+            fault = moved.fault.with_motion(motion)
+            first = frames[min(self._since(fault, edges, poses), len(frames) - 1)]
+        return replace(moved, fault=fault, first=first)
+
+    def _since(
+        self, fault: CameraFault, edges: Sequence[EdgePoints], poses: Sequence[Array]
+    ) -> int:
+        """Since which of some pictures a camera is at fault."""
+        camera = self._cameras[fault.name]
+        there = camera.with_pose(fault.motion.X_WC)
+        pairs = list(zip(edges, poses, strict=True))
+        before = [share_of(self._fit, camera, edge, values) for edge, values in pairs]
+        after = [share_of(self._fit, there, edge, values) for edge, values in pairs]
+        least = _AGREES * fault.others_share
+        return moved_since(before, [max(one, least) for one in after])
+
+    def _view(self, frame: int) -> FrameView:
+        masks = self._recording.read(frame)
+        edges = {name: self._edge(name, mask) for name, mask in masks.items()}
+        return FrameView(edges, self._values[frame])
+
+    def _edge(self, name: str, mask: Mask) -> EdgePoints:
+        spacing = max(2.0, self._cameras[name].height / EDGE_POINTS)
+        return find_edge_points(mask, spacing)
+
+
+def _spread(captured: PersonCapture, seen: Sequence[int], count: int) -> PersonCapture:
+    """A capture of some frames as one of all: nan, and a share of 0, in the others."""
+    if len(seen) == count:
+        return captured
+    q = np.full((count, captured.q.shape[1]), np.nan)
+    deviations, shares = q.copy(), np.zeros(count)
+    q[seen], deviations[seen], shares[seen] = captured.q, captured.deviations, captured.shares
+    return replace(captured, q=q, shares=shares, deviations=deviations)

@@ -1,0 +1,253 @@
+"""Connected figures of masks, and the persons that they belong to: where figures of views meet."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.camera.models import Camera, ParallelCamera
+from drake_pose.person.rays import meeting_of_all, nearest_points, viewing_rays
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# So fine [pixels of the shorter side] figures are told apart.
+_RASTER = 240
+# A figure of less than this share of the picture's largest is a speck, or a part of another.
+_SPECK = 0.05
+# Nobody is as small as this many pixels, or this share of the picture.
+_LEAST_PIXELS, _LEAST_SHARE = 16.0, 2e-4
+# Middles of one person's silhouettes lie no farther apart, other persons stand farther off [m].
+_WITHIN = 0.35
+_APART = 0.5
+# What speaks for a place: a figure around it whose middle it is, one that covers it, none there.
+_FITS, _COVERS, _MISSES = 1.0, 0.4, -1.0
+# Another person's silhouettes are no smaller than this share of the first's.
+_LEAST_AREA = 0.25
+# How many of the best places are looked at more closely.
+_LOOKED_AT = 8
+
+
+class Figure(NamedTuple):
+    """A connected part of a mask.
+
+    Attributes:
+        middle: (2,) [pixel].
+        area: [pixel^2].
+        box: (4,) left, top, right, bottom [pixel].
+    """
+
+    middle: Array
+    area: float
+    box: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Person:
+    """Somebody whom two cameras see or more.
+
+    Args:
+        place: (3,) the middle of the body [m].
+        figures: by the camera's index, the index of the figure of nobody else.
+        area: of the middle one of these figures, of two the smaller one [pixel^2].
+    """
+
+    place: Array
+    figures: dict[int, int] = field(default_factory=dict)
+    area: float = 0.0
+
+
+def find_figures(mask: Mask) -> tuple[Figure, ...]:
+    """The figures of a mask (H, W), the largest first; specks are left out."""
+    step = _step(mask)
+    small = _small(mask, step)
+    left, top, width, height = cv2.boundingRect(small)
+    if not width:
+        return ()
+    # Most of a picture is empty, and to label that takes as long.
+    inner = np.ascontiguousarray(small[top : top + height, left : left + width])
+    _, _, boxes, middles = cv2.connectedComponentsWithStats(inner)
+    corner = np.array([left, top], dtype=np.float64)
+    found = [
+        Figure(
+            step * (corner + middle),
+            float(step * step * box[cv2.CC_STAT_AREA]),
+            step * np.concatenate([corner + box[:2], corner + box[:2] + box[2:4]]),
+        )
+        for middle, box in zip(middles[1:], boxes[1:], strict=True)
+    ]
+    found.sort(key=lambda one: -one.area)
+    least = max(_LEAST_PIXELS, _LEAST_SHARE * mask.size)
+    return tuple(one for one in found if one.area > max(least, _SPECK * found[0].area))
+
+
+def cut_figures(mask: Mask, unwanted: Sequence[Figure]) -> Mask:
+    """A mask (H, W) without some of its figures."""
+    step = _step(mask)
+    count, labels, _, middles = cv2.connectedComponentsWithStats(_small(mask, step))
+    middles = step * middles
+    gone = np.zeros(count, dtype=np.uint8)
+    for figure in unwanted:
+        gone[1 + int(np.argmin(np.linalg.norm(middles[1:] - figure.middle, axis=1)))] = 1
+    # What the raster left out of a figure lies within one step of it.
+    small = gone[labels]
+    if step > 1:
+        small = cv2.dilate(small, np.ones((3, 3), np.uint8))
+    height, width = mask.shape
+    large = np.repeat(np.repeat(small, step, axis=0), step, axis=1)[:height, :width]
+    return np.asarray(mask & (large == 0))
+
+
+def find_persons(
+    cameras: Sequence[Camera], figures: Sequence[Sequence[Figure]]
+) -> tuple[Person, ...]:
+    """The persons whom two cameras or more see, the best supported first.
+
+    Args:
+        cameras: the cameras.
+        figures: of each camera's mask.
+    """
+    if all(len(own) <= 1 for own in figures):
+        seers = [k for k, own in enumerate(figures) if own]
+        if len(seers) < 2:
+            return ()
+        place = meeting_of_all([cameras[k] for k in seers], [figures[k][0].middle for k in seers])
+        offs = [metres_off(cameras[k], figures[k][0].middle, place[None])[0] for k in seers]
+        if max(offs) < _WITHIN:
+            return (_person(place, dict.fromkeys(seers, 0), figures),)
+    free = [set(range(len(own))) for own in figures]
+    persons: list[Person] = []
+    while True:
+        best = _best_person(cameras, figures, free)
+        if best is None or (persons and not _is_other(best, persons)):
+            return tuple(persons)
+        persons.append(best)
+        for camera, index in best.figures.items():
+            free[camera].discard(index)
+
+
+def _person(place: Array, taken: dict[int, int], figures: Sequence[Sequence[Figure]]) -> Person:
+    areas = sorted(figures[k][i].area for k, i in taken.items())
+    return Person(place, taken, areas[(len(areas) - 1) // 2])
+
+
+def _best_person(
+    cameras: Sequence[Camera], figures: Sequence[Sequence[Figure]], free: Sequence[set[int]]
+) -> Person | None:
+    """The best supported place of which two cameras have a figure that is still free."""
+    places = _candidates(cameras, figures, free)
+    if not len(places):
+        return None
+    scores, _ = _support(cameras, figures, free, places)
+    best: tuple[float, float, Person] | None = None
+    for place in places[np.argsort(-scores)[:_LOOKED_AT]]:
+        for _ in range(2):
+            score, nearest = _support(cameras, figures, free, place[None])
+            taken = {k: int(i) for k, i in enumerate(nearest[0]) if i >= 0}
+            if len(taken) < 2:
+                break
+            used = [figures[k][i].middle for k, i in taken.items()]
+            place = meeting_of_all([cameras[k] for k in taken], used)
+        if len(taken) < 2:
+            continue
+        person = _person(place, taken, figures)
+        if best is None or (float(score[0]), person.area) > best[:2]:
+            best = float(score[0]), person.area, person
+    return None if best is None else best[2]
+
+
+def _candidates(
+    cameras: Sequence[Camera], figures: Sequence[Sequence[Figure]], free: Sequence[set[int]]
+) -> Array:
+    """Where rays (n, 3) of the middles of two views' figures meet, of which one is free [m]."""
+    rays = [
+        viewing_rays(camera, np.array([figure.middle for figure in own]).reshape(-1, 2))
+        for camera, own in zip(cameras, figures, strict=True)
+    ]
+    sides: list[list[Array]] = [[], [], [], []]
+    for a, b in combinations(range(len(cameras)), 2):
+        pairs = [
+            (i, j)
+            for i in range(len(figures[a]))
+            for j in range(len(figures[b]))
+            if i in free[a] or j in free[b]
+        ]
+        if pairs:
+            i, j = np.array(pairs).T
+            ends = rays[a][0][i], rays[a][1][i], rays[b][0][j], rays[b][1][j]
+            for side, end in zip(sides, ends, strict=True):
+                side.append(end)
+    if not sides[0]:
+        return np.empty((0, 3))
+    points, distance, usable = nearest_points(*(np.concatenate(side) for side in sides))
+    return points[usable & (distance < 2.0 * _WITHIN)]
+
+
+def _support(
+    cameras: Sequence[Camera],
+    figures: Sequence[Sequence[Figure]],
+    free: Sequence[set[int]],
+    places: Array,
+) -> tuple[Array, NDArray[np.int64]]:
+    """What speaks (n,) for somebody at places (n, 3), and by camera (n, m) the figure, or -1."""
+    scores = np.zeros(len(places))
+    taken = np.full((len(places), len(cameras)), -1)
+    for k, (camera, own) in enumerate(zip(cameras, figures, strict=True)):
+        uv, depth = camera.project(places)
+        with np.errstate(invalid="ignore"):
+            seen = (depth > 0.0) & (uv >= 0.0).all(axis=1)
+            seen &= (uv < [camera.width, camera.height]).all(axis=1)
+        if not own:
+            scores += _MISSES * seen
+            continue
+        offs = np.array([metres_off(camera, figure.middle, places) for figure in own])
+        offs[[i for i in range(len(own)) if i not in free[k]]] = np.inf
+        nearest = offs.argmin(axis=0)
+        off = offs.min(axis=0)
+        boxes = np.array([figure.box for figure in own])
+        with np.errstate(invalid="ignore"):
+            within = (uv[:, None] >= boxes[:, :2]) & (uv[:, None] <= boxes[:, 2:])
+        covered = np.any(np.all(within, axis=2), axis=1)
+        fits = seen & (off < _WITHIN)
+        taken[:, k] = np.where(fits, nearest, -1)
+        points = np.where(covered, _COVERS, _MISSES)
+        points[fits] = _FITS - 0.5 * off[fits] / _WITHIN
+        scores += points * seen
+    return scores, taken
+
+
+def _is_other(person: Person, persons: Sequence[Person]) -> bool:
+    """Whether somebody stands apart from all others, and is no part of them."""
+    if person.area < _LEAST_AREA * max(one.area for one in persons):
+        return False
+    return all(np.linalg.norm((person.place - one.place)[:2]) > _APART for one in persons)
+
+
+def pixels_per_metre(camera: Camera, place: Array) -> float:
+    """How large a metre is in a picture at a place (3,), however far to the side [pixel/m]."""
+    if isinstance(camera, ParallelCamera):
+        return camera.pixels_per_metre
+    depth = abs(float(camera.X_CW[2, :3] @ place + camera.X_CW[2, 3]))
+    return camera.focal_y / max(depth, camera.near)
+
+
+def metres_off(camera: Camera, uv: Array, places: Array) -> Array:
+    """How far (n,) the ray of a pixel (2,) passes by places (n, 3) [m]."""
+    origin, direction = viewing_rays(camera, uv[None])
+    across = places - origin
+    along = across @ direction[0]
+    return np.asarray(np.linalg.norm(across - along[:, None] * direction, axis=1))
+
+
+def _step(mask: Mask) -> int:
+    return max(1, min(mask.shape) // _RASTER)
+
+
+def _small(mask: Mask, step: int) -> NDArray[np.uint8]:
+    return np.ascontiguousarray(mask[::step, ::step]).view(np.uint8)

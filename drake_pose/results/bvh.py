@@ -1,0 +1,220 @@
+"""BVH files: a skeleton and its motion, for animation programs.
+
+A joint of the file is a link of the model that is seen, or on which several such links hang; links
+between them that only pass a motion on are left out, and so is the far half of a limb whose length
+is a joint of the model and stays the same all the time. At rest, with all rotations zero, the
+skeleton stands as the model does at its default positions, with the lengths that were captured.
+
+Offsets are in centimetres and rotations in degrees, Z, X, Y in this order; y is up, as the
+format's readers expect: x forward, y left, z up becomes x forward, y up, z right, as in the TRC
+file. The root has position channels. So has a part whose place in the part before it changes in
+time: its offset is zero then, so that readers that add the offset and those that replace it agree.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.multibody.tree import PrismaticJoint
+from scipy.spatial.transform import Rotation
+
+from drake_pose.body.model import ArticulatedModel
+from drake_pose.body.tree.link_graph import PlantKinematics
+from drake_pose.errors import SettingsError
+
+Array = NDArray[np.float64]
+
+# Turns the scene's world, z up, into that of the file, y up; nothing is mirrored.
+R_YW = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+_CENTIMETRES = 100.0
+# A part stays where it is in the part before it if it moves by less [m].
+_STAYS = 1e-5
+# How a link hangs on the one before it: by nothing that moves, by a length that stays, or else.
+_WELD, _LENGTH, _MOTION = "weld", "length", "motion"
+_POSITIONS = ("Xposition", "Yposition", "Zposition")
+_ROTATIONS = ("Zrotation", "Xrotation", "Yrotation")
+
+
+@dataclass(frozen=True, eq=False)
+class SkeletonJoint:
+    """A joint of the file.
+
+    Args:
+        link: the plant's link whose origin it is; "world" where several parts stand in the world.
+        parent: index of the joint before it; -1 for the root.
+    """
+
+    link: str
+    parent: int
+
+
+def skeleton_of(model: ArticulatedModel, q: Array) -> tuple[SkeletonJoint, ...]:
+    """The joints, parents before children.
+
+    Args:
+        model: the model.
+        q: (frames, nq) positions [rad or m], which tell the lengths that stay the same.
+    """
+    names, children = model.link_names, _children(model, q)
+    branches = [0] * len(names)
+
+    def count_branches(body: int) -> bool:
+        branches[body] = sum([count_branches(child) for child, _ in children[body]])
+        return branches[body] > 0 or names[body] in model.link_meshes
+
+    count_branches(0)
+    found: list[SkeletonJoint] = []
+
+    def walk(body: int, parent: int, steps: tuple[str, ...]) -> None:
+        is_half = parent >= 0 and branches[body] > 0 and _LENGTH in steps and _MOTION not in steps
+        if (names[body] in model.link_meshes or branches[body] > 1) and not is_half:
+            found.append(SkeletonJoint(names[body], parent))
+            parent, steps = len(found) - 1, ()
+        for child, step in children[body]:
+            walk(child, parent, (*steps, step))
+
+    walk(0, -1, ())
+    return tuple(found)
+
+
+def _children(model: ArticulatedModel, q: Array) -> list[list[tuple[int, str]]]:
+    """By body: the bodies that hang on it, and by what kind of joint."""
+    plant = model.plant
+    children: list[list[tuple[int, str]]] = [[] for _ in range(plant.num_bodies())]
+    for index in plant.GetJointIndices():
+        joint, step = plant.get_joint(index), _WELD
+        if joint.num_positions():
+            step = _MOTION
+            if joint.type_name() == PrismaticJoint.kTypeName:
+                stays = np.ptp(q[:, joint.position_start()]) < _STAYS
+                step = _LENGTH if stays else _MOTION
+        children[int(joint.parent_body().index())].append((int(joint.child_body().index()), step))
+    return children
+
+
+def motion_as_bvh(
+    model: ArticulatedModel, q: Array, X_WB: Array | None, rate_hz: float
+) -> tuple[str, int]:
+    """A BVH file of a motion.
+
+    Args:
+        model: the model.
+        q: (frames, nq) positions [rad or m]; a frame of nan has no pose, and is filled by the last
+            one known before it, or by the first one known.
+        X_WB: (frames, 4, 4) poses of the plant's world in the scene's; None: the same world.
+        rate_hz: frames a second.
+
+    Returns:
+        The text, and how many frames were filled.
+
+    Raises:
+        SettingsError: no frame has a pose.
+    """
+    known = np.flatnonzero(np.isfinite(q).all(axis=1))
+    if not len(known):
+        raise SettingsError("a BVH file needs a frame with a pose; none has one")
+    skeleton = skeleton_of(model, q[known])
+    X_YL, X_Y0 = _link_poses(model, skeleton, q[known], None if X_WB is None else X_WB[known])
+    # What turns a joint's own axes into its link's is what its link shows at rest.
+    R_YJ = X_YL[..., :3, :3] @ np.swapaxes(X_Y0[:, :3, :3], 1, 2)
+    p_PJ = np.empty((len(known), len(skeleton), 3))
+    R_PJ = np.empty((len(known), len(skeleton), 3, 3))
+    for k, joint in enumerate(skeleton):
+        if joint.parent < 0:
+            p_PJ[:, k], R_PJ[:, k] = X_YL[:, k, :3, 3], R_YJ[:, k]
+            continue
+        R_JY = np.swapaxes(R_YJ[:, joint.parent], 1, 2)
+        step = X_YL[:, k, :3, 3] - X_YL[:, joint.parent, :3, 3]
+        p_PJ[:, k], R_PJ[:, k] = (R_JY @ step[..., None])[..., 0], R_JY @ R_YJ[:, k]
+    offsets = p_PJ.mean(axis=0)
+    slides = np.abs(p_PJ - offsets).max(axis=(0, 2)) > _STAYS
+    slides[0] = True
+    offsets[slides] = 0.0
+    columns = []
+    for k in range(len(skeleton)):
+        if slides[k]:
+            columns.append(_CENTIMETRES * p_PJ[:, k])
+        columns.append(_smooth_angles(R_PJ[:, k]))
+    rows = np.hstack(columns)
+    # The last known frame at or before each; the first known for those before it.
+    source = np.maximum(np.searchsorted(known, np.arange(len(q)), side="right") - 1, 0)
+    text = [
+        "HIERARCHY",
+        *_hierarchy(skeleton, offsets, slides, _tips(model, skeleton, X_Y0)),
+        "MOTION",
+        f"Frames: {len(q)}",
+        f"Frame Time: {1.0 / rate_hz:.8f}",
+        *(" ".join(f"{number:.6f}" for number in rows[k]) for k in source),
+    ]
+    return "\n".join(text) + "\n", len(q) - len(known)
+
+
+def _link_poses(
+    model: ArticulatedModel, skeleton: Sequence[SkeletonJoint], q: Array, X_WB: Array | None
+) -> tuple[Array, Array]:
+    """The joints' links in the file's world: (frames, n, 4, 4), and (n, 4, 4) at the defaults."""
+    kinematics = PlantKinematics(model)
+    bodies = [model.link_index(joint.link) for joint in skeleton]
+    X_YW = np.eye(4)
+    X_YW[:3, :3] = R_YW
+    X_BL = np.array([[kinematics.pose_at(body, row) for body in bodies] for row in q])
+    X_YB = X_YW if X_WB is None else (X_YW @ X_WB)[:, None]
+    return X_YB @ X_BL, X_YW @ np.array([kinematics.pose(body) for body in bodies])
+
+
+def _smooth_angles(R: Array) -> Array:
+    """(n, 3) rotations about Z, X, Y [deg] without jumps, of rotation matrices (n, 3, 3)."""
+    with warnings.catch_warnings():
+        # At 90 degrees about X one of the others is free: any choice is right.
+        warnings.filterwarnings("ignore", message="Gimbal lock", category=UserWarning)
+        angles = Rotation.from_matrix(R).as_euler("ZXY", degrees=True)
+    for k in range(1, len(angles)):
+        z, x, y = angles[k]
+        ways = np.array([(z, x, y), (z + 180.0, 180.0 - x, y + 180.0)])
+        ways -= 360.0 * np.round((ways - angles[k - 1]) / 360.0)
+        angles[k] = ways[np.argmin(np.abs(ways - angles[k - 1]).sum(axis=1))]
+    return np.asarray(angles)
+
+
+def _tips(model: ArticulatedModel, skeleton: Sequence[SkeletonJoint], X_Y0: Array) -> Array:
+    """(n, 3) the farthest point of each joint's link, along the file's axes at rest [m]."""
+    tips = np.zeros((len(skeleton), 3))
+    for k, joint in enumerate(skeleton):
+        mesh = model.link_meshes.get(joint.link)
+        if mesh is not None:
+            farthest = np.argmax(np.linalg.norm(mesh.vertices, axis=1))
+            tips[k] = X_Y0[k, :3, :3] @ mesh.vertices[farthest]
+    return tips
+
+
+def _hierarchy(
+    skeleton: Sequence[SkeletonJoint], offsets: Array, slides: NDArray[np.bool_], tips: Array
+) -> list[str]:
+    """The lines of the hierarchy."""
+    lines: list[str] = []
+
+    def write(k: int, depth: int) -> None:
+        name = "".join("_" if c.isspace() or c in "{}" else c for c in skeleton[k].link)
+        channels = (*(_POSITIONS if slides[k] else ()), *_ROTATIONS)
+        lines.append("\t" * depth + f"{'JOINT' if depth else 'ROOT'} {name}")
+        lines.append("\t" * depth + "{")
+        lines.append("\t" * (depth + 1) + _offset(offsets[k]))
+        lines.append("\t" * (depth + 1) + " ".join(["CHANNELS", str(len(channels)), *channels]))
+        below = [n for n, joint in enumerate(skeleton) if joint.parent == k]
+        for n in below:
+            write(n, depth + 1)
+        if not below:
+            ends = ("End Site", "{", "\t" + _offset(tips[k]), "}")
+            lines.extend("\t" * (depth + 1) + line for line in ends)
+        lines.append("\t" * depth + "}")
+
+    write(0, 0)
+    return lines
+
+
+def _offset(place: Array) -> str:
+    return " ".join(["OFFSET", *(f"{_CENTIMETRES * number:.6f}" for number in place)])

@@ -1,0 +1,267 @@
+"""Multi-start search: from silhouettes, also damaged or ill fitting, to continuous positions.
+
+A body that is the object itself, in a pose of the grid, is found by the exact stages of the beam
+search, and J = 0 ends the search. Else poses that are roughly right are found by places
+(``rough_search``), drawn to the silhouettes' edges by saturating costs (``fit``), and about
+the best of them other explanations are sought: a limb searched again, joints that turn against each
+other (``self_motions``).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.errors import SettingsError
+from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.surfaces import few_triangles
+from drake_pose.search.continuous.equivalent_poses import RobustFamilies
+from drake_pose.search.continuous.mask_noise import without_specks
+from drake_pose.search.continuous.multi_start_settings import (
+    FROM_AFAR,
+    HALFWAY,
+    IN_THE_END,
+    MultiStartSettings,
+)
+from drake_pose.search.continuous.views_fit import (
+    FittedPose,
+    ViewsFit,
+    distinct,
+    refine_best,
+)
+from drake_pose.search.grid.beam.search import BeamSearch
+from drake_pose.search.grid.families.examination import examine
+from drake_pose.search.grid.sampled_body import SampledBody
+from drake_pose.search.pose_families import PoseSet
+from drake_pose.search.result import MatchResult, View
+from drake_pose.search.scoring import Scoring
+from drake_pose.search.starts.coarse_search import CoarsePoses, CoarseSearch
+from drake_pose.search.starts.self_motions import counter_turns, flips
+from drake_pose.silhouette.areas.scoring import score_bodies
+
+
+class MultiStartSearch:
+    """Matches silhouettes with a pose tree at continuous values.
+
+    Args:
+        tree: the pose tree.
+        settings: the parameters.
+    """
+
+    def __init__(self, tree: PoseTree, settings: MultiStartSettings | None = None) -> None:
+        self.tree = tree
+        self.settings = settings or MultiStartSettings()
+        beam = self.settings.beam
+        self._grid_search = BeamSearch(tree, beam, self.settings.examination)
+        self.sampled = self._grid_search.sampled
+        if self.settings.continuous:
+            coarse = self.settings.coarse
+            self._body = SampledBody(
+                tree,
+                replace(
+                    beam,
+                    interval=coarse.interval,
+                    length_interval=coarse.length_interval,
+                    intervals={},
+                ),
+            )
+            self._outlines = few_triangles(self.sampled.surfaces)
+            self._kinematics = TreeKinematics(tree)
+
+    def without_alternatives(self) -> MultiStartSearch:
+        """The same search where only E_total is wanted: one round, and no set of poses."""
+        settings = replace(self.settings, rounds=0, families=None, examination=None)
+        return MultiStartSearch(self.tree, settings)
+
+    def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> MatchResult:
+        """Estimate the pose that the views show.
+
+        Args:
+            views: one or several silhouettes of the same instant.
+            root_position: (3,), the root's known position in the world [m], where it is not the
+                pose tree's own.
+
+        Returns:
+            The best pose found. ``stopped_by`` is "exact" if J = 0, "end" if all was tried, or
+            "time_limit".
+
+        Raises:
+            SettingsError: if there is no view.
+        """
+        if not views:
+            raise SettingsError("a match needs at least one view, but none was given")
+        if not self.settings.continuous:
+            return self._grid_search.match(views, root_position)
+        start = time.perf_counter()
+        clean = [View(view.camera, without_specks(view.mask)) for view in views]
+        if all(np.array_equal(one.mask, view.mask) for one, view in zip(clean, views, strict=True)):
+            exact = self._grid_search.match_exactly(views, root_position)
+            if exact is not None:
+                if self.settings.examination is None:
+                    return exact
+                body, settings = self._grid_search.body, self.settings.examination
+                return examine(body, views, exact, settings, root_position)
+        result = self._run(clean, root_position, start).result(views)
+        return replace(result, seconds=time.perf_counter() - start)
+
+    def _run(
+        self, views: Sequence[View], root_position: np.ndarray | None, start: float
+    ) -> _MultiStartRun:
+        body, kinematics = self._body, self._kinematics
+        if root_position is not None:
+            body = body.with_root_position(root_position)
+            kinematics = TreeKinematics(body.sampled.tree)
+        limit = self.settings.beam.time_limit
+        deadline = np.inf if limit is None else start + limit
+        fit = ViewsFit(kinematics, self._outlines, views)
+        run = _MultiStartRun(body, kinematics, fit, views, deadline)
+        run.search(self.settings)
+        return run
+
+
+class _MultiStartRun:
+    """One match of a body, sampled roughly, with silhouettes, until a deadline."""
+
+    def __init__(
+        self,
+        body: SampledBody,
+        kinematics: TreeKinematics,
+        fit: ViewsFit,
+        views: Sequence[View],
+        deadline: float,
+    ) -> None:
+        self.body = body
+        self.kinematics = kinematics
+        self.fit = fit
+        self.poses: list[FittedPose] = []
+        self.first: FittedPose | None = None
+        self.stopped_by = "end"
+        self._views = views
+        self._deadline = deadline
+        self._families: RobustFamilies | None = None
+
+    def search(self, settings: MultiStartSettings) -> None:
+        """Find coarse poses, refine them, seek other explanations, and refine to the end."""
+        coarse_settings = settings.coarse
+        if not self._proceed():
+            coarse_settings = replace(coarse_settings, hypotheses=1)
+        search = CoarseSearch(self.body, self._views, coarse_settings)
+        starts = search.choose_distinct(search.find(), settings.starts, settings.apart)
+        pool = refine_best(
+            self.fit,
+            self._values(starts),
+            [(FROM_AFAR, settings.survivors), (HALFWAY, settings.survivors)],
+            self._proceed,
+        )
+        self.first = pool[0]
+        done: list[np.ndarray] = []
+        for _ in range(settings.rounds):
+            found = []
+            for pose in pool[: settings.sought_about]:
+                if any(pose.values is values for values in done) or not self._proceed():
+                    continue
+                done.append(pose.values)
+                found += self._others(search, pose.values, settings)
+            pool = distinct([*pool, *found], settings.survivors, self.kinematics.turns_around)
+        refined = refine_best(
+            self.fit,
+            [pose.values for pose in pool[: settings.finalists]],
+            [(IN_THE_END, settings.finalists)],
+            self._proceed,
+        )
+        turned = [self.kinematics.nearest_turns(pose.values) for pose in refined]
+        self.poses = [
+            replace(pose, values=values) for pose, values in zip(refined, turned, strict=True)
+        ]
+        if settings.families is not None:
+            self._families = RobustFamilies(self.fit, settings.families, self._proceed)
+
+    def _proceed(self) -> bool:
+        if time.perf_counter() < self._deadline:
+            return True
+        self.stopped_by = "time_limit"
+        return False
+
+    def _others(
+        self, search: CoarseSearch, values: np.ndarray, settings: MultiStartSettings
+    ) -> list[FittedPose]:
+        """Other explanations near a pose, refined."""
+        kinematics, interval = self.kinematics, settings.coarse.interval
+        flipped = [flip.values for flip in flips(kinematics, values)]
+        tried = counter_turns(kinematics, values, interval)
+        X_WN = kinematics.poses(values)
+        for nodes in self._limbs():
+            found = search.find_again(X_WN, nodes)
+            best = search.choose_distinct(found, settings.tried, settings.apart)
+            tried += self._values(best, values)
+        look = Round(HALFWAY[0].scale, FROM_AFAR[0].spacing)
+        best_looks = []
+        for group, count in ((flipped, settings.flipped), (tried, settings.tried)):
+            looks = [FittedPose(one, self.fit.cost(one, look)) for one in group]
+            best_looks += distinct(looks, count, kinematics.turns_around, 0.5 * interval)
+        return [self.fit.refine(look.values, HALFWAY) for look in best_looks if self._proceed()]
+
+    def _limbs(self) -> list[list[int]]:
+        """The subtrees of no more than half of the nodes."""
+        nodes = self.body.sampled.tree.nodes
+        subtrees: list[list[int]] = [[] for _ in nodes]
+        for i in reversed(range(len(nodes))):
+            subtrees[i] = [i, *(j for child in nodes[i].children for j in subtrees[child])]
+        return [tree for tree in subtrees if 2 * len(tree) <= len(nodes)]
+
+    def _values(self, coarse: CoarsePoses, values: np.ndarray | None = None) -> list[np.ndarray]:
+        """All values (m,) of coarse poses; those of nodes not searched are taken from values."""
+        grids = self.body.sampled.values
+        base = np.zeros(len(self.kinematics.names)) if values is None else values
+        found = []
+        for samples in coarse.samples:
+            parts = list(self.kinematics.split(base.copy()))
+            for node, sample in enumerate(samples):
+                if sample >= 0:
+                    parts[node] = grids[node][sample]
+            found.append(self.kinematics.flatten(parts))
+        return found
+
+    def _pose_set(self, scoring: Scoring) -> PoseSet | None:
+        if self._families is None:
+            return None
+        return self._families.find(self.poses, lambda values: self._J(scoring, values))
+
+    def _J(self, scoring: Scoring, values: np.ndarray) -> float:
+        """The objective (1) at values (m,), skin included [pixel]."""
+        outlines = self.body.sampled.surfaces.at(self.kinematics.split(values))
+        X_WN = self.kinematics.poses(values)
+        total = scoring.silhouette_area
+        for view, prefixes in zip(scoring.views, scoring.silhouette_prefixes, strict=True):
+            areas = score_bodies(outlines, (view.camera.X_CW @ X_WN)[None], view.camera, prefixes)
+            total += float(areas[0, 0] - 2 * areas[0, 1])
+        return total
+
+    def result(self, views: Sequence[View]) -> MatchResult:
+        """What the search found, judged by silhouettes as they were given."""
+        scoring = Scoring(self.body.sampled, views)
+        best, area = self.poses[0], scoring.silhouette_area
+        node_values = tuple(self.kinematics.split(best.values))
+        q, X_WB = self.body.sampled.tree.positions_from(node_values)
+        J = self._J(scoring, best.values)
+        first = J if self.first is None else self._J(scoring, self.first.values)
+        return MatchResult(
+            found=True,
+            q=q,
+            X_WB=X_WB,
+            node_values=node_values,
+            J=J,
+            E_total=J / area,
+            first_E_total=first / area,
+            runs=self.fit.evaluations,
+            outside_limit=(),
+            untried={},
+            stopped_by=self.stopped_by,
+            seconds=0.0,
+            pose_set=self._pose_set(scoring),
+        )

@@ -1,0 +1,366 @@
+"""The beam search where nobody knows where the root is, nor the scale of a parallel camera.
+
+The root's samples are the product of its rotations and of positions all over the silhouettes. For
+every scale or depth a beam of hypotheses is grown of which no root position may keep more than its
+quota: what covers most at first is not what fits best at last. Whole poses compare fairly whatever
+their scale. The best are refined with the root free; where the roots of the best of these are, the
+beam search is run as with a known root; and in what comes of that what still fits badly is placed
+anew.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.camera.models import ParallelCamera
+from drake_pose.errors import SettingsError
+from drake_pose.search.grid.beam.hypotheses import Beam, Hypotheses
+from drake_pose.search.grid.beam.search import BeamSearch
+from drake_pose.search.grid.node_poses import Pictures, PoseStore, coarsen
+from drake_pose.search.grid.settings import BeamSearchSettings, Stage
+from drake_pose.search.raster_fit.body import RefinementBody
+from drake_pose.search.raster_fit.passes import COARSE_PASSES, FINE_PASSES, Pass, descend
+from drake_pose.search.raster_fit.problem import RefinementProblem
+from drake_pose.search.result import PlacedMatch, View
+from drake_pose.search.starts.neighbourhood import NeighbourhoodSearch
+from drake_pose.search.starts.part_placement import PartSearch
+from drake_pose.search.starts.root_placement import (
+    Layer,
+    PlacementSettings,
+    choose_root_samples,
+    find_layers,
+    place_body,
+    scale_camera,
+    slide_root,
+    whereabouts,
+)
+from drake_pose.silhouette.areas.outline import outline_from_mesh
+from drake_pose.silhouette.areas.scoring import prefix_sums, score_bodies
+
+# What may lie outside, as in the beam search's tolerant stages; the root is off by half a step.
+_OUTSIDE_SHARE, _OUTSIDE_WEIGHT = 0.6, 2
+# The silhouettes are looked at with about this many pixels.
+_PIXELS = 1500
+# How many times the width are kept of the root alone.
+_ROOT_FACTOR = 4
+# How many times a position's quota of the root's rotations are grown at it.
+_ROOT_SPARE = 2
+# How many times the width are grown, before the quota.
+_SPARE = 8
+# The search about a root that has been found, and which of its poses differ (best_poses).
+_STAGES, _ALIKE = (Stage(60, 1.0, 2),), 0.5
+# The share of the silhouettes' area that may be wrong in a pose that is not searched on.
+_ENOUGH = 0.004
+# Parameters of the refinement after the tree's values.
+_TRANSLATION, _GROWTH = (0, 1, 2), (3,)
+
+
+@dataclass(frozen=True, eq=False)
+class _Placed:
+    """A pose somewhere.
+
+    Attributes:
+        views: the silhouettes, their camera scaled.
+        scale: of the camera, times what it was given as.
+        parameters: of the refinement; the body has its own size.
+        J: the objective (1) [pixel].
+    """
+
+    views: tuple[View, ...]
+    scale: float
+    parameters: np.ndarray
+    J: float
+
+
+class RootPlacementSearch:
+    """Matches silhouettes with a pose tree whose root can be anywhere.
+
+    Args:
+        tree: the pose tree; where its root is makes no difference.
+        settings: the grids and the time limit; its stages are not used.
+        placement: what is unknown and how finely it is tried.
+
+    Raises:
+        SettingsError: if the tree has several roots.
+        ModelError: if the model's joints do not let the root be anywhere.
+    """
+
+    def __init__(
+        self,
+        tree: PoseTree,
+        settings: BeamSearchSettings | None = None,
+        placement: PlacementSettings | None = None,
+    ) -> None:
+        if sum(node.parent < 0 for node in tree.nodes) != 1:
+            raise SettingsError("a root position can be searched only of a tree with one root")
+        self.settings = settings or BeamSearchSettings()
+        self.placement = placement or PlacementSettings()
+        p_WR = tree.node_poses(tree.default_values())[0, :3, 3]
+        self.tree = tree.with_root_position(p_WR)
+        self._grid = BeamSearch(
+            self.tree,
+            replace(self.settings, stages=_STAGES, research_hypotheses=0, time_limit=None),
+        )
+        self.body = self._grid.body
+        self.sampled = self.body.sampled
+        self._refined = RefinementBody(self.tree)
+        self._parts = PartSearch(self._refined, self.sampled.values)
+        growth = _GROWTH if self.placement.scale_unknown else ()
+        self._free = {
+            True: self._refined.freedom(extra=(*_TRANSLATION, *growth)),
+            False: self._refined.freedom(extra=growth),
+        }
+
+    def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PlacedMatch:
+        """Estimate the pose that the views show, and where it is.
+
+        Args:
+            views: one or several silhouettes of the same instant.
+            root_position: (3,) [m] where it is known all the same.
+
+        Returns:
+            The best pose found. ``stopped_by`` is "end" or "time_limit".
+
+        Raises:
+            SettingsError: if there is no view, or a scale cannot be searched with these cameras.
+        """
+        if not views:
+            raise SettingsError("a match needs at least one view, but none was given")
+        begin = time.perf_counter()
+        limit = self.settings.time_limit
+        deadline = math.inf if limit is None else begin + limit
+        layers = find_layers(self.body, views, self.placement, root_position)
+        placed: list[_Placed] = []
+        width = math.ceil(self.placement.hypotheses / len(layers))
+        runs = 0
+        for outside_share in (_OUTSIDE_SHARE, math.inf):
+            for layer in layers:
+                if placed and time.perf_counter() >= deadline:
+                    break
+                placed += self._search_layer(layer, width, outside_share)
+                runs += len(self.tree.nodes)
+            if placed:
+                break
+        if not placed:
+            return self._nothing(runs, time.perf_counter() - begin)
+        placed.sort(key=lambda one: one.J)
+        first = placed[0].J / _area(views)
+        best = self._improve(placed[: self.placement.starts], root_position is None, deadline)
+        stopped_by = "time_limit" if time.perf_counter() >= deadline else "end"
+        result = self._answer(best, first, runs, stopped_by)
+        return replace(result, seconds=time.perf_counter() - begin)
+
+    def _search_layer(self, layer: Layer, width: int, outside_share: float) -> list[_Placed]:
+        """The best whole poses of a scale or depth, of each root placement the best."""
+        if len(layer.positions) == 0:
+            return []
+        views = [coarsen(view, _PIXELS) for view in layer.views]
+        turns = _ROOT_SPARE * _ROOT_FACTOR * self._quota(width)
+        chosen = choose_root_samples(self.body, views, layer.positions, turns, _OUTSIDE_WEIGHT)
+        body = place_body(self.body, layer.positions, chosen)
+        pictures = Pictures(body, views, self.settings.band)
+        store = PoseStore(body, pictures, outside_share)
+        last = self._grow(Beam(store), width, chosen // len(self.sampled.X_PN[0]))
+        if last is None:
+            return []
+        # As many pixels as in the silhouettes themselves.
+        finer = _area(layer.views) / pictures.area
+        Js = finer * (pictures.area - last.covered + last.outside)
+        samples = store.samples(last.poses)
+        found: dict[int, _Placed] = {}
+        for i in np.argsort(Js, kind="stable"):
+            root = int(samples[i, 0])
+            if root in found:
+                continue
+            values = [grid[t] for grid, t in zip(body.sampled.values, samples[i], strict=True)]
+            p_WR = body.sampled.X_PN[0][root, :3, 3]
+            parameters = self._refined.parameters(values, p_WR)
+            found[root] = _Placed(layer.views, layer.scale, parameters, float(Js[i]))
+            if len(found) >= self.placement.starts:
+                break
+        return list(found.values())
+
+    def _quota(self, width: int) -> int:
+        return math.ceil(self.placement.quota * width)
+
+    def _grow(self, beam: Beam, width: int, places: np.ndarray) -> Hypotheses | None:
+        """Whole poses, no root position having more than its quota at any time.
+
+        Args:
+            beam: grows them.
+            width: how many.
+            places: the position of each of the root's samples.
+        """
+        quota = self._quota(width)
+        hypotheses: Hypotheses | None = beam.start()
+        for place, node in enumerate(self.body.order):
+            if hypotheses is None:
+                break
+            factor = _ROOT_FACTOR if place == 0 else 1
+            spare = _SPARE * factor * width
+            grown, _ = beam.grow(hypotheses, node, spare, _OUTSIDE_WEIGHT, False)
+            hypotheses = None
+            if grown is not None:
+                roots = beam.store.nodes[0].samples[grown.poses[:, 0]]
+                kept = _within_quota(places[roots], factor * quota)[: factor * width]
+                hypotheses = _choose(grown, kept)
+        return hypotheses
+
+    def _improve(self, starts: Sequence[_Placed], moves: bool, deadline: float) -> _Placed:
+        """The best pose reached from some; the root moves, too, if its position is unknown."""
+        pool: list[_Placed] = []
+        for start in starts:
+            if time.perf_counter() >= deadline:
+                break
+            pool.append(self._settle(start, COARSE_PASSES, moves))
+        pool.sort(key=lambda one: one.J)
+        for one in self._elsewhere(pool)[: self.placement.finalists]:
+            if time.perf_counter() < deadline:
+                pool += self._search_again(one, moves)
+        pool.sort(key=lambda one: one.J)
+        best = min([*pool, *starts], key=lambda one: one.J)
+        for one in pool[: self.placement.finalists]:
+            if time.perf_counter() >= deadline or best.J <= _ENOUGH * _area(best.views):
+                break
+            best = min(best, self._finish(one, moves, deadline), key=lambda one: one.J)
+        return best
+
+    def _elsewhere(self, pool: Sequence[_Placed]) -> list[_Placed]:
+        """Those whose root is not near that of one before them."""
+        chosen: list[_Placed] = []
+        there: list[np.ndarray] = []
+        for one in pool:
+            here = whereabouts(one.views, self._root_of(one), self.placement)
+            if all(np.abs(here - other).max() >= 1.0 for other in there):
+                chosen.append(one)
+                there.append(here)
+        return chosen
+
+    def _settle(self, start: _Placed, passes: Sequence[Pass], moves: bool) -> _Placed:
+        """The pose refined with its root free, growth turned into the camera's scale."""
+        problem = RefinementProblem(self._refined, start.views, start.parameters)
+        parameters, _, _ = descend(problem, start.parameters, self._free[moves], passes)
+        refined = replace(start, parameters=parameters, J=float(problem.J(parameters)))
+        growth, camera = math.exp(parameters[-1]), start.views[0].camera
+        if growth == 1.0 or not isinstance(camera, ParallelCamera):
+            return refined
+        p_WR = slide_root(camera, self._root_of(refined), 1.0 / growth)
+        values = self._refined.node_values(parameters)
+        return _Placed(
+            (View(scale_camera(camera, growth), start.views[0].mask),),
+            start.scale * growth,
+            self._refined.parameters(values, p_WR),
+            refined.J,
+        )
+
+    def _root_of(self, placed: _Placed) -> np.ndarray:
+        """(3,) where its root is [m]."""
+        return np.array(self._refined.motions(placed.parameters).X_WN[0, :3, 3])
+
+    def _search_again(self, start: _Placed, moves: bool) -> list[_Placed]:
+        """Poses that the beam search finds with the root where it is, refined."""
+        p_WR = self._root_of(start)
+        poses = self._grid.best_poses(start.views, p_WR, self.placement.again, _ALIKE)
+        return [
+            self._settle(
+                replace(start, parameters=self._refined.parameters(values, p_WR)),
+                COARSE_PASSES,
+                moves,
+            )
+            for values in poses.node_values
+        ]
+
+    def _finish(self, start: _Placed, moves: bool, deadline: float) -> _Placed:
+        """The pose refined to the end, and what fits badly placed anew."""
+        near = self._settle(start, FINE_PASSES[:2], moves)
+        problem = RefinementProblem(self._refined, near.views, near.parameters)
+        enough = _ENOUGH * problem.area
+        about = NeighbourhoodSearch(problem, self._parts)
+        parameters, J = about.improve(near.parameters, enough, deadline)
+        better = replace(near, parameters=parameters, J=float(J))
+        end = self._settle(better, FINE_PASSES, moves)
+        return min(start, near, better, end, key=lambda one: one.J)
+
+    def _answer(self, best: _Placed, first: float, runs: int, stopped_by: str) -> PlacedMatch:
+        """The result."""
+        p_WR = self._root_of(best)
+        tree = self.tree.with_root_position(p_WR)
+        node_values = []
+        parameters = self._refined.nearest_turns(best.parameters)
+        for i, values in enumerate(self._refined.node_values(parameters)):
+            # The plant's own joints hold the root where it is now.
+            lower, upper = tree.value_bounds(i)
+            node_values.append(np.where(lower == upper, lower, values))
+        q, X_WB = tree.positions_from(node_values)
+        J = _objective(tree, node_values, best.views)
+        return PlacedMatch(
+            found=True,
+            q=q,
+            X_WB=X_WB,
+            node_values=tuple(node_values),
+            J=J,
+            E_total=J / _area(best.views),
+            first_E_total=first,
+            runs=runs,
+            outside_limit=(),
+            untried={},
+            stopped_by=stopped_by,
+            seconds=0.0,
+            root_position=p_WR,
+            scale=best.scale,
+        )
+
+    def _nothing(self, runs: int, seconds: float) -> PlacedMatch:
+        """The answer where no pose was found."""
+        missing = np.full(len(self.tree.model.position_names), np.nan)
+        nothing = float("nan")
+        return PlacedMatch(
+            False, missing, np.eye(4), (), nothing, nothing, nothing, runs, (), {}, "end", seconds
+        )
+
+
+def _area(views: Sequence[View]) -> float:
+    """The silhouettes' area [pixel]."""
+    return float(sum(view.mask.sum() for view in views))
+
+
+def _objective(tree: PoseTree, node_values: Sequence[np.ndarray], views: Sequence[View]) -> float:
+    """The objective (1) of a pose, skin included [pixel]."""
+    outlines = [
+        outline_from_mesh(node.surface(values))
+        for node, values in zip(tree.nodes, node_values, strict=True)
+    ]
+    X_WN = tree.node_poses(node_values)
+    total = 0.0
+    for view in views:
+        X_CN = view.camera.X_CW @ X_WN[None]
+        areas = score_bodies(outlines, X_CN, view.camera, prefix_sums(view.mask)[None])[0]
+        total += float(areas[0] + view.mask.sum() - 2 * areas[1])
+    return total
+
+
+def _within_quota(groups: np.ndarray, quota: int) -> np.ndarray:
+    """Indices of the first ``quota`` elements of every group, in their order."""
+    order = np.argsort(groups, kind="stable")
+    ordered = groups[order]
+    first = np.searchsorted(ordered, ordered)
+    rank = np.empty(len(groups), dtype=np.int64)
+    rank[order] = np.arange(len(groups)) - first
+    return np.flatnonzero(rank < quota)
+
+
+def _choose(hypotheses: Hypotheses, chosen: np.ndarray) -> Hypotheses:
+    """Some of the hypotheses."""
+    return Hypotheses(
+        hypotheses.masks[chosen],
+        hypotheses.poses[chosen],
+        hypotheses.hashes[chosen],
+        hypotheses.covered[chosen],
+        hypotheses.outside[chosen],
+    )

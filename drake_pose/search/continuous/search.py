@@ -1,0 +1,377 @@
+"""The continuous search: the beam search's best poses on grids, refined between their samples."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.errors import SettingsError
+from drake_pose.search.continuous.intervals import (
+    Intervals,
+    IntervalSettings,
+    find_intervals,
+    pose_set,
+)
+from drake_pose.search.grid.beam.search import BeamSearch
+from drake_pose.search.grid.settings import BeamSearchSettings, Stage
+from drake_pose.search.raster_fit.body import RefinementBody
+from drake_pose.search.raster_fit.passes import (
+    COARSE_PASSES,
+    FINE_PASSES,
+    LAST_PASSES,
+    Pass,
+    descend,
+)
+from drake_pose.search.raster_fit.problem import RefinementProblem
+from drake_pose.search.result import MatchResult, View
+from drake_pose.search.starts.neighbourhood import NeighbourhoodSearch, NeighbourhoodSettings
+from drake_pose.search.starts.part_placement import PartSearch
+
+# No other start is searched on where one has led to this many times what is enough.
+_FAIR = 6.0
+# Rounds agree where the worse one's J is no more than this many times the better one's.
+_AGREEING = 1.1
+# How often another pose found may take the best one's place.
+_BETTER = 3
+
+
+def _grid(interval_deg: float, stage: Stage) -> BeamSearchSettings:
+    return BeamSearchSettings(
+        interval=math.radians(interval_deg), stages=(stage,), research_hypotheses=0
+    )
+
+
+# What one grid and order of nodes misses, another often has.
+_GRIDS = (
+    _grid(20.0, Stage(60, 0.3, 5)),
+    _grid(15.0, Stage(60, 1.0, 2)),
+    _grid(15.0, Stage(60, 1.0, 2, limb_by_limb=True)),
+    _grid(15.0, Stage(60, 0.3, 5, limb_by_limb=True)),
+)
+
+
+@dataclass(frozen=True)
+class RefinementSettings:
+    """Parameters of a refinement.
+
+    Args:
+        passes: of the descent to the local optimum.
+        extra: which of root shift along x, y, z (0, 1, 2) and growth (3) are unknown, too.
+        escape: how parts are placed anew; None: they are not.
+        enough: wrong pixels, as a share of the length of the silhouettes' borders, of a pose that
+            is not searched on; a little more than the pixels' own noise.
+        intervals: how intervals are found; None: they are not.
+    """
+
+    passes: tuple[Pass, ...] = COARSE_PASSES + FINE_PASSES
+    extra: tuple[int, ...] = ()
+    escape: NeighbourhoodSettings | None = field(default_factory=NeighbourhoodSettings)
+    enough: float = 0.03
+    intervals: IntervalSettings | None = field(default_factory=IntervalSettings)
+
+    def __post_init__(self) -> None:
+        if not self.enough >= 0.0:
+            raise SettingsError(f"enough must be 0 or more, not {self.enough}")
+
+
+@dataclass(frozen=True)
+class ContinuousSearchSettings:
+    """Parameters of the continuous search.
+
+    Args:
+        grids: of the beam searches that find where to start, at least one; the next one searches
+            only where none before has led to a good pose.
+        starts: how many poses of each that do not look alike are refined.
+        alike: as in ``BeamSearch.best_poses``.
+        escapes: of how many of these parts are placed anew, the best first.
+        refinement: of the refinement.
+        time_limit: the search returns its best pose so far after this time [s]; None: no limit.
+    """
+
+    grids: tuple[BeamSearchSettings, ...] = _GRIDS
+    starts: int = 4
+    alike: float = 0.5
+    escapes: int = 1
+    refinement: RefinementSettings = field(default_factory=RefinementSettings)
+    time_limit: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.starts < 1 or self.escapes < 1:
+            raise SettingsError("starts and escapes must be 1 or more")
+        if not self.grids:
+            raise SettingsError("a continuous search needs at least one grid")
+
+
+@dataclass(frozen=True)
+class RefinedMatch(MatchResult):
+    """A refined pose; ``pose_set`` holds the intervals and the other poses that are as good.
+
+    Args:
+        shift: (3,) the root's shift from where the tree has it [m].
+        growth: the body's size, 1 where it is as the model says.
+        covariance: (m, m) of the tree's values about this pose; (0, 0) if intervals were not
+            wanted.
+        interval_seconds: wall time of the intervals, which ``seconds`` leaves out.
+    """
+
+    shift: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    growth: float = 1.0
+    covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    interval_seconds: float = 0.0
+
+
+class _Reached(NamedTuple):
+    """Where descents led: parameters and J, the first J, the steps, what was found about them."""
+
+    parameters: np.ndarray
+    J: float
+    first_J: float
+    steps: int
+    about: NeighbourhoodSearch
+
+
+class Refiner:
+    """Refines poses of one body.
+
+    Args:
+        tree: the pose tree.
+        settings: the parameters.
+        grids: for each node its values (n, k) that are tried when parts are placed anew; None:
+            the tree's sampling grid at 20 degrees.
+    """
+
+    def __init__(
+        self,
+        tree: PoseTree,
+        settings: RefinementSettings | None = None,
+        grids: Sequence[np.ndarray] | None = None,
+    ) -> None:
+        self.tree = tree
+        self.settings = settings or RefinementSettings()
+        self.body = RefinementBody(tree)
+        if grids is None:
+            grids = [tree.grid(i, math.radians(20.0)) for i in range(len(tree.nodes))]
+        self._parts = PartSearch(self.body, grids)
+
+    def refine(
+        self,
+        views: Sequence[View],
+        starts: Sequence[Sequence[np.ndarray]],
+        root_position: np.ndarray | None = None,
+        escapes: int = 1,
+        deadline: float = math.inf,
+        others: Iterable[Sequence[Sequence[np.ndarray]]] = (),
+    ) -> RefinedMatch:
+        """The best pose reached from some poses.
+
+        Args:
+            views: one or several silhouettes of the same instant.
+            starts: node values of each pose to start from, at least one.
+            root_position: (3,) the root's position [m], where it is not the tree's own.
+            escapes: how many of the refined poses are searched on by placing parts anew.
+            deadline: what has begun then is ended by the shortest way (``time.perf_counter``).
+            others: more poses to start from, taken one round after another while none has led to a
+                good pose. Two rounds that end equally well end the search: the body fits no better.
+
+        Raises:
+            SettingsError: if there is no view or no start.
+        """
+        if not starts:
+            raise SettingsError("a refinement needs at least one pose to start from")
+        begin = time.perf_counter()
+        poses = [self.body.parameters(start, root_position) for start in starts]
+        problem = RefinementProblem(self.body, views, poses[0])
+        reached = self._descend_all(problem, poses, escapes, deadline)
+        rounds = iter(others)
+        fair = _FAIR * self.settings.enough * problem.border_length
+        while reached.J > fair and time.perf_counter() < deadline:
+            more = next(rounds, None)
+            if more is None:
+                break
+            poses = [self.body.parameters(start, root_position) for start in more]
+            if not poses:
+                continue
+            again = self._descend_all(problem, poses, escapes, deadline)
+            reached, worse = sorted((reached, again), key=lambda one: one.J)
+            if worse.J <= _AGREEING * reached.J:
+                break
+        in_time = time.perf_counter() <= deadline
+        if in_time:
+            reached = self._descend_last(problem, reached, deadline)
+        nearest = self.body.nearest_turns(reached.parameters)
+        reached = reached._replace(parameters=nearest)
+        middle = time.perf_counter()
+        intervals, settings = None, self.settings
+        if settings.intervals is not None:
+            reached, found = self._find_others(problem, reached, settings.intervals)
+            intervals = find_intervals(
+                problem, found, reached.parameters, settings.intervals, settings.extra
+            )
+        end = time.perf_counter()
+        stopped_by = "end" if in_time else "time_limit"
+        return self._answer(problem, reached, intervals, (middle - begin, end - middle), stopped_by)
+
+    def _descend_all(
+        self,
+        problem: RefinementProblem,
+        poses: Sequence[np.ndarray],
+        escapes: int,
+        deadline: float,
+    ) -> _Reached:
+        """The best pose reached."""
+        settings = self.settings
+        freedom = self.body.freedom(None, settings.extra)
+        passes = settings.passes if len(poses) == 1 else COARSE_PASSES
+        steps = 0
+        coarse: list[tuple[int, int, np.ndarray]] = []
+        for pose in poses:
+            if coarse and time.perf_counter() > deadline:
+                break
+            parameters, _, count = descend(problem, pose, freedom, passes)
+            coarse.append((problem.J(parameters), len(coarse), parameters))
+            steps += count
+        coarse.sort(key=lambda entry: entry[:2])
+        enough = settings.enough * problem.border_length
+        about = NeighbourhoodSearch(problem, self._parts, settings.escape)
+        best = _Reached(coarse[0][2], coarse[0][0], coarse[0][0], 0, about)
+        for index, (_, _, parameters) in enumerate(coarse[:escapes]):
+            if index > 0 and (best.J <= _FAIR * enough or time.perf_counter() > deadline):
+                break
+            parameters, _, count = descend(problem, parameters, freedom, FINE_PASSES)
+            steps += count
+            about = NeighbourhoodSearch(problem, self._parts, settings.escape)
+            if settings.escape is not None:
+                parameters, _ = about.improve(parameters, enough, deadline)
+            J = float(problem.J(parameters))
+            if J < best.J:
+                best = best._replace(parameters=parameters, J=J, about=about)
+        return best._replace(steps=steps)
+
+    def _descend_last(
+        self, problem: RefinementProblem, reached: _Reached, deadline: float
+    ) -> _Reached:
+        """What was reached, improved all over, as near its optimum as there is time."""
+        parameters = reached.parameters
+        if self.settings.escape is not None:
+            parameters, _ = reached.about.improve(parameters, 0.0, deadline, everywhere=True)
+        return self._end(problem, reached, parameters)
+
+    def _end(
+        self, problem: RefinementProblem, reached: _Reached, parameters: np.ndarray
+    ) -> _Reached:
+        """What was reached from there, if it is better."""
+        freedom = self.body.freedom(None, self.settings.extra)
+        last, _, steps = descend(problem, parameters, freedom, LAST_PASSES)
+        steps += reached.steps
+        best = min((reached.parameters, parameters, last), key=problem.J)
+        return reached._replace(parameters=best, J=float(problem.J(best)), steps=steps)
+
+    def _find_others(
+        self, problem: RefinementProblem, reached: _Reached, settings: IntervalSettings
+    ) -> tuple[_Reached, list[np.ndarray]]:
+        """The best of all poses found, and the others that are as good."""
+        others: list[np.ndarray] = []
+        for _ in range(_BETTER):
+            limit = reached.J + settings.tolerance * problem.border_length
+            others = reached.about.others(reached.parameters, limit, settings.same)
+            if not others or problem.J(others[0]) >= reached.J:
+                break
+            reached = self._end(problem, reached, others[0])
+            nearest = self.body.nearest_turns(reached.parameters)
+            reached = reached._replace(parameters=nearest)
+        return reached, others
+
+    def _answer(
+        self,
+        problem: RefinementProblem,
+        reached: _Reached,
+        intervals: Intervals | None,
+        seconds: tuple[float, float],
+        stopped_by: str,
+    ) -> RefinedMatch:
+        """The result."""
+        parameters = reached.parameters
+        tree = self.tree
+        if parameters[-4:-1].any():
+            tree = tree.with_root_position(self.body.poses(parameters)[0, :3, 3])
+        node_values = self.body.node_values(parameters)
+        q, X_WB = tree.positions_from(node_values)
+        J = reached.J
+        return RefinedMatch(
+            found=True,
+            q=q,
+            X_WB=X_WB,
+            node_values=node_values,
+            J=J,
+            E_total=J / problem.area,
+            first_E_total=reached.first_J / problem.area,
+            runs=reached.steps,
+            outside_limit=(),
+            untried={},
+            stopped_by=stopped_by,
+            seconds=seconds[0],
+            pose_set=None if intervals is None else pose_set(problem, tree, intervals),
+            shift=parameters[-4:-1],
+            growth=float(np.exp(parameters[-1])),
+            covariance=np.zeros((0, 0)) if intervals is None else intervals.covariance,
+            interval_seconds=seconds[1],
+        )
+
+
+class ContinuousSearch:
+    """Matches silhouettes with a pose tree whose values are continuous.
+
+    Args:
+        tree: the pose tree.
+        settings: the parameters.
+    """
+
+    def __init__(self, tree: PoseTree, settings: ContinuousSearchSettings | None = None) -> None:
+        self.tree = tree
+        self.settings = settings or ContinuousSearchSettings()
+        self._grids = [BeamSearch(tree, grid) for grid in self.settings.grids]
+        self.sampled = self._grids[0].sampled
+        self._refiner = Refiner(tree, self.settings.refinement, self.sampled.values)
+
+    def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> RefinedMatch:
+        """Estimate the pose that the views show.
+
+        Args:
+            views: one or several silhouettes of the same instant.
+            root_position: (3,), the root's known position in the world [m], where it is not the
+                pose tree's own.
+
+        Raises:
+            SettingsError: if there is no view.
+        """
+        begin = time.perf_counter()
+        limit = self.settings.time_limit
+        deadline = math.inf if limit is None else begin + limit
+        rounds = self._starts(views, root_position)
+        starts = next((starts for starts in rounds if starts), ())
+        if not starts:
+            nothing = np.full(len(self.tree.model.position_names), np.nan)
+            return RefinedMatch(
+                False, nothing, np.eye(4), (), np.nan, np.nan, np.nan, 0, (), {}, "time_limit",
+                time.perf_counter() - begin,
+            )  # fmt: skip
+        grid_seconds = time.perf_counter() - begin
+        refined = self._refiner.refine(
+            views, starts, root_position, self.settings.escapes, deadline, rounds
+        )
+        return replace(refined, seconds=refined.seconds + grid_seconds)
+
+    def _starts(
+        self, views: Sequence[View], root_position: np.ndarray | None
+    ) -> Iterator[Sequence[Sequence[np.ndarray]]]:
+        """Each grid's best poses, made when they are asked for."""
+        for grid in self._grids:
+            yield grid.best_poses(
+                views, root_position, self.settings.starts, self.settings.alike
+            ).node_values

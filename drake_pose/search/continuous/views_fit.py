@@ -1,0 +1,171 @@
+"""The pose of one instant's silhouettes, however damaged, in the unit of their own size.
+
+Where neither scale nor distance of a body is known, lengths in a picture are only told by the
+silhouettes themselves: the unit of length is the root of their mean area.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_pose.body.limits import nearest_turn
+from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.fit.contour_fit import (
+    FINEST_SCALE,
+    ContourFit,
+    Noise,
+    pack_views,
+)
+from drake_pose.fit.covariance import Distances, distances
+from drake_pose.fit.evidence import find_edge_points
+from drake_pose.fit.kernel import COST
+from drake_pose.fit.levenberg_marquardt import Round, StepSettings
+from drake_pose.search.result import View
+from drake_pose.silhouette.areas.outline import Outline
+
+_STEPS = StepSettings(longest=0.3, damping=1e-2, even_damping=1e-3)
+# From one point of a silhouette's edge to the next, as a share of its size.
+_EDGE_SPACING = 1.0 / 80.0
+# Errors of masks and cameras are about a pixel, or this share of the silhouettes' size.
+_ERROR_UNIT = 1.0 / 200.0
+# What is missing or too much is about as large, as a share of the silhouettes' size.
+_PIECE = 0.2
+
+
+@dataclass(frozen=True)
+class FittedPose:
+    """A fitted pose.
+
+    Args:
+        values: (m,) all values of the pose tree [rad or m].
+        cost: what does not fit [pixel of contour]; comparable at one scale and spacing only.
+    """
+
+    values: np.ndarray
+    cost: float
+
+
+class ViewsFit:
+    """One body and the silhouettes of one instant.
+
+    Attributes:
+        kinematics: the pose tree's.
+        size: the root of the silhouettes' mean area [pixel], the unit of length of all rounds.
+        camera_count: how many cameras see it.
+        edge_length: the length of the silhouettes' edges [pixel].
+        evaluations: how often contours were compared.
+
+    Args:
+        kinematics: the pose tree's kinematics.
+        outlines: a surface for each node; few triangles will do, see ``few_triangles``.
+        views: the silhouettes.
+    """
+
+    def __init__(
+        self, kinematics: TreeKinematics, outlines: tuple[Outline, ...], views: Sequence[View]
+    ) -> None:
+        self.kinematics = kinematics
+        self.size = math.sqrt(float(np.mean([np.count_nonzero(view.mask) for view in views])))
+        # A pixel of contour counts one, whatever its noise: the cost is in pixels.
+        even = Noise(deviation=1.0, correlation=0.5 / self.size**3)
+        self._fit = ContourFit(kinematics, outlines, even, _STEPS, pixels=self.size)
+        spacing = max(1.0, round(_EDGE_SPACING * self.size))
+        self._views = pack_views(
+            [view.camera for view in views],
+            [find_edge_points(view.mask, spacing) for view in views],
+        )
+        self.edge_length = max(1.0, float(self._views.evidence.lengths.sum()))
+        self.camera_count = len(views)
+        self.evaluations = 0
+
+    def cost(self, values: np.ndarray, step: Round) -> float:
+        """What does not fit at values (m,) [pixel]."""
+        self.evaluations += 1
+        sums = self._fit.compare_views(self._views, values, step).sums
+        return float(sums[..., COST].sum()) / self._scale(step) ** 2
+
+    def distances(self, values: np.ndarray, step: Round) -> Distances:
+        """What is left of the contours' distances at values (m,)."""
+        self.evaluations += 1
+        compared = self._fit.compare_views(self._views, values, step)
+        unit = max(1.0, _ERROR_UNIT * self.size)
+        return distances(self._fit, self._views, compared, unit)
+
+    def piece_costs(self, values: np.ndarray, step: Round) -> np.ndarray:
+        """What does not fit at values (m,), by pieces of the pictures that err on their own."""
+        self.evaluations += 1
+        side = max(1.0, _PIECE * self.size)
+        return self._fit.piece_costs(self._views, values, step, side) / self._scale(step) ** 2
+
+    def refine(
+        self, values: np.ndarray, rounds: Sequence[Round], held: Sequence[int] = ()
+    ) -> FittedPose:
+        """Refine values (m,), but for some that are held, by indices."""
+        fixed = self.kinematics.upper <= self.kinematics.lower
+        fixed[list(held)] = True
+        found = self._fit.fit_views(self._views, values, rounds, None, fixed)
+        self.evaluations += found.evaluations
+        return FittedPose(found.values, found.cost / self._scale(rounds[-1]) ** 2)
+
+    def _scale(self, step: Round) -> float:
+        return max(FINEST_SCALE, step.scale * self.size)
+
+
+def refine_best(
+    fit: ViewsFit,
+    starts: Sequence[np.ndarray],
+    parts: Sequence[tuple[Sequence[Round], int]],
+    proceed: Callable[[], bool],
+) -> list[FittedPose]:
+    """Refine many poses, after each pass only the best of those that still differ.
+
+    Args:
+        fit: the body and the silhouettes.
+        starts: each (m,), best first.
+        parts: rounds, and how many poses are kept after each.
+        proceed: asked before each refinement whether to go on.
+
+    Returns:
+        The poses kept after the last pass, best first; at least one.
+    """
+    values = list(starts)
+    kept: list[FittedPose] = []
+    for rounds, count in parts:
+        refined: list[FittedPose] = []
+        for start in values:
+            if refined and not proceed():
+                break
+            refined.append(fit.refine(start, rounds))
+        kept = distinct(refined, count, fit.kinematics.turns_around)
+        values = [pose.values for pose in kept]
+    return kept
+
+
+def distinct(
+    poses: Sequence[FittedPose],
+    count: int,
+    turns_around: np.ndarray | bool = False,
+    apart: float = 0.05,
+) -> list[FittedPose]:
+    """The best poses some value of which differs by more than so much [rad or m] from better ones.
+
+    Args:
+        poses: in any order.
+        count: at most so many.
+        turns_around: (m,) the values that are the same after a full turn.
+        apart: the difference.
+    """
+    chosen: list[FittedPose] = []
+    for pose in sorted(poses, key=lambda one: one.cost):
+        gaps = (
+            nearest_turn(pose.values, other.values, turns_around) - other.values for other in chosen
+        )
+        if all(np.abs(gap).max(initial=0.0) > apart for gap in gaps):
+            chosen.append(pose)
+        if len(chosen) >= count:
+            break
+    return chosen

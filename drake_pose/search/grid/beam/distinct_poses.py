@@ -1,0 +1,205 @@
+"""The best poses of a search on the grid that do not look alike."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_pose.compiled import compiled
+from drake_pose.errors import SettingsError
+from drake_pose.search.grid.beam.drawing import draw_node
+from drake_pose.search.grid.beam.limb_search import poses_at
+from drake_pose.search.grid.node_poses import Pictures
+from drake_pose.search.grid.pair_kernel import count_bits
+from drake_pose.search.scoring import Scoring
+
+# How many times the poses asked for are looked at in one go, and scored in full.
+_LOOKED_AT = 8
+_SCORED = 2
+
+
+@dataclass(frozen=True)
+class GridPoses:
+    """Whole poses on the sampling grid, smallest J first; no two of them look alike.
+
+    Args:
+        samples: (m, nodes) int, the index of each node's sample in its grid.
+        node_values: of each pose the values of each node of the pose tree.
+        X_WN: (m, nodes, 4, 4) the nodes' poses in the world.
+        J: (m,) the objective (1) [pixel].
+        area: the silhouettes' area [pixel]: J / area is E_total.
+    """
+
+    samples: np.ndarray
+    node_values: tuple[tuple[np.ndarray, ...], ...]
+    X_WN: np.ndarray
+    J: np.ndarray
+    area: float
+
+    def __len__(self) -> int:
+        return len(self.J)
+
+
+def check_choice(count: int, alike: float) -> None:
+    """Raises SettingsError if count is below 1 or alike is not positive."""
+    if count < 1:
+        raise SettingsError(f"count must be 1 or more, not {count}")
+    if not alike > 0.0:
+        raise SettingsError(f"alike must be positive, not {alike}")
+
+
+class Gathering:
+    """Collects the poses that a search comes by."""
+
+    def __init__(self) -> None:
+        self._samples: list[np.ndarray] = []
+        self._errors: list[np.ndarray] = []
+
+    def add(self, samples: np.ndarray, errors: np.ndarray) -> None:
+        """Take in poses.
+
+        Args:
+            samples: (n, nodes) the sample of each node.
+            errors: (n,) about what J over the silhouettes' area is.
+        """
+        self._samples.append(np.asarray(samples))
+        self._errors.append(np.asarray(errors, dtype=np.float64))
+
+    def choose(self, scoring: Scoring, pictures: Pictures, count: int, alike: float) -> GridPoses:
+        """The best poses that do not look alike.
+
+        Args:
+            scoring: gives J.
+            pictures: with bands; in them poses are compared.
+            count: at most this many.
+            alike: as in BeamSearch.best_poses.
+        """
+        nodes = len(scoring.sampled.values)
+        samples = self._different_samples(nodes)
+        chosen = np.empty((0, nodes), dtype=samples.dtype)
+        looks = _Looks.of(pictures, chosen, poses_at(scoring, chosen))
+        chunk = _LOOKED_AT * count
+        for begin in range(0, len(samples), chunk):
+            more = samples[begin : begin + chunk]
+            looks = looks.joined(_Looks.of(pictures, more, poses_at(scoring, more)))
+            kept = _find_different(
+                looks.masks, looks.areas, looks.hidden, len(chosen), _SCORED * count, alike
+            )
+            chosen = np.concatenate([chosen, more])[kept]
+            looks = looks.only(kept)
+            if len(chosen) >= _SCORED * count:
+                break
+        X_WN = poses_at(scoring, chosen)
+        J = scoring.J(X_WN, chosen)
+        best = np.argsort(J, kind="stable")[:count]
+        values = scoring.sampled.values
+        return GridPoses(
+            samples=chosen[best],
+            node_values=tuple(
+                tuple(grid[t] for grid, t in zip(values, pose, strict=True))
+                for pose in chosen[best]
+            ),
+            X_WN=X_WN[best],
+            J=J[best],
+            area=scoring.silhouette_area,
+        )
+
+    def _different_samples(self, nodes: int) -> np.ndarray:
+        """All poses, each once, (n, nodes), the smallest errors first."""
+        if not self._samples:
+            return np.empty((0, nodes), dtype=np.int32)
+        samples, errors = np.concatenate(self._samples), np.concatenate(self._errors)
+        samples = samples[np.argsort(errors, kind="stable")]
+        first = np.unique(samples, axis=0, return_index=True)[1]
+        return np.asarray(samples[np.sort(first)])
+
+
+@dataclass(frozen=True)
+class _Looks:
+    """What nodes look like: masks (n, nodes, W) uint64, areas (n, nodes) and hidden (n, nodes)."""
+
+    masks: np.ndarray
+    areas: np.ndarray
+    hidden: np.ndarray
+
+    @staticmethod
+    def of(pictures: Pictures, samples: np.ndarray, X_WN: np.ndarray) -> "_Looks":
+        """Draw all nodes at samples (n, nodes) and poses (n, nodes, 4, 4)."""
+        shape = X_WN.shape[:2]
+        masks = np.zeros((*shape, int(pictures.part_starts[-1])), dtype=np.uint64)
+        areas = np.zeros(shape, dtype=np.int64)
+        far = np.zeros(shape, dtype=np.int64)
+        for node in range(shape[1]):
+            drawn = draw_node(pictures, node, samples[:, node], X_WN[:, node], masks[:, node])
+            areas[:, node], far[:, node] = drawn.sum(axis=1), drawn[:, 2]
+        return _Looks(masks, areas, _find_hidden(masks, far))
+
+    def joined(self, others: "_Looks") -> "_Looks":
+        """These and others."""
+        return _Looks(
+            np.concatenate([self.masks, others.masks]),
+            np.concatenate([self.areas, others.areas]),
+            np.concatenate([self.hidden, others.hidden]),
+        )
+
+    def only(self, kept: np.ndarray) -> "_Looks":
+        """Those at indices (m,)."""
+        return _Looks(self.masks[kept], self.areas[kept], self.hidden[kept])
+
+
+@compiled
+def _find_hidden(masks: np.ndarray, far: np.ndarray) -> np.ndarray:
+    """Which nodes (n, nodes) bool add nothing to what the others of their pose cover.
+
+    masks: (n, nodes, W) uint64; far: (n, nodes) the areas that have no bits.
+    """
+    hidden = far == 0
+    for i in range(masks.shape[0]):
+        once, twice = np.zeros_like(masks[i, 0]), np.zeros_like(masks[i, 0])
+        for node in range(masks.shape[1]):
+            for k in range(masks.shape[2]):
+                twice[k] |= once[k] & masks[i, node, k]
+                once[k] |= masks[i, node, k]
+        for node in range(masks.shape[1]):
+            for k in range(masks.shape[2]):
+                if masks[i, node, k] & ~twice[k] != np.uint64(0):
+                    hidden[i, node] = False
+                    break
+    return hidden
+
+
+@compiled
+def _find_different(
+    masks: np.ndarray, areas: np.ndarray, hidden: np.ndarray, known: int, count: int, alike: float
+) -> np.ndarray:
+    """The first poses that do not look like one before, (m,) int64, at most ``count``.
+
+    The first ``known`` are known to be different.
+    """
+    chosen = np.empty(count, dtype=np.int64)
+    for i in range(known):
+        chosen[i] = i
+    found = known
+    for i in range(known, masks.shape[0]):
+        if found == count:
+            break
+        new = True
+        for other in range(found):
+            j = chosen[other]
+            different = False
+            for node in range(masks.shape[1]):
+                if hidden[i, node] and hidden[j, node]:
+                    continue
+                common = np.uint64(0)
+                for k in range(masks.shape[2]):
+                    common += count_bits(masks[i, node, k] & masks[j, node, k])
+                union = areas[i, node] + areas[j, node] - np.int64(common)
+                if common < alike * union:
+                    different = True
+                    break
+            if not different:
+                new = False
+                break
+        if new:
+            chosen[found] = i
+            found += 1
+    return chosen[:found]

@@ -1,0 +1,327 @@
+"""The beam search: many hypotheses at once, ranked by what the whole objective will be.
+
+Like Kameda's search it places one node after another, each at the samples of its grid, and scores
+what a node covers newly (5). Unlike it, it keeps many hypotheses instead of one with K
+alternatives, and needs no threshold r: its first stages let nothing lie outside the silhouette and
+end at J = 0, which certifies itself; later ones let more and more, weighed against what is covered.
+"""
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.errors import SettingsError
+from drake_pose.search.grid.beam.distinct_poses import Gathering, GridPoses, check_choice
+from drake_pose.search.grid.beam.hypotheses import Beam, Hypotheses
+from drake_pose.search.grid.beam.limb_search import (
+    poses_at,
+    search_limbs_again,
+    turn_single_nodes,
+)
+from drake_pose.search.grid.families.examination import ExaminationSettings, examine
+from drake_pose.search.grid.node_poses import Pictures, PoseStore, coarsen
+from drake_pose.search.grid.sampled_body import SampledBody
+from drake_pose.search.grid.settings import BeamSearchSettings, Stage
+from drake_pose.search.result import MatchResult, View
+from drake_pose.search.scoring import Scoring
+
+# A body that is the object itself needs far less.
+_MOST_BYTES = 1_000_000_000
+
+
+class BeamSearch:
+    """Matches silhouettes with a pose tree by the beam search.
+
+    Grids and tables are made once; :meth:`match` may then be called for any number of pictures.
+
+    Args:
+        tree: the pose tree.
+        settings: the parameters.
+        examination: how every answer is examined: whether it is proved best, and which other poses
+            look the same; None: it is not.
+    """
+
+    def __init__(
+        self,
+        tree: PoseTree,
+        settings: BeamSearchSettings | None = None,
+        examination: ExaminationSettings | None = None,
+    ) -> None:
+        self.tree = tree
+        self.settings = settings or BeamSearchSettings()
+        self.examination = examination
+        self.body = SampledBody(tree, self.settings)
+        self.sampled = self.body.sampled
+
+    def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> MatchResult:
+        """Estimate the pose that the views show.
+
+        Args:
+            views: one or several silhouettes of the same instant.
+            root_position: (3,), the root's known position in the world [m], where it is not the
+                pose tree's own.
+
+        Returns:
+            The best pose found. ``stopped_by`` is "exact" if J = 0, "end" if all stages were run,
+            or the limit that stopped the search: "time_limit" or "hypothesis_limit". ``runs``
+            counts how often a node was placed.
+
+        Raises:
+            SettingsError: if there is no view.
+        """
+        start = time.perf_counter()
+        run = self._run(views, root_position, None)
+        result = run.result(time.perf_counter() - start)
+        if self.examination is not None:
+            result = examine(self.body, views, result, self.examination, root_position)
+            result = replace(result, seconds=time.perf_counter() - start)
+        return result
+
+    def match_exactly(
+        self, views: Sequence[View], root_position: np.ndarray | None = None
+    ) -> MatchResult | None:
+        """Run the stages that let nothing lie outside; they end at once where nothing fits.
+
+        Where so much fits roughly that its poses fill a gigabyte, as in a picture of another body
+        that may be turned anyhow, they end, too.
+
+        Args:
+            views: one or several silhouettes of the same instant.
+            root_position: as in match.
+
+        Returns:
+            A pose whose J is 0, or None.
+
+        Raises:
+            SettingsError: if there is no view.
+        """
+        start = time.perf_counter()
+        exact = tuple(stage for stage in self.settings.stages if stage.outside_share == 0.0)
+        run = self._prepare(views, root_position, None)
+        run.most_bytes = _MOST_BYTES
+        run.run_stages(exact)
+        if run.J > 0:
+            return None
+        run.stopped_by = "exact"
+        return run.result(time.perf_counter() - start)
+
+    def best_poses(
+        self,
+        views: Sequence[View],
+        root_position: np.ndarray | None = None,
+        count: int = 30,
+        alike: float = 0.7,
+    ) -> GridPoses:
+        """The best whole poses that the search came by and that do not look alike.
+
+        Slower than :meth:`match`: the search does not end at J = 0 before it has also looked at
+        poses that leave the silhouette a little.
+
+        Args:
+            views: one or several silhouettes of the same instant.
+            root_position: as in match.
+            count: at most this many.
+            alike: two poses look alike if each node's pictures in both have so much of their union
+                in common in all views, or it is hidden in both, covering nothing that other nodes
+                do not cover. Above 1: all poses of the grid differ.
+
+        Returns:
+            The poses, the smallest J first; an empty list if a limit of the settings left none.
+
+        Raises:
+            SettingsError: if there is no view, count is below 1 or alike is not positive.
+        """
+        check_choice(count, alike)
+        gathering = Gathering()
+        run = self._run(views, root_position, gathering)
+        return gathering.choose(run.scoring, run.pictures(exact=False), count, alike)
+
+    def _run(
+        self,
+        views: Sequence[View],
+        root_position: np.ndarray | None,
+        gathering: Gathering | None,
+    ) -> "_Run":
+        run = self._prepare(views, root_position, gathering)
+        run.search()
+        return run
+
+    def _prepare(
+        self,
+        views: Sequence[View],
+        root_position: np.ndarray | None,
+        gathering: Gathering | None,
+    ) -> "_Run":
+        if not views:
+            raise SettingsError("a match needs at least one view, but none was given")
+        body = self.body
+        if root_position is not None:
+            body = body.with_root_position(root_position)
+        return _Run(body, views, self.settings, gathering)
+
+
+class _Run:
+    """One match."""
+
+    def __init__(
+        self,
+        body: SampledBody,
+        views: Sequence[View],
+        settings: BeamSearchSettings,
+        gathering: Gathering | None,
+    ) -> None:
+        limit = settings.time_limit
+        self.deadline = np.inf if limit is None else time.perf_counter() + limit
+        self.gathering = gathering
+        self.body = body
+        self.views = views
+        self.settings = settings
+        self.scoring = Scoring(body.sampled, views)
+        self.samples: np.ndarray | None = None
+        self._pictures: dict[bool, Pictures] = {}
+        self.J = np.inf
+        self.first_J = np.nan
+        self.runs = 0
+        self.hypotheses = 0
+        self.stopped_by = ""
+        self.most_bytes = math.inf
+        self._stores: dict[float, PoseStore] = {}
+
+    def search(self) -> None:
+        """Run stage after stage until J = 0 or a limit is reached; then polish the answer."""
+        self.run_stages(self.settings.stages)
+        if self.samples is None:
+            self._answer_somehow()
+        elif self.J > 0 and self.settings.research_hypotheses and not self.stopped_by:
+            turned = turn_single_nodes(
+                self.scoring, self.pictures(exact=False), self.samples, lambda: self.proceed(0)
+            )
+            self._keep_if_better(turned)
+        self.stopped_by = "exact" if self.J == 0 else self.stopped_by or "end"
+
+    def run_stages(self, stages: Sequence[Stage]) -> None:
+        """Run stage after stage until J = 0 or a limit is reached."""
+        skip_exact = False
+        for stage in stages:
+            exact = stage.outside_share == 0.0
+            if exact and skip_exact:
+                continue
+            if stage.outside_share not in self._stores:
+                self._stores[stage.outside_share] = PoseStore(
+                    self.body, self.pictures(exact), stage.outside_share
+                )
+            complete = self._run_stage(Beam(self._stores[stage.outside_share]), stage)
+            if self.stopped_by or (self.J == 0 and (self.gathering is None or not exact)):
+                break
+            skip_exact = skip_exact or complete or self.J == 0
+
+    def pictures(self, exact: bool) -> Pictures:
+        """The silhouettes as bits: coarse ones with a band for stages that are not exact."""
+        if exact not in self._pictures:
+            views, band = self.views, 0
+            if not exact:
+                views = tuple(coarsen(view, self.settings.coarse_pixels) for view in views)
+                band = self.settings.band
+            self._pictures[exact] = Pictures(self.body, views, band)
+        return self._pictures[exact]
+
+    def proceed(self, made: int) -> bool:
+        """Whether the limits allow to go on, after one more node with this many hypotheses."""
+        self.runs += 1
+        self.hypotheses += made
+        limit = self.settings.hypothesis_limit
+        if limit is not None and self.hypotheses >= limit:
+            self.stopped_by = "hypothesis_limit"
+        elif time.perf_counter() >= self.deadline:
+            self.stopped_by = "time_limit"
+        elif sum(store.nbytes for store in self._stores.values()) > self.most_bytes:
+            self.stopped_by = "memory_limit"
+        return not self.stopped_by
+
+    def _run_stage(self, beam: Beam, stage: Stage) -> bool:
+        """Returns whether the stage lost no hypothesis."""
+        exact = stage.outside_share == 0.0
+        order = self.body.limb_order if stage.limb_by_limb else self.body.order
+        last, complete = beam.run(
+            beam.start(), order, stage.hypotheses, stage.outside_weight, exact, self.proceed
+        )
+        if last is None:
+            return complete
+        Js = self._gather(beam, last)
+        best = int(np.argmin(Js))
+        poses = last.poses[best]
+        self._keep_if_better(beam.store.samples(poses))
+        if self.settings.research_hypotheses and (self.J > 0 or (self.gathering and not exact)):
+            better = search_limbs_again(
+                beam,
+                order,
+                poses,
+                float(Js[best]),
+                self.settings.research_hypotheses,
+                self.proceed,
+                lambda hypotheses: self._gather(beam, hypotheses),
+            )
+            self._keep_if_better(beam.store.samples(better))
+        return complete
+
+    def _answer_somehow(self) -> None:
+        """A pose whatever lies outside; found by one hypothesis alone if a limit was reached."""
+        width = 1 if self.stopped_by else self.settings.stages[-1].hypotheses
+        store = PoseStore(self.body, self.pictures(exact=False), np.inf)
+        beam = Beam(store)
+        last, _ = beam.run(beam.start(), self.body.order, width, 2, False, lambda made: True)
+        if last is not None:
+            Js = self._gather(beam, last)
+            self._keep_if_better(store.samples(last.poses[int(np.argmin(Js))]))
+
+    def _gather(self, beam: Beam, hypotheses: Hypotheses) -> np.ndarray:
+        """What J is (n,) as the beam counts it; whole poses are gathered if that is wanted."""
+        Js = beam.store.pictures.area - hypotheses.covered + hypotheses.outside
+        if self.gathering is not None:
+            self.gathering.add(beam.store.samples(hypotheses.poses), Js / beam.store.pictures.area)
+        return np.asarray(Js)
+
+    def _keep_if_better(self, samples: np.ndarray) -> None:
+        """Keep samples (nodes,) if their J is the smallest so far."""
+        X_WN = poses_at(self.scoring, samples[None])
+        J = float(self.scoring.J(X_WN, samples[None])[0])
+        if self.samples is None:
+            self.first_J = J
+        if J < self.J:
+            self.J, self.samples = J, samples
+            if self.gathering is not None:
+                self.gathering.add(samples[None], np.array([J / self.scoring.silhouette_area]))
+
+    def _values(self, samples: np.ndarray) -> list[np.ndarray]:
+        return [values[t] for values, t in zip(self.body.sampled.values, samples, strict=True)]
+
+    def result(self, seconds: float) -> MatchResult:
+        """What the search found."""
+        tree, area = self.body.sampled.tree, self.scoring.silhouette_area
+        if self.samples is None:
+            missing = np.full(len(tree.model.position_names), np.nan)
+            nothing = float("nan")
+            return MatchResult(
+                False, missing, np.eye(4), (), nothing, nothing, nothing, self.runs, (), {},
+                self.stopped_by, seconds,
+            )  # fmt: skip
+        values = self._values(self.samples)
+        q, X_WB = tree.positions_from(values)
+        return MatchResult(
+            found=True,
+            q=q,
+            X_WB=X_WB,
+            node_values=tuple(values),
+            J=self.J,
+            E_total=self.J / area,
+            first_E_total=self.first_J / area,
+            runs=self.runs,
+            outside_limit=(),
+            untried={},
+            stopped_by=self.stopped_by,
+            seconds=seconds,
+        )

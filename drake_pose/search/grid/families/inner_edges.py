@@ -1,0 +1,354 @@
+"""Edges inside the silhouette choose among poses that the silhouette cannot tell apart.
+
+Where one limb passes in front of another, a label or colour image shows an edge that the silhouette
+does not (Kameda, Minoh, Ikeda, section 7, name this as future work). How likely the edges are if a
+pose is the true one follows from how often edges are missed, displaced or wrong; poses under which
+they are far too unlikely are ruled out, so that the true one seldom is (``choose_by_edges``).
+"""
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from scipy.special import logsumexp
+
+from drake_pose.errors import SettingsError
+from drake_pose.search.grid.branch_and_bound.partial_pose_graph import PartialPoseGraph
+from drake_pose.search.grid.families.joint_estimates import estimate_joints
+from drake_pose.search.grid.families.search import GridPoseSet
+from drake_pose.search.pose_families import JointEstimate
+
+RenderSegments = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Draws a pose, q (nq,) and X_WB (4, 4): (H, W) int the segment seen at each pixel, -1 for none.
+``LabelRenderer.segments`` is one."""
+
+_CANNY = (50, 150)
+# Colours change at the silhouette's edge, too: so near to it no edge counts.
+_RIM = 3
+# Where no wrong edge passes, so few pixels are wrong nevertheless.
+_WRONG_PIXEL = 1e-3
+# Errors reach beyond a patch into its neighbours, but seldom farther. In each of four classes of
+# patches none touches another: by Hoelder's inequality the fourth root of the product over all
+# patches exaggerates nothing, as if each class alone had been looked at.
+_CLASSES = 4
+
+
+@dataclass(frozen=True)
+class EdgeErrors:
+    """How the edges of a picture may be wrong; all of them are up to a pixel off besides.
+
+    Args:
+        missing: the share that is not seen.
+        wrong: the length of those that are none, as a share of the true ones'.
+        patch: edges are missing in squares of this side, and so long is a wrong one [pixel].
+
+    Raises:
+        SettingsError: if a value is out of its range.
+    """
+
+    missing: float = 0.2
+    wrong: float = 0.05
+    patch: int = 5
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.missing < 1.0:
+            raise SettingsError(f"missing must be above 0 and below 1, not {self.missing}")
+        if not 0.0 < self.wrong < np.inf:
+            raise SettingsError(f"wrong must be above 0 and finite, not {self.wrong}")
+        if self.patch < 1:
+            raise SettingsError(f"patch must be 1 pixel or more, not {self.patch}")
+
+    @cached_property
+    def log_pixel(self) -> np.ndarray:
+        """The log probability (4, 2, 10) of a pixel.
+
+        By what its patch holds (0: nothing, 1: the true edges, 2: a wrong one, 3: both), by whether
+        an edge is seen there, and by how many of it and its neighbours the pose expects one at.
+        """
+        expected = np.arange(10)
+        table = np.empty((4, 2, 10))
+        for state in range(4):
+            unexplained = 1.0 / (1 + self.patch) if state >= 2 else _WRONG_PIXEL
+            # Each expected pixel is displaced to any of the nine around it.
+            missed = (1.0 - unexplained) * (8.0 / 9.0) ** (expected * (state % 2))
+            table[state] = np.log([missed, 1.0 - missed])
+        return table
+
+    def log_patch(self, seen: int, patches: float) -> np.ndarray:
+        """The log probability (4,) of what a patch holds, as in ``log_pixel``.
+
+        Args:
+            seen: how many pixels of the picture are edges.
+            patches: how many patches there are.
+        """
+        # A line as long as a patch is wide lies in two of them, mostly.
+        wrong = np.clip(2.0 * self.wrong * seen / (self.patch * patches), _WRONG_PIXEL, 0.5)
+        missing = self.missing
+        return np.log(np.outer([1.0 - wrong, wrong], [missing, 1.0 - missing]).ravel())
+
+
+@dataclass(frozen=True)
+class InnerEdges:
+    """The edges that one camera's picture shows inside its silhouette.
+
+    Args:
+        edges: (H, W) bool.
+        window: first row, row after the last, first column and column after the last of the
+            silhouette's surroundings.
+        mask: (H, W) bool, the silhouette.
+        rim: so near to the silhouette's edge no edge counts [pixel].
+        errors: how they may be wrong.
+    """
+
+    edges: np.ndarray
+    window: tuple[int, int, int, int]
+    mask: np.ndarray
+    rim: int
+    errors: EdgeErrors = EdgeErrors()
+
+    @cached_property
+    def _inside(self) -> np.ndarray:
+        """The pixels of the window at which edges count."""
+        top, bottom, left, right = self.window
+        return _interior(self.mask[top:bottom, left:right], self.rim)
+
+    @cached_property
+    def _seen(self) -> np.ndarray:
+        """(pixels inside,) int: 1 where an edge is seen."""
+        top, bottom, left, right = self.window
+        return self.edges[top:bottom, left:right][self._inside].astype(np.int64)
+
+    @cached_property
+    def _patches(self) -> np.ndarray:
+        """(pixels inside,) int: the patch that each lies in."""
+        rows, columns = (places // self.errors.patch for places in np.nonzero(self._inside))
+        across = 1 + int(columns.max(initial=0))
+        return np.unique(rows * across + columns, return_inverse=True)[1]
+
+    def log_likelihood(self, segments: np.ndarray) -> float:
+        """The log probability of the edges if a pose's picture is segments (H, W) int.
+
+        That the edges are without any error counts as likely beforehand as that they have the
+        errors which ``errors`` describes.
+
+        Args:
+            segments: the segment seen at each pixel, -1 where none is.
+        """
+        top, bottom, left, right = self.window
+        window = (slice(top, bottom), slice(left, right))
+        borders = find_borders(np.where(self.mask[window], segments[window], -1))
+        near = cv2.boxFilter(
+            borders.astype(np.float32), -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT
+        )
+        expected = np.rint(near[self._inside]).astype(np.int64)
+        sums = [
+            np.bincount(self._patches, table[self._seen, expected])
+            for table in self.errors.log_pixel
+        ]
+        seen = int(self._seen.sum())
+        weights = self.errors.log_patch(seen, max(1.0, len(expected) / self.errors.patch**2))
+        damaged = float(logsumexp(np.array(sums) + weights[:, None], axis=0).sum()) / _CLASSES
+        flawless = 0.0 if np.array_equal(borders[self._inside], self._seen > 0) else -np.inf
+        return float(np.logaddexp(flawless, damaged) + np.log(0.5))
+
+
+def edges_of_labels(labels: np.ndarray, mask: np.ndarray) -> InnerEdges:
+    """The borders between the labels inside a silhouette.
+
+    Args:
+        labels: (H, W) int, a label for each segment; negative: none.
+        mask: (H, W) bool, the silhouette.
+
+    Raises:
+        SettingsError: if the shapes differ or the silhouette is empty.
+    """
+    window = _window(labels.shape[:2], mask)
+    edges = find_borders(np.where(mask, labels, -1))
+    return InnerEdges(edges, window, mask, 0)
+
+
+def edges_of_colours(
+    picture: np.ndarray, mask: np.ndarray, thresholds: tuple[int, int] = _CANNY
+) -> InnerEdges:
+    """Canny's edges inside a silhouette, a little away from its own edge.
+
+    Args:
+        picture: (H, W, 3) or (H, W) uint8.
+        mask: (H, W) bool, the silhouette.
+        thresholds: Canny's lower and upper one.
+
+    Raises:
+        SettingsError: if the shapes differ or the silhouette is empty.
+    """
+    window = _window(picture.shape[:2], mask)
+    edges = cv2.Canny(np.ascontiguousarray(picture), *thresholds) > 0
+    return InnerEdges(edges & _interior(mask, _RIM), window, mask, _RIM)
+
+
+def find_borders(segments: np.ndarray) -> np.ndarray:
+    """Pixels (H, W) bool of a segment whose right or lower neighbour is of another segment."""
+    borders = np.zeros(segments.shape, dtype=np.bool_)
+    right, lower = segments[:, 1:], segments[1:]
+    here = segments[:, :-1]
+    borders[:, :-1] |= (here >= 0) & (right >= 0) & (here != right)
+    here = segments[:-1]
+    borders[:-1] |= (here >= 0) & (lower >= 0) & (here != lower)
+    return borders
+
+
+@dataclass(frozen=True)
+class EdgeChoice:
+    """What inner edges leave of a set of poses.
+
+    Attributes:
+        samples: (n, nodes) the poses judged, best first.
+        probabilities: (n,) of each, if one of these is the true one and all are as likely
+            beforehand.
+        left: how many of the first are not ruled out.
+        joints: each value of the pose tree, over those left.
+        exhaustive: whether all poses of the set were judged.
+    """
+
+    samples: np.ndarray
+    probabilities: np.ndarray
+    left: int
+    joints: tuple[JointEstimate, ...]
+    exhaustive: bool
+
+    @property
+    def settled(self) -> bool:
+        """Whether one pose is left, and no other of the set can be as good."""
+        return self.left == 1 and self.exhaustive
+
+    def rules_out(self, samples: np.ndarray) -> bool:
+        """Whether a pose of the set, samples (nodes,), was judged and is ruled out.
+
+        Of a large set not all poses are judged: one that was not is not ruled out.
+        """
+        return bool((self.samples[self.left :] == samples).all(axis=1).any())
+
+
+def choose_by_edges(
+    answer: GridPoseSet,
+    edges: Sequence[InnerEdges],
+    renders: Sequence[RenderSegments],
+    most: int = 1000,
+    risk: float = 1e-3,
+) -> EdgeChoice:
+    """Judge the poses of a set by inner edges.
+
+    A pose is ruled out where the edges are far less likely under it than under the mean of all.
+    That ratio's expectation is 1 under the true pose, so that by Markov's inequality the true one
+    is ruled out with probability ``risk`` at most, however many poses there are and whatever they
+    look like, as long as the edges are no worse than their ``errors`` say.
+
+    Args:
+        answer: the set.
+        edges: of each camera.
+        renders: one for each camera.
+        most: a set of more poses is judged by this many random ones; from the best of them, one
+            node and all that hangs on it is then turned in a tenth as many ways while that helps.
+        risk: the probability that the true pose may be ruled out with.
+
+    Raises:
+        SettingsError: if the risk is not above 0 and below 1.
+    """
+    if not 0.0 < risk < 1.0:
+        raise SettingsError(f"risk must be above 0 and below 1, not {risk}")
+    tree = answer.sampled.tree
+    known: dict[tuple[int, ...], float] = {}
+
+    def judge(samples: np.ndarray) -> float:
+        key = tuple(samples.tolist())
+        if key not in known:
+            values = [grid[t] for grid, t in zip(answer.sampled.values, samples, strict=True)]
+            q, X_WB = tree.positions_from(values)
+            known[key] = sum(
+                edge.log_likelihood(render(q, X_WB))
+                for edge, render in zip(edges, renders, strict=True)
+            )
+        return known[key]
+
+    exhaustive = answer.size <= most
+    random = np.random.default_rng(0)
+    members = _members(answer.graph, most, random)
+    found = [judge(samples) for samples in members]
+    if not exhaustive:
+        _turn_subtrees(answer, members[int(np.argmax(found))], judge, 1 + most // 10, random)
+    log_likelihoods = np.array(list(known.values()))
+    log_probabilities = log_likelihoods - logsumexp(log_likelihoods)
+    order = np.argsort(-log_probabilities, kind="stable")
+    samples, log_probabilities = np.array(list(known))[order], log_probabilities[order]
+    # Half of the probability beforehand is that of edges without error, in each camera's picture.
+    allowed = np.log(risk) - len(edges) * np.log(2.0) - np.log(answer.size)
+    left = max(1, int((log_probabilities >= allowed).sum()))
+    seen = [np.unique(column) for column in samples[:left].T]
+    best = [grid[t] for grid, t in zip(answer.sampled.values, samples[0], strict=True)]
+    complete = answer.complete and exhaustive
+    joints = estimate_joints(answer.sampled, seen, best, complete=complete)
+    return EdgeChoice(samples, np.exp(log_probabilities), left, joints, exhaustive)
+
+
+def _turn_subtrees(
+    answer: GridPoseSet,
+    samples: np.ndarray,
+    judge: Callable[[np.ndarray], float],
+    most: int,
+    random: np.random.Generator,
+) -> None:
+    """Judge what can be reached from a pose by turning one node and all that hangs on it.
+
+    The best found is followed until nothing is better; the smallest subtrees come first.
+    """
+    nodes = answer.sampled.tree.nodes
+    subtrees = [{i} for i in range(len(nodes))]
+    for i in reversed(range(len(nodes))):
+        if nodes[i].parent >= 0:
+            subtrees[nodes[i].parent] |= subtrees[i]
+    order = sorted(subtrees, key=len)
+    best, unchanged = judge(samples), 0
+    for subtree in itertools.cycle(order):
+        allowed = [
+            None if node in subtree else np.arange(len(grid)) == samples[node]
+            for node, grid in enumerate(answer.sampled.values)
+        ]
+        members = _members(answer.graph.restricted(allowed), most, random)
+        found = [judge(member) for member in members]
+        unchanged += 1
+        if max(found) > best:
+            place = int(np.argmax(found))
+            best, samples, unchanged = found[place], members[place], 0
+        if unchanged >= len(order):
+            return
+
+
+def _members(graph: PartialPoseGraph, most: int, random: np.random.Generator) -> np.ndarray:
+    """All poses (n, nodes) of a graph, or this many of them drawn at random."""
+    if graph.size <= most:
+        return graph.members()
+    return graph.draw(most, random)
+
+
+def _window(shape: tuple[int, ...], mask: np.ndarray) -> tuple[int, int, int, int]:
+    """The rows and columns of a silhouette."""
+    if shape != mask.shape:
+        raise SettingsError(
+            f"the picture for inner edges is {shape[::-1]} pixels (width, height), but the "
+            f"silhouette is {mask.shape[::-1]}: give both of the same camera and size"
+        )
+    rows, columns = np.nonzero(mask)
+    if len(rows) == 0:
+        raise SettingsError("the silhouette is empty: it has no inner edges")
+    return int(rows.min()), int(rows.max()) + 1, int(columns.min()), int(columns.max()) + 1
+
+
+def _interior(mask: np.ndarray, rim: int) -> np.ndarray:
+    """Pixels of a mask (H, W) bool that are farther than this many pixels from its edge."""
+    if rim == 0:
+        return mask
+    padded = np.pad(mask.astype(np.uint8), 1)
+    distances = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.asarray(distances[1:-1, 1:-1] > rim)

@@ -1,0 +1,281 @@
+"""The poses that nodes take in one search, each drawn once and shared by all hypotheses."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
+from drake_pose.search.grid.sampled_body import SampledBody
+from drake_pose.search.result import View
+from drake_pose.silhouette.bits.bit_kernel import draw_bits
+from drake_pose.silhouette.bits.bit_view import WORD, BitView, make_bit_view
+from drake_pose.silhouette.bits.bounding_balls import draw_discs, sift_by_balls
+
+_ONE, _ALL = 1, 2
+
+
+def coarsen(view: View, pixels: int) -> View:
+    """The view at the whole fraction of its size that shows about this many silhouette pixels.
+
+    A pixel is in the silhouette if at least half of those that it replaces are.
+    """
+    factor = round(float(np.sqrt(view.mask.sum() / pixels)))
+    if factor < 2:
+        return view
+    height, width = (-(-side // factor) for side in view.mask.shape)
+    padded = np.zeros((height * factor, width * factor), dtype=np.uint8)
+    padded[: view.mask.shape[0], : view.mask.shape[1]] = view.mask
+    counts = padded.reshape(height, factor, width, factor).sum(axis=(1, 3), dtype=np.int64)
+    return View(_coarse_camera(view.camera, factor, width, height), 2 * counts >= factor**2)
+
+
+def _coarse_camera(camera: Camera, factor: int, width: int, height: int) -> Camera:
+    """The camera with pixels this many times as large, in a picture of the given size."""
+    # Pixel centres are at integers.
+    center_x = (camera.center_x + 0.5) / factor - 0.5
+    center_y = (camera.center_y + 0.5) / factor - 0.5
+    if isinstance(camera, ParallelCamera):
+        scale = camera.pixels_per_metre / factor
+        return ParallelCamera(camera.name, width, height, scale, center_x, center_y, camera.X_WC)
+    return PinholeCamera(
+        camera.name,
+        width,
+        height,
+        camera.focal_x / factor,
+        camera.focal_y / factor,
+        center_x,
+        center_y,
+        camera.X_WC,
+        camera.near,
+    )
+
+
+class Pictures:
+    """The silhouettes of one instant as bits: parts of one long mask, silhouettes before bands.
+
+    Attributes:
+        body, views: what it was made of.
+        bit_views: one for each view.
+        has_bands: whether pixels outside the silhouettes have bits, too.
+        part_starts: (parts + 1,) where each part begins, and the mask's length [word].
+        area: the silhouettes' area [pixel].
+        everything: (w,) uint64 all pixels of the silhouettes.
+
+    Args:
+        body: the body.
+        views: the silhouettes.
+        band: the width of the band [pixel]; 0: none.
+    """
+
+    def __init__(self, body: SampledBody, views: Sequence[View], band: int) -> None:
+        self.body = body
+        self.views = tuple(views)
+        self.has_bands = band > 0
+        self.bit_views: list[BitView] = [
+            make_bit_view(view.mask, view.camera.kernel_parameters(), view.camera.X_CW, band)
+            for view in views
+        ]
+        pixels = [int(view.inside[-1, -1]) for view in self.bit_views]
+        self.area = float(sum(pixels))
+        if self.has_bands:
+            pixels += [int(view.band[-1, -1]) for view in self.bit_views]
+        counts = pixels[: len(views)]
+        self.everything = np.concatenate([_ones(count) for count in counts])
+        self.part_starts = np.concatenate([[0], np.cumsum([n // WORD + 1 for n in pixels])])
+
+
+def _ones(count: int) -> np.ndarray:
+    """The first ``count`` bits set, in as many words as a part of that many pixels has."""
+    bits = np.zeros((count // WORD + 1) * WORD, dtype=np.uint8)
+    bits[:count] = 1
+    return np.packbits(bits, bitorder="little").view(np.uint64)
+
+
+@dataclass
+class _Poses:
+    """Poses of one node: arrays that grow by whole groups."""
+
+    samples: np.ndarray
+    parents: np.ndarray
+    X_WN: np.ndarray
+    areas: np.ndarray
+    runs: np.ndarray
+    words: np.ndarray
+
+    @property
+    def nbytes(self) -> int:
+        """The memory that they take [byte]."""
+        arrays = (self.samples, self.parents, self.X_WN, self.areas, self.runs, self.words)
+        return sum(array.nbytes for array in arrays)
+
+
+class PoseStore:
+    """All poses of all nodes that stay inside a limit, by the pose of their parent.
+
+    Args:
+        body: the body.
+        pictures: the silhouettes.
+        outside_share: the share of a node's mean projected area that may lie outside.
+    """
+
+    def __init__(self, body: SampledBody, pictures: Pictures, outside_share: float) -> None:
+        self.body = body
+        self.pictures = pictures
+        self._outside_share = outside_share
+        parts = len(pictures.part_starts) - 1
+        self.nodes = [
+            _Poses(
+                np.empty(0, dtype=np.int32),
+                np.empty(0, dtype=np.int32),
+                np.empty((0, 4, 4)),
+                np.empty((0, 3), dtype=np.int32),
+                np.empty((0, parts, 3), dtype=np.int64),
+                np.empty(0, dtype=np.uint64),
+            )
+            for _ in body.sampled.tree.nodes
+        ]
+        # For each node and pose of its parent: where its poses begin and end, and how many of
+        # them are drawn: none, one that is enough, or all.
+        self._groups = [np.zeros((0, 3), dtype=np.int64) for _ in self.nodes]
+        self._reach_rows = [np.full(0, -1, dtype=np.int64) for _ in self.nodes]
+        self.reach_runs = np.empty((0, len(pictures.views), 3), dtype=np.int64)
+        self.reach_words = np.empty(0, dtype=np.uint64)
+
+    @property
+    def nbytes(self) -> int:
+        """The memory that poses and what can be reached from them take [byte]."""
+        reaches = self.reach_runs.nbytes + self.reach_words.nbytes
+        return reaches + sum(poses.nbytes for poses in self.nodes)
+
+    def groups(self, node: int, parents: np.ndarray, hidden: np.ndarray) -> np.ndarray:
+        """Where the node's poses begin and end (n, 2), for poses (n,) of its parent; 0 for a root.
+
+        What is missing is drawn. Where ``hidden`` (n,) one pose is enough.
+        """
+        size = int(parents.max()) + 1
+        if len(self._groups[node]) < size:
+            more = np.zeros((size - len(self._groups[node]) + 64, 3), dtype=np.int64)
+            self._groups[node] = np.concatenate([self._groups[node], more])
+        known = self._groups[node]
+        if known[parents, 2].min() == _ALL:
+            return known[parents, :2]
+        wanted = np.zeros(len(known), dtype=np.int64)
+        wanted[parents] = _ONE
+        wanted[parents[~hidden]] = _ALL
+        missing = np.flatnonzero(wanted > known[:, 2])
+        if len(missing):
+            counts = self._draw(node, missing, wanted[missing] == _ONE)
+            ends = len(self.nodes[node].samples) - counts.sum() + np.cumsum(counts)
+            known[missing, 0], known[missing, 1] = ends - counts, ends
+            known[missing, 2] = wanted[missing]
+        return known[parents, :2]
+
+    def samples(self, poses: np.ndarray) -> np.ndarray:
+        """The samples (..., nodes) that the nodes take at poses (..., nodes)."""
+        return np.stack(
+            [stored.samples[poses[..., i]] for i, stored in enumerate(self.nodes)], axis=-1
+        )
+
+    def reach_rows(self, node: int, parents: np.ndarray) -> np.ndarray:
+        """For all poses of the node's parent the row of ``reach_runs`` of what the node can reach.
+
+        Only the rows of the poses (n,) asked for are sure to be there.
+        """
+        size = int(parents.max()) + 1
+        if len(self._reach_rows[node]) < size:
+            more = np.full(size - len(self._reach_rows[node]) + 64, -1, dtype=np.int64)
+            self._reach_rows[node] = np.concatenate([self._reach_rows[node], more])
+        rows = self._reach_rows[node]
+        if rows[parents].min() >= 0:
+            return rows
+        wanted = np.zeros(len(rows), dtype=np.bool_)
+        wanted[parents] = True
+        missing = np.flatnonzero(wanted & (rows < 0))
+        if len(missing):
+            ball = self.body.reach_balls[node]
+            runs = np.empty((len(missing), len(self.pictures.bit_views), 3), dtype=np.int64)
+            used, pieces = len(self.reach_words), [self.reach_words]
+            for index, view in enumerate(self.pictures.bit_views):
+                view_runs, words = draw_discs(
+                    view, self._parent_poses(node, missing), ball[:3], ball[3]
+                )
+                runs[:, index] = view_runs + np.array([self.pictures.part_starts[index], 0, used])
+                used += len(words)
+                pieces.append(words)
+            rows[missing] = len(self.reach_runs) + np.arange(len(missing))
+            self.reach_runs = np.concatenate([self.reach_runs, runs])
+            self.reach_words = np.concatenate(pieces)
+        return rows
+
+    def _parent_poses(self, node: int, parents: np.ndarray) -> np.ndarray:
+        """X_WP (n, 4, 4) of poses (n,) of the node's parent."""
+        parent = self.body.sampled.tree.nodes[node].parent
+        return np.eye(4)[None] if parent < 0 else self.nodes[parent].X_WN[parents]
+
+    def _draw(self, node: int, parents: np.ndarray, one_enough: np.ndarray) -> np.ndarray:
+        """Draw the node for poses of its parent; returns how many poses each adds."""
+        X_WP = self._parent_poses(node, parents)
+        X_PN = self.body.sampled.X_PN[node]
+        pairs = np.empty((len(X_WP) * len(X_PN), 2), dtype=np.int32)
+        pairs[:, 0] = np.repeat(np.arange(len(X_WP)), len(X_PN))
+        pairs[:, 1] = np.tile(np.arange(len(X_PN)), len(X_WP))
+        limit = self._limit(node)
+        for view in self.pictures.bit_views:
+            left = sift_by_balls(
+                view, X_WP, self.body.p_PB[node], self.body.ball_radii[node], pairs, limit
+            )
+            pairs = pairs[left]
+        several = len(self.pictures.views) > 1
+        if several:
+            # A pose that is enough for one view may not be one for another.
+            one_enough = np.zeros_like(one_enough)
+        drawn: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        for index, view in enumerate(self.pictures.bit_views):
+            celled = self.body.celled_outline(
+                node, self.pictures.views[index].camera, coarse=self.pictures.has_bands
+            )
+            kept, areas, runs, words = draw_bits(celled, view, X_WP, X_PN, pairs, limit, one_enough)
+            pairs = pairs[kept]
+            drawn = [(a[kept], r[kept], w) for a, r, w in drawn] + [(areas, runs, words)]
+        if several:
+            kept = sum(areas[:, 1:].sum(axis=1) for areas, _, _ in drawn) <= limit
+            pairs = pairs[kept]
+            drawn = [(a[kept], r[kept], w) for a, r, w in drawn]
+        self._append(node, parents, X_WP, pairs, drawn)
+        return np.bincount(pairs[:, 0], minlength=len(X_WP))
+
+    def _limit(self, node: int) -> float:
+        """The area that may lie outside the silhouettes in all views together [pixel]."""
+        if self._outside_share in (0.0, np.inf):
+            return self._outside_share
+        areas = [self.body.mean_area(node, view.camera) for view in self.pictures.views]
+        return self._outside_share * sum(areas)
+
+    def _append(
+        self,
+        node: int,
+        parents: np.ndarray,
+        X_WP: np.ndarray,
+        pairs: np.ndarray,
+        drawn: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
+    ) -> None:
+        """Add drawn poses to the node's arrays."""
+        poses, starts = self.nodes[node], self.pictures.part_starts
+        views = len(drawn)
+        runs = np.empty((len(pairs), len(starts) - 1, 3), dtype=np.int64)
+        areas = np.zeros((len(pairs), 3), dtype=np.int32)
+        used = len(poses.words)
+        for index, (view_areas, view_runs, words) in enumerate(drawn):
+            areas += view_areas
+            for kind in range(2 if self.pictures.has_bands else 1):
+                part = kind * views + index
+                runs[:, part] = view_runs[:, kind] + np.array([starts[part], 0, used])
+            used += len(words)
+        X_WN = X_WP[pairs[:, 0]] @ self.body.sampled.X_PN[node][pairs[:, 1]]
+        poses.samples = np.concatenate([poses.samples, pairs[:, 1]])
+        poses.parents = np.concatenate([poses.parents, parents[pairs[:, 0]].astype(np.int32)])
+        poses.X_WN = np.concatenate([poses.X_WN, X_WN])
+        poses.areas = np.concatenate([poses.areas, areas])
+        poses.runs = np.concatenate([poses.runs, runs])
+        poses.words = np.concatenate([poses.words, *(words for _, _, words in drawn)])

@@ -1,0 +1,257 @@
+"""What the beam search knows of a sampled body before it sees a picture."""
+
+import copy
+
+import fast_simplification
+import numpy as np
+
+from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.camera.models import Camera, ParallelCamera
+from drake_pose.errors import SettingsError
+from drake_pose.search.grid.settings import BeamSearchSettings
+from drake_pose.search.scoring import SampledTree
+from drake_pose.search.settings import PaperSearchSettings
+from drake_pose.silhouette.areas.inscribed_balls import VisualHull
+from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
+from drake_pose.silhouette.contours.direction_cells import CelledOutline, divide_outline
+
+_BALLS = 10
+# Surfaces of more triangles are simplified to fewer for stages that need not be exact.
+_MANY_TRIANGLES = 400
+_FEW_TRIANGLES = 300
+# A node may be nearer to the camera than the nearest root by this factor before its table is too
+# narrow; then it is drawn without one.
+_NEARER = 0.8
+# Tables of contour edges are made for these spreads of directions [rad].
+_SPREADS = tuple(0.02 * 1.3**k for k in range(13))
+
+
+class SampledBody:
+    """A sampled tree with what makes its nodes quick to draw and to reject; made once.
+
+    Attributes:
+        sampled: the sampled tree.
+        surface_areas: the mean area of each node's parallel projection from all sides [m^2].
+        order: the nodes in the order in which they are placed: the ends of limbs last.
+        limb_order: the same, but one limb after another.
+        ball_radii: for each node (k,) radii of balls that its picture covers [m]: balls inside the
+            node, and inside its children about points that their joints leave where they are.
+        p_PB: for each node (n, k, 3) their centres in its parent's frame at each sample [m].
+        reach_balls: (nodes, 4) centre in the parent's frame and radius [m] of a ball that holds the
+            node and its descendants at all samples.
+
+    Args:
+        tree: the pose tree.
+        settings: intervals and order.
+
+    Raises:
+        SettingsError: if the order does not name every node once, parents before children.
+    """
+
+    def __init__(self, tree: PoseTree, settings: BeamSearchSettings) -> None:
+        self.sampled = SampledTree(
+            tree,
+            PaperSearchSettings(
+                interval=settings.interval,
+                length_interval=settings.length_interval,
+                intervals=settings.intervals,
+            ),
+        )
+        # The mean projected area of a convex surface is a quarter of its area (Cauchy); a plane's
+        # normal is twice its triangle's area long.
+        self.surface_areas = [
+            0.125 * float(np.linalg.norm(outline.planes[:, :3], axis=1).sum())
+            for outline in self.sampled.outlines
+        ]
+        hulls = [VisualHull(outline) for outline in self.sampled.outlines]
+        balls = [self._find_balls(node, hulls) for node in range(len(tree.nodes))]
+        self._p_NB = [ball[:, :3] for ball in balls]
+        self.ball_radii = [np.ascontiguousarray(ball[:, 3]) for ball in balls]
+        self.p_PB = [self._place_balls(node) for node in range(len(tree.nodes))]
+        self.reach_balls = self._find_reaches()
+        self._celled: dict[tuple[int, float, bool], CelledOutline] = {}
+        given = named_order(tree, settings.node_order)
+        self.order = given or self._find_order(limb_by_limb=False)
+        self.limb_order = given or self._find_order(limb_by_limb=True)
+
+    def with_root_position(self, root_position: np.ndarray) -> "SampledBody":
+        """The same with the root at another position (3,) [m]; all but the root is shared."""
+        moved = copy.copy(self)
+        moved.sampled = self.sampled.with_root_position(root_position)
+        moved.p_PB = list(self.p_PB)
+        for i, node in enumerate(moved.sampled.tree.nodes):
+            if node.parent < 0:
+                moved.p_PB[i] = moved._place_balls(i)
+        moved.reach_balls = moved._find_reaches()
+        return moved
+
+    def celled_outline(self, node: int, camera: Camera, coarse: bool) -> CelledOutline:
+        """The node's surface, or a coarse one, with contour tables that suit a camera."""
+        spread = 0.0
+        if not isinstance(camera, ParallelCamera):
+            spread = self._spread(node, camera)
+        outline = self.sampled.outlines[node]
+        coarse = coarse and len(outline.triangles) > _MANY_TRIANGLES
+        key = (node, spread, coarse)
+        if key not in self._celled:
+            skin, bands = self.sampled.tree.nodes[node].skin, self.sampled.bands[node]
+            self._celled[key] = divide_outline(
+                _coarse_outline(outline) if coarse else outline,
+                spread,
+                None if skin is None else skin.mesh,
+                bands,
+            )
+        return self._celled[key]
+
+    def mean_area(self, node: int, camera: Camera) -> float:
+        """The node's mean projected area in a camera, seen from all sides [pixel]."""
+        scale = float(camera.kernel_parameters()[1])
+        if not isinstance(camera, ParallelCamera):
+            scale /= float(self._root_distances(camera).mean())
+        return self.surface_areas[node] * scale**2
+
+    def _root_distances(self, camera: Camera) -> np.ndarray:
+        """From the camera to where the roots can be [m]."""
+        roots = [
+            X[:, :3, 3]
+            for X, node in zip(self.sampled.X_PN, self.sampled.tree.nodes, strict=True)
+            if node.parent < 0
+        ]
+        return np.asarray(np.linalg.norm(np.vstack(roots) - camera.X_WC[:3, 3], axis=1))
+
+    def _spread(self, node: int, camera: Camera) -> float:
+        """How far the directions to the node's points may differ, from where the roots can be."""
+        needed = self.sampled.outlines[node].ball[3] / max(
+            1e-6, _NEARER * self._root_distances(camera).min()
+        )
+        return next((spread for spread in _SPREADS if spread >= needed), _SPREADS[-1])
+
+    def _find_balls(self, node: int, hulls: list[VisualHull]) -> np.ndarray:
+        balls = [hulls[node].spread_balls(_BALLS)]
+        # What lies farthest from the parent's joint leaves the silhouette first.
+        balls[0] = balls[0][np.argsort(-np.linalg.norm(balls[0][:, :3], axis=1), kind="stable")]
+        for child in self.sampled.tree.nodes[node].children:
+            X_NC = self.sampled.X_PN[child]
+            p_CF = _fixed_points(X_NC, self.sampled.outlines[child].ball)
+            if len(p_CF):
+                radii = hulls[child].radii(p_CF)
+                best = int(np.argmax(radii))
+                if radii[best] > 0.0:
+                    p_N = X_NC[0, :3, :3] @ p_CF[best] + X_NC[0, :3, 3]
+                    balls.append(np.append(p_N, radii[best])[None])
+        return np.vstack(balls)
+
+    def _place_balls(self, node: int) -> np.ndarray:
+        X_PN = self.sampled.X_PN[node]
+        placed = self._p_NB[node] @ np.swapaxes(X_PN[:, :3, :3], 1, 2) + X_PN[:, None, :3, 3]
+        return np.ascontiguousarray(placed)
+
+    def _find_reaches(self) -> np.ndarray:
+        nodes = self.sampled.tree.nodes
+        reaches = np.zeros((len(nodes), 4))
+        for i in reversed(range(len(nodes))):
+            balls = np.vstack([self._whole_ball(i), reaches[list(nodes[i].children)]])
+            X_PN = self.sampled.X_PN[i]
+            centers = balls[:, :3] @ np.swapaxes(X_PN[:, :3, :3], 1, 2) + X_PN[:, None, :3, 3]
+            reaches[i] = _ball_around(centers.reshape(-1, 3), np.tile(balls[:, 3], len(X_PN)))
+        return reaches
+
+    def _whole_ball(self, node: int) -> np.ndarray:
+        """A ball (4,) about the node's surface, its band at all samples included."""
+        ball, bands = self.sampled.outlines[node].ball, self.sampled.bands[node]
+        if bands is None:
+            return ball
+        farthest = float(np.linalg.norm(bands - ball[:3], axis=-1).max())
+        return np.append(ball[:3], max(ball[3], farthest))
+
+    def _find_order(self, limb_by_limb: bool) -> tuple[int, ...]:
+        """Trunk first, then limb after limb, the larger before the smaller.
+
+        The trunk is what a fork lies beyond. The nodes at the ends of the limbs come last: they
+        are small and have many poses, most of which hang on what is not placed yet.
+
+        Args:
+            limb_by_limb: a limb's end comes with the limb.
+        """
+        nodes = self.sampled.tree.nodes
+        forks = [len(node.children) > 1 for node in nodes]
+        sizes = [round(area, 6) for area in self.surface_areas]
+        for i in reversed(range(len(nodes))):
+            forks[i] = forks[i] or any(forks[child] for child in nodes[i].children)
+            sizes[i] += sum(sizes[child] for child in nodes[i].children)
+        placed: list[int] = []
+        while len(placed) < len(nodes):
+            last = placed[-1] if placed else -1
+
+            def rank(i: int, last: int = last) -> tuple[bool, bool, bool, float, int]:
+                is_end = not nodes[i].children and not limb_by_limb
+                follows = not is_end and nodes[i].parent == last
+                return not forks[i], is_end, not follows, -sizes[i], i
+
+            waiting = [
+                i
+                for i, node in enumerate(nodes)
+                if i not in placed and (node.parent < 0 or node.parent in placed)
+            ]
+            placed.append(min(waiting, key=rank))
+        return tuple(placed)
+
+
+def named_order(tree: PoseTree, names: tuple[str, ...]) -> tuple[int, ...]:
+    """The nodes of an order given by names; () for none.
+
+    Raises:
+        SettingsError: if it does not name every node once, parents before children.
+    """
+    if not names:
+        return ()
+    order = tuple(tree.node_index(name) for name in names)
+    if sorted(order) != list(range(len(tree.nodes))):
+        raise SettingsError("node_order must name every node of the tree once")
+    for place, node in enumerate(order):
+        if tree.nodes[node].parent not in (-1, *order[:place]):
+            raise SettingsError(
+                f"node_order names '{tree.nodes[node].name}' before its parent "
+                f"'{tree.nodes[tree.nodes[node].parent].name}'"
+            )
+    return order
+
+
+def _fixed_points(X_PN: np.ndarray, ball: np.ndarray) -> np.ndarray:
+    """Points (n, 3) of frame N that the samples X_PN leave where they are; none: (0, 3).
+
+    Where that is an axis, the points of it that lie in a ball (4,), centre and radius [m].
+    """
+    A = (X_PN[:, :3, :3] - X_PN[0, :3, :3]).reshape(-1, 3)
+    b = (X_PN[0, :3, 3] - X_PN[:, :3, 3]).reshape(-1)
+    _, sizes, Vt = np.linalg.svd(A, full_matrices=False)
+    solid = sizes > 1e-9 * max(1.0, float(sizes[0]))
+    point = np.linalg.lstsq(A, b, rcond=1e-9)[0]
+    if np.abs(A @ point - b).max() > 1e-9:
+        return np.zeros((0, 3))
+    if solid.sum() != 2:
+        return point[None]
+    along = Vt[2] @ (ball[:3] - point) + np.linspace(-ball[3], ball[3], 61)
+    return np.asarray(point + along[:, None] * Vt[2])
+
+
+def _coarse_outline(outline: Outline) -> Outline:
+    """The surface with fewer triangles (Garland and Heckbert's quadric error metric)."""
+    points, triangles = fast_simplification.simplify(
+        outline.vertices, outline.triangles, target_count=_FEW_TRIANGLES
+    )
+    return outline_from_mesh(TriangleMesh(np.asarray(points, dtype=np.float64), triangles))
+
+
+def _ball_around(centers: np.ndarray, radii: np.ndarray) -> np.ndarray:
+    """A small ball (4,), centre and radius, that holds balls (Badoiu and Clarkson)."""
+    center = 0.5 * (centers.min(axis=0) + centers.max(axis=0))
+    best, best_radius = center, np.inf
+    for step in range(2, 50):
+        distances = np.linalg.norm(centers - center, axis=1) + radii
+        farthest = int(np.argmax(distances))
+        if distances[farthest] < best_radius:
+            best, best_radius = center, distances[farthest]
+        center = center + (centers[farthest] - center) / step
+    return np.append(best, best_radius)

@@ -1,0 +1,323 @@
+"""Kameda's search: one silhouette to joint angles, node by node (sections 5.1 and 5.2).
+
+The steps keep the paper's numbers and letters: F (``done``), S' (``uncovered``), JAC_i(t)
+(``_NodeList.samples[t]``), u_i (``_NodeList.adopted``). With several views every area is summed
+over the views, and (4) holds in each view.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.errors import SettingsError
+from drake_pose.search.kameda.leaf_combinations import best_leaf_combination
+from drake_pose.search.result import Candidates, MatchResult, View
+from drake_pose.search.scoring import Regions, SampledTree, Scoring
+from drake_pose.search.settings import PaperSearchSettings
+
+# The paper's r = 200 pixels is 12.6 % of a node's mean projected area (section 6.1).
+_OUTSIDE_SHARE = 0.126
+
+
+@dataclass(frozen=True)
+class NodeList:
+    """The candidate list of one node.
+
+    Args:
+        samples: (n,) indices into the node's sampling grid, best first: JAC_i(1), JAC_i(2), ...
+        scores: (n,) their scores e_i(t) when the list was made [pixel].
+        X_WN: (n, 4, 4) their poses.
+        adopted: u_i, the one in use.
+    """
+
+    samples: np.ndarray
+    scores: np.ndarray
+    X_WN: np.ndarray
+    adopted: int = 0
+
+    @property
+    def has_untried(self) -> bool:
+        """Whether a candidate after the adopted one is left."""
+        return self.adopted + 1 < len(self.samples)
+
+
+@dataclass(frozen=True)
+class _Best:
+    J: float
+    lists: dict[int, NodeList]
+
+
+class PaperSearch:
+    """Matches silhouettes with a pose tree by the paper's search.
+
+    The sampling grids are made once; :meth:`match` may then be called for any number of pictures.
+
+    Args:
+        tree: the pose tree.
+        settings: the parameters; the paper's where not given.
+    """
+
+    def __init__(self, tree: PoseTree, settings: PaperSearchSettings | None = None) -> None:
+        self.tree = tree
+        self.settings = settings or PaperSearchSettings()
+        self.sampled = SampledTree(tree, self.settings)
+
+    def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> MatchResult:
+        """Estimate the pose that the views show.
+
+        Args:
+            views: one or several silhouettes of the same instant.
+            root_position: (3,), the root's known position in the world [m], where it is not the
+                pose tree's own.
+
+        Returns:
+            The best pose found; ``found`` is False where none was.
+
+        Raises:
+            SettingsError: if there is no view.
+        """
+        if not views:
+            raise SettingsError("a match needs at least one view, but none was given")
+        start = time.perf_counter()
+        sampled = self.sampled
+        if root_position is not None:
+            sampled = sampled.with_root_position(root_position)
+        scoring = Scoring(sampled, views)
+        if self.settings.outside_limit is not None:
+            limits = [float(self.settings.outside_limit)] * len(views)
+            run = _Run(scoring, self.settings, limits)
+            run.search()
+            return run.result(time.perf_counter() - start)
+        X_WN = sampled.tree.node_poses([values[0] for values in sampled.values])
+        limits = [max(1.0, _OUTSIDE_SHARE * area) for area in scoring.mean_node_areas(X_WN)]
+        picture_areas = [view.camera.width * view.camera.height for view in views]
+        runs = 0
+        while True:
+            run = _Run(scoring, self.settings, limits, runs)
+            run.search()
+            runs = run.runs
+            exhausted = all(r >= area for r, area in zip(limits, picture_areas, strict=True))
+            if run.best is not None or exhausted or runs >= self.settings.run_limit:
+                return run.result(time.perf_counter() - start)
+            limits = [2.0 * r for r in limits]
+
+
+class _Run:
+    """One run of the search with a given threshold r."""
+
+    def __init__(
+        self,
+        scoring: Scoring,
+        settings: PaperSearchSettings,
+        outside_limit: Sequence[float],
+        runs: int = 0,
+    ) -> None:
+        self.tree = scoring.sampled.tree
+        self.nodes = self.tree.nodes
+        self.scoring = scoring
+        self.settings = settings
+        self.outside_limit = tuple(outside_limit)
+        self.runs = runs
+        self.lists: dict[int, NodeList] = {}
+        self.best: _Best | None = None
+        self.first_J = float("nan")
+        self.stopped_by = "end"
+
+    # Section 5.1
+
+    def search(self) -> None:
+        """Run sections 5.1 and 5.2 to their end, or to the run limit."""
+        while self._complete():
+            J = self._whole_pose_J()
+            if self.best is None:
+                self.first_J = J
+            self._keep_if_better(J)
+            self._combine_leaves(J)
+            if not self._adopt_most_exposed():
+                return
+
+    def _complete(self) -> bool:
+        """Steps 1 to 6 until every node has its angles; False if no pose is left (or allowed)."""
+        uncovered: Regions | None = None
+        while (node := self._next_node()) is not None:
+            if self.runs >= self.settings.run_limit:
+                self.stopped_by = "run_limit"
+                return False
+            if uncovered is None:
+                done = sorted(self.lists)
+                uncovered = self.scoring.uncovered(
+                    done, self._adopted_samples(), self._adopted_poses()
+                )
+            self.runs += 1
+            made = self.make_list(node, uncovered)
+            if made is not None:
+                self.lists[node] = made
+                uncovered.subtract([node], made.samples[:1], made.X_WN[:1])
+            elif self._backtrack(node):
+                uncovered = None
+            else:
+                return False
+        return True
+
+    def _next_node(self) -> int | None:
+        """Step 1: the node whose parent is done that is the fewest steps from the root."""
+        waiting = [
+            i
+            for i, node in enumerate(self.nodes)
+            if i not in self.lists and (node.parent < 0 or node.parent in self.lists)
+        ]
+        return min(waiting, key=lambda i: (self.nodes[i].depth, i), default=None)
+
+    def make_list(self, node: int, uncovered: Regions) -> NodeList | None:
+        """Steps 3 to 5: sample, keep what stays inside (4), score (5), sort, keep the best K."""
+        parent = self.nodes[node].parent
+        X_WP = np.eye(4) if parent < 0 else self._adopted_pose(parent)
+        X_WN = self.scoring.candidate_poses(node, X_WP)
+        everything = np.arange(len(X_WN))
+        outside, covered = self.scoring.candidate_areas(node, everything, X_WN, uncovered)
+        limits = np.array(self.outside_limit)[:, None]
+        inside = np.flatnonzero((outside <= limits).all(axis=0))
+        if len(inside) == 0:
+            return None
+        scores = covered[inside]
+        # A stable sort: equal scores keep the grid's order, which begins nearest to zero.
+        worth = scores - self.settings.outside_weight * outside[:, inside].sum(axis=0)
+        order = np.argsort(-worth, kind="stable")
+        if len(self.nodes[node].mesh.triangles):
+            order = order[: self.settings.candidate_limit]
+        samples = inside[order]
+        return NodeList(samples, scores[order], X_WN[samples])
+
+    def _backtrack(self, node: int) -> bool:
+        """Step 6: the nearest node towards the root with an untried candidate adopts it."""
+        ancestor = self.nodes[node].parent
+        while ancestor >= 0:
+            current = self.lists[ancestor]
+            if current.has_untried:
+                self._adopt(ancestor, current.adopted + 1)
+                return True
+            ancestor = self.nodes[ancestor].parent
+        return False
+
+    def _adopt(self, node: int, candidate: int) -> None:
+        """Adopt a candidate of an inner node and give up all that hangs on the node."""
+        self.lists[node] = replace(self.lists[node], adopted=candidate)
+        waiting = list(self.nodes[node].children)
+        while waiting:
+            child = waiting.pop()
+            self.lists.pop(child, None)
+            waiting.extend(self.nodes[child].children)
+
+    # Section 5.2
+
+    def _combine_leaves(self, J: float) -> None:
+        """Section 5.2.1: the best combination of the leaves' candidates is adopted."""
+        leaves = [i for i in range(len(self.nodes)) if not self.nodes[i].children]
+        inner = [i for i in range(len(self.nodes)) if self.nodes[i].children]
+        if all(len(self.lists[leaf].samples) == 1 for leaf in leaves):
+            return
+        choice, gain = best_leaf_combination(
+            self.scoring,
+            inner,
+            (self._adopted_samples()[inner], self._adopted_poses()[inner]),
+            leaves,
+            [(self.lists[leaf].samples, self.lists[leaf].X_WN) for leaf in leaves],
+            [self.lists[leaf].adopted for leaf in leaves],
+            self.settings.leaf_combination_limit,
+        )
+        for leaf, candidate in zip(leaves, choice, strict=True):
+            self.lists[leaf] = replace(self.lists[leaf], adopted=candidate)
+        self._keep_if_better(J - gain)
+
+    def _adopt_most_exposed(self) -> bool:
+        """Section 5.2.2: adopt the most exposed node's candidate; False if A becomes empty."""
+        covers = []
+        samples, poses = self._adopted_samples(), self._adopted_poses()
+        for i, node in enumerate(self.nodes):
+            current = self.lists[i]
+            if not node.children or not current.has_untried:
+                continue
+            others = [k for k in range(len(self.nodes)) if k != i]
+            exposed = self.scoring.uncovered(others, samples, poses)
+            rest = slice(current.adopted, None)
+            _, cover = self.scoring.candidate_areas(
+                i, current.samples[rest], current.X_WN[rest], exposed
+            )
+            # argmax takes the first of equals: the adopted candidate stays unless one is better.
+            best = int(np.argmax(cover))
+            covers.append((cover[best], i, current.adopted + best))
+        # Nodes whose best candidate is the adopted one leave A one after another, largest cover
+        # first, until one is met that has a better candidate.
+        for _, i, candidate in sorted(covers, key=lambda entry: (-entry[0], entry[1])):
+            if candidate > self.lists[i].adopted:
+                self._adopt(i, candidate)
+                return True
+        return False
+
+    # Poses and answers
+
+    def _adopted_pose(self, node: int) -> np.ndarray:
+        current = self.lists[node]
+        return current.X_WN[current.adopted]
+
+    def _adopted_poses(self) -> np.ndarray:
+        """(nodes, 4, 4), the identity for nodes that are not done."""
+        poses = np.tile(np.eye(4), (len(self.nodes), 1, 1))
+        for node in self.lists:
+            poses[node] = self._adopted_pose(node)
+        return poses
+
+    def _adopted_samples(self) -> np.ndarray:
+        """(nodes,) int, 0 for nodes that are not done."""
+        samples = np.zeros(len(self.nodes), dtype=np.int64)
+        for node, current in self.lists.items():
+            samples[node] = current.samples[current.adopted]
+        return samples
+
+    def _whole_pose_J(self) -> float:
+        samples = self._adopted_samples()[None]
+        return float(self.scoring.J(self._adopted_poses()[None], samples)[0])
+
+    def _keep_if_better(self, J: float) -> None:
+        if self.best is None or J < self.best.J:
+            self.best = _Best(J, dict(self.lists))
+
+    def result(self, seconds: float) -> MatchResult:
+        """What the search found, as plain arrays."""
+        area = self.scoring.silhouette_area
+        if self.best is None:
+            missing = np.full(len(self.tree.model.position_names), np.nan)
+            nothing = float("nan")
+            return MatchResult(
+                False, missing, np.eye(4), (), nothing, nothing, nothing, self.runs,
+                self.outside_limit, {}, self.stopped_by, seconds,
+            )  # fmt: skip
+        values = []
+        untried = {}
+        for i, node in enumerate(self.nodes):
+            current = self.best.lists[i]
+            grid = self.scoring.sampled.values[i]
+            values.append(grid[current.samples[current.adopted]])
+            first = current.adopted + 1 if node.children else 0
+            rest = [t for t in range(first, len(current.samples)) if t != current.adopted]
+            untried[node.name] = Candidates(
+                node.value_names, grid[current.samples[rest]], current.scores[rest]
+            )
+        q, X_WB = self.tree.positions_from(values)
+        return MatchResult(
+            found=True,
+            q=q,
+            X_WB=X_WB,
+            node_values=tuple(values),
+            J=self.best.J,
+            E_total=self.best.J / area,
+            first_E_total=self.first_J / area,
+            runs=self.runs,
+            outside_limit=self.outside_limit,
+            untried=untried,
+            stopped_by=self.stopped_by,
+            seconds=seconds,
+        )

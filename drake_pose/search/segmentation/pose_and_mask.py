@@ -1,0 +1,349 @@
+"""Pose and mask in turn: a rough pose tells where to look for the mask, the mask tells the pose.
+
+How likely the body is at each pixel is sampled from the pose's uncertainty. Pictures of a camera
+that stands still show the background beside the body; where they do, colours tell the body from it,
+elsewhere GrabCut does. The first poses are searched by the cross-entropy method (Rubinstein 1999),
+since joints that are all a few degrees off put a hand far beside its picture; then the one fit
+draws the contour to the mask's edge. The last mask is the model's silhouette, along whose edge the
+colours decide.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.camera.models import Camera
+from drake_pose.fit.contour_fit import ContourFit, Prior
+from drake_pose.fit.evidence import NO_EDGE, find_edge_points
+from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.surfaces import VERY_FEW, few_triangles
+from drake_pose.silhouette.areas.bending import TreeSurfaces
+from drake_pose.silhouette.areas.outline import Outline
+from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.pictures.mask_agreement import intersection_over_union
+from drake_pose.silhouette.segmentation.background_beside import tell_from_background
+from drake_pose.silhouette.segmentation.grab_cut import cut
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Picture = NDArray[np.uint8]
+
+# Triangles of a part that the contour fit sees.
+_TRIANGLES = 600
+# Poses that are drawn to tell how likely the body is at each pixel.
+_SAMPLES = 32
+# The cross-entropy search: rounds, poses in each, and how many of them shape the next.
+_SEARCH_ROUNDS, _SEARCHED, _KEPT = 5, 60, 8
+# The spread of these is widened a little, and stays above a share of the first one.
+_WIDENED, _LEAST_SPREAD = 1.1, 0.15
+# The first rounds search; later ones fit alone.
+_SEARCHING = 2
+# How far off a start that was searched still is, as a share; and where rounds end.
+_SEARCHED_SHARE, _FINEST_SHARE = 0.4, 0.14
+# Masks and poses that agree so well let the uncertainty shrink by half; those that agree less, by
+# less.
+_GOOD, _FAIR = 0.9, 0.8
+# A surface is this uncertain beside the pose, and the last mask follows colours along such a band,
+# as shares of the silhouette's size.
+_SURFACE, _BAND = 0.02, 0.01
+# Surely the body, and surely not, by log-odds; and the least that any pixel is left.
+_SURE, _LEAST_PROBABILITY = 4.0, 0.01
+# GrabCut's rounds, and the side of the median filter that takes specks away [pixel].
+_CUTS, _SPECKS = 2, 5
+# The contour fit's first and last scale, as shares of the silhouette's size.
+_WIDE, _NARROW, _SPACING = 0.25, 0.03, 0.05
+# Silhouettes that overlap so much from round to round are settled.
+_SETTLED = 0.995
+
+
+@dataclass(frozen=True)
+class PoseAndMaskSettings:
+    """How far off the first poses may be, and how long they are bettered.
+
+    Args:
+        angle: standard deviation of each angle of the first poses [rad].
+        length_share: of each length, as a share of its range.
+        length: of each length without limits [m].
+        rounds: at most so many.
+    """
+
+    angle: float = math.radians(5.0)
+    length_share: float = 0.5
+    length: float = 0.05
+    rounds: int = 6
+
+
+@dataclass(frozen=True, eq=False)
+class FoundPose:
+    """One frame's pose, and its masks.
+
+    Args:
+        values: (m,) of the pose tree [rad or m].
+        masks: (H, W) of each camera; None where it has no picture of the frame.
+        agreements: of each camera, IoU of the model's silhouette and of the mask that colours give
+            by themselves; nan where there is no picture.
+        deviations: (m,) how far the values are off the first ones, in their standard deviations.
+    """
+
+    values: Array
+    masks: tuple[Mask | None, ...]
+    agreements: tuple[float, ...]
+    deviations: Array
+
+
+class PoseAndMask:
+    """Finds poses and masks of a body in the pictures of cameras that stand still.
+
+    Args:
+        kinematics: of the body's pose tree.
+        cameras: the cameras.
+        settings: how far off the first poses may be.
+        seed: of the random poses.
+    """
+
+    def __init__(
+        self,
+        kinematics: TreeKinematics,
+        cameras: Sequence[Camera],
+        settings: PoseAndMaskSettings | None = None,
+        seed: int = 0,
+    ) -> None:
+        self._kinematics, self._cameras = kinematics, tuple(cameras)
+        self._settings = settings or PoseAndMaskSettings()
+        self._rng = np.random.default_rng(seed)
+        self._surfaces = TreeSurfaces(kinematics.tree)
+        self._few = few_triangles(self._surfaces, VERY_FEW)
+        fitted = few_triangles(self._surfaces, _TRIANGLES)
+        self._fit = ContourFit(kinematics, fitted, pixels=100.0)
+        ranges = kinematics.upper - kinematics.lower
+        lengths = np.where(
+            np.isfinite(ranges), self._settings.length_share * ranges, self._settings.length
+        )
+        spread = np.where(kinematics.is_angle, self._settings.angle, lengths)
+        self._spread = np.where(ranges > 0.0, spread, 0.0)
+
+    def run(
+        self,
+        pictures: Sequence[Sequence[Picture | None]],
+        starts: Sequence[Array],
+        on_round: Callable[[int], None] = lambda _: None,
+    ) -> list[FoundPose]:
+        """Finds all frames' poses and masks.
+
+        Args:
+            pictures: of each frame, each camera's (H, W, 3); None where it has none.
+            starts: of each frame, (m,) a rough pose of the tree [rad or m].
+            on_round: is told how many rounds are done.
+        """
+        values = [np.clip(one, self._kinematics.lower, self._kinematics.upper) for one in starts]
+        shares = np.ones(len(values))
+        last: list[list[Mask]] = []
+        for k in range(self._settings.rounds):
+            chances = self._chances(values, shares)
+            ratios = self._ratios(pictures, chances)
+            if k < _SEARCHING:
+                values = [
+                    self._search(one, share, own, seen)
+                    for one, share, own, seen in zip(values, shares, ratios, pictures, strict=True)
+                ]
+                shares = np.minimum(shares, _SEARCHED_SHARE)
+                chances = self._chances(values, shares)
+            cuts = self._cut(pictures, chances, ratios)
+            values = [self._refine(*one) for one in zip(values, starts, cuts, shares, strict=True)]
+            drawn = [[self._draw(one, camera) for camera in self._cameras] for one in values]
+            agreements = [self._agree(*one) for one in zip(drawn, cuts, strict=True)]
+            shares = np.array([_narrowed(*one) for one in zip(shares, agreements, strict=True)])
+            on_round(k + 1)
+            if last and (shares <= _FINEST_SHARE).all() and _settled(drawn, last):
+                break
+            last = drawn
+        return [
+            FoundPose(
+                one,
+                self._finish(one, silhouettes, own),
+                agreed,
+                (one - start) / np.where(self._spread > 0.0, self._spread, np.inf),
+            )
+            for one, silhouettes, own, agreed, start in zip(
+                values, drawn, cuts, agreements, starts, strict=True
+            )
+        ]
+
+    def _draw(self, values: Array, camera: Camera, few: bool = False) -> Mask:
+        """The body's silhouette (H, W)."""
+        outlines: Sequence[Outline] = (
+            self._few if few else self._surfaces.at(self._kinematics.split(values))
+        )
+        return draw_mask(outlines, camera.X_CW @ self._kinematics.poses(values), camera)
+
+    def _sample(self, values: Array, spread: Array, count: int) -> Array:
+        """(count, m) values about some, inside the limits."""
+        drawn = values + spread * self._rng.standard_normal((count, len(values)))
+        return np.clip(drawn, self._kinematics.lower, self._kinematics.upper)
+
+    def _chances(
+        self, values: Sequence[Array], shares: NDArray[np.float64]
+    ) -> list[list[NDArray[np.float32]]]:
+        """How likely the body is at each pixel, of each frame and camera."""
+        found = []
+        for one, share in zip(values, shares, strict=True):
+            poses = self._sample(one, share * self._spread, _SAMPLES)
+            own = []
+            for camera in self._cameras:
+                total = np.zeros((camera.height, camera.width), dtype=np.float32)
+                for pose in poses:
+                    total += self._draw(pose, camera, few=True)
+                blur = max(1.0, _SURFACE * math.sqrt(float(total.sum()) / _SAMPLES))
+                chance = cv2.GaussianBlur(total / _SAMPLES, (0, 0), blur)
+                least = _LEAST_PROBABILITY
+                own.append(np.clip(chance, least, 1.0 - least).astype(np.float32))
+            found.append(own)
+        return found
+
+    def _ratios(
+        self,
+        pictures: Sequence[Sequence[Picture | None]],
+        chances: Sequence[Sequence[NDArray[np.float32]]],
+    ) -> list[list[NDArray[np.float32]]]:
+        """What the background says, of each frame and camera."""
+        found = [[np.zeros_like(one) for one in own] for own in chances]
+        for c in range(len(self._cameras)):
+            seen = [(f, own[c]) for f, own in enumerate(pictures)]
+            there = [(f, picture) for f, picture in seen if picture is not None]
+            told = tell_from_background(
+                [picture for _, picture in there], [chances[f][c] for f, _ in there]
+            )
+            for (f, _), ratio in zip(there, told, strict=True):
+                found[f][c] = ratio
+        return found
+
+    def _search(
+        self,
+        values: Array,
+        share: float,
+        ratios: Sequence[NDArray[np.float32]],
+        pictures: Sequence[Picture | None],
+    ) -> Array:
+        """The pose near some values that covers most of what is not background."""
+        if not any(ratio.any() for ratio in ratios):
+            return values
+        seen = [c for c, picture in enumerate(pictures) if picture is not None]
+        first = share * self._spread
+        middle, spread, best, most = values, first, values, -math.inf
+        for _ in range(_SEARCH_ROUNDS):
+            poses = self._sample(middle, spread, _SEARCHED)
+            poses[0] = middle
+            scores = np.array(
+                [
+                    sum(
+                        float(ratios[c][self._draw(pose, self._cameras[c], few=True)].sum())
+                        for c in seen
+                    )
+                    for pose in poses
+                ]
+            )
+            order = np.argsort(-scores, kind="stable")[:_KEPT]
+            if scores[order[0]] > most:
+                best, most = poses[order[0]], scores[order[0]]
+            middle = poses[order].mean(axis=0)
+            spread = np.maximum(_WIDENED * poses[order].std(axis=0), _LEAST_SPREAD * first)
+        return best
+
+    def _cut(
+        self,
+        pictures: Sequence[Sequence[Picture | None]],
+        chances: Sequence[Sequence[NDArray[np.float32]]],
+        ratios: Sequence[Sequence[NDArray[np.float32]]],
+    ) -> list[list[Mask | None]]:
+        """What colours give, of each frame and camera."""
+        return [
+            [
+                None if picture is None else cut_by_odds(picture, chance, ratio)
+                for picture, chance, ratio in zip(*own, strict=True)
+            ]
+            for own in zip(pictures, chances, ratios, strict=True)
+        ]
+
+    def _refine(
+        self, values: Array, start: Array, masks: Sequence[Mask | None], share: float
+    ) -> Array:
+        """The pose whose contour lies along the masks' edges."""
+        areas = [np.count_nonzero(mask) for mask in masks if mask is not None and mask.any()]
+        if not areas:
+            return values
+        size = math.sqrt(float(np.mean(areas)))
+        edges = [NO_EDGE if mask is None else find_edge_points(mask, 2.0) for mask in masks]
+        scale = max(_SPACING, _WIDE * float(share))
+        # Rounds are in hundreds of pixels.
+        rounds = [Round(one * size / 200.0, _SPACING, 8) for one in np.geomspace(scale, _NARROW, 4)]
+        known = np.where(self._spread > 0.0, 1.0 / np.maximum(self._spread, 1e-9) ** 2, 0.0)
+        prior = Prior(start, known)
+        held = self._spread <= 0.0
+        return self._fit.fit(self._cameras, edges, values, rounds, prior, held).values
+
+    def _agree(self, drawn: Sequence[Mask], masks: Sequence[Mask | None]) -> tuple[float, ...]:
+        """IoU of silhouettes and masks; nan where there is no picture."""
+        return tuple(
+            math.nan if mask is None else intersection_over_union(own, mask)
+            for own, mask in zip(drawn, masks, strict=True)
+        )
+
+    def _finish(
+        self, values: Array, drawn: Sequence[Mask], masks: Sequence[Mask | None]
+    ) -> tuple[Mask | None, ...]:
+        """Silhouettes, along whose edges colours decide."""
+        return tuple(
+            None if mask is None else follow_colours(own, mask)
+            for own, mask in zip(drawn, masks, strict=True)
+        )
+
+
+def cut_by_odds(picture: Picture, chance: NDArray[np.float32], ratio: NDArray[np.float32]) -> Mask:
+    """The object (H, W) in a picture (H, W, 3), by GrabCut where neither pose nor colour is sure.
+
+    Args:
+        picture: the picture.
+        chance: (H, W) how likely the object is, by its pose.
+        ratio: (H, W) logarithm of how much more likely its colour makes it.
+    """
+    odds = np.log(chance / (1.0 - chance)) + ratio
+    labels = np.where(odds > 0.0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    labels[odds > _SURE] = cv2.GC_FGD
+    labels[(odds < -_SURE) | (chance <= _LEAST_PROBABILITY)] = cv2.GC_BGD
+    found = cut(picture, labels, _CUTS)
+    return np.asarray(cv2.medianBlur(found.astype(np.uint8), _SPECKS) > 0)
+
+
+def follow_colours(silhouette: Mask, mask: Mask) -> Mask:
+    """A silhouette (H, W) that is as a mask (H, W) is along its edge."""
+    size = math.sqrt(max(1, int(np.count_nonzero(silhouette))))
+    reach = max(1, round(_BAND * size))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    own = silhouette.astype(np.uint8)
+    inner = cv2.erode(own, disc, borderType=cv2.BORDER_REPLICATE) > 0
+    outer = cv2.dilate(own, disc) > 0
+    return np.asarray(inner | (outer & mask))
+
+
+def _narrowed(share: float, agreements: Sequence[float]) -> float:
+    """How far off a pose may still be, as a share, after a round that agreed so well."""
+    agreed = float(np.nanmin(np.array(agreements)))
+    if agreed > _GOOD:
+        return max(0.5 * share, _FINEST_SHARE)
+    return max(0.7 * share, _SEARCHED_SHARE) if agreed > _FAIR else share
+
+
+def _settled(drawn: Sequence[Sequence[Mask]], last: Sequence[Sequence[Mask]]) -> bool:
+    """Whether no silhouette changes any more."""
+    return all(
+        intersection_over_union(*pair) > _SETTLED
+        for own, other in zip(drawn, last, strict=True)
+        for pair in zip(own, other, strict=True)
+    )

@@ -1,0 +1,354 @@
+"""The coarse search: poses from which a continuous refinement has a chance.
+
+On a grid as coarse as is affordable, the pose nearest to the truth may show less of the silhouette
+than a wrong one: a thin limb half a step off leaves it altogether. So this search compares places,
+not areas, and lets a distance of less than half a step pass. It places one node after another and
+keeps thousands of hypotheses; of those whose nodes with children to come stand alike only the best,
+because their future is the same.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_pose.camera.models import ParallelCamera
+from drake_pose.errors import SettingsError
+from drake_pose.search.grid.sampled_body import SampledBody
+from drake_pose.search.result import View
+from drake_pose.search.starts.coarse_kernel import (
+    Balls,
+    CoarseView,
+    fill_cover,
+    score_samples,
+    unite_pairs,
+)
+from drake_pose.silhouette.pictures.signed_distances import signed_distances
+
+_WORDS = 4
+_LEVELS = 10
+# How many cells of a cover are as wide as the root of the silhouettes' area.
+_CELLS = 40.0
+# A cover has this many rows and columns at most: 80 MB.
+_MOST_CELLS = 500
+# A cell is divided into this many parts along its side, where it has as many pixels.
+_PARTS = 4
+_LEAST_HYPOTHESES = 64
+# How many times the hypotheses kept are looked at for some that do not stand alike.
+_SPARE = 8
+# Nodes come nearer to a camera than the root by this factor at most.
+_NEARER = 0.7
+
+
+@dataclass(frozen=True)
+class CoarseSettings:
+    """Parameters of the coarse search.
+
+    Args:
+        interval: sampling interval of every angle [rad].
+        length_interval: sampling interval of every prismatic position [m].
+        hypotheses: at most this many are kept after each node.
+        again_hypotheses: the same where a limb of a pose is searched again.
+        evaluations: fewer are kept where a node's samples times the hypotheses exceed this.
+        slack: distances that do not count, as a share of the root of the silhouette's area.
+        outside_weight: what a pixel outside counts; one newly covered counts one.
+        alike: frames stand alike if points in them differ by less than about this share of the
+            body's reach.
+    """
+
+    interval: float = math.radians(15.0)
+    length_interval: float = 0.05
+    hypotheses: int = 2500
+    again_hypotheses: int = 300
+    evaluations: int = 150_000
+    slack: float = 0.05
+    outside_weight: float = 0.8
+    alike: float = 0.04
+
+    def __post_init__(self) -> None:
+        for name in ("interval", "length_interval", "outside_weight", "alike"):
+            if not getattr(self, name) > 0.0:
+                raise SettingsError(f"{name} must be positive, not {getattr(self, name)}")
+        for name in ("hypotheses", "again_hypotheses", "evaluations"):
+            if getattr(self, name) < 1:
+                raise SettingsError(f"{name} must be 1 or more, not {getattr(self, name)}")
+        if not self.slack >= 0.0:
+            raise SettingsError(f"slack must be 0 or more, not {self.slack}")
+
+
+@dataclass(frozen=True)
+class CoarsePoses:
+    """Poses on the grid, best first.
+
+    Args:
+        samples: (n, nodes) the sample of each node; -1 where the node was not searched.
+        X_WN: (n, nodes, 4, 4) the nodes' poses.
+        costs: (n,) [pixel], comparable within one search only.
+    """
+
+    samples: np.ndarray
+    X_WN: np.ndarray
+    costs: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    def only(self, chosen: np.ndarray) -> CoarsePoses:
+        """Those at indices."""
+        return CoarsePoses(self.samples[chosen], self.X_WN[chosen], self.costs[chosen])
+
+
+class CoarseSearch:
+    """Finds coarse poses of one body in the silhouettes of one instant.
+
+    Args:
+        body: the body, sampled at the settings' intervals.
+        views: the silhouettes.
+        settings: the parameters.
+    """
+
+    def __init__(self, body: SampledBody, views: Sequence[View], settings: CoarseSettings) -> None:
+        self.body = body
+        self._settings = settings
+        self._views = _prepare_views(body, views, settings)
+        self._size = _mean_size(views)
+        self._nodes = body.sampled.tree.nodes
+        self._reach = max(
+            float(body.reach_balls[i, 3]) for i, node in enumerate(self._nodes) if node.parent < 0
+        )
+        self._p_NB = [
+            (p_PB[0] - X_PN[0, :3, 3]) @ X_PN[0, :3, :3]
+            for p_PB, X_PN in zip(body.p_PB, body.sampled.X_PN, strict=True)
+        ]
+        self._balls = [
+            Balls(
+                _by_ball(body.p_PB[i]),
+                radii.astype(np.float32),
+                body.surface_areas[i] / max(1, len(radii)),
+            )
+            for i, radii in enumerate(body.ball_radii)
+        ]
+
+    def find(self) -> CoarsePoses:
+        """Search all nodes."""
+        nodes = range(len(self._nodes))
+        start = np.tile(np.eye(4), (len(self._nodes), 1, 1))
+        return self._find(start, set(nodes), self._settings.hypotheses)
+
+    def find_again(self, X_WN: np.ndarray, again: Sequence[int]) -> CoarsePoses:
+        """Search some nodes of a pose again.
+
+        Args:
+            X_WN: (nodes, 4, 4) the pose.
+            again: the nodes; with a node all its descendants must be among them.
+        """
+        return self._find(X_WN, set(again), self._settings.again_hypotheses)
+
+    def _find(self, start: np.ndarray, wanted: set[int], hypotheses: int) -> CoarsePoses:
+        nodes = self._nodes
+        poses = CoarsePoses(np.full((1, len(nodes)), -1), start[None].copy(), np.zeros(1))
+        masks = [np.zeros((1, _WORDS), dtype=np.uint64) for _ in self._views]
+        placed = set(range(len(nodes))) - wanted
+        for node in placed:
+            masks = self._cover(node, start, masks)
+        for node in self.body.limb_order:
+            if node in wanted:
+                placed.add(node)
+                poses, masks = self._grow(node, poses, masks, placed, hypotheses)
+        return poses
+
+    def choose_distinct(self, poses: CoarsePoses, count: int, apart: float) -> CoarsePoses:
+        """The best poses some ball of which lies apart from where it lies in any better one.
+
+        Args:
+            poses: of find.
+            count: at most this many.
+            apart: in some view it is seen so far away, as a share of the root of the silhouette's
+                area.
+        """
+        places = []
+        for i, p_NB in enumerate(self._p_NB):
+            if len(p_NB) == 0:
+                continue
+            marks = np.vstack([p_NB.mean(axis=0), p_NB[0]])
+            X = poses.X_WN[:, i]
+            p_WB = marks @ np.swapaxes(X[:, :3, :3], 1, 2) + X[:, None, :3, 3]
+            places += [_project(p_WB, view.camera, view.X_CW) for view in self._views]
+        together = np.hstack([place.reshape(len(poses), -1) for place in places])
+        chosen: list[int] = []
+        for i in range(len(together)):
+            gaps = np.abs(together[chosen] - together[i]).max(axis=1, initial=0.0)
+            if not chosen or gaps.min() > apart * self._size:
+                chosen.append(i)
+            if len(chosen) >= count:
+                break
+        return poses.only(np.array(chosen, dtype=np.int64))
+
+    def _parent_in(self, view: CoarseView, node: int, X_WN: np.ndarray) -> np.ndarray:
+        """X_CP (n, 4, 4) of a node's parent at poses X_WN (n, nodes, 4, 4)."""
+        parent = self._nodes[node].parent
+        X_WP = np.tile(np.eye(4), (len(X_WN), 1, 1)) if parent < 0 else X_WN[:, parent]
+        return np.ascontiguousarray(view.X_CW @ X_WP)
+
+    def _cover(self, node: int, X_WN: np.ndarray, masks: list[np.ndarray]) -> list[np.ndarray]:
+        """What one hypothesis covers together with a node that has its place."""
+        still = self._balls[node]._replace(p_PB=_by_ball(self._p_NB[node][None]))
+        one = np.zeros((1, 2), dtype=np.int64)
+        return [
+            unite_pairs(view, np.ascontiguousarray(view.X_CW @ X_WN[node])[None], still, mask, one)
+            for view, mask in zip(self._views, masks, strict=True)
+        ]
+
+    def _grow(
+        self,
+        node: int,
+        poses: CoarsePoses,
+        masks: list[np.ndarray],
+        placed: set[int],
+        hypotheses: int,
+    ) -> tuple[CoarsePoses, list[np.ndarray]]:
+        """Place one more node in every hypothesis and keep the best."""
+        settings, balls = self._settings, self._balls[node]
+        X_PN = self.body.sampled.X_PN[node]
+        X_CPs = [self._parent_in(view, node, poses.X_WN) for view in self._views]
+        added = np.zeros((len(poses), len(X_PN)))
+        for view, X_CP, mask in zip(self._views, X_CPs, masks, strict=True):
+            score_samples(view, X_CP, balls, mask, settings.outside_weight, added)
+        costs = (poses.costs[:, None] + added).ravel()
+        following = [i for i in self.body.limb_order if i not in placed]
+        widest = len(self.body.sampled.X_PN[following[0]]) if following else 1
+        width = min(hypotheses, max(_LEAST_HYPOTHESES, settings.evaluations // widest))
+        pool = min(len(costs), _SPARE * width)
+        best = np.argpartition(costs, pool - 1)[:pool]
+        best = best[np.lexsort((best, costs[best]))]
+        X_WN = poses.X_WN[best // len(X_PN)]
+        parent = self._nodes[node].parent
+        X_WP = np.eye(4) if parent < 0 else X_WN[:, parent]
+        X_WN[:, node] = X_WP @ X_PN[best % len(X_PN)]
+        kept = self._unlike(X_WN, placed)[:width]
+        best = best[kept]
+        pairs = np.column_stack([best // len(X_PN), best % len(X_PN)])
+        samples = poses.samples[pairs[:, 0]]
+        samples[:, node] = pairs[:, 1]
+        united = [
+            unite_pairs(view, X_CP, balls, mask, pairs)
+            for view, X_CP, mask in zip(self._views, X_CPs, masks, strict=True)
+        ]
+        return CoarsePoses(samples, X_WN[kept], costs[best]), united
+
+    def _unlike(self, X_WN: np.ndarray, placed: set[int]) -> np.ndarray:
+        """Indices of the poses whose open nodes stand unlike those of any better pose."""
+        is_open = [i for i in sorted(placed) if not placed.issuperset(self._nodes[i].children)]
+        if not is_open:
+            return np.arange(len(X_WN))
+        X = X_WN[:, is_open]
+        lever = 0.15 * self._reach
+        points = [X[..., :3, 3], X[..., :3, 3] + lever * X[..., :3, 0]]
+        points.append(X[..., :3, 3] + lever * X[..., :3, 2])
+        cells = np.rint(np.concatenate(points, axis=1) / (self._settings.alike * self._reach))
+        cells = cells.reshape(len(X_WN), -1).astype(np.int64)
+        # Any odd numbers will do; always the same, so that answers are.
+        keys = np.random.default_rng(2718).integers(1, 2**62, cells.shape[1]) | 1
+        return np.sort(np.unique((cells * keys).sum(axis=1), return_index=True)[1])
+
+
+def _distances_at(
+    mask: np.ndarray, origin: np.ndarray, side: float, rows: int, columns: int
+) -> np.ndarray:
+    """(rows, columns) signed distances in the middles of squares, from an origin (2,) on."""
+    places = [
+        np.clip(np.rint(first + side * (np.arange(count) + 0.5)), 0, size - 1).astype(int)
+        for first, count, size in zip(origin, (rows, columns), mask.shape, strict=True)
+    ]
+    return np.ascontiguousarray(signed_distances(mask)[np.ix_(*places)])
+
+
+def _by_ball(p_PB: np.ndarray) -> np.ndarray:
+    """(k, 3, n) float32 of centres (n, k, 3)."""
+    return np.ascontiguousarray(p_PB.transpose(1, 2, 0), dtype=np.float32)
+
+
+def _mean_size(views: Sequence[View]) -> float:
+    """The root of the silhouettes' mean area [pixel]."""
+    return math.sqrt(float(np.mean([np.count_nonzero(view.mask) for view in views])))
+
+
+def _prepare_views(
+    body: SampledBody, views: Sequence[View], settings: CoarseSettings
+) -> list[CoarseView]:
+    """The silhouettes as the coarse search sees them."""
+    size = _mean_size(views)
+    slack, least_cell = settings.slack * size, max(1.0, size / _CELLS)
+    largest = max(max((float(r.max(initial=0.0)) for r in body.ball_radii), default=0.0), 1e-6)
+    seen = []
+    for view in views:
+        points = _spread_points(view.mask)
+        # No ball counts whose middle is outside the picture, and one as large as it covers all.
+        reach = min(largest * _largest_scale(body, view), math.hypot(*view.mask.shape)) + slack
+        radii = np.linspace(0.15, 1.0, _LEVELS) * reach
+        origin = np.maximum(points.min(axis=0) - reach, -1.0)
+        end = np.minimum(points.max(axis=0) + reach, np.add(view.mask.shape, 1.0))
+        cell = max(least_cell, float((end - origin).max()) / _MOST_CELLS)
+        rows, columns = np.ceil((end - origin) / cell).astype(int)
+        parts = max(1, min(_PARTS, round(cell)))
+        cover = np.zeros((_LEVELS, rows, columns, _WORDS), dtype=np.uint64)
+        fill_cover(cover, points, origin, cell, radii)
+        seen.append(
+            CoarseView(
+                camera=view.camera.kernel_parameters(),
+                X_CW=np.ascontiguousarray(view.camera.X_CW),
+                origin=origin,
+                cell=cell,
+                radii=radii,
+                cover=cover,
+                parts=parts,
+                distances=_distances_at(
+                    view.mask, origin, cell / parts, parts * rows, parts * columns
+                ),
+                point_area=np.count_nonzero(view.mask) / len(points),
+                slack=slack,
+            )
+        )
+    return seen
+
+
+def _largest_scale(body: SampledBody, view: View) -> float:
+    """Pixels a metre at the nearest place where the body may be."""
+    scale = float(view.camera.kernel_parameters()[1])
+    if isinstance(view.camera, ParallelCamera):
+        return scale
+    roots = [
+        X_PN[:, :3, 3]
+        for X_PN, node in zip(body.sampled.X_PN, body.sampled.tree.nodes, strict=True)
+        if node.parent < 0
+    ]
+    distances = np.linalg.norm(np.vstack(roots) - view.camera.X_WC[:3, 3], axis=1)
+    return scale / max(1e-6, _NEARER * float(distances.min()))
+
+
+def _spread_points(mask: np.ndarray) -> np.ndarray:
+    """At most 64 * words points (n, 2) row, column of a mask, evenly spread; at least one."""
+    most = 64 * _WORDS
+    step = max(1.0, math.sqrt(np.count_nonzero(mask) / most))
+    while True:
+        rows = np.arange(0.5 * (step - 1.0), mask.shape[0] - 0.5, step)
+        columns = np.arange(0.5 * (step - 1.0), mask.shape[1] - 0.5, step)
+        grid = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1).reshape(-1, 2)
+        index = np.rint(grid).astype(int)
+        points = grid[mask[index[:, 0], index[:, 1]]]
+        if 0 < len(points) <= most:
+            return points
+        if len(points) == 0:
+            places = np.argwhere(mask)
+            return places[:: -(-len(places) // most)].astype(np.float64)
+        step *= 1.02
+
+
+def _project(p_W: np.ndarray, camera: np.ndarray, X_CW: np.ndarray) -> np.ndarray:
+    """Pixels (n, k, 2) of points (n, k, 3), from the principal point."""
+    p_C = p_W @ X_CW[:3, :3].T + X_CW[:3, 3]
+    depth = np.maximum(p_C[..., 2:], camera[5]) if camera[0] == 0.0 else 1.0
+    return np.asarray(p_C[..., :2] * camera[1:3] / depth)

@@ -1,0 +1,454 @@
+"""Where a body's root can be, told from silhouettes alone: positions, depths and scales to try.
+
+One parallel camera of unknown scale: a body twice as large looks like a camera with twice as many
+pixels a metre, so the scale is tried on the camera and the body keeps its size. One pinhole: what
+is unknown beside the place in the picture is the depth. Both are bounded by the silhouette's area,
+beside that of the body's own random poses, and tried in geometric steps. Several calibrated
+cameras: a grid in space, of which every camera leaves what lies in its silhouette.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.camera.models import Camera, ParallelCamera
+from drake_pose.errors import SettingsError
+from drake_pose.search.grid.sampled_body import SampledBody
+from drake_pose.search.result import View
+from drake_pose.silhouette.areas.scoring import score_bodies
+from drake_pose.silhouette.bits.bit_kernel import draw_bits
+from drake_pose.silhouette.bits.bit_view import WORD, make_bit_view
+
+# The picture in which random poses are measured [pixel], and how many.
+_SIDE, _POSES = 240, 100
+# Shares of the random poses whose area is smaller and larger than what is reckoned with.
+_RARE = 0.03
+# Half the cube in space that the root is looked for in [the silhouette's extent].
+_HALF_CUBE = 0.75
+# The root is drawn no farther than this from its origin [pixel].
+_FARTHEST = 60
+
+
+@dataclass(frozen=True)
+class PlacementSettings:
+    """What is unknown about the root, and how finely it is tried.
+
+    Args:
+        scale_unknown: the camera is parallel and its pixels_per_metre is not known.
+        positions_across: how many positions are tried across the silhouette.
+        ratio: of two scales or depths tried one after the other.
+        cut_off: where the silhouette touches the picture's edge the body may be larger by this
+            factor than it looks, and the root that share of the silhouette's extent, less one,
+            beyond the edge.
+        hypotheses: how many are kept, shared among the scales or depths.
+        quota: the share of them that may have the root at one position.
+        starts: how many poses are refined from far.
+        finalists: at how many of the root positions reached the poses are searched again; and how
+            many of all poses are refined to the end.
+        again: how many poses are refined of those found by each of these searches.
+
+    Raises:
+        SettingsError: if a value is out of its range.
+    """
+
+    scale_unknown: bool = False
+    positions_across: int = 12
+    ratio: float = 1.12
+    cut_off: float = 1.5
+    hypotheses: int = 1000
+    quota: float = 0.05
+    starts: int = 24
+    finalists: int = 3
+    again: int = 4
+
+    def __post_init__(self) -> None:
+        for name in ("positions_across", "hypotheses", "starts", "finalists", "again"):
+            if getattr(self, name) < 1:
+                raise SettingsError(f"{name} must be 1 or more, not {getattr(self, name)}")
+        if not 0.0 < self.quota <= 1.0:
+            raise SettingsError(f"quota must lie between 0 and 1, not {self.quota}")
+        if not 1.0 < self.ratio < 2.0:
+            raise SettingsError(f"ratio must lie between 1 and 2, not {self.ratio}")
+        if not self.cut_off >= 1.0:
+            raise SettingsError(f"cut_off must be 1 or more, not {self.cut_off}")
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """Root positions that are tried together.
+
+    Attributes:
+        views: the silhouettes, with a parallel camera's scale as it is tried.
+        positions: (n, 3) of the root's origin in the world [m].
+        scale: of the camera, times what it was given as.
+    """
+
+    views: tuple[View, ...]
+    positions: np.ndarray
+    scale: float
+
+
+def find_layers(
+    body: SampledBody, views: Sequence[View], settings: PlacementSettings, known: np.ndarray | None
+) -> list[Layer]:
+    """Where the root can be, the likeliest scales and depths first.
+
+    Args:
+        body: the body, its root anywhere.
+        views: the silhouettes.
+        settings: what is unknown.
+        known: (3,) the root's position [m] if only the scale is unknown.
+
+    Raises:
+        SettingsError: the scale is unknown, but there is not just one parallel camera.
+    """
+    main = max(views, key=lambda view: int(view.mask.sum()))
+    camera = main.camera
+    if settings.scale_unknown and (len(views) > 1 or not isinstance(camera, ParallelCamera)):
+        raise SettingsError(
+            "an unknown scale needs one parallel camera, but there are: "
+            f"{', '.join(view.camera.name for view in views)}; a pinhole's or several cameras' "
+            "scale follows from their calibration"
+        )
+    if known is not None and not settings.scale_unknown:
+        return [Layer(tuple(views), known[None], 1.0)]
+    sizes = _pixel_sizes(body, main, settings)
+    if len(views) > 1:
+        middle = _meeting_point(views)
+        if middle is not None:
+            return [_space_layer(views, middle, sizes, settings)]
+    p_CR = _in_camera(camera, body.sampled.X_PN[0][0, :3, 3])
+    places = _picture_grid(main, settings)
+    if not isinstance(camera, ParallelCamera):
+        focal = 0.5 * (camera.focal_x + camera.focal_y)
+        return [Layer(tuple(views), _lift(camera, places, focal / size), 1.0) for size in sizes]
+    scales = sizes / camera.pixels_per_metre if settings.scale_unknown else np.ones(1)
+    layers = []
+    for scale in scales:
+        scaled = scale_camera(camera, float(scale))
+        positions = _lift(scaled, places, p_CR[2]) if known is None else known[None]
+        layers.append(Layer((View(scaled, main.mask),), positions, float(scale)))
+    return layers
+
+
+def hub(tree: PoseTree) -> str:
+    """The name of the node with geometry that has the most neighbours, the first of equals."""
+    counts = [
+        len(node.children) + (node.parent >= 0) if len(node.mesh.triangles) else -1
+        for node in tree.nodes
+    ]
+    return tree.nodes[int(np.argmax(counts))].name
+
+
+def turns_freely(tree: PoseTree) -> bool:
+    """Whether the plant's own joints at the tree's only root turn it in all ways."""
+    if sum(node.parent < 0 for node in tree.nodes) != 1 or not tree.nodes[0].positions:
+        return False
+    kinds = [tree.model.position_kinds[position] for position in tree.nodes[0].positions]
+    lower, upper = tree.value_bounds(0)
+    ranges = np.sort((upper - lower)[[kind == "angle" for kind in kinds]])
+    # Joints that are held do not turn it.
+    ranges = ranges[ranges > 0.0]
+    wanted = np.array([np.pi, 2.0 * np.pi, 2.0 * np.pi])
+    return len(ranges) == 3 and bool(np.all(ranges >= wanted - 1e-6))
+
+
+def scale_camera(camera: ParallelCamera, scale: float) -> ParallelCamera:
+    """The camera with this many times its pixels a metre."""
+    return dataclasses.replace(camera, pixels_per_metre=scale * camera.pixels_per_metre)
+
+
+def slide_root(camera: ParallelCamera, p_WR: np.ndarray, factor: float) -> np.ndarray:
+    """(3,) where a root at (3,) [m] comes to lie that is moved across a parallel camera's axis.
+
+    Seen by a camera of so many times the scale, it keeps its place if it comes so many times
+    nearer to the axis: a body and its root's place grow alike, or the camera's scale does.
+    """
+    p_CR = _in_camera(camera, p_WR)
+    p_CR[:2] *= factor
+    return np.asarray(camera.X_WC[:3, :3] @ p_CR + camera.X_WC[:3, 3])
+
+
+def whereabouts(views: Sequence[View], p_WR: np.ndarray, settings: PlacementSettings) -> np.ndarray:
+    """Where a root (3,) is seen, and how large: 1 apart is one step of what is tried.
+
+    Returns:
+        (3 n,) for each of n views the root's place in its picture, and the logarithm of the pixels
+        a metre there.
+    """
+    here: list[float] = []
+    for view in views:
+        camera = view.camera
+        place, depth = camera.project(p_WR[None])
+        if isinstance(camera, ParallelCamera):
+            size = camera.pixels_per_metre
+        else:
+            size = 1.0 / max(float(depth[0]), camera.near)
+        spacing = _extent(view.mask) / settings.positions_across
+        here += [*(place[0] / spacing), np.log(size) / np.log(settings.ratio)]
+    return np.array(here)
+
+
+def place_body(body: SampledBody, positions: np.ndarray, chosen: np.ndarray) -> SampledBody:
+    """The body whose root is sampled at combinations of positions (n, 3) and its rotations.
+
+    Args:
+        body: the body.
+        positions: (n, 3) of the root's origin in the world [m].
+        chosen: (m,) the samples that it has: i is rotation i % r at position i // r, of r.
+    """
+    placed, sampled = copy.copy(body), copy.copy(body.sampled)
+    X_WR = sampled.X_PN[0]
+    places, turns = np.divmod(chosen, len(X_WR))
+    shifts = positions[places] - X_WR[0, :3, 3]
+    X = X_WR[turns]
+    X[:, :3, 3] += shifts
+    sampled.X_PN = [X, *sampled.X_PN[1:]]
+    sampled.values = [sampled.values[0][turns], *sampled.values[1:]]
+    band = sampled.bands[0]
+    if band is not None:
+        sampled.bands = [band[turns], *sampled.bands[1:]]
+    placed.sampled = sampled
+    placed.p_PB = [np.ascontiguousarray(body.p_PB[0][turns] + shifts[:, None]), *body.p_PB[1:]]
+    return placed
+
+
+def choose_root_samples(
+    body: SampledBody,
+    views: Sequence[View],
+    positions: np.ndarray,
+    count: int,
+    outside_weight: float,
+) -> np.ndarray:
+    """At every position the rotations of the root whose pictures fit best.
+
+    In one view the root looks nearly alike wherever it is in the picture: it is drawn once for
+    each rotation and moved by whole pixels. In several views all rotations are taken.
+
+    Args:
+        body: the body.
+        views: the silhouettes.
+        positions: (n, 3) of the root's origin in the world [m], of one depth.
+        count: so many rotations at each.
+        outside_weight: what a pixel outside counts; one covered counts one.
+
+    Returns:
+        (m,) the samples of ``place_body``, increasing.
+    """
+    rotations = len(body.sampled.X_PN[0])
+    if len(views) > 1 or count >= rotations:
+        return np.arange(len(positions) * rotations)
+    (view,) = views
+    places = np.atleast_2d(view.camera.project(positions)[0])
+    middle = int(np.argmin(np.abs(places - places.mean(axis=0)).sum(axis=1)))
+    pictures = _draw_root(body, view.camera, positions[middle], places[middle])
+    side = pictures.shape[1]
+    # Beyond the picture's edge nothing counts.
+    worth = np.pad(outside_weight - (1.0 + outside_weight) * view.mask, side).astype(np.float32)
+    corners = np.rint(places).astype(np.int64) - side // 2 + side
+    corners = np.clip(corners, 0, np.array(worth.shape)[::-1] - side)
+    windows = np.lib.stride_tricks.sliding_window_view(worth, (side, side))
+    seen = windows[corners[:, 1], corners[:, 0]].reshape(len(places), -1)
+    costs = seen @ pictures.reshape(rotations, -1).T
+    best = np.argpartition(costs, count - 1, axis=1)[:, :count]
+    return np.sort((best + rotations * np.arange(len(places))[:, None]).ravel())
+
+
+def _draw_root(
+    body: SampledBody, camera: Camera, p_WR: np.ndarray, place: np.ndarray
+) -> np.ndarray:
+    """Pictures (r, side, side) float32 of the root at its rotations, its place in the middle.
+
+    Args:
+        body: the body.
+        camera: the camera.
+        p_WR: (3,) where the root's origin is [m].
+        place: (2,) where that is seen [pixel].
+    """
+    rotations = len(body.sampled.X_PN[0])
+    ball = body.sampled.outlines[0].ball
+    depth = float(_in_camera(camera, p_WR)[2])
+    scale = float(camera.kernel_parameters()[1])
+    reach = float(np.linalg.norm(ball[:3]) + ball[3])
+    if not isinstance(camera, ParallelCamera):
+        scale /= max(depth - reach, 0.2 * depth)
+    half = min(_FARTHEST, math.ceil(scale * reach) + 1)
+    side = 2 * half + 1
+    inner = side - 2
+    window = dataclasses.replace(
+        camera,
+        width=side,
+        height=side,
+        center_x=camera.center_x - float(place[0]) + half,
+        center_y=camera.center_y - float(place[1]) + half,
+    )
+    everywhere = np.zeros((side, side), dtype=np.bool_)
+    everywhere[1:-1, 1:-1] = True
+    placed = place_body(body, p_WR[None], np.arange(rotations))
+    pairs = np.column_stack([np.zeros(rotations), np.arange(rotations)]).astype(np.int32)
+    _, _, runs, words = draw_bits(
+        placed.celled_outline(0, camera, coarse=True),
+        make_bit_view(everywhere, window.kernel_parameters(), camera.X_CW, 0),
+        np.eye(4)[None],
+        placed.sampled.X_PN[0],
+        pairs,
+        np.inf,
+        np.zeros(1, dtype=np.bool_),
+    )
+    bits = np.zeros((rotations, -(-(inner**2) // WORD) * WORD // 8), dtype=np.uint8)
+    data = words.view(np.uint8).reshape(-1, 8)
+    for row, (first, length, start) in zip(bits.reshape(rotations, -1, 8), runs[:, 0], strict=True):
+        row[first : first + length] = data[start : start + length]
+    pixels = np.unpackbits(bits, axis=1, count=inner**2, bitorder="little")
+    pictures = np.zeros((rotations, side, side), dtype=np.float32)
+    pictures[:, 1:-1, 1:-1] = pixels.reshape(rotations, inner, inner)
+    return pictures
+
+
+def _pixel_sizes(body: SampledBody, view: View, settings: PlacementSettings) -> np.ndarray:
+    """How many pixels a metre at the body may have (n,), the likeliest first."""
+    area = float(view.mask.sum())
+    low, middle, high = np.quantile(_random_areas(body, view.camera), [_RARE, 0.5, 1.0 - _RARE])
+    smallest, likely, largest = np.sqrt(area / np.array([high, middle, low]))
+    if _touches_edge(view.mask):
+        largest *= settings.cut_off
+    step = np.log(settings.ratio)
+    steps = np.arange(
+        np.floor(np.log(smallest / likely) / step), np.ceil(np.log(largest / likely) / step) + 1
+    )
+    steps = steps[np.argsort(np.abs(steps), kind="stable")]
+    return np.asarray(likely * settings.ratio**steps)
+
+
+def _random_areas(body: SampledBody, camera: Camera) -> np.ndarray:
+    """Areas of parallel projections of random poses of the grid, seen along the camera's axis."""
+    generator = np.random.default_rng(1)
+    sampled, nodes = body.sampled, body.sampled.tree.nodes
+    X_WN = np.empty((_POSES, len(nodes), 4, 4))
+    samples = np.empty((_POSES, len(nodes)), dtype=np.int64)
+    for i, node in enumerate(nodes):
+        samples[:, i] = generator.integers(len(sampled.X_PN[i]), size=_POSES)
+        X_PN = sampled.X_PN[i][samples[:, i]]
+        X_WN[:, i] = X_PN if node.parent < 0 else X_WN[:, node.parent] @ X_PN
+    balls = np.array([outline.ball for outline in sampled.outlines])
+    X_CN = camera.X_CW @ X_WN
+    centers = np.einsum("nkij,kj->nki", X_CN[..., :3, :3], balls[:, :3]) + X_CN[..., :3, 3]
+    low = (centers - balls[:, 3:]).min(axis=1)
+    high = (centers + balls[:, 3:]).max(axis=1)
+    X_CN[..., :3, 3] -= 0.5 * (low + high)[:, None]
+    scale = _SIDE / float((high - low)[:, :2].max())
+    middle = 0.5 * (_SIDE - 1)
+    measuring = ParallelCamera("", _SIDE, _SIDE, scale, middle, middle, np.eye(4))
+    nothing = np.zeros((0, _SIDE, _SIDE + 1), dtype=np.int32)
+    areas = score_bodies(
+        sampled.outlines_at(range(len(nodes)), samples[0]), X_CN, measuring, nothing
+    )
+    return np.asarray(areas[:, 0] / scale**2)
+
+
+def _touches_edge(mask: np.ndarray) -> bool:
+    return bool(mask[[0, -1]].any() or mask[:, [0, -1]].any())
+
+
+def _box(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The least and greatest u and v of a silhouette, (2,) each."""
+    v, u = np.nonzero(mask)
+    return np.array([u.min(), v.min()], float), np.array([u.max(), v.max()], float)
+
+
+def _extent(mask: np.ndarray) -> float:
+    """The silhouette's extent [pixel]: of a square as large as its bounding box."""
+    low, high = _box(mask)
+    return float(np.sqrt(np.prod(high - low + 1.0)))
+
+
+def _picture_grid(view: View, settings: PlacementSettings) -> np.ndarray:
+    """Places (n, 2) in the picture where the root can be seen, or beyond its edge [pixel]."""
+    low, high = _box(view.mask)
+    extent = _extent(view.mask)
+    spacing = extent / settings.positions_across
+    beyond = (settings.cut_off - 1.0) * extent
+    size = np.array([view.camera.width, view.camera.height])
+    low = np.where(low < 1, -beyond, low - 0.5 * spacing)
+    high = np.where(high > size - 2, size - 1 + beyond, high + 0.5 * spacing)
+    axes = [low[k] + spacing * np.arange(int((high[k] - low[k]) / spacing) + 1) for k in range(2)]
+    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    return places[_near(view, places, 0.75 * spacing, beyond)]
+
+
+def _near(view: View, places: np.ndarray, spacing: float, beyond: float) -> np.ndarray:
+    """Which places (n, 2) [pixel] lie at the silhouette, or beyond it out of the picture."""
+    distances = distance_transform_edt(~view.mask)
+    inside = np.clip(places, 0, np.array(view.mask.shape)[::-1] - 1)
+    column, row = np.rint(inside).astype(np.int64).T
+    over = np.linalg.norm(places - inside, axis=1)
+    return np.asarray((distances[row, column] <= spacing) & (over <= beyond))
+
+
+def _lift(camera: Camera, places: np.ndarray, depth: float) -> np.ndarray:
+    """The points (n, 3) of the world that are seen at places (n, 2) [pixel] in a depth [m]."""
+    if isinstance(camera, ParallelCamera):
+        scale = np.full(2, 1.0 / camera.pixels_per_metre)
+    else:
+        scale = depth / np.array([camera.focal_x, camera.focal_y])
+    p_C = np.empty((len(places), 3))
+    p_C[:, :2] = (places - [camera.center_x, camera.center_y]) * scale
+    p_C[:, 2] = depth
+    return np.asarray(p_C @ camera.X_WC[:3, :3].T + camera.X_WC[:3, 3])
+
+
+def _in_camera(camera: Camera, p_W: np.ndarray) -> np.ndarray:
+    return np.asarray(camera.X_CW[:3, :3] @ p_W + camera.X_CW[:3, 3])
+
+
+def _meeting_point(views: Sequence[View]) -> np.ndarray | None:
+    """The point (3,) nearest to the rays through all silhouettes' middles; None: parallel ones."""
+    A, b = np.zeros((3, 3)), np.zeros(3)
+    for view in views:
+        low, high = _box(view.mask)
+        ends = np.array([_lift(view.camera, 0.5 * (low + high)[None], z)[0] for z in (1.0, 2.0)])
+        along = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+        across = np.eye(3) - np.outer(along, along)
+        A += across
+        b += across @ ends[0]
+    # The smallest eigenvalue is about the squared sine of half the angle between two rays.
+    if np.linalg.eigvalsh(A)[0] < 0.01:
+        return None
+    return np.asarray(np.linalg.solve(A, b))
+
+
+def _space_layer(
+    views: Sequence[View], middle: np.ndarray, sizes: np.ndarray, settings: PlacementSettings
+) -> Layer:
+    """A grid in space about a point, of which all views leave what lies in their silhouettes.
+
+    Args:
+        views: the silhouettes.
+        middle: (3,) about the body's middle [m].
+        sizes: the pixels a metre in the largest silhouette, the likeliest first.
+        settings: how finely.
+    """
+    main = max(views, key=lambda view: int(view.mask.sum()))
+    extent = _extent(main.mask) / float(sizes[0])
+    half = _HALF_CUBE * extent * (settings.cut_off if _touches_edge(main.mask) else 1.0)
+    spacing = extent / settings.positions_across
+    steps = spacing * np.arange(-np.ceil(half / spacing), np.ceil(half / spacing) + 1)
+    points = middle + np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
+    for view in views:
+        places, depth = view.camera.project(points)
+        seen = np.ones(len(points), dtype=np.bool_)
+        if not isinstance(view.camera, ParallelCamera):
+            seen = depth > view.camera.near
+        wide = _extent(view.mask) / settings.positions_across
+        beyond = (settings.cut_off - 1.0) * _extent(view.mask)
+        seen[seen] = _near(view, places[seen], 0.75 * wide, beyond)
+        points = points[seen]
+    return Layer(tuple(views), points, 1.0)

@@ -1,0 +1,218 @@
+"""Benchmarks: ratios measured in one process (`make bench`)."""
+
+from __future__ import annotations
+
+import resource
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.common import MemoryFile
+from pydrake.geometry import (
+    FramePoseVector,
+    GeometryFrame,
+    GeometryInstance,
+    InMemoryMesh,
+    MakeRenderEngineVtk,
+    Mesh,
+    PerceptionProperties,
+    RenderEngineVtkParams,
+    RenderLabel,
+    SceneGraph,
+)
+from pydrake.math import RigidTransform, RotationMatrix
+from rich.console import Console
+from rich.table import Table
+from scipy.spatial.transform import Rotation
+
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import load_model
+from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.camera.drake import camera_to_drake
+from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
+from drake_pose.papers.date.cost import cost_table
+from drake_pose.papers.kameda.experiment import (
+    experiment_camera,
+    experiment_search,
+    run_experiment,
+)
+from drake_pose.papers.kameda.table import experiment_table
+from drake_pose.silhouette.areas.agreement import measure_agreement
+from drake_pose.silhouette.areas.outline import outline_from_mesh
+from drake_pose.silhouette.areas.scoring import prefix_sums, score_candidates
+
+_RENDERER = "benchmark"
+_SIDE = 700
+_SCALE = 226.0
+"""Kameda's: 2.26 pixels a centimetre."""
+
+_RADIUS = 0.088
+_LENGTH = 0.44
+_CANDIDATES = 1000
+_IMAGES = 30
+
+
+@dataclass(frozen=True)
+class KernelFigures:
+    """What one segment costs in one core, in one process.
+
+    Args:
+        triangles: the segment's triangles.
+        kernel_microseconds: time to score one candidate against two sets [us].
+        label_image_microseconds: time of one Drake label image of the segment [us].
+    """
+
+    triangles: int
+    kernel_microseconds: float
+    label_image_microseconds: float
+
+    @property
+    def ratio(self) -> float:
+        """Candidates scored in the time of one label image."""
+        return self.label_image_microseconds / self.kernel_microseconds
+
+
+def measure_kernel(columns: int = 14, rows: int = 16, seed: int = 0) -> KernelFigures:
+    """Times the span kernel against Drake label images of the same limb in the same poses.
+
+    The limb is 44 cm by 17.6 cm, in a picture of 700 x 700 pixels at Kameda's scale (100 x 40
+    pixels); 14 x 16 give 420 triangles, 72 x 71 give 10,080.
+
+    Args:
+        columns, rows: how finely the limb is divided around and along.
+        seed: of the poses.
+    """
+    mesh = limb_mesh(columns, rows)
+    camera = ParallelCamera("benchmark", _SIDE, _SIDE, _SCALE, 0.5 * _SIDE, 0.5 * _SIDE, np.eye(4))
+    rng = np.random.default_rng(seed)
+    X_CN = np.tile(np.eye(4), (_CANDIDATES, 1, 1))
+    X_CN[:, :3, :3] = Rotation.random(_CANDIDATES, random_state=rng).as_matrix()
+    X_CN[:, :3, 3] = rng.uniform(-1.0, 1.0, (_CANDIDATES, 3))
+    prefixes = np.array([prefix_sums(rng.random((_SIDE, _SIDE)) < 0.5) for _ in range(2)])
+    outline = outline_from_mesh(mesh)
+    kernel = _fastest(lambda: score_candidates(outline, X_CN, camera, prefixes), 20)
+    render = _label_images(mesh, camera, X_CN[:_IMAGES])
+    images = _fastest(render, 3)
+    return KernelFigures(len(mesh.triangles), kernel / _CANDIDATES * 1e6, images / _IMAGES * 1e6)
+
+
+def limb_mesh(columns: int, rows: int) -> TriangleMesh:
+    """Returns a closed ellipsoid of 2 columns (rows - 1) triangles."""
+    polar = np.pi * np.arange(1, rows) / rows
+    around = 2.0 * np.pi * np.arange(columns) / columns
+    ring = np.column_stack([np.cos(around), np.sin(around), np.zeros(columns)])
+    rings = ring * np.sin(polar)[:, None, None]
+    rings[:, :, 2] = np.cos(polar)[:, None]
+    unit = np.vstack([[[0.0, 0.0, 1.0]], rings.reshape(-1, 3), [[0.0, 0.0, -1.0]]])
+    following = np.roll(np.arange(columns), -1)
+    last = len(unit) - 1
+    triangles = [[0, 1 + a, 1 + b] for a, b in enumerate(following)]
+    for first in range(1, 1 + columns * (rows - 2), columns):
+        for a, b in enumerate(following):
+            lower = first + columns
+            triangles += [[first + a, lower + a, lower + b], [first + a, lower + b, first + b]]
+    first = last - columns
+    triangles += [[first + a, last, first + b] for a, b in enumerate(following)]
+    semi_axes = np.array([_RADIUS, _RADIUS, 0.5 * _LENGTH])
+    return TriangleMesh(unit * semi_axes, np.array(triangles, dtype=np.int32))
+
+
+def _label_images(
+    mesh: TriangleMesh, camera: ParallelCamera, X_CN: np.ndarray
+) -> Callable[[], None]:
+    """Returns a function that renders Drake's label image of a mesh in each pose."""
+    scene_graph = SceneGraph()
+    source = scene_graph.RegisterSource("benchmark")
+    frame = scene_graph.RegisterFrame(source, GeometryFrame("segment"))
+    shape = Mesh(InMemoryMesh(mesh_file=MemoryFile(obj_text(mesh), ".obj", "segment")))
+    instance = GeometryInstance(RigidTransform(), shape, "segment")
+    properties = PerceptionProperties()
+    properties.AddProperty("label", "id", RenderLabel(1))
+    instance.set_perception_properties(properties)
+    scene_graph.RegisterGeometry(source, frame, instance)
+    scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(RenderEngineVtkParams()))
+    context = scene_graph.CreateDefaultContext()
+    color, _, X_WC = camera_to_drake(camera, renderer_name=_RENDERER)
+    poses = [
+        RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), X[:3, 3]) for X in X_CN
+    ]
+
+    def render() -> None:
+        for pose in poses:
+            vector = FramePoseVector()
+            vector.set_value(frame, pose)
+            scene_graph.get_source_pose_port(source).FixValue(context, vector)
+            query = scene_graph.get_query_output_port().Eval(context)
+            query.RenderLabelImage(color, scene_graph.world_frame_id(), X_WC)
+
+    return render
+
+
+def obj_text(mesh: TriangleMesh) -> str:
+    """Returns a mesh as OBJ text with normals, which Drake's VTK engine insists on."""
+    normals = mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True)
+    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in mesh.vertices.tolist()]
+    lines += [f"vn {x!r} {y!r} {z!r}" for x, y, z in normals.tolist()]
+    lines += [f"f {a}//{a} {b}//{b} {c}//{c}" for a, b, c in (mesh.triangles + 1).tolist()]
+    return "\n".join(lines) + "\n"
+
+
+def _fastest(function: Callable[[], object], repeats: int) -> float:
+    """Returns the shortest time of a call [s], after one that warms up."""
+    function()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        function()
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+def main() -> None:
+    """Print what kernel, agreement with Drake, Date's capture and experiment A come to here."""
+    console = Console()
+    table = Table(title="One segment, 700 x 700 pixels, one core")
+    for heading in ("triangles", "kernel, a candidate", "Drake label image", "ratio"):
+        table.add_column(heading, justify="right")
+    for columns, rows in ((14, 16), (72, 71)):
+        figures = measure_kernel(columns, rows)
+        table.add_row(
+            str(figures.triangles),
+            f"{figures.kernel_microseconds:.1f} us",
+            f"{figures.label_image_microseconds:.0f} us",
+            f"{figures.ratio:.0f}",
+        )
+    console.print(table)
+    console.print(_agreement_table())
+    console.print(cost_table())
+    start = time.process_time()
+    result = run_experiment(experiment_search())
+    seconds = time.process_time() - start
+    console.print(experiment_table([[result]]))
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    console.print(f"experiment A: {seconds:.1f} s CPU on one core; peak memory {memory:.0f} MiB")
+
+
+def _agreement_table() -> Table:
+    """The span kernel against Drake's label images, 200 random poses of each bundled body."""
+    table = Table(title="XOR of the kernel's masks and Drake's, 200 random poses")
+    for heading in ("body", "projection", "worst", "mean"):
+        table.add_column(heading)
+    parallel = experiment_camera()
+    pinhole = PinholeCamera(
+        "front", 700, 700, 1130.0, 1130.0, parallel.center_x, parallel.center_y, parallel.X_WC
+    )
+    cameras: dict[str, Camera] = {"parallel": parallel, "pinhole": pinhole}
+    held = dict.fromkeys(("position_x", "position_y", "position_z"), 0.0)
+    for name in ("woman", "man"):
+        model = load_model(bundled_model(name))
+        for projection, camera in cameras.items():
+            agreement = measure_agreement(model, camera, held=held)
+            worst, mean = f"{agreement.worst:.3%}", f"{agreement.mean:.4%}"
+            table.add_row(name, projection, worst, mean)
+    return table
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,37 @@
+"""Peak memory of processes whose memory is known."""
+
+import os
+
+import psutil
+import pytest
+
+from drake_pose.commands.main import app
+from tests.benchmarks.memory import benchmark_commands, measure_memory
+
+_ONE, _OTHER = 200, 500
+MIB = 2**20
+
+
+@pytest.mark.slow
+def test_memory_is_that_of_the_process():
+    # Filled, because pages that nobody wrote take none.
+    def took(size):
+        floor = psutil.Process(os.getpid()).memory_info().rss // MIB
+        program = ("-c", f"import sys; b = b'x' * ({floor + size} * {MIB}); sys.exit(3)")
+        return measure_memory(["word"], program), floor
+
+    for size in (_ONE, _OTHER):
+        found, floor = took(size)
+        assert found.mebibytes == pytest.approx(floor + size, abs=40)
+        assert (found.exit_code, found.words) == (3, ("word",))
+
+
+def test_every_command_of_the_benchmark_is_one(tmp_path):
+    from typer.main import get_command
+
+    for words in benchmark_commands(tmp_path):
+        command = get_command(app)
+        while hasattr(command, "commands"):
+            command, words = command.commands[words[0]], words[1:]
+        # Parses without running it; an option that is none raises.
+        command.make_context("drake-pose", list(words))

@@ -1,0 +1,122 @@
+"""The program as it is run: start-up, help, Ctrl-C, checks."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+import drake_pose
+from drake_pose.commands.main import app
+from tests.jobs.scenes import TinyScene, read_rows, write_scene
+
+PROGRAM = [sys.executable, "-m", "drake_pose.commands.main"]
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def plain(text: str) -> str:
+    """Text without terminal colours and boxes, in one line."""
+    return " ".join(re.sub(r"\x1b\[[0-9;]*m|[│╭╮╰╯─]", " ", text).split())
+
+
+def test_help_imports_nothing_heavy() -> None:
+    script = (
+        "import sys; import drake_pose.commands.main; "
+        "print([m for m in ('numpy', 'numba', 'cv2', 'pydrake') if m in sys.modules])"
+    )
+    finished = subprocess.run(
+        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert finished.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        (["estimate"], ["drake-pose estimate ../shared/data/arm_two_views", "[deg", "E_total"]),
+        (["demo"], ["drake-pose demo --out", "ankle"]),
+        (["check"], ["drake-pose check urdf/woman/woman.urdf", "pose tree"]),
+        (["reproduce"], ["kameda"]),
+        (["reproduce", "kameda"], ["drake-pose reproduce kameda --images 20", "head"]),
+    ],
+)
+def test_help_teaches(command: list[str], words: list[str], runner: CliRunner) -> None:
+    result = runner.invoke(app, [*command, "--help"])
+    assert result.exit_code == 0
+    for word in words:
+        assert word in plain(result.stdout)
+
+
+def test_version(runner: CliRunner) -> None:
+    result = runner.invoke(app, ["--version"])
+    assert result.stdout == f"drake-pose {drake_pose.__version__}\n"
+
+
+def test_check_of_a_fit_model(tiny_scene: TinyScene, runner: CliRunner) -> None:
+    result = runner.invoke(app, ["check", str(tiny_scene.model)])
+    assert result.exit_code == 0, result.output
+    assert "crane: 3 segments" in result.stdout
+    assert re.search(r"lift +-91\.67\d* \.\. 91\.67\d* deg", result.stdout)
+    assert "fit for use" in result.stderr
+
+
+def test_check_as_json(tiny_scene: TinyScene, runner: CliRunner, tmp_path: Path) -> None:
+    report = json.loads(runner.invoke(app, ["check", str(tiny_scene.model), "--json"]).stdout)
+    assert report["usable"] is True
+    assert [node["name"] for node in report["nodes"]] == ["base", "boom", "jib"]
+    result = runner.invoke(app, ["check", str(tmp_path / "nowhere.urdf"), "--json"])
+    assert result.exit_code == 1
+    report = json.loads(result.stdout)
+    assert report["usable"] is False
+    assert "nowhere.urdf" in report["errors"][0]
+
+
+@pytest.mark.slow
+def test_ctrl_c_keeps_finished_frames_and_the_job_can_be_resumed(tmp_path: Path) -> None:
+    angles = [(20.0 * (index % 5 - 2), -20.0 * (index % 7)) for index in range(60)]
+    scene = write_scene(tmp_path / "scene", angles, ("front", "side"))
+    out = tmp_path / "out"
+    command = [*PROGRAM, "estimate", str(scene.folder), "--model", str(scene.model)]
+    command += ["--out", str(out), "--method", "paper", "--interval", "2", "--no-replay"]
+    environment = {**os.environ, "COLUMNS": "200"}
+    process = subprocess.Popen(
+        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        # Whoever runs the tests in the background has the signal ignored, which children inherit.
+        env=environment, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
+    poses = out / "poses.csv"
+    deadline = time.monotonic() + 120.0
+    while process.poll() is None and time.monotonic() < deadline:
+        if poses.is_file() and len(poses.read_text().splitlines()) > 3:
+            break
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    stdout, stderr = process.communicate(timeout=60)
+    assert process.returncode == 1, stderr
+    assert stdout == ""
+    assert stderr.startswith("drake-pose: error: interrupted")
+    assert "--resume" in stderr
+    assert str(out) in stderr
+    assert "Traceback" not in stderr
+    finished = poses.read_text().splitlines()
+    assert 3 < len(finished) < 61
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["complete"] is False
+    assert list(summary["frames"]) == [line.split(",")[0] for line in finished[1:]]
+
+    resumed = subprocess.run(
+        [*command, "--resume", "--json"], cwd=ROOT, capture_output=True, text=True, env=environment
+    )
+    assert resumed.returncode == 0, resumed.stderr
+    assert poses.read_text().splitlines()[: len(finished)] == finished
+    assert [row["frame"] for row in read_rows(poses)] == list(scene.truth)
+    summary = json.loads(resumed.stdout)
+    assert summary["complete"] is True
+    assert summary["found_count"] == 60
+    assert not list(out.rglob("*.part"))

@@ -1,0 +1,159 @@
+import numpy as np
+import pytest
+
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import load_model
+from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.fit.contour_fit import ContourFit, Prior
+from drake_pose.fit.evidence import find_edge_points
+from drake_pose.fit.kernel import collect, nearest_alike
+from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.parameters import affine_motions
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+
+STEPS = (Round(0.08, 0.06), Round(0.04, 0.06), Round(0.02, 0.05), Round(0.02, 0.05))
+
+
+@pytest.fixture(scope="module")
+def person():
+    return load_model(bundled_model("person"), check=False)
+
+
+@pytest.fixture(scope="module")
+def fit(person):
+    return ContourFit(person.pose_tree())
+
+
+def standing(person, **degrees):
+    q = np.zeros(len(person.position_names))
+    q[person.position_index("position_z")] = 1.55
+    for name, angle in degrees.items():
+        q[person.position_index(name)] = np.radians(angle)
+    return q
+
+
+class TestEdges:
+    @pytest.fixture
+    def ring(self):
+        v, u = np.mgrid[:240, :320]
+        distance = np.hypot(u - 150.3, v - 110.7)
+        return (distance < 80.0) & (distance > 40.0)
+
+    def test_points_lie_on_the_circles_and_normals_point_outwards(self, ring):
+        edge = find_edge_points(ring, 4.0)
+        off = edge.uv - [150.3, 110.7]
+        radius = np.linalg.norm(off, axis=1)
+        outer = radius > 60.0
+        np.testing.assert_allclose(radius[outer], 80.0, atol=1.0)
+        np.testing.assert_allclose(radius[~outer], 40.0, atol=1.0)
+        along = (off / radius[:, None] * edge.normals).sum(axis=1)
+        assert along[outer].min() > 0.9
+        assert along[~outer].max() < -0.9
+        assert edge.lengths[outer].sum() == pytest.approx(2 * np.pi * 80.0, rel=0.03)
+        assert edge.lengths[~outer].sum() == pytest.approx(2 * np.pi * 40.0, rel=0.03)
+        assert (np.diff(edge.uv[:, 1]) >= 0.0).all()
+
+    def test_border_of_the_picture_is_no_edge(self):
+        mask = np.zeros((60, 80), dtype=bool)
+        mask[20:, 30:50] = True
+        edge = find_edge_points(mask, 2.0)
+        assert edge.uv[:, 1].max() < 59.0
+
+    def test_nobody(self):
+        edge = find_edge_points(np.zeros((60, 80), dtype=bool), 2.0)
+        assert len(edge.uv) == 0
+        assert np.isnan(edge.middle).all()
+
+
+def test_nearest_points_against_brute_force():
+    generator = np.random.default_rng(3)
+
+    def cloud(count):
+        uv, angle = generator.uniform(0, 60, (count, 2)), generator.uniform(0, 2 * np.pi, count)
+        return uv[np.argsort(uv[:, 1])], np.column_stack([np.cos(angle), np.sin(angle)])
+
+    (uv, normals), (edge_uv, edge_normals) = cloud(70), cloud(90)
+    of_point, of_edge = nearest_alike(uv, normals, edge_uv, edge_normals, 9.0)
+    distance = np.linalg.norm(uv[:, None] - edge_uv[None], axis=2)
+    distance[(normals @ edge_normals.T < 0.3) | (distance >= 9.0)] = np.inf
+    for found, expected in ((of_point, distance), (of_edge, distance.T)):
+        wanted = np.where(np.isinf(expected.min(axis=1)), -1, expected.argmin(axis=1))
+        np.testing.assert_array_equal(found, wanted)
+
+
+def test_affine_motions_against_finite_differences(fit, person):
+    values = fit.kinematics.flatten(
+        person.pose_tree().values_from_positions(standing(person, left_forearm_x=-40, head_y=30))
+    )
+    motions = fit.kinematics.motions(values)
+    affine = affine_motions(motions.twists).reshape(-1, 3, 4)
+    p_N = np.array([0.1, -0.2, 0.05])
+    for node in range(len(motions.X_WN)):
+        place = motions.X_WN[node, :3, :3] @ p_N + motions.X_WN[node, :3, 3]
+        for index in np.flatnonzero(motions.moves[node]):
+            moved = values.copy()
+            moved[index] += 1e-6
+            X = fit.kinematics.poses(moved)[node]
+            speed = (X[:3, :3] @ p_N + X[:3, 3] - place) / 1e-6
+            np.testing.assert_allclose(affine[index] @ [*place, 1.0], speed, atol=1e-5)
+
+
+def test_equations_are_collected_as_dense_products():
+    generator = np.random.default_rng(0)
+    half = generator.normal(size=(2, 12, 12))
+    A = np.einsum("nij,nkj->nik", half, half)
+    b, motions = generator.normal(size=(2, 12)), generator.normal(size=(5, 12))
+    owners, parameters = np.array([0, 2, 1, 3, 4]), np.array([0, 1, 1, 2, 3])
+    H, g = collect(np.tril(A), b, motions, np.array([0, 2, 5]), owners, parameters, 4)
+    expected_H, expected_g = np.zeros((4, 4)), np.zeros(4)
+    for node, rows in ((0, [0, 1]), (1, [2, 3, 4])):
+        J = np.zeros((12, 4))
+        for row in rows:
+            J[:, parameters[row]] += motions[owners[row]]
+        expected_H += J.T @ A[node] @ J
+        expected_g -= J.T @ b[node]
+    np.testing.assert_allclose(H, expected_H, rtol=1e-9)
+    np.testing.assert_allclose(g, expected_g, rtol=1e-9)
+
+
+class TestFit:
+    @pytest.mark.parametrize("count", [4, 9])
+    def test_pose_is_found_again_in_drakes_pictures(self, person, fit, count):
+        true = standing(
+            person,
+            left_upper_arm_z=50,
+            left_forearm_x=-60,
+            right_upper_arm_x=-70,
+            right_forearm_x=-30,
+            left_thigh_x=-40,
+            left_shin_x=50,
+            neck_base_x=20,
+        )
+        cameras = list(circle_of_cameras(count, size=(320, 240), face_camera=False).values())
+        edges = [
+            find_edge_points(LabelRenderer(person, camera).mask(true), 4.0) for camera in cameras
+        ]
+        order = [person.position_index(name) for name in fit.kinematics.names]
+        start = true[order] + np.random.default_rng(1).normal(0.0, 0.08, len(order))
+        prior = Prior(start, np.full(len(start), 1.0 / 0.3**2))
+        found = fit.fit(cameras, edges, start, (*STEPS, *STEPS), prior)
+        off = fit.kinematics.poses(found.values) - fit.kinematics.poses(true[order])
+        assert 1e3 * np.linalg.norm(off[:, :3, 3], axis=1).max() < 12.0
+        assert found.share > 0.9
+        assert (found.values >= fit.lower).all()
+        assert (found.values <= fit.upper).all()
+
+    def test_held_values_stay_and_nothing_seen_changes_nothing(self, person, fit):
+        camera = circle_of_cameras(1, size=(160, 120), face_camera=False)["camera_0"]
+        start = np.zeros(len(fit.lower))
+        empty = find_edge_points(np.zeros((120, 160), dtype=bool), 4.0)
+        found = fit.fit([camera], [empty], start, STEPS)
+        np.testing.assert_allclose(found.values, start, atol=1e-9)
+        edge = find_edge_points(LabelRenderer(person, camera).mask(standing(person)), 4.0)
+        order = [person.position_index(name) for name in fit.kinematics.names]
+        start = standing(person)[order] + 0.05
+        held = np.arange(len(start)) % 2 == 0
+        found = fit.fit([camera], [edge], start, STEPS, None, held)
+        clipped = np.clip(start, fit.lower, fit.upper)
+        np.testing.assert_array_equal(found.values[held], start[held])
+        assert np.abs(found.values - clipped)[~held].max() > 1e-3

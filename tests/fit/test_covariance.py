@@ -1,0 +1,145 @@
+"""How sure values are where contours err together: known answers, and drawn arms."""
+
+import numpy as np
+import pytest
+
+from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.fit.covariance import (
+    Distances,
+    ErrorEffects,
+    ErrorSizes,
+    estimate_sizes,
+    values_covariance,
+)
+from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.surfaces import few_triangles
+from drake_pose.search.continuous.views_fit import ViewsFit
+from drake_pose.search.result import View
+from drake_pose.silhouette.areas.bending import TreeSurfaces
+
+from ..arms import arm_cameras, arm_tree, damaged_views, draw_pose, draw_view
+from ..mask_damage import nudge_camera
+
+FINE = tuple(Round(scale, 0.0125, 8) for scale in (0.025, 0.0125))
+STEP = Round(0.025, 0.0125)
+ANGLES = np.ones(3, dtype=bool)
+ALL = np.arange(3)
+
+
+def drawn_distances(
+    generator: np.random.Generator, sizes: ErrorSizes, count: int = 150
+) -> tuple[Distances, np.ndarray]:
+    """Distances that follow three values and five kinds of errors; and the values' errors."""
+    X = generator.normal(0.0, 20.0, (count, 3))
+    kinds = [generator.normal(0.0, 1.5, (count, k)) for k in (40, 60, 12)]
+    y = generator.normal(0.0, sizes.noise, count)
+    # The second half repeats some noise of the first.
+    again = np.tile(np.eye(count // 2), (2, 1))
+    kinds = [again, *kinds]
+    for size, kind in zip(sizes[1:], kinds, strict=True):
+        y += size * kind @ generator.standard_normal(kind.shape[1])
+    effects = ErrorEffects(np.eye(count), *(kind @ kind.T for kind in kinds))
+    which = np.arange(count) // (count // 2)
+    seen = Distances(y, X, effects, X.T @ X, kinds[1], which)
+    return seen, np.linalg.solve(X.T @ X, X.T @ y)
+
+
+def test_sizes_are_those_that_were_drawn() -> None:
+    generator = np.random.default_rng(1)
+    sizes = ErrorSizes(1.5, 1.2, 0.4, 1.0, 2.0)
+    found = [estimate_sizes(drawn_distances(generator, sizes)[0], ANGLES) for _ in range(4)]
+    np.testing.assert_allclose(np.median(found, axis=0), sizes, rtol=0.4)
+
+
+def test_a_calibration_is_not_trusted_beyond_a_pixel() -> None:
+    seen, _ = drawn_distances(np.random.default_rng(2), ErrorSizes(1.0, 0.5, 0.1, 0.1, 0.01))
+    assert estimate_sizes(seen, ANGLES).camera == 1.0
+
+
+def test_covariance_is_that_of_many_fits() -> None:
+    generator = np.random.default_rng(3)
+    sizes = ErrorSizes(1.0, 1.0, 0.5, 0.5, 2.0)
+    ratios = []
+    for _ in range(300):
+        seen, errors = drawn_distances(generator, sizes, 60)
+        covariance = values_covariance(seen, sizes, ALL, ANGLES)
+        ratios.append(errors @ np.linalg.solve(covariance, errors))
+    # The mean of chi squared with three degrees of freedom.
+    assert np.mean(ratios) == pytest.approx(3.0, rel=0.15)
+
+
+def test_values_that_do_not_show_are_as_unsure_as_a_full_turn() -> None:
+    nothing = Distances(
+        np.zeros(0),
+        np.zeros((0, 3)),
+        ErrorEffects(*[np.zeros((0, 0))] * 5),
+        np.diag([0.0, 1e6, 1e6]),
+        np.zeros((0, 12)),
+        np.zeros(0, dtype=np.intp),
+    )
+    sizes = estimate_sizes(nothing, ANGLES)
+    deviations = np.sqrt(np.diag(values_covariance(nothing, sizes, ALL, ANGLES)))
+    assert deviations[0] == pytest.approx(2.0 * np.pi / np.sqrt(12.0))
+    assert deviations[1] < 0.01
+
+
+@pytest.fixture(scope="module")
+def kinematics(tmp_path_factory: pytest.TempPathFactory) -> TreeKinematics:
+    return TreeKinematics(arm_tree(tmp_path_factory.mktemp("arm")))
+
+
+def fitted(
+    kinematics: TreeKinematics, views: list[View], truth: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, ErrorSizes]:
+    """How far a pose fitted from the truth is from it, its standard deviations, and the sizes."""
+    fit = ViewsFit(kinematics, few_triangles(TreeSurfaces(kinematics.tree)), views)
+    values = fit.refine(truth, FINE).values
+    seen = fit.distances(values, STEP)
+    sizes = estimate_sizes(seen, kinematics.is_angle)
+    free = np.arange(len(truth))
+    covariance = values_covariance(seen, sizes, free, kinematics.is_angle)
+    return values - truth, np.sqrt(np.diag(covariance)), sizes
+
+
+def test_truths_lie_in_their_intervals_where_cameras_masks_and_links_are_off(
+    kinematics: TreeKinematics,
+) -> None:
+    """And points that erred each by itself would claim far more."""
+    errors, deviations = [], []
+    generator = np.random.default_rng(7)
+    for seed in range(12):
+        truth = 0.8 * draw_pose(kinematics.tree, generator)
+        error, deviation, _ = fitted(kinematics, damaged_views(kinematics.tree, truth, seed), truth)
+        errors.append(error)
+        deviations.append(deviation)
+    ratios = np.abs(errors) / np.array(deviations)
+    assert np.mean(ratios < 1.96) >= 0.95
+    assert np.median(ratios) > 0.2
+
+
+def test_cameras_that_are_off_show(kinematics: TreeKinematics) -> None:
+    truth = np.array([0.6, 0.7, -0.7, 0.9, 0.3])
+    generator = np.random.default_rng(4)
+    found = []
+    for pixels in (0.0, 4.0):
+        views = [
+            draw_view(kinematics.tree, truth, camera, None, nudge_camera(camera, pixels, generator))
+            for camera in arm_cameras(640, 480)
+        ]
+        found.append(fitted(kinematics, views, truth))
+    (_, sure, small), (error, unsure, large) = found
+    assert small.camera == 1.0
+    assert large.camera > 1.5
+    assert np.all(unsure > 1.2 * sure)
+    assert np.all(np.abs(error) < 3.0 * unsure)
+
+
+def test_costs_by_pieces_add_up(kinematics: TreeKinematics) -> None:
+    truth = np.array([0.6, 0.7, -0.7, 0.9, 0.3])
+    views = damaged_views(kinematics.tree, truth, 2)
+    fit = ViewsFit(kinematics, few_triangles(TreeSurfaces(kinematics.tree)), views)
+    pieces = fit.piece_costs(truth, STEP)
+    assert pieces.sum() == pytest.approx(fit.cost(truth, STEP))
+    # Only where a silhouette or the body has an edge.
+    assert 5 < np.count_nonzero(pieces[0]) < 80
+    assert (pieces >= 0.0).all()

@@ -1,0 +1,291 @@
+"""Unknowns of every kind found again in drawn silhouettes, and their equations."""
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_array
+
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import load_model
+from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.camera.models import ParallelCamera, PinholeCamera
+from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.errors import SettingsError, UnknownNameError
+from drake_pose.fit.evidence import find_edge_points, pack_evidence
+from drake_pose.fit.frames_fit import FittedFrames, FramesFit
+from drake_pose.fit.levenberg_marquardt import Coupling, Equations, Round
+from drake_pose.fit.parameters import (
+    CAMERA_NAMES,
+    GIRTH_PREFIX,
+    ROOT_NAMES,
+    BodyParameters,
+    CameraParameters,
+)
+from drake_pose.fit.surfaces import VERY_FEW, few_triangles
+from drake_pose.fit.unknowns import choose, join
+from drake_pose.silhouette.areas.bending import TreeSurfaces
+from drake_pose.silhouette.areas.outline import outline_from_mesh
+from drake_pose.silhouette.areas.scoring import draw_mask
+
+ROUNDS = (Round(0.08, 0.04, 3), Round(0.04, 0.03, 3), Round(0.01, 0.02, 8))
+BENT = ("left_forearm_x", "right_forearm_x", "left_shin_x", "right_shin_x")
+
+
+@pytest.fixture(scope="module")
+def person():
+    return load_model(bundled_model("person"), check=False)
+
+
+@pytest.fixture(scope="module")
+def body(person):
+    tree = person.pose_tree()
+    groups = np.arange(len(tree.nodes)) % 2
+    outlines = few_triangles(TreeSurfaces(tree), VERY_FEW)
+    return BodyParameters(TreeKinematics(tree), outlines, groups, ("even", "odd"))
+
+
+@pytest.fixture(scope="module")
+def rig():
+    return list(circle_of_cameras(4, face_camera=False, size=(480, 360)).values())
+
+
+def parallel(pinhole, scale=150.0):
+    return ParallelCamera("parallel", 480, 360, scale, 239.5, 179.5, pinhole.X_WC)
+
+
+def poses(body, count, seed):
+    """Some different poses (count, n) of the body."""
+    generator = np.random.default_rng(seed)
+    kinematics = body.kinematics
+    lower, upper = np.maximum(kinematics.lower, -1.0), np.minimum(kinematics.upper, 1.0)
+    theta = np.zeros((count, len(body.names)))
+    values = kinematics.flatten(kinematics.tree.default_values())
+    for row in theta:
+        row[: len(values)] = np.clip(
+            values + 0.25 * (upper - lower) * generator.uniform(-1, 1, len(values)), lower, upper
+        )
+        for name, place in (("position_x", 0.0), ("position_y", 0.0), ("position_z", 1.0)):
+            row[list(body.names).index(name)] = place
+    return theta
+
+
+def draw(body, cameras, theta, camera_theta=None):
+    """The edges that cameras see of a body; drawn by the span kernel, not by the fit's."""
+    placement = body.place(theta)
+    parameters = np.zeros(7 * len(cameras)) if camera_theta is None else camera_theta
+    X_CW, kernel, _ = CameraParameters(cameras, root_of(body)).place(parameters)
+    edges = []
+    for c, camera in enumerate(cameras):
+        focal = float(kernel[c, 1])
+        moved = (
+            PinholeCamera(
+                camera.name, camera.width, camera.height, focal, float(kernel[c, 2]),
+                camera.center_x, camera.center_y, np.linalg.inv(X_CW[c]),
+            )
+            if isinstance(camera, PinholeCamera)
+            else ParallelCamera(
+                camera.name, camera.width, camera.height, focal,
+                camera.center_x, camera.center_y, np.linalg.inv(X_CW[c]),
+            )
+        )  # fmt: skip
+        outlines = _outlines(body, placement)
+        edges.append(find_edge_points(draw_mask(outlines, X_CW[c] @ placement.X_WN, moved), 2.0))
+    return pack_evidence(edges)
+
+
+def _outlines(body, placement):
+    starts = placement.packed.starts[:, 0]
+    return [
+        outline_from_mesh(
+            TriangleMesh(placement.packed.points[:, starts[k] : starts[k + 1]].T, one.triangles)
+        )
+        for k, one in enumerate(body.outlines)
+    ]
+
+
+def root_of(body):
+    kinematics = body.kinematics
+    return kinematics.poses(kinematics.flatten(kinematics.tree.default_values()))[0, :3, 3]
+
+
+def names_of(camera, count=7):
+    return [f"{camera.name}.{name}" for name in CAMERA_NAMES[:count]]
+
+
+class TestKnownAnswers:
+    def test_joint_positions_and_root_pose_of_each_frame(self, body, rig):
+        truth = poses(body, 2, 11)
+        names = [*BENT, *ROOT_NAMES[:3]]
+        fit = FramesFit(body, rig, choose(body.names, names))
+        wanted = np.array([[0.25, -0.2, 0.15, 0.2, 0.03, -0.04, 0.02]] * 2)
+        held = truth.copy()
+        index = [list(body.names).index(name) for name in names]
+        held[:, index] -= wanted
+        frames = [draw(body, rig, theta) for theta in truth]
+        found = fit.fit(frames, held, np.zeros((2, 7)), np.zeros(0), ROUNDS)
+        np.testing.assert_allclose(found.own[:, :4], wanted[:, :4], atol=0.06)
+        np.testing.assert_allclose(found.own[:, 4:], wanted[:, 4:], atol=0.004)
+        assert found.shares.min() > 0.9
+
+    def test_camera_pose_where_the_poses_are_known(self, body, rig):
+        truth = poses(body, 4, 2)
+        moved = np.array([0.06, -0.05, 0.04, 0.05, -0.04, 0.08, 0.0])
+        names = names_of(rig[0], 6)
+        all_names = [*body.names, *names_of(rig[0])]
+        fit = FramesFit(body, rig[:1], choose(all_names, names, shared=True))
+        frames = [draw(body, rig[:1], theta, moved) for theta in truth]
+        found = fit.fit(frames, truth, np.zeros((4, 0)), np.zeros(6), ROUNDS)
+        np.testing.assert_allclose(found.shared[:3], moved[:3], atol=0.01)
+        np.testing.assert_allclose(found.shared[3:], moved[3:6], atol=0.02)
+
+    def test_focal_length_and_scale(self, body, rig):
+        truth = poses(body, 3, 3)
+        for camera in (rig[0], parallel(rig[0])):
+            moved = np.array([0.0] * 6 + [0.08])
+            all_names = [*body.names, *names_of(camera)]
+            unknowns = choose(all_names, names_of(camera)[6:], shared=True)
+            frames = [draw(body, [camera], theta, moved) for theta in truth]
+            found = FramesFit(body, [camera], unknowns).fit(
+                frames, truth, np.zeros((3, 0)), np.zeros(1), ROUNDS
+            )
+            np.testing.assert_allclose(found.shared, 0.08, atol=0.004)
+
+    def test_joint_zeros_of_all_frames(self, body, rig):
+        truth = poses(body, 4, 4)
+        zeros = np.array([0.08, -0.1, 0.07, 0.05])
+        index = [list(body.names).index(name) for name in BENT]
+        readings = truth.copy()
+        readings[:, index] -= zeros
+        fit = FramesFit(body, rig, choose(body.names, BENT, shared=True))
+        frames = [draw(body, rig, theta) for theta in truth]
+        found = fit.fit(frames, readings, np.zeros((4, 0)), np.zeros(4), ROUNDS)
+        np.testing.assert_allclose(found.shared, zeros, atol=0.012)
+        deviations = np.sqrt(np.diag(found.shared_covariance))
+        assert (np.abs(found.shared - zeros) < 4.0 * deviations).all()
+
+    def test_growth_and_girths_of_all_frames_beside_their_poses(self, body, rig):
+        truth = poses(body, 3, 5)
+        girths = [name for name in body.names if name.startswith(GIRTH_PREFIX)]
+        shared = [ROOT_NAMES[3], *girths]
+        index = [list(body.names).index(name) for name in shared]
+        truth[:, index] = [0.05, 0.1, -0.08]
+        held = truth.copy()
+        held[:, index] = 0.0
+        bent = [list(body.names).index(name) for name in BENT]
+        held[:, bent] -= 0.1
+        unknowns = join(choose(body.names, shared, shared=True), choose(body.names, BENT))
+        frames = [draw(body, rig, theta) for theta in truth]
+        found = FramesFit(body, rig, unknowns).fit(
+            frames, held, np.zeros((3, 4)), np.zeros(3), ROUNDS
+        )
+        np.testing.assert_allclose(found.shared[0], 0.05, atol=0.01)
+        np.testing.assert_allclose(found.shared[1:], [0.1, -0.08], atol=0.04)
+        np.testing.assert_allclose(found.own, 0.1, atol=0.05)
+
+    def test_segment_lengths_of_all_frames_beside_their_poses(self):
+        tree = load_model(
+            bundled_model("person").parent / "person_shape.urdf", check=False
+        ).pose_tree()
+        kinematics = TreeKinematics(tree)
+        body = BodyParameters(kinematics, few_triangles(TreeSurfaces(tree), VERY_FEW))
+        rig = list(circle_of_cameras(4, face_camera=False, size=(480, 360)).values())
+        root = {"position_x", "position_y", "position_z"}
+        kinds = tree.model.position_kinds
+        lengths = [
+            name
+            for name in kinematics.names
+            if name not in root and kinds[tree.model.position_index(name)] == "length"
+        ]
+        truth = poses(body, 3, 6)
+        index = [list(body.names).index(name) for name in lengths]
+        truth[:, index] = 0.03
+        held = truth.copy()
+        held[:, index] = 0.0
+        unknowns = join(
+            choose(body.names, lengths, shared=True, deviation=0.1), choose(body.names, BENT)
+        )
+        frames = [draw(body, rig, theta) for theta in truth]
+        found = FramesFit(body, rig, unknowns).fit(
+            frames, held, np.zeros((3, 4)), np.zeros(len(lengths)), ROUNDS
+        )
+        np.testing.assert_allclose(found.shared, 0.03, atol=0.015)
+        assert np.abs(found.own).max() < 0.1
+
+
+def test_equations_are_the_slope_of_the_cost(body, rig):
+    """Of every parameter at once, where all points have their counterparts."""
+    camera = parallel(rig[0])
+    cameras = [rig[1], camera]
+    truth = poses(body, 1, 7)
+    all_names = [*body.names, *names_of(rig[1]), *names_of(camera)]
+    fit = FramesFit(body, cameras, choose(all_names, all_names))
+    evidence = [draw(body, cameras, truth[0])]
+    base = np.pad(truth, ((0, 0), (0, 14)))
+    step = Round(0.1, 0.002)
+    generator = np.random.default_rng(0)
+    base += 0.015 * generator.uniform(-1, 1, base.shape)
+    none = np.zeros(0)
+    at = fit.equations(evidence, base, np.zeros((1, len(all_names))), none, step)
+    slopes, expected = [], []
+    for k in range(len(all_names)):
+        ends = []
+        for sign in (-1.0, 1.0):
+            own = np.zeros((1, len(all_names)))
+            own[0, k] = sign * 2e-3
+            ends.append(fit.equations(evidence, base, own, none, step).cost)
+        slopes.append((ends[1] - ends[0]) / (2 * 2e-3))
+        expected.append(2.0 * at.g[0, k])
+    slopes, expected = np.array(slopes), np.array(expected)
+    # Counterparts change on the way: the slopes agree on the whole.
+    cosine = slopes @ expected / np.linalg.norm(slopes) / np.linalg.norm(expected)
+    assert cosine > 0.93
+    assert np.linalg.norm(slopes) == pytest.approx(np.linalg.norm(expected), rel=0.2)
+
+
+def test_what_does_not_fit_is_refused(body, rig):
+    with pytest.raises(UnknownNameError, match="no_such"):
+        choose(body.names, ["no_such"])
+    fit = FramesFit(body, rig, choose(body.names, BENT))
+    nothing = draw(body, rig, poses(body, 1, 1)[0])
+    with pytest.raises(SettingsError, match="1 frames with 4 own and 0 shared"):
+        fit.fit([nothing], np.zeros((1, 3)), np.zeros((1, 3)), np.zeros(0), ROUNDS)
+
+
+@pytest.mark.parametrize("couples", [False, True])
+def test_deviations_of_frames_are_those_of_the_whole_system(couples):
+    generator = np.random.default_rng(4)
+    frames, p, q = 4, 3, 2
+    J = generator.normal(size=(frames, 9, p + q))
+    H = np.einsum("fij,fik->fjk", J, J)
+    rows, information = generator.normal(size=(5, frames * p)), generator.uniform(1.0, 9.0, 5)
+    coupling = Coupling(csr_array(rows), np.zeros(5), information) if couples else None
+    equations = Equations(H, np.zeros((frames, p + q)), 0.0)
+    nothing = np.zeros((frames, p))
+    fitted = FittedFrames(nothing, np.zeros(q), nothing, nothing, nothing, 0.0, equations, coupling)
+    whole = np.zeros((frames * p + q, frames * p + q))
+    for k in range(frames):
+        at = np.r_[k * p : (k + 1) * p, frames * p : frames * p + q]
+        whole[np.ix_(at, at)] += H[k]
+    if couples:
+        whole[: frames * p, : frames * p] += rows.T @ np.diag(information) @ rows
+    expected = np.sqrt(np.diag(np.linalg.inv(whole))[: frames * p]).reshape(frames, p)
+    np.testing.assert_allclose(fitted.own_deviations(), expected, rtol=1e-3)
+
+
+def test_what_nothing_tells_has_a_large_deviation():
+    rows = csr_array(np.array([[1.0, -1.0]]))
+    coupling = Coupling(rows, np.zeros(1), np.array([1e6]))
+    H = np.zeros((2, 2, 2))
+    H[:, 1, 1] = 1.0
+    nothing = np.zeros((2, 1))
+    fitted = FittedFrames(
+        nothing,
+        np.zeros(1),
+        nothing,
+        nothing,
+        nothing,
+        0.0,
+        Equations(H, np.zeros((2, 2)), 0.0),
+        coupling,
+    )
+    assert (fitted.own_deviations() > 50.0).all()

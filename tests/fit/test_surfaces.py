@@ -1,0 +1,108 @@
+"""Surfaces of few triangles against exact shapes, bundled bodies, and points taken one by one."""
+
+import fast_simplification
+import numpy as np
+import pytest
+import trimesh
+
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import load_model
+from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.fit.surface_distance import surface_distance
+from drake_pose.fit.surfaces import FEW, VERY_FEW, few_triangles
+from drake_pose.silhouette.areas.bending import TreeSurfaces
+from drake_pose.silhouette.areas.outline import outline_from_mesh
+
+RADIUS, TUBE, ENDS = 0.08, 0.06, (0.1, 0.3)
+
+
+class Rigid:
+    """What ``few_triangles`` asks of surfaces."""
+
+    def __init__(self, *outlines):
+        self.rigid, self.bending = outlines, [None] * len(outlines)
+
+
+def ball_and_tube(slivers):
+    """A ball of 5120 triangles and beside it a closed tube of slivers along its whole length."""
+    ball = trimesh.creation.icosphere(4, radius=RADIUS)
+    tube = trimesh.creation.cylinder(TUBE, segment=[[0, 0, z] for z in ENDS], sections=slivers)
+    both = trimesh.util.concatenate([ball, tube])
+    return outline_from_mesh(TriangleMesh(both.vertices, both.faces))
+
+
+def distance_to_shape(points):
+    """Of points (n, 3) to the ball's or the tube's exact surface, whichever is nearer."""
+    ball = np.abs(np.linalg.norm(points, axis=1) - RADIUS)
+    across = np.linalg.norm(points[:, :2], axis=1) - TUBE
+    along = np.abs(points[:, 2] - np.mean(ENDS)) - 0.5 * (ENDS[1] - ENDS[0])
+    outside = np.hypot(np.maximum(across, 0), np.maximum(along, 0))
+    return np.minimum(ball, np.abs(outside + np.minimum(np.maximum(across, along), 0)))
+
+
+def on_surface(outline, count=4000):
+    """Points on triangles drawn by their areas."""
+    mesh = trimesh.Trimesh(outline.vertices, outline.triangles, process=False)
+    return np.asarray(trimesh.sample.sample_surface(mesh, count, seed=4)[0])
+
+
+def nearest_sample(points, outline):
+    """The distance of each point to the nearest of many samples: a little too large."""
+    samples = on_surface(outline, 20_000)
+    return np.array([np.sqrt(((samples - p) ** 2).sum(axis=1).min()) for p in points])
+
+
+@pytest.mark.parametrize("slivers", [40, 100])
+def test_slivers_leave_the_shape_as_it_is(slivers):
+    given = ball_and_tube(slivers)
+    (simple,) = few_triangles(Rigid(given))
+    assert 0.5 * FEW < len(simple.triangles) < 1.2 * FEW
+    # Nothing has been lost, and nothing sticks out.
+    assert nearest_sample(on_surface(given, 400), simple).max() < 0.012
+    assert distance_to_shape(on_surface(simple)).max() < 0.008
+
+
+def test_without_slivers_surfaces_are_what_the_simplifier_makes():
+    surfaces = TreeSurfaces(load_model(bundled_model("person"), check=False).pose_tree())
+    for count in (FEW, VERY_FEW):
+        for given, simple in zip(surfaces.rigid, few_triangles(surfaces, count), strict=True):
+            if len(given.triangles) > count:
+                points, _ = fast_simplification.simplify(
+                    given.vertices, given.triangles, target_count=count
+                )
+                assert {*map(tuple, simple.vertices)} <= {*map(tuple, points.astype(float))}
+
+
+def test_thin_rod_of_many_triangles_is_not_lost():
+    rod = trimesh.creation.cylinder(0.0005, height=1.0, sections=600)
+    (simple,) = few_triangles(Rigid(outline_from_mesh(TriangleMesh(rod.vertices, rod.faces))))
+    assert len(simple.triangles) > 0
+    np.testing.assert_allclose(np.ptp(simple.vertices, axis=0)[2], 1.0, atol=0.01)
+
+
+def test_distance_of_surfaces():
+    generator = np.random.default_rng(7)
+    one, other = (
+        outline_from_mesh(
+            TriangleMesh(center + generator.uniform(-1, 1, (30, 3)), np.arange(30).reshape(-1, 3))
+        )
+        for center in (0.0, 0.7)
+    )
+    there = nearest_sample(on_surface(one, 1000), other)
+    back = nearest_sample(on_surface(other, 1000), one)
+    expected = np.sqrt(0.5 * ((there**2).mean() + (back**2).mean()))
+    np.testing.assert_allclose(surface_distance(one, other), expected, rtol=0.1)
+    empty = outline_from_mesh(TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32)))
+    assert surface_distance(one, empty) == np.inf
+    assert surface_distance(one, one) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_body_loaded_again_is_not_simplified_again_but_a_changed_one_is():
+    once, again = (few_triangles(Rigid(ball_and_tube(40)))[0] for _ in range(2))
+    given = ball_and_tube(40)
+    wider = outline_from_mesh(TriangleMesh(1.1 * given.vertices, given.triangles))
+    (other,) = few_triangles(Rigid(wider))
+    (coarser,) = few_triangles(Rigid(given), VERY_FEW)
+    assert again is once
+    np.testing.assert_allclose(np.ptp(other.vertices, axis=0), np.ptp(wider.vertices, axis=0), 0.02)
+    assert len(coarser.triangles) < len(once.triangles)

@@ -1,0 +1,111 @@
+"""Many scenes are audited: what contradicts is told by scene; finished ones are left alone."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from typer.testing import CliRunner, Result
+
+from drake_pose.camera.files import save_cameras
+from drake_pose.commands.main import app
+from drake_pose.errors import SettingsError
+from drake_pose.jobs.batch.job import read_job
+from tests.jobs.registration.arm_scenes import ArmScene, write_arm_scene
+
+
+@pytest.fixture(scope="module")
+def jobs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene that is right, one with a frame whose elbow reads otherwise, one without joints."""
+    base = tmp_path_factory.mktemp("audits")
+    (base / "first").mkdir()
+    right = write_arm_scene(base / "first")
+    save_cameras(base / "cameras.yaml", right.cameras)
+    (base / "second").mkdir()
+    wrong: ArmScene = right.copy(base / "second")
+    rows = wrong.rows()
+    column = rows[0].index("elbow_turn")
+    rows[3][column] = str(float(rows[3][column]) + np.radians(10.0))
+    wrong.write_rows(rows)
+    content = {
+        "defaults": {"model": "first/arm.urdf", "camera_file": "cameras.yaml", "overlay": False},
+        "scenes": {
+            "right": {"scene": "first/scene", "audit": "first/joints.csv"},
+            "wrong": {"scene": "second/scene", "audit": "second/joints.csv"},
+            "lost": {"scene": "second/scene", "audit": "nowhere.csv"},
+        },
+    }
+    (base / "jobs.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
+    return base / "jobs.yaml"
+
+
+@pytest.fixture(scope="module")
+def audited(jobs: Path, runner: CliRunner) -> Result:
+    return runner.invoke(app, ["batch", str(jobs), "--out", str(jobs.parent / "out")])
+
+
+@pytest.mark.slow
+def test_what_contradicts_is_named_by_scene(jobs: Path, audited: Result) -> None:
+    out = jobs.parent / "out"
+    # The scene that failed did not stop the others.
+    assert audited.exit_code == 1
+    assert "scene 'lost'" in audited.stderr
+    assert "nowhere.csv" in audited.stderr
+    scenes = json.loads((out / "batch.json").read_text())["scenes"]
+    assert [scenes[name]["state"] for name in scenes] == ["finished", "finished", "failed"]
+    assert scenes["right"]["contradictions"] == []
+    assert scenes["right"]["agreeing_count"] == scenes["right"]["frame_count"] == 5
+    assert [one["name"] for one in scenes["wrong"]["contradictions"]] == ["0002"]
+    with (out / "contradictions.csv").open(newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert (row["scene"], row["what"], row["name"]) == ("wrong", "frame", "0002")
+    assert (
+        row["text"]
+        == json.loads((out / "wrong" / "summary.json").read_text())["contradictions"][0]["text"]
+    )
+    assert "frame 0002" in audited.stdout
+
+
+@pytest.mark.slow
+def test_it_is_resumed(jobs: Path, audited: Result, runner: CliRunner) -> None:
+    out = jobs.parent / "out"
+    before = {name: (out / name / "summary.json").stat().st_mtime_ns for name in ("right", "wrong")}
+    content = yaml.safe_load(jobs.read_text())
+    content["scenes"]["lost"]["audit"] = "first/joints.csv"
+    content["scenes"]["found"] = content["scenes"].pop("lost")
+    (jobs.parent / "more.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
+    given = ["batch", str(jobs.parent / "more.yaml"), "--out", str(out), "--resume", "--json"]
+    result = runner.invoke(app, given)
+    assert result.exit_code == 0, result.output
+    scenes = json.loads(result.stdout)["scenes"]
+    assert scenes["found"]["state"] == "finished"
+    for name, time in before.items():
+        assert (out / name / "summary.json").stat().st_mtime_ns == time
+    assert [one["name"] for one in scenes["wrong"]["contradictions"]] == ["0002"]
+    # Masks that are others by now are not those that were audited.
+    masks = jobs.parent / "first" / "scene" / "masks" / "left"
+    first = (masks / "0000.png").read_bytes()
+    (masks / "0000.png").write_bytes((masks / "0001.png").read_bytes())
+    result = runner.invoke(app, given)
+    (masks / "0000.png").write_bytes(first)
+    assert result.exit_code == 1
+    assert "masks of frame 0000 were replaced" in " ".join(result.stderr.split())
+
+
+@pytest.mark.parametrize(
+    ("entry", "said"),
+    [
+        ({"audit": "joints.csv", "interval": 5}, "an audit has no setting interval"),
+        ({"audit": "joints.csv", "truth": "joints.csv"}, "an audit has no setting truth"),
+        ({"camera_file": "cameras.yaml"}, "camera_file is a setting of audits"),
+    ],
+)
+def test_settings_of_the_other_kind_are_refused(
+    entry: dict[str, object], said: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "jobs.yaml"
+    path.write_text(yaml.safe_dump({"scenes": {"one": {"scene": "one", **entry}}}))
+    with pytest.raises(SettingsError, match=said):
+        read_job(path)

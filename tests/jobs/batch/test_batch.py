@@ -1,0 +1,360 @@
+"""Many scenes by any number of workers."""
+
+import csv
+import dataclasses
+import gc
+import json
+import os
+import shutil
+import signal
+import socket
+import sys
+import threading
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from drake_pose.commands.main import app
+from drake_pose.errors import ClusterError, OutputError, SettingsError
+from drake_pose.jobs.batch.batch import run_batch
+from drake_pose.jobs.batch.job import SETTINGS, SceneJob, read_job
+from drake_pose.jobs.batch.tasks import WORK, Outcome, Task, perform
+from drake_pose.jobs.batch.workers import ClusterPool
+from drake_pose.jobs.cluster.scheduler import open_cluster, require_fit_workers
+from drake_pose.jobs.estimate.scene import estimate_scene
+from drake_pose.results.settings import EstimateSettings
+from tests.jobs.scenes import write_scene
+
+MOTION = [(20.0 + 5.0 * k, -40.0 - 4.0 * k) for k in range(5)]
+QUICK = {"method": "paper", "interval": 20.0, "replay": False, "overlay": False}
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory):
+    """Five stills, and a sequence of three frames."""
+    base = tmp_path_factory.mktemp("scenes")
+    write_scene(base / "stills", MOTION)
+    write_scene(base / "motion", MOTION[:3])
+    (base / "motion" / "scene.yaml").write_text("sequence: true\nframe_rate_hz: 30\n")
+    return base
+
+
+def write_job(folder: Path, scenes: dict[str, dict], name: str = "jobs.yaml") -> Path:
+    path = folder / name
+    content = {"chunk": 2, "defaults": {"model": "crane.urdf", **QUICK}, "scenes": scenes}
+    path.write_text(yaml.safe_dump(content, sort_keys=False))
+    return path
+
+
+@pytest.fixture(scope="module")
+def jobs(scenes):
+    both = {"stills": {"scene": "stills"}, "motion": {"scene": "motion", "overlay": True}}
+    return read_job(write_job(scenes, both))
+
+
+@pytest.fixture(scope="module")
+def alone(jobs, tmp_path_factory):
+    """What this process makes of them."""
+    out = tmp_path_factory.mktemp("alone") / "out"
+    run_batch(jobs, out)
+    return out
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    with open_cluster(2) as client:
+        yield client
+
+
+def rows(folder: Path) -> list[list[str]]:
+    """poses.csv without the seconds."""
+    with (folder / "poses.csv").open(newline="") as file:
+        return [row[:-1] for row in csv.reader(file)]
+
+
+def same_results(one: Path, other: Path) -> bool:
+    return all(rows(one / name) == rows(other / name) for name in ("stills", "motion"))
+
+
+class OneAtATime(ClusterPool):
+    """As if there were one worker."""
+
+    size = 1
+
+
+@pytest.mark.slow
+def test_results_do_not_depend_on_who_works(jobs, alone, cluster, scenes, tmp_path):
+    for name, pool in (("one", OneAtATime(cluster)), ("two", ClusterPool(cluster))):
+        result = run_batch(jobs, tmp_path / name, pool)
+        assert not result.failed
+        assert same_results(alone, tmp_path / name)
+    # Three chunks and two, and each scene put together.
+    assert {name: one.attempts for name, one in result.scenes.items()} == {"stills": 4, "motion": 3}
+    assert sorted(path.name for path in (tmp_path / "two").iterdir()) == [
+        "batch.json", "motion", "stills",
+    ]  # fmt: skip
+    estimate_scene(
+        scenes / "stills", scenes / "crane.urdf", tmp_path / "plain", jobs[0].settings,
+        replay=False, overlay=False,
+    )  # fmt: skip
+    for file in ("joints.csv", "families.csv"):
+        plain = tmp_path / "plain" / file
+        assert plain.exists() == (alone / "stills" / file).exists()
+    assert rows(tmp_path / "plain") == rows(alone / "stills")
+    summary = json.loads((alone / "motion" / "summary.json").read_text())
+    assert summary["complete"]
+    assert list(summary["frames"]) == ["0000", "0001", "0002"]
+    assert len(list((alone / "motion" / "overlay" / "front").iterdir())) == 3
+
+
+@pytest.mark.slow
+def test_one_chunk_of_a_sequence_is_an_estimate(scenes, jobs, tmp_path):
+    whole = dataclasses.replace(jobs[1], chunk=100)
+    run_batch([whole], tmp_path / "batch")
+    estimate_scene(whole.scene, whole.model, tmp_path / "plain", whole.settings, replay=False)
+    assert rows(tmp_path / "batch" / "motion") == rows(tmp_path / "plain")
+
+
+def test_replaced_masks_are_named_when_a_batch_is_resumed(scenes, jobs, tmp_path):
+    shutil.copytree(scenes / "motion", tmp_path / "motion")
+    job = dataclasses.replace(jobs[1], scene=tmp_path / "motion", chunk=100)
+    run_batch([job], tmp_path / "batch")
+    before = rows(tmp_path / "batch" / "motion")
+    assert not run_batch([job], tmp_path / "batch", resume=True).failed
+    masks = tmp_path / "motion" / "masks" / "front"
+    shutil.copyfile(masks / "0002.png", masks / "0001.png")
+    again = run_batch([job], tmp_path / "batch", resume=True)
+    assert again.failed
+    assert "the masks of frame 0001 were replaced" in str(again.scenes["motion"].errors)
+    assert rows(tmp_path / "batch" / "motion") == before
+
+
+@pytest.mark.slow
+def test_failing_scene_is_named_and_resume_computes_only_what_is_missing(
+    scenes, jobs, alone, tmp_path
+):
+    shutil.copytree(scenes, tmp_path / "own")
+    both = {"stills": {"scene": "stills"}, "motion": {"scene": "motion", "model": "broken.urdf"}}
+    (tmp_path / "own" / "broken.urdf").write_text("<robot")
+    path, out = write_job(tmp_path / "own", both), tmp_path / "out"
+    runner = CliRunner()
+    arguments = ["batch", str(path), "--out", str(out), "--workers", "0"]
+    failed = runner.invoke(app, arguments)
+    assert failed.exit_code == 1
+    assert "scene 'motion'" in failed.stderr
+    assert "broken.urdf" in failed.stderr
+    assert rows(out / "stills") == rows(alone / "stills")
+    assert not (out / "motion").exists()
+    written = (out / "stills" / "poses.csv").stat().st_mtime_ns
+    again = runner.invoke(app, arguments)
+    assert again.exit_code == 1
+    assert "--resume" in again.stderr
+    # The model is mended: another job by its digest.
+    shutil.copyfile(scenes / "crane.urdf", tmp_path / "own" / "broken.urdf")
+    other = runner.invoke(app, [*arguments, "--resume"])
+    assert other.exit_code == 1
+    assert "sha256" in other.stderr
+    write_job(tmp_path / "own", {"stills": both["stills"], "mended": both["motion"]})
+    resumed = runner.invoke(app, [*arguments, "--resume", "--json"])
+    assert resumed.exit_code == 0, resumed.stderr
+    report = json.loads(resumed.stdout)
+    assert report["complete"]
+    assert report["scenes"]["stills"]["attempts"] == 0
+    assert rows(out / "mended") == rows(alone / "motion")
+    assert (out / "stills" / "poses.csv").stat().st_mtime_ns == written
+
+
+def die_on_second_chunk(task: Task) -> Outcome:
+    """A chunk that kills whoever touches it."""
+    if task.index == 1 and task.job.name == "stills":
+        with (task.out / "deaths").open("a") as file:
+            file.write("x")
+        os.kill(os.getpid(), signal.SIGKILL)
+    return perform(task)
+
+
+@pytest.mark.slow
+def test_poisoned_chunk_is_given_up_and_the_rest_is_kept(
+    jobs, alone, cluster, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("drake_pose.jobs.batch.workers.TRIES", 2)
+    out = tmp_path / "out"
+    heard = []
+    result = run_batch(
+        jobs, out, ClusterPool(cluster, die_on_second_chunk),
+        on_progress=lambda done, total, message: heard.append((done, total, message)),
+    )  # fmt: skip
+    assert result.failed == ("stills",)
+    ((error, where),) = result.scenes["stills"].errors.items()
+    assert "given up after 2 tries" in error
+    assert "SIGKILL" in error
+    assert where == ["frames 0002 to 0003"]
+    assert [message for *_, message in heard if "frames 0002 to 0003" in message]
+    assert (out / "deaths").read_text() == "xx"
+    assert rows(out / "motion") == rows(alone / "motion")
+    assert not (out / "stills").exists()
+    assert len([path for path in (out / WORK / "stills").iterdir() if path.is_dir()]) == 2
+    resumed = run_batch(jobs, out, resume=True)
+    assert not resumed.failed
+    # Two chunks then; one chunk and putting it together now.
+    assert resumed.scenes["stills"].attempts == 4
+    assert same_results(alone, out)
+    assert not (out / WORK).exists()
+
+
+def slow(task: Task) -> Outcome:
+    time.sleep(0.4)
+    return perform(task)
+
+
+@pytest.mark.slow
+def test_killed_worker_loses_and_repeats_nothing(jobs, alone, cluster, tmp_path):
+    out = tmp_path / "out"
+    victims = list(cluster.run(os.getpid).values())[:1]
+
+    def kill(done: int, total: int, message: str) -> None:
+        if done and victims:
+            os.kill(victims.pop(), signal.SIGKILL)
+
+    result = run_batch(jobs, out, ClusterPool(cluster, slow), on_progress=kill)
+    assert not victims
+    assert not result.failed
+    assert same_results(alone, out)
+    # Seven tasks, and at most the one that the worker had once more.
+    assert 7 <= sum(one.attempts for one in result.scenes.values()) <= 8
+    cluster.wait_for_workers(2, timeout=30)
+
+
+def test_everything_listens_on_the_loopback_address(cluster):
+    this = psutil.Process()
+    listening = [
+        connection.laddr.ip
+        for process in [this, *this.children(recursive=True)]
+        for connection in process.net_connections(kind="inet")
+        if connection.status == psutil.CONN_LISTEN
+    ]
+    assert len(listening) >= 3
+    assert set(listening) == {"127.0.0.1"}
+
+
+def test_workers_must_be_like_this_program(cluster, tmp_path, monkeypatch):
+    require_fit_workers(cluster, tmp_path / "new")
+    assert list((tmp_path / "new").iterdir()) == []
+    monkeypatch.setattr("drake_pose.version.VERSION", "99.0")
+    with pytest.raises(ClusterError, match=r"here is 99\.0"):
+        require_fit_workers(cluster, tmp_path)
+
+
+def test_unreachable_scheduler_is_refused(jobs, scenes, tmp_path, monkeypatch):
+    monkeypatch.setattr("drake_pose.jobs.cluster.scheduler._TIMEOUT", 0.5)
+    result = CliRunner().invoke(
+        app,
+        ["batch", str(scenes / "jobs.yaml"), "--out", str(tmp_path / "out"),
+         "--scheduler", "tcp://127.0.0.1:9"],
+    )  # fmt: skip
+    assert result.exit_code == 1
+    assert "no scheduler answers at tcp://127.0.0.1:9" in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("words", [b"", b"HTTP/1.0 400 Bad request\r\n\r\n" * 8])
+def test_who_listens_but_is_no_scheduler_is_named_in_time(words, monkeypatch, caplog, capfd):
+    monkeypatch.setattr("drake_pose.jobs.cluster.scheduler._TIMEOUT", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def talk():
+            while True:
+                try:
+                    talked.append(listening.accept()[0])
+                    talked[-1].sendall(words)
+                except OSError:
+                    return
+
+        talked = []
+        threading.Thread(target=talk, daemon=True).start()
+        address = f"tcp://127.0.0.1:{listening.getsockname()[1]}"
+        begin = time.monotonic()
+        with pytest.raises(ClusterError, match=address), open_cluster(scheduler=address):
+            pass
+        assert time.monotonic() - begin < 5.0
+        listening.shutdown(socket.SHUT_RDWR)
+    assert talked
+    for connection in talked:
+        connection.close()
+    gc.collect()
+    assert caplog.text == capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("address", ["foo", "10.0.0.7:8786", "tcp://foo", "htp://x:1"])
+def test_what_is_no_address_of_a_scheduler_is_named(address):
+    message = f"'{address}' is no scheduler's address"
+    with pytest.raises(ClusterError, match=message), open_cluster(scheduler=address):
+        pass
+
+
+def test_missing_extra_is_named(jobs, scenes, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    result = CliRunner().invoke(
+        app, ["batch", str(scenes / "jobs.yaml"), "--out", str(tmp_path / "out")]
+    )
+    assert result.exit_code == 1
+    assert 'pip install "drake_pose[cluster]"' in result.stderr
+
+
+def test_job_of_other_chunks_is_not_resumed(jobs, alone):
+    other = [dataclasses.replace(job, chunk=3) for job in jobs]
+    with pytest.raises(OutputError, match="chunk = 2, not 3"):
+        run_batch(other, alone, resume=True)
+
+
+def test_every_setting_can_be_given():
+    assert set(SETTINGS) == {field.name for field in dataclasses.fields(EstimateSettings)}
+
+
+def test_job_file_gives_the_settings(tmp_path):
+    entry = {
+        "scene": "a", "model": "m.urdf", "cameras": ["left"], "frames": "0:9", "root": "base",
+        "root_position": [1, 2, 3], "root_rotation": "y=-180:180", "interval": 5,
+        "hold": {"lift": 10}, "method": "beam", "truth": "t.csv", "replay": False,
+    }  # fmt: skip
+    path = tmp_path / "jobs.yaml"
+    path.write_text(yaml.safe_dump({"scenes": {"a": entry}}))
+    (job,) = read_job(path, chunk=7)
+    settings = EstimateSettings(
+        cameras=("left",), frames=("0:9",), root="base", root_position=(1.0, 2.0, 3.0),
+        root_rotation={"y": (-180.0, 180.0)}, interval=5.0, hold={"lift": 10.0}, method="beam",
+    )  # fmt: skip
+    truth = tmp_path / "t.csv"
+    assert job == SceneJob(
+        "a", tmp_path / "a", tmp_path / "m.urdf", settings, truth, replay=False, chunk=7
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("scenes: {}", "names no scenes"),
+        ("scenes: {a: {}}", "scene 'a': 'scene' is missing"),
+        ("scenes: {../a: {scene: a}}", "slashes"),
+        ("scenes: {1: {scene: a}}", "quotes"),
+        ("scenes: {a: {scene: a, intervall: 3}}", "no setting intervall; there is: scene, model"),
+        ("scenes: {a: {scene: a, interval: wide}}", "interval: must be a number"),
+        ("scenes: {a: {scene: a, frames: [1]}}", "put numbers in quotes"),
+        ("scenes: {a: {scene: a, method: best}}", "scene 'a': there is no method 'best'"),
+        ("scenes: {a: {scene: a, root_position: here}}", "scene 'a': root_position"),
+        ("scenes: {a: {scene: a}}\nchunk: 0", "chunk: must be a whole number"),
+        ("scenes: {a: {scene: a}}\ndefaults: {model: 3}", "model: must be a text"),
+        ("scene: {a: {scene: a}}", "no setting scene"),
+        ("scenes: {a: {scene: a}, a: {scene: b}}", "given twice"),
+    ],
+)
+def test_job_file_is_checked(text, words, tmp_path):
+    path = tmp_path / "jobs.yaml"
+    path.write_text(text)
+    with pytest.raises(SettingsError, match=r"jobs\.yaml") as caught:
+        read_job(path)
+    assert words in str(caught.value)

@@ -1,0 +1,305 @@
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.landmarks import landmark_positions, load_landmarks
+from drake_pose.camera.files import save_cameras
+from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.commands.main import app
+from drake_pose.errors import ModelError, SceneError, SettingsError
+from drake_pose.fit.contour_fit import ContourFit
+from drake_pose.jobs.estimate.capture import capture_scene
+from drake_pose.jobs.estimate.scene import estimate_scene
+from drake_pose.person.recordings.checked_capture import CheckedCapture
+from drake_pose.person.recordings.person_capture import PersonCapture
+from drake_pose.person.recordings.person_recording import ViewFaults
+from drake_pose.results.settings import EstimateSettings
+from drake_pose.silhouette.pictures.masks import write_mask
+from tests.jobs.bvh_reader import read_bvh
+from tests.jobs.persons import PersonScene, record_person
+from tests.jobs.scenes import read_rows
+
+FRAMES = 3
+FILES = {
+    "joint_centres.csv", "joint_centres.trc", "joints.csv", "motion.bvh", "poses.csv",
+    "positions.mot", "report.html", "summary.json",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> PersonScene:
+    """Shared, so do not change it."""
+    return record_person(tmp_path_factory.mktemp("person") / "scene", FRAMES)
+
+
+@pytest.fixture
+def own_recording(recording: PersonScene, tmp_path: Path) -> PersonScene:
+    """A copy to be spoilt."""
+    shutil.copytree(recording.folder, tmp_path / "scene")
+    return PersonScene(tmp_path / "scene", recording.person, recording.truth)
+
+
+@pytest.fixture
+def known(recording: PersonScene, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Puts the truth in the place of the capture, which takes seconds; how many were asked for."""
+    counts: list[int] = []
+
+    def capture(tree, cameras, read, count, settings, on_frame):
+        counts.append(count)
+        q = recording.truth[:count].copy()
+        for k in range(count):
+            read(k)
+            on_frame(k)
+        captured = PersonCapture(
+            q=q,
+            shares=np.ones(count),
+            shape=None,
+            outlines=ContourFit(tree).outlines,
+            tree=tree,
+            deviations=np.full_like(q, 0.01),
+        )
+        return CheckedCapture(captured, ViewFaults(), (), None, read)
+
+    monkeypatch.setattr("drake_pose.jobs.estimate.person.capture_checked", capture)
+    return counts
+
+
+def arguments(scene: PersonScene, out: Path, *more: str) -> list[str]:
+    return [
+        "estimate",
+        str(scene.folder),
+        "--model",
+        str(scene.person.path),
+        "--out",
+        str(out),
+        *more,
+    ]
+
+
+@pytest.mark.slow
+def test_person_is_captured_and_a_corrupt_picture_costs_only_itself(
+    own_recording: PersonScene, tmp_path: Path
+) -> None:
+    scene, person = own_recording.folder, own_recording.person
+    (scene / "masks" / "camera_1" / "0001.png").write_bytes(b"no picture")
+    out = tmp_path / "out"
+    stages: list[tuple[str, int]] = []
+    captured = estimate_scene(
+        scene, person.path, out, EstimateSettings(method="person"), replay=False,
+        on_stage=lambda stage, done, _: stages.append((stage, done)),
+    )  # fmt: skip
+    assert captured.found_count == FRAMES
+    names = list(dict.fromkeys(stage for stage, _ in stages))
+    assert names[:3] == ["reading", "finding and measuring the person", "following"]
+    assert [done for stage, done in stages if stage == "following"] == [1, 2, 3]
+    assert captured.summary["mean_iou"] > 0.85
+    assert any("camera_1" in text and "0001" in text for text in captured.warnings)
+    summary = json.loads((out / "summary.json").read_text())
+    assert "camera_1" not in summary["frames"]["0001"]["ious"]
+    rows = read_rows(out / "poses.csv")
+    joint = "left_upper_arm_z"
+    truth = np.degrees(own_recording.truth[:, person.position_index(joint)])
+    np.testing.assert_allclose(np.degrees([float(row[joint]) for row in rows]), truth, atol=8.0)
+    known = [row for row in read_rows(out / "joints.csv") if row["joint"] == joint]
+    assert all(float(row["high"]) - float(row["low"]) < 40.0 for row in known)
+
+
+@pytest.mark.slow
+def test_camera_that_moved_since_calibration_is_named(tmp_path: Path) -> None:
+    scene = record_person(tmp_path / "scene", FRAMES, moved="camera_2")
+    captured = capture_scene(scene.folder, tmp_path / "out", scene.person.path, replay=False)
+    # It has no say, but one can see why.
+    assert "camera_2" not in captured.summary["cameras"]
+    assert len(list((tmp_path / "out" / "overlay" / "camera_2").iterdir())) == FRAMES
+    assert [text for text in captured.warnings if "camera_2" in text]
+    assert not [text for text in captured.warnings if "camera_0" in text]
+
+
+def test_estimate_follows_a_person_and_says_so(
+    recording: PersonScene, known: list[int], runner: CliRunner, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    result = runner.invoke(app, arguments(recording, out, "--no-replay"))
+    assert result.exit_code == 0, result.output
+    assert "followed by all silhouettes" in result.stdout
+    assert known == [FRAMES]
+    assert {path.name for path in out.iterdir()} == FILES | {"overlay"}
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["complete"] is True
+    assert summary["method"] == "person"
+    assert summary["cameras"]["camera_3"]["frames"] == FRAMES
+    # The person stands in front of the cameras as the masks show: what is compared is the truth.
+    assert summary["mean_iou"] > 0.94
+    assert {path.parent.name for path in out.glob("overlay/*/*.png")} == set(summary["cameras"])
+    assert len(list(out.glob("overlay/*/*.png"))) == 4 * FRAMES
+
+
+def test_files_of_motion_hold_the_persons_joints(
+    recording: PersonScene, known: list[int], tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    estimate_scene(recording.folder, recording.person.path, out, replay=False, overlay=False)
+    landmarks = load_landmarks(recording.person.path)
+    centres = read_rows(out / "joint_centres.csv")
+    places = read_bvh((out / "motion.bvh").read_text()).places()
+    for k, q in enumerate(recording.truth):
+        truth = landmark_positions(recording.person, landmarks, q)
+        rows = [row for row in centres if row["frame"] == f"{k:04d}"]
+        assert [row["joint"] for row in rows] == list(landmarks)
+        found = np.array([[float(row[axis]) for axis in "xyz"] for row in rows])
+        np.testing.assert_allclose(found, truth, atol=1e-4)
+        x, y, z = 100.0 * truth[list(landmarks).index("left_elbow")]
+        np.testing.assert_allclose(places["left_forearm"][k], [x, z, -y], atol=0.01)
+    assert "NumFrames\tNumMarkers" in (out / "joint_centres.trc").read_text()
+    assert f"nRows={FRAMES}" in (out / "positions.mot").read_text()
+    assert not (out / "overlay").exists()
+
+
+def test_deviations_become_intervals_of_95_percent(
+    recording: PersonScene, known: list[int], tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    estimate_scene(recording.folder, recording.person.path, out, replay=False, overlay=False)
+    rows = read_rows(out / "joints.csv")
+    row = next(r for r in rows if (r["frame"], r["joint"]) == ("0001", "left_upper_arm_z"))
+    half = np.degrees(1.96 * 0.01)
+    assert float(row["low"]) == pytest.approx(40.0 - half, abs=1e-3)
+    assert float(row["high"]) == pytest.approx(40.0 + half, abs=1e-3)
+    assert row["determined"] == "yes"
+    # At a limit the interval ends there.
+    elbow = next(r for r in rows if (r["frame"], r["joint"]) == ("0001", "left_forearm_x"))
+    assert float(elbow["high"]) == 0.0
+
+
+def test_stills_cameras_and_frames_are_chosen_like_an_estimates(
+    known: list[int], runner: CliRunner, tmp_path: Path
+) -> None:
+    scene = record_person(tmp_path / "scene", FRAMES, sequence=False)
+    out = tmp_path / "out"
+    some = ("--frame", "0:1", "--camera", "camera_0", "--camera", "camera_2", "--no-replay")
+    result = runner.invoke(app, arguments(scene, out, *some, "--json", "--no-overlay"))
+    assert result.exit_code == 0, result.output
+    summary = json.loads(result.stdout)
+    assert list(summary["frames"]) == ["0000", "0001"]
+    assert set(summary["cameras"]) == {"camera_0", "camera_2"}
+    assert not (out / "motion.bvh").exists()
+    assert len(read_rows(out / "joint_centres.csv")) == 2 * 14
+
+
+def test_the_command_capture_takes_the_bundled_person(
+    recording: PersonScene,
+    runner: CliRunner,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked = {}
+
+    def note(scene, model, out, settings, **options):
+        asked.update(options, model=model, settings=settings)
+
+    monkeypatch.setattr("drake_pose.commands.capture.run_estimate", note)
+    out = tmp_path / "out"
+    options = ["--out", str(out), "--no-overlay", "--frame", "1"]
+    assert runner.invoke(app, ["capture", str(recording.folder), *options]).exit_code == 0
+    assert asked["model"].name == "person_shape.urdf"
+    assert asked["settings"] == EstimateSettings(method="person", frames=("1",))
+    assert asked["overlay"] is False
+
+
+def interrupt(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
+def test_an_interrupted_recording_does_not_look_whole_and_can_be_begun_again(
+    recording: PersonScene,
+    known: list[int],
+    runner: CliRunner,
+    tmp_path: Path,
+) -> None:
+    out = tmp_path / "out"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("drake_pose.jobs.estimate.person.capture_checked", interrupt)
+        result = runner.invoke(app, arguments(recording, out, "--no-replay"))
+    assert result.exit_code == 1
+    assert "--resume" in result.stderr
+    assert json.loads((out / "summary.json").read_text())["complete"] is False
+    assert read_rows(out / "poses.csv") == []
+    assert not (out / "report.html").exists()
+    result = runner.invoke(app, arguments(recording, out, "--no-replay", "--resume"))
+    assert result.exit_code == 0, result.output
+    assert json.loads((out / "summary.json").read_text())["complete"] is True
+    assert len(read_rows(out / "poses.csv")) == FRAMES
+    # Nothing is left to be done.
+    assert known == [FRAMES]
+    again = runner.invoke(app, arguments(recording, out, "--no-replay", "--resume"))
+    assert again.exit_code == 0
+    assert known == [FRAMES]
+
+
+def test_resuming_with_more_frames_loses_none(
+    recording: PersonScene, known: list[int], tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    first = EstimateSettings(frames=("0",))
+    estimate_scene(recording.folder, recording.person.path, out, first, replay=False)
+    more = EstimateSettings(frames=("1:2",))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("drake_pose.jobs.estimate.person.capture_checked", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            estimate_scene(recording.folder, recording.person.path, out, more, resume=True)
+    assert [row["frame"] for row in read_rows(out / "poses.csv")] == ["0000"]
+    estimate_scene(recording.folder, recording.person.path, out, more, resume=True, replay=False)
+    assert known == [1, FRAMES]
+    assert [row["frame"] for row in read_rows(out / "poses.csv")] == ["0000", "0001", "0002"]
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        EstimateSettings(method="beam"),
+        EstimateSettings(cameras=("camera_0",)),
+        EstimateSettings(hold={"left_forearm_x": -20.0}),
+        EstimateSettings(root="left_foot", root_position=(0.0, 0.0, 0.0)),
+    ],
+    ids=["method", "one camera", "hold", "root"],
+)
+def test_options_of_the_search_lead_to_the_search(
+    recording: PersonScene, settings: EstimateSettings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Searched(Exception):
+        """Stands for the search."""
+
+    def search(*_: object, **__: object) -> None:
+        raise Searched
+
+    monkeypatch.setattr("drake_pose.jobs.estimate.inputs._make_search", search)
+    with pytest.raises(Searched):
+        estimate_scene(recording.folder, recording.person.path, None, settings)
+
+
+def test_what_the_method_person_cannot_do_is_refused(
+    recording: PersonScene, tmp_path: Path
+) -> None:
+    with pytest.raises(SettingsError, match="leave hold out"):
+        EstimateSettings(method="person", hold={"head_y": 1.0})
+    hand = bundled_model("hand")
+    with pytest.raises(ModelError, match=r"left_ankle.*landmarks\.yaml"):
+        capture_scene(recording.folder, tmp_path / "out", hand)
+    assert not (tmp_path / "out").exists()
+
+
+def test_one_camera_is_too_few(tmp_path: Path) -> None:
+    cameras = circle_of_cameras(1, size=(160, 120), face_camera=False)
+    save_cameras(tmp_path / "cameras.yaml", cameras)
+    path = tmp_path / "masks" / "camera_0" / "0000.png"
+    path.parent.mkdir(parents=True)
+    mask = np.zeros((120, 160), dtype=bool)
+    mask[40:80, 60:90] = True
+    write_mask(path, mask)
+    with pytest.raises(SceneError, match="two calibrated cameras"):
+        capture_scene(tmp_path, tmp_path / "out")

@@ -1,0 +1,203 @@
+"""A sequence of pictures without masks, painted over Drake's label images."""
+
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from drake_pose.camera.files import save_cameras
+from drake_pose.errors import SceneError, SettingsError
+from drake_pose.jobs.estimate.scene import estimate_scene
+from drake_pose.results.settings import EstimateSettings
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from drake_pose.silhouette.pictures.scenes import load_scene
+from tests.filtering.tracking.test_colours import painted, room
+from tests.filtering.tracking.test_match_and_track import swings
+from tests.search.bodies import forked_body, near_camera
+
+FRAMES = 8
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """A scene of pictures, the model's file, the true positions, and a file of the first ones."""
+    folder = tmp_path_factory.mktemp("recording")
+    model, camera = forked_body(folder), near_camera()
+    generator = np.random.default_rng(9)
+    background = room(generator)
+    truth = swings(FRAMES, np.array([0.1, 0.9, -0.8]), 0.25, generator)
+    scene = folder / "scene"
+    (scene / "images" / "front").mkdir(parents=True)
+    renderer = LabelRenderer(model, camera)
+    for k, q in enumerate(truth):
+        picture = painted(renderer.mask(q), background, generator)
+        cv2.imwrite(str(scene / "images" / "front" / f"{k:04d}.png"), picture[..., ::-1])
+    save_cameras(scene / "cameras.yaml", [camera])
+    (scene / "scene.yaml").write_text("sequence: true\nframe_rate_hz: 30\n")
+    start = folder / "start.csv"
+    rows = [",".join(["frame", *model.position_names]), ",".join(map(str, [0, *truth[0]]))]
+    start.write_text("\n".join(rows))
+    cv2.imwrite(str(folder / "first.png"), 255 * renderer.mask(truth[0]).astype(np.uint8))
+    return scene, model.path, truth, start
+
+
+def errors(estimate, truth):
+    """(frames,) the greatest error of each frame [deg]."""
+    found = np.array([row.q for row in estimate.rows])
+    return np.degrees(np.abs(found - truth).max(axis=1))
+
+
+def test_pictures_and_a_start_are_enough(recording):
+    scene, model, truth, start = recording
+    estimate = estimate_scene(scene, model, settings=EstimateSettings(start=start))
+    assert estimate.found_count == FRAMES
+    assert np.median(errors(estimate, truth)) < 1.5
+
+
+@pytest.mark.slow
+def test_pictures_and_a_mask_of_the_first_frame_are_enough(recording, tmp_path):
+    scene, model, truth, _ = recording
+    copy = tmp_path / "scene"
+    shutil.copytree(scene, copy)
+    (copy / "masks" / "front").mkdir(parents=True)
+    shutil.copy(scene.parent / "first.png", copy / "masks" / "front" / "0000.png")
+    estimate = estimate_scene(copy, model)
+    assert estimate.found_count == FRAMES
+    assert np.median(errors(estimate, truth)) < 1.5
+
+
+@pytest.fixture(scope="module")
+def filmed(recording, tmp_path_factory):
+    """The same scene with a video in place of the pictures."""
+    scene = recording[0]
+    copy = tmp_path_factory.mktemp("filmed")
+    shutil.copy(scene / "cameras.yaml", copy)
+    (copy / "scene.yaml").write_text("sequence: true\n")
+    (copy / "videos").mkdir()
+    pictures = [cv2.imread(str(file)) for file in sorted(scene.glob("images/front/*.png"))]
+    height, width = pictures[0].shape[:2]
+    kind = cv2.VideoWriter.fourcc(*"MJPG")
+    writer = cv2.VideoWriter(str(copy / "videos" / "front.avi"), kind, 25.0, (width, height))
+    for picture in pictures:
+        writer.write(picture)
+    writer.release()
+    return copy
+
+
+def test_a_video_stands_for_pictures(recording, filmed):
+    scene, model, truth, start = recording
+    loaded = load_scene(filmed)
+    assert loaded.frames == tuple(f"{k:06d}" for k in range(FRAMES))
+    assert loaded.frame_rate_hz == pytest.approx(25.0)
+    # In order, back, and over some: compression changes little.
+    still = load_scene(scene)
+    for k in (0, 1, 5, 2, 7):
+        off = loaded.read_image("front", f"{k:06d}").astype(float)
+        off -= still.read_image("front", f"{k:04d}")
+        assert np.abs(off).mean() < 12.0
+    estimate = estimate_scene(filmed, model, settings=EstimateSettings(start=start))
+    assert estimate.found_count == FRAMES
+    assert np.median(errors(estimate, truth)) < 3.0
+
+
+def test_frames_of_a_video_are_named_as_its_masks_are(recording, filmed, tmp_path):
+    copy = tmp_path / "scene"
+    shutil.copytree(filmed, copy)
+    (copy / "masks" / "front").mkdir(parents=True)
+    shutil.copy(recording[0].parent / "first.png", copy / "masks" / "front" / "0.png")
+    loaded = load_scene(copy)
+    assert loaded.frames == ("0", *(f"{k:06d}" for k in range(1, FRAMES)))
+    assert ("front", "0") in loaded.images
+
+
+def test_what_is_no_video_is_named(filmed, tmp_path):
+    copy = tmp_path / "scene"
+    shutil.copytree(filmed, copy)
+    (copy / "videos" / "front.avi").write_bytes(b"no video")
+    with pytest.raises(SceneError, match=r"front\.avi.*not a video"):
+        load_scene(copy)
+
+
+def test_nothing_says_where_the_body_is_at_first(recording):
+    scene, model, _, _ = recording
+    with pytest.raises(SceneError, match=r"'0000'.*masks/front/0000\.png.*--start"):
+        estimate_scene(scene, model)
+
+
+def test_a_start_of_another_frame_is_refused(recording):
+    scene, model, _, start = recording
+    settings = EstimateSettings(start=start, frames=("0003:0005",))
+    with pytest.raises(SceneError, match=r"start\.csv.*'0003'"):
+        estimate_scene(scene, model, settings=settings)
+
+
+def test_pictures_without_masks_are_refused_where_nothing_is_tracked(recording):
+    scene, model, _, start = recording
+    with pytest.raises(SettingsError, match="sequence: true"):
+        estimate_scene(scene, model, settings=EstimateSettings(start=start, track=False))
+    with pytest.raises(SettingsError, match="--no-track"):
+        estimate_scene(scene, model, settings=EstimateSettings(track=False))
+
+
+def test_a_bad_picture_is_met_before_the_work_begins(recording, tmp_path):
+    scene, model, _, start = recording
+    copy = tmp_path / "scene"
+    shutil.copytree(scene, copy)
+    cv2.imwrite(str(copy / "images" / "front" / "0005.png"), np.zeros((10, 20, 3), np.uint8))
+    with pytest.raises(SceneError, match=r"0005\.png.*20 x 10"):
+        estimate_scene(copy, model, tmp_path / "out", EstimateSettings(start=start))
+    (copy / "images" / "front" / "0005.png").write_bytes(b"no picture")
+    with pytest.raises(SceneError, match=r"0005\.png"):
+        estimate_scene(copy, model, tmp_path / "out", EstimateSettings(start=start))
+    assert not (tmp_path / "out" / "poses.csv").exists()
+
+
+def test_an_interrupted_sequence_of_pictures_goes_on_as_if_it_had_not_been(recording, tmp_path):
+    scene, model, _, start = recording
+    settings, heard = EstimateSettings(start=start), []
+
+    def stop(done, total, frame, record):
+        if done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        estimate_scene(scene, model, tmp_path / "out", settings, on_frame=stop, overlay=False)
+    resumed = estimate_scene(
+        scene, model, tmp_path / "out", settings, resume=True, overlay=False,
+        on_frame=lambda done, total, frame, record: heard.append((done, frame)),
+    )  # fmt: skip
+    assert heard == [(3, ""), *((k + 1, f"{k:04d}") for k in range(3, FRAMES))]
+    whole = estimate_scene(scene, model, settings=settings)
+    for one, other in zip(resumed.rows, whole.rows, strict=True):
+        np.testing.assert_allclose(one.q, other.q, atol=1e-6)
+
+
+def test_overlays_show_the_body_over_the_pictures(recording, tmp_path):
+    scene, model, _, start = recording
+    settings = EstimateSettings(start=start, frames=("0000:0001",))
+    estimate_scene(scene, model, tmp_path / "out", settings)
+    shown = cv2.imread(str(tmp_path / "out" / "overlay" / "front" / "0001.png"))
+    picture = cv2.imread(str(scene / "images" / "front" / "0001.png"))
+    # The contour is orange, blue green red; the rest is the picture's.
+    line = np.all(shown == (0, 94, 213), axis=-1)
+    assert 100 < line.sum() < 0.1 * line.size
+    colours = {tuple(one) for one in picture.reshape(-1, 3).tolist()}
+    inside = shown[120:-10, 250:-250].reshape(-1, 3).tolist()
+    assert np.mean([tuple(one) in colours for one in inside]) > 0.9
+
+
+def test_stills_have_no_pictures_and_full_masks_need_none(recording, tmp_path):
+    scene, _, _, _ = recording
+    copy = tmp_path / "scene"
+    shutil.copytree(scene, copy)
+    (copy / "masks" / "front").mkdir(parents=True)
+    for k in range(FRAMES):
+        shutil.copy(scene.parent / "first.png", copy / "masks" / "front" / f"{k:04d}.png")
+    assert not load_scene(copy).images
+    (copy / "masks" / "front" / "0007.png").unlink()
+    assert load_scene(copy).images
+    (copy / "scene.yaml").write_text("sequence: false\n")
+    found = load_scene(copy)
+    assert not found.images
+    assert len(found.frames) == FRAMES - 1

@@ -1,0 +1,83 @@
+import math
+from pathlib import Path
+
+import pytest
+
+from drake_pose.errors import SceneError, UnknownNameError
+from drake_pose.jobs.estimate.measurements import (
+    angle_difference,
+    read_joint_centres,
+    read_true_angles,
+)
+
+CENTRES = "frame,joint,x,y,z\n0,ankle,1,2,3\n0,knee,4,5,6\n7,ankle,-1,-2,-3\n"
+
+
+def written(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+def test_joint_centres_compare_frames_as_numbers(tmp_path: Path) -> None:
+    path = written(tmp_path / "centres.csv", CENTRES)
+    positions = read_joint_centres(path, "ankle", ["0000", "0007"])
+    assert positions["0000"].tolist() == [1, 2, 3]
+    assert positions["0007"].tolist() == [-1, -2, -3]
+
+
+@pytest.mark.parametrize("frame", ["0001", "still"])
+def test_a_frame_without_a_row_is_named(tmp_path: Path, frame: str) -> None:
+    path = written(tmp_path / "centres.csv", CENTRES)
+    with pytest.raises(SceneError, match=f"centres.csv.*'ankle'.*'{frame}'"):
+        read_joint_centres(path, "ankle", ["0000", frame])
+
+
+def test_an_unknown_joint_lists_those_that_exist(tmp_path: Path) -> None:
+    path = written(tmp_path / "centres.csv", CENTRES)
+    with pytest.raises(UnknownNameError, match="ankle, knee"):
+        read_joint_centres(path, "elbow", ["0000"])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is empty"),
+        ("a,b\n", "first line"),
+        ("frame,joint,x,y,z\n0,ankle,1,2\n", "line 2 has 4 columns"),
+        ("frame,joint,x,y,z\n0,ankle,1,2,here\n", "line 2"),
+        ("frame,joint,x,y,z\n0,ankle,1,2,nan\n", "not finite"),
+    ],
+)
+def test_damaged_joint_centres(tmp_path: Path, text: str, message: str) -> None:
+    path = written(tmp_path / "centres.csv", text)
+    with pytest.raises(SceneError, match=message):
+        read_joint_centres(path, "ankle", ["0000"])
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(SceneError, match=r"nowhere\.csv"):
+        read_joint_centres(tmp_path / "nowhere.csv", "ankle", ["0000"])
+
+
+def test_true_angles(tmp_path: Path) -> None:
+    path = written(tmp_path / "angles.csv", "frame,b,a\n3,0.5,-1\n")
+    truth = read_true_angles(path, ["a", "b", "c"])
+    assert truth.names == ("b", "a")
+    values = truth.of("0003")
+    assert values is not None
+    assert values.tolist() == [0.5, -1.0]
+    assert truth.of("0004") is None
+    assert truth.of("still") is None
+
+
+def test_true_angles_of_an_unknown_joint(tmp_path: Path) -> None:
+    path = written(tmp_path / "angles.csv", "frame,b,d\n3,0.5,-1\n")
+    with pytest.raises(UnknownNameError, match=r"angles.csv.*'d'.*a, b, c"):
+        read_true_angles(path, ["a", "b", "c"])
+
+
+def test_angles_differ_by_at_most_half_a_turn() -> None:
+    assert angle_difference(math.radians(170), math.radians(-170)) == pytest.approx(
+        math.radians(-20)
+    )
+    assert angle_difference(7.0, 7.0 - 4.0 * math.pi) == pytest.approx(0.0)

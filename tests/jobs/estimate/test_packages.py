@@ -1,0 +1,110 @@
+"""`--package NAME=FOLDER` on every command that reads a model."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import trimesh
+import yaml
+from typer.testing import CliRunner, Result
+
+from drake_pose.commands.main import app
+from drake_pose.errors import SettingsError
+from drake_pose.results.options import parse_packages
+from tests.jobs.scenes import LINK, TinyScene
+
+BOOM = LINK.format(name="boom", z=0.25, size="0.1 0.12 0.5")
+
+
+@pytest.fixture
+def far(tmp_path: Path, tiny_scene: TinyScene) -> tuple[Path, Path]:
+    """A model whose boom is a mesh of a package that lies far away, and that package's folder."""
+    folder = tmp_path / "far away" / "crane parts"
+    folder.mkdir(parents=True)
+    trimesh.creation.box((0.1, 0.12, 0.5)).export(folder / "boom.stl")
+    model = tmp_path / "robots" / "crane.urdf"
+    model.parent.mkdir()
+    mesh = BOOM.replace('<box size="0.1 0.12 0.5"/>', '<mesh filename="package://parts/boom.stl"/>')
+    assert mesh != BOOM
+    model.write_text(tiny_scene.model.read_text().replace(BOOM, mesh))
+    return model, folder
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [str(one) for one in arguments])
+
+
+def assert_names_option(result: Result) -> None:
+    assert result.exit_code == 1, result.output
+    message = " ".join(result.stderr.split())
+    assert "link 'boom': mesh 'package://parts/boom.stl'" in message
+    assert "--package parts=FOLDER" in message
+
+
+def test_check(far: tuple[Path, Path]) -> None:
+    model, folder = far
+    assert_names_option(run("check", model))
+    assert run("check", model, "--package", f"parts={folder}").exit_code == 0
+
+
+@pytest.mark.parametrize("text", ["parts", "=x", "parts=", "parts=/no/such/folder"])
+def test_another_form_is_wrong_usage(far: tuple[Path, Path], text: str) -> None:
+    result = run("check", far[0], "--package", text)
+    assert result.exit_code == 2
+    assert "--package" in result.stderr
+    with pytest.raises(SettingsError, match="given twice"):
+        parse_packages([f"a={far[1]}", f"a={far[1]}"])
+
+
+def test_estimate_and_its_resumption(
+    tmp_path: Path, tiny_scene: TinyScene, far: tuple[Path, Path]
+) -> None:
+    model, folder = far
+    out = tmp_path / "out"
+    arguments = ("estimate", tiny_scene.folder, "--model", model, "--out", out, "--interval", 20)
+    arguments = (*arguments, "--no-replay", "--no-overlay")
+    assert_names_option(run(*arguments))
+    package = ("--package", f"parts={folder}")
+    result = run(*arguments, *package, "--frame", "0")
+    assert result.exit_code == 0, result.output
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["settings"]["packages"] == {"parts": str(folder)}
+    assert summary["found_count"] == 1
+    moved = folder.with_name("moved")
+    shutil.copytree(folder, moved)
+    refused = run(*arguments, "--resume", "--package", f"parts={moved}")
+    assert refused.exit_code == 1
+    assert "packages" in refused.stderr
+    resumed = run(*arguments, *package, "--frame", "0:1", "--resume")
+    assert resumed.exit_code == 0, resumed.output
+    assert json.loads((out / "summary.json").read_text())["found_count"] == 2
+
+
+@pytest.mark.slow
+def test_batch(tmp_path: Path, tiny_scene: TinyScene, far: tuple[Path, Path]) -> None:
+    model, folder = far
+    scene = {"scene": str(tiny_scene.folder), "model": str(model), "frames": "0", "interval": 20}
+    jobs = tmp_path / "jobs.yaml"
+    job = {"defaults": {"replay": False, "overlay": False}, "scenes": {"one": scene}}
+    jobs.write_text(yaml.safe_dump(job))
+    assert_names_option(run("batch", jobs, "--out", tmp_path / "refused"))
+    job["defaults"]["packages"] = {"parts": str(folder.relative_to(tmp_path))}
+    jobs.write_text(yaml.safe_dump(job))
+    result = run("batch", jobs, "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    summary = json.loads((tmp_path / "out" / "one" / "summary.json").read_text())
+    assert summary["settings"]["packages"] == {"parts": str(folder)}
+
+
+def test_capture_and_walk(tmp_path: Path, tiny_scene: TinyScene, far: tuple[Path, Path]) -> None:
+    model, folder = far
+    recorded = ("capture", tiny_scene.folder, "--out", tmp_path / "out", "--model", model)
+    played = ("walk", tmp_path, "--rate", 30, "--no-browser", "--model", model)
+    for arguments in (recorded, played):
+        assert_names_option(run(*arguments))
+        told = run(*arguments, "--package", f"parts={folder}")
+        # With its package the model is read, and is then found to be none of a person.
+        assert told.exit_code == 1
+        assert "package" not in told.stderr
+    assert run("walk", "--simulate", "--package", f"parts={folder}").exit_code == 2

@@ -1,0 +1,121 @@
+"""A person in a sequence of pictures without masks, painted over Drake's label images."""
+
+import csv
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.camera.files import load_cameras
+from drake_pose.commands.main import app
+from drake_pose.errors import SceneError
+from drake_pose.jobs.estimate.scene import estimate_scene
+from drake_pose.results.settings import EstimateSettings
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from tests.jobs.persons import record_person
+
+FRAMES = 5
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """A scene of pictures, the masks of another folder, the model, the truth, and a start."""
+    folder = tmp_path_factory.mktemp("person")
+    scene = record_person(folder / "scene", FRAMES, size=(240, 180))
+    shutil.move(folder / "scene" / "masks", folder / "masks")
+    generator = np.random.default_rng(2)
+    for name, camera in load_cameras(folder / "scene" / "cameras.yaml").items():
+        renderer = LabelRenderer(scene.person, camera)
+        room = generator.integers(0, 120, (12, 16, 3)).repeat(15, axis=0).repeat(15, axis=1)
+        (folder / "scene" / "images" / name).mkdir(parents=True)
+        for k, q in enumerate(scene.truth):
+            clothes = np.where(renderer.segments(q)[..., None] % 2, (40, 90, 240), (120, 220, 250))
+            picture = np.where(renderer.mask(q)[..., None], clothes, room)
+            picture = picture + generator.normal(0.0, 4.0, picture.shape)
+            file = folder / "scene" / "images" / name / f"{k:04d}.png"
+            cv2.imwrite(str(file), np.clip(picture, 0, 255).astype(np.uint8))
+    with (folder / "start.csv").open("w", newline="") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(["frame", *scene.person.position_names])
+        writer.writerow(["0000", *scene.truth[0]])
+    return folder / "scene", folder / "masks", scene.truth, folder / "start.csv"
+
+
+def moved(estimate, truth):
+    """Errors of the arm that moves [degrees]."""
+    k = list(estimate.position_names).index("left_upper_arm_z")
+    return np.abs(np.degrees([row.q[k] for row in estimate.rows] - truth[:, k]))
+
+
+def test_a_person_is_followed_from_a_start(recording, tmp_path):
+    scene, _, truth, start = recording
+    settings = EstimateSettings(start=start)
+    model = bundled_model("person")
+
+    def stop(done, total, frame, record):
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        estimate_scene(scene, model, tmp_path / "out", settings, on_frame=stop)
+    found = estimate_scene(scene, model, tmp_path / "out", settings, resume=True)
+    assert found.summary["method"] == "person"
+    assert found.found_count == FRAMES
+    assert not any("lost" in text for text in found.warnings)
+    # The arm is raised by 40 degrees; a pixel is 1.6 cm.
+    assert moved(found, truth).max() < 3.0
+    assert all(0.0 < row.error < 0.6 for row in found.rows)
+    overlays = list((tmp_path / "out" / "overlay").glob("*/*.png"))
+    assert len(overlays) == 4 * FRAMES
+
+
+def test_a_person_who_is_lost_is_said_to_be(recording, tmp_path):
+    scene, _, _, start = recording
+    copy = tmp_path / "scene"
+    shutil.copytree(scene, copy)
+    for file in copy.glob("images/*/0003.png"):
+        cv2.imwrite(str(file), np.full((180, 240, 3), 200, np.uint8))
+    settings = EstimateSettings(start=start)
+    found = estimate_scene(copy, bundled_model("person"), settings=settings)
+    assert not found.records["0003"].found
+    assert any("frame 0003" in text and "is lost" in text for text in found.warnings)
+
+
+def test_one_mask_does_not_say_where_a_person_is(recording, tmp_path):
+    scene, masks, _, _ = recording
+    copy = tmp_path / "scene"
+    shutil.copytree(scene, copy)
+    (copy / "masks" / "camera_0").mkdir(parents=True)
+    shutil.copy(masks / "camera_0" / "0000.png", copy / "masks" / "camera_0" / "0000.png")
+    with pytest.raises(SceneError, match=r"two cameras.*'0000'.*--start"):
+        estimate_scene(copy, bundled_model("person"))
+
+
+def test_the_command_takes_a_start(recording, tmp_path):
+    scene, _, _, start = recording
+    out = str(tmp_path / "out")
+    words = ["capture", str(scene), "--out", out, "--start", str(start), "--no-replay", "--json"]
+    done = CliRunner().invoke(app, [*words, "--frame", "0000:0002"])
+    assert done.exit_code == 0, done.output
+    with (tmp_path / "out" / "poses.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert [row["frame"] for row in rows] == ["0000", "0001", "0002"]
+    assert all(row["position_z"] for row in rows)
+
+
+@pytest.mark.slow
+def test_a_person_is_followed_from_masks_of_the_first_frame(recording, tmp_path):
+    scene, masks, truth, _ = recording
+    copy = tmp_path / "scene"
+    shutil.copytree(scene, copy)
+    for folder in masks.iterdir():
+        (copy / "masks" / folder.name).mkdir(parents=True)
+        shutil.copy(folder / "0000.png", copy / "masks" / folder.name / "0000.png")
+    found = estimate_scene(copy, bundled_model("person"))
+    assert found.found_count == FRAMES
+    assert found.records["0000"].ious
+    assert not found.records["0004"].ious
+    assert moved(found, truth).max() < 6.0

@@ -1,0 +1,157 @@
+"""Faults of a scene's files, found without a capture."""
+
+import os
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drake_pose.camera.files import save_cameras
+from drake_pose.camera.models import Camera, ParallelCamera
+from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.errors import MaskError
+from drake_pose.jobs.estimate.scene_checks import (
+    check_scene,
+    check_upright,
+    frame_ranges,
+    leave_out_unreadable,
+)
+from drake_pose.silhouette.pictures.masks import write_mask
+from drake_pose.silhouette.pictures.scenes import Scene, load_scene
+
+NAMES = ("left", "middle", "right")
+
+
+def record(folder: Path, frames: list[str], still: tuple[str, ...] = ()) -> Scene:
+    """A square that moves to the right; from the third frame on it stands still in some cameras."""
+    cameras = [ParallelCamera(n, 60, 40, 10.0, 30.0, 20.0, np.eye(4)) for n in NAMES]
+    save_cameras(folder / "cameras.yaml", cameras)
+    (folder / "scene.yaml").write_text("sequence: true\n")
+    for name in NAMES:
+        (folder / "masks" / name).mkdir(parents=True)
+        for k, frame in enumerate(frames):
+            mask = np.zeros((40, 60), dtype=bool)
+            at = 2 * (min(k, 2) if name in still else k)
+            mask[10:30, 5 + at : 25 + at] = True
+            write_mask(folder / "masks" / name / f"{frame}.png", mask)
+    return load_scene(folder)
+
+
+def kinds(scene: Scene) -> list[tuple[str, tuple[str, ...], tuple[str, ...]]]:
+    return [(one.kind, one.cameras, one.frames) for one in check_scene(scene).warnings]
+
+
+def test_sound_scene_has_no_fault(tmp_path: Path) -> None:
+    scene = record(tmp_path, [str(k) for k in range(8, 13)])
+    # 9 precedes 10.
+    assert scene.frames == ("8", "9", "10", "11", "12")
+    assert kinds(scene) == []
+
+
+def test_frozen_camera_is_left_out(tmp_path: Path) -> None:
+    scene = record(tmp_path, ["1", "2", "3", "4", "5"], still=("middle",))
+    assert kinds(scene) == [("duplicate frames", ("middle",), ("4", "5"))]
+    assert ("middle", "4") not in check_scene(scene).scene.masks
+    assert ("middle", "3") in check_scene(scene).scene.masks
+
+
+def test_frames_recorded_twice_are_kept(tmp_path: Path) -> None:
+    scene = record(tmp_path, ["1", "2", "3", "4"], still=NAMES)
+    assert kinds(scene) == [("duplicate frames", (), ("4",))]
+    assert check_scene(scene).scene.masks == scene.masks
+
+
+def test_dropped_frames(tmp_path: Path) -> None:
+    scene = record(tmp_path, ["f_0002", "f_0004", "f_0006", "f_0012", "f_0014"])
+    ((kind, cameras, frames),) = kinds(scene)
+    assert (kind, cameras, frames) == ("dropped frames", (), ("f_0012",))
+    (warning,) = check_scene(scene).warnings
+    assert "2 frames dropped by all cameras between f_0006 and f_0012" in warning.text
+    stills = replace(scene, sequence=False)
+    assert kinds(stills) == []
+
+
+def test_frames_that_a_camera_lacks(tmp_path: Path) -> None:
+    scene = record(tmp_path, [f"{k:02d}" for k in range(8)])
+    for frame in ("02", "03", "05"):
+        (tmp_path / "masks" / "right" / f"{frame}.png").unlink()
+    scene = load_scene(tmp_path)
+    (warning,) = check_scene(scene).warnings
+    assert "camera 'right' has 5 of 8 frames; it lacks 02-03, 05" in warning.text
+
+
+def test_numbers_with_and_without_zeros_are_the_same_frames(tmp_path: Path) -> None:
+    record(tmp_path, ["0001", "0002"])
+    for frame in ("0001", "0002"):
+        path = tmp_path / "masks" / "left" / f"{frame}.png"
+        path.rename(path.with_name(f"{int(frame)}.png"))
+    scene = load_scene(tmp_path)
+    assert scene.frames == ("0001", "0002")
+    assert kinds(scene) == []
+    assert scene.mask_path("left", "0002").name == "2.png"
+
+
+def test_misspelt_camera(tmp_path: Path) -> None:
+    record(tmp_path, ["1", "2"])
+    (tmp_path / "masks" / "middle").rename(tmp_path / "masks" / "Midle")
+    first, second = check_scene(load_scene(tmp_path)).warnings
+    assert (first.kind, first.cameras) == ("without calibration", ("Midle",))
+    assert "2 masks are left out: is it 'middle'?" in first.text
+    assert (second.kind, second.cameras) == ("without masks", ("middle",))
+
+
+def test_unreadable_masks_are_left_out_where_others_have_the_frame(tmp_path: Path) -> None:
+    record(tmp_path, ["1", "2", "3"])
+    for frame in ("2", "3"):
+        (tmp_path / "masks" / "left" / f"{frame}.png").write_bytes(b"")
+    (tmp_path / "masks" / "right" / "3.png").unlink()
+    (tmp_path / "masks" / "right" / "3.png").symlink_to("nowhere.png")
+    scene = load_scene(tmp_path)
+    checked = leave_out_unreadable(scene, NAMES, scene.frames)
+    assert [(one.cameras, one.frames) for one in checked.warnings] == [
+        (("left",), ("2", "3")),
+        (("right",), ("3",)),
+    ]
+    assert checked.scene.cameras_of("3") == ("middle",)
+    with pytest.raises(MaskError, match=r"3\.png"):
+        leave_out_unreadable(scene, ("left", "right"), scene.frames)
+
+
+@pytest.mark.parametrize(("axis", "name"), [((1.0, 0.0, 0.0), "-z"), ((0.0, 1.0, 0.0), "x")])
+def test_world_that_does_not_stand(axis: tuple[float, float, float], name: str) -> None:
+    cameras = list(circle_of_cameras(4, size=(160, 120), face_camera=False).values())
+    assert check_upright(cameras) == ()
+    half = np.pi if name == "-z" else np.pi / 2.0
+    turned = [turn(camera, np.array(axis), half) for camera in cameras]
+    (warning,) = check_upright(turned)
+    assert f"is the world's {'+' if name == 'x' else ''}{name}," in warning.text
+
+
+def turn(camera: Camera, axis: np.ndarray, angle: float) -> Camera:
+    x, y, z = axis
+    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    X = np.eye(4)
+    X[:3, :3] += np.sin(angle) * K + (1.0 - np.cos(angle)) * K @ K
+    return camera.with_pose(X @ camera.X_WC)
+
+
+def test_many_masks_are_listed_in_linear_time(tmp_path: Path) -> None:
+    """Comparing each with each takes ten times the seconds at this count already."""
+    record(tmp_path, ["00001", "00002", "00003"])
+    for name in NAMES:
+        own = tmp_path / "masks" / name
+        for k in range(4, 5001):
+            os.link(own / f"0000{1 + k % 3}.png", own / f"{k:05d}.png")
+    begin = time.process_time()
+    checked = check_scene(load_scene(tmp_path))
+    assert time.process_time() - begin < 5.0
+    assert len(checked.scene.frames) == 5000
+    assert len(checked.scene.masks) == 3 * 5000
+
+
+def test_ranges() -> None:
+    known = [f"{k:02d}" for k in range(40)]
+    assert frame_ranges(["03", "02", "07", "04"], known) == "02-04, 07"
+    assert frame_ranges(known[::3], known) == "00, 03, 06, 09, 12, 15 and 8 more"

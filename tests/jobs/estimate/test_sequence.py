@@ -1,0 +1,113 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drake_pose.commands.main import app
+from drake_pose.filtering.tracking.match_and_track import TRACKED
+from drake_pose.jobs.estimate.scene import estimate_scene
+from drake_pose.jobs.estimate.sequence import sequence_tracking
+from drake_pose.results.settings import EstimateSettings
+from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
+from drake_pose.silhouette.pictures.scenes import Scene, load_scene
+from tests.jobs.scenes import TinyScene, write_scene
+
+# A crane that swings, and stands otherwise after a cut.
+BEFORE = [(20 + 3 * k, -40 - 2 * k) for k in range(6)]
+AFTER = [(-60 + 2 * k, -90 + 3 * k) for k in range(5)]
+
+
+def write_sequence(folder: Path, text: str) -> TinyScene:
+    scene = write_scene(folder, [*BEFORE, *AFTER], ("front", "side"))
+    (folder / "scene.yaml").write_text(text)
+    return scene
+
+
+def test_a_sequence_is_matched_first_tracked_and_matched_after_a_cut(tmp_path: Path) -> None:
+    scene = write_sequence(tmp_path / "scene", "sequence: true\nframe_rate_hz: 30\n")
+    settings = EstimateSettings(interval=20.0, method="paper")
+    result = estimate_scene(scene.folder, scene.model, settings=settings, replay=False)
+    how = [result.records[frame].stopped_by == TRACKED for frame in scene.truth]
+    runs = [result.records[frame].runs for frame in scene.truth]
+    # A matched frame is refined by its contour; a tracked one has asked no search.
+    assert how.count(True) >= 9
+    assert runs[1:6] == [0] * 5
+    errors = np.degrees([np.abs(row.q - scene.truth[row.frame]).max() for row in result.rows])
+    assert errors.max() < 2.5
+    assert np.median(errors) < 1.0
+
+
+def test_stills_are_matched_one_by_one(tmp_path: Path) -> None:
+    scene = write_sequence(tmp_path / "scene", "sequence: false\n")
+    settings = EstimateSettings(interval=20.0, method="paper", frames=("0000", "0006"))
+    result = estimate_scene(scene.folder, scene.model, settings=settings, replay=False)
+    assert all(record.stopped_by != TRACKED for record in result.records.values())
+
+
+def test_a_sequence_need_not_be_tracked(tmp_path: Path) -> None:
+    """Unrelated stills whose scene.yaml says otherwise: as if it did not."""
+    said = write_sequence(tmp_path / "said", "sequence: true\nframe_rate_hz: 30\n")
+    stills = write_sequence(tmp_path / "stills", "sequence: false\n")
+    found = []
+    for scene, track in ((said, False), (stills, True)):
+        settings = EstimateSettings(
+            interval=20.0, method="paper", frames=("0000", "0001"), track=track
+        )
+        result = estimate_scene(scene.folder, scene.model, settings=settings, replay=False)
+        assert all(record.stopped_by != TRACKED for record in result.records.values())
+        assert result.summary["settings"]["track"] is track
+        found.append([row.q for row in result.rows])
+    np.testing.assert_array_equal(found[0], found[1])
+
+
+def test_the_command_has_the_option(tmp_path: Path) -> None:
+    scene = write_sequence(tmp_path / "scene", "sequence: true\nframe_rate_hz: 30\n")
+    (scene.model.parent / "landmarks.yaml").write_text(
+        "landmarks:\n  hook: {link: jib, point: [0, 0, 0.4]}\n"
+    )
+    made = {}
+    for option in ("--track", "--no-track"):
+        out = tmp_path / option
+        with pytest.raises(SystemExit) as ended:
+            app(
+                [
+                    *("estimate", str(scene.folder), "--model", str(scene.model)),
+                    *("--out", str(out), "--method", "paper", "--interval", "20"),
+                    *("--frame", "0000:0002", "--no-replay", option),
+                ]
+            )
+        assert ended.value.code == 0
+        files = {path.name for path in out.iterdir()}
+        assert files > {
+            "joint_centres.csv", "joint_centres.trc", "positions.mot", "motion.bvh", "report.html"
+        }  # fmt: skip
+        frames = json.loads((out / "summary.json").read_text())["frames"]
+        made[option] = sum(frame["stopped_by"] == TRACKED for frame in frames.values())
+    assert made["--track"] >= 2
+    assert made["--no-track"] == 0
+
+
+def test_how_a_scene_is_tracked(tiny_scene: TinyScene) -> None:
+    def scene_with(text: str) -> Scene:
+        (tiny_scene.folder / "scene.yaml").write_text(text)
+        return load_scene(tiny_scene.folder)
+
+    search = _Known()
+    assert sequence_tracking(scene_with("sequence: false\n"), search) is None
+    video = scene_with("sequence: true\nframe_rate_hz: 60\n")
+    known = sequence_tracking(video, search)
+    assert known is not None
+    assert not known.root_moves
+    slow = sequence_tracking(scene_with("sequence: true\n"), search)
+    assert slow is not None
+    # The diagram plays a frame a second; the motion of a step must be the same.
+    assert slow.angle_acceleration * 1.0**2 == known.angle_acceleration / 30**2
+    assert sequence_tracking(video, search, track=False) is None
+    moved = sequence_tracking(video, RootPlacementSearch.__new__(RootPlacementSearch))
+    assert moved is not None
+    assert moved.root_moves
+
+
+class _Known:
+    """Stands for a search whose root is known."""

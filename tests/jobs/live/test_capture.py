@@ -1,0 +1,209 @@
+import csv
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from drake_pose.commands.main import app
+from drake_pose.errors import OutputError, SceneError, SettingsError
+from drake_pose.jobs.live.capture import LiveSettings, capture_live
+from drake_pose.jobs.live.empty_room import take_empty_room
+from drake_pose.jobs.live.scene import load_live_scene
+from drake_pose.person.recordings.known_shape import KnownShape, tracker_of_person
+from tests.jobs.live_scenes import RATE_HZ, absent, load_person, standing, write_studio
+
+FRAMES = 12
+GAP = range(5, 10)
+
+
+@pytest.fixture(scope="module")
+def person():
+    return load_person()
+
+
+@pytest.fixture(scope="module")
+def studio(tmp_path_factory, person):
+    """Masks of a person who raises an arm; nobody is there at first, and one camera pauses."""
+    folder = tmp_path_factory.mktemp("studio")
+    poses = [absent(person)] + [standing(person, arm_deg=30.0 + 3.0 * k) for k in range(FRAMES)]
+    write_studio(folder, person, poses, "masks")
+    for k in GAP:
+        (folder / "masks" / "camera_1" / f"{k:04d}.png").unlink()
+    (folder / "masks" / "camera_2" / "0004.png").write_bytes(b"\x89PNG\r\n\x1a\n broken")
+    return folder
+
+
+def read(path):
+    with path.open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+@pytest.fixture(scope="module")
+def captured(studio, person, tmp_path_factory):
+    out = tmp_path_factory.mktemp("results") / "out"
+    reports = []
+    result = capture_live(
+        load_live_scene(studio),
+        out,
+        person.path,
+        LiveSettings(replay=False),
+        on_report=reports.append,
+    )
+    return out, result, reports
+
+
+def test_person_is_captured_as_pictures_come(captured, person):
+    out, result, _ = captured
+    assert not result.interrupted
+    rows = read(out / "poses.csv")
+    assert [row["frame"] for row in rows] == [f"{k:06d}" for k in range(FRAMES + 1)]
+    assert rows[0]["error"] == "", "nobody was there"
+    found = [np.degrees(float(row["left_upper_arm_z"])) for row in rows[1:]]
+    off = np.abs(np.array(found) - 30.0 - 3.0 * np.arange(FRAMES))
+    # Three small pictures do not always tell where an arm is.
+    assert np.median(off) < 3.0
+    assert np.sort(off)[-2] < 9.0
+    times = [float(row["time"]) for row in read(out / "timestamps.csv")]
+    np.testing.assert_allclose(times, np.arange(FRAMES + 1) / RATE_HZ, atol=1e-6)
+    assert {"joint_centres.csv", "joint_centres.trc", "positions.mot"} <= {
+        path.name for path in out.iterdir()
+    }
+    assert result.estimate.summary["mean_iou"] > 0.85
+
+
+def test_how_sure_each_position_is_is_written(captured, person):
+    out, _, _ = captured
+    rows = read(out / "joints.csv")
+    frames = [row["frame"] for row in rows if row["joint"] == "left_upper_arm_z"]
+    assert frames == [f"{k:06d}" for k in range(1, FRAMES + 1)], "nobody was there at first"
+    poses = {row["frame"]: row for row in read(out / "poses.csv")}
+    unit = {"angle": np.degrees(1.0), "length": 1.0}
+    widths = {}
+    for row in rows:
+        k = person.position_index(row["joint"])
+        factor = unit.get(person.position_kinds[k], 1.0)
+        low, high = float(row["low"]), float(row["high"])
+        found = factor * float(poses[row["frame"]][row["joint"]])
+        assert low - 1e-3 <= found <= high + 1e-3
+        widths.setdefault(row["frame"], []).append((high - low) / factor)
+    # With a camera less one is less sure.
+    fewer, all_three = ([np.median(widths[f"{k:06d}"]) for k in own] for own in (GAP, (1, 2, 11)))
+    assert np.mean(fewer) > np.mean(all_three)
+
+
+def test_what_happened_to_cameras_is_told(captured):
+    out, result, reports = captured
+    text = "\n".join(reports)
+    assert "camera 'camera_1' stopped at 0.27 s" in text
+    assert "camera 'camera_1' returned at 0.67 s" in text
+    assert "0004.png" in text
+    summary = json.loads((out / "summary.json").read_text())
+    frames = summary["frames"]
+    assert set(frames["000006"]["ious"]) == {"camera_0", "camera_2"}
+    assert set(frames["000011"]["ious"]) == {"camera_0", "camera_1", "camera_2"}
+    assert summary["sources"]["camera_2"]["dropped"] == 1
+    assert [one["what"] for one in summary["sources"]["camera_1"]["changes"]] == [
+        "stopped",
+        "returned",
+    ]
+    assert not result.troubles or "could not be used" in result.troubles[0]
+
+
+def test_ctrl_c_keeps_everything(studio, person, tmp_path):
+    def interrupt(count, found):
+        if count == 6:
+            raise KeyboardInterrupt
+
+    out = tmp_path / "out"
+    settings = LiveSettings(replay=False)
+    result = capture_live(load_live_scene(studio), out, person.path, settings, on_frame=interrupt)
+    assert result.interrupted
+    assert len(read(out / "poses.csv")) == 6
+    assert json.loads((out / "summary.json").read_text())["complete"]
+    assert (out / "joint_centres.trc").is_file()
+
+
+@pytest.mark.slow
+def test_command_captures_and_refuses(studio, person, tmp_path):
+    words = ["capture", str(studio), "--model", str(person.path), "--no-replay", "--json"]
+    done = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "a"), "--seconds", "0.3"])
+    assert done.exit_code == 0, done.output
+    summary = json.loads(done.stdout)
+    assert 3 <= summary["frame_count"] <= 6
+    assert "0004.png" in done.stderr or summary["frame_count"] < 5
+    done = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "a")])
+    assert done.exit_code == 1
+    assert "not empty" in done.stderr
+    done = CliRunner().invoke(app, [*words[:-1], "--out", str(tmp_path / "c"), "--no-fit-shape"])
+    assert done.exit_code == 0, done.output
+    assert "stopped at 0.27 s, returned at 0.67 s" in done.stdout
+    done = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "b"), "--frame", "3"])
+    assert done.exit_code == 2
+    done = CliRunner().invoke(
+        app, ["capture", str(tmp_path), "--out", str(tmp_path / "b"), "--seconds", "3"]
+    )
+    assert done.exit_code == 2
+    assert "sources.yaml" in done.stderr
+
+
+@pytest.mark.slow
+def test_persons_own_shape_is_found_in_a_video_and_taken_from_its_result(person, tmp_path):
+    folder = tmp_path / "studio"
+    folder.mkdir()
+    poses = [standing(person, arm_deg=20.0 + 4.0 * k) for k in range(10)]
+    write_studio(folder, person, poses, "videos", cameras=4)
+    scene, first, second = load_live_scene(folder), tmp_path / "first", tmp_path / "second"
+    found = capture_live(scene, first, None, LiveSettings(replay=False)).estimate.summary
+    assert found["found_count"] == 10
+    assert found["mean_iou"] > 0.85
+    assert len(found["lengths_m"]) > 5
+    again = capture_live(scene, second, None, LiveSettings(shape=first, replay=False))
+    assert again.estimate.summary["girths"] == pytest.approx(found["girths"])
+    assert again.estimate.summary["mean_iou"] > 0.85
+
+
+def test_known_shape_is_worn(person):
+    from drake_pose.body.files.packages import bundled_model
+    from drake_pose.body.model import load_model
+    from drake_pose.errors import UnknownNameError
+
+    model = load_model(bundled_model("person").with_name("person_shape.urdf"), check=False)
+    tree = model.pose_tree()
+    shape = KnownShape({"left_thigh_stretch": 0.02}, {"trunk": 1.2})
+    tracker = tracker_of_person(tree, shape)
+    plain = tracker_of_person(tree, None)
+    names = [node.name for node in tree.nodes]
+    trunk = next(k for k, name in enumerate(names) if "trunk" in name)
+    wide, usual = (np.ptp(one.fit.outlines[trunk].vertices, axis=0) for one in (tracker, plain))
+    np.testing.assert_allclose(wide / usual, [1.2, 1.0, 1.2], rtol=1e-6)
+    q = tracker.positions(tracker.start(tracker.values(model.default_positions)).values)
+    assert q[model.position_index("left_thigh_stretch")] == 0.0
+    for wrong in (KnownShape({"nose": 0.1}, {}), KnownShape({}, {"nose": 1.1})):
+        with pytest.raises(UnknownNameError, match="nose"):
+            tracker_of_person(tree, wrong)
+
+
+def test_results_without_a_shape_and_wrong_settings_are_refused(captured, studio, tmp_path):
+    with pytest.raises(OutputError, match="lengths_m"):
+        capture_live(
+            load_live_scene(studio), tmp_path / "out", None, LiveSettings(shape=captured[0])
+        )
+    with pytest.raises(SettingsError, match="positive"):
+        LiveSettings(seconds=0.0)
+    with pytest.raises(SceneError, match=r"sources\.yaml"):
+        load_live_scene(tmp_path)
+
+
+def test_empty_room_is_taken_once(person, tmp_path):
+    write_studio(tmp_path, person, [absent(person)] * 3, "videos", cameras=2)
+    with pytest.raises(OutputError, match="exists already"):
+        take_empty_room(tmp_path, 2)
+    for path in sorted((tmp_path / "empty").glob("*/*")):
+        path.unlink()
+    with pytest.raises(SceneError, match="3 of 9"):
+        take_empty_room(tmp_path, 9)
+    done = CliRunner().invoke(app, ["empty-room", str(tmp_path), "--pictures", "2"])
+    assert done.exit_code == 0, done.output
+    assert len(list((tmp_path / "empty").glob("*/*.png"))) == 4
+    assert set(load_live_scene(tmp_path).backgrounds) == {"camera_0", "camera_1"}

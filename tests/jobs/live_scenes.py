@@ -1,0 +1,90 @@
+"""Studios of a simulated person: cameras.yaml, sources.yaml, and the pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import yaml
+
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.camera.files import save_cameras
+from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.systems.pictures.camera_rig import build_camera_rig
+
+SIZE = (240, 180)
+RATE_HZ = 15.0
+
+
+def load_person() -> ArticulatedModel:
+    return load_model(bundled_model("person"), check=False)
+
+
+def standing(person: ArticulatedModel, ahead: float = 0.0, arm_deg: float = 30.0) -> np.ndarray:
+    """A person who stands, ahead of the middle [m], with raised arms and bent elbows."""
+    q = np.zeros(len(person.position_names))
+    q[person.position_index("position_x")] = ahead
+    q[person.position_index("position_z")] = 1.55
+    q[person.position_index("left_upper_arm_z")] = np.radians(arm_deg)
+    q[person.position_index("right_upper_arm_z")] = -np.radians(30.0)
+    for side in ("left", "right"):
+        # Silhouettes must tell front from back.
+        q[person.position_index(f"{side}_forearm_x")] = np.radians(-70.0)
+    return q
+
+
+def absent(person: ArticulatedModel) -> np.ndarray:
+    """Nobody to be seen."""
+    q = standing(person)
+    q[person.position_index("position_z")] = -9.0
+    return q
+
+
+def write_studio(
+    folder: Path,
+    person: ArticulatedModel,
+    poses: list[np.ndarray],
+    kind: str,
+    cameras: int = 3,
+    size: tuple[int, int] = SIZE,
+) -> None:
+    """Write what the cameras see: kind videos, with noise and backgrounds, or masks in folders."""
+    placed = circle_of_cameras(cameras, size=size, radius=2.6, face_camera=False)
+    save_cameras(folder / "cameras.yaml", placed)
+    rig = build_camera_rig(person, placed)
+    context = rig.diagram.CreateDefaultContext()
+    generator = np.random.default_rng(0)
+
+    def picture(name: str) -> np.ndarray:
+        seen = rig.picture(context, name) + generator.normal(0.0, 2.0, (size[1], size[0], 3))
+        return cv2.cvtColor(np.clip(seen, 0, 255).astype(np.uint8), cv2.COLOR_RGB2BGR)
+
+    entries = {}
+    writers = {}
+    rig.set_positions(context, absent(person))
+    for name in placed:
+        if kind == "masks":
+            (folder / "masks" / name).mkdir(parents=True)
+            entries[name] = {"kind": "folder", "location": f"masks/{name}", "rate_hz": RATE_HZ}
+            entries[name]["masks"] = True
+            continue
+        (folder / "empty" / name).mkdir(parents=True)
+        for k in range(3):
+            cv2.imwrite(str(folder / "empty" / name / f"{k}.png"), picture(name))
+        place = f"{name}.avi"
+        entries[name] = {"kind": "video", "location": place, "background": f"empty/{name}"}
+        fourcc = cv2.VideoWriter_fourcc(*"MJPG")
+        writers[name] = cv2.VideoWriter(str(folder / place), fourcc, RATE_HZ, size)
+    (folder / "sources.yaml").write_text(yaml.safe_dump(entries))
+    for k, q in enumerate(poses):
+        rig.set_positions(context, q)
+        for name in placed:
+            if kind == "masks":
+                mask = rig.mask(context, name).astype(np.uint8) * 255
+                cv2.imwrite(str(folder / "masks" / name / f"{k:04d}.png"), mask)
+            else:
+                writers[name].write(picture(name))
+    for writer in writers.values():
+        writer.release()

@@ -1,0 +1,275 @@
+"""Masks found in pictures: by the empty room, by boxes and strokes, by a network."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import onnx
+import pytest
+import yaml
+from onnx import TensorProto, helper, numpy_helper
+from typer.testing import CliRunner
+
+from drake_pose import MaskSettings, load_scene, make_masks
+from drake_pose.commands.main import app
+from drake_pose.errors import DrakePoseError, MaskError, SceneError, SettingsError
+from drake_pose.jobs.masks.strokes import read_strokes
+from tests.jobs.masks.rooms import iou, moving, write_pictures
+from tests.jobs.scenes import NAMES, read_rows
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory):
+    """A moving crane, filmed by two cameras; shared, so do not change it."""
+    return write_pictures(
+        tmp_path_factory.mktemp("filmed") / "scene", moving(), ("front", "side")
+    ).folder
+
+
+@pytest.fixture
+def pictures(filmed, tmp_path):
+    """Its pictures and cameras alone, to be spoilt."""
+    folder = tmp_path / "pictures"
+    for name in ("images", "background"):
+        shutil.copytree(filmed / name, folder / name)
+    shutil.copy(filmed / "cameras.yaml", folder)
+    return folder
+
+
+def agreement(made, filmed, moves=False):
+    """IoU with the true masks; of what moves alone."""
+    true, found = load_scene(filmed), load_scene(made)
+    values = []
+    for camera in true.cameras:
+        masks = {f: true.read(camera, f) for f in true.frames}
+        still = np.logical_and.reduce(list(masks.values())) & moves
+        for frame in true.frames:
+            if (camera, frame) in found.masks:
+                values.append(iou(masks[frame] & ~still, found.read(camera, frame) & ~still))
+    return np.array(values)
+
+
+def test_empty_room_beside_the_pictures_is_used(filmed, pictures, tmp_path):
+    result = make_masks(pictures, tmp_path / "out")
+    assert result.count == 80
+    assert agreement(tmp_path / "out", filmed).mean() > 0.88
+    assert (tmp_path / "out" / "cameras.yaml").read_bytes() == (
+        filmed / "cameras.yaml"
+    ).read_bytes()
+    overlay = cv2.imread(str(tmp_path / "out" / "overlay" / "side" / "0003.jpg"))
+    assert overlay.shape == (160, 200, 3)
+
+
+@pytest.mark.slow
+def test_angles_come_out_where_pictures_went_in(tmp_path, runner: CliRunner):
+    scene = write_pictures(tmp_path / "scene", moving(5), ("front", "side"))
+    shutil.rmtree(scene.folder / "masks")
+    done = runner.invoke(app, ["masks", str(scene.folder), "--out", str(tmp_path / "made")])
+    assert done.exit_code == 0, done.output
+    command = ["estimate", str(tmp_path / "made"), "--model", str(scene.model), "--no-replay"]
+    done = runner.invoke(app, [*command, "--no-overlay", "--out", str(tmp_path / "angles")])
+    assert done.exit_code == 0, done.output
+    rows = {row["frame"]: row for row in read_rows(tmp_path / "angles" / "poses.csv")}
+    for frame, q in scene.truth.items():
+        found = [float(rows[frame][name]) for name in NAMES]
+        assert np.degrees(np.abs(found - q)).max() < 5.0
+
+
+def test_masks_of_another_tool_may_lie_in_masks(filmed, tmp_path):
+    shutil.copytree(filmed / "masks", tmp_path / "source" / "masks")
+    shutil.copy(filmed / "cameras.yaml", tmp_path / "source")
+    make_masks(tmp_path / "source", tmp_path / "out")
+    assert (agreement(tmp_path / "out", filmed) == 1.0).all()
+
+
+def test_median_of_a_recording_finds_what_moves(filmed, pictures, tmp_path):
+    shutil.rmtree(pictures / "background")
+    result = make_masks(pictures, tmp_path / "out", MaskSettings(background="median"))
+    assert not any("no good background" in text for text in result.warnings)
+    assert agreement(tmp_path / "out", filmed, moves=True).mean() > 0.8
+
+
+def test_median_of_a_body_that_hardly_moves_says_that_it_is_no_background(tmp_path):
+    angles = [(20.0 + 6.0 * k, -40.0 - 5.0 * k) for k in range(10)]
+    scene = write_pictures(tmp_path / "scene", angles)
+    shutil.rmtree(scene.folder / "background")
+    result = make_masks(
+        scene.folder / "images", tmp_path / "out", MaskSettings(background="median")
+    )
+    assert sum("no good background" in text for text in result.warnings) == 1
+
+
+@pytest.mark.slow
+def test_median_of_ten_stills_of_an_arm_says_that_it_is_no_background(shared_data, tmp_path):
+    source = shared_data / "franka_one_view"
+    result = make_masks(source / "images", tmp_path / "out", MaskSettings(background="median"))
+    assert sum("no good background" in text for text in result.warnings) == 1
+
+
+def test_light_that_changed_and_pictures_of_another_size_are_named(pictures, tmp_path):
+    files = sorted((pictures / "images" / "front").iterdir())
+    cv2.imwrite(str(files[3]), 255 - cv2.imread(str(files[3])) // 2)
+    result = make_masks(pictures, tmp_path / "out")
+    assert any("0003.png" in text and "light change" in text for text in result.warnings)
+    cv2.imwrite(str(pictures / "background" / "side.png"), np.zeros((10, 10, 3), np.uint8))
+    with pytest.raises(SceneError, match=r"side\.png.*10 x 10.*200 x 160"):
+        make_masks(pictures, tmp_path / "again")
+    (pictures / "background" / "side.png").unlink()
+    with pytest.raises(SceneError, match="no picture of the empty room before camera 'side'"):
+        make_masks(pictures, tmp_path / "again")
+    shutil.copy(pictures / "background" / "front.png", pictures / "background" / "side.png")
+    files[0].write_bytes(b"no picture")
+    with pytest.raises(SceneError, match=r"0000\.png"):
+        make_masks(pictures, tmp_path / "again")
+    assert not any((tmp_path / "again").glob("**/*.png"))
+
+
+def test_ways_cannot_be_mixed():
+    with pytest.raises(SettingsError, match="two ways"):
+        MaskSettings(background="median", box=(1, 2, 3, 4))
+    with pytest.raises(SettingsError, match="--class"):
+        MaskSettings(background="median", classes=("1",))
+    with pytest.raises(SettingsError, match="--network FILE"):
+        MaskSettings(network_bgr=True)
+    with pytest.raises(SettingsError, match="4 numbers"):
+        MaskSettings(box=(1, 2, 3))
+
+
+@pytest.fixture
+def still(tmp_path):
+    """A blue box with a hole before a yellow table, and the truth."""
+    rng = np.random.default_rng(3)
+    true = np.zeros((120, 160), bool)
+    true[30:90, 40:110] = True
+    true[50:60, 60:80] = False
+    colours = np.where(true[:, :, None], (60, 80, 190), (200, 180, 70))
+    picture = (colours + 12.0 * rng.standard_normal(colours.shape)).clip(0, 255).astype(np.uint8)
+    path = tmp_path / "still.png"
+    cv2.imwrite(str(path), picture[:, :, ::-1])
+    return path, true
+
+
+def test_box_cuts_a_still_out(still, tmp_path, runner: CliRunner):
+    path, true = still
+    out = tmp_path / "out"
+    done = runner.invoke(app, ["masks", str(path), "-o", str(out), "--box", "30,20,95,85"])
+    assert done.exit_code == 0, done.output
+    found = load_scene(out).read("camera", "still")
+    assert iou(found, true) > 0.97
+    for box in ("300,20,95,85", "0,0,160,120"):
+        none = tmp_path / "none"
+        done = runner.invoke(app, ["masks", str(path), "-o", str(none), "--box", box])
+        assert done.exit_code == 1
+        assert "still.png: the box" in done.stderr
+    assert runner.invoke(app, ["masks", str(path), "-o", "x", "--box", "1,2,3"]).exit_code == 2
+
+
+def test_strokes_say_what_belongs_to_the_object(still, tmp_path):
+    path, true = still
+    file = tmp_path / "strokes.yaml"
+    inside = [[[45, 35], [100, 35], [100, 80], [45, 80]]]
+    beside = [[[10, 10], [150, 10], [150, 110]], [[62, 55], [78, 55]]]
+    marks = {"camera": {"still": {"object": inside, "background": beside, "width": 4}}}
+    file.write_text(yaml.safe_dump(marks))
+    make_masks(path, tmp_path / "out", MaskSettings(strokes=file))
+    assert iou(load_scene(tmp_path / "out").read("camera", "still"), true) > 0.97
+    marks["camera"]["other"] = {"box": [1, 2, 30, 40]}
+    file.write_text(yaml.safe_dump(marks))
+    with pytest.raises(SceneError, match="no picture of camera 'camera', frame 'other'"):
+        make_masks(path, tmp_path / "none", MaskSettings(strokes=file))
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        ({"box": [1, 2, 3]}, "box: expected 4 numbers"),
+        ({"box": [1, 2, 3, float("nan")]}, "box: expected 4 numbers"),
+        ({"object": [[1, 2]]}, "object"),
+        ({"object": 3}, "object must be a list"),
+        ({"lines": []}, "unknown field lines"),
+        ({"width": 0, "box": [1, 2, 3, 4]}, "width must be positive"),
+        ({}, "expected box"),
+    ],
+)
+def test_damaged_strokes_are_refused(tmp_path, entry, words):
+    file = tmp_path / "strokes.yaml"
+    file.write_text(yaml.safe_dump({"left": {"0001": entry}}))
+    with pytest.raises(SceneError, match=f"camera 'left', frame '0001'.*{words}"):
+        read_strokes(file)
+
+
+def network(path, kind):
+    """Weighs the colours of every pixel: blue against the rest."""
+    weights = np.array([[-1.0, -1.0, 3.0], [1.0, 1.0, -3.0], [0.0, 0.0, 0.0]], np.float32)
+    order = {"scores": [1, 0], "three": [1, 2, 0], "logit": [0]}[kind]
+    constant = numpy_helper.from_array(weights[order][:, :, None, None], "W")
+    graph = helper.make_graph(
+        [helper.make_node("Conv", ["x", "W"], ["y"], kernel_shape=[1, 1])],
+        "blue",
+        [helper.make_tensor_value_info("x", TensorProto.FLOAT, [1, 3, 60, 80])],
+        [helper.make_tensor_value_info("y", TensorProto.FLOAT, [1, len(order), 60, 80])],
+        [constant],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
+    onnx.checker.check_model(model)
+    onnx.save(model, str(path))
+    return path
+
+
+@pytest.mark.parametrize(("kind", "classes"), [("scores", ()), ("three", ("2",)), ("logit", ())])
+def test_network_of_the_user_s(still, tmp_path, kind, classes):
+    path, true = still
+    file = network(tmp_path / "net.onnx", kind)
+    settings = MaskSettings(network=file, network_size=(80, 60), classes=classes)
+    make_masks(path, tmp_path / "out", settings)
+    assert iou(load_scene(tmp_path / "out").read("camera", "still"), true) > 0.95
+
+
+def test_network_takes_the_colours_that_are_said(still, tmp_path):
+    path, true = still
+    file = network(tmp_path / "net.onnx", "scores")
+    # With red for blue the table is the object.
+    swapped = MaskSettings(network=file, network_size=(80, 60), network_bgr=True)
+    result = make_masks(path, tmp_path / "table", swapped)
+    assert iou(load_scene(tmp_path / "table").read("camera", "still"), ~true) > 0.95
+    assert "is it the background?" in result.warnings[0]
+    # 2 blue - red - green is more than 0; what is taken away and divided by, moves that.
+    moved = MaskSettings(
+        network=file, network_size=(80, 60), network_mean=(0.0, 0.0, 1.0), network_std=(1, 1, 0.1)
+    )
+    with pytest.raises(MaskError, match="not found"):
+        make_masks(path, tmp_path / "none", moved)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"classes": ()}, "3 classes; say which"),
+        ({"classes": ("9",)}, "classes 0 to 2, not 9"),
+        ({"classes": ("robot",)}, "numbers, not 'robot'"),
+        ({"classes": ("0", "1", "2")}, "all of its 3 classes"),
+        ({"network": "none.onnx"}, "no such network"),
+    ],
+)
+def test_networks_that_do_not_fit_are_refused(still, tmp_path, change, words):
+    path, _ = still
+    file = network(tmp_path / "net.onnx", "three")
+    values = {"network": file, "network_size": (80, 60), "classes": ("2",)} | change
+    if values["network"] == "none.onnx":
+        values["network"] = tmp_path / "none.onnx"
+    with pytest.raises(DrakePoseError, match=words):
+        make_masks(path, tmp_path / "out", MaskSettings(**values))
+
+
+def test_what_is_no_network_is_refused(still, tmp_path, runner: CliRunner):
+    file = tmp_path / "net.onnx"
+    file.write_bytes(b"nothing")
+    command = ["masks", str(still[0]), "-o", str(tmp_path / "o"), "--network", str(file)]
+    done = runner.invoke(app, command)
+    assert done.exit_code == 1
+    assert "net.onnx" in done.stderr
+    good = network(file, "three")
+    done = runner.invoke(app, [*command, "--network-size", "80,60", "--class", "2", "--json"])
+    assert done.exit_code == 0, (done.output, good)
+    assert json.loads(done.stdout)["settings"]["network_size"] == [80, 60]

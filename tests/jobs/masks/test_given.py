@@ -1,0 +1,256 @@
+"""Masks of other tools become a scene."""
+
+import base64
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from pycocotools import mask as coco
+from typer.testing import CliRunner
+
+from drake_pose import MaskSettings, load_scene, make_masks
+from drake_pose.commands.main import app
+from drake_pose.errors import CameraError, DrakePoseError, MaskError, OutputError, SceneError
+from tests.jobs.scenes import write_scene
+
+POLYGON = [60.0, 40.0, 120.0, 40.0, 120.0, 100.0, 60.0, 100.0]
+
+
+@pytest.fixture
+def two_views(tmp_path):
+    """A scene of two cameras: three frames."""
+    return write_scene(tmp_path / "scene", cameras=("front", "side"))
+
+
+def runs_of(mask, packed):
+    """A mask as run lengths of COCO."""
+    runs = coco.encode(np.asfortranarray(mask, dtype=np.uint8))
+    if packed:
+        return {"size": list(mask.shape), "counts": runs["counts"].decode()}
+    changes = np.flatnonzero(np.diff(np.concatenate([[False], mask.T.ravel()])))
+    counts = np.diff(np.concatenate([[0], changes, [mask.size]])).tolist()
+    return {"size": list(mask.shape), "counts": counts}
+
+
+def write_coco(path, scene, annotate, paths="{camera}/{frame}.jpg"):
+    """A file whose annotations are annotate(mask) of each picture: (class, segmentation)s."""
+    images, annotations = [], []
+    for k, ((camera, frame), _) in enumerate(scene.masks.items()):
+        mask = scene.read(camera, frame)
+        name = paths.format(camera=camera, frame=frame)
+        images.append({"id": k, "file_name": name, "width": mask.shape[1], "height": mask.shape[0]})
+        for number, segmentation in annotate(mask):
+            annotations.append(
+                {"id": len(annotations), "image_id": k, "category_id": number,
+                 "segmentation": segmentation}
+            )  # fmt: skip
+    names = [{"id": 3, "name": "arm"}, {"id": 4, "name": "tool"}]
+    content = {"images": images, "annotations": annotations, "categories": names}
+    path.write_text(json.dumps(content))
+    return path
+
+
+def assert_same_masks(made, scene):
+    found = load_scene(made)
+    assert set(found.masks) == set(scene.masks)
+    for camera, frame in scene.masks:
+        assert (found.read(camera, frame) == scene.read(camera, frame)).all(), (camera, frame)
+
+
+@pytest.mark.parametrize("packed", [True, False])
+def test_coco_run_lengths_become_the_same_masks(tmp_path, two_views, packed):
+    scene = load_scene(two_views.folder)
+
+    def halves(mask):
+        upper = mask & (np.arange(len(mask)) < 70)[:, None]
+        return [(3, runs_of(upper, packed)), (4, runs_of(mask & ~upper, packed))]
+
+    file = write_coco(tmp_path / "a.json", scene, halves)
+    cameras = two_views.folder / "cameras.yaml"
+    result = make_masks(file, tmp_path / "out", MaskSettings(classes=("arm", "4"), cameras=cameras))
+    assert result.count == 6
+    assert result.warnings == ()
+    assert_same_masks(tmp_path / "out", scene)
+    with pytest.raises(MaskError, match=r"classes arm, tool.*--class 'arm'"):
+        make_masks(file, tmp_path / "none", MaskSettings(cameras=cameras))
+    with pytest.raises(DrakePoseError, match=r"no class 'robot'; it has: arm, tool"):
+        make_masks(file, tmp_path / "none", MaskSettings(classes=("robot",), cameras=cameras))
+    assert not (tmp_path / "none").exists() or not any((tmp_path / "none").iterdir())
+
+
+def test_coco_polygons_without_cameras(tmp_path, two_views):
+    scene = load_scene(two_views.folder)
+    file = write_coco(tmp_path / "a.json", scene, lambda _: [(3, [POLYGON])])
+    result = make_masks(file, tmp_path / "out")
+    assert "have no cameras.yaml" in result.warnings[0]
+    mask = cv2.imread(str(tmp_path / "out" / "masks" / "side" / "0001.png"), cv2.IMREAD_GRAYSCALE)
+    expected = np.zeros((160, 200))
+    expected[40:100, 60:120] = 255
+    assert (mask == expected).all()
+
+
+def test_pictures_of_an_object_that_is_not_there_are_named(tmp_path, two_views):
+    scene = load_scene(two_views.folder)
+    count = iter(range(6))
+    file = write_coco(tmp_path / "a.json", scene, lambda _: [(3, [POLYGON])] if next(count) else [])
+    result = make_masks(file, tmp_path / "out", MaskSettings(cameras=scene.path / "cameras.yaml"))
+    assert result.count == 5
+    assert "front/0000.jpg': the object is not found" in result.warnings[0]
+    assert "0000" not in [path.stem for path in (tmp_path / "out/masks/front").iterdir()]
+    empty = write_coco(tmp_path / "b.json", scene, lambda _: [])
+    with pytest.raises(MaskError, match=r"not found.*and 5 more"):
+        make_masks(empty, tmp_path / "none")
+    assert not (tmp_path / "none" / "masks").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (
+            {"segmentation": {"size": [5, 5], "counts": [25]}},
+            "annotation 0 of image 0.*another size",
+        ),
+        ({"segmentation": {"size": [160, 200], "counts": [25]}}, "fill 25 pixels"),
+        ({"segmentation": [[1.0, 2.0, 3.0]]}, "annotation 0 of image 0"),
+        ({"segmentation": [["a", "b"] * 3]}, "annotation 0 of image 0"),
+        ({"image_id": 77}, "image 77, which is not there"),
+    ],
+)
+def test_damaged_coco_files_are_refused(tmp_path, two_views, change, words):
+    file = write_coco(tmp_path / "a.json", load_scene(two_views.folder), lambda _: [(3, [POLYGON])])
+    content = json.loads(file.read_text())
+    content["annotations"][0] |= change
+    file.write_text(json.dumps(content))
+    with pytest.raises(MaskError, match=rf"a\.json.*{words}"):
+        make_masks(file, tmp_path / "out")
+    for text in ("{", "[]", "{}", '{"images": 3, "annotations": [], "categories": []}'):
+        file.write_text(text)
+        with pytest.raises(MaskError, match=r"a\.json"):
+            make_masks(file, tmp_path / "out")
+
+
+def test_annotations_of_another_size_or_camera_are_refused(tmp_path, two_views):
+    scene = load_scene(two_views.folder)
+    cameras = scene.path / "cameras.yaml"
+    file = write_coco(tmp_path / "a.json", scene, lambda _: [(3, [POLYGON])], "x/{frame}.jpg")
+    with pytest.raises(SceneError, match=r"no folder of its path is a camera.*front, side"):
+        make_masks(file, tmp_path / "out", MaskSettings(cameras=cameras))
+    with pytest.raises(SceneError, match="has frame 0000 twice"):
+        make_masks(file, tmp_path / "out")
+    content = json.loads(file.read_text())
+    content["images"] = [
+        {**one, "width": 100, "file_name": "side/3.png"} for one in content["images"]
+    ]
+    file.write_text(json.dumps(content))
+    with pytest.raises(SceneError, match=r"100 x 160 pixels.*camera 'side'.*200 x 160"):
+        make_masks(file, tmp_path / "out", MaskSettings(cameras=cameras))
+    with pytest.raises(CameraError):
+        make_masks(file, tmp_path / "out", MaskSettings(cameras=tmp_path / "none.yaml"))
+
+
+def test_labelme_files_beside_their_pictures(tmp_path):
+    drawn = np.zeros((20, 30), np.uint8)
+    drawn[4:15, 5:25] = 1
+    part = base64.b64encode(cv2.imencode(".png", drawn[4:15, 5:25])[1]).decode()
+    shapes = [
+        {"label": "a", "shape_type": "polygon", "points": [[1, 2], [9, 2], [9, 7], [1, 7]]},
+        {"label": "a", "shape_type": "rectangle", "points": [[9, 7], [1, 2]]},
+        {"label": "a", "shape_type": "circle", "points": [[15, 10], [15, 16]]},
+        {"label": "a", "shape_type": "mask", "points": [[5, 4], [24, 14]], "mask": part},
+    ]
+    areas = (40, 40, np.pi * 36, 220)
+    folder = tmp_path / "source" / "left"
+    folder.mkdir(parents=True)
+    for k, shape in enumerate(shapes):
+        content = {
+            "imagePath": f"..\\pictures\\{k}.jpg", "imageWidth": 30, "imageHeight": 20,
+            "shapes": [shape, {"label": "a", "shape_type": "point", "points": [[3, 3]]}],
+        }  # fmt: skip
+        (folder / f"{k}.json").write_text(json.dumps(content))
+    result = make_masks(tmp_path / "source", tmp_path / "out")
+    assert any("1 shapes of the kind point have no area" in text for text in result.warnings)
+    for k, area in enumerate(areas):
+        mask = cv2.imread(str(tmp_path / "out" / "masks" / "left" / f"{k}.png"), 0) > 0
+        assert mask.sum() == pytest.approx(area, rel=0.03)
+        y, x = np.argwhere(mask).mean(axis=0) + 0.5
+        assert (x, y) == pytest.approx([(5, 4.5), (5, 4.5), (15, 10), (15, 9.5)][k], abs=0.1)
+    shapes[3]["points"][0] = [15, 4]
+    (folder / "3.json").write_text(json.dumps({**content, "shapes": [shapes[3]]}))
+    with pytest.raises(MaskError, match=r"3\.jpg': shape 0 \('a'\).*reaches beyond"):
+        make_masks(tmp_path / "source", tmp_path / "again")
+
+
+def test_probabilities_of_an_unknown_camera_are_estimated_at_once(tmp_path, two_views):
+    """Blurred by a pixel they are one half on the edge, as networks' are."""
+    scene = load_scene(two_views.folder)
+    source = tmp_path / "probabilities"
+    source.mkdir()
+    for frame in scene.frames:
+        mask = scene.read("front", frame).astype(np.float32)
+        soft = np.rint(65535 * cv2.GaussianBlur(mask, (5, 5), 1.0)).astype(np.uint16)
+        cv2.imwrite(str(source / f"{frame}.png"), soft)
+    make_masks(source, tmp_path / "out")
+    made = load_scene(tmp_path / "out")
+    assert made.scale_unknown
+    for frame in scene.frames:
+        one, other = made.read("camera", frame), scene.read("front", frame)
+        assert (one & other).sum() / (one | other).sum() > 0.97
+
+
+def test_masks_in_a_video_become_a_sequence(tmp_path, two_views):
+    scene = load_scene(two_views.folder)
+    source = tmp_path / "source"
+    (source / "videos").mkdir(parents=True)
+    shutil.copy(scene.path / "cameras.yaml", source)
+    for camera in scene.cameras:
+        path = str(source / "videos" / f"{camera}.avi")
+        video = cv2.VideoWriter(path, cv2.VideoWriter_fourcc(*"MJPG"), 25.0, (200, 160))
+        for frame in scene.frames:
+            video.write(
+                np.dstack([np.where(scene.read(camera, frame), 255, 0).astype(np.uint8)] * 3)
+            )
+        video.release()
+    make_masks(source, tmp_path / "out")
+    made = load_scene(tmp_path / "out")
+    assert made.sequence
+    assert made.frame_rate_hz == 25.0
+    for (camera, frame), mask in zip(made.masks, scene.masks, strict=True):
+        assert (made.read(camera, frame) == scene.read(*mask)).mean() > 0.999
+
+
+def test_sources_in_doubt_are_refused(tmp_path, two_views):
+    out = tmp_path / "out"
+    masks = two_views.folder / "masks"
+    with pytest.raises(SceneError, match="no such folder or file"):
+        make_masks(tmp_path / "none", out)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(SceneError, match="holds no pictures"):
+        make_masks(tmp_path / "empty", out)
+    shutil.copy(two_views.folder / "cameras.yaml", masks)
+    (masks / "front").rename(masks / "middle")
+    with pytest.raises(SceneError, match=r"'middle' belong to no camera.*front, side"):
+        make_masks(masks, out)
+    with pytest.raises(SceneError, match=r"no camera's folder.*2 cameras"):
+        make_masks(masks / "side", out, MaskSettings(cameras=masks / "cameras.yaml"))
+    make_masks(masks / "side", out)
+    with pytest.raises(OutputError, match="not empty"):
+        make_masks(masks / "side", out)
+
+
+def test_command_says_what_was_made(tmp_path, two_views, runner: CliRunner):
+    source = two_views.folder / "masks" / "side"
+    done = runner.invoke(app, ["masks", str(source), "--out", str(tmp_path / "a"), "--json"])
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["mask_count"] == 3
+    done = runner.invoke(app, ["masks", str(source), "--out", str(tmp_path / "b")])
+    assert "3 masks of 3 pictures" in done.stdout
+    wrong = ["masks", str(source), "--out", str(tmp_path / "c"), "--pixels", "soft"]
+    assert runner.invoke(app, wrong).exit_code == 2
+    photograph = tmp_path / "photograph.png"
+    noise = np.random.default_rng(0).integers(0, 255, (9, 9, 3), dtype=np.uint8)
+    cv2.imwrite(str(photograph), noise)
+    done = runner.invoke(app, ["masks", str(photograph), "--out", str(tmp_path / "c")])
+    assert done.exit_code == 1
+    assert "photograph.png: is a colour picture" in done.stderr

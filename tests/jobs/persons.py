@@ -1,0 +1,58 @@
+"""Small recordings of the bundled person, drawn by Drake's renderer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.camera.files import save_cameras
+from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from drake_pose.silhouette.pictures.masks import write_mask
+
+
+@dataclass(frozen=True)
+class PersonScene:
+    """A scene's folder, the person in it, and the true positions (frames, nq)."""
+
+    folder: Path
+    person: ArticulatedModel
+    truth: np.ndarray
+
+
+def record_person(
+    folder: Path,
+    frames: int = 3,
+    moved: str | None = None,
+    sequence: bool = True,
+    size: tuple[int, int] = (160, 120),
+) -> PersonScene:
+    """Records a person who raises an arm; one camera may have moved after its calibration."""
+    folder.mkdir(parents=True, exist_ok=True)
+    person = load_model(bundled_model("person"), check=False)
+    cameras = circle_of_cameras(4, size=size, face_camera=False)
+    save_cameras(folder / "cameras.yaml", cameras)
+    rate = "frame_rate_hz: 30\n" if sequence else ""
+    (folder / "scene.yaml").write_text(f"sequence: {str(sequence).lower()}\n{rate}")
+    truth = np.zeros((frames, len(person.position_names)))
+    truth[:, person.position_index("position_z")] = 1.55
+    truth[:, person.position_index("left_upper_arm_z")] = np.radians(
+        30.0 + 10.0 * np.arange(frames)
+    )
+    truth[:, person.position_index("right_upper_arm_z")] = np.radians(-30.0)
+    for name, camera in cameras.items():
+        seen = camera
+        if name == moved:
+            X_WC = camera.X_WC.copy()
+            X_WC[2, 3] += 0.35
+            seen = camera.with_pose(X_WC)
+        renderer = LabelRenderer(person, seen)
+        for k, q in enumerate(truth):
+            path = folder / "masks" / name / f"{k:04d}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_mask(path, renderer.mask(q))
+    return PersonScene(folder, person, truth)

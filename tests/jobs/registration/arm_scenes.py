@@ -1,0 +1,87 @@
+"""Recorded scenes of a small arm whose joint positions are known, drawn by Drake's renderer."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from drake_pose.body.model import load_model
+from drake_pose.camera.files import load_cameras, save_cameras
+from drake_pose.camera.models import Camera
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from drake_pose.silhouette.pictures.masks import write_mask
+from tests.search.arms import LINKS, arm_cameras, arm_urdf
+
+JOINTS = tuple(f"{name}_turn" for name, *_ in LINKS)
+
+
+@dataclass(frozen=True)
+class ArmScene:
+    """A scene's folder, its robot's file, its table of joint positions, and the true cameras."""
+
+    folder: Path
+    model: Path
+    joints: Path
+    cameras: dict[str, Camera]
+
+    def copy(self, place: Path) -> ArmScene:
+        """The same elsewhere, to be spoilt."""
+        shutil.copytree(self.folder, place / "scene")
+        joints = shutil.copy(self.joints, place / "joints.csv")
+        return ArmScene(place / "scene", self.model, Path(joints), self.cameras)
+
+    def rows(self) -> list[list[str]]:
+        """The table, its first line among them."""
+        with self.joints.open(newline="") as file:
+            return list(csv.reader(file))
+
+    def write_rows(self, rows: Sequence[Sequence[object]]) -> None:
+        """Writes the table anew."""
+        with self.joints.open("w", newline="") as file:
+            csv.writer(file).writerows(rows)
+
+    def edit_cameras(self, name: str, **fields: object) -> None:
+        """Changes fields of a camera in the camera file; those that are None are taken out."""
+        path = self.folder / "cameras.yaml"
+        content = yaml.safe_load(path.read_text())
+        content[name] |= fields
+        content[name] = {key: value for key, value in content[name].items() if value is not None}
+        path.write_text(yaml.safe_dump(content, sort_keys=False))
+
+
+def write_arm_scene(folder: Path, count: int = 5, seed: int = 4) -> ArmScene:
+    """Random poses before two cameras; `right` has its X_WC in the camera file, `left` has not."""
+    scene = ArmScene(
+        folder / "scene",
+        folder / "arm.urdf",
+        folder / "joints.csv",
+        {camera.name: camera for camera in arm_cameras()},
+    )
+    scene.folder.mkdir()
+    scene.model.write_text(arm_urdf())
+    model, rng = load_model(scene.model), np.random.default_rng(seed)
+    limits = np.radians([limit for _, _, _, limit, _, _ in LINKS])
+    poses = rng.uniform(limits[:, 0], limits[:, 1], size=(count, len(limits)))
+    save_cameras(scene.folder / "cameras.yaml", scene.cameras)
+    for camera in load_cameras(scene.folder / "cameras.yaml").values():
+        renderer = LabelRenderer(model, camera)
+        masks = scene.folder / "masks" / camera.name
+        masks.mkdir(parents=True)
+        for k, q in enumerate(poses):
+            write_mask(masks / f"{k:04d}.png", renderer.mask(q))
+    scene.write_rows([["frame", *JOINTS], *([k, *q] for k, q in enumerate(poses))])
+    scene.edit_cameras("left", X_WC=None)
+    return scene
+
+
+def pose_errors(found: np.ndarray, true: np.ndarray) -> tuple[float, float]:
+    """How far a pose (4, 4) is off [mm, deg]."""
+    cosine = 0.5 * (np.trace(found[:3, :3].T @ true[:3, :3]) - 1.0)
+    turn = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    return 1e3 * float(np.linalg.norm(found[:3, 3] - true[:3, 3])), float(turn)

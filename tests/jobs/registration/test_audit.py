@@ -1,0 +1,109 @@
+"""`drake-pose audit`: what contradicts the rest, from masks, cameras and joint positions."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from drake_pose.camera.files import save_cameras
+from drake_pose.commands.main import app
+from drake_pose.errors import CameraError, MaskError, SceneError
+from drake_pose.jobs.registration.audit import audit_scene
+from drake_pose.silhouette.pictures.masks import write_mask
+from tests.jobs.registration.arm_scenes import JOINTS, ArmScene, write_arm_scene
+
+
+def run(runner: CliRunner, scene: ArmScene, *more: str) -> Result:
+    given = ["--model", str(scene.model), "--joints", str(scene.joints)]
+    return runner.invoke(app, ["audit", str(scene.folder), *given, *more])
+
+
+@pytest.fixture(scope="module")
+def audited(tmp_path_factory: pytest.TempPathFactory) -> ArmScene:
+    """Eight frames of two cameras; frame 2 has the positions of frame 6."""
+    scene = write_arm_scene(tmp_path_factory.mktemp("audited"), count=8)
+    save_cameras(scene.folder / "cameras.yaml", scene.cameras)
+    rows = scene.rows()
+    rows[1 + 2] = [rows[1 + 2][0], *rows[1 + 6][1:]]
+    scene.write_rows(rows)
+    return scene
+
+
+@pytest.fixture(scope="module")
+def found(
+    audited: ArmScene, tmp_path_factory: pytest.TempPathFactory, runner: CliRunner
+) -> tuple[Path, dict[str, Any]]:
+    """The result folder, and what the command printed as JSON."""
+    out = tmp_path_factory.mktemp("audit") / "out"
+    result = run(runner, audited, "--out", str(out), "--json")
+    assert result.exit_code == 0, result.output
+    return out, json.loads(result.stdout)
+
+
+class TestAudit:
+    def test_the_frame_with_another_one_s_positions_is_named(self, found) -> None:
+        out, summary = found
+        assert [one["name"] for one in summary["contradictions"]] == ["0002"]
+        assert summary["contradictions"][0]["what"] == "frame"
+        assert "'0002'" in summary["contradictions"][0]["text"]
+        assert (summary["frame_count"], summary["agreeing_count"]) == (8, 7)
+        assert summary["frames"]["0003"]["agrees"]
+        assert summary == json.loads((out / "summary.json").read_text())
+
+    def test_only_what_contradicts_is_drawn(self, found) -> None:
+        drawn = sorted(path.relative_to(found[0]) for path in found[0].rglob("*.png"))
+        assert drawn == [Path("overlay/left/0002.png"), Path("overlay/right/0002.png")]
+
+    def test_without_out_the_table_is_printed(self, audited, runner: CliRunner) -> None:
+        result = run(runner, audited, "--frame", "0:4")
+        assert result.exit_code == 0, result.output
+        assert "frame '0002'" in result.stdout
+        assert "4 of 5 frames agree" in result.stdout
+
+    def test_a_camera_file_of_another_place(self, audited, tmp_path: Path) -> None:
+        """One camera was told to stand 2 cm beside where it took the pictures."""
+        left = audited.cameras["left"]
+        X_WC = left.X_WC.copy()
+        X_WC[:3, 3] += 0.02 * X_WC[:3, 0]
+        path = tmp_path / "cameras.yaml"
+        save_cameras(path, {**audited.cameras, "left": left.with_pose(X_WC)})
+        result = audit_scene(audited.folder, audited.model, audited.joints, cameras=path)
+        named = [(one["what"], one["name"]) for one in result.summary["contradictions"]]
+        assert named == [("camera", "left"), ("frame", "0002")]
+        assert result.summary["contradictions"][0]["shift_mm"] == pytest.approx(20.0, abs=5.0)
+        assert result.folder is None
+
+    def test_degrees_are_refused(self, audited, tmp_path: Path) -> None:
+        own = audited.copy(tmp_path)
+        header, *rows = own.rows()
+        turned = [[row[0], *np.degrees(np.array(row[1:], float))] for row in rows]
+        own.write_rows([header, *turned])
+        with pytest.raises(SceneError, match="in degrees"):
+            audit_scene(own.folder, own.model, own.joints)
+
+    def test_a_joint_without_a_column_is_named(self, audited, tmp_path: Path) -> None:
+        own = audited.copy(tmp_path)
+        own.write_rows([row[:-1] for row in own.rows()])
+        with pytest.raises(SceneError, match=JOINTS[-1]):
+            audit_scene(own.folder, own.model, own.joints)
+
+    def test_cameras_must_be_known(self, audited, tmp_path: Path) -> None:
+        own = audited.copy(tmp_path)
+        own.edit_cameras("left", X_WC=None)
+        with pytest.raises(CameraError, match=r"'left'.*drake-pose register"):
+            audit_scene(own.folder, own.model, own.joints)
+
+    def test_masks_that_show_nothing(self, audited, tmp_path: Path) -> None:
+        own = audited.copy(tmp_path)
+        for name in own.cameras:
+            write_mask(own.folder / "masks" / name / "0001.png", np.zeros((240, 320), bool))
+        result = audit_scene(own.folder, own.model, own.joints)
+        assert [text for text in result.warnings if "0001" in text and "nothing" in text]
+        assert result.summary["frame_count"] == 7
+        for path in own.folder.rglob("*.png"):
+            write_mask(path, np.zeros((240, 320), bool))
+        with pytest.raises(MaskError, match="no mask shows the body"):
+            audit_scene(own.folder, own.model, own.joints)

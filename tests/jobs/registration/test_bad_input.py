@@ -1,0 +1,164 @@
+"""What cannot be registered: a message that names the culprit, and nothing like a pose is left."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from tests.jobs.estimate.test_bad_input import assert_refused
+from tests.jobs.registration.arm_scenes import ArmScene
+from tests.jobs.registration.test_register import run
+
+Spoil = Callable[[ArmScene], None]
+
+
+def change_rows(change: Callable[[list[list[str]]], object]) -> Spoil:
+    def spoil(scene: ArmScene) -> None:
+        rows = scene.rows()
+        change(rows)
+        scene.write_rows(rows)
+
+    return spoil
+
+
+def drop_column(rows: list[list[str]]) -> None:
+    for row in rows:
+        del row[3]
+
+
+def to_degrees(rows: list[list[str]]) -> None:
+    for row in rows[1:]:
+        row[1:] = [str(np.degrees(float(cell))) for cell in row[1:]]
+
+
+def add_column(rows: list[list[str]]) -> None:
+    for k, row in enumerate(rows):
+        row.append("time" if k == 0 else str(k))
+
+
+def to_next(rows: list[list[str]]) -> None:
+    """What was said of a frame is said of the one before."""
+    places = [row[1:] for row in rows[1:]]
+    for row, place in zip(rows[1:], [*places[1:], places[0]], strict=True):
+        row[1:] = place
+
+
+def name_twice(rows: list[list[str]]) -> None:
+    rows[0][2] = rows[0][1]
+
+
+def change_masks(change: Callable[[np.ndarray], np.ndarray], frames: str = "*") -> Spoil:
+    def spoil(scene: ArmScene) -> None:
+        for path in (scene.folder / "masks" / "left").glob(f"{frames}.png"):
+            cv2.imwrite(str(path), change(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)))
+
+    return spoil
+
+
+def edit(name: str, **fields: object) -> Spoil:
+    return lambda scene: scene.edit_cameras(name, **fields)
+
+
+BEFORE_WORK: dict[str, tuple[Spoil, list[str]]] = {
+    "no table": (lambda s: s.joints.unlink(), ["joints.csv: cannot read it"]),
+    "a joint without column": (
+        change_rows(drop_column),
+        ["joints.csv: has no column for joint roll_turn of arm.urdf", "--hold roll_turn=VALUE"],
+    ),
+    "degrees": (
+        change_rows(to_degrees),
+        ["joints.csv: column '", "frame", "the file seems to be in degrees", "radians"],
+    ),
+    "a column of no joint": (
+        change_rows(add_column),
+        ["joints.csv has a column that the model lacks", "'time'", "turret_turn"],
+    ),
+    "a column twice": (change_rows(name_twice), ["has the column 'turret_turn' twice"]),
+    "a frame twice": (change_rows(lambda r: r.append(r[1])), ["line 7: frame '0' is given twice"]),
+    "a frame without row": (
+        change_rows(lambda r: r.pop(3)),
+        ["joints.csv: has no row of frame '0002'", "camera 'left'", "--frame"],
+    ),
+    "an empty mask": (
+        change_masks(np.zeros_like, "0003"),
+        ["0003.png: the mask is empty", "camera 'left'", "frame '0003'", "--frame"],
+    ),
+    "a mask of another size": (
+        change_masks(lambda mask: mask[:, 1:], "0001"),
+        ["0001.png: the mask has 319 x 240 pixels", "frame '0001'"],
+    ),
+    "a parallel camera": (
+        edit("left", projection="parallel", pixels_per_metre=100.0, focal_x=None, focal_y=None,
+             clipping_near=None),
+        ["camera 'left' is a parallel camera", "focal length"],
+    ),
+    "no focal length": (edit("left", focal_x=None), ["camera 'left'", "needs focal_x"]),
+    "all cameras stand": (
+        edit("left", X_WC=np.eye(4).tolist()),
+        ["every camera has an X_WC", "--camera left"],
+    ),
+    "no masks": (
+        lambda s: (s.folder / "masks").rename(s.folder / "pictures"),
+        ["has no folder masks/"],
+    ),
+    "no camera file": (lambda s: (s.folder / "cameras.yaml").unlink(), ["cameras.yaml"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BEFORE_WORK)
+def test_bad_input_is_refused_before_work(
+    case: str, own_arm: ArmScene, runner: CliRunner, tmp_path: Path
+) -> None:
+    spoil, parts = BEFORE_WORK[case]
+    spoil(own_arm)
+    assert_refused(run(runner, own_arm, tmp_path / "out"), *parts)
+    assert not (tmp_path / "out").exists()
+
+
+def test_unknown_names_are_refused(arm_scene: ArmScene, runner: CliRunner, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert_refused(run(runner, arm_scene, out, "--camera", "top"), "'top'", "left, right")
+    assert_refused(run(runner, arm_scene, out, "--frame", "9"), "'9'", "0004")
+    assert_refused(run(runner, arm_scene, out, "--hold", "nose=3"), "'nose'")
+    assert_refused(run(runner, arm_scene, out, "--hold", "nose"), "NAME=NUMBER", status=2)
+    (tmp_path / "letter.txt").write_text("Do not lose me.")
+    assert_refused(run(runner, arm_scene, tmp_path), "not empty")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.9, 1.15])
+def test_a_focal_length_that_is_not_the_camera_s(
+    factor: float, own_arm: ArmScene, runner: CliRunner, tmp_path: Path
+) -> None:
+    true = own_arm.cameras["left"].focal_x
+    own_arm.edit_cameras("left", focal_x=factor * true, focal_y=factor * true)
+    result = run(runner, own_arm, tmp_path / "out")
+    assert_refused(result, "camera 'left': its masks tell a focal length", "Nothing was written")
+    told = float(re.search(r"a focal length of (\d+) pixels", result.stderr)[1])
+    assert told == pytest.approx(true, rel=0.03)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+class TestNoPoseExplains:
+    @pytest.mark.parametrize(
+        ("spoil", "part"),
+        [
+            (change_masks(lambda mask: mask[:, ::-1]), "they fit when they are mirrored"),
+            (edit("left", focal_x=120.0, focal_y=120.0), "they fit with focal lengths near"),
+            (change_rows(to_next), "they fit with the joint positions of the previous frame"),
+            (change_masks(lambda mask: cv2.circle(0 * mask, (150, 110), 60, 255, -1)), "robot"),
+        ],
+        ids=["mirrored", "focal length", "one row off", "something else"],
+    )
+    def test_nothing_is_written(
+        self, spoil: Spoil, part: str, own_arm: ArmScene, runner: CliRunner, tmp_path: Path
+    ) -> None:
+        spoil(own_arm)
+        result = run(runner, own_arm, tmp_path / "out")
+        assert_refused(result, "camera 'left': no pose explains its masks", part)
+        assert not (tmp_path / "out").exists()

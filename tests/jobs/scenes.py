@@ -1,0 +1,101 @@
+"""A tiny body and recorded scenes of it, drawn by Drake's renderer."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from drake_pose.body.model import load_model
+from drake_pose.camera.files import save_cameras
+from drake_pose.camera.models import PinholeCamera
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from drake_pose.silhouette.pictures.masks import write_mask
+
+LINK = """
+  <link name="{name}">
+    <inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
+    <visual><origin xyz="0 0 {z}"/><geometry><box size="{size}"/></geometry></visual>
+  </link>"""
+
+JOINT = """
+  <joint name="{name}" type="revolute">
+    <parent link="{parent}"/><child link="{child}"/><origin xyz="0 0 {z}"/>
+    <axis xyz="1 0 0"/><limit lower="{lower}" upper="{upper}" effort="1" velocity="1"/>
+  </joint>"""
+
+URDF = (
+    '<robot name="crane"><link name="world"/>'
+    '<joint name="bolt" type="fixed"><parent link="world"/><child link="base"/></joint>'
+    + LINK.format(name="base", z=0.0, size="0.3 0.5 0.2")
+    + LINK.format(name="boom", z=0.25, size="0.1 0.12 0.5")
+    + LINK.format(name="jib", z=0.2, size="0.1 0.08 0.4")
+    + JOINT.format(name="lift", parent="base", child="boom", z=0.1, lower=-1.6, upper=1.6)
+    + JOINT.format(name="luff", parent="boom", child="jib", z=0.5, lower=-2.2, upper=0.1)
+    + "</robot>"
+)
+
+NAMES = ("lift", "luff")
+ANGLES = ((20.0, -40.0), (-40.0, -80.0), (60.0, 0.0))
+"""Degrees, multiples of 20, a row a frame."""
+
+
+@dataclass(frozen=True)
+class TinyScene:
+    """A scene's folder, its body's file, and the truth [rad] by frame."""
+
+    folder: Path
+    model: Path
+    truth: dict[str, np.ndarray]
+
+
+def camera(name: str, turn_deg: float = 0.0) -> PinholeCamera:
+    """A camera 3 m before the body, turned about the vertical."""
+    c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    X_WC = np.eye(4)
+    X_WC[:3, :3] = turn @ np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    X_WC[:3, 3] = turn @ np.array([3.0, 0.0, 0.3])
+    return PinholeCamera(name, 200, 160, 160.0, 160.0, 99.5, 79.5, X_WC)
+
+
+def write_scene(
+    folder: Path, angles: Sequence[Sequence[float]] = ANGLES, cameras: Sequence[str] = ("front",)
+) -> TinyScene:
+    """Write the body and a scene in which it stands at the given angles [deg]."""
+    folder.mkdir(parents=True, exist_ok=True)
+    model_path = folder.parent / "crane.urdf"
+    model_path.write_text(URDF)
+    model = load_model(model_path)
+    turns = {"front": 0.0, "side": 50.0}
+    rig = [camera(name, turns[name]) for name in cameras]
+    save_cameras(folder / "cameras.yaml", rig)
+    renderers = [LabelRenderer(model, view) for view in rig]
+    truth = {}
+    for index, row in enumerate(angles):
+        frame = f"{index:04d}"
+        truth[frame] = np.radians(row)
+        for view, renderer in zip(rig, renderers, strict=True):
+            path = folder / "masks" / view.name / f"{frame}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_mask(path, renderer.mask(truth[frame]))
+    return TinyScene(folder, model_path, truth)
+
+
+def write_truth(scene: TinyScene, path: Path | None = None) -> Path:
+    """Write the truth as a joint_angles.csv; frames are plain numbers there."""
+    path = path or scene.folder / "joint_angles.csv"
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["frame", *NAMES])
+        writer.writerows([int(frame), *q] for frame, q in scene.truth.items())
+    return path
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """The rows of a CSV file."""
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))

@@ -1,0 +1,176 @@
+"""`drake-pose calibrate`'s function: pictures in a folder to camera files."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from drake_pose.camera.calibration.calibrate import CalibrationSettings
+from drake_pose.camera.calibration.lens import load_lenses
+from drake_pose.camera.files import load_cameras
+from drake_pose.errors import CameraError, UnknownNameError
+from drake_pose.jobs.calibrate import calibrate_folder, undistort_pictures
+from tests.camera.boards import CHECKERBOARD, facing, inside, photograph, poses_for_pairs, ring
+
+BOARD_YAML = "kind: checkerboard\nsquares: [8, 5]\nsquare_length: 0.12\n"
+
+
+@pytest.fixture(scope="module")
+def taken(tmp_path_factory):
+    """Pictures of a board by three known cameras, one of them of nothing, and one damaged."""
+    folder = tmp_path_factory.mktemp("taken")
+    generator = np.random.default_rng(4)
+    cameras = ring(3, generator, radius=2.0, spread=75.0)
+    poses = poses_for_pairs(cameras, CHECKERBOARD, generator, 14)
+    (folder / "board.yaml").write_text(BOARD_YAML)
+    for name, camera in cameras.items():
+        (folder / "images" / name).mkdir(parents=True)
+        for frame, X_WB in poses.items():
+            uv = camera.project(CHECKERBOARD.points @ X_WB[:3, :3].T + X_WB[:3, 3])
+            if facing(X_WB, camera) and inside(uv, camera):
+                picture = photograph(camera, CHECKERBOARD, X_WB, generator)
+                cv2.imwrite(str(folder / "images" / name / f"{frame}.png"), picture)
+    cv2.imwrite(str(folder / "images" / "c1" / "9998.png"), np.full((480, 640), 90, np.uint8))
+    (folder / "images" / "c2" / "9999.png").write_bytes(b"\x89PNG\r\n\x1a\nbroken")
+    return folder, cameras, poses
+
+
+@pytest.fixture(scope="module")
+def report(taken, tmp_path_factory):
+    folder = taken[0]
+    out = tmp_path_factory.mktemp("out") / "cameras.yaml"
+    return calibrate_folder(folder, folder / "board.yaml", out)
+
+
+def test_known_cameras_come_back_from_pictures(taken, report):
+    _, cameras, _ = taken
+    written = load_cameras(report.files[0])
+    assert list(written) == list(cameras)
+    for name, true in cameras.items():
+        X_0C = np.linalg.inv(cameras["c0"].X_WC) @ true.X_WC
+        D = np.linalg.inv(X_0C) @ written[name].X_WC
+        assert np.linalg.norm(D[:3, 3]) < 0.04
+        assert report.calibration.camera_errors[name] < 0.4
+        assert report.calibration.lenses[name].focal_x == pytest.approx(true.focal, rel=0.02)
+
+
+def test_bad_pictures_are_named_and_harm_nothing(report):
+    assert report.seen.not_found == (("c1", "9998"),)
+    assert set(report.seen.unreadable) == {("c2", "9999")}
+    text = "\n".join(report.warnings)
+    assert "'9998'" in text
+    assert "9999.png" in text
+
+
+def test_json_and_table(report):
+    values = json.loads(json.dumps(report.as_json(), allow_nan=False))
+    assert set(values["cameras"]) == {"c0", "c1", "c2"}
+    assert 0.0 < values["error_pixels"] < 0.4
+    assert values["world"] == "camera:c0"
+    assert values["not_found"] == [["c1", "9998"]]
+    assert report.table().row_count == 3
+
+
+def test_undistorted_pictures_fit_the_written_cameras(taken, report, tmp_path):
+    folder, cameras, poses = taken
+    (folder / "images" / "c2" / "9999.png").rename(tmp_path / "broken.png")
+    try:
+        written = undistort_pictures(folder, load_lenses(report.files[1]), tmp_path)
+    finally:
+        (tmp_path / "broken.png").rename(folder / "images" / "c2" / "9999.png")
+    straight = load_cameras(report.files[0])
+    X_0W = np.linalg.inv(cameras["c0"].X_WC)
+    checked = 0
+    for (name, frame), path in list(written.items())[::3]:
+        if frame not in poses:
+            continue
+        detection = CHECKERBOARD.find(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+        if detection is None:
+            continue  # Cut off by the undistorted picture's edge.
+        X_0B = X_0W @ poses[frame]
+        uv, _ = straight[name].project(CHECKERBOARD.points @ X_0B[:3, :3].T + X_0B[:3, 3])
+        difference = detection.uv - uv
+        # The shape must fit; how far off the whole lies is the poses' error.
+        assert np.abs(difference - difference.mean(axis=0)).max() < 1.5
+        checked += 1
+    assert checked >= 4
+
+
+def test_board_as_the_world(taken, tmp_path):
+    folder, cameras, poses = taken
+    settings = CalibrationSettings(world="board:0001")
+    found = calibrate_folder(folder, folder / "board.yaml", settings=settings)
+    assert found.files == ()
+    X_BW = np.linalg.inv(poses["0001"])
+    for name, true in cameras.items():
+        expected = (X_BW @ true.X_WC)[:3, 3]
+        assert np.linalg.norm(found.calibration.cameras[name].X_WC[:3, 3] - expected) < 0.05
+
+
+def test_spoilt_picture_is_named_and_dropped_on_request(taken, tmp_path):
+    folder, _, _ = taken
+    for name in ("c0", "c1"):
+        place = tmp_path / "images" / name
+        place.mkdir(parents=True)
+        for file in (folder / "images" / name).glob("0*.png"):
+            (place / file.name).write_bytes(file.read_bytes())
+    (tmp_path / "board.yaml").write_text(BOARD_YAML)
+    shared = sorted(
+        {p.name for p in (tmp_path / "images/c0").iterdir()}
+        & {p.name for p in (tmp_path / "images/c1").iterdir()}
+    )
+    late = tmp_path / "images" / "c1" / shared[0]
+    late.write_bytes((tmp_path / "images" / "c1" / shared[1]).read_bytes())
+    with pytest.raises(CameraError, match=f"camera 'c1', picture '{late.stem}'"):
+        calibrate_folder(tmp_path, tmp_path / "board.yaml")
+    found = calibrate_folder(
+        tmp_path, tmp_path / "board.yaml", settings=CalibrationSettings(drop_spoilt=True)
+    )
+    assert ("c1", late.stem) in found.calibration.left_out
+    assert any(late.stem in line for line in found.warnings)
+
+
+@pytest.mark.parametrize(
+    ("prepare", "message"),
+    [
+        (lambda folder: None, "holds no picture"),
+        (lambda folder: _picture(folder, "c0/1.png", (20, 30)), "found in 0 pictures"),
+        (
+            lambda folder: (
+                _picture(folder, "c0/1.png", (20, 30)),
+                _picture(folder, "c0/2.png", (30, 20)),
+            ),
+            r"2\.png: 20 x 30 pixels",
+        ),
+        (
+            lambda folder: (
+                _picture(folder, "c0/1.png", (20, 30)),
+                _picture(folder, "c0/1.jpg", (20, 30)),
+            ),
+            "twice",
+        ),
+    ],
+)
+def test_folders_that_cannot_be_used(tmp_path, prepare, message):
+    (tmp_path / "images").mkdir()
+    (tmp_path / "board.yaml").write_text(BOARD_YAML)
+    prepare(tmp_path)
+    with pytest.raises(CameraError, match=message):
+        calibrate_folder(tmp_path, tmp_path / "board.yaml")
+
+
+def test_missing_folder_and_unknown_camera(taken, tmp_path):
+    folder, _, _ = taken
+    with pytest.raises(CameraError, match="no such folder"):
+        calibrate_folder(tmp_path / "nowhere", folder / "board.yaml")
+    with pytest.raises(UnknownNameError, match="c7"):
+        calibrate_folder(
+            folder, folder / "board.yaml", settings=CalibrationSettings(leave_out=["c7"])
+        )
+
+
+def _picture(folder, name, shape):
+    path = folder / "images" / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), np.zeros(shape, np.uint8))

@@ -1,0 +1,65 @@
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+from drake_pose.commands.main import app
+from drake_pose.errors import SceneError
+from drake_pose.jobs.demo import stored_scene
+from drake_pose.papers.kameda.real_pictures import picture_names
+
+
+def reproduce(*options):
+    return CliRunner().invoke(app, ["reproduce", "kameda", *options])
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--experiment", "D"), ("A, B or C",)),
+        (("--experiment", "B", "--seed", "1"), ("--seed", "--experiment A")),
+        (("--experiment", "C", "--outside-limit", "9"), ("--outside-limit", "--experiment A")),
+    ],
+)
+def test_what_means_nothing_is_refused(options, words):
+    refused = reproduce(*options)
+    assert refused.exit_code == 2
+    for word in words:
+        assert word in refused.stderr
+
+
+def test_a_folder_that_holds_something_is_refused(tmp_path):
+    (tmp_path / "mine.txt").write_text("mine")
+    refused = reproduce("--experiment", "C", "--out", str(tmp_path))
+    assert refused.exit_code == 1
+    assert "not empty" in refused.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_the_pictures_are_there():
+    assert picture_names("B") == ("0000", "0010", "0020", "0030", "0040", "0049")
+    assert len(picture_names("C")) == 2
+    with pytest.raises(SceneError, match="'none'"):
+        stored_scene("none")
+
+
+@pytest.mark.slow
+def test_both_methods_find_the_hand(tmp_path):
+    """One of two pictures; E_total is compared with Drake's label image of the pose found."""
+    made = reproduce("--experiment", "C", "--images", "1", "--out", str(tmp_path / "c"), "--json")
+    assert made.exit_code == 0, made.output
+    ours = json.loads(made.stdout)
+    paper = ours["paper_method"]
+    assert (ours["images"], paper["images"], ours["paper_images"]) == (1, 1, 3)
+    assert (ours["method"], paper["method"]) == ("beam", "paper")
+    assert ours["paper_mean_e_total"] == 0.172
+    for figures in (ours, paper):
+        assert figures["not_found"] == 0
+        assert figures["mean_e_total"] == figures["e_total"]["0000"]
+        folder = tmp_path / "c" / figures["method"]
+        record = json.loads((folder / "summary.json").read_text())["frames"]["0000"]
+        (iou,) = record["ious"].values()
+        # Of an area J of their difference, whichever of the two bodies it lies outside of.
+        assert 1 - iou - 0.005 <= figures["mean_e_total"] <= (1 - iou) / iou + 0.005
+        assert len(list(folder.rglob("overlay/*/0000.png"))) == 1
+    assert ours["mean_e_total"] < min(0.172, paper["mean_e_total"])

@@ -1,0 +1,416 @@
+"""Skeleton, inverse kinematics and the search on circles, against Drake and known poses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.landmarks import landmark_positions, load_landmarks
+from drake_pose.body.model import load_model
+from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.errors import ModelError
+from drake_pose.person.date.body_pose import Waist, estimate_pose, waist_of
+from drake_pose.person.date.inverse_kinematics import move_limb, reach, upper_body
+from drake_pose.person.date.limb_search import (
+    correlation,
+    joint_circle,
+    limb_angles,
+    place_limb,
+    rectangles,
+    search_limb,
+)
+from drake_pose.person.date.skeleton import LIMBS, load_skeleton, rotation
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+
+
+@pytest.fixture(scope="module")
+def person():
+    return load_model(bundled_model("person"), check=False)
+
+
+@pytest.fixture(scope="module")
+def skeleton(person):
+    return load_skeleton(person)
+
+
+def posed(person, **degrees):
+    """Standing, with the given angles."""
+    q = np.array(person.default_positions)
+    q[person.position_index("position_z")] = 1.55
+    for name, value in degrees.items():
+        q[person.position_index(name)] = np.radians(value)
+    return q
+
+
+def drawn_pose(skeleton, generator, share=0.5):
+    """Positions somewhere in the middle of the limits."""
+    middle = 0.5 * (skeleton.lower + skeleton.upper)
+    q = middle + share * generator.uniform(-0.5, 0.5, len(middle)) * (
+        skeleton.upper - skeleton.lower
+    )
+    q[skeleton.head_positions] = generator.uniform([-1, -1, 1.4], [1, 1, 1.7])
+    return q
+
+
+class TestSkeleton:
+    def test_points_are_drakes(self, person, skeleton):
+        generator = np.random.default_rng(0)
+        landmarks = load_landmarks(person.path)
+        for _ in range(5):
+            q = drawn_pose(skeleton, generator, 1.0)
+            true = dict(zip(landmarks, landmark_positions(person, landmarks, q), strict=True))
+            np.testing.assert_allclose(skeleton.trunk_pose(q)[1], true["neck"], atol=1e-12)
+            for name in LIMBS:
+                side, kind = name.split("_")
+                root, middle = ("shoulder", "elbow") if kind == "arm" else ("hip", "knee")
+                points = skeleton.limb_points(q, name)
+                np.testing.assert_allclose(points[0], true[f"{side}_{root}"], atol=1e-12)
+                np.testing.assert_allclose(points[1], true[f"{side}_{middle}"], atol=1e-12)
+
+    def test_ends_are_inside_hands_and_feet(self, person, skeleton):
+        q = drawn_pose(skeleton, np.random.default_rng(1))
+        context = person.plant.CreateDefaultContext()
+        person.plant.SetPositions(context, q)
+        features = skeleton.features(q)
+        links = ("head", "left_hand", "right_hand", "left_foot", "right_foot")
+        for link, place in zip(links, features, strict=True):
+            X_WL = person.plant.GetBodyByName(link).EvalPoseInWorld(context).GetAsMatrix4()
+            vertices = person.link_meshes[link].vertices @ X_WL[:3, :3].T + X_WL[:3, 3]
+            assert (vertices.min(axis=0) < place).all()
+            assert (place < vertices.max(axis=0)).all()
+
+    def test_other_models_are_refused(self):
+        with pytest.raises(ModelError, match="trunk"):
+            load_skeleton(load_model(bundled_model("man"), check=False))
+
+
+class TestReach:
+    def test_jacobian_leads_to_the_target(self, skeleton):
+        generator = np.random.default_rng(2)
+        for name in LIMBS:
+            limb = skeleton.limbs[name]
+            for _ in range(10):
+                middle = 0.5 * (limb.lower + limb.upper)
+                true = middle + 0.3 * generator.uniform(-1, 1, 4) * (limb.upper - limb.lower)
+                q = np.zeros(len(skeleton.lower))
+                q[limb.positions] = true
+                root, _, end = skeleton.limb_points(q, name)
+                start = np.clip(true + generator.uniform(-0.3, 0.3, 4), limb.lower, limb.upper)
+                R_WT, _ = skeleton.trunk_pose(q)
+                found = move_limb(limb, R_WT, root, start, end)
+                q[limb.positions] = found
+                assert np.linalg.norm(skeleton.limb_points(q, name)[2] - end) < 2e-3
+                assert (found >= limb.lower).all()
+                assert (found <= limb.upper).all()
+
+    def test_steps_are_small(self, skeleton):
+        limb = skeleton.limbs["left_arm"]
+        offsets = np.zeros((4, 3))
+        offsets[3] = limb.middle_U
+        start = np.array([0.1, 0.3, 0.0, -0.5])
+        moved, distance = reach(
+            np.eye(3), np.zeros(3), limb.axes, offsets, limb.end_L, start, limb.lower, limb.upper,
+            np.ones(4, dtype=bool), np.array([0.3, 0.4, 0.3]), 5,
+        )  # fmt: skip
+        assert 0 < np.abs(moved - start).max() <= 5 * np.radians(2.0) + 1e-12
+        assert distance > 0.1
+
+    def test_out_of_reach_keeps_the_limits(self, skeleton):
+        limb = skeleton.limbs["right_leg"]
+        found = move_limb(limb, np.eye(3), np.zeros(3), np.zeros(4), np.array([0.0, 3.0, 0.0]))
+        assert np.isfinite(found).all()
+        assert (found >= limb.lower).all()
+        assert (found <= limb.upper).all()
+
+    @pytest.mark.parametrize("face_known", [True, False])
+    def test_both_hands_are_reached(self, person, skeleton, face_known):
+        before = posed(person, left_upper_arm_z=20, right_upper_arm_z=-20)
+        after = posed(
+            person, left_upper_arm_z=45, left_forearm_x=-40, right_upper_arm_x=-50,
+            right_upper_arm_z=-25, right_forearm_x=-30, neck_base_x=6,
+        )  # fmt: skip
+        features = skeleton.features(after)
+        found = upper_body(skeleton, before, features, face_known=face_known)
+        hands = skeleton.features(found)[1:3]
+        assert np.linalg.norm(hands - features[1:3], axis=1).max() < 5e-3
+        same = found[skeleton.head_angles] == before[skeleton.head_angles]
+        assert same.all() == face_known
+
+
+class TestCircle:
+    @pytest.mark.parametrize("name", LIMBS)
+    def test_joint_lies_on_its_circle(self, skeleton, name):
+        generator = np.random.default_rng(3)
+        limb = skeleton.limbs[name]
+        for _ in range(20):
+            q = drawn_pose(skeleton, generator)
+            root, middle, end = skeleton.limb_points(q, name)
+            neck = skeleton.trunk_pose(q)[1]
+            circle = joint_circle(limb, root, end, root - neck)
+            assert abs(np.linalg.norm(middle - circle.center) - circle.radius) < 1e-9
+            for point in circle.points(np.array([0.0, 45.0, 200.0])):
+                assert np.linalg.norm(point - root) == pytest.approx(limb.lengths[0])
+                assert np.linalg.norm(point - end) == pytest.approx(limb.lengths[1])
+            np.testing.assert_allclose(circle.i @ circle.j, 0.0, atol=1e-12)
+
+    def test_directions_are_the_papers(self, person, skeleton):
+        # Arms hang a little bent, he faces +x: 0 degrees is behind him, 90 degrees outwards.
+        q = posed(person, left_forearm_x=-40, right_forearm_x=-40)
+        for name, side in (("left_arm", 1.0), ("right_arm", -1.0)):
+            root, _, end = skeleton.limb_points(q, name)
+            circle = joint_circle(skeleton.limbs[name], root, end, root - skeleton.trunk_pose(q)[1])
+            assert circle.i[1] * side > 0.9
+            assert circle.j[0] < -0.7
+        q = posed(person, left_shin_x=60, right_shin_x=60, left_thigh_x=-30, right_thigh_x=-30)
+        for name, side in (("left_leg", 1.0), ("right_leg", -1.0)):
+            root, middle, end = skeleton.limb_points(q, name)
+            outward = root - skeleton.limb_points(q, "left_leg")[0]
+            outward = outward if outward.any() else np.array([0.0, 1.0, 0.0])
+            circle = joint_circle(skeleton.limbs[name], root, end, np.array([0.0, side, 0.0]))
+            assert circle.i[1] * side > 0.9
+            assert circle.j[0] > 0.7
+            assert (middle - circle.center) @ circle.j > 0.9 * circle.radius
+
+    def test_limb_beyond_its_reach_is_straight(self, skeleton):
+        limb = skeleton.limbs["left_arm"]
+        circle = joint_circle(limb, np.zeros(3), np.array([0, 0, -2.0]), np.array([0, 1.0, 0]))
+        assert circle.radius == 0.0
+        assert circle.center[2] == pytest.approx(-2.0 * limb.lengths[0] / sum(limb.lengths))
+
+    def test_rectangles(self):
+        root, middle, end = np.zeros(3), np.array([0.0, 0.3, 0.0]), np.array([0.4, 0.3, 0.0])
+        points = rectangles(root, middle[None], end, np.array([0.05, 0.02]))[0]
+        assert np.abs(points[:, 2]).max() == 0.0
+        first, second = points[:60], points[60:]
+        assert np.abs(first[:, 0]).max() == pytest.approx(0.05)
+        assert np.abs(second[:, 1] - 0.3).max() == pytest.approx(0.02)
+        np.testing.assert_allclose(first.mean(axis=0), [0, 0.15, 0], atol=1e-12)
+
+    def test_correlation_is_the_share_inside(self):
+        cameras = list(circle_of_cameras(2, face_camera=False).values())
+        generator = np.random.default_rng(4)
+        samples = generator.uniform([-2.5, -2.5, 0], [2.5, 2.5, 2], (3, 200, 3))
+        regions = [generator.uniform(size=(480, 640)) < 0.4 for _ in cameras]
+        expected = np.zeros(3)
+        for camera, region in zip(cameras, regions, strict=True):
+            for n in range(3):
+                uv, depth = camera.project(samples[n])
+                uv = np.floor(uv[depth > camera.near] + 0.5).astype(int)
+                ok = (uv >= 0).all(axis=1) & (uv < [640, 480]).all(axis=1)
+                expected[n] += region[uv[ok, 1], uv[ok, 0]].mean() / 2
+        np.testing.assert_allclose(correlation(samples, cameras, regions), expected)
+        nobody = np.zeros((480, 640), bool)
+        alone = correlation(samples, cameras[:1], regions[:1])
+        np.testing.assert_allclose(correlation(samples, cameras, [regions[0], nobody]), alone)
+
+
+class TestAngles:
+    @pytest.mark.parametrize("name", LIMBS)
+    def test_angles_come_back_from_points(self, skeleton, name):
+        generator = np.random.default_rng(5)
+        limb = skeleton.limbs[name]
+        for _ in range(30):
+            q = drawn_pose(skeleton, generator, 0.9)
+            root, middle, end = skeleton.limb_points(q, name)
+            R_WT, _ = skeleton.trunk_pose(q)
+            true = q[limb.positions]
+            if abs(true[3]) < 0.3:
+                continue
+            near = true + generator.uniform(-0.1, 0.1, 4)
+            found = limb_angles(limb, R_WT, root, middle, end, near)
+            q[limb.positions] = found
+            moved = skeleton.limb_points(q, name)
+            assert np.abs(moved - [root, middle, end]).max() < 1e-6
+
+    def test_straight_arm_is_not_turned_about_itself(self, skeleton):
+        limb = skeleton.limbs["left_arm"]
+        last = np.array([0.2, 0.4, 0.5, 0.0])
+        q = np.zeros(len(skeleton.lower))
+        q[limb.positions] = last
+        root, _, _ = skeleton.limb_points(q, "left_arm")
+        end = root + np.array([0.0, 0.7, -0.2])
+        middle = root + (end - root) * limb.lengths[0] / sum(limb.lengths)
+        R_WT, _ = skeleton.trunk_pose(q)
+        found = limb_angles(limb, R_WT, root, middle, end, last)
+        R_before = rotation(limb.axes[:3], last[:3])
+        R_after = rotation(limb.axes[:3], found[:3])
+        # The shortest turn from the old direction of the arm to the new one, and no other.
+        turned = np.arccos((np.trace(R_before.T @ R_after) - 1) / 2)
+        old, new = R_WT @ R_before @ limb.middle_U, end - root
+        needed = np.arccos(old @ new / np.linalg.norm(old) / np.linalg.norm(new))
+        assert turned < needed + 0.1
+
+    def test_limits_hold_for_impossible_points(self, skeleton):
+        generator = np.random.default_rng(6)
+        for name in LIMBS:
+            limb = skeleton.limbs[name]
+            for _ in range(20):
+                points = generator.uniform(-1, 1, (3, 3))
+                found = limb_angles(limb, np.eye(3), *points, np.zeros(4))
+                assert np.isfinite(found).all()
+                assert (found >= limb.lower).all()
+                assert (found <= limb.upper).all()
+
+
+@pytest.fixture(scope="module")
+def views(person):
+    cameras = list(circle_of_cameras(8, size=(320, 240), face_camera=False).values())
+    return cameras, [LabelRenderer(person, camera) for camera in cameras]
+
+
+class TestPose:
+    def test_waist(self):
+        features = np.array([[0.1, 0.2, 1.6], [0, 0, 0], [0, 0, 0], [0, 0, 0.04], [0, 0, 0.2]])
+        expected = [0.1, 0.2, 0.55 * 1.6 + 0.225 * 0.2 + 0.225 * 0.04]
+        np.testing.assert_allclose(Waist().place(features, 0.7), expected)
+
+    def test_a_lifted_foot_does_not_lift_the_waist_out_of_the_legs_reach(
+        self, person, skeleton, views
+    ):
+        """The formula takes the mean of both feet; above the legs' reach no circle is left."""
+        cameras, renderers = views
+        true = posed(person, left_thigh_x=-25, left_shin_x=6, right_thigh_x=25, right_shin_x=30)
+        regions = [renderer.mask(true) for renderer in renderers]
+        features, own = skeleton.features(true), waist_of(skeleton)
+        hips = np.mean([skeleton.limb_points(true, name)[0] for name in LIMBS[2:]], axis=0)
+        found = {
+            in_reach: estimate_pose(
+                skeleton, posed(person), features, true[skeleton.head_angles], cameras, regions,
+                waist=replace(own, in_reach=in_reach),
+            )
+            for in_reach in (False, True)
+        }  # fmt: skip
+        assert found[False].waist[2] - hips[2] > 0.02
+        assert abs(found[True].waist[2] - hips[2]) < 0.012
+        knees = np.array([skeleton.limb_points(true, name)[1] for name in LIMBS[2:]])
+        errors = {
+            key: np.linalg.norm([one.limbs[n][1] for n in LIMBS[2:]] - knees, axis=1).mean()
+            for key, one in found.items()
+        }
+        assert errors[True] < 0.6 * errors[False]
+
+    def test_search_finds_elbows_that_inverse_kinematics_misses(self, person, skeleton, views):
+        cameras, renderers = views
+        true = posed(
+            person, left_upper_arm_z=75, left_upper_arm_y=-20, left_forearm_x=-85,
+            right_upper_arm_z=-75, right_upper_arm_y=20, right_forearm_x=-85,
+        )  # fmt: skip
+        regions = [renderer.mask(true) for renderer in renderers]
+        last = posed(person, left_upper_arm_z=15, right_upper_arm_z=-15)
+        features = skeleton.features(true)
+        errors = {}
+        for search in ("surfaces", "rectangles", "none"):
+            found = estimate_pose(
+                skeleton, last, features, true[skeleton.head_angles], cameras, regions,
+                search=search,
+            )  # fmt: skip
+            errors[search] = max(
+                np.linalg.norm(found.limbs[name][1] - skeleton.limb_points(true, name)[1])
+                for name in ("left_arm", "right_arm")
+            )
+        assert errors["rectangles"] < 0.07
+        assert errors["rectangles"] < 0.6 * errors["none"]
+        assert errors["surfaces"] < 0.02
+
+    @pytest.mark.parametrize(("search", "off"), [("surfaces", 0.015), ("rectangles", 0.05)])
+    def test_search_finds_a_knee(self, person, skeleton, views, search, off):
+        cameras, renderers = views
+        true = posed(person, left_thigh_x=-60, left_thigh_z=30, left_shin_x=70)
+        regions = [renderer.mask(true) for renderer in renderers]
+        limb = skeleton.limbs["left_leg"]
+        root, middle, end = skeleton.limb_points(true, "left_leg")
+        R_WT, _ = skeleton.trunk_pose(true)
+        last = true[limb.positions]
+        found = search_limb(
+            limb, R_WT, root, end, np.array([0.0, 1.0, 0.0]), root, last, cameras, regions, search
+        )
+        assert np.linalg.norm(found.middle - middle) < off
+        assert found.score > 0.85
+
+    @pytest.mark.parametrize(
+        ("bend", "search", "off"),
+        [
+            (0.0, "rectangles", 0.01),
+            (15.0, "rectangles", 0.04),
+            (100.0, "rectangles", 0.06),
+            (0.0, "surfaces", 0.01),
+            (15.0, "surfaces", 0.015),
+            (100.0, "surfaces", 0.015),
+        ],
+    )
+    def test_search_finds_the_knees_of_straight_and_bent_legs(
+        self, person, skeleton, views, bend, search, off
+    ):
+        """Of a straight leg the knee lies behind the line from the hip to the foot's middle."""
+        cameras, renderers = views
+        true = posed(person, left_thigh_x=-0.6 * bend, left_shin_x=bend)
+        regions = [renderer.mask(true) for renderer in renderers]
+        limb = skeleton.limbs["left_leg"]
+        root, middle, end = skeleton.limb_points(true, "left_leg")
+        R_WT, _ = skeleton.trunk_pose(true)
+        last, outward = np.radians([0.0, 0.0, 0.0, 20.0]), np.array([0.0, 1.0, 0.0])
+        found = search_limb(limb, R_WT, root, end, outward, root, last, cameras, regions, search)
+        assert np.linalg.norm(found.middle - middle) < off
+
+    @pytest.mark.parametrize("along", [-0.012, -0.004, 0.004, 0.012])
+    def test_an_end_measured_a_little_off_hardly_moves_the_knee(
+        self, person, skeleton, views, along
+    ):
+        """A nearly straight leg's circle is 2 cm wider where the foot is 1 mm too near."""
+        cameras, renderers = views
+        true = posed(person, left_thigh_x=-12, left_shin_x=15)
+        regions = [renderer.mask(true) for renderer in renderers]
+        limb = skeleton.limbs["left_leg"]
+        root, middle, end = skeleton.limb_points(true, "left_leg")
+        R_WT, _ = skeleton.trunk_pose(true)
+        measured = end + along * (end - root) / np.linalg.norm(end - root)
+        last, outward = true[limb.positions], np.array([0.0, 1.0, 0.0])
+        off = {
+            search: np.linalg.norm(
+                search_limb(
+                    limb, R_WT, root, measured, outward, middle, last, cameras, regions, search
+                ).middle
+                - middle
+            )
+            for search in ("surfaces", "rectangles")
+        }
+        assert off["surfaces"] < 0.02
+        assert off["surfaces"] < off["rectangles"]
+
+    @pytest.mark.parametrize("name", LIMBS)
+    def test_a_limb_is_placed_where_its_limits_allow_it(self, skeleton, name):
+        """Anywhere on its circle, by its own kinematics; where it truly is, inside its limits."""
+        generator = np.random.default_rng(5)
+        limb = skeleton.limbs[name]
+        for _ in range(20):
+            q = drawn_pose(skeleton, generator)
+            root, middle, end = skeleton.limb_points(q, name)
+            R_WT, _ = skeleton.trunk_pose(q)
+            across = (end - root) / np.linalg.norm(end - root)
+            turns = Rotation.from_rotvec(np.linspace(0.0, 5.0, 6)[:, None] * across)
+            middles = root + turns.apply(middle - root)
+            angles, beyond = place_limb(limb, R_WT, root, middles, end, q[limb.positions])
+            assert beyond[0] < 1e-6
+            excess = np.abs(angles - np.clip(angles, limb.lower, limb.upper)).max(axis=1)
+            np.testing.assert_allclose(beyond, excess, atol=1e-6)
+            for place, found in zip(middles, angles, strict=True):
+                turned = np.array(q)
+                turned[limb.positions] = found
+                points = skeleton.limb_points(turned, name)
+                np.testing.assert_allclose(points, [root, place, end], atol=1e-6)
+
+    def test_positions_hold_the_limits(self, person, skeleton, views):
+        cameras, renderers = views
+        generator = np.random.default_rng(7)
+        true = posed(person, left_upper_arm_z=40)
+        regions = [renderer.mask(true) for renderer in renderers]
+        for _ in range(10):
+            features = skeleton.features(true) + generator.normal(0, 0.3, (5, 3))
+            found = estimate_pose(
+                skeleton, true, features, generator.normal(0, 2, 2), cameras, regions
+            )
+            assert np.isfinite(found.q).all()
+            assert (found.q >= skeleton.lower).all()
+            assert (found.q <= skeleton.upper).all()

@@ -1,0 +1,150 @@
+import math
+
+import numpy as np
+import pytest
+
+from drake_pose.errors import SettingsError
+from drake_pose.person.date.walk_commands import (
+    NO_COMMAND,
+    NO_STEPS,
+    WalkSettings,
+    follow_command,
+    follow_steps,
+    offsets_from_rest,
+    recognise_command,
+    stance_of,
+    walks_on_spot,
+)
+
+SETTINGS = WalkSettings()
+
+
+def stance(heading_deg=0.0, ahead=0.0, left=0.0, feet_ahead=None, nod_deg=0.0):
+    """Somebody who rests at (1, 2), facing along y: ahead is +y, left is -x."""
+    heading, nod = math.radians(heading_deg + 90.0), math.radians(nod_deg)
+    forward = np.array(
+        [math.cos(heading) * math.cos(nod), math.sin(heading) * math.cos(nod), -math.sin(nod)]
+    )
+    up = np.array(
+        [math.cos(heading) * math.sin(nod), math.sin(heading) * math.sin(nod), math.cos(nod)]
+    )
+    feet = ahead if feet_ahead is None else feet_ahead
+    head_W = np.array([1.0 - left, 2.0 + ahead, 1.6])
+    feet_W = np.array([[0.9 - left, 2.1 + feet, 0.05], [1.1 - left, 1.9 + feet, 0.05]])
+    return stance_of(np.cross(up, forward), head_W, feet_W)
+
+
+REST = stance()
+
+
+def commands(stances):
+    last, found = NO_COMMAND, []
+    for one in stances:
+        last = recognise_command(one, REST, last, SETTINGS)
+        found.append(last)
+    return found
+
+
+@pytest.mark.parametrize("nod_deg", [0.0, 40.0, 90.0])
+def test_heading_does_not_depend_on_the_nod(nod_deg):
+    turned, ahead = offsets_from_rest(stance(30.0, nod_deg=nod_deg), REST)
+    assert math.degrees(turned) == pytest.approx(30.0)
+    assert ahead == pytest.approx(0.0)
+
+
+def test_table_1():
+    turns = [stance(), stance(40.0), stance(), stance(-40.0), stance()]
+    walks = [stance(ahead=0.3), stance(), stance(ahead=-0.3)]
+    found = commands([*turns, *walks, stance(-40.0, ahead=0.3), stance()])
+    turn = [0, 1, 0, -1, 0, 0, 0, 0, -1, 0]
+    walk = [0, 0, 0, 0, 0, 1, 0, -1, 1, 0]
+    assert found == list(zip(turn, walk, strict=True))
+
+
+def spot_walk(lifts, seconds=0.1):
+    steps, found = np.array(NO_STEPS), []
+    for lift in lifts:
+        steps = follow_steps(lift, steps, seconds, SETTINGS)
+        found.append(walks_on_spot(steps))
+    return found
+
+
+def test_one_foot_and_then_the_other_is_walking_on_the_spot():
+    step = [0.0, 0.1, 0.1, 0.0]
+    left, right = np.array(step), -np.array(step)
+    assert spot_walk([*left, *right, *left]) == [False] * 5 + [True] * 7
+    # It ends one pause after the last step.
+    found = spot_walk([*left, *right, *([0.0] * 12)])
+    assert found[5:14] == [True] * 9
+    assert not any(found[16:])
+
+
+def test_what_is_no_walking_on_the_spot():
+    foot_held_up = [0.2] * 30
+    same_foot = [0.1, 0.0] * 15
+    noise = list(np.random.default_rng(0).normal(0.0, 0.01, 60))
+    slow = ([0.1] + [0.0] * 12 + [-0.1] + [0.0] * 12) * 3
+    lost = [math.nan] * 10
+    for lifts in (foot_held_up, same_foot, noise, slow, lost):
+        assert not any(spot_walk(lifts))
+
+
+def test_command_begins_late_and_ends_early():
+    degrees = [20.0, 26.0, 20.0, 16.0, 14.0, 20.0, -24.0, -26.0, -16.0, 16.0]
+    assert [c[0] for c in commands(stance(d) for d in degrees)] == [0, 1, 1, 1, 0, 0, 0, -1, -1, 0]
+    metres = [0.15, 0.2, 0.12, 0.09, 0.15, -0.2, -0.12, 0.12, 0.3]
+    found = [c[1] for c in commands(stance(ahead=m) for m in metres)]
+    assert found == [0, 1, 1, 0, 0, -1, -1, 0, 1]
+
+
+def test_noise_at_the_threshold_does_not_flicker():
+    generator = np.random.default_rng(3)
+    noise = generator.normal(0.0, 0.02, 300)
+    found = [c[1] for c in commands([stance(), *(stance(ahead=0.18 + n) for n in noise)])]
+    assert np.count_nonzero(np.diff(found)) == 1
+
+
+def test_leaning_stepping_aside_and_being_lost_do_not_walk():
+    assert commands([stance(ahead=0.4, feet_ahead=0.0)]) == [NO_COMMAND]
+    assert commands([stance(ahead=0.0, feet_ahead=-0.4)]) == [NO_COMMAND]
+    assert commands([stance(ahead=0.3, feet_ahead=-0.3)]) == [NO_COMMAND]
+    assert commands([stance(left=0.5)]) == [NO_COMMAND]
+    assert commands([stance(ahead=0.4), np.full(5, np.nan)]) == [(0, 1), NO_COMMAND]
+
+
+def test_facing_backwards_is_a_turn_whichever_way_the_angle_wraps():
+    assert commands([stance(175.0)]) == [(1, 0)]
+    assert commands([stance(-175.0)]) == [(-1, 0)]
+
+
+@pytest.mark.parametrize("command", [(1, 1), (-1, 1), (0, -1), (1, -1), (1, 0)])
+def test_way_is_that_of_many_small_steps(command):
+    pose, small, count = np.array([0.3, -0.2, 0.7]), np.array([0.3, -0.2, 0.7]), 20_000
+    for _ in range(count):
+        small[:2] += (
+            command[1]
+            * SETTINGS.speed
+            * 1.5
+            / count
+            * np.array([math.cos(small[2]), math.sin(small[2])])
+        )
+        small[2] += command[0] * SETTINGS.turn_rate * 1.5 / count
+    np.testing.assert_allclose(follow_command(pose, command, 1.5, SETTINGS), small, atol=1e-4)
+
+
+def test_walls_and_obstacles_are_not_walked_through():
+    pose, obstacles = np.array([-4.0, 0.05, 0.0]), np.array([[0.0, 0.0, 0.5]])
+    nearest = math.inf
+    for _ in range(400):
+        pose = follow_command(pose, (0, 1), 1 / 30, SETTINGS, 5.0, obstacles)
+        nearest = min(nearest, float(np.hypot(*pose[:2])))
+    assert nearest == pytest.approx(0.5 + SETTINGS.body_radius, abs=1e-9)
+    assert pose[0] == pytest.approx(5.0 - SETTINGS.body_radius)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"turn_begin": 0.1}, {"step_end": 0.5}, {"speed": 0.0}, {"turn_rate": math.nan}]
+)
+def test_settings_that_cannot_be_are_refused(wrong):
+    with pytest.raises(SettingsError, match=next(iter(wrong)).split("_")[0]):
+        WalkSettings(**wrong)

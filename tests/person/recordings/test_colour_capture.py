@@ -1,0 +1,160 @@
+"""A person in clothes of several colours before a room of patches: the truth is known."""
+
+import numpy as np
+import pytest
+
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.landmarks import landmark_positions, load_landmarks
+from drake_pose.body.model import load_model
+from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.errors import SettingsError
+from drake_pose.fit.colour_lines import BESIDE, ON
+from drake_pose.fit.contour_fit import ContourFit
+from drake_pose.person.colour_views import ColourViews, PersonColourSettings
+from drake_pose.person.recordings.colour_capture import ColourRecording, capture_by_colour
+from drake_pose.person.shape import shape_noise
+from drake_pose.person.silhouette_tracker import SilhouetteTracker
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from tests.person.recordings.test_person_capture import stepping
+
+FRAMES = 8
+CLOTHES = np.array([[230, 130, 40], [200, 40, 60], [240, 210, 60], [120, 20, 30], [250, 160, 150]])
+
+
+@pytest.fixture(scope="module")
+def person():
+    return load_model(bundled_model("person"), check=False)
+
+
+@pytest.fixture(scope="module")
+def cameras():
+    return circle_of_cameras(4, size=(320, 240), face_camera=False)
+
+
+@pytest.fixture(scope="module")
+def recording(person, cameras):
+    """What the cameras see of a few steps, the masks, and the positions."""
+    generator = np.random.default_rng(11)
+    renderers = {name: LabelRenderer(person, camera) for name, camera in cameras.items()}
+    # Clothes are warm, the room is cold.
+    rooms = {
+        name: generator.integers(0, 256, (24, 32, 3)).repeat(10, axis=0).repeat(10, axis=1)
+        * np.array([0.4, 0.9, 1.0])
+        for name in cameras
+    }
+    q = np.array([stepping(person, 0.12 * k) for k in range(FRAMES)])
+    pictures, masks = [], []
+    for pose in q:
+        segments = {name: one.segments(pose) for name, one in renderers.items()}
+        masks.append({name: one >= 0 for name, one in segments.items()})
+        pictures.append(
+            {name: _painted(one, rooms[name], generator) for name, one in segments.items()}
+        )
+    return pictures, masks, q
+
+
+def _painted(segments, room, generator):
+    colours = CLOTHES[np.maximum(segments, 0) % len(CLOTHES)]
+    picture = np.where((segments >= 0)[..., None], colours, room)
+    noisy = picture + generator.normal(0.0, 5.0, picture.shape)
+    return np.clip(noisy, 0, 255).astype(np.uint8)
+
+
+def joint_errors(person, found, truth):
+    """Distances of joint centres [mm]."""
+    landmarks = load_landmarks(person.path)
+    places = [landmark_positions(person, landmarks, q) for q in (found, truth)]
+    return 1e3 * np.linalg.norm(np.array(places[0]) - np.array(places[1]), axis=1)
+
+
+def given(cameras, recording, starts, masks=lambda _: {}, pictures=None):
+    pictures = recording[0] if pictures is None else pictures
+    return ColourRecording(cameras, FRAMES, masks, lambda k: pictures[k], starts)
+
+
+def test_followed_from_a_start_without_any_mask(person, cameras, recording):
+    heard = []
+    captured = capture_by_colour(
+        person.pose_tree(), given(cameras, recording, {0: recording[2][0]}), (),
+        on_frame=heard.append,
+    ).captured  # fmt: skip
+    assert heard == list(range(FRAMES))
+    errors = np.array(
+        [joint_errors(person, *pair) for pair in zip(captured.q, recording[2], strict=True)]
+    )
+    # The person has moved on by more than that.
+    assert joint_errors(person, recording[2][0], recording[2][-1]).max() > 100.0
+    assert np.mean(errors) < 15.0
+    assert np.all(captured.shares > 0.8)
+    angles = [k for k, kind in enumerate(person.position_kinds) if kind == "angle"]
+    assert np.all(captured.deviations[:, angles] > 0.0)
+
+
+def test_a_loss_is_said_and_a_start_goes_on(person, cameras, recording):
+    grey = {name: np.full((240, 320, 3), 128, np.uint8) for name in cameras}
+    pictures = [*recording[0][:3], grey, grey, *recording[0][5:]]
+    starts = {0: recording[2][0], 5: recording[2][5]}
+    found = capture_by_colour(
+        person.pose_tree(), given(cameras, recording, starts, pictures=pictures), ()
+    ).captured
+    lost = np.isnan(found.q).any(axis=1)
+    assert lost.tolist() == [False] * 3 + [True] * 2 + [False] * 3
+    assert np.isnan(found.deviations[lost]).all()
+    assert np.mean(joint_errors(person, found.q[-1], recording[2][-1])) < 20.0
+
+
+def test_nothing_is_found_before_it_is_said_where_the_person_is(person, cameras, recording):
+    found = capture_by_colour(
+        person.pose_tree(), given(cameras, recording, {4: recording[2][4]}), ()
+    )
+    assert np.isnan(found.captured.q[:4]).all()
+    assert np.isfinite(found.captured.q[4:]).all()
+    assert np.isfinite(found.distances[4:]).all()
+
+
+@pytest.mark.slow
+def test_followed_from_masks_of_the_first_frame(person, cameras, recording):
+    def masks(k):
+        return recording[1][k] if k == 0 else {}
+
+    found = capture_by_colour(person.pose_tree(), given(cameras, recording, {}, masks), (0,))
+    assert found.masked == (0,)
+    errors = joint_errors(person, found.captured.q[-1], recording[2][-1])
+    assert np.mean(errors) < 20.0
+
+
+class TestLearning:
+    def test_masks_say_which_colours_are_the_persons(self, person, cameras, recording):
+        """Of a model that is 4 cm off, colours are learned right where the masks are known."""
+        pictures, masks, q = (one[0] for one in recording)
+        fit = ContourFit(person.pose_tree(), noise=shape_noise())
+        tracker = SilhouetteTracker(fit)
+        off = q.copy()
+        off[person.position_index("position_y")] += 0.04
+        views = ColourViews(list(cameras.values()), list(pictures.values()), {})
+        wrong = []
+        for regions in (None, masks):
+            known = views.learned(fit, tracker.values(off), regions)
+            # Red is little in the room.
+            on = sum(one[:, ON].reshape(-1, 16, 256)[:, :7].sum() for one in known.values())
+            seen = sum((one[:, ON].sum(axis=1) > 0.0).sum() for one in known.values())
+            wrong.append(on / seen)
+            beside = [one[:, BESIDE].sum(axis=1) for one in known.values()]
+            assert np.all(np.isclose(beside, 0.0) | np.isclose(beside, 1.0, atol=1e-3))
+        assert wrong[1] < 0.5 * wrong[0]
+
+    def test_a_camera_that_is_not_known_says_nothing(self, person, cameras, recording):
+        pictures, _, q = (one[0] for one in recording)
+        fit = ContourFit(person.pose_tree(), noise=shape_noise())
+        tracker = SilhouetteTracker(fit)
+        views = ColourViews(list(cameras.values()), list(pictures.values()), {})
+        state = tracker.follow_by_colour(tracker.start(tracker.values(q)), views)
+        assert state.share == 0.0
+        assert tracker.is_lost(state)
+        assert np.isnan(tracker.distance_by_colour(state.values, views))
+
+    def test_settings_are_checked(self):
+        with pytest.raises(SettingsError, match="rate"):
+            PersonColourSettings(rate=1.5)
+        with pytest.raises(SettingsError, match="inside"):
+            PersonColourSettings(inside=0.0)

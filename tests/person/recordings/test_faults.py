@@ -1,0 +1,263 @@
+"""Cameras that moved, rigs that are mirrored or exchanged, others in view."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.camera.models import Camera
+from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.fit.contour_fit import ContourFit
+from drake_pose.fit.evidence import find_edge_points
+from drake_pose.person.recordings.camera_faults import (
+    CameraFault,
+    FrameView,
+    camera_motion,
+    find_fault,
+    moved_since,
+)
+from drake_pose.person.recordings.figures import cut_figures, find_figures, find_persons
+from drake_pose.person.recordings.other_persons import keep_person, keep_views
+from drake_pose.person.recordings.person_recording import PersonRecording
+from drake_pose.person.recordings.rig_faults import find_rig_fault
+from drake_pose.person.silhouette_tracker import SilhouetteTracker
+from drake_pose.person.silhouette_view import see_silhouette
+from drake_pose.silhouette.pictures.scenes import load_scene
+from tests.person.persons_in_view import see, stepping
+
+Masks = list[dict[str, np.ndarray]]
+
+
+@dataclass(frozen=True)
+class Stage:
+    person: ArticulatedModel
+    fit: ContourFit
+    cameras: Mapping[str, Camera]
+    poses: np.ndarray
+    masks: Masks
+
+    def frames(self, masks: Masks) -> list[FrameView]:
+        tracker = SilhouetteTracker(self.fit)
+        return [
+            FrameView({n: find_edge_points(m, 2.0) for n, m in own.items()}, tracker.values(q))
+            for own, q in zip(masks, self.poses, strict=True)
+        ]
+
+    def find(self, masks: Masks) -> CameraFault | None:
+        return find_fault(self.fit, self.cameras, self.frames(masks))
+
+    def seen_by_moved(self, name: str, turn: float, shift: tuple[float, float, float]) -> Masks:
+        """What the rig sees where a camera was turned about the vertical [deg] and shifted [m]."""
+        X_WC = self.cameras[name].X_WC.copy()
+        R = Rotation.from_euler("z", turn, degrees=True).as_matrix()
+        X_WC[:3, :3] = R @ X_WC[:3, :3]
+        X_WC[:3, 3] += shift
+        moved = {name: self.cameras[name].with_pose(X_WC)}
+        seen = see(self.person, moved, self.poses)
+        return [{**own, **new} for own, new in zip(self.masks, seen, strict=True)]
+
+
+def make_stage(count: int) -> Stage:
+    person = load_model(bundled_model("person"), check=False)
+    cameras = circle_of_cameras(count, size=(160, 120), face_camera=False)
+    poses = np.array([stepping(person, 0.4 * k, -0.2 + 0.1 * k, 0.1) for k in range(4)])
+    fit = ContourFit(person.pose_tree())
+    return Stage(person, fit, cameras, poses, see(person, cameras, poses))
+
+
+@pytest.fixture(scope="module")
+def four() -> Stage:
+    return make_stage(4)
+
+
+@pytest.fixture(scope="module")
+def nine() -> Stage:
+    return make_stage(9)
+
+
+MOVES = {
+    "3 degrees": (3.0, (0.0, 0.0, 0.0)),
+    "10 degrees": (-10.0, (0.0, 0.0, 0.0)),
+    "5 cm": (0.0, (0.0, 0.0, 0.05)),
+    "20 cm": (0.0, (0.2, 0.0, 0.0)),
+}
+
+
+class TestMovedCamera:
+    @pytest.mark.parametrize("stage", ["four", "nine"])
+    @pytest.mark.slow
+    def test_sound_rig_has_no_fault(self, stage: str, request: pytest.FixtureRequest) -> None:
+        found = request.getfixturevalue(stage)
+        assert found.find(found.masks) is None
+
+    @pytest.mark.parametrize("name", ["3 degrees", "5 cm"])
+    @pytest.mark.slow
+    def test_moved_camera_is_found_among_nine(self, name: str, nine: Stage) -> None:
+        fault = nine.find(nine.seen_by_moved("camera_2", *MOVES[name]))
+        assert fault is not None
+        assert (fault.name, fault.is_explained, fault.rivals) == ("camera_2", True, ())
+        # How far the person's middle moved in the picture is known from the cameras alone.
+        middle = np.array([[*nine.poses[:, :2].mean(axis=0), 1.0]])
+        camera = nine.cameras["camera_2"]
+        turn, shift = MOVES[name]
+        X_WC = camera.X_WC.copy()
+        X_WC[:3, :3] = Rotation.from_euler("z", turn, degrees=True).as_matrix() @ X_WC[:3, :3]
+        X_WC[:3, 3] += shift
+        off = camera.with_pose(X_WC).project(middle)[0] - camera.project(middle)[0]
+        np.testing.assert_allclose(fault.motion.shift, off[0], atol=1.5)
+
+    @pytest.mark.parametrize("name", MOVES)
+    def test_moved_camera_is_found_among_four(self, name: str, four: Stage) -> None:
+        fault = four.find(four.seen_by_moved("camera_1", *MOVES[name]))
+        assert fault is not None
+        assert (fault.name, fault.is_explained) == ("camera_1", True)
+
+    def test_of_three_cameras_nobody_can_tell_which(self, four: Stage) -> None:
+        names = ["camera_0", "camera_1", "camera_2"]
+        moved = four.seen_by_moved("camera_1", 6.0, (0.0, 0.0, 0.0))
+        fault = four.find([{name: own[name] for name in names} for own in moved])
+        assert fault is not None
+        assert "camera_1" in (fault.name, *fault.rivals)
+        assert not fault.is_explained
+        sound = [{name: own[name] for name in names} for own in four.masks]
+        assert four.find(sound) is None
+
+    def test_camera_whose_masks_are_poor_has_not_moved(self, nine: Stage) -> None:
+        """Each frame lacks another half of the person: no motion explains that."""
+        masks = [dict(own) for own in nine.masks]
+        for k, own in enumerate(masks):
+            half = own["camera_2"].copy()
+            rows = np.flatnonzero(half.any(axis=1))
+            middle = int(rows.mean())
+            half[slice(None, middle) if k % 2 else slice(middle, None)] = False
+            own["camera_2"] = half
+        fault = nine.find(masks)
+        assert fault is None or (fault.name, fault.is_explained) == ("camera_2", False)
+
+    def test_motion_is_none_where_the_camera_stands(self, four: Stage) -> None:
+        frames = four.frames(four.masks)
+        camera = four.cameras["camera_0"]
+        edges = [frame.edges["camera_0"] for frame in frames]
+        motion = camera_motion(four.fit, camera, edges, [frame.values for frame in frames])
+        assert motion.pixels < 0.5
+        np.testing.assert_allclose(motion.X_WC[:3, 3], camera.X_WC[:3, 3], atol=0.05)
+
+    def test_since_when_it_has_moved(self) -> None:
+        good, bad = [0.9, 0.95, 0.9], [0.2, 0.1, 0.3]
+        assert moved_since([*good, *bad], [*bad, *good]) == 3
+        assert moved_since(bad, good) == 0
+        assert moved_since(good, bad) == 3
+        assert moved_since([0.9, 0.3, 0.9, 0.2, 0.1], [0.1, 0.4, 0.2, 0.9, 0.9]) == 3
+
+
+def mirrored(masks: Masks, names: tuple[str, ...]) -> Masks:
+    return [{n: m[:, ::-1] if n in names else m for n, m in own.items()} for own in masks]
+
+
+@pytest.mark.slow
+class TestRig:
+    def test_sound_rig_has_no_fault(self, four: Stage, nine: Stage) -> None:
+        assert find_rig_fault(four.cameras, four.masks[:2]) is None
+        assert find_rig_fault(nine.cameras, nine.masks[:1]) is None
+
+    @pytest.mark.parametrize("names", [("camera_1",), tuple(f"camera_{k}" for k in range(4))])
+    def test_mirrored_pictures_are_named(self, names: tuple[str, ...], four: Stage) -> None:
+        spoilt = mirrored(four.masks[2:], names)
+        fault = find_rig_fault(four.cameras, spoilt)
+        assert fault is not None
+        assert (fault.mirrored, fault.exchanged) == (names, ())
+        for own, good in zip(spoilt, four.masks[2:], strict=True):
+            for name, mask in fault.undo(own).items():
+                np.testing.assert_array_equal(mask, good[name])
+
+    def test_exchanged_cameras_are_named(self, four: Stage) -> None:
+        pair = ("camera_1", "camera_2")
+        spoilt = [{**own, pair[0]: own[pair[1]], pair[1]: own[pair[0]]} for own in four.masks[:2]]
+        fault = find_rig_fault(four.cameras, spoilt)
+        assert fault is not None
+        assert (fault.mirrored, fault.exchanged) == ((), pair)
+        np.testing.assert_array_equal(fault.undo(spoilt[0])[pair[0]], four.masks[0][pair[0]])
+
+    def test_moved_camera_is_not_taken_for_a_mirrored_one(self, four: Stage) -> None:
+        fault = find_rig_fault(four.cameras, four.seen_by_moved("camera_2", 10.0, (0, 0, 0))[:2])
+        assert fault is None or (fault.mirrored, fault.exchanged) == ((), ())
+
+    def test_real_rig_is_sound(self, shared_data: object) -> None:
+        scene = load_scene(f"{shared_data}/human_four_views")
+        frames = scene.frames[::25]
+        masks = [{name: scene.read(name, f) for name in scene.cameras} for f in frames]
+        assert find_rig_fault(scene.cameras, masks) is None
+
+
+class TestOthers:
+    def test_two_persons_are_where_they_are(self, nine: Stage) -> None:
+        poses = [nine.poses[0], stepping(nine.person, 1.0, 0.5, 1.2)]
+        both = see(nine.person, nine.cameras, np.array(poses))
+        masks = [one | other for one, other in zip(*(own.values() for own in both), strict=True)]
+        persons = find_persons(list(nine.cameras.values()), [find_figures(m) for m in masks])
+        assert len(persons) == 2
+        places = sorted((one.place for one in persons), key=lambda place: place[1])
+        np.testing.assert_allclose(places[0][:2], poses[0][:2], atol=0.2)
+        np.testing.assert_allclose(places[1][:2], [0.5, 1.2], atol=0.2)
+
+    def test_the_other_is_cut_out(self, nine: Stage) -> None:
+        other = see(nine.person, nine.cameras, np.array([stepping(nine.person, 1.0, 0.5, 1.2)]))[0]
+        alone = nine.masks[0]
+        kept = keep_person(
+            nine.cameras, {n: m | other[n] for n, m in alone.items()}, np.array([-0.2, 0.1, 0.9])
+        )
+        assert kept.person is not None
+        assert set(kept.cut) & set(kept.merged) == set()
+        assert len(kept.cut) >= 4
+        for name in kept.cut:
+            np.testing.assert_array_equal(kept.masks[name], alone[name])
+        cameras = list(nine.cameras.values())
+        views = [see_silhouette(mask | other[name], 2.0) for name, mask in alone.items()]
+        place = np.array([-0.2, 0.1, 0.9])
+        found = keep_views(cameras, views, lambda _: 2.0, place)
+        assert (found.cut, found.merged) == (kept.cut, kept.merged)
+        for name, view in zip(alone, found.views, strict=True):
+            np.testing.assert_array_equal(view.region, kept.masks[name])
+            if name in kept.cut:
+                np.testing.assert_array_equal(view.edge.uv, find_edge_points(alone[name], 2.0).uv)
+
+    def test_one_person_keeps_all_fragments(self, four: Stage) -> None:
+        masks = {name: mask.copy() for name, mask in four.masks[0].items()}
+        rows = np.flatnonzero(masks["camera_0"].any(axis=1))
+        masks["camera_0"][int(rows.mean()) : int(rows.mean()) + 5] = False
+        kept = keep_person(four.cameras, masks)
+        assert (kept.cut, kept.merged) == ((), ())
+        for name, mask in masks.items():
+            np.testing.assert_array_equal(kept.masks[name], mask)
+
+    def test_nobody(self, four: Stage) -> None:
+        empty = {name: np.zeros((120, 160), dtype=bool) for name in four.cameras}
+        assert keep_person(four.cameras, empty).person is None
+
+    def test_figures_of_large_pictures_are_cut_whole(self) -> None:
+        mask = np.zeros((960, 1280), dtype=bool)
+        mask[100:500, 101:303] = True
+        alone = mask.copy()
+        mask[203:397, 611:801] = True
+        large, small = find_figures(mask)
+        assert large.area > small.area
+        np.testing.assert_allclose(small.middle, [705.5, 299.5], atol=4.0)
+        np.testing.assert_array_equal(cut_figures(mask, [small]), alone)
+
+    def test_who_is_hidden_or_away(self, four: Stage) -> None:
+        """Seen, hidden from all but one, away, and back."""
+        masks = [dict(four.masks[min(k, 3)]) for k in range(5)]
+        for name in four.cameras:
+            if name != "camera_0":
+                masks[1][name] = np.zeros((120, 160), dtype=bool)
+            masks[2][name] = np.zeros((120, 160), dtype=bool)
+        recording = PersonRecording(four.cameras, lambda k: masks[k], 5, True)
+        assert recording.seen == [0, 3, 4]
+        faults = recording.faults()
+        assert faults.nobody == (1, 2)
+        assert (faults.blind, faults.others) == ({}, {})
+        assert 1.3 < recording.height < 2.1

@@ -1,0 +1,168 @@
+import csv
+
+import numpy as np
+import pytest
+
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.landmarks import landmark_positions, load_landmarks
+from drake_pose.body.model import load_model
+from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.errors import ModelError, SettingsError
+from drake_pose.fit.contour_fit import ContourFit
+from drake_pose.fit.evidence import find_edge_points
+from drake_pose.fit.surfaces import with_girths
+from drake_pose.person.recordings.person_capture import PersonCaptureSettings, capture_person
+from drake_pose.person.shape import fit_shape, shape_noise, shape_values
+from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from drake_pose.silhouette.pictures.scenes import load_scene
+
+LENGTHS = {
+    "trunk_stretch": 0.03,
+    "left_thigh_stretch": -0.03,
+    "right_thigh_stretch": -0.03,
+    "left_shin_stretch": 0.03,
+    "right_shin_stretch": 0.03,
+    "left_upper_arm_stretch": 0.025,
+    "right_upper_arm_stretch": 0.025,
+    "left_forearm_stretch": -0.02,
+    "right_forearm_stretch": -0.02,
+}
+
+
+@pytest.fixture(scope="module")
+def person():
+    return load_model(bundled_model("person").with_name("person_shape.urdf"), check=False)
+
+
+@pytest.fixture(scope="module")
+def cameras():
+    return circle_of_cameras(5, size=(320, 240), face_camera=False)
+
+
+def stepping(person, phase):
+    q = np.zeros(len(person.position_names))
+    degrees = {
+        "left_thigh_x": -35 * np.sin(phase),
+        "right_thigh_x": 35 * np.sin(phase),
+        "left_shin_x": 45 + 20 * np.sin(phase),
+        "right_shin_x": 45 - 20 * np.sin(phase),
+        "left_upper_arm_z": 40,
+        "right_upper_arm_z": -40,
+        "left_upper_arm_x": 30 * np.sin(phase),
+        "right_upper_arm_x": -30 * np.sin(phase),
+        "left_forearm_x": -60 + 30 * np.sin(phase),
+        "right_forearm_x": -60 - 30 * np.sin(phase),
+    }
+    for name, angle in degrees.items():
+        q[person.position_index(name)] = np.radians(angle)
+    q[person.position_index("position_z")] = 1.5
+    return q
+
+
+class TestShape:
+    def test_lengths_are_found(self, person, cameras):
+        fit = ContourFit(person.pose_tree(), noise=shape_noise())
+        order = [person.position_index(name) for name in fit.kinematics.names]
+        renderers = [LabelRenderer(person, camera) for camera in cameras.values()]
+        frames, starts = [], []
+        for phase in np.linspace(0.0, 2 * np.pi, 6, endpoint=False):
+            q = stepping(person, phase)
+            starts.append(q[order])
+            worn = q.copy()
+            for name, stretch in LENGTHS.items():
+                worn[person.position_index(name)] = stretch
+            edges = [find_edge_points(renderer.mask(worn), 3.0) for renderer in renderers]
+            frames.append((list(cameras.values()), edges))
+        shape = fit_shape(fit, frames, np.array(starts))
+        found = dict(zip(fit.kinematics.names, shape.values, strict=True))
+        for name, stretch in LENGTHS.items():
+            assert found[name] == pytest.approx(stretch, abs=0.02), name
+        off = np.array([found[name] - stretch for name, stretch in LENGTHS.items()])
+        assert np.abs(off).mean() < 0.5 * np.mean(np.abs(list(LENGTHS.values())))
+        assert all(0.93 < girth < 1.07 for girth in shape.girths.values())
+        names = [n for n, is_length in zip(found, shape.is_shape, strict=True) if is_length]
+        off = np.array([found[name] - LENGTHS.get(name, 0.0) for name in names])
+        assert 0.05 < off @ np.linalg.solve(shape.covariance, off) / len(off) < 2.0
+
+    def test_girths_are_found(self, person, cameras):
+        fit = ContourFit(person.pose_tree(), noise=shape_noise())
+        order = [person.position_index(name) for name in fit.kinematics.names]
+        factors = {"trunk": 1.1, "thigh": 1.2, "shin": 0.9}
+        girths = np.ones(len(fit.outlines))
+        for k, node in enumerate(fit.tree.nodes):
+            for part, factor in factors.items():
+                if part in node.name:
+                    girths[k] = factor
+        outlines = with_girths(fit.outlines, girths)
+        frames, starts = [], []
+        for phase in np.linspace(0.0, 2 * np.pi, 4, endpoint=False):
+            values = stepping(person, phase)[order]
+            X_WN = fit.kinematics.poses(values)
+            starts.append(values)
+            masks = [draw_mask(outlines, c.X_CW @ X_WN, c) for c in cameras.values()]
+            frames.append((list(cameras.values()), [find_edge_points(m, 3.0) for m in masks]))
+        shape = fit_shape(fit, frames, np.array(starts))
+        for part, factor in factors.items():
+            assert shape.girths[part] == pytest.approx(factor, abs=0.05), part
+
+    def test_model_of_fixed_lengths_is_refused(self):
+        person = load_model(bundled_model("person"), check=False)
+        assert not shape_values(person.pose_tree()).any()
+        with pytest.raises(ModelError, match="shape joints"):
+            fit_shape(ContourFit(person.pose_tree()), [], np.zeros((0, 23)))
+
+
+class TestCapture:
+    def test_no_frame(self, person, cameras):
+        with pytest.raises(SettingsError, match="one frame"):
+            capture_person(person.pose_tree(), cameras, lambda k: {}, 0)
+
+    def test_nobody_in_any_frame(self, person, cameras):
+        def read(_):
+            return {name: np.zeros((240, 320), dtype=bool) for name in cameras}
+
+        with pytest.raises(SettingsError, match="two cameras"):
+            capture_person(person.pose_tree(), cameras, read, 2)
+
+    def test_settings_are_checked(self):
+        with pytest.raises(SettingsError, match="shape_frames"):
+            PersonCaptureSettings(shape_frames=0)
+
+    @pytest.mark.slow
+    def test_real_person_of_unknown_proportions(self, person, shared_data):
+        scene = load_scene(shared_data / "human_four_views")
+        frames = scene.frames[::8]
+
+        def read(k):
+            return {name: scene.read(name, frames[k]) for name in scene.cameras}
+
+        settings = PersonCaptureSettings(starts=2)
+        captured = capture_person(person.pose_tree(), scene.cameras, read, len(frames), settings)
+        landmarks = load_landmarks(person.path)
+        truth = {}
+        with (scene.path / "joint_centres.csv").open() as stream:
+            for row in csv.DictReader(stream):
+                place = np.array([float(row[axis]) for axis in "xyz"])
+                truth.setdefault(int(row["frame"]), {})[row["joint"]] = place
+        errors = []
+        for frame, q in zip(frames, captured.q, strict=True):
+            found = dict(zip(landmarks, landmark_positions(person, landmarks, q), strict=True))
+            for joint, place in truth[int(frame)].items():
+                if joint != "head_top":
+                    errors.append(1e3 * np.linalg.norm(found[joint] - place))
+        assert np.mean(errors) < 60.0
+        assert captured.deviations.shape == captured.q.shape
+        angles = [k for k, kind in enumerate(person.position_kinds) if kind == "angle"]
+        assert (captured.deviations[:, angles] > 0.003).all()
+        assert np.median(captured.deviations[:, angles]) < 0.15
+        assert (captured.q >= person.lower - 1e-9).all()
+        assert (captured.q <= person.upper + 1e-9).all()
+        ious = []
+        for k in (0, len(frames) // 2, len(frames) - 1):
+            X_WN = captured.tree.node_poses(captured.tree.values_from_positions(captured.q[k]))
+            for name, mask in read(k).items():
+                camera = scene.cameras[name]
+                body = draw_mask(captured.outlines, camera.X_CW @ X_WN, camera)
+                ious.append((body & mask).sum() / (body | mask).sum())
+        assert np.mean(ious) > 0.75

@@ -1,0 +1,145 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import load_model
+from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.fit.contour_fit import ContourFit
+from drake_pose.fit.evidence import find_edge_points
+from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.person.pose_uncertainty import pose_uncertainty
+from drake_pose.silhouette.areas.outline import outline_from_mesh
+from drake_pose.silhouette.areas.scoring import draw_mask
+
+STEP = Round(0.03, 0.05)
+
+
+class World:
+    def __init__(self):
+        self.person = load_model(bundled_model("person"), check=False)
+        self.fit = ContourFit(self.person.pose_tree())
+        self.cameras = list(circle_of_cameras(6, size=(320, 240), face_camera=False).values())
+        self.names = self.fit.kinematics.names
+
+    def values(self, **degrees):
+        values = np.zeros(len(self.names))
+        values[self.names.index("position_z")] = 1.55
+        for name, angle in degrees.items():
+            values[self.names.index(name)] = np.radians(angle)
+        return values
+
+    def edges(self, values, outlines=None, cameras=None):
+        X_WN = self.fit.kinematics.poses(values)
+        outlines = self.fit.outlines if outlines is None else outlines
+        return [
+            find_edge_points(draw_mask(outlines, camera.X_CW @ X_WN, camera), 4.0)
+            for camera in (self.cameras if cameras is None else cameras)
+        ]
+
+    def deviations(self, values, edges, cameras=None, **more):
+        cameras = self.cameras if cameras is None else cameras
+        found = pose_uncertainty(self.fit, self.fit.compare(cameras, edges, values, STEP), **more)
+        return dict(zip(self.names, np.sqrt(np.diag(found.covariance)), strict=True))
+
+
+@pytest.fixture(scope="module")
+def world():
+    return World()
+
+
+POSE = {
+    "left_upper_arm_z": 50.0,
+    "right_upper_arm_z": -60.0,
+    "left_forearm_x": -70.0,
+    "right_forearm_x": -50.0,
+    "left_thigh_x": -30.0,
+    "left_shin_x": 50.0,
+    "right_shin_x": 15.0,
+}
+
+
+def misshapen(outlines, generator, size):
+    """Every part of the body shifted and swollen by so much [m]."""
+    found = []
+    for outline in outlines:
+        middle = outline.vertices.mean(axis=0)
+        wide = np.sqrt(((outline.vertices - middle) ** 2).mean(axis=0))
+        growth = 1.0 + generator.normal(0.0, size, 3) / wide
+        vertices = middle + growth * (outline.vertices - middle)
+        vertices = vertices + generator.normal(0.0, size, 3)
+        found.append(outline_from_mesh(TriangleMesh(vertices, outline.triangles)))
+    return tuple(found)
+
+
+class TestUncertainty:
+    @pytest.mark.parametrize("size", [0.0, 0.003])
+    def test_truths_lie_within_two_deviations(self, world, size):
+        generator = np.random.default_rng(3)
+        ratios, surfaces = [], []
+        for _ in range(6):
+            pose = {name: angle * generator.uniform(0.7, 1.3) for name, angle in POSE.items()}
+            true = world.values(**pose, head_y=generator.uniform(-20, 20))
+            edges = world.edges(true, misshapen(world.fit.outlines, generator, size))
+            values = world.fit.fit(world.cameras, edges, true, [STEP] * 6).values
+            found = pose_uncertainty(
+                world.fit, world.fit.compare(world.cameras, edges, values, STEP)
+            )
+            ratios.append((values - true) / np.sqrt(np.diag(found.covariance)))
+            surfaces.append(found.surface)
+        inside = (np.abs(ratios) < 2.0).mean()
+        assert 0.8 < inside <= 1.0
+        assert 0.2 < np.mean(np.square(ratios)) < 2.0
+        if size:
+            assert 0.3 * size < np.median(surfaces) < 3.0 * size
+        else:
+            assert np.median(surfaces) < 0.002
+
+    def test_fewer_cameras_are_less_sure(self, world):
+        values = world.values(**POSE)
+        edges = world.edges(values)
+        many = world.deviations(values, edges)
+        few = world.deviations(values, edges[:2], world.cameras[:2])
+        assert np.median([few[name] / many[name] for name in world.names]) > 1.3
+
+    def test_what_silhouettes_do_not_tell_is_as_unsure_as_the_limits_allow(self, world):
+        values = world.values(**POSE)
+        nobody = [find_edge_points(np.zeros((240, 320), dtype=bool), 4.0) for _ in world.cameras]
+        found = world.deviations(values, nobody)
+        kinematics = world.fit.kinematics
+        for k, name in enumerate(world.names):
+            if kinematics.is_angle[k]:
+                span = min(kinematics.upper[k] - kinematics.lower[k], 2.0 * np.pi)
+                assert found[name] == pytest.approx(span / np.sqrt(12.0), rel=1e-6)
+        # A hanging, stretched arm looks the same however it is turned about itself.
+        stretched = world.values(left_upper_arm_z=20.0)
+        bent = world.values(left_upper_arm_z=20.0, left_forearm_x=-90.0)
+        twists = [
+            world.deviations(pose, world.edges(pose))["left_upper_arm_y"]
+            for pose in (stretched, bent)
+        ]
+        assert twists[0] > 1.5 * twists[1]
+
+    def test_held_values_bring_their_own_uncertainty(self, world):
+        values = world.values(**POSE)
+        edges = world.edges(values)
+        held = np.array([name == "left_upper_arm_z" for name in world.names])
+        exact = world.deviations(values, edges, held=held)
+        assert exact["left_upper_arm_z"] == 0.0
+        rough = world.deviations(values, edges, held=held, held_covariance=np.array([[0.2**2]]))
+        assert rough["left_upper_arm_z"] == pytest.approx(0.2)
+        assert rough["left_upper_arm_y"] > 1.5 * exact["left_upper_arm_y"]
+        assert rough["right_shin_x"] < 1.5 * exact["right_shin_x"]
+
+    def test_noise_is_measured_not_assumed(self, world):
+        values = world.values(**POSE)
+        edges = world.edges(values)
+        modest = world.deviations(values, edges)
+        noise = replace(world.fit.noise, deviation=2.0 * world.fit.noise.deviation)
+        other = ContourFit(world.person.pose_tree(), noise=noise)
+        found = pose_uncertainty(other, other.compare(world.cameras, edges, values, STEP))
+        bold = dict(zip(world.names, np.sqrt(np.diag(found.covariance)), strict=True))
+        for name in world.names:
+            assert modest[name] / 1.5 < bold[name] < 1.5 * modest[name], name

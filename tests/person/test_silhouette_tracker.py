@@ -1,0 +1,181 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import load_model
+from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.errors import ModelError, SettingsError
+from drake_pose.fit.contour_fit import ContourFit
+from drake_pose.person.body_plan import crowding
+from drake_pose.person.frame_views import FrameViews
+from drake_pose.person.search import SearchSettings
+from drake_pose.person.silhouette_tracker import SilhouetteTracker, TrackerSettings
+from drake_pose.person.silhouette_view import see_silhouette
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+
+
+class World:
+    def __init__(self):
+        self.person = load_model(bundled_model("person"), check=False)
+        ring = circle_of_cameras(5, size=(320, 240), face_camera=False)
+        self.cameras = list(ring.values())
+        self.renderers = [LabelRenderer(self.person, camera) for camera in self.cameras]
+        self.tracker = SilhouetteTracker(ContourFit(self.person.pose_tree()))
+
+    def pose(self, **degrees):
+        q = np.zeros(len(self.person.position_names))
+        q[self.person.position_index("position_z")] = 1.55
+        for name, angle in degrees.items():
+            q[self.person.position_index(name)] = np.radians(angle)
+        return q
+
+    def views(self, q):
+        return [see_silhouette(renderer.mask(q), 4.0) for renderer in self.renderers]
+
+    def off(self, values, q):
+        """The largest distance of a joint centre from where it is [mm]."""
+        plan, kinematics = self.tracker.plan, self.tracker.fit.kinematics
+        places = [
+            plan.landmarks.positions(kinematics.poses(v)) for v in (values, self.tracker.values(q))
+        ]
+        return 1e3 * np.linalg.norm(places[0] - places[1], axis=1).max()
+
+
+@pytest.fixture(scope="module")
+def world():
+    return World()
+
+
+WALKING = {
+    "left_upper_arm_x": 25.0,
+    "right_upper_arm_x": -25.0,
+    "left_forearm_x": -25.0,
+    "right_forearm_x": -25.0,
+    "left_thigh_x": -25.0,
+    "right_thigh_x": 20.0,
+    "left_shin_x": 10.0,
+    "right_shin_x": 35.0,
+    "left_upper_arm_z": 10.0,
+    "right_upper_arm_z": -10.0,
+}
+
+
+class TestTracker:
+    def test_positions_and_values_are_each_others_inverse(self, world):
+        q = world.pose(**WALKING, head_y=120)
+        np.testing.assert_allclose(world.tracker.positions(world.tracker.values(q)), q, atol=1e-12)
+        turned = world.tracker.values(q)
+        turned[world.tracker.plan.heading] += 2 * np.pi
+        np.testing.assert_allclose(world.tracker.positions(turned), q, atol=1e-12)
+
+    def test_person_is_found_and_followed_even_without_a_camera(self, world):
+        state = world.tracker.follow(None, world.cameras, world.views(world.pose(**WALKING)))
+        assert world.off(state.values, world.pose(**WALKING)) < 40.0
+        for k in range(1, 6):
+            q = world.pose(**{name: (1 - 0.2 * k) * a for name, a in WALKING.items()}, head_y=5 * k)
+            views = world.views(q)
+            cameras = world.cameras
+            if k >= 3:
+                cameras, views = cameras[1:], views[1:]
+            state = world.tracker.follow(state, cameras, views)
+            assert world.off(state.values, q) < 30.0, k
+
+    def test_destroyed_track_is_right_again_without_a_registered_pose(self, world):
+        q = world.pose(**WALKING, head_y=-70)
+        views = world.views(q)
+        state = world.tracker.start(world.tracker.values(q))
+        generator = np.random.default_rng(5)
+        wrong = np.clip(
+            state.values + generator.normal(0.0, 0.7, len(state.values)),
+            world.tracker.fit.lower,
+            world.tracker.fit.upper,
+        )
+        state = replace(state, values=wrong)
+        errors = []
+        for _ in range(15):
+            state = world.tracker.follow(state, world.cameras, views)
+            errors.append(world.off(state.values, q))
+        assert min(errors) < 25.0
+        assert errors[-1] < 25.0
+
+    def test_stretched_arms_are_not_bent_the_wrong_way(self, world):
+        # Slightly bent backwards and twisted about itself, a stretched arm looks almost the same.
+        q = world.pose(left_upper_arm_z=80.0, right_upper_arm_z=-80.0)
+        state = world.tracker.follow(None, world.cameras, world.views(q))
+        assert world.off(state.values, q) < 25.0
+
+    def test_lost_arm_is_searched_again(self, world):
+        q = world.pose(**WALKING)
+        lifted = world.pose(**{**WALKING, "left_upper_arm_z": 110.0, "left_forearm_x": -20.0})
+        state = world.tracker.start(world.tracker.values(q))
+        for _ in range(4):
+            state = world.tracker.follow(state, world.cameras, world.views(lifted))
+        assert world.off(state.values, lifted) < 25.0
+
+    def test_nobody_in_view(self, world):
+        empty = [see_silhouette(np.zeros((240, 320), dtype=bool), 4.0) for _ in world.cameras]
+        assert world.tracker.follow(None, world.cameras, empty) is None
+        values = world.tracker.values(world.pose())
+        state = world.tracker.follow(world.tracker.start(values), world.cameras, empty)
+        assert state.share == 0.0
+        np.testing.assert_allclose(state.values, values, atol=1e-6)
+
+    def test_all_headings_are_tried_the_first_ones_all_around(self):
+        settings = SearchSettings(headings=12, headings_a_frame=3)
+        tried = [settings.turns(k) for k in range(4)]
+        assert sorted(turn for turns in tried for turn in turns) == list(range(12))
+        assert tried[0] == [0, 4, 8]
+        assert tried[1] == [2, 6, 10]
+        assert settings.turns(4) == tried[0]
+
+    def test_small_pictures_show_the_same_places(self, world):
+        views = world.views(world.pose(**WALKING))
+        frame_views = FrameViews(world.cameras, views)
+        points = np.array([[0.1, 0.2, 1.0], [-0.1, 0.0, 0.4]])
+        for k, small, region in zip(frame_views.judges, *frame_views.small, strict=True):
+            assert region.shape == (small.height, small.width)
+            stride = world.cameras[k].height / small.height
+            uv, _ = world.cameras[k].project(points)
+            np.testing.assert_allclose(small.project(points)[0], uv / stride, atol=1e-9)
+
+    def test_settings_are_checked(self):
+        with pytest.raises(SettingsError, match="round"):
+            TrackerSettings(rounds=())
+        with pytest.raises(SettingsError, match="headings must be 1"):
+            SearchSettings(headings=0)
+        with pytest.raises(SettingsError, match="round"):
+            SearchSettings(rounds=())
+        with pytest.raises(SettingsError, match="share"):
+            SearchSettings(fitted=0.0)
+
+
+class TestPlan:
+    def test_limbs_move_nothing_else_and_their_poses_hold_the_limits(self, world):
+        plan = world.tracker.plan
+        names = np.array(plan.kinematics.names)
+        for name, limb in plan.limbs.items():
+            side, kind = name.split("_")
+            parts = ("upper_arm", "forearm") if kind == "arm" else ("thigh", "shin")
+            assert all(
+                n.startswith(tuple(f"{side}_{p}" for p in parts)) for n in names[limb.values]
+            )
+            assert len(limb.values) == 4
+            middle = [
+                n for n, v in enumerate(limb.values) if "forearm" in names[v] or "shin" in names[v]
+            ]
+            assert (limb.poses[limb.stretched][:, middle] == 0.0).all()
+            assert 0 < len(limb.stretched) < len(limb.poses)
+            assert (limb.poses >= plan.kinematics.lower[limb.values]).all()
+            assert (limb.poses <= plan.kinematics.upper[limb.values]).all()
+
+    def test_points_beside_each_other_count_less(self):
+        samples = np.zeros((1, 3, 3))
+        samples[0, 2, 0] = 1.0
+        np.testing.assert_allclose(crowding(samples), [[1 / 6, 1 / 6, 1 / 3]])
+
+    def test_model_without_landmarks_is_refused(self):
+        hand = load_model(bundled_model("two_finger_hand"), check=False)
+        with pytest.raises(ModelError, match="landmarks"):
+            SilhouetteTracker(ContourFit(hand.pose_tree()))

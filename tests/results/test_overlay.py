@@ -1,0 +1,127 @@
+import cv2
+import numpy as np
+import pytest
+
+from drake_pose.results.overlay import (
+    AGREEMENT_RGB,
+    BACKGROUND_RGB,
+    EXCESS_RGB,
+    MISSING_RGB,
+    OUTLINE_RGB,
+    draw_overlay,
+    draw_shapes,
+    encode_png,
+    paint_agreement,
+)
+
+
+def rectangle(shape: tuple[int, int], rows: slice, columns: slice) -> np.ndarray:
+    mask = np.zeros(shape, dtype=bool)
+    mask[rows, columns] = True
+    return mask
+
+
+def count(picture: np.ndarray, colour: tuple[int, int, int]) -> int:
+    return int((picture == np.array(colour, dtype=np.uint8)).all(axis=2).sum())
+
+
+def test_each_kind_of_pixel_has_its_colour() -> None:
+    mask = rectangle((6, 8), slice(1, 5), slice(1, 5))
+    body = rectangle((6, 8), slice(1, 5), slice(3, 7))
+    picture = paint_agreement(mask, body)
+    assert tuple(picture[0, 0]) == BACKGROUND_RGB
+    assert tuple(picture[2, 1]) == MISSING_RGB
+    assert tuple(picture[2, 3]) == AGREEMENT_RGB
+    assert tuple(picture[2, 6]) == EXCESS_RGB
+    assert [count(picture, c) for c in (MISSING_RGB, AGREEMENT_RGB, EXCESS_RGB)] == [8, 8, 8]
+
+
+def test_borders_between_segments_are_drawn_and_no_others() -> None:
+    mask = rectangle((6, 8), slice(1, 5), slice(1, 7))
+    segments = np.where(mask, 1, -1)
+    assert count(paint_agreement(mask, mask, segments), OUTLINE_RGB) == 0
+    segments[1:5, 4:7] = 2
+    picture = paint_agreement(mask, mask, segments)
+    assert (picture[1:5, 3] == OUTLINE_RGB).all()
+    assert count(picture, OUTLINE_RGB) == 4
+
+
+def luminance(colour: tuple[int, int, int]) -> float:
+    return float(np.dot(colour, [0.2126, 0.7152, 0.0722]))
+
+
+# What people without red or green cones see, as matrices on linear RGB: Vienot, Brettel and Mollon
+# (1999).
+DICHROMATS = {
+    "protanope": [[0.11238, 0.88762, 0.0], [0.11238, 0.88762, 0.0], [0.00401, -0.00401, 1.0]],
+    "deuteranope": [[0.29275, 0.70725, 0.0], [0.29275, 0.70725, 0.0], [-0.02234, 0.02234, 1.0]],
+}
+
+
+@pytest.mark.parametrize("kind", DICHROMATS)
+def test_colours_differ_for_colour_blind_people(kind: str) -> None:
+    seen = [
+        np.array(DICHROMATS[kind]) @ (np.array(colour) / 255.0) ** 2.2
+        for colour in (AGREEMENT_RGB, MISSING_RGB, EXCESS_RGB, BACKGROUND_RGB)
+    ]
+    distances = [np.linalg.norm(a - b) for i, a in enumerate(seen) for b in seen[i + 1 :]]
+    assert min(distances) > 0.2
+
+
+def test_agreement_is_brighter_than_both_errors_in_a_grey_print() -> None:
+    assert luminance(AGREEMENT_RGB) > luminance(EXCESS_RGB) + 60 > luminance(MISSING_RGB) + 60
+    assert luminance(MISSING_RGB) > luminance(BACKGROUND_RGB) + 40
+
+
+def test_a_large_picture_is_cut_to_the_surroundings_of_the_body() -> None:
+    mask = rectangle((1900, 1100), slice(1000, 1600), slice(300, 600))
+    body = rectangle((1900, 1100), slice(1000, 1600), slice(310, 610))
+    picture = draw_overlay(mask, body, None, ["title"])
+    assert picture.shape[0] < 900
+    assert picture.shape[1] < 900
+    assert count(picture, MISSING_RGB) >= 600 * 10
+    assert count(picture, EXCESS_RGB) >= 600 * 10
+    assert count(picture, AGREEMENT_RGB) >= 600 * 290
+
+
+def test_shapes_are_drawn_as_contours_over_the_silhouette() -> None:
+    mask = rectangle((600, 600), slice(100, 500), slice(100, 500))
+    first = rectangle((600, 600), slice(100, 500), slice(150, 450))
+    corrected = rectangle((600, 600), slice(100, 500), slice(200, 400))
+    names = ("the file's", "corrected")
+    picture = draw_shapes(mask, [first, corrected], names, ["title"])
+    legend = draw_shapes(mask, [np.zeros_like(mask)] * 2, names, ["title"])
+    # Their upper and lower sides lie upon each other, where the corrected one is drawn last.
+    for colour, own in ((MISSING_RGB, 2 * 400 + 2 * 100), (EXCESS_RGB, 2 * 400 + 2 * 200)):
+        shown = count(picture, colour) - count(legend, colour)
+        assert own < shown < 4 * own
+    assert count(picture, AGREEMENT_RGB) > 0.95 * 400 * 400
+
+
+def test_a_small_picture_is_enlarged_by_whole_pixels() -> None:
+    mask = rectangle((40, 40), slice(15, 25), slice(15, 25))
+    picture = draw_overlay(mask, np.zeros_like(mask), None, ["title"])
+    legend = count(draw_overlay(mask, mask, None, ["title"]), MISSING_RGB)
+    shown = count(picture, MISSING_RGB) - legend
+    scale = int(np.sqrt(shown / 100))
+    assert scale > 1
+    assert shown == 100 * scale**2
+
+
+def test_where_nothing_is_shown_the_whole_picture_stays() -> None:
+    nothing = np.zeros((500, 700), dtype=bool)
+    assert draw_overlay(nothing, nothing, None, ["title"]).shape[1] == 700
+
+
+def test_title_and_legend_are_written() -> None:
+    mask = rectangle((500, 700), slice(100, 400), slice(100, 600))
+    picture = draw_overlay(mask, mask, None, ["cam  frame 1  E_total 3.0 %"])
+    assert (picture[:36] > 200).any()
+    assert (picture[-38:] == np.array(EXCESS_RGB, dtype=np.uint8)).all(axis=2).any()
+
+
+def test_png_keeps_red_red() -> None:
+    picture = np.zeros((4, 5, 3), dtype=np.uint8)
+    picture[:] = EXCESS_RGB
+    decoded = cv2.imdecode(np.frombuffer(encode_png(picture), np.uint8), cv2.IMREAD_COLOR)
+    assert tuple(decoded[0, 0][::-1]) == EXCESS_RGB

@@ -1,0 +1,116 @@
+"""A small robot arm of capsules and boxes, two cameras around it, and damaged pictures of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from drake_pose.body.model import load_model
+from drake_pose.body.surfaces.mesh import TriangleMesh
+from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.camera.models import Camera, PinholeCamera
+from drake_pose.search.result import View
+from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
+from drake_pose.silhouette.areas.scoring import draw_mask
+from tests.search.mask_damage import MaskDamage, damage_views, nudge_camera
+
+# Each: name, parent's length, the joint's axis, its limits [deg], the box's sides and length [m].
+LINKS = (
+    ("turret", 0.0, "0 0 1", (-150, 150), (0.16, 0.11), 0.2),
+    ("shoulder", 0.2, "0 1 0", (-110, 110), (0.11, 0.1), 0.35),
+    ("roll", 0.35, "0 0 1", (-150, 150), (0.09, 0.13), 0.1),
+    ("elbow", 0.1, "0 1 0", (-120, 120), (0.08, 0.07), 0.3),
+    ("hand", 0.3, "0 1 0", (-90, 90), (0.05, 0.1), 0.15),
+)
+
+
+def arm_urdf(links: Sequence[tuple] = LINKS) -> str:
+    """The arm on a plate in the world."""
+    parts = ['<robot name="arm"><link name="world"/>']
+    parent = "world"
+    for name, z, axis, (low, high), (width, depth), length in links:
+        parts.append(
+            f'<link name="{name}"><visual><origin xyz="0.01 0 {length / 2}"/><geometry>'
+            f'<box size="{width} {depth} {length}"/></geometry></visual></link>'
+            f'<joint name="{name}_turn" type="revolute"><parent link="{parent}"/>'
+            f'<child link="{name}"/><origin xyz="0 0 {z}"/><axis xyz="{axis}"/>'
+            f'<limit lower="{np.radians(low)}" upper="{np.radians(high)}" effort="1" '
+            'velocity="1"/></joint>'
+        )
+        parent = name
+    return "".join(parts) + "</robot>"
+
+
+def arm_tree(folder: Path) -> PoseTree:
+    """The arm's pose tree."""
+    path = folder / "arm.urdf"
+    path.write_text(arm_urdf())
+    return load_model(path).pose_tree()
+
+
+def arm_cameras(width: int = 320, height: int = 240) -> tuple[PinholeCamera, ...]:
+    """Two cameras two metres away, 70 degrees apart, looking at the arm's middle."""
+    cameras = []
+    for name, turn in (("left", -35.0), ("right", 35.0)):
+        c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+        X_WC = np.eye(4)
+        X_WC[:3, :3] = np.array([[-s, 0.0, -c], [c, 0.0, -s], [0.0, -1.0, 0.0]])
+        X_WC[:3, 3] = [2.2 * c, 2.2 * s, 0.45]
+        focal = 0.9 * width
+        centre = (width / 2 - 0.5, height / 2 - 0.5)
+        cameras.append(PinholeCamera(name, width, height, focal, focal, *centre, X_WC))
+    return tuple(cameras)
+
+
+def draw_view(
+    tree: PoseTree,
+    values: np.ndarray,
+    camera: Camera,
+    outlines: Sequence[Outline] | None = None,
+    seen_by: Camera | None = None,
+) -> View:
+    """The silhouette at values (m,); drawn in ``seen_by`` where the camera stands elsewhere."""
+    outlines = outlines or [outline_from_mesh(node.mesh) for node in tree.nodes]
+    X_WN = tree.node_poses(split(tree, values))
+    real = seen_by or camera
+    return View(camera, draw_mask(outlines, real.X_CW @ X_WN, real))
+
+
+def split(tree: PoseTree, values: np.ndarray) -> list[np.ndarray]:
+    """Each node's values of all values (m,)."""
+    counts = np.cumsum([len(node.value_names) for node in tree.nodes])[:-1]
+    return np.split(np.asarray(values, dtype=np.float64), counts)
+
+
+def draw_pose(tree: PoseTree, generator: np.random.Generator) -> np.ndarray:
+    """Values (m,) anywhere inside the limits."""
+    bounds = [tree.value_bounds(i) for i in range(len(tree.nodes))]
+    return generator.uniform(
+        np.concatenate([low for low, _ in bounds]), np.concatenate([high for _, high in bounds])
+    )
+
+
+def damaged_views(
+    tree: PoseTree, values: np.ndarray, seed: int, width: int = 640, height: int = 480
+) -> list[View]:
+    """What the cameras see of an arm whose links are a little too thick or thin, damaged."""
+    generator = np.random.default_rng(seed)
+    outlines = []
+    for node in tree.nodes:
+        middle = node.mesh.vertices.mean(axis=0)
+        scale = np.exp(generator.normal(0.0, 0.015))
+        vertices = middle + scale * (node.mesh.vertices - middle)
+        outlines.append(outline_from_mesh(TriangleMesh(vertices, node.mesh.triangles)))
+    damage = MaskDamage()
+    clean = [
+        draw_view(tree, values, camera, outlines, nudge_camera(camera, damage.shift, generator))
+        for camera in arm_cameras(width, height)
+    ]
+    X_WN = tree.node_poses(split(tree, values))
+    points = [
+        node.mesh.vertices @ X[:3, :3].T + X[:3, 3]
+        for node, X in zip(tree.nodes, X_WN, strict=True)
+    ]
+    return damage_views(clean, np.vstack(points), damage, generator)

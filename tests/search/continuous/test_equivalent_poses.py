@@ -1,0 +1,111 @@
+"""The answer as a set where bodies fit badly: intervals, free joints, flips."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drake_pose.body.model import load_model
+from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.errors import SettingsError
+from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.surfaces import few_triangles
+from drake_pose.search.continuous.equivalent_poses import RobustFamilies, RobustFamilySettings
+from drake_pose.search.continuous.views_fit import ViewsFit
+from drake_pose.search.pose_families import PoseSet
+from drake_pose.search.result import View
+from drake_pose.search.starts.self_motions import flips
+from drake_pose.silhouette.areas.bending import TreeSurfaces
+from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_view, split
+
+TRUTH = np.array([0.6, 0.7, -0.7, 0.9, 0.3])
+FINE = tuple(Round(scale, 0.0125, 8) for scale in (0.025, 0.0125))
+
+
+def find(
+    kinematics: TreeKinematics, views: list[View], values: np.ndarray, **settings: object
+) -> PoseSet:
+    fit = ViewsFit(kinematics, few_triangles(TreeSurfaces(kinematics.tree)), views)
+    families = RobustFamilies(fit, RobustFamilySettings(**settings), lambda: True)
+    return families.find([fit.refine(values, FINE)], lambda values: float(values[0]))
+
+
+@pytest.fixture(scope="module")
+def kinematics(tmp_path_factory: pytest.TempPathFactory) -> TreeKinematics:
+    return TreeKinematics(arm_tree(tmp_path_factory.mktemp("arm")))
+
+
+def test_intervals_hold_the_truth_and_widen_with_the_damage(kinematics: TreeKinematics) -> None:
+    tree = kinematics.tree
+    clean = [draw_view(tree, TRUTH, camera) for camera in arm_cameras(640, 480)]
+    widths = []
+    for views in (clean, damaged_views(tree, TRUTH, 1)):
+        answer = find(kinematics, views, TRUTH)
+        assert answer.within_intervals(split(tree, TRUTH))
+        family = answer.families[0]
+        assert family.J == family.q[0]
+        widths.append([joint.high - joint.low for joint in family.joints])
+        for joint, value in zip(family.joints, family.q, strict=True):
+            assert joint.holds(value)
+    assert np.all(np.array(widths[0]) < np.radians(10.0))
+    # A pixel of error in every camera is assumed where nothing is damaged, too.
+    assert np.median(np.array(widths[1]) / widths[0]) > 1.03
+
+
+def test_flips_are_families_of_their_own(kinematics: TreeKinematics) -> None:
+    """Where nothing is significant, all that flips make is as good; nothing is determined."""
+    tree = kinematics.tree
+    views = [draw_view(tree, TRUTH, camera) for camera in arm_cameras()]
+    answer = find(kinematics, views, TRUTH, significance=1e6, families=5)
+    assert not any(answer.determined)
+    answer = find(kinematics, damaged_views(tree, TRUTH, 1), TRUTH)
+    flipped = [flip.values for flip in flips(kinematics, answer.families[0].q)]
+    for family in answer.families[1:]:
+        gaps = [np.abs(family.q - values).max() for values in flipped]
+        assert min(gaps) < np.radians(15.0)
+
+
+def test_a_round_hand_may_turn_as_it_likes(tmp_path: Path) -> None:
+    """A cylinder's turn about its axis does not show: free, and over the whole range."""
+    path = tmp_path / "mast.urdf"
+    path.write_text(
+        '<robot name="mast"><link name="world"/>'
+        '<link name="boom"><visual><origin xyz="0 0 0.3"/><geometry><box size="0.1 0.2 0.6"/>'
+        "</geometry></visual></link>"
+        '<link name="knob"><visual><origin xyz="0 0 0.15"/><geometry>'
+        '<cylinder radius="0.05" length="0.3"/></geometry></visual></link>'
+        '<joint name="tilt" type="revolute"><parent link="world"/><child link="boom"/>'
+        '<axis xyz="1 0 0"/><limit lower="-1.5" upper="1.5" effort="1" velocity="1"/></joint>'
+        '<joint name="spin" type="revolute"><parent link="boom"/><child link="knob"/>'
+        '<origin xyz="0 0 0.6"/><axis xyz="0 0 1"/>'
+        '<limit lower="-2" upper="2.5" effort="1" velocity="1"/></joint></robot>'
+    )
+    tree = load_model(path).pose_tree()
+    values = np.array([0.4, 0.2])
+    views = [draw_view(tree, values, camera) for camera in arm_cameras()]
+    answer = find(TreeKinematics(tree), views, values)
+    tilt, spin = answer.joints
+    assert tilt.determined
+    assert tilt.holds(0.4)
+    assert not spin.determined
+    assert (spin.low, spin.high) == (-2.0, 2.5)
+
+
+def test_time_that_is_up_leaves_the_intervals_of_the_curvature(kinematics: TreeKinematics) -> None:
+    views = damaged_views(kinematics.tree, TRUTH, 1)
+    fit = ViewsFit(kinematics, few_triangles(TreeSurfaces(kinematics.tree)), views)
+    pose = fit.refine(TRUTH, FINE)
+    before = fit.evaluations
+    answer = RobustFamilies(fit, RobustFamilySettings(), lambda: False).find([pose], lambda _: 0.0)
+    assert answer.family_count == 1
+    assert fit.evaluations - before < 5
+    assert all(joint.low < joint.high for joint in answer.joints)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["significance", "widest_angle", "widest_length", "moved_angle", "moved_length", "families"],
+)
+def test_settings_out_of_range(name: str) -> None:
+    with pytest.raises(SettingsError, match=name):
+        RobustFamilySettings(**{name: 0})

@@ -1,0 +1,213 @@
+"""The multi-start search on arms drawn by the tests, clean and damaged, and on bad input."""
+
+import cv2
+import numpy as np
+import pytest
+
+from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.errors import SettingsError
+from drake_pose.search.continuous.multi_start import MultiStartSearch
+from drake_pose.search.continuous.multi_start_settings import MultiStartSettings
+from drake_pose.search.grid.settings import BeamSearchSettings
+from drake_pose.search.result import MatchResult, View
+from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_pose, draw_view, split
+
+GRID = np.radians(20.0)
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory: pytest.TempPathFactory) -> PoseTree:
+    return arm_tree(tmp_path_factory.mktemp("arm"))
+
+
+@pytest.fixture(scope="module")
+def search(tree: PoseTree) -> MultiStartSearch:
+    return MultiStartSearch(tree, MultiStartSettings(BeamSearchSettings(interval=GRID)))
+
+
+@pytest.fixture(scope="module")
+def pose(tree: PoseTree) -> np.ndarray:
+    return draw_pose(tree, np.random.default_rng(20))
+
+
+def clean_views(tree: PoseTree, values: np.ndarray) -> list[View]:
+    return [draw_view(tree, values, camera) for camera in arm_cameras()]
+
+
+def all_values(result: MatchResult) -> np.ndarray:
+    return np.concatenate(result.node_values)
+
+
+def joint_ends(tree: PoseTree, values: np.ndarray) -> np.ndarray:
+    """Where every link begins, and the hand ends [m]."""
+    X_WN = tree.node_poses(split(tree, values))
+    return np.vstack([X_WN[:, :3, 3], X_WN[-1, :3, 3] + 0.15 * X_WN[-1, :3, 2]])
+
+
+def worst_place(tree: PoseTree, result: MatchResult, values: np.ndarray) -> float:
+    """How far any of these is from where it should be [m]."""
+    gaps = joint_ends(tree, all_values(result)) - joint_ends(tree, values)
+    return float(np.linalg.norm(gaps, axis=1).max())
+
+
+def recount(tree: PoseTree, result: MatchResult, views: list[View]) -> int:
+    """J by its definition (1): pixels that differ."""
+    drawn = [draw_view(tree, all_values(result), view.camera) for view in views]
+    return sum(int((one.mask ^ view.mask).sum()) for one, view in zip(drawn, views, strict=True))
+
+
+def test_continuous_pose_is_found_and_said_to_be_known(
+    tree: PoseTree, search: MultiStartSearch, pose: np.ndarray
+) -> None:
+    views = clean_views(tree, pose)
+    result = search.match(views)
+    assert result.found
+    assert result.explained
+    assert result.stopped_by == "end"
+    assert result.J == recount(tree, result, views)
+    assert result.E_total < 0.03
+    assert worst_place(tree, result, pose) < 0.01
+    answer = result.pose_set
+    assert answer is not None
+    assert answer.within_intervals(split(tree, pose))
+    np.testing.assert_array_equal(answer.families[0].q, result.q)
+    assert answer.families[0].J == result.J
+    assert sum(answer.determined) >= 4
+
+
+def test_a_pose_of_the_grid_ends_the_search_at_once(
+    tree: PoseTree, search: MultiStartSearch
+) -> None:
+    grids = search.sampled.values
+    generator = np.random.default_rng(5)
+    values = np.concatenate([grid[generator.integers(len(grid))] for grid in grids])
+    result = search.match(clean_views(tree, values))
+    assert result.stopped_by == "exact"
+    assert result.J == 0
+    assert result.pose_set is not None
+
+
+def test_grid_alone(tree: PoseTree, pose: np.ndarray) -> None:
+    settings = MultiStartSettings(BeamSearchSettings(interval=GRID), continuous=False)
+    result = MultiStartSearch(tree, settings).match(clean_views(tree, pose))
+    steps = all_values(result) / GRID
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-6)
+
+
+@pytest.mark.slow
+def test_damaged_and_ill_fitting_arms(tree: PoseTree, search: MultiStartSearch) -> None:
+    places, held = [], []
+    for seed in range(8):
+        values = draw_pose(tree, np.random.default_rng(100 + seed))
+        result = search.match(damaged_views(tree, values, seed))
+        places.append(worst_place(tree, result, values))
+        assert result.pose_set is not None
+        held.append(
+            max(
+                np.mean([one.holds(v) for one, v in zip(family.joints, values, strict=True)])
+                for family in result.pose_set.families
+            )
+        )
+    # Flips leave the hand where it is, but not what is between.
+    assert np.median(places) < 0.02
+    assert np.mean(held) >= 0.85
+
+
+def test_the_same_every_time(tree: PoseTree, search: MultiStartSearch, pose: np.ndarray) -> None:
+    views = damaged_views(tree, pose, 3)
+    first, again = search.match(views), search.match(views)
+    np.testing.assert_array_equal(first.q, again.q)
+    assert first.pose_set is not None
+    assert again.pose_set is not None
+    for one, other in zip(first.pose_set.joints, again.pose_set.joints, strict=True):
+        assert (one.low, one.high) == (other.low, other.high)
+
+
+def test_no_time_at_all(tree: PoseTree, pose: np.ndarray) -> None:
+    settings = MultiStartSettings(BeamSearchSettings(interval=GRID, time_limit=0.0))
+    views = clean_views(tree, pose)
+    result = MultiStartSearch(tree, settings).match(views)
+    assert result.found
+    assert result.stopped_by == "time_limit"
+    assert result.J == recount(tree, result, views)
+    assert result.seconds < 2.0
+
+
+def test_a_mask_that_no_pose_explains(search: MultiStartSearch) -> None:
+    views = []
+    for camera in arm_cameras():
+        mask = np.zeros((camera.height, camera.width), dtype=bool)
+        mask[:12, :] = True
+        views.append(View(camera, mask))
+    result = search.match(views)
+    assert result.found
+    assert not result.explained
+    assert result.E_total > 0.5
+
+
+@pytest.mark.parametrize("which", ["all", "one pixel"])
+def test_masks_without_a_shape(search: MultiStartSearch, which: str) -> None:
+    (camera, _) = arm_cameras()
+    mask = np.full((camera.height, camera.width), which == "all")
+    mask[100, 150] = True
+    result = search.match([View(camera, mask)])
+    assert result.found
+    assert np.isfinite(result.J)
+    assert not result.explained
+
+
+def test_body_cut_off_by_the_pictures_edge(
+    tree: PoseTree, search: MultiStartSearch, pose: np.ndarray
+) -> None:
+    """What would lie outside the picture does not count against a pose."""
+    views = []
+    for camera, columns in zip(arm_cameras(320, 240), (slice(0, 250), slice(60, 320)), strict=True):
+        whole = draw_view(tree, pose, camera)
+        first, last = columns.start, columns.stop
+        part = type(camera)(
+            camera.name, last - first, 170, camera.focal_x, camera.focal_y,
+            camera.center_x - first, camera.center_y, camera.X_WC,
+        )  # fmt: skip
+        views.append(View(part, np.ascontiguousarray(whole.mask[:170, columns])))
+        assert whole.mask[170].any()
+    result = search.match(views)
+    assert result.J == recount(tree, result, views)
+    assert result.E_total < 0.05
+    assert worst_place(tree, result, pose) < 0.02
+
+
+def test_other_things_in_the_picture(
+    tree: PoseTree, search: MultiStartSearch, pose: np.ndarray
+) -> None:
+    views = clean_views(tree, pose)
+    for view, center in zip(views, ((40, 60), (280, 200)), strict=True):
+        blob = np.zeros(view.mask.shape, np.uint8)
+        cv2.circle(blob, center, 15, 1, -1)
+        assert not (view.mask & (blob > 0)).any()
+        view.mask[blob > 0] = True
+    result = search.match(views)
+    assert worst_place(tree, result, pose) < 0.02
+    blobs = 2 * np.pi * 15**2 / sum(view.mask.sum() for view in views)
+    assert blobs - 0.03 < result.E_total < blobs + 0.05
+
+
+def test_salt_noise(tree: PoseTree, search: MultiStartSearch, pose: np.ndarray) -> None:
+    generator = np.random.default_rng(8)
+    views = clean_views(tree, pose)
+    for view in views:
+        view.mask[generator.random(view.mask.shape) < 0.1] = True
+    result = search.match(views)
+    assert worst_place(tree, result, pose) < 0.02
+    # J is still that of the silhouettes as they were given.
+    assert result.J == recount(tree, result, views)
+
+
+def test_no_view(search: MultiStartSearch) -> None:
+    with pytest.raises(SettingsError, match="at least one view"):
+        search.match([])
+
+
+@pytest.mark.parametrize("name", ["starts", "survivors", "finalists", "sought_about", "tried"])
+def test_settings_out_of_range(name: str) -> None:
+    with pytest.raises(SettingsError, match=name):
+        MultiStartSettings(**{name: 0})

@@ -1,0 +1,150 @@
+"""The continuous search: from silhouettes to a refined pose with intervals."""
+
+import math
+
+import numpy as np
+import pytest
+
+from drake_pose.errors import SettingsError
+from drake_pose.search.continuous.search import (
+    ContinuousSearch,
+    ContinuousSearchSettings,
+    RefinementSettings,
+    Refiner,
+)
+from drake_pose.search.result import View
+from drake_pose.silhouette.areas.bending import TreeSurfaces
+from drake_pose.silhouette.areas.scoring import draw_mask
+from tests.search.bodies import front_camera, swinging_chain
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory):
+    return swinging_chain(tmp_path_factory.mktemp("chain"), 3).pose_tree()
+
+
+@pytest.fixture(scope="module")
+def search(tree):
+    return ContinuousSearch(tree)
+
+
+def view_of(tree, values, side=200, shift=0.37):
+    camera = front_camera(side, shift=shift)
+    outlines = TreeSurfaces(tree).at(values)
+    return View(camera, draw_mask(outlines, camera.X_CW @ tree.node_poses(values), camera))
+
+
+def drawn_values(tree, rng):
+    return [rng.uniform(*tree.value_bounds(i)) for i in range(len(tree.nodes))]
+
+
+def test_poses_between_the_samples_are_found(tree, search):
+    rng = np.random.default_rng(4)
+    errors, inside = [], []
+    for _ in range(6):
+        values = drawn_values(tree, rng)
+        view = view_of(tree, values)
+        found = search.match([view])
+        q, _ = tree.positions_from(found.node_values)
+        np.testing.assert_allclose(found.q, q)
+        drawn = view_of(tree, found.node_values)
+        assert found.J == np.count_nonzero(drawn.mask != view.mask)
+        assert found.E_total == pytest.approx(found.J / np.count_nonzero(view.mask))
+        errors.append(
+            np.degrees(np.abs(np.concatenate(found.node_values) - np.concatenate(values)))
+        )
+        joints = found.pose_set.joints
+        flat = np.concatenate(values)
+        inside += [j.holds(v) for j, v in zip(joints, flat, strict=True) if j.determined]
+    assert np.median(errors) < 1.0
+    assert len(inside) >= 12
+    assert np.mean(inside) > 0.85
+
+
+def test_the_same_every_time(tree, search):
+    view = view_of(tree, drawn_values(tree, np.random.default_rng(9)))
+    one, other = search.match([view]), search.match([view])
+    assert one.J == other.J
+    np.testing.assert_array_equal(one.q, other.q)
+    for a, b in zip(one.pose_set.joints, other.pose_set.joints, strict=True):
+        assert (a.low, a.high, a.determined) == (b.low, b.high, b.determined)
+
+
+def test_families_are_as_good_as_the_best(tree, search):
+    view = view_of(tree, drawn_values(tree, np.random.default_rng(10)))
+    found = search.match([view])
+    families = found.pose_set.families
+    assert families[0].J == found.J
+    assert found.pose_set.family_count == len(families)
+    for family in families:
+        assert family.J <= found.J + found.pose_set.tolerance
+        np.testing.assert_allclose(family.q, tree.positions_from(family.node_values)[0])
+        assert family.joints[0].holds(family.node_values[0][0])
+
+
+def test_without_time_there_is_still_an_answer(tree):
+    hurried = ContinuousSearch(tree, ContinuousSearchSettings(time_limit=0.0))
+    found = hurried.match([view_of(tree, drawn_values(tree, np.random.default_rng(2)))])
+    assert found.found
+    assert found.stopped_by == "time_limit"
+    assert math.isfinite(found.J)
+
+
+def test_refining_from_a_given_pose(tree):
+    rng = np.random.default_rng(3)
+    values = drawn_values(tree, rng)
+    start = [np.clip(v + 0.1, *tree.value_bounds(i)) for i, v in enumerate(values)]
+    refiner = Refiner(tree, RefinementSettings(intervals=None))
+    found = refiner.refine([view_of(tree, values)], [start])
+    assert found.pose_set is None
+    assert found.covariance.shape == (0, 0)
+    np.testing.assert_allclose(
+        np.concatenate(found.node_values), np.concatenate(values), atol=math.radians(2.0)
+    )
+    with pytest.raises(SettingsError, match="start from"):
+        refiner.refine([view_of(tree, values)], [])
+
+
+def test_more_starts_are_asked_for_only_where_none_is_good(tree):
+    values = drawn_values(tree, np.random.default_rng(5))
+    view = view_of(tree, values)
+    bounds = [tree.value_bounds(i) for i in range(len(values))]
+    far = [np.where(2.0 * v > a + b, a, b) for v, (a, b) in zip(values, bounds, strict=True)]
+    refiner = Refiner(tree, RefinementSettings(intervals=None, escape=None))
+    asked = []
+
+    def others():
+        asked.append(1)
+        yield [values]
+        asked.append(2)
+        yield [far]
+
+    assert refiner.refine([view], [values], others=others()).E_total < 0.01
+    assert asked == []
+    alone, helped = refiner.refine([view], [far]), refiner.refine([view], [far], others=others())
+    assert alone.E_total > 0.1
+    assert helped.E_total < 0.01
+    assert asked == [1]
+
+
+def test_nothing_is_determined_where_the_body_does_not_fit(tree, search):
+    values = drawn_values(tree, np.random.default_rng(6))
+    view = view_of(tree, values)
+    assert any(joint.determined for joint in search.match([view]).pose_set.joints)
+    spoilt = view.mask.copy()
+    spoilt[5:60, 5:60] = True
+    joints = search.match([View(view.camera, spoilt)]).pose_set.joints
+    limits = np.concatenate([np.column_stack(tree.value_bounds(i)) for i in range(len(tree.nodes))])
+    assert not any(joint.determined for joint in joints)
+    np.testing.assert_allclose([(joint.low, joint.high) for joint in joints], limits)
+
+
+def test_bad_settings_are_refused(search):
+    with pytest.raises(SettingsError, match="starts"):
+        ContinuousSearchSettings(starts=0)
+    with pytest.raises(SettingsError, match="grid"):
+        ContinuousSearchSettings(grids=())
+    with pytest.raises(SettingsError, match="enough"):
+        RefinementSettings(enough=-1.0)
+    with pytest.raises(SettingsError, match="view"):
+        search.match([])

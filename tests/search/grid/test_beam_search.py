@@ -1,0 +1,282 @@
+"""The beam search against brute force over whole grids, and what it promises of its answers."""
+
+import itertools
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body.tree.root import RootRotation
+from drake_pose.camera.models import ParallelCamera
+from drake_pose.errors import SettingsError
+from drake_pose.papers.kameda.experiment import (
+    draw_values,
+    experiment_camera,
+    experiment_search,
+)
+from drake_pose.search.grid.beam.search import BeamSearch
+from drake_pose.search.grid.settings import BeamSearchSettings, Stage
+from drake_pose.search.result import View
+from drake_pose.search.scoring import SampledTree, Scoring
+from drake_pose.search.settings import PaperSearchSettings
+from drake_pose.silhouette.areas.bending import TreeSurfaces
+from drake_pose.silhouette.areas.scoring import draw_mask
+from tests.search.bodies import (
+    box_link,
+    forked_body,
+    front_camera,
+    joint,
+    load_body,
+    swinging_chain,
+)
+
+INTERVAL = 0.35
+
+
+def all_Js(tree: PoseTree, views: list[View], interval: float = INTERVAL) -> np.ndarray:
+    """J of every pose of the grid: nothing but the definition."""
+    sampled = SampledTree(tree, PaperSearchSettings(interval=interval))
+    scoring = Scoring(sampled, views)
+    choices = itertools.product(*(range(len(values)) for values in sampled.values))
+    X_WN = np.array(
+        [
+            tree.node_poses([sampled.values[i][t] for i, t in enumerate(choice)])
+            for choice in choices
+        ]
+    )
+    return scoring.J(X_WN)
+
+
+def picture(tree: PoseTree, camera: ParallelCamera, values: list[np.ndarray]) -> View:
+    outlines = TreeSurfaces(tree).at(values)
+    return View(camera, draw_mask(outlines, camera.X_CW @ tree.node_poses(values), camera))
+
+
+def random_values(tree: PoseTree, generator: np.random.Generator) -> list[np.ndarray]:
+    bounds = [tree.value_bounds(i) for i in range(len(tree.nodes))]
+    return [generator.uniform(lower, upper) for lower, upper in bounds]
+
+
+def search(tree: PoseTree, **settings: object) -> BeamSearch:
+    return BeamSearch(tree, BeamSearchSettings(interval=INTERVAL, **settings))
+
+
+def cameras(count: int) -> list[ParallelCamera]:
+    """Cameras at 0 and 60 degrees about the vertical."""
+    front = front_camera(80, shift=0.137)
+    X_WC = np.array(front.X_WC)
+    turn = np.eye(4)
+    c, s = math.cos(math.radians(60)), math.sin(math.radians(60))
+    turn[:2, :2] = [[c, -s], [s, c]]
+    return [front, front.with_pose(turn @ X_WC)][:count]
+
+
+@pytest.mark.parametrize("make", ["chain", "fork"])
+@pytest.mark.parametrize("count", [1, 2])
+def test_finds_the_minimum_that_brute_force_finds(tmp_path: Path, make: str, count: int) -> None:
+    model = swinging_chain(tmp_path, 3) if make == "chain" else forked_body(tmp_path)
+    tree = model.pose_tree()
+    matcher = search(tree)
+    generator = np.random.default_rng(3)
+    for _ in range(4):
+        values = random_values(tree, generator)
+        views = [picture(tree, camera, values) for camera in cameras(count)]
+        result = matcher.match(views)
+        assert result.found
+        assert result.J == all_Js(tree, views).min()
+
+
+def test_finds_the_minimum_for_a_mask_that_no_pose_explains(tmp_path: Path) -> None:
+    tree = forked_body(tmp_path).pose_tree()
+    camera = front_camera(60, shift=0.137)
+    generator = np.random.default_rng(4)
+    view = picture(tree, camera, random_values(tree, generator))
+    mask = view.mask ^ (generator.random(view.mask.shape) < 0.1)
+    mask[40:50, 5:15] = True
+    view = View(camera, mask)
+    result = search(tree).match([view])
+    assert result.stopped_by == "end"
+    assert result.J == all_Js(tree, [view]).min()
+
+
+def test_ends_at_an_exact_pose_and_reports_the_objective_of_its_own_answer(tmp_path: Path) -> None:
+    tree = swinging_chain(tmp_path, 4).pose_tree()
+    matcher = search(tree)
+    camera = front_camera(100, shift=0.137)
+    generator = np.random.default_rng(5)
+    for _ in range(5):
+        values = [grid[generator.integers(len(grid))] for grid in matcher.sampled.values]
+        view = picture(tree, camera, values)
+        result = matcher.match([view])
+        assert result.stopped_by == "exact"
+        assert result.J == 0.0 == result.E_total
+        shown = picture(tree, camera, list(result.node_values))
+        assert np.array_equal(shown.mask, view.mask)
+
+
+def test_exact_stages_end_where_their_poses_take_too_much_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tree = swinging_chain(tmp_path, 4).pose_tree()
+    matcher = search(tree)
+    values = [grid[len(grid) // 2] for grid in matcher.sampled.values]
+    view = picture(tree, front_camera(100, shift=0.137), values)
+    found = matcher.match_exactly([view])
+    assert found is not None
+    assert found.J == 0.0
+    monkeypatch.setattr("drake_pose.search.grid.beam.search._MOST_BYTES", 100)
+    assert matcher.match_exactly([view]) is None
+    # The search that goes on without them is not cut short.
+    assert matcher.match([view]).stopped_by == "exact"
+
+
+def test_the_objective_is_that_of_the_definition(tmp_path: Path) -> None:
+    tree = forked_body(tmp_path).pose_tree()
+    views = [
+        picture(tree, camera, random_values(tree, np.random.default_rng(6)))
+        for camera in cameras(2)
+    ]
+    result = search(tree).match(views)
+    shown = [picture(tree, view.camera, list(result.node_values)) for view in views]
+    J = sum(int((a.mask ^ b.mask).sum()) for a, b in zip(shown, views, strict=True))
+    assert result.J == J
+    assert result.E_total == pytest.approx(J / sum(int(view.mask.sum()) for view in views))
+    assert result.first_E_total >= result.E_total
+
+
+def test_a_sliding_joint_and_a_fixed_one(tmp_path: Path) -> None:
+    model = load_body(
+        tmp_path,
+        box_link("rail", 30, 4),
+        joint("slide", "prismatic", "world", "rail", (-0.2, 0.2), axis="0 1 0"),
+        box_link("arm", 4, 14, y=1.0, z=-6.0),
+        joint("swing", "revolute", "rail", "arm", (-1.0, 1.0), y=12.0),
+    )
+    tree = model.pose_tree()
+    matcher = BeamSearch(tree, BeamSearchSettings(interval=0.25, length_interval=0.05))
+    camera = front_camera(90, shift=0.137)
+    view = picture(tree, camera, [np.array([0.15]), np.array([-0.5])])
+    result = matcher.match([view])
+    assert result.J == 0.0
+    np.testing.assert_allclose(result.q, [0.15, -0.5], atol=1e-9)
+
+
+def test_what_lies_outside_the_picture_costs_nothing(tmp_path: Path) -> None:
+    tree = swinging_chain(tmp_path, 3).pose_tree()
+    matcher = search(tree)
+    camera = ParallelCamera("cut", 40, 25, 100.0, 19.637, 19.637, front_camera().X_WC)
+    values = [grid[2] for grid in matcher.sampled.values]
+    view = picture(tree, camera, values)
+    whole = picture(tree, front_camera(100, shift=0.137), values)
+    assert view.mask.sum() < whole.mask.sum()
+    assert matcher.match([view]).stopped_by == "exact"
+
+
+def test_equal_input_equal_answer(tmp_path: Path) -> None:
+    tree = forked_body(tmp_path).pose_tree()
+    view = picture(tree, cameras(1)[0], random_values(tree, np.random.default_rng(8)))
+    one, other = search(tree).match([view]), search(tree).match([view])
+    assert np.array_equal(one.q, other.q)
+    assert (one.J, one.runs, one.stopped_by) == (other.J, other.runs, other.stopped_by)
+
+
+def test_a_turned_over_tree_matches_as_well(tmp_path: Path) -> None:
+    model = swinging_chain(tmp_path, 3)
+    tree = model.pose_tree()
+    matcher = search(tree)
+    camera = front_camera(100, shift=0.137)
+    values = [grid[1] for grid in matcher.sampled.values]
+    view = picture(tree, camera, values)
+    X_WE = tree.node_poses(values)[-1]
+    turned = model.pose_tree(
+        root=tree.nodes[-1].name,
+        root_position=X_WE[:3, 3],
+        root_rotation=RootRotation.fixed(X_WE[:3, :3]),
+    )
+    result = search(turned).match([view])
+    assert matcher.match([view]).J == 0.0
+    # Rounding may move a pixel on an edge.
+    assert result.J <= 2.0
+
+
+def test_a_root_at_another_position(tmp_path: Path) -> None:
+    model = swinging_chain(tmp_path, 3)
+    still = model.pose_tree()
+    values = [np.array([0.35])] * 3
+    X_WE = still.node_poses(values)[0]
+    rotation = RootRotation.limited([("x", -60, 60)])
+    tree = model.pose_tree(root="segment_0", root_position=np.zeros(3), root_rotation=rotation)
+    view = picture(still, front_camera(100, shift=0.137), values)
+    result = search(tree).match([view], root_position=X_WE[:3, 3])
+    assert result.J <= 2.0
+
+
+@pytest.mark.parametrize(
+    ("limits", "reason"),
+    [({"time_limit": 0.0}, "time_limit"), ({"hypothesis_limit": 1}, "hypothesis_limit")],
+)
+def test_a_limit_still_answers_and_says_so(
+    tmp_path: Path, limits: dict[str, float], reason: str
+) -> None:
+    tree = forked_body(tmp_path).pose_tree()
+    view = picture(tree, cameras(1)[0], random_values(tree, np.random.default_rng(9)))
+    result = search(tree, **limits).match([view])
+    assert result.found
+    assert np.isfinite(result.q).all()
+    assert result.stopped_by == reason
+    assert result.J == Scoring(SampledTree(tree, PaperSearchSettings()), [view]).J(
+        tree.node_poses(result.node_values)[None]
+    )
+
+
+def test_the_order_of_nodes_can_be_given_and_is_checked(tmp_path: Path) -> None:
+    tree = forked_body(tmp_path).pose_tree()
+    names = ("trunk", "right", "left")
+    assert [tree.nodes[i].name for i in search(tree, node_order=names).body.order] == list(names)
+    with pytest.raises(SettingsError, match="before its parent"):
+        search(tree, node_order=("left", "trunk", "right"))
+    with pytest.raises(SettingsError, match="every node"):
+        search(tree, node_order=("trunk", "left"))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"interval": 0.0},
+        {"stages": ()},
+        {"band": 0},
+        {"coarse_pixels": 0},
+        {"research_hypotheses": -1},
+        {"time_limit": -1.0},
+        {"hypothesis_limit": 0},
+    ],
+)
+def test_settings_out_of_range_are_refused(settings: dict[str, object]) -> None:
+    with pytest.raises(SettingsError):
+        BeamSearchSettings(**settings)
+
+
+def test_a_stage_out_of_range_is_refused() -> None:
+    for arguments in ((0,), (1, -0.1), (1, 0.0, 0)):
+        with pytest.raises(SettingsError):
+            Stage(*arguments)
+
+
+def test_no_view_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match="at least one view"):
+        search(forked_body(tmp_path).pose_tree()).match([])
+
+
+@pytest.mark.slow
+def test_experiment_a_is_matched_exactly() -> None:
+    paper, camera = experiment_search(), experiment_camera()
+    matcher = BeamSearch(paper.tree)
+    generator = np.random.default_rng(2024)
+    results = []
+    for _ in range(25):
+        values = draw_values(paper, "grid", generator)
+        results.append(matcher.match([picture(paper.tree, camera, values)]))
+    assert sum(result.stopped_by == "exact" for result in results) >= 24
+    assert np.mean([result.E_total for result in results]) < 1e-3

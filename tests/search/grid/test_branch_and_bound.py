@@ -1,0 +1,150 @@
+"""The branch and bound against the definition over whole grids."""
+
+import math
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drake_pose.search.grid.branch_and_bound.full_detail import BoundLimits
+from drake_pose.search.grid.branch_and_bound.partial_pose_graph import PartialPoseGraph
+from drake_pose.search.grid.branch_and_bound.search import branch_and_bound
+from tests.search.bodies import box_link, forked_body, joint, load_body, swinging_chain
+from tests.search.grid_problems import GridProblem, ProblemMaker
+
+
+def members(graph: PartialPoseGraph, problem: GridProblem) -> set[tuple[int, ...]]:
+    return {tuple(row) for row in problem.choices.tolist() if graph.contains(np.array(row))}
+
+
+@pytest.fixture(scope="module", params=["chain", "fork"])
+def maker(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> ProblemMaker:
+    folder = tmp_path_factory.mktemp("body")
+    model = swinging_chain(folder, 3) if request.param == "chain" else forked_body(folder)
+    return ProblemMaker(model.pose_tree(), 0.35)
+
+
+@pytest.mark.parametrize("views", [1, 2])
+@pytest.mark.parametrize("extra", [0.0, 3.0, 40.0, 400.0])
+def test_finds_exactly_the_poses_within_the_limit(
+    maker: ProblemMaker, views: int, extra: float
+) -> None:
+    generator = np.random.default_rng(1)
+    for noise, on_grid in [(0.0, True), (0.0, False), (0.01, True)]:
+        problem = maker.make(generator, views=views, noise=noise, on_grid=on_grid)
+        limit = problem.best[1] + extra
+        found = branch_and_bound(maker.body, problem.views, limit)
+        assert found.complete
+        expected = problem.within(limit)
+        assert members(found.graph, problem) == expected
+        assert found.graph.size == len(expected)
+        for row, J in zip(problem.choices, problem.Js, strict=True):
+            if J <= limit:
+                assert found.graph.objective(row) == J
+            else:
+                assert found.lower_bound <= J
+
+
+def test_a_limit_that_no_pose_reaches_leaves_nothing(maker: ProblemMaker) -> None:
+    problem = maker.make(np.random.default_rng(2), views=1, noise=0.02, on_grid=False)
+    found = branch_and_bound(maker.body, problem.views, problem.best[1] - 1.0)
+    assert found.complete
+    assert found.graph.size == 0.0
+    assert found.lower_bound == problem.best[1]
+
+
+def test_what_was_left_out_is_no_better_than_the_bound(maker: ProblemMaker) -> None:
+    generator = np.random.default_rng(3)
+    for limits in (BoundLimits(states=3), BoundLimits(pairs=5), BoundLimits(deadline=0.0)):
+        problem = maker.make(generator, views=1, noise=0.02, on_grid=False)
+        samples, J = problem.best
+        found = branch_and_bound(maker.body, problem.views, J + 60.0, limits, samples)
+        assert not found.complete
+        there = members(found.graph, problem)
+        assert there <= problem.within(J + 60.0)
+        left_out = [J for row, J in zip(problem.choices.tolist(), problem.Js, strict=True)
+                    if tuple(row) not in there]  # fmt: skip
+        assert min(left_out) >= found.lower_bound
+        if math.isinf(limits.deadline):
+            assert found.graph.contains(samples)
+
+
+def test_time_is_kept(maker: ProblemMaker) -> None:
+    problem = maker.make(np.random.default_rng(4), views=1, noise=0.0, on_grid=False)
+    branch_and_bound(maker.body, problem.views, 1.0)
+    start = time.perf_counter()
+    found = branch_and_bound(maker.body, problem.views, 500.0, BoundLimits(deadline=start))
+    assert time.perf_counter() - start < 1.0
+    assert not found.complete
+
+
+def test_hidden_limbs_multiply_and_are_counted(tmp_path: Path) -> None:
+    """Two short arms of two links each that a broad trunk hides at every angle."""
+    parts = [
+        box_link("trunk", 40, 40),
+        joint("trunk_turn", "revolute", "world", "trunk", (0.0, 0.0)),
+    ]
+    for side, y in (("left", 5.0), ("right", -5.0)):
+        parts += [
+            box_link(f"{side}_upper", 3, 6, z=-3.0),
+            joint(f"{side}_shoulder", "revolute", "trunk", f"{side}_upper", (-1.5, 1.5), y=y),
+            box_link(f"{side}_lower", 3, 6, z=-3.0),
+            joint(
+                f"{side}_elbow", "revolute", f"{side}_upper", f"{side}_lower", (-1.5, 1.5), z=-5.0
+            ),
+        ]
+    maker = ProblemMaker(load_body(tmp_path, *parts).pose_tree(), 0.5)
+    problem = maker.make(np.random.default_rng(5), views=1, noise=0.0, on_grid=True)
+    found = branch_and_bound(maker.body, problem.views, 0.0)
+    assert found.complete
+    assert found.graph.size == len(maker.choices) == 7**4
+    # Hidden limbs leave nothing to tell their poses apart by.
+    assert sum(len(layer.samples) for layer in found.graph.layers) < 2 * (7 + 7**2) + 2
+
+
+def test_random_members_are_spread_evenly(maker: ProblemMaker) -> None:
+    generator = np.random.default_rng(6)
+    problem = maker.make(generator, views=1, noise=0.0, on_grid=True)
+    limit = float(np.sort(problem.Js)[7])
+    graph = branch_and_bound(maker.body, problem.views, limit).graph
+    drawn = graph.draw(200 * int(graph.size), generator)
+    found, counts = np.unique(drawn, axis=0, return_counts=True)
+    assert {tuple(row) for row in found.tolist()} == problem.within(limit)
+    assert counts.min() > 130
+    assert counts.max() < 270
+
+
+def test_a_narrower_limit_and_fewer_samples_leave_fewer_poses(maker: ProblemMaker) -> None:
+    problem = maker.make(np.random.default_rng(7), views=1, noise=0.0, on_grid=False)
+    best = problem.best[1]
+    graph = branch_and_bound(maker.body, problem.views, best + 100.0).graph
+    assert members(graph.up_to(best + 30.0), problem) == problem.within(best + 30.0)
+    allowed = np.zeros(len(maker.body.sampled.values[1]), dtype=np.bool_)
+    allowed[::2] = True
+    expected = {row for row in problem.within(best + 100.0) if row[1] % 2 == 0}
+    assert members(graph.restricted([None, allowed, None]), problem) == expected
+    nothing = graph.restricted([None, np.zeros_like(allowed), None])
+    assert nothing.size == 0.0
+    with pytest.raises(ValueError, match="empty"):
+        nothing.draw(1, np.random.default_rng(0))
+    with pytest.raises(ValueError, match="empty"):
+        nothing.central()
+
+
+def test_the_central_pose_is_a_best_one(maker: ProblemMaker) -> None:
+    problem = maker.make(np.random.default_rng(8), views=2, noise=0.01, on_grid=True)
+    best = problem.best[1]
+    graph = branch_and_bound(maker.body, problem.views, best + 50.0).graph
+    assert tuple(graph.central().tolist()) in problem.within(best)
+
+
+def test_a_picture_that_cuts_the_body_off(tmp_path: Path) -> None:
+    maker = ProblemMaker(swinging_chain(tmp_path, 3).pose_tree(), 0.35)
+    generator = np.random.default_rng(9)
+    problem = maker.make(generator, views=1, noise=0.0, on_grid=True, side=26)
+    mask = problem.views[0].mask
+    assert mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any()
+    limit = problem.best[1] + 5.0
+    found = branch_and_bound(maker.body, problem.views, limit)
+    assert members(found.graph, problem) == problem.within(limit)

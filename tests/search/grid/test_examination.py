@@ -1,0 +1,102 @@
+"""Answers with their proof and their set, against the definition over whole grids."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from drake_pose.errors import SettingsError
+from drake_pose.search.grid.beam.search import BeamSearch
+from drake_pose.search.grid.families.examination import ExaminationSettings, examine
+from drake_pose.search.grid.families.search import samples_at
+from drake_pose.search.grid.settings import BeamSearchSettings
+from tests.search.bodies import swinging_chain
+from tests.search.grid_problems import ProblemMaker
+
+INTERVAL = 0.5
+
+
+@pytest.fixture(scope="module")
+def maker(tmp_path_factory: pytest.TempPathFactory) -> ProblemMaker:
+    return ProblemMaker(swinging_chain(tmp_path_factory.mktemp("chain"), 3).pose_tree(), INTERVAL)
+
+
+def search_of(maker: ProblemMaker, examination: ExaminationSettings | None) -> BeamSearch:
+    return BeamSearch(maker.tree, BeamSearchSettings(interval=INTERVAL), examination)
+
+
+def test_what_is_proved_is_the_best_of_the_grid(maker: ProblemMaker) -> None:
+    examined = search_of(maker, ExaminationSettings(proof_poses=10**6, family_poses=10**6))
+    generator = np.random.default_rng(5)
+    for noise in (0.0, 0.003, 0.01, 0.03) * 4:
+        problem = maker.make(generator, views=1, noise=noise, on_grid=noise == 0.0)
+        result = examined.match(problem.views)
+        best = problem.best[1]
+        assert result.proved_optimal
+        assert result.J == result.lower_bound == best
+        assert not result.budget_spent
+        samples = samples_at(maker.body.sampled, result.node_values)
+        assert samples is not None
+        assert tuple(samples.tolist()) in problem.within(best)
+        area = sum(int(view.mask.sum()) for view in problem.views)
+        assert result.E_total == pytest.approx(best / area)
+        q, X_WB = maker.tree.positions_from(result.node_values)
+        np.testing.assert_array_equal(result.q, q)
+        np.testing.assert_array_equal(result.X_WB, X_WB)
+        answer = result.pose_set
+        assert answer is not None
+        assert answer.complete
+        assert answer.size == len(problem.within(best + answer.tolerance))
+
+
+def test_a_worse_pose_is_replaced(maker: ProblemMaker) -> None:
+    search = search_of(maker, None)
+    generator = np.random.default_rng(8)
+    for noise in (0.0, 0.01) * 3:
+        problem = maker.make(generator, views=1, noise=noise, on_grid=noise == 0.0)
+        found = search.match(problem.views)
+        assert found.pose_set is None
+        assert not found.proved_optimal
+        wrong = int(generator.integers(len(problem.Js)))
+        values = tuple(
+            grid[t]
+            for grid, t in zip(maker.body.sampled.values, problem.choices[wrong], strict=True)
+        )
+        bad = replace(found, node_values=values, J=float(problem.Js[wrong]))
+        mended = examine(search.body, problem.views, bad, ExaminationSettings())
+        assert mended.proved_optimal
+        assert mended.J == problem.best[1] < bad.J
+        samples = samples_at(maker.body.sampled, mended.node_values)
+        assert samples is not None
+        assert tuple(samples.tolist()) in problem.within(mended.J)
+
+
+def test_without_time_nothing_is_proved_but_what_is_exact(maker: ProblemMaker) -> None:
+    hasty = search_of(maker, ExaminationSettings(proof_time_limit=0.0, family_time_limit=0.0))
+    generator = np.random.default_rng(6)
+    for noise in (0.0, 0.01) * 4:
+        problem = maker.make(generator, views=1, noise=noise, on_grid=noise == 0.0)
+        result = hasty.match(problem.views)
+        assert result.lower_bound <= problem.best[1] <= result.J
+        assert result.proved_optimal == (result.J == 0)
+        assert result.budget_spent
+        assert result.pose_set is not None
+        assert not result.pose_set.complete
+        assert not any(joint.determined for joint in result.pose_set.joints)
+
+
+def test_a_pose_between_the_samples_is_refused(maker: ProblemMaker) -> None:
+    search = search_of(maker, None)
+    problem = maker.make(np.random.default_rng(7), views=1, noise=0.0, on_grid=True)
+    result = search.match(problem.views)
+    values = tuple(value + 0.1 for value in result.node_values)
+    moved = replace(result, node_values=values)
+    with pytest.raises(SettingsError, match="not on the body's sampling grid"):
+        examine(search.body, problem.views, moved, ExaminationSettings())
+
+
+@pytest.mark.parametrize("name", ["proof_time_limit", "family_time_limit"])
+@pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf")])
+def test_times_are_checked(name: str, value: float) -> None:
+    with pytest.raises(SettingsError, match=name):
+        ExaminationSettings(**{name: value})

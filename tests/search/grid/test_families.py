@@ -1,0 +1,239 @@
+"""The set of poses as good as the best: against the definition, and on experiment A."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drake_pose.errors import SettingsError
+from drake_pose.papers.kameda.experiment import (
+    beam_experiment_search,
+    draw_values,
+    experiment_camera,
+)
+from drake_pose.search.grid.beam.limb_search import poses_at
+from drake_pose.search.grid.families.joint_estimates import estimate_joints, grid_steps
+from drake_pose.search.grid.families.search import (
+    FamilySettings,
+    GridPoseSet,
+    contour_length,
+    find_families,
+    samples_at,
+)
+from drake_pose.search.grid.families.split import cluster_samples
+from drake_pose.search.pose_families import JointEstimate
+from drake_pose.search.result import View
+from drake_pose.search.scoring import Scoring
+from tests.search.bodies import box_link, forked_body, joint, load_body, swinging_chain
+from tests.search.grid_problems import GridProblem, ProblemMaker, show_pose
+
+
+@pytest.fixture(scope="module")
+def flipping_body(tmp_path_factory: pytest.TempPathFactory) -> ProblemMaker:
+    """A trunk, an arm whose turn towards the camera looks like one away from it, a hidden hand."""
+    model = load_body(
+        tmp_path_factory.mktemp("flipping"),
+        box_link("trunk", 14, 20),
+        joint("turn", "revolute", "world", "trunk", (-0.4, 0.4)),
+        box_link("arm", 4, 20, z=10.0),
+        joint("flip", "revolute", "trunk", "arm", (-1.3, 1.3), axis="0 1 0", y=3.0, z=8.0),
+        box_link("knob", 2, 3, z=-1.0),
+        joint("spin", "revolute", "trunk", "knob", (-1.5, 1.5)),
+    )
+    return ProblemMaker(model.pose_tree(), 0.4)
+
+
+def found_families(problem: GridProblem, tolerance: float | None = None) -> GridPoseSet:
+    samples, J = problem.best
+    settings = FamilySettings(tolerance=tolerance)
+    return find_families(problem.body, problem.views, samples, J, settings)
+
+
+def seen_values(problem: GridProblem, J: float, node: int) -> np.ndarray:
+    rows = np.array(sorted(problem.within(J)))
+    return np.unique(problem.body.sampled.values[node][rows[:, node], 0])
+
+
+def test_towards_and_away_from_the_camera_are_two_families(flipping_body: ProblemMaker) -> None:
+    values = [np.array([0.4]), np.array([0.8]), np.array([-1.2])]
+    problem = flipping_body.show(values)
+    answer = found_families(problem)
+    assert answer.complete
+    assert answer.tolerance == 0.0
+    assert answer.contains(values)
+    assert answer.family_count == 2
+    assert [family.size for family in answer.families] == [7.0, 7.0]
+    flips = sorted(float(family.node_values[1][0]) for family in answer.families)
+    assert flips == pytest.approx([-0.8, 0.8])
+    turn, flip, spin = answer.joints
+    assert turn.determined
+    assert (turn.low, turn.high) == pytest.approx((0.2, 0.4))
+    assert not flip.determined
+    np.testing.assert_allclose(flip.values, [-0.8, 0.8])
+    assert not spin.determined
+    assert (spin.low, spin.high) == pytest.approx((-1.2, 1.2))
+    for family in answer.families:
+        assert [report.determined for report in family.joints] == [True, True, False]
+        assert family.joints[1].holds(float(family.node_values[1][0]))
+    assert answer.within_intervals(values)
+    assert not answer.within_intervals([np.array([0.4]), np.array([0.0]), np.array([0.0])])
+
+
+def test_the_set_is_that_of_the_definition(tmp_path: Path) -> None:
+    generator = np.random.default_rng(21)
+    for model in (swinging_chain(tmp_path, 3), forked_body(tmp_path)):
+        maker = ProblemMaker(model.pose_tree(), 0.4)
+        for tolerance in (0.0, 25.0, 150.0):
+            problem = maker.make(generator, views=1, noise=0.005, on_grid=False)
+            answer = found_families(problem, tolerance)
+            J = problem.best[1] + tolerance
+            expected = problem.within(J)
+            assert answer.complete
+            assert answer.size == len(expected) == sum(family.size for family in answer.families)
+            for row in problem.choices:
+                values = [grid[t] for grid, t in zip(maker.body.sampled.values, row, strict=True)]
+                assert answer.contains(values) == (tuple(row.tolist()) in expected)
+            for node, report in enumerate(answer.joints):
+                np.testing.assert_allclose(report.values, seen_values(problem, J, node))
+
+
+def test_families_are_the_connected_groups_of_clusters(flipping_body: ProblemMaker) -> None:
+    problem = flipping_body.make(np.random.default_rng(22), views=1, noise=0.01, on_grid=False)
+    answer = found_families(problem, 120.0)
+    J = problem.best[1] + 120.0
+    gap = 0.4 * 1.01
+    groups = set()
+    for row in problem.within(J):
+        group = []
+        for node, t in enumerate(row):
+            seen = seen_values(problem, J, node)
+            breaks = seen[1:][np.diff(seen) > gap]
+            value = flipping_body.body.sampled.values[node][t, 0]
+            group.append(int((value >= breaks - 1e-9).sum()))
+        groups.add(tuple(group))
+    assert answer.family_count == len(groups)
+    assert [f.J for f in answer.families] == sorted(f.J for f in answer.families)
+
+
+def test_a_better_pose_that_turns_up_takes_the_place_of_the_known_one(
+    flipping_body: ProblemMaker,
+) -> None:
+    problem = flipping_body.make(np.random.default_rng(23), views=1, noise=0.0, on_grid=True)
+    worse = int(np.argsort(problem.Js)[40])
+    J = float(problem.Js[worse])
+    assert J > 0.0
+    answer = find_families(
+        problem.body, problem.views, problem.choices[worse], J, FamilySettings(tolerance=0.0)
+    )
+    assert answer.families[0].J == problem.best[1]
+    assert answer.size == len(problem.within(problem.best[1]))
+
+
+@pytest.mark.parametrize("limits", [{"time_limit": 0.0}, {"states": 1}, {"pairs": 1}])
+def test_a_limit_still_leaves_the_best_pose_and_is_reported(
+    flipping_body: ProblemMaker, limits: dict[str, float]
+) -> None:
+    problem = flipping_body.make(np.random.default_rng(24), views=1, noise=0.0, on_grid=False)
+    samples, J = problem.best
+    settings = FamilySettings(tolerance=60.0, **limits)
+    answer = find_families(problem.body, problem.views, samples, J, settings)
+    assert not answer.complete
+    assert answer.graph.contains(samples)
+    assert answer.families[0].J == J
+
+
+def test_by_default_the_noise_is_a_share_of_the_contour(flipping_body: ProblemMaker) -> None:
+    problem = flipping_body.make(np.random.default_rng(25), views=1, noise=0.01, on_grid=True)
+    assert found_families(problem).tolerance == pytest.approx(0.05 * contour_length(problem.views))
+    mask = np.zeros((70, 70), dtype=np.bool_)
+    mask[10:20, 30:50] = True
+    # Along the picture's edge there is no contour: what lies beyond is not known.
+    mask[60:, 10:12] = True
+    expected = 2 * 20 + 2 * 8 + 20
+    assert contour_length([View(problem.views[0].camera, mask)]) == expected
+
+
+def test_samples_that_turn_a_node_alike_are_one_cluster(tmp_path: Path) -> None:
+    model = load_body(
+        tmp_path,
+        box_link("wheel", 10, 4),
+        joint("spin", "revolute", "world", "wheel", (-math.pi, math.pi)),
+    )
+    maker = ProblemMaker(model.pose_tree(), math.pi / 4)
+    values = maker.body.sampled.values[0][:, 0]
+    ends = np.flatnonzero(np.abs(values) > 2.0)
+    labels = cluster_samples(maker.body.sampled, 0, ends)
+    assert len(set(labels[ends].tolist())) == 1
+    assert set(labels.tolist()) == {-1, 0}
+
+
+def test_steps_of_grids() -> None:
+    product = np.array([[0.0, 1.0, 5.0], [0.0, 3.0, 5.0], [0.5, 1.0, 5.0], [0.5, 3.0, 5.0]])
+    np.testing.assert_allclose(grid_steps(product), [0.5, 2.0, np.inf])
+    circle = np.array([[math.cos(a), math.sin(a)] for a in np.arange(6) * math.pi / 3])
+    np.testing.assert_allclose(grid_steps(circle), [1.0, 1.0])
+
+
+def test_two_neighbouring_values_are_still_determined(tmp_path: Path) -> None:
+    sampled = ProblemMaker(swinging_chain(tmp_path, 2).pose_tree(), 0.5).body.sampled
+    grid = sampled.values[0][:, 0]
+    pair, three = [np.flatnonzero((grid > -0.1) & (grid < limit)) for limit in (0.6, 1.1)]
+    one, other = estimate_joints(sampled, [pair, three], [np.zeros(1)] * 2)
+    assert one.determined
+    assert (one.low, one.high) == pytest.approx((-0.25, 0.75))
+    assert not other.determined or len(three) <= 2
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"tolerance": -1.0},
+        {"contour_share": 1.5},
+        {"families": 0},
+        {"states": 0},
+        {"pairs": 0},
+        {"time_limit": -1.0},
+    ],
+)
+def test_settings_out_of_range_are_refused(settings: dict[str, float]) -> None:
+    with pytest.raises(SettingsError):
+        FamilySettings(**settings)
+
+
+def test_a_pose_off_the_grid_has_no_samples(tmp_path: Path) -> None:
+    sampled = ProblemMaker(swinging_chain(tmp_path, 2).pose_tree(), 0.5).body.sampled
+    assert samples_at(sampled, [np.array([0.5]), np.array([-1.0])]) is not None
+    assert samples_at(sampled, [np.array([0.5]), np.array([-0.9])]) is None
+
+
+@pytest.mark.slow
+def test_experiment_a_the_truth_is_in_the_set_and_all_members_look_alike() -> None:
+    search, camera = beam_experiment_search(), experiment_camera()
+    generator = np.random.default_rng(26)
+    sizes, complete = [], []
+    for _ in range(12):
+        values = draw_values(search, "grid", generator)
+        view = show_pose(search.sampled, values, camera)
+        true_samples = samples_at(search.sampled, values)
+        assert true_samples is not None
+        found = search.match([view])
+        samples = samples_at(search.sampled, found.node_values)
+        assert samples is not None
+        answer = find_families(search.body, [view], samples, found.J)
+        assert answer.contains(values)
+        members = answer.graph.draw(10, generator)
+        scoring = Scoring(search.sampled, [view])
+        assert scoring.J(poses_at(scoring, members), members).max() == 0.0
+        flat = np.concatenate(values)
+        assert all(report.holds(v) for report, v in zip(answer.joints, flat, strict=True))
+        sizes.append(answer.size)
+        complete.append(answer.complete)
+    assert all(complete)
+    assert max(sizes) > 1.0
+
+
+def test_a_report_holds_what_lies_between() -> None:
+    report = JointEstimate("elbow", 0, True, -0.5, 0.5, np.array([0.0]))
+    assert report.holds(0.5)
+    assert not report.holds(0.51)

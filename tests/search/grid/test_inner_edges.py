@@ -1,0 +1,205 @@
+"""Edges inside the silhouette: of hand-made pictures, and as a judge among poses."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drake_pose.errors import SettingsError
+from drake_pose.papers.kameda.experiment import (
+    beam_experiment_search,
+    draw_values,
+    experiment_camera,
+)
+from drake_pose.search.grid.families.inner_edges import (
+    EdgeErrors,
+    choose_by_edges,
+    edges_of_colours,
+    edges_of_labels,
+    find_borders,
+)
+from drake_pose.search.grid.families.search import GridPoseSet, find_families, samples_at
+from drake_pose.search.grid.sampled_body import SampledBody
+from drake_pose.search.grid.settings import BeamSearchSettings
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from tests.search.bodies import box_link, front_camera, joint, load_body
+from tests.search.grid_problems import show_pose
+
+
+def two_halves(column: int) -> np.ndarray:
+    segments = np.full((40, 60), -1)
+    segments[5:35, 10:50] = 0
+    segments[5:35, column:50] = 1
+    return segments
+
+
+def test_borders_lie_between_segments_and_not_at_the_silhouette() -> None:
+    borders = find_borders(two_halves(30))
+    expected = np.zeros((40, 60), dtype=np.bool_)
+    expected[5:35, 29] = True
+    assert np.array_equal(borders, expected)
+
+
+@pytest.mark.parametrize(("shift", "at_least", "below"), [(0, -1, 1), (1, -150, -1), (3, -999, 0)])
+def test_edges_are_likely_where_they_are_expected(shift: int, at_least: int, below: int) -> None:
+    segments = two_halves(30)
+    edges = edges_of_labels(segments, segments >= 0)
+    found = [edges.log_likelihood(two_halves(30 + far)) for far in (shift, shift + 2)]
+    assert at_least <= found[0] < below
+    assert found[0] > found[1] or shift == 3
+
+
+def test_half_an_edge_is_likelier_than_none() -> None:
+    segments = two_halves(30)
+    edges = edges_of_labels(segments, segments >= 0)
+    half = np.where(np.arange(40)[:, None] < 20, segments, np.where(segments >= 0, 0, -1))
+    plain = np.where(segments >= 0, 0, -1)
+    found = [edges.log_likelihood(one) for one in (segments, half, plain)]
+    assert found == sorted(found, reverse=True)
+    assert len(set(found)) == 3
+
+
+def test_what_may_be_seen_sums_to_one() -> None:
+    errors = EdgeErrors(missing=0.3, wrong=0.1, patch=3)
+    assert np.allclose(np.exp(errors.log_pixel).sum(axis=1), 1.0)
+    assert np.exp(errors.log_patch(50, 100.0)).sum() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [({"missing": 0.0}, "missing"), ({"wrong": -1.0}, "wrong"), ({"patch": 0}, "patch")],
+)
+def test_errors_out_of_range_are_refused(values: dict[str, float], message: str) -> None:
+    with pytest.raises(SettingsError, match=message):
+        EdgeErrors(**values)
+
+
+def test_colours_show_the_same_edges_and_their_noise_is_borne() -> None:
+    generator = np.random.default_rng(1)
+    segments = two_halves(30)
+    colours = np.array([[200, 60, 60], [60, 60, 200], [0, 0, 0]])[segments]
+    noise = generator.integers(-8, 9, (*segments.shape, 3))
+    picture = np.clip(colours + noise, 0, 255).astype(np.uint8)
+    edges = edges_of_colours(picture, segments >= 0)
+    true, other = (edges.log_likelihood(two_halves(column)) for column in (30, 20))
+    assert true > other + 5.0
+
+
+def test_pictures_that_do_not_fit_are_refused() -> None:
+    segments = two_halves(30)
+    with pytest.raises(SettingsError, match="same camera"):
+        edges_of_labels(segments, np.ones((30, 60), dtype=np.bool_))
+    with pytest.raises(SettingsError, match="empty"):
+        edges_of_colours(np.zeros((40, 60, 3), dtype=np.uint8), np.zeros((40, 60), dtype=np.bool_))
+
+
+@pytest.fixture
+def arm_before_trunk(tmp_path: Path) -> tuple[GridPoseSet, np.ndarray, LabelRenderer]:
+    """Fifteen poses with one silhouette, the samples of one of them, and what draws them."""
+    model = load_body(
+        tmp_path,
+        box_link("trunk", 40, 40),
+        joint("turn", "revolute", "world", "trunk", (0.0, 0.0)),
+        box_link("arm", 4, 14, y=1.0, z=-6.0),
+        '<joint name="swing" type="revolute"><parent link="trunk"/><child link="arm"/>'
+        '<origin xyz="0.1 0 0"/><axis xyz="1 0 0"/>'
+        '<limit lower="-3" upper="3" effort="1" velocity="1"/></joint>',
+    )
+    body = SampledBody(model.pose_tree(), BeamSearchSettings(interval=0.4))
+    camera = front_camera(80, shift=0.137)
+    values = [np.zeros(1), np.array([1.2])]
+    view = show_pose(body.sampled, values, camera)
+    samples = samples_at(body.sampled, values)
+    assert samples is not None
+    answer = find_families(body, [view], np.zeros(2, dtype=np.int64), 0.0)
+    assert answer.size == 15
+    return answer, samples, LabelRenderer(model, camera)
+
+
+def show_segments(answer: GridPoseSet, samples: np.ndarray, renderer: LabelRenderer) -> np.ndarray:
+    values = [grid[t] for grid, t in zip(answer.sampled.values, samples, strict=True)]
+    return renderer.segments(*answer.sampled.tree.positions_from(values))
+
+
+@pytest.mark.parametrize("most", [300, 12])
+def test_a_hand_before_the_trunk_is_found_by_its_edges(
+    arm_before_trunk: tuple[GridPoseSet, np.ndarray, LabelRenderer], most: int
+) -> None:
+    """The silhouette shows nothing of it, its edges everything."""
+    answer, samples, renderer = arm_before_trunk
+    seen = show_segments(answer, samples, renderer)
+    choice = choose_by_edges(
+        answer, [edges_of_labels(seen, seen >= 0)], [renderer.segments], most=most
+    )
+    assert choice.left == 1
+    # Of twelve of fifteen poses nobody knows what the other three would say.
+    assert choice.settled == (most == 300)
+    assert np.array_equal(choice.samples[0], samples)
+    assert not choice.rules_out(samples)
+    judged = {tuple(row) for row in choice.samples.tolist()}
+    for member in answer.graph.members():
+        others = tuple(member.tolist()) in judged and not np.array_equal(member, samples)
+        assert choice.rules_out(member) == others
+    assert choice.probabilities[0] == pytest.approx(1.0)
+    assert choice.exhaustive == (most == 300)
+    assert choice.joints[-1].holds(1.2)
+    assert choice.joints[-1].determined == choice.exhaustive
+
+
+def test_noise_on_the_edges_leaves_the_true_pose(
+    arm_before_trunk: tuple[GridPoseSet, np.ndarray, LabelRenderer],
+) -> None:
+    """Edges damaged at the rates that are stated, in squares that lie anywhere: 100 draws."""
+    answer, samples, renderer = arm_before_trunk
+    seen = show_segments(answer, samples, renderer)
+    exact = edges_of_labels(seen, seen >= 0)
+    generator = np.random.default_rng(5)
+    drawn = {
+        tuple(member.tolist()): show_segments(answer, member, renderer)
+        for member in answer.graph.members()
+    }
+    pictures: Iterator[np.ndarray] = iter(())
+
+    def render(q: np.ndarray, X_WB: np.ndarray) -> np.ndarray:
+        return next(pictures)
+
+    left = []
+    for _ in range(100):
+        lost = np.kron(generator.random((17, 17)) < 0.2, np.ones((5, 5), dtype=np.bool_))
+        row, column = generator.integers(5, size=2)
+        places = np.argwhere(exact.edges & ~lost[row : row + 80, column : column + 80])
+        places += generator.integers(-1, 2, places.shape)
+        damaged = np.zeros_like(exact.edges)
+        damaged[tuple(places.T)] = True
+        row, column = generator.choice(np.argwhere(exact.mask))
+        damaged[row, column : column + 5] = True
+        pictures = iter(drawn.values())
+        choice = choose_by_edges(answer, [replace(exact, edges=damaged & exact.mask)], [render])
+        assert not choice.rules_out(samples)
+        left.append(choice.left)
+    assert np.median(left) <= 5
+
+
+@pytest.mark.slow
+def test_experiment_a_edges_never_speak_against_the_truth() -> None:
+    search, camera = beam_experiment_search(), experiment_camera()
+    generator = np.random.default_rng(77)
+    renderer = LabelRenderer(search.tree.model, camera)
+    before, after = 0.0, 0
+    for _ in range(12):
+        values = draw_values(search, "grid", generator)
+        view = show_pose(search.sampled, values, camera)
+        samples = samples_at(search.sampled, values)
+        assert samples is not None
+        answer = find_families(search.body, [view], samples, 0.0)
+        if not 1.0 < answer.size <= 100.0:
+            continue
+        seen = renderer.segments(*search.tree.positions_from(values))
+        edges = [edges_of_labels(seen, view.mask)]
+        choice = choose_by_edges(answer, edges, [renderer.segments])
+        left = {tuple(row) for row in choice.samples[: choice.left].tolist()}
+        assert tuple(samples.tolist()) in left
+        before, after = before + answer.size, after + choice.left
+    assert after < 0.5 * before

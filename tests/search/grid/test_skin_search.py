@@ -1,0 +1,128 @@
+"""The searches with a body whose skin bends, against brute force and against turned-over trees."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from drake_pose.body.model import ArticulatedModel
+from drake_pose.body.tree.root import RootRotation
+from drake_pose.camera.models import ParallelCamera
+from drake_pose.search.grid.beam.limb_search import poses_at
+from drake_pose.search.grid.beam.search import BeamSearch
+from drake_pose.search.grid.settings import BeamSearchSettings
+from drake_pose.search.kameda.search import PaperSearch
+from drake_pose.search.result import View
+from drake_pose.search.scoring import SampledTree, Scoring
+from drake_pose.search.settings import PaperSearchSettings
+from drake_pose.silhouette.areas.bending import TreeSurfaces
+from drake_pose.silhouette.areas.scoring import draw_mask
+from tests.body.skins import load_limb
+from tests.search.naive_search import NaiveSearch
+
+INTERVAL = 0.8
+
+
+@pytest.fixture(scope="module")
+def limb(tmp_path_factory: pytest.TempPathFactory) -> ArticulatedModel:
+    return load_limb(tmp_path_factory.mktemp("limb"))
+
+
+def side_camera() -> ParallelCamera:
+    """Looks along -x from an odd angle; the shoulder is at the middle of the picture."""
+    turn = 0.3
+    c, s = np.cos(turn), np.sin(turn)
+    X_WC = np.array([[-s, 0, -c, 4.0], [c, 0, -s, 1.0], [0, -1, 0, 0.2], [0, 0, 0, 1.0]])
+    return ParallelCamera("side", 120, 120, 90.0, 60.2, 60.1, X_WC)
+
+
+def view_of(tree, values) -> View:
+    camera = side_camera()
+    surfaces = TreeSurfaces(tree).at(values)
+    return View(camera, draw_mask(surfaces, camera.X_CW @ tree.node_poses(values), camera))
+
+
+def random_samples(sampled: SampledTree, rng: np.random.Generator) -> np.ndarray:
+    return np.array([rng.integers(len(values)) for values in sampled.values])
+
+
+def test_the_objective_counts_the_skin(limb: ArticulatedModel) -> None:
+    tree = limb.pose_tree()
+    sampled = SampledTree(tree, PaperSearchSettings(interval=INTERVAL))
+    rng = np.random.default_rng(0)
+    target = random_samples(sampled, rng)
+    view = view_of(tree, [v[t] for v, t in zip(sampled.values, target, strict=True)])
+    scoring = Scoring(sampled, [view])
+    samples = np.array([target, *(random_samples(sampled, rng) for _ in range(20))])
+    Js = scoring.J(poses_at(scoring, samples), samples)
+    assert Js[0] == 0
+    for J, taken in zip(Js, samples, strict=True):
+        mask = view_of(tree, [v[t] for v, t in zip(sampled.values, taken, strict=True)]).mask
+        assert np.count_nonzero(mask ^ view.mask) == J
+    with pytest.raises(ValueError, match="samples of lower, hand are needed"):
+        scoring.J(poses_at(scoring, samples))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_papers_search_is_that_of_plain_pictures(limb: ArticulatedModel, seed: int) -> None:
+    tree = limb.pose_tree()
+    settings = PaperSearchSettings(interval=INTERVAL, outside_limit=8.0, candidate_limit=3)
+    search = PaperSearch(tree, settings)
+    rng = np.random.default_rng(seed)
+    values = [rng.uniform(*tree.value_bounds(i)) for i in range(3)]
+    view = view_of(tree, values)
+    result = search.match([view])
+    naive = NaiveSearch(search, view.camera, view.mask, 8.0, 3).run()
+    assert result.found == (naive.best is not None)
+    assert result.runs == naive.runs
+    if naive.best is not None:
+        assert result.J == naive.best[0]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_wide_search_finds_the_minimum(limb: ArticulatedModel, seed: int) -> None:
+    tree = limb.pose_tree()
+    search = BeamSearch(tree, BeamSearchSettings(interval=INTERVAL))
+    sampled = search.sampled
+    rng = np.random.default_rng(10 + seed)
+    target = [v[t] for v, t in zip(sampled.values, random_samples(sampled, rng), strict=True)]
+    exact = search.match([view_of(tree, target)])
+    assert exact.J == 0
+    values = [rng.uniform(*tree.value_bounds(i)) for i in range(3)]
+    view = view_of(tree, values)
+    scoring = Scoring(sampled, [view])
+    everything = itertools.product(*(range(len(v)) for v in sampled.values))
+    samples = np.array(list(everything))
+    assert search.match([view]).J == scoring.J(poses_at(scoring, samples), samples).min()
+
+
+@pytest.mark.parametrize("root", ["lower", "hand"])
+def test_a_turned_over_tree_gives_the_same_J(limb: ArticulatedModel, root: str) -> None:
+    own = limb.pose_tree()
+    rng = np.random.default_rng(3)
+    for _ in range(5):
+        q = rng.uniform(limb.lower, limb.upper)
+        values = own.values_from_positions(q)
+        view = view_of(own, values)
+        index = own.node_index(root)
+        turned = limb.pose_tree(
+            root,
+            root_position=own.node_poses(values)[index, :3, 3],
+            root_rotation=RootRotation.free(),
+        )
+        other = view_of(turned, turned.values_from_positions(q))
+        assert view.mask.sum() > 250
+        assert np.count_nonzero(view.mask ^ other.mask) <= 1
+
+
+def test_grid_poses_are_judged_with_their_skin(limb: ArticulatedModel) -> None:
+    tree = limb.pose_tree()
+    search = BeamSearch(tree, BeamSearchSettings(interval=INTERVAL))
+    rng = np.random.default_rng(4)
+    target = random_samples(search.sampled, rng)
+    view = view_of(tree, [v[t] for v, t in zip(search.sampled.values, target, strict=True)])
+    poses = search.best_poses([view], count=5)
+    assert poses.J[0] == 0
+    for samples, J in zip(poses.samples, poses.J, strict=True):
+        values = [v[t] for v, t in zip(search.sampled.values, samples, strict=True)]
+        assert np.count_nonzero(view_of(tree, values).mask ^ view.mask) == J

@@ -1,0 +1,277 @@
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from drake_pose.errors import MaskError, SettingsError
+from drake_pose.search.kameda.search import NodeList, PaperSearch
+from drake_pose.search.result import View
+from drake_pose.search.scoring import Scoring
+from drake_pose.search.settings import PaperSearchSettings
+from drake_pose.silhouette.areas.scoring import draw_mask
+from tests.search.bodies import (
+    box_link,
+    forked_body,
+    front_camera,
+    joint,
+    load_body,
+    swinging_chain,
+)
+from tests.search.naive_search import NaiveSearch
+
+
+def silhouette(search, camera, values):
+    X_CN = camera.X_CW @ search.tree.node_poses(values)
+    return draw_mask(search.sampled.outlines, X_CN, camera)
+
+
+def random_silhouette(search, camera, generator):
+    values = [grid[generator.integers(len(grid))] for grid in search.sampled.values]
+    return silhouette(search, camera, values)
+
+
+@pytest.fixture
+def sliders(tmp_path):
+    """A 20 x 10 box that slides right, and on it a 6 x 8 box that slides up: areas by hand."""
+    model = load_body(
+        tmp_path,
+        box_link("wide", 20, 10),
+        joint("right", "prismatic", "world", "wide", (-0.1, 0.1), axis="0 1 0"),
+        box_link("small", 6, 8),
+        joint("up", "prismatic", "wide", "small", (0.0, 0.08), axis="0 0 1"),
+    )
+    return model.pose_tree()
+
+
+def slider_search(tree, r=0.0, K=5):
+    settings = PaperSearchSettings(
+        intervals={"right": 0.05, "up": 0.04}, outside_limit=r, candidate_limit=K
+    )
+    return PaperSearch(tree, settings)
+
+
+def test_step_3_keeps_what_stays_inside_and_step_4_scores_it(sliders):
+    """The silhouette is the wide box 5 pixels to the right with the small one 8 pixels up.
+
+    Outside area of the wide box at -10, -5, 0, 5, 10: 15, 10, 5, 0, 5 columns of 10 pixels.
+    """
+    camera = front_camera()
+    search = slider_search(sliders, r=60.0)
+    mask = silhouette(search, camera, [np.array([0.05]), np.array([0.08])])
+    # 20 x 10, and of the small box (rows 4 to 12 above the middle) all but one row.
+    assert mask.sum() == 200 + 6 * 7
+    scoring = Scoring(search.sampled, [View(camera, mask)])
+    slides = search.sampled.values[0][:, 0]
+    nothing_covered = scoring.uncovered([], np.empty(0, dtype=int), np.empty((0, 4, 4)))
+    poses = scoring.candidate_poses(0, np.eye(4))
+    outside, covered = scoring.candidate_areas(0, np.arange(len(poses)), poses, nothing_covered)
+    np.testing.assert_array_equal(outside[0] + covered, 200)
+    # To the right of the middle of the picture the small box hides no column of the wide one.
+    expected = {-0.10: 150, -0.05: 100, 0.0: 50, 0.05: 0, 0.10: 50}
+    assert {round(s, 2): area for s, area in zip(slides, outside[0], strict=True)} == expected
+    result = search.match([View(camera, mask)])
+    assert result.J == 0
+    np.testing.assert_allclose(result.q, [0.05, 0.08])
+    # Kept at r = 60: 5 (score 200), 0 and 10 (150 each): nearest to zero first among equals.
+    np.testing.assert_allclose(result.untried["wide"].values[:, 0], [0.0, 0.10])
+    np.testing.assert_allclose(result.untried["wide"].scores, [150, 150])
+    # The small box at 0 is hidden, at 4 shows 3 rows of 6, at 8 shows 7 rows of 6.
+    np.testing.assert_allclose(result.untried["small"].values[:, 0], [0.04, 0.0])
+    np.testing.assert_allclose(result.untried["small"].scores, [18, 0])
+    assert result.runs == 2
+
+
+def test_step_5_keeps_the_best_K(sliders):
+    camera = front_camera()
+    search = slider_search(sliders, r=60.0, K=2)
+    mask = silhouette(search, camera, [np.array([0.05]), np.array([0.08])])
+    result = search.match([View(camera, mask)])
+    assert len(result.untried["wide"].values) == 1
+
+
+def test_step_6_goes_back_to_the_nearest_ancestor_with_an_untried_candidate(tmp_path):
+    """The first box fits a blot best, but only from the other place can the second one reach on.
+
+    A blot of 12 x 10 pixels on the left draws the 10 x 10 box; on the right stands the true
+    body: 10 x 8 for the first box (so its score is smaller there) and its arm of 20 x 4 below.
+    """
+    model = load_body(
+        tmp_path,
+        box_link("first", 10, 10),
+        joint("slide", "prismatic", "world", "first", (-0.2, 0.2), axis="0 1 0"),
+        box_link("arm", 4, 20, z=-15.0),
+        joint("weld_like", "prismatic", "first", "arm", (0.0, 0.0), axis="0 1 0"),
+    )
+    search = PaperSearch(
+        model.pose_tree(), PaperSearchSettings(intervals={"slide": 0.2}, outside_limit=20.0)
+    )
+    camera = front_camera()
+    mask = silhouette(search, camera, [np.array([0.2]), np.array([0.0])])
+    mask[45:47, 65:75] = False  # two rows of the true first box are missing: 20 pixels outside
+    mask[45:55, 25:35] = True  # the blot, at slide = -0.2
+    result = search.match([View(camera, mask)])
+    np.testing.assert_allclose(result.q, [0.2, 0.0])
+    # Step 3 for the box, for the arm in vain, and for the arm again.
+    assert result.runs == 3
+    assert result.J == 20 + 100
+
+
+def test_no_pose_is_an_answer(sliders):
+    camera = front_camera()
+    mask = np.zeros((100, 100), dtype=bool)
+    mask[2:4, 2:4] = True
+    result = slider_search(sliders, r=0.0).match([View(camera, mask)])
+    assert not result.found
+    assert np.isnan(result.q).all()
+    assert result.runs == 1
+    assert result.stopped_by == "end"
+
+
+def test_automatic_threshold_doubles_until_a_pose_is_found(sliders):
+    camera = front_camera()
+    mask = np.zeros((100, 100), dtype=bool)
+    mask[46:54, 41:59] = True
+    settings = PaperSearchSettings(intervals={"right": 0.05, "up": 0.04})
+    result = PaperSearch(sliders, settings).match([View(camera, mask)])
+    # 12.6 % of the mean of 200 and 48 pixels is 15.6; the wide box leaves the mask by 56.
+    assert result.found
+    assert result.outside_limit[0] == pytest.approx(0.126 * 124 * 4)
+    assert result.runs == 1 + 1 + 2
+
+
+def test_leaf_combination_helps_where_leaves_overlap(tmp_path):
+    """Each leaf alone wants the larger blot; together they must share two blots (5.2.1)."""
+    model = load_body(
+        tmp_path,
+        box_link("trunk", 4, 10),
+        joint("fixed_here", "prismatic", "world", "trunk", (0.0, 0.0), axis="0 1 0"),
+        box_link("near", 8, 8, z=-9.0),
+        joint("near_slide", "prismatic", "trunk", "near", (-0.1, 0.1), axis="0 1 0"),
+        box_link("far", 8, 7, z=-9.0),
+        joint("far_slide", "prismatic", "trunk", "far", (-0.1, 0.1), axis="0 1 0"),
+    )
+    settings = PaperSearchSettings(length_interval=0.1, outside_limit=30.0)
+    search = PaperSearch(model.pose_tree(), settings)
+    camera = front_camera()
+    values = [np.array([0.0]), np.array([0.1]), np.array([-0.1])]
+    mask = silhouette(search, camera, values)
+    # The true place of "near" loses a column: its other place scores 56 of its 64 pixels too.
+    mask[:, 63] = False
+    expected = 8
+    result = search.match([View(camera, mask)])
+    assert result.J == expected
+
+
+@pytest.mark.parametrize("K", [1, 2, 5])
+@pytest.mark.parametrize("body", ["chain2", "chain3", "chain4", "fork"])
+@pytest.mark.parametrize("outside_weight", [0.0, 1.5])
+def test_search_does_what_the_paper_says(tmp_path, body, K, outside_weight):
+    """Against the same procedure on plain pictures: pose, J, first J and runs of step 3."""
+    model = forked_body(tmp_path) if body == "fork" else swinging_chain(tmp_path, int(body[-1]))
+    r = 12.0
+    settings = PaperSearchSettings(
+        outside_limit=r,
+        outside_weight=outside_weight,
+        candidate_limit=K,
+        interval=math.radians(30),
+    )
+    search = PaperSearch(model.pose_tree(), settings)
+    camera = front_camera(shift=0.1234)
+    generator = np.random.default_rng(K)
+    for _ in range(6):
+        mask = random_silhouette(search, camera, generator)
+        naive = NaiveSearch(search, camera, mask, r, K, outside_weight).run()
+        result = search.match([View(camera, mask)])
+        assert result.runs == naive.runs
+        assert result.found == (naive.best is not None)
+        if result.found:
+            assert result.J == naive.best[0]
+            assert result.first_E_total * mask.sum() == pytest.approx(naive.first_J)
+            for i, values in naive.best[1].items():
+                np.testing.assert_array_equal(result.node_values[i], values)
+
+
+@pytest.mark.parametrize("body", ["chain2", "chain3", "fork"])
+def test_search_against_brute_force_over_the_whole_grid(tmp_path, body):
+    """The search never claims less than the true minimum, and nearly always reaches it."""
+    model = forked_body(tmp_path) if body == "fork" else swinging_chain(tmp_path, int(body[-1]))
+    settings = PaperSearchSettings(outside_limit=10.0, candidate_limit=8, interval=math.radians(30))
+    search = PaperSearch(model.pose_tree(), settings)
+    camera = front_camera(shift=0.1234)
+    generator = np.random.default_rng(7)
+    reached = 0
+    for _ in range(20):
+        mask = random_silhouette(search, camera, generator)
+        smallest = min(
+            int((silhouette(search, camera, values) ^ mask).sum())
+            for values in itertools.product(*search.sampled.values)
+        )
+        assert smallest == 0
+        result = search.match([View(camera, mask)])
+        own = silhouette(search, camera, result.node_values) ^ mask
+        assert result.J == own.sum()
+        assert result.E_total == pytest.approx(own.sum() / mask.sum())
+        reached += result.J == smallest
+    assert reached >= 18
+
+
+def test_several_views_are_one_search(tmp_path):
+    """Two cameras at right angles settle a turn that one camera cannot see."""
+    model = load_body(
+        tmp_path,
+        box_link("disc", 12, 12, y=3.0),
+        joint("spin", "revolute", "world", "disc", (-1.5, 1.5), axis="0 0 1"),
+    )
+    search = PaperSearch(
+        model.pose_tree(), PaperSearchSettings(interval=math.radians(10), outside_limit=5.0)
+    )
+    front = front_camera()
+    side = front_camera(name="side").with_pose(
+        np.array([[1.0, 0, 0, 0], [0, 0, 1, -5], [0, -1, 0, 0], [0, 0, 0, 1]])
+    )
+    turn = [np.array([math.radians(-40)])]
+    views = [View(camera, silhouette(search, camera, turn)) for camera in (front, side)]
+    result = search.match(views)
+    np.testing.assert_allclose(result.q, turn[0])
+    assert result.J == 0
+    assert len(result.outside_limit) == 2
+
+
+def test_the_search_is_deterministic(tmp_path):
+    search = PaperSearch(swinging_chain(tmp_path, 4).pose_tree())
+    camera = front_camera()
+    mask = random_silhouette(search, camera, np.random.default_rng(3))
+    first, second = (search.match([View(camera, mask)]) for _ in range(2))
+    np.testing.assert_array_equal(first.q, second.q)
+    assert (first.J, first.runs) == (second.J, second.runs)
+
+
+def test_run_limit_stops_and_says_so(tmp_path):
+    settings = PaperSearchSettings(run_limit=2, outside_limit=50.0)
+    search = PaperSearch(swinging_chain(tmp_path, 3).pose_tree(), settings)
+    camera = front_camera()
+    mask = random_silhouette(search, camera, np.random.default_rng(3))
+    result = search.match([View(camera, mask)])
+    assert (result.found, result.runs, result.stopped_by) == (False, 2, "run_limit")
+
+
+def test_bad_input_is_refused(sliders):
+    camera = front_camera()
+    with pytest.raises(MaskError, match=r"front.*empty"):
+        View(camera, np.zeros((100, 100), dtype=bool))
+    with pytest.raises(MaskError, match=r"front.*\(80, 100\)"):
+        View(camera, np.ones((100, 80), dtype=bool))
+    with pytest.raises(SettingsError, match="at least one view"):
+        slider_search(sliders).match([])
+    for bad in ({"interval": 0.0}, {"candidate_limit": 0}, {"outside_limit": -1.0},
+                {"run_limit": 0}, {"interval": math.nan}, {"intervals": {"up": -1.0}}):  # fmt: skip
+        with pytest.raises(SettingsError, match=next(iter(bad)).rstrip("s")):
+            PaperSearchSettings(**bad)
+
+
+def test_node_list_knows_its_untried_candidates():
+    one = NodeList(np.array([3]), np.array([1.0]), np.eye(4)[None])
+    two = NodeList(np.array([3, 4]), np.array([1.0, 0.5]), np.stack([np.eye(4)] * 2))
+    assert not one.has_untried
+    assert two.has_untried

@@ -1,0 +1,346 @@
+"""Refinement against what is drawn, against finite differences and against scipy."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.optimize import lsq_linear
+
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import load_model
+from drake_pose.camera.models import ParallelCamera, PinholeCamera
+from drake_pose.errors import SettingsError
+from drake_pose.search.continuous.intervals import (
+    IntervalSettings,
+    find_intervals,
+)
+from drake_pose.search.raster_fit.body import RefinementBody
+from drake_pose.search.raster_fit.passes import (
+    COARSE_PASSES,
+    FINE_PASSES,
+    LAST_PASSES,
+    Pass,
+    descend,
+    limited_step,
+)
+from drake_pose.search.raster_fit.problem import RefinementProblem
+from drake_pose.search.result import View
+from drake_pose.search.starts.depth_reflections import find_reflections
+from drake_pose.search.starts.neighbourhood import NeighbourhoodSearch, NeighbourhoodSettings
+from drake_pose.search.starts.part_placement import PartSearch, find_parts
+from drake_pose.silhouette.areas.bending import TreeSurfaces
+from drake_pose.silhouette.areas.scoring import draw_mask
+
+_X_WC = np.array(
+    [[0.0, 0.0, -1.0, 5.0], [1.0, 0.0, 0.0, 0.1], [0.0, -1.0, 0.0, -0.35], [0.0, 0.0, 0.0, 1.0]]
+)
+_TURN = np.array([[0.0, -1.0, 0, 0], [1.0, 0.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]])
+
+
+def camera_of(kind, turned=False):
+    X_WC = _TURN @ _X_WC if turned else _X_WC
+    if kind == "parallel":
+        return ParallelCamera("c", 400, 400, 130.0, 199.5, 199.5, X_WC)
+    return PinholeCamera("c", 400, 400, 650.0, 660.0, 199.5, 199.5, X_WC)
+
+
+@pytest.fixture(scope="module")
+def body():
+    tree = load_model(bundled_model("woman")).pose_tree(root_position=np.zeros(3))
+    return RefinementBody(tree)
+
+
+@pytest.fixture(scope="module")
+def search(body):
+    nodes = range(len(body.tree.nodes))
+    return PartSearch(body, [body.tree.grid(i, math.radians(20.0)) for i in nodes])
+
+
+def drawn(body, parameters, camera):
+    """The silhouette, drawn by the exact renderer of whole bodies."""
+    outlines = TreeSurfaces(body.tree).at(body.node_values(parameters))
+    return draw_mask(outlines, camera.X_CW @ body.poses(parameters), camera)
+
+
+def random_pose(body, seed, share=0.8):
+    """A pose inside the middle of the limits, the root where it is."""
+    rng = np.random.default_rng(seed)
+    lower, upper = body.lower[:-4], body.upper[:-4]
+    middle, half = 0.5 * (upper + lower), 0.5 * share * (upper - lower)
+    return np.append(middle + half * rng.uniform(-1.0, 1.0, len(middle)), np.zeros(4))
+
+
+def problem_of(body, pose, cameras):
+    views = [View(camera, drawn(body, pose, camera)) for camera in cameras]
+    return RefinementProblem(body, views, pose)
+
+
+@pytest.mark.parametrize("kind", ["parallel", "pinhole"])
+def test_J_is_that_of_the_drawn_body(body, kind):
+    """Skin, shift and growth included, whatever poses were asked for before."""
+    camera = camera_of(kind)
+    problem = problem_of(body, random_pose(body, 1), [camera])
+    for seed in (2, 3):
+        pose = random_pose(body, seed)
+        pose[-4:] = 0.02, -0.03, 0.05, 0.1
+        expected = np.count_nonzero(drawn(body, pose, camera) != problem.views[0].mask)
+        assert problem.J(pose) == expected
+    assert problem.J(random_pose(body, 1)) == 0
+
+
+def test_areas_and_borders_near(body):
+    camera = camera_of("parallel")
+    problem = problem_of(body, random_pose(body, 1), [camera])
+    pose = random_pose(body, 2)
+    mask = problem.views[0].mask
+    wrong = drawn(body, pose, camera) != mask
+    discs = np.array([[[200.0, 150.0, 40.0], [180.3, 220.0, 90.0], [5.0, 5.0, 3.0]]])
+    v, u = np.mgrid[:400, :400]
+    inside = [(u - x) ** 2 + (v - y) ** 2 < r**2 for x, y, r in discs[0]]
+    expected = [np.count_nonzero(wrong & disc) for disc in inside]
+    np.testing.assert_allclose(problem.apart_near(pose, discs), expected, rtol=0.03, atol=15.0)
+    # A square's border is as long as its sides but for what crosses at 0 and 90 degrees only.
+    square = np.zeros((400, 400), dtype=bool)
+    square[100:200, 100:300] = True
+    lone = RefinementProblem(body, [View(camera, square)], pose)
+    assert lone.border_length == pytest.approx(600.0 * math.pi / 4.0)
+
+
+@pytest.mark.parametrize("kind", ["parallel", "pinhole"])
+def test_one_step_takes_a_small_change_back(body, kind):
+    """The normal equations know how far each value is off: their derivatives are right."""
+    cameras = [camera_of(kind), camera_of(kind, turned=True)]
+    true = random_pose(body, 5)
+    problem = problem_of(body, true, cameras)
+    freedom = body.freedom(None, (0, 1, 2, 3))
+    step = 0.02
+    shares = []
+    for one, j in enumerate(freedom.columns):
+        off = true.copy()
+        off[j] += step
+        equations = problem.equations(off, freedom, 1, 0, 3.0)
+        shares.append(equations.g[one] / equations.H[one, one] / step)
+    # Pixels, and what the change covers and uncovers, leave some doubt.
+    assert np.median(np.abs(np.array(shares) - 1.0)) < 0.1
+    assert np.quantile(np.abs(np.array(shares) - 1.0), 0.85) < 0.35
+
+
+def test_limited_steps_solve_the_bounded_problem():
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        A, b = rng.normal(size=(9, 6)), rng.normal(size=9)
+        at_limit = rng.random(6) < 0.5
+        current, lower, upper = np.zeros(6), np.full(6, -50.0), np.full(6, 50.0)
+        lower[at_limit] = 0.0
+        found = limited_step(A.T @ A, -A.T @ b, current, lower, upper, 1e-9, 1e9)
+        assert np.all(found >= lower)
+        assert np.all(found <= upper)
+        expected = lsq_linear(A, b, (lower, upper), tol=1e-12)
+        # A value let go stays at its limit for the step: no better than the best, and near it.
+        assert np.linalg.norm(A @ found - b) <= 1.2 * np.sqrt(2.0 * expected.cost) + 1e-6
+        if not at_limit.any():
+            np.testing.assert_allclose(found, expected.x, rtol=1e-2)
+    g, one = np.array([-3.0, 1.0]), np.ones(2)
+    short = limited_step(np.eye(2), g, 0.0 * one, -one, one, 1e-9, 0.5)
+    assert np.abs(short).max() == pytest.approx(0.5)
+
+
+def test_a_refined_pose_is_a_local_optimum_inside_the_limits(body):
+    cameras = [camera_of("parallel"), camera_of("parallel", turned=True)]
+    for seed in (7, 8):
+        true = random_pose(body, seed, share=1.0)
+        # Some values are at their limits.
+        true[10:14] = body.upper[10:14]
+        problem = problem_of(body, true, cameras)
+        start = true + 0.06 * np.random.default_rng(seed).normal(size=len(true))
+        start = np.clip(start, body.lower, body.upper)
+        start[-4:] = 0.0
+        freedom = body.freedom()
+        refined, _, steps = descend(problem, start, freedom, COARSE_PASSES + FINE_PASSES)
+        assert steps > 0
+        assert np.all(refined >= body.lower)
+        assert np.all(refined <= body.upper)
+        assert problem.J(refined) < 0.05 * problem.J(start)
+        assert np.median(np.degrees(np.abs(refined - true))[freedom.columns]) < 0.5
+
+        least = problem.J(refined)
+        for j in freedom.columns[::4]:
+            for sign in (-1.0, 1.0):
+                moved = refined.copy()
+                moved[j] = np.clip(moved[j] + sign * 0.02, body.lower[j], body.upper[j])
+                assert problem.J(moved) >= 0.9 * least
+
+
+def test_a_part_in_the_wrong_place_is_found_again(body, search):
+    camera = camera_of("parallel")
+    true = random_pose(body, 11, share=0.5)
+    problem = problem_of(body, true, [camera])
+    wrong = true.copy()
+    names = [node.name for node in body.tree.nodes]
+    shoulder = body.columns(names.index("left_upper_arm"))
+    elbow = body.columns(names.index("left_forearm"))
+    wrong[shoulder] = np.clip(wrong[shoulder] - 1.2, body.lower[shoulder], body.upper[shoulder])
+    wrong[elbow] = np.clip(wrong[elbow] + 0.5, body.lower[elbow], body.upper[elbow])
+    before = problem.J(wrong)
+    found, J = NeighbourhoodSearch(problem, search).improve(wrong, 0.0)
+    assert J == problem.J(found)
+    assert J < 0.25 * before
+    again, _ = NeighbourhoodSearch(problem, search).improve(wrong, 0.0)
+    np.testing.assert_array_equal(found, again)
+    never = NeighbourhoodSettings(rounds=0)
+    unchanged, _ = NeighbourhoodSearch(problem, search, never).improve(wrong, 0.0)
+    np.testing.assert_array_equal(unchanged, wrong)
+    once, _ = NeighbourhoodSearch(problem, search).improve(wrong, 0.0, tries=0)
+    np.testing.assert_array_equal(once, wrong)
+
+
+@pytest.mark.slow
+def test_others_are_as_good_and_differ(body, search):
+    """From a part mirrored in depth, which one camera hardly tells from the true one."""
+    camera = camera_of("parallel")
+    for seed in (41, 42, 43):
+        true = random_pose(body, seed, share=0.5)
+        problem = problem_of(body, true, [camera])
+        part = next(part for part in search.parts if len(part.nodes) == 2)
+        mirrored = search.mirror(true, part, problem.views[0])
+        start, _, _ = descend(problem, mirrored, body.freedom(), FINE_PASSES)
+        about = NeighbourhoodSearch(problem, search)
+        best, J = about.improve(start, 0.0, everywhere=True)
+        assert J == problem.J(best) <= problem.J(start)
+        limit = J + 0.03 * problem.border_length
+        for other in about.others(best, limit, 0.1):
+            assert problem.J(other) <= limit
+            assert np.abs(other - best).max() > 0.1
+
+
+def test_pixels_that_are_right_pull_little(body):
+    """Refined to the end fewer pixels are wrong, and the pose is nearer, than by least squares."""
+    camera = camera_of("parallel")
+    shares, errors = [], []
+    for seed in (51, 52, 53, 54):
+        true = random_pose(body, seed, share=0.5)
+        problem = problem_of(body, true, [camera])
+        start = true + 0.02 * np.random.default_rng(seed).normal(size=len(true))
+        start[-4:] = 0.0
+        start = np.clip(start, body.lower, body.upper)
+        freedom = body.freedom()
+        squares, _, _ = descend(problem, start, freedom, FINE_PASSES)
+        last, _, _ = descend(problem, squares, freedom, LAST_PASSES)
+        shares.append(problem.J(last) / problem.J(squares))
+        columns = freedom.columns
+        off = [np.median(np.abs(pose - true)[columns]) for pose in (last, squares)]
+        errors.append(off[0] / off[1])
+    assert np.median(shares) < 0.8
+    assert np.median(errors) < 0.9
+
+
+def test_parts_are_ends_of_limbs_and_nodes_of_the_trunk(body):
+    nodes = body.tree.nodes
+    parts = find_parts(body.tree)
+    assert {node for part in parts for node in part.nodes} == set(range(len(nodes)))
+    for part in parts:
+        for before, after in zip(part.nodes, part.nodes[1:], strict=False):
+            assert nodes[after].parent == before
+        assert part.held == (len(nodes[part.nodes[-1]].children) > 0)
+
+
+def middles(body, parameters, part):
+    """The middles of a part's nodes (k, 3)."""
+    X_WN = body.poses(parameters)[list(part.nodes)]
+    p_N = np.array([body.outlines[node].ball[:3] for node in part.nodes])
+    return np.einsum("kij,kj->ki", X_WN[:, :3, :3], p_N) + X_WN[:, :3, 3]
+
+
+def test_a_mirrored_part_looks_nearly_the_same(body, search):
+    camera = camera_of("parallel")
+    true = random_pose(body, 4, share=0.5)
+    problem = problem_of(body, true, [camera])
+    parts = [part for part in find_parts(body.tree) if len(part.nodes) == 2]
+    depth, shares = _X_WC[:3, 2], []
+    for part in parts:
+        mirrored = search.mirror(true, part, problem.views[0])
+        assert np.all(mirrored >= body.lower)
+        assert np.all(mirrored <= body.upper)
+        joint = body.poses(true)[part.nodes[0], :3, 3]
+        before, after = middles(body, true, part), middles(body, mirrored, part)
+        wanted = before - 2.0 * np.outer((before - joint) @ depth, depth)
+        shares.append(np.linalg.norm(after - wanted) / np.linalg.norm(before - wanted))
+    # Limits do not let every part be mirrored.
+    assert max(shares) < 1.0
+    assert np.median(shares) < 0.4
+
+
+def test_a_body_mirrored_with_left_and_right_exchanged_looks_nearly_the_same(body, search):
+    """Seen by parallel rays, a body that is its own mirror image is the other one's equal."""
+    camera = camera_of("parallel")
+    whole = [r for r in find_reflections(body.tree) if len(r.nodes) == len(body.tree.nodes)]
+    assert len(whole) == 1
+    names = [node.name for node in body.tree.nodes]
+    for node, source in zip(whole[0].nodes, whole[0].sources, strict=True):
+        sides = {"left": "right", "right": "left"}
+        side = names[node].split("_")[0]
+        assert names[source] == names[node].replace(side, sides.get(side, side))
+    shares = []
+    for seed in range(6, 11):
+        true = random_pose(body, seed, share=0.3)
+        problem = problem_of(body, true, [camera])
+        reflected = search.reflect(true, whole[0], problem.views[0])
+        other, _, _ = descend(problem, reflected, body.freedom(), COARSE_PASSES + FINE_PASSES)
+        assert np.abs(other - true).max() > 0.3
+        shares.append(problem.J(other) / problem.area)
+    # Limits do not let every pose be mirrored.
+    assert np.median(shares) < 0.1
+
+
+def test_intervals_hold_the_truth_and_say_what_is_free(body, search):
+    cameras = [camera_of("parallel"), camera_of("parallel", turned=True)]
+    held, claimed = 0, 0
+    for seed in (21, 22, 23):
+        true = random_pose(body, seed)
+        problem = problem_of(body, true, cameras)
+        refined, _, _ = descend(problem, true, body.freedom(), FINE_PASSES + LAST_PASSES)
+        about = NeighbourhoodSearch(problem, search)
+        about.improve(refined, 0.0, everywhere=True)
+        others = about.others(refined, 2.0 * problem.J(refined) + 40.0, 0.1)
+        others = [pose for pose in others if problem.J(pose) <= problem.J(refined) + 20.0]
+        intervals = find_intervals(problem, others, refined, IntervalSettings())
+        assert len(intervals.joints) == len(true) - 4
+        np.testing.assert_array_equal(intervals.families[0].members[0], refined)
+        for pose in intervals.alternatives:
+            assert problem.J(pose) <= problem.J(refined) + intervals.tolerance
+        for j, joint in enumerate(intervals.joints):
+            if joint.determined and body.upper[j] > body.lower[j]:
+                claimed += 1
+                held += joint.holds(true[j])
+    assert claimed > 60
+    assert held / claimed > 0.9
+
+
+def test_a_body_of_other_size_and_place(body):
+    camera = camera_of("pinhole")
+    true = random_pose(body, 31, share=0.5)
+    true[-4:] = 0.03, -0.04, 0.02, 0.05
+    problem = problem_of(body, true, [camera, camera_of("pinhole", turned=True)])
+    start = true.copy()
+    start[-4:] = 0.0
+    found, _, _ = descend(problem, start, body.freedom(None, (0, 1, 2, 3)), FINE_PASSES)
+    np.testing.assert_allclose(found[-4:], true[-4:], atol=0.01)
+
+
+def test_bad_settings_are_refused(body):
+    with pytest.raises(SettingsError, match="iteration"):
+        Pass(0, 1, 1.0, 1.0)
+    with pytest.raises(SettingsError, match="slack"):
+        Pass(1, 1, 1.0, 1.0, slack=0.6)
+    with pytest.raises(SettingsError, match="scale"):
+        Pass(1, 1, 0.0, 1.0)
+    with pytest.raises(SettingsError, match="confidence"):
+        IntervalSettings(confidence=1.0)
+    with pytest.raises(SettingsError, match="noise_factor"):
+        IntervalSettings(noise_factor=0.0)
+    with pytest.raises(SettingsError, match="proposals"):
+        NeighbourhoodSettings(proposals=0)
+    with pytest.raises(SettingsError, match="extra"):
+        body.freedom(None, (4,))
+    with pytest.raises(SettingsError, match="view"):
+        RefinementProblem(body, [], random_pose(body, 1))

@@ -1,0 +1,158 @@
+"""The coarse search: what is roughly right is among the few that are refined."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.camera.models import ParallelCamera
+from drake_pose.errors import SettingsError
+from drake_pose.search.grid.sampled_body import SampledBody
+from drake_pose.search.grid.settings import BeamSearchSettings
+from drake_pose.search.result import View
+from drake_pose.search.starts.coarse_kernel import fill_cover, score_samples, unite_pairs
+from drake_pose.search.starts.coarse_search import (
+    CoarseSearch,
+    CoarseSettings,
+    _spread_points,
+)
+from drake_pose.silhouette.pictures.signed_distances import signed_distances
+from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_pose, draw_view, split
+
+SETTINGS = CoarseSettings()
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory: pytest.TempPathFactory) -> PoseTree:
+    return arm_tree(tmp_path_factory.mktemp("arm"))
+
+
+@pytest.fixture(scope="module")
+def body(tree: PoseTree) -> SampledBody:
+    return SampledBody(tree, BeamSearchSettings(interval=SETTINGS.interval))
+
+
+def nearest(tree: PoseTree, X_WN: np.ndarray, values: np.ndarray) -> float:
+    """How far the joints of the nearest pose are from where they should be, at most [m]."""
+    gaps = X_WN[:, :, :3, 3] - tree.node_poses(split(tree, values))[:, :3, 3]
+    return float(np.linalg.norm(gaps, axis=2).max(axis=1).min())
+
+
+@pytest.mark.slow
+def test_the_pose_is_among_the_few(tree: PoseTree, body: SampledBody) -> None:
+    found = []
+    for seed in range(10):
+        values = draw_pose(tree, np.random.default_rng(40 + seed))
+        search = CoarseSearch(body, damaged_views(tree, values, seed), SETTINGS)
+        poses = search.choose_distinct(search.find(), 40, 0.13)
+        assert 1 <= len(poses) <= 40
+        assert (np.diff(poses.costs) >= 0.0).all()
+        found.append(nearest(tree, poses.X_WN, values))
+    # The arm is 1.1 m long; half a step of 15 degrees moves its end by up to 14 cm.
+    assert np.mean(np.array(found) < 0.15) >= 0.9
+
+
+def test_poses_are_those_of_their_samples(tree: PoseTree, body: SampledBody) -> None:
+    views = [draw_view(tree, draw_pose(tree, np.random.default_rng(1)), arm_cameras()[0])]
+    poses = CoarseSearch(body, views, SETTINGS).find()
+    for samples, X_WN in zip(poses.samples[:20], poses.X_WN[:20], strict=True):
+        values = [grid[t] for grid, t in zip(body.sampled.values, samples, strict=True)]
+        np.testing.assert_allclose(X_WN, tree.node_poses(values), atol=1e-9)
+
+
+def test_a_limb_searched_again_leaves_the_rest(tree: PoseTree, body: SampledBody) -> None:
+    values = draw_pose(tree, np.random.default_rng(2))
+    views = [draw_view(tree, values, camera) for camera in arm_cameras()]
+    X_WN = tree.node_poses(split(tree, values))
+    hand = len(tree.nodes) - 1
+    poses = CoarseSearch(body, views, SETTINGS).find_again(X_WN, [hand])
+    np.testing.assert_array_equal(poses.X_WN[:, :hand], np.tile(X_WN[:hand], (len(poses), 1, 1, 1)))
+    assert (poses.samples[:, :hand] == -1).all()
+    best = body.sampled.values[hand][poses.samples[0, hand], 0]
+    assert abs(best - values[-1]) <= SETTINGS.interval
+
+
+@pytest.mark.parametrize("longer", [1e3, 1e9])
+def test_a_lens_that_is_far_too_long_does_not_fill_the_memory(
+    tree: PoseTree, body: SampledBody, longer: float
+) -> None:
+    view = draw_view(tree, draw_pose(tree, np.random.default_rng(3)), arm_cameras()[0])
+    focal = longer * arm_cameras()[0].focal_x
+    wrong = View(replace(arm_cameras()[0], focal_x=focal, focal_y=focal), view.mask)
+    search = CoarseSearch(body, [wrong], SETTINGS)
+    assert sum(view.cover.nbytes for view in search._views) < 1e8
+    assert len(search.find()) >= 1
+
+
+def test_cover_holds_the_points_within_the_radius() -> None:
+    generator = np.random.default_rng(3)
+    points, origin = generator.uniform(0.0, 30.0, (100, 2)), np.array([-3.0, -4.0])
+    radii = np.array([2.0, 5.0])
+    cover = np.zeros((2, 12, 13, 2), dtype=np.uint64)
+    fill_cover(cover, points, origin, 3.0, radii)
+    for level, i, j in ((0, 2, 3), (1, 5, 6), (1, 11, 0)):
+        middle = origin + 3.0 * (np.array([i, j]) + 0.5)
+        expected = np.linalg.norm(points - middle, axis=1) <= radii[level]
+        bits = [int(cover[level, i, j, p // 64]) >> (p % 64) & 1 for p in range(100)]
+        np.testing.assert_array_equal(bits, expected)
+
+
+@pytest.mark.parametrize("parallel", [False, True])
+def test_scores_are_those_of_balls_looked_at_one_by_one(
+    tree: PoseTree, body: SampledBody, parallel: bool
+) -> None:
+    """Against plain numpy: a ball's place, how far it leaves the mask, and the points within it."""
+    generator = np.random.default_rng(5)
+    camera = arm_cameras()[0]
+    values = draw_pose(tree, generator)
+    seen = draw_view(tree, values, camera)
+    if parallel:
+        middle = camera.center_x, camera.center_y
+        camera = ParallelCamera("", camera.width, camera.height, 130.0, *middle, camera.X_WC)
+    search = CoarseSearch(body, [View(camera, seen.mask)], SETTINGS)
+    (view,) = search._views
+    distances, points = signed_distances(seen.mask), _spread_points(seen.mask)
+    n, node = 20, 3
+    radii, p_PB = body.ball_radii[node], body.p_PB[node]
+    X_WP = tree.node_poses(split(tree, values))[[node - 1] * n]
+    X_WP[:, :3, 3] += generator.uniform(-0.2, 0.2, (n, 3))
+    X_CP = np.ascontiguousarray(camera.X_CW @ X_WP)
+    scores = np.zeros((n, len(p_PB)))
+    masks = np.zeros((n, 4), dtype=np.uint64)
+    score_samples(view, X_CP, search._balls[node], masks, 0.8, scores)
+    area = body.surface_areas[node] / len(radii)
+    gaps = []
+    for h, sample in np.ndindex(scores.shape):
+        p_WB = p_PB[sample] @ X_WP[h, :3, :3].T + X_WP[h, :3, 3]
+        uv, depth = camera.project(p_WB)
+        pixels = np.full(len(uv), 130.0) if parallel else camera.focal_x / depth
+        size = np.array([camera.width, camera.height])
+        inside = ((uv > -0.5) & (uv < size - 0.5)).all(axis=1)
+        uv, pixels, r = uv[inside], pixels[inside], (pixels * radii)[inside]
+        column, row = np.rint(uv).astype(int).T
+        beyond = distances[row, column] + r - view.slack
+        cost = (pixels**2 * area * np.clip(beyond / (2.0 * r), 0.0, 1.0)).sum()
+        level = np.searchsorted(view.radii, r + view.slack, side="right") - 1
+        within = view.radii[np.maximum(level, 0)]
+        far = np.linalg.norm(points[:, None] - uv[:, ::-1], axis=2)
+        covered = (far <= within).any(axis=1).sum()
+        gaps.append(scores[h, sample] - (0.8 * cost - covered * view.point_area))
+    # The tables know places to a cell and distances to a quarter of one only.
+    assert np.abs(gaps).max() < 0.1 * seen.mask.sum()
+    assert np.abs(np.mean(gaps)) < 0.005 * seen.mask.sum()
+    pairs = np.column_stack([np.arange(n), np.full(n, 2)])
+    united = unite_pairs(view, X_CP, search._balls[node], masks, pairs)
+    again = np.zeros_like(scores)
+    score_samples(view, X_CP, search._balls[node], united, 0.8, again)
+    # What is covered already counts no more.
+    assert (again[:, 2] >= 0.0).all()
+    assert (again[:, 2] > scores[:, 2]).any()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("interval", 0.0), ("hypotheses", 0), ("slack", -1.0), ("alike", 0.0)]
+)
+def test_settings_out_of_range(name: str, value: float) -> None:
+    with pytest.raises(SettingsError, match=name):
+        CoarseSettings(**{name: value})

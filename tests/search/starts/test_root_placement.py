@@ -1,0 +1,238 @@
+import math
+
+import numpy as np
+import pytest
+
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import load_model
+from drake_pose.body.tree.root import RootRotation
+from drake_pose.camera.models import ParallelCamera, PinholeCamera
+from drake_pose.errors import SettingsError
+from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
+from drake_pose.search.grid.sampled_body import SampledBody
+from drake_pose.search.grid.settings import BeamSearchSettings
+from drake_pose.search.result import View
+from drake_pose.search.starts.root_placement import (
+    PlacementSettings,
+    choose_root_samples,
+    find_layers,
+    whereabouts,
+)
+from drake_pose.silhouette.areas.scoring import draw_mask
+from tests.search.bodies import box_link, front_camera, joint, load_body
+
+SETTINGS = BeamSearchSettings(interval=math.radians(30.0))
+
+
+@pytest.fixture(scope="module")
+def body(tmp_path_factory):
+    """A trunk with two unequal arms, which turns in the picture and slides anywhere."""
+    return load_body(
+        tmp_path_factory.mktemp("body"),
+        box_link("carriage_y", 0.001, 0.001).replace("visual", "collision"),
+        joint("slide_x", "prismatic", "world", "carriage_x", (-9.0, 9.0), axis="1 0 0"),
+        box_link("carriage_x", 0.001, 0.001).replace("visual", "collision"),
+        joint("slide_y", "prismatic", "carriage_x", "carriage_y", (-9.0, 9.0), axis="0 1 0"),
+        box_link("carriage_z", 0.001, 0.001).replace("visual", "collision"),
+        joint("slide_z", "prismatic", "carriage_y", "carriage_z", (-9.0, 9.0), axis="0 0 1"),
+        box_link("trunk", 10, 24, z=-12.0),
+        joint("trunk_turn", "revolute", "carriage_z", "trunk", (-1.2, 1.2)),
+        box_link("left", 4, 15, y=1.0, z=-7.0),
+        joint("left_turn", "revolute", "trunk", "left", (-0.2, 2.2), y=4.0, z=-2.0),
+        box_link("right", 5, 12, y=-1.0, z=-5.0),
+        joint("right_turn", "revolute", "trunk", "right", (-2.2, 0.2), y=-4.0, z=-2.0),
+    )
+
+
+TRUE_ANGLES = {"trunk_turn": 0.4, "left_turn": 1.3, "right_turn": -0.9}
+
+
+def picture(body, camera, position, angles=TRUE_ANGLES):
+    """The silhouette of the body as its own joints place it, by the plant's own kinematics."""
+    q = np.array(body.default_positions)
+    named = dict(zip(("slide_x", "slide_y", "slide_z"), position, strict=True)) | angles
+    for name, value in named.items():
+        q[body.position_index(name)] = value
+    tree = body.pose_tree()
+    X_WN = tree.node_poses(tree.values_from_positions(q))
+    search = RootPlacementSearch(tree, SETTINGS)
+    return draw_mask(search.sampled.outlines, camera.X_CW @ X_WN, camera)
+
+
+def angle_errors(body, result):
+    return [abs(result.q[body.position_index(name)] - value) for name, value in TRUE_ANGLES.items()]
+
+
+def test_position_and_scale_of_a_parallel_camera_are_found(body):
+    camera = front_camera(160)
+    mask = picture(body, camera, (0.0, 0.13, 0.31))
+    told = ParallelCamera("front", 160, 160, 7.0, 79.5, 79.5, camera.X_WC)
+    search = RootPlacementSearch(body.pose_tree(), SETTINGS, PlacementSettings(scale_unknown=True))
+    result = search.match([View(told, mask)])
+    assert result.E_total < 0.04
+    assert result.scale * 7.0 == pytest.approx(100.0, rel=0.04)
+    assert result.root_position[1:] == pytest.approx([0.13, 0.31], abs=0.02)
+    assert max(angle_errors(body, result)) < 0.1
+    q_position = [result.q[body.position_index(f"slide_{axis}")] for axis in "yz"]
+    assert q_position == pytest.approx(result.root_position[1:])
+
+
+def test_depth_of_a_pinhole_is_found(body):
+    camera = PinholeCamera("eye", 200, 200, 300.0, 300.0, 99.5, 99.5, front_camera().X_WC)
+    mask = picture(body, camera, (3.8, 0.05, 0.1))
+    result = RootPlacementSearch(body.pose_tree(), SETTINGS).match([View(camera, mask)])
+    assert result.E_total < 0.05
+    # The camera stands at x = 5.
+    assert 5.0 - result.root_position[0] == pytest.approx(1.2, rel=0.06)
+    assert result.root_position[1:] == pytest.approx([0.05, 0.1], abs=0.03)
+
+
+def test_two_cameras_find_the_position_in_space(body):
+    front = front_camera(160)
+    R_turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    X_WC = np.eye(4)
+    X_WC[:3, :3] = R_turn @ front.X_WC[:3, :3]
+    side = ParallelCamera("side", 160, 160, 100.0, 79.5, 79.5, X_WC)
+    position = (0.21, -0.12, 0.18)
+    views = [View(camera, picture(body, camera, position)) for camera in (front, side)]
+    search = RootPlacementSearch(body.pose_tree(), SETTINGS)
+    result = search.match(views)
+    assert result.E_total < 0.06
+    assert result.root_position == pytest.approx(position, abs=0.03)
+    # A camera may be missing; what the other one cannot see stays arbitrary.
+    alone = search.match(views[:1])
+    assert alone.E_total < 0.06
+    assert alone.root_position[1:] == pytest.approx(position[1:], abs=0.03)
+
+
+def test_what_touches_the_pictures_edge_may_reach_beyond_it(body):
+    camera = front_camera(160)
+    mask = picture(body, camera, (0.0, 0.1, 0.8))
+    assert mask[0].any()
+    search = RootPlacementSearch(body.pose_tree(), SETTINGS)
+    (layer,) = find_layers(search.body, [View(camera, mask)], search.placement, None)
+    assert np.linalg.norm(layer.positions[:, 1:] - [0.1, 0.8], axis=1).min() < 0.04
+
+
+def test_a_turned_over_tree_finds_as_good_a_pose(body):
+    """The same silhouette, searched from the trunk and from the end of an arm."""
+    camera = front_camera(160)
+    mask = picture(body, camera, (0.0, 0.13, 0.31))
+    own = RootPlacementSearch(body.pose_tree(), SETTINGS).match([View(camera, mask)])
+    rotation = RootRotation.limited([("x", -180.0, 180.0)])
+    tree = body.pose_tree("left", root_position=np.zeros(3), root_rotation=rotation)
+    turned = RootPlacementSearch(tree, SETTINGS).match([View(camera, mask)])
+    assert abs(own.E_total - turned.E_total) < 0.03
+    # The plant's own joints cannot turn the body about the arm: its world is turned instead.
+    assert max(angle_errors(body, own)) < 0.1
+    assert max(angle_errors(body, turned)[1:]) < 0.1
+    assert math.atan2(*turned.X_WB[[2, 1], 1]) == pytest.approx(TRUE_ANGLES["trunk_turn"], abs=0.1)
+
+
+def test_turned_over_trees_score_alike(body):
+    """A pose of one tree, put into another by the plant's positions, has the same silhouette."""
+    camera = front_camera(160, shift=0.3)
+    generator = np.random.default_rng(5)
+    tree = body.pose_tree()
+    outlines = RootPlacementSearch(tree, SETTINGS).sampled.outlines
+    for root in ("left", "right"):
+        rotation = RootRotation.free()
+        other = body.pose_tree(root, root_position=np.zeros(3), root_rotation=rotation)
+        other_outlines = RootPlacementSearch(other, SETTINGS).sampled.outlines
+        for _ in range(5):
+            q = np.array(body.default_positions)
+            bounds = np.clip(body.lower, -0.2, None), np.clip(body.upper, None, 0.2)
+            q[:] = generator.uniform(*bounds)
+            X_WN = tree.node_poses(tree.values_from_positions(q))
+            p_WR = X_WN[tree.node_index(root), :3, 3]
+            moved = other.with_root_position(p_WR)
+            X_WM = moved.node_poses(moved.values_from_positions(q))
+            one = draw_mask(outlines, camera.X_CW @ X_WN, camera)
+            two = draw_mask(other_outlines, camera.X_CW @ X_WM, camera)
+            assert one.any()
+            assert np.count_nonzero(one != two) <= 2
+
+
+def test_a_known_position_is_kept(body):
+    camera = front_camera(160)
+    position = np.array([0.0, 0.13, 0.31])
+    mask = picture(body, camera, position)
+    result = RootPlacementSearch(body.pose_tree(), SETTINGS).match([View(camera, mask)], position)
+    assert result.root_position == pytest.approx(position)
+    assert result.E_total < 0.04
+
+
+def test_no_time_gives_an_answer_all_the_same(body):
+    camera = front_camera(160)
+    mask = picture(body, camera, (0.0, 0.13, 0.31))
+    settings = BeamSearchSettings(interval=SETTINGS.interval, time_limit=0.0)
+    result = RootPlacementSearch(body.pose_tree(), settings).match([View(camera, mask)])
+    assert result.found
+    assert result.stopped_by == "time_limit"
+
+
+def test_scale_needs_one_parallel_camera(body):
+    camera = PinholeCamera("eye", 200, 200, 300.0, 300.0, 99.5, 99.5, front_camera().X_WC)
+    search = RootPlacementSearch(body.pose_tree(), SETTINGS, PlacementSettings(scale_unknown=True))
+    with pytest.raises(SettingsError, match="eye"):
+        search.match([View(camera, np.ones((200, 200), dtype=np.bool_))])
+    with pytest.raises(SettingsError, match="at least one view"):
+        search.match([])
+
+
+def test_settings_are_checked():
+    with pytest.raises(SettingsError, match="quota"):
+        PlacementSettings(quota=0.0)
+    with pytest.raises(SettingsError, match="starts"):
+        PlacementSettings(starts=0)
+    with pytest.raises(SettingsError, match="ratio"):
+        PlacementSettings(ratio=1.0)
+    with pytest.raises(SettingsError, match="cut_off"):
+        PlacementSettings(cut_off=0.5)
+
+
+def test_whereabouts_count_the_steps_that_are_tried():
+    settings = PlacementSettings(positions_across=10, ratio=1.25)
+    mask = np.zeros((200, 200), dtype=np.bool_)
+    mask[50:150, 50:150] = True
+    camera = PinholeCamera("eye", 200, 200, 300.0, 300.0, 99.5, 99.5, front_camera().X_WC)
+    near = whereabouts([View(camera, mask)], np.array([3.0, 0.0, 0.0]), settings)
+    far = whereabouts([View(camera, mask)], np.array([2.5, 0.0, 0.0]), settings)
+    aside = whereabouts([View(camera, mask)], np.array([3.0, 2.0 * 20.0 / 300.0, 0.0]), settings)
+    # The camera stands at x = 5; a tenth of the silhouette's extent is 10 pixels.
+    assert near - far == pytest.approx([0.0, 0.0, 1.0])
+    assert np.abs(aside - near) == pytest.approx([2.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("parallel", [True, False])
+def test_the_roots_best_rotations_are_chosen(parallel):
+    """Against drawing every rotation at every position."""
+    tree = load_model(bundled_model("hand")).pose_tree(
+        "palm", root_position=np.zeros(3), root_rotation=RootRotation.free(interval_deg=60.0)
+    )
+    body = SampledBody(tree, BeamSearchSettings(interval=math.radians(60.0)))
+    X_WC = np.array([[0.0, 0.0, -1.0, 0.5], [1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0]])
+    X_WC = np.vstack([X_WC, [0.0, 0.0, 0.0, 1.0]])
+    if parallel:
+        camera = ParallelCamera("c", 60, 50, 260.0, 29.5, 24.5, X_WC)
+    else:
+        camera = PinholeCamera("c", 60, 50, 130.0, 130.0, 29.5, 24.5, X_WC)
+    X_WR, outline = body.sampled.X_PN[0], body.sampled.outlines[0]
+    positions = np.array([[0.0, 0.0, 0.0], [0.0, 0.02, -0.015], [0.0, -0.05, 0.06]])
+
+    def drawn(position, rotation):
+        X_WN = X_WR[rotation].copy()
+        X_WN[:3, 3] += position - X_WR[0, :3, 3]
+        return draw_mask([outline], (camera.X_CW @ X_WN)[None], camera)
+
+    mask = drawn(np.array([0.0, 0.003, 0.002]), 11)
+    chosen = choose_root_samples(body, [View(camera, mask)], positions, 30, 2)
+    places, rotations = np.divmod(chosen, len(X_WR))
+    assert (np.bincount(places) == 30).all()
+    for k, position in enumerate(positions):
+        masks = [drawn(position, rotation) for rotation in range(len(X_WR))]
+        costs = [2.0 * (one & ~mask).sum() - (one & mask).sum() for one in masks]
+        best = np.argsort(costs)[:10]
+        # A whole pixel's shift is all that the pictures may be off by.
+        missing = set(best) - set(rotations[places == k])
+        assert len(missing) <= 1

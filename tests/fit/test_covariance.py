@@ -16,9 +16,8 @@ from drake_pose.fit.surfaces import few_triangles
 from drake_pose.search.continuous.views_fit import ViewsFit
 from drake_pose.search.result import View
 from drake_pose.silhouette.areas.bending import TreeSurfaces
-
-from ..arms import arm_cameras, arm_tree, damaged_views, draw_pose, draw_view
-from ..mask_damage import nudge_camera
+from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_pose, draw_view
+from tests.search.mask_damage import nudge_camera
 
 FINE = tuple(Round(scale, 0.0125, 8) for scale in (0.025, 0.0125))
 STEP = Round(0.025, 0.0125)

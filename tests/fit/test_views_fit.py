@@ -11,8 +11,7 @@ from drake_pose.search.continuous.views_fit import FittedPose, ViewsFit, distinc
 from drake_pose.search.result import View
 from drake_pose.search.starts.coarse_search import signed_distances
 from drake_pose.silhouette.areas.bending import TreeSurfaces
-
-from ..arms import arm_cameras, arm_tree, draw_pose, draw_view
+from tests.search.arms import arm_cameras, arm_tree, draw_pose, draw_view
 
 FINE = tuple(Round(scale, 0.0125, 8) for scale in (0.05, 0.025, 0.0125))
 

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from drake_pose.jobs.registration.register import SceneRegistration, register_scene
     from drake_pose.results.settings import EstimateSettings
     from drake_pose.search.continuous.multi_start import MultiStartSearch
+    from drake_pose.search.estimates import View
     from drake_pose.search.grid.beam.search import BeamSearch
-    from drake_pose.search.pose_search import View
     from drake_pose.silhouette.pictures.scenes import Scene, load_scene
     from drake_pose.systems.estimators.camera_registration import CameraRegistration
     from drake_pose.systems.estimators.silhouette_matcher import SilhouetteMatcher
@@ -61,7 +61,7 @@ _HOMES = {
     "SilhouetteMatcher": "systems.estimators.silhouette_matcher",
     "SilhouetteTracker": "systems.estimators.silhouette_tracker",
     "TruncatedEkf": "systems.estimators.truncated_ekf",
-    "View": "search.pose_search",
+    "View": "search.estimates",
     "audit_scene": "jobs.registration.audit",
     "build_pose_tree": "body.tree.tree_builder",
     "bundled_model": "body.files.packages",

@@ -48,7 +48,7 @@ from drake_pose.papers.shimada.pictures import save_hypotheses
 from drake_pose.papers.shimada.pictures import save_pictures as save_shimada
 from drake_pose.papers.shimada.static_view import run_static_experiment
 from drake_pose.results.folder import without_nan
-from drake_pose.search.pose_search import PoseSearch
+from drake_pose.search.scoring import PoseSearch
 from drake_pose.version import VERSION
 
 REPORT, FIGURES, TABLES, BESIDE = "report.html", "figures.json", "tables.txt", "paper.json"

@@ -11,7 +11,7 @@ import numpy as np
 
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.results.summary import FrameRecord, JointRecord
-from drake_pose.search.pose_families import JointEstimate, PoseSet
+from drake_pose.search.estimates import JointEstimate, PoseSet
 
 JOINT_COLUMNS = ("frame", "joint", "determined", "low", "high", "families")
 """A row for each frame and joint, over all families [deg or m]."""

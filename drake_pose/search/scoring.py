@@ -3,12 +3,13 @@
 import copy
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import Protocol
 
 import numpy as np
 
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import Camera
-from drake_pose.search.result import View
+from drake_pose.search.estimates import PoseEstimate, View
 from drake_pose.search.settings import PaperSearchSettings
 from drake_pose.silhouette.areas.bending import TreeSurfaces, score_bending
 from drake_pose.silhouette.areas.outline import Outline
@@ -266,3 +267,24 @@ class Regions:
             scoring.views, scoring.X_CW, self.masks, self.prefixes, strict=True
         ):
             subtract_body(mask, prefixes[1], outlines, X_CW @ X_WN, view.camera)
+
+
+class PoseSearch(Protocol):
+    """A search for the pose that silhouettes show: what systems and programs need of any."""
+
+    @property
+    def tree(self) -> PoseTree:
+        """The pose tree that is searched."""
+
+    @property
+    def sampled(self) -> SampledTree:
+        """The pose tree with its sampling grids."""
+
+    def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
+        """Estimate the pose that the views of one instant show.
+
+        Args:
+            views: one or several silhouettes of the same instant.
+            root_position: (3,), the root's known position in the world [m], where it is not the
+                pose tree's own.
+        """

@@ -14,7 +14,7 @@ from drake_pose.fit.covariance import (
 from drake_pose.fit.levenberg_marquardt import Round
 from drake_pose.fit.surfaces import few_triangles
 from drake_pose.search.continuous.views_fit import ViewsFit
-from drake_pose.search.result import View
+from drake_pose.search.estimates import View
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_pose, draw_view
 from tests.search.mask_damage import nudge_camera

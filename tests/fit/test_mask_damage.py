@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from drake_pose.search.result import View
+from drake_pose.search.estimates import View
 from tests.search.arms import arm_cameras
 from tests.search.mask_damage import MaskDamage, damage_views, nudge_camera
 

@@ -8,7 +8,7 @@ from drake_pose.errors import SettingsError
 from drake_pose.fit.levenberg_marquardt import Round
 from drake_pose.fit.surfaces import few_triangles
 from drake_pose.search.continuous.views_fit import FittedPose, ViewsFit, distinct
-from drake_pose.search.result import View
+from drake_pose.search.estimates import View
 from drake_pose.search.starts.coarse_search import signed_distances
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from tests.search.arms import arm_cameras, arm_tree, draw_pose, draw_view

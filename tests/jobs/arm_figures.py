@@ -16,7 +16,7 @@ import numpy as np
 
 from drake_pose.jobs.estimate.inputs import Inputs, read_inputs
 from drake_pose.results.settings import EstimateSettings
-from drake_pose.search.result import View
+from drake_pose.search.estimates import View
 from drake_pose.search.scoring import Scoring
 
 BASE, WRIST = slice(0, 4), slice(4, 7)

@@ -11,7 +11,7 @@ from drake_pose.body.model import load_model
 from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import Camera, PinholeCamera
-from drake_pose.search.result import View
+from drake_pose.search.estimates import View
 from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask
 from tests.search.mask_damage import MaskDamage, damage_views, nudge_camera

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drake_pose.camera.models import Camera, PinholeCamera
-from drake_pose.search.result import View
+from drake_pose.search.estimates import View
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ from drake_pose.camera.drake import camera_to_drake
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.jobs.demo import run_demo
 from drake_pose.results.overlay import paint_agreement
+from drake_pose.search.estimates import View
 from drake_pose.search.kameda.search import PaperSearch
-from drake_pose.search.result import View
 from drake_pose.search.settings import PaperSearchSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
@@ -75,7 +75,8 @@ def woman_picture() -> np.ndarray:
     mask = renderer.mask(q)
     search = PaperSearch(woman.pose_tree(root_position=ROOT_POSITION), PaperSearchSettings())
     result = search.match([View(camera, mask)])
-    print(f"woman: E_total {result.E_total:.2%}, {result.runs} runs, {result.seconds:.2f} s")
+    runs = result.statistics.runs
+    print(f"woman: E_total {result.E_total:.2%}, {runs} runs, {result.seconds:.2f} s")
     segments = renderer.segments(result.q)
     silhouette = np.repeat(np.where(mask, 255, 24).astype(np.uint8)[:, :, None], 3, axis=2)
     overlay = paint_agreement(mask, segments >= 0, segments)

@@ -23,7 +23,7 @@ from drake_pose.results.settings import EstimateSettings
 if TYPE_CHECKING:
     from drake_pose.papers.kameda.continuous import ContinuousResult
     from drake_pose.papers.kameda.experiment import ExperimentResult
-    from drake_pose.search.pose_search import PoseSearch
+    from drake_pose.search.scoring import PoseSearch
 
 # What is about experiment A alone.
 _OF_A = (

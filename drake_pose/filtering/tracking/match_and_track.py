@@ -15,14 +15,11 @@ from drake_pose.camera.models import Camera
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.tracking.contour_tracker import ContourTracker, Track, TrackingSettings
 from drake_pose.fit.colours import Picture
-from drake_pose.search.pose_search import PoseSearch
-from drake_pose.search.result import UNEXPLAINED, MatchResult, PlacedMatch, View
+from drake_pose.search.estimates import TRACKED, UNEXPLAINED, PoseEstimate, View
+from drake_pose.search.scoring import PoseSearch
 from drake_pose.silhouette.pictures.mask_agreement import edge_area
 
 Array = NDArray[np.float64]
-
-TRACKED = "tracked"
-"""``MatchResult.stopped_by`` of a pose that no search found."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +102,7 @@ class MatchAndTrack:
         root_position: Array | None = None,
         pictures: Mapping[str, Picture] | None = None,
         start: Array | None = None,
-    ) -> tuple[Followed, MatchResult]:
+    ) -> tuple[Followed, PoseEstimate]:
         """The next frame.
 
         Args:
@@ -125,7 +122,7 @@ class MatchAndTrack:
             SettingsError: masks or pictures that do not fit the cameras.
         """
         frame = _Frame(views, root_position, self._pictures(pictures), time.perf_counter())
-        tracked: tuple[Track, MatchResult] | None = None
+        tracked: tuple[Track, PoseEstimate] | None = None
         if last.track is not None:
             track = self._follow(last.track, frame, False)
             tracked = track, self._result(track, frame)
@@ -139,8 +136,7 @@ class MatchAndTrack:
         found = [] if tracked is None else [tracked]
         if matched.found:
             observation = self._observation(root_position)
-            scale = matched.scale if isinstance(matched, PlacedMatch) else 1.0
-            x = observation.state(matched.q, matched.X_WB, scale)
+            x = observation.state(matched.q, matched.X_WB, matched.scale)
             if last.track is not None:
                 # A search does not know how often an angle has turned round.
                 x = observation.continued(x, last.track.state.best.mean)
@@ -153,7 +149,7 @@ class MatchAndTrack:
         track, result = min(found, key=lambda pair: pair[1].E_total)
         return Followed(track, result.E_total, last.matches + 1), result
 
-    def _begin(self, start: Array, last: Followed, frame: _Frame) -> tuple[Followed, MatchResult]:
+    def _begin(self, start: Array, last: Followed, frame: _Frame) -> tuple[Followed, PoseEstimate]:
         """A track that begins where the body is known to be."""
         x = self._observation(frame.root_position).state(start)
         if last.track is not None:
@@ -164,8 +160,8 @@ class MatchAndTrack:
         return Followed(track, reference, last.matches), replace(result, found=not track.lost)
 
     def _go_on(
-        self, last: Followed, tracked: tuple[Track, MatchResult] | None, frame: _Frame
-    ) -> tuple[Followed, MatchResult]:
+        self, last: Followed, tracked: tuple[Track, PoseEstimate] | None, frame: _Frame
+    ) -> tuple[Followed, PoseEstimate]:
         """What is known where neither a track nor a mask nor a start says where the body is."""
         if tracked is None:
             nowhere = self._observation(None).state(self._search.tree.model.default_positions)
@@ -183,7 +179,7 @@ class MatchAndTrack:
             return None
         return [pictures.get(camera.name) for camera in self.tracker.observation.cameras]
 
-    def _turned(self, matched: MatchResult, node_values: Sequence[Array]) -> MatchResult:
+    def _turned(self, matched: PoseEstimate, node_values: Sequence[Array]) -> PoseEstimate:
         """A pose in the turns of a track that goes on."""
         turns = [
             2.0 * np.pi * np.round((now - then) / (2.0 * np.pi))
@@ -202,7 +198,7 @@ class MatchAndTrack:
         return observation.with_root_position(root_position)
 
     def _is_lost(
-        self, track: Track, result: MatchResult, reference: float, has_masks: bool
+        self, track: Track, result: PoseEstimate, reference: float, has_masks: bool
     ) -> bool:
         limit = self.settings.lost_growth * reference + self.settings.lost_margin
         return track.lost or (has_masks and result.E_total > min(limit, UNEXPLAINED))
@@ -225,24 +221,19 @@ class MatchAndTrack:
             J += edge_area(drawn) * track.measurement.distance
         return J, max(area, 1.0)
 
-    def _result(self, track: Track, frame: _Frame) -> MatchResult:
+    def _result(self, track: Track, frame: _Frame) -> PoseEstimate:
         """The pose of a track, and how well it explains what is seen."""
         observation = self._observation(frame.root_position)
         x = track.state.best.mean
         q, X_WB = observation.positions(x)
         J, area = self._difference(track, frame)
-        E_total = J / area
-        return PlacedMatch(
+        return PoseEstimate(
             found=True,
             q=q,
             X_WB=X_WB,
             node_values=observation.node_values(x),
             J=float(J),
-            E_total=E_total,
-            first_E_total=E_total,
-            runs=0,
-            outside_limit=(),
-            untried={},
+            area=float(area),
             stopped_by=TRACKED,
             seconds=time.perf_counter() - frame.begin,
             root_position=observation.root_position(x),

@@ -29,7 +29,7 @@ from drake_pose.fit.proportions import (
     fit_proportions,
 )
 from drake_pose.fit.surfaces import few_rigid_triangles
-from drake_pose.search.pose_families import JointEstimate, PoseFamily, PoseSet
+from drake_pose.search.estimates import JointEstimate, PoseFamily, PoseSet
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 
 Array = NDArray[np.float64]

@@ -20,7 +20,7 @@ import numpy as np
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.tracking.contour_tracker import ContourTracker, TrackingSettings
-from drake_pose.filtering.tracking.match_and_track import TRACKED, make_tracker
+from drake_pose.filtering.tracking.match_and_track import make_tracker
 from drake_pose.filtering.tracking.sequence_fit import FittedSequence, fit_sequence, pose_set
 from drake_pose.filtering.tracking.start_poses import FollowedStart, StartSettings, find_start
 from drake_pose.jobs.estimate.inputs import Inputs, leave_out_links, make_placement_search
@@ -29,7 +29,7 @@ from drake_pose.jobs.estimate.sequence import sequence_tracking
 from drake_pose.results.overlay import draw_shapes
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
-from drake_pose.search.result import PlacedMatch, View
+from drake_pose.search.estimates import TRACKED, PoseEstimate, View
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.systems.estimators.mask_player import DEFAULT_FRAME_RATE_HZ
@@ -75,7 +75,7 @@ class _Fitted(NamedTuple):
     """
 
     search: RootPlacementSearch
-    known: dict[int, PlacedMatch]
+    known: dict[int, PoseEstimate]
     model: ArticulatedModel
     observation: ContourObservation
     x: np.ndarray
@@ -84,11 +84,11 @@ class _Fitted(NamedTuple):
 class _StartedSearch(RootPlacementSearch):
     """A search whose answer for one silhouette is known."""
 
-    def start_with(self, mask: np.ndarray, answer: PlacedMatch) -> None:
+    def start_with(self, mask: np.ndarray, answer: PoseEstimate) -> None:
         """Remember an answer."""
         self._known = mask, answer
 
-    def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PlacedMatch:
+    def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
         """As RootPlacementSearch."""
         mask, answer = self._known
         if len(views) == 1 and np.array_equal(views[0].mask, mask):
@@ -230,8 +230,8 @@ class _BodyFit:
         return draw_shapes(self._masks[0], shapes, ("the file's", "corrected"), [title])
 
     def _without_hidden(
-        self, search: RootPlacementSearch, first: PlacedMatch
-    ) -> tuple[RootPlacementSearch, PlacedMatch]:
+        self, search: RootPlacementSearch, first: PoseEstimate
+    ) -> tuple[RootPlacementSearch, PoseEstimate]:
         """The search and its answer, without parts that are not there where that is better."""
         hidden = () if self._settings.unseen else self._hidden_parts(search, first)
         if not hidden:
@@ -256,7 +256,7 @@ class _BodyFit:
     def _tracker(self, search: RootPlacementSearch) -> ContourTracker:
         return make_tracker(search.tree, [self._camera], self._period, self._tracking)
 
-    def _hidden_parts(self, search: RootPlacementSearch, match: PlacedMatch) -> tuple[str, ...]:
+    def _hidden_parts(self, search: RootPlacementSearch, match: PoseEstimate) -> tuple[str, ...]:
         """Parts that end at the root, and of which next to nothing shows."""
         observation = self._tracker(search).observation
         x = observation.state(match.q, match.X_WB, match.scale)
@@ -280,24 +280,18 @@ class _BodyFit:
     def _pixels_per_metre(self) -> float:
         return float(getattr(self._camera, "pixels_per_metre", 1.0))
 
-    def _answer(self, observation: ContourObservation, x: np.ndarray, frame: int) -> PlacedMatch:
+    def _answer(self, observation: ContourObservation, x: np.ndarray, frame: int) -> PoseEstimate:
         """A state in a frame, by its number, as a search would give it."""
         q, X_WB = observation.positions(x)
         wrong, area = observation.difference(x, [(self._camera, self._masks[frame])])
-        E_total = wrong / max(area, 1)
-        return PlacedMatch(
+        return PoseEstimate(
             found=True,
             q=q,
             X_WB=X_WB,
             node_values=observation.node_values(x),
             J=float(wrong),
-            E_total=E_total,
-            first_E_total=E_total,
-            runs=0,
-            outside_limit=(),
-            untried={},
+            area=float(max(area, 1)),
             stopped_by=TRACKED,
-            seconds=0.0,
             root_position=observation.root_position(x),
             scale=observation.scale(x),
         )

@@ -24,7 +24,7 @@ from drake_pose.fit.surfaces import few_triangles
 from drake_pose.search.continuous.multi_start import MultiStartSearch
 from drake_pose.search.continuous.multi_start_settings import HALFWAY
 from drake_pose.search.continuous.views_fit import ViewsFit
-from drake_pose.search.result import View
+from drake_pose.search.estimates import View
 
 _SIDE = 64
 

@@ -18,7 +18,7 @@ from drake_pose.jobs.estimate.scene_checks import frame_ranges
 from drake_pose.results.folder import PoseRow
 from drake_pose.results.summary import FrameRecord
 from drake_pose.results.texts import percent
-from drake_pose.search.result import View
+from drake_pose.search.estimates import View
 
 BADLY_EXPLAINED = 0.25
 """From this E_total on, a pose explains its pictures badly."""

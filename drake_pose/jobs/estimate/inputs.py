@@ -33,10 +33,10 @@ from drake_pose.results.settings import EstimateSettings, RootTurns
 from drake_pose.search.continuous.multi_start import MultiStartSearch
 from drake_pose.search.continuous.multi_start_settings import MultiStartSettings
 from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
+from drake_pose.search.estimates import PoseEstimate
 from drake_pose.search.grid.settings import BeamSearchSettings
 from drake_pose.search.kameda.search import PaperSearch
-from drake_pose.search.pose_search import PoseSearch
-from drake_pose.search.result import MatchResult
+from drake_pose.search.scoring import PoseSearch
 from drake_pose.search.settings import PaperSearchSettings
 from drake_pose.search.starts.root_placement import PlacementSettings, hub, turns_freely
 from drake_pose.silhouette.areas.visibility import require_visible
@@ -74,7 +74,7 @@ class Inputs:
     truth: TrueAngles | None
     warnings: tuple[str, ...] = ()
     starts: Mapping[str, np.ndarray] = field(default_factory=dict)
-    known: Mapping[str, MatchResult] = field(default_factory=dict)
+    known: Mapping[str, PoseEstimate] = field(default_factory=dict)
 
 
 def read_inputs(

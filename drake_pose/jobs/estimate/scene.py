@@ -24,8 +24,8 @@ from drake_pose.results.overlay import encode_png
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.results.summary import FrameRecord, check_same_job, describe_job
 from drake_pose.search.continuous.multi_start import MultiStartSearch
-from drake_pose.search.pose_search import PoseSearch
-from drake_pose.search.result import MatchResult, PlacedMatch, View
+from drake_pose.search.estimates import PoseEstimate, View
+from drake_pose.search.scoring import PoseSearch
 from drake_pose.search.starts.root_placement import scale_camera
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.mask_agreement import compare_masks
@@ -190,7 +190,7 @@ class _Matching:
         if contradiction is not None:
             self._result.warn([contradiction.text])
 
-    def _finish_frame(self, frame: str, match: MatchResult | None) -> None:
+    def _finish_frame(self, frame: str, match: PoseEstimate | None) -> None:
         if match is None:
             raise SettingsError(f"frame '{frame}': the matcher got no picture")
         base = None
@@ -205,9 +205,9 @@ class _Matching:
             E_total=match.E_total if match.found else None,
             seconds=match.seconds,
             first_E_total=match.first_E_total if match.found else None,
-            runs=match.runs,
+            runs=match.statistics.runs,
             stopped_by=match.stopped_by,
-            outside_limit=match.outside_limit,
+            outside_limit=match.statistics.outside_limit,
             joint_errors=self._result.joint_errors(frame, match.q, match.found),
             camera_scale=self._camera_scale(frame, match),
             explained=match.explained,
@@ -218,7 +218,7 @@ class _Matching:
         )
         self._result.finish_frame(row, record)
 
-    def _compare(self, row: PoseRow, match: MatchResult) -> dict[str, float]:
+    def _compare(self, row: PoseRow, match: PoseEstimate) -> dict[str, float]:
         """Draws the body beside masks and over pictures; the masks' IoU by camera."""
         scene = self._inputs.scene
         masks, bodies = {}, {}
@@ -237,20 +237,19 @@ class _Matching:
                 self._result.write_overlay(camera.name, row, seen, body, segments)
         return dict(compare_masks(masks, bodies).ious) if match.found else {}
 
-    def _renderer(self, camera: Camera, match: MatchResult) -> LabelRenderer:
+    def _renderer(self, camera: Camera, match: PoseEstimate) -> LabelRenderer:
         """Draws the body in a camera, whose scale may have been found."""
-        scale = match.scale if isinstance(match, PlacedMatch) else 1.0
         if camera.name not in self._renderers:
             self._renderers[camera.name] = LabelRenderer(self._inputs.model, camera)
         renderer = self._renderers[camera.name]
         if isinstance(camera, ParallelCamera):
-            renderer.camera = scale_camera(camera, scale)
+            renderer.camera = scale_camera(camera, match.scale)
         return renderer
 
-    def _camera_scale(self, frame: str, match: MatchResult) -> float | None:
+    def _camera_scale(self, frame: str, match: PoseEstimate) -> float | None:
         """Pixels a metre of the frame's camera, where they were not known."""
         scene = self._inputs.scene
-        if not (scene.scale_unknown and isinstance(match, PlacedMatch) and match.found):
+        if not (scene.scale_unknown and match.found):
             return None
         camera = scene.cameras[scene.cameras_of(frame)[0]]
         if not isinstance(camera, ParallelCamera):

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from drake_pose.filtering.tracking.contour_tracker import TrackingSettings
 from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
-from drake_pose.search.pose_search import PoseSearch
+from drake_pose.search.scoring import PoseSearch
 from drake_pose.silhouette.pictures.scenes import Scene
 from drake_pose.systems.estimators.mask_player import DEFAULT_FRAME_RATE_HZ
 

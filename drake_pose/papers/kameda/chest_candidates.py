@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from drake_pose.camera.models import Camera
 from drake_pose.papers.kameda.experiment import ExperimentResult, Trial
+from drake_pose.search.estimates import View
 from drake_pose.search.grid.families.search import samples_at
 from drake_pose.search.kameda.search import PaperSearch
-from drake_pose.search.result import View
 from drake_pose.search.scoring import Scoring
 from drake_pose.silhouette.areas.scoring import draw_mask
 

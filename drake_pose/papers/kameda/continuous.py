@@ -16,8 +16,8 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import SettingsError
 from drake_pose.papers.kameda.experiment import draw_values, experiment_camera
-from drake_pose.search.continuous.search import ContinuousSearch, RefinedMatch
-from drake_pose.search.result import View
+from drake_pose.search.continuous.search import ContinuousSearch, PoseEstimate
+from drake_pose.search.estimates import View
 from drake_pose.silhouette.areas.outline import Outline
 from drake_pose.silhouette.areas.scoring import draw_mask
 
@@ -42,7 +42,7 @@ class ContinuousTrial:
 
     true_values: np.ndarray
     searched: np.ndarray
-    result: RefinedMatch
+    result: PoseEstimate
     seconds: tuple[float, float]
 
     @property
@@ -210,7 +210,8 @@ def run_continuous_experiment(
         start = time.process_time()
         result = search.match(pictures)
         seconds = time.process_time() - start
-        share = result.interval_seconds / max(result.seconds + result.interval_seconds, 1e-9)
+        interval_seconds = result.statistics.interval_seconds
+        share = interval_seconds / max(result.seconds + interval_seconds, 1e-9)
         trials.append(
             ContinuousTrial(
                 np.concatenate(values),

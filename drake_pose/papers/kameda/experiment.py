@@ -13,13 +13,13 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import SettingsError
 from drake_pose.papers.kameda.causes import Causes, causes_of_wrong_angles
+from drake_pose.search.estimates import PoseEstimate, View
 from drake_pose.search.grid.beam.search import BeamSearch
 from drake_pose.search.grid.families.examination import ExaminationSettings, examine
 from drake_pose.search.grid.families.search import GridPoseSet
 from drake_pose.search.grid.settings import BeamSearchSettings
 from drake_pose.search.kameda.search import PaperSearch
-from drake_pose.search.pose_search import PoseSearch
-from drake_pose.search.result import MatchResult, View
+from drake_pose.search.scoring import PoseSearch
 from drake_pose.search.settings import PaperSearchSettings
 from drake_pose.silhouette.areas.scoring import draw_mask
 
@@ -70,7 +70,7 @@ class Trial:
 
     true_values: tuple[np.ndarray, ...]
     inside: bool
-    result: MatchResult
+    result: PoseEstimate
     pose_equal: bool
     seconds: float
     examination_seconds: float = 0.0
@@ -103,7 +103,7 @@ class ExperimentResult:
         E_total is over the silhouettes for which a pose was found; ``not_found`` counts the others.
         """
         E_total = [trial.E_total for trial in self.trials if trial.result.found]
-        runs = np.sort([trial.result.runs for trial in self.trials])
+        runs = np.sort([trial.result.statistics.runs for trial in self.trials])
         seconds = [trial.seconds for trial in self.trials]
         improved = [
             t.result.found and t.result.E_total < t.result.first_E_total for t in self.trials

@@ -10,8 +10,7 @@ from matplotlib.figure import Figure
 
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.results.overlay import paint_agreement
-from drake_pose.search.pose_families import PoseFamily, PoseSet
-from drake_pose.search.result import View
+from drake_pose.search.estimates import PoseFamily, PoseSet, View
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
 _MARGIN = 20

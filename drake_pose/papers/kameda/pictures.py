@@ -15,8 +15,8 @@ from drake_pose.papers.kameda.experiment import (
     side_camera,
 )
 from drake_pose.papers.kameda.family_pictures import save_families
+from drake_pose.search.estimates import View
 from drake_pose.search.kameda.search import PaperSearch
-from drake_pose.search.result import View
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
@@ -69,7 +69,7 @@ def save_pictures(result: ExperimentResult, folder: Path) -> list[Path]:
             path = folder / f"{name}.png"
             files.append(_save_examples(path, title, trials, result, renderers))
     if isinstance(result.search, PaperSearch):
-        runs = np.array([trial.result.runs for trial in result.trials])
+        runs = np.array([trial.result.statistics.runs for trial in result.trials])
         path = folder / "figure_11_runs_of_step_3.png"
         files.append(_save_histogram(path, runs, 100, "runs of step 3"))
         K = result.search.settings.candidate_limit
@@ -119,7 +119,9 @@ def _save_examples(
         for axis, segments in zip(column[[0, 1, 3, 4]], [*pictures, *side], strict=True):
             axis.imshow(np.where(segments[..., None] >= 0, colours[segments], _BACKGROUND))
         column[2].imshow(_compare(pictures[0] >= 0, pictures[1] >= 0))
-        column[0].set_title(f"E_total {trial.E_total:.2%}, {trial.result.runs} runs", fontsize=9)
+        column[0].set_title(
+            f"E_total {trial.E_total:.2%}, {trial.result.statistics.runs} runs", fontsize=9
+        )
     for axis, label in zip(axes[:, 0], _PANELS, strict=True):
         axis.set_ylabel(label)
     for axis in axes.ravel():

@@ -22,7 +22,7 @@ from drake_pose.fit.covariance import ErrorSizes, estimate_sizes, values_covaria
 from drake_pose.fit.levenberg_marquardt import Round
 from drake_pose.fit.significance import excess
 from drake_pose.search.continuous.views_fit import FittedPose, ViewsFit
-from drake_pose.search.pose_families import JointEstimate, PoseFamily, PoseSet
+from drake_pose.search.estimates import JointEstimate, PoseFamily, PoseSet
 from drake_pose.search.starts.self_motions import Flip, flips
 
 _LOOK = Round(0.0125, 0.026, 2)

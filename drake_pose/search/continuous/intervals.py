@@ -25,7 +25,7 @@ from scipy.special import ndtri
 
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.errors import SettingsError
-from drake_pose.search.pose_families import JointEstimate, PoseFamily, PoseSet
+from drake_pose.search.estimates import JointEstimate, PoseFamily, PoseSet
 from drake_pose.search.raster_fit.body import Freedom
 from drake_pose.search.raster_fit.passes import FINE_PASSES
 from drake_pose.search.raster_fit.problem import RefinementProblem

@@ -34,11 +34,10 @@ from drake_pose.search.continuous.views_fit import (
     distinct,
     refine_best,
 )
+from drake_pose.search.estimates import PoseEstimate, PoseSet, SearchStatistics, View
 from drake_pose.search.grid.beam.search import BeamSearch
 from drake_pose.search.grid.families.examination import examine
 from drake_pose.search.grid.sampled_body import SampledBody
-from drake_pose.search.pose_families import PoseSet
-from drake_pose.search.result import MatchResult, View
 from drake_pose.search.scoring import Scoring
 from drake_pose.search.starts.coarse_search import CoarsePoses, CoarseSearch
 from drake_pose.search.starts.self_motions import counter_turns, flips
@@ -78,7 +77,7 @@ class MultiStartSearch:
         settings = replace(self.settings, rounds=0, families=None, examination=None)
         return MultiStartSearch(self.tree, settings)
 
-    def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> MatchResult:
+    def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
         """Estimate the pose that the views show.
 
         Args:
@@ -242,26 +241,18 @@ class _MultiStartRun:
             total += float(areas[0, 0] - 2 * areas[0, 1])
         return total
 
-    def result(self, views: Sequence[View]) -> MatchResult:
+    def result(self, views: Sequence[View]) -> PoseEstimate:
         """What the search found, judged by silhouettes as they were given."""
         scoring = Scoring(self.body.sampled, views)
         best, area = self.poses[0], scoring.silhouette_area
-        node_values = tuple(self.kinematics.split(best.values))
-        q, X_WB = self.body.sampled.tree.positions_from(node_values)
         J = self._J(scoring, best.values)
         first = J if self.first is None else self._J(scoring, self.first.values)
-        return MatchResult(
-            found=True,
-            q=q,
-            X_WB=X_WB,
-            node_values=node_values,
-            J=J,
-            E_total=J / area,
-            first_E_total=first / area,
-            runs=self.fit.evaluations,
-            outside_limit=(),
-            untried={},
+        return PoseEstimate.of_values(
+            self.body.sampled.tree,
+            self.kinematics.split(best.values),
+            J,
+            area,
             stopped_by=self.stopped_by,
-            seconds=0.0,
             pose_set=self._pose_set(scoring),
+            statistics=SearchStatistics(self.fit.evaluations, first),
         )

@@ -20,6 +20,7 @@ import numpy as np
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import SettingsError
+from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
 from drake_pose.search.grid.beam.hypotheses import Beam, Hypotheses
 from drake_pose.search.grid.beam.search import BeamSearch
 from drake_pose.search.grid.node_poses import Pictures, PoseStore, coarsen
@@ -27,7 +28,6 @@ from drake_pose.search.grid.settings import BeamSearchSettings, Stage
 from drake_pose.search.raster_fit.body import RefinementBody
 from drake_pose.search.raster_fit.passes import COARSE_PASSES, FINE_PASSES, Pass, descend
 from drake_pose.search.raster_fit.problem import RefinementProblem
-from drake_pose.search.result import PlacedMatch, View
 from drake_pose.search.starts.neighbourhood import NeighbourhoodSearch
 from drake_pose.search.starts.part_placement import PartSearch
 from drake_pose.search.starts.root_placement import (
@@ -117,7 +117,7 @@ class RootPlacementSearch:
             False: self._refined.freedom(extra=growth),
         }
 
-    def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PlacedMatch:
+    def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
         """Estimate the pose that the views show, and where it is.
 
         Args:
@@ -148,7 +148,12 @@ class RootPlacementSearch:
             if placed:
                 break
         if not placed:
-            return self._nothing(runs, time.perf_counter() - begin)
+            return PoseEstimate.nothing(
+                self.tree,
+                stopped_by="end",
+                seconds=time.perf_counter() - begin,
+                statistics=SearchStatistics(runs),
+            )
         placed.sort(key=lambda one: one.J)
         first = placed[0].J / _area(views)
         best = self._improve(placed[: self.placement.starts], root_position is None, deadline)
@@ -287,7 +292,7 @@ class RootPlacementSearch:
         end = self._settle(better, FINE_PASSES, moves)
         return min(start, near, better, end, key=lambda one: one.J)
 
-    def _answer(self, best: _Placed, first: float, runs: int, stopped_by: str) -> PlacedMatch:
+    def _answer(self, best: _Placed, first: float, runs: int, stopped_by: str) -> PoseEstimate:
         """The result."""
         p_WR = self._root_of(best)
         tree = self.tree.with_root_position(p_WR)
@@ -297,31 +302,16 @@ class RootPlacementSearch:
             # The plant's own joints hold the root where it is now.
             lower, upper = tree.value_bounds(i)
             node_values.append(np.where(lower == upper, lower, values))
-        q, X_WB = tree.positions_from(node_values)
-        J = _objective(tree, node_values, best.views)
-        return PlacedMatch(
-            found=True,
-            q=q,
-            X_WB=X_WB,
-            node_values=tuple(node_values),
-            J=J,
-            E_total=J / _area(best.views),
-            first_E_total=first,
-            runs=runs,
-            outside_limit=(),
-            untried={},
+        area = _area(best.views)
+        return PoseEstimate.of_values(
+            tree,
+            node_values,
+            _objective(tree, node_values, best.views),
+            area,
             stopped_by=stopped_by,
-            seconds=0.0,
             root_position=p_WR,
             scale=best.scale,
-        )
-
-    def _nothing(self, runs: int, seconds: float) -> PlacedMatch:
-        """The answer where no pose was found."""
-        missing = np.full(len(self.tree.model.position_names), np.nan)
-        nothing = float("nan")
-        return PlacedMatch(
-            False, missing, np.eye(4), (), nothing, nothing, nothing, runs, (), {}, "end", seconds
+            statistics=SearchStatistics(runs, first * area),
         )
 
 

@@ -18,6 +18,7 @@ from drake_pose.search.continuous.intervals import (
     find_intervals,
     pose_set,
 )
+from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
 from drake_pose.search.grid.beam.search import BeamSearch
 from drake_pose.search.grid.settings import BeamSearchSettings, Stage
 from drake_pose.search.raster_fit.body import RefinementBody
@@ -29,7 +30,6 @@ from drake_pose.search.raster_fit.passes import (
     descend,
 )
 from drake_pose.search.raster_fit.problem import RefinementProblem
-from drake_pose.search.result import MatchResult, View
 from drake_pose.search.starts.neighbourhood import NeighbourhoodSearch, NeighbourhoodSettings
 from drake_pose.search.starts.part_placement import PartSearch
 
@@ -108,24 +108,6 @@ class ContinuousSearchSettings:
             raise SettingsError("a continuous search needs at least one grid")
 
 
-@dataclass(frozen=True)
-class RefinedMatch(MatchResult):
-    """A refined pose; ``pose_set`` holds the intervals and the other poses that are as good.
-
-    Args:
-        shift: (3,) the root's shift from where the tree has it [m].
-        growth: the body's size, 1 where it is as the model says.
-        covariance: (m, m) of the tree's values about this pose; (0, 0) if intervals were not
-            wanted.
-        interval_seconds: wall time of the intervals, which ``seconds`` leaves out.
-    """
-
-    shift: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    growth: float = 1.0
-    covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
-    interval_seconds: float = 0.0
-
-
 class _Reached(NamedTuple):
     """Where descents led: parameters and J, the first J, the steps, what was found about them."""
 
@@ -167,7 +149,7 @@ class Refiner:
         escapes: int = 1,
         deadline: float = math.inf,
         others: Iterable[Sequence[Sequence[np.ndarray]]] = (),
-    ) -> RefinedMatch:
+    ) -> PoseEstimate:
         """The best pose reached from some poses.
 
         Args:
@@ -294,33 +276,28 @@ class Refiner:
         intervals: Intervals | None,
         seconds: tuple[float, float],
         stopped_by: str,
-    ) -> RefinedMatch:
+    ) -> PoseEstimate:
         """The result."""
         parameters = reached.parameters
-        tree = self.tree
+        tree, root_position = self.tree, None
         if parameters[-4:-1].any():
-            tree = tree.with_root_position(self.body.poses(parameters)[0, :3, 3])
+            root_position = self.body.poses(parameters)[0, :3, 3]
+            tree = tree.with_root_position(root_position)
         node_values = self.body.node_values(parameters)
-        q, X_WB = tree.positions_from(node_values)
-        J = reached.J
-        return RefinedMatch(
-            found=True,
-            q=q,
-            X_WB=X_WB,
-            node_values=node_values,
-            J=J,
-            E_total=J / problem.area,
-            first_E_total=reached.first_J / problem.area,
-            runs=reached.steps,
-            outside_limit=(),
-            untried={},
+        return PoseEstimate.of_values(
+            tree,
+            node_values,
+            reached.J,
+            problem.area,
             stopped_by=stopped_by,
             seconds=seconds[0],
+            root_position=root_position,
+            scale=float(np.exp(parameters[-1])),
+            covariance=None if intervals is None else intervals.covariance,
             pose_set=None if intervals is None else pose_set(problem, tree, intervals),
-            shift=parameters[-4:-1],
-            growth=float(np.exp(parameters[-1])),
-            covariance=np.zeros((0, 0)) if intervals is None else intervals.covariance,
-            interval_seconds=seconds[1],
+            statistics=SearchStatistics(
+                reached.steps, reached.first_J, interval_seconds=seconds[1]
+            ),
         )
 
 
@@ -339,7 +316,7 @@ class ContinuousSearch:
         self.sampled = self._grids[0].sampled
         self._refiner = Refiner(tree, self.settings.refinement, self.sampled.values)
 
-    def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> RefinedMatch:
+    def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
         """Estimate the pose that the views show.
 
         Args:
@@ -356,11 +333,8 @@ class ContinuousSearch:
         rounds = self._starts(views, root_position)
         starts = next((starts for starts in rounds if starts), ())
         if not starts:
-            nothing = np.full(len(self.tree.model.position_names), np.nan)
-            return RefinedMatch(
-                False, nothing, np.eye(4), (), np.nan, np.nan, np.nan, 0, (), {}, "time_limit",
-                time.perf_counter() - begin,
-            )  # fmt: skip
+            seconds = time.perf_counter() - begin
+            return PoseEstimate.nothing(self.tree, stopped_by="time_limit", seconds=seconds)
         grid_seconds = time.perf_counter() - begin
         refined = self._refiner.refine(
             views, starts, root_position, self.settings.escapes, deadline, rounds

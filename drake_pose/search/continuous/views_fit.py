@@ -24,7 +24,7 @@ from drake_pose.fit.covariance import Distances, distances
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.kernel import COST
 from drake_pose.fit.levenberg_marquardt import Round, StepSettings
-from drake_pose.search.result import View
+from drake_pose.search.estimates import View
 from drake_pose.silhouette.areas.outline import Outline
 
 _STEPS = StepSettings(longest=0.3, damping=1e-2, even_damping=1e-3)

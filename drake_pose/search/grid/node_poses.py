@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
+from drake_pose.search.estimates import View
 from drake_pose.search.grid.sampled_body import SampledBody
-from drake_pose.search.result import View
 from drake_pose.silhouette.bits.bit_kernel import draw_bits
 from drake_pose.silhouette.bits.bit_view import WORD, BitView, make_bit_view
 from drake_pose.silhouette.bits.bounding_balls import draw_discs, sift_by_balls

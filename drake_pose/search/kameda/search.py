@@ -13,8 +13,8 @@ import numpy as np
 
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.errors import SettingsError
+from drake_pose.search.estimates import Candidates, PoseEstimate, SearchStatistics, View
 from drake_pose.search.kameda.leaf_combinations import best_leaf_combination
-from drake_pose.search.result import Candidates, MatchResult, View
 from drake_pose.search.scoring import Regions, SampledTree, Scoring
 from drake_pose.search.settings import PaperSearchSettings
 
@@ -65,7 +65,7 @@ class PaperSearch:
         self.settings = settings or PaperSearchSettings()
         self.sampled = SampledTree(tree, self.settings)
 
-    def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> MatchResult:
+    def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
         """Estimate the pose that the views show.
 
         Args:
@@ -285,16 +285,13 @@ class _Run:
         if self.best is None or J < self.best.J:
             self.best = _Best(J, dict(self.lists))
 
-    def result(self, seconds: float) -> MatchResult:
+    def result(self, seconds: float) -> PoseEstimate:
         """What the search found, as plain arrays."""
-        area = self.scoring.silhouette_area
+        statistics = SearchStatistics(self.runs, self.first_J, self.outside_limit)
         if self.best is None:
-            missing = np.full(len(self.tree.model.position_names), np.nan)
-            nothing = float("nan")
-            return MatchResult(
-                False, missing, np.eye(4), (), nothing, nothing, nothing, self.runs,
-                self.outside_limit, {}, self.stopped_by, seconds,
-            )  # fmt: skip
+            return PoseEstimate.nothing(
+                self.tree, stopped_by=self.stopped_by, seconds=seconds, statistics=statistics
+            )
         values = []
         untried = {}
         for i, node in enumerate(self.nodes):
@@ -306,18 +303,12 @@ class _Run:
             untried[node.name] = Candidates(
                 node.value_names, grid[current.samples[rest]], current.scores[rest]
             )
-        q, X_WB = self.tree.positions_from(values)
-        return MatchResult(
-            found=True,
-            q=q,
-            X_WB=X_WB,
-            node_values=tuple(values),
-            J=self.best.J,
-            E_total=self.best.J / area,
-            first_E_total=self.first_J / area,
-            runs=self.runs,
-            outside_limit=self.outside_limit,
-            untried=untried,
+        return PoseEstimate.of_values(
+            self.tree,
+            values,
+            self.best.J,
+            self.scoring.silhouette_area,
             stopped_by=self.stopped_by,
             seconds=seconds,
+            statistics=replace(statistics, untried=untried),
         )

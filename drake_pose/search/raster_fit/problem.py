@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_pose.errors import SettingsError
+from drake_pose.search.estimates import View
 from drake_pose.search.raster_fit.body import Freedom, RefinementBody
 from drake_pose.search.raster_fit.kernel import (
     Movements,
@@ -21,7 +22,6 @@ from drake_pose.search.raster_fit.lines import (
     find_border,
 )
 from drake_pose.search.raster_fit.placing import place_surfaces
-from drake_pose.search.result import View
 from drake_pose.silhouette.contours.contour_body import ContourBody, contour_body
 
 # Every so many rows are looked at where areas are only compared.

@@ -17,8 +17,8 @@ import numpy as np
 
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import SettingsError
+from drake_pose.search.estimates import View
 from drake_pose.search.grid.sampled_body import SampledBody
-from drake_pose.search.result import View
 from drake_pose.search.starts.coarse_kernel import (
     Balls,
     CoarseView,

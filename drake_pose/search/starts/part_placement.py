@@ -18,10 +18,10 @@ import numpy as np
 
 from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.search.estimates import View
 from drake_pose.search.raster_fit.body import RefinementBody
 from drake_pose.search.raster_fit.lines import Border, clear_spans
 from drake_pose.search.raster_fit.problem import RefinementProblem
-from drake_pose.search.result import View
 from drake_pose.search.starts.depth_reflections import Reflection, find_reflections
 from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh, pack
 from drake_pose.silhouette.areas.prefix_sums import sum_rows

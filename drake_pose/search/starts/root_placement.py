@@ -21,8 +21,8 @@ from scipy.ndimage import distance_transform_edt
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.errors import SettingsError
+from drake_pose.search.estimates import View
 from drake_pose.search.grid.sampled_body import SampledBody
-from drake_pose.search.result import View
 from drake_pose.silhouette.areas.scoring import score_bodies
 from drake_pose.silhouette.bits.bit_kernel import draw_bits
 from drake_pose.silhouette.bits.bit_view import WORD, make_bit_view

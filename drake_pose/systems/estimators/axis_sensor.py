@@ -11,8 +11,8 @@ from pydrake.systems.sensors import ImageLabel16I
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.measurements.axes import AxisObservation
-from drake_pose.search.pose_search import PoseSearch
-from drake_pose.search.result import View
+from drake_pose.search.estimates import View
+from drake_pose.search.scoring import PoseSearch
 from drake_pose.silhouette.pictures.label_images import EMPTY, label_data, label_image_to_mask
 from drake_pose.systems.estimators.truncated_ekf import STATISTICS
 

@@ -30,7 +30,7 @@ from drake_pose.body.tree.tree_builder import build_pose_tree
 from drake_pose.camera.drake import camera_to_drake
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.filtering.tracking.contour_tracker import TrackingSettings
-from drake_pose.search.pose_search import PoseSearch
+from drake_pose.search.scoring import PoseSearch
 from drake_pose.silhouette.pictures.scenes import Scene
 from drake_pose.systems.bodies.posed_geometry import pose_plant
 from drake_pose.systems.bodies.skin import add_meshcat_skin, add_skin

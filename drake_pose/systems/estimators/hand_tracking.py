@@ -21,7 +21,7 @@ from drake_pose.filtering.measurements.segment_axes import AxisSettings, Ends
 from drake_pose.filtering.state import Belief
 from drake_pose.filtering.tracking.contour_tracker import ContourTracker, TrackingSettings
 from drake_pose.filtering.truncation.couplings import model_inequalities
-from drake_pose.search.pose_search import PoseSearch
+from drake_pose.search.scoring import PoseSearch
 from drake_pose.systems.estimators.axis_sensor import AxisSensor, BodyBelief, StateMatcher
 from drake_pose.systems.estimators.diagrams import (
     ESTIMATE_COLOUR,

@@ -17,8 +17,8 @@ from pydrake.systems.sensors import ImageLabel16I
 
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
-from drake_pose.search.pose_search import PoseSearch
-from drake_pose.search.result import MatchResult, View
+from drake_pose.search.estimates import PoseEstimate, View
+from drake_pose.search.scoring import PoseSearch
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 
 STATISTICS = ("found", "J", "E_total", "first_E_total", "runs", "outside_limit", "seconds")
@@ -124,7 +124,7 @@ class SilhouetteMatcher(LeafSystem):
             )
         ]
         self.DeclarePeriodicDiscreteUpdateEvent(period, offset, self._match)
-        self.last_result: MatchResult | None = None
+        self.last_result: PoseEstimate | None = None
 
     def _declare_estimates(self, position_count: int) -> None:
         """The outputs of what is estimated, which only read the state."""
@@ -184,7 +184,8 @@ class SilhouetteMatcher(LeafSystem):
                 root_position = self._root_position.Eval(context)
             result = self._find(context, discrete_state, views, root_position)
             self.last_result = result
-            statistics[4:] = result.runs, max(result.outside_limit, default=0.0), result.seconds
+            search = result.statistics
+            statistics[4:] = search.runs, max(search.outside_limit, default=0.0), result.seconds
             if result.found:
                 statistics[:4] = 1.0, result.J, result.E_total, result.first_E_total
                 discrete_state.set_value(self._positions, result.q)
@@ -203,25 +204,24 @@ class SilhouetteMatcher(LeafSystem):
         discrete_state: DiscreteValues,
         views: Sequence[View],
         root_position: np.ndarray | None,
-    ) -> MatchResult:
+    ) -> PoseEstimate:
         """The pose that the views show."""
         return self._search.match(views, root_position)
 
-    def _set_worth(self, result: MatchResult, discrete_state: DiscreteValues) -> None:
+    def _set_worth(self, result: PoseEstimate, discrete_state: DiscreteValues) -> None:
         """Put what the answer is worth into the state."""
         proved, determined, lower, upper, families = self._worth
         answer = result.pose_set
         if answer is None:
             return
         names = self._search.tree.model.position_names
-        estimates = answer.positions(names)
         positions = np.full((discrete_state.value(families).size // len(names), len(names)), np.nan)
         found = [family.q for family in answer.families[: len(positions)]]
         positions[: len(found)] = found
         discrete_state.set_value(proved, np.array([float(result.proved_optimal)]))
-        discrete_state.set_value(determined, estimates.determined)
-        discrete_state.set_value(lower, estimates.low)
-        discrete_state.set_value(upper, estimates.high)
+        intervals = answer.position_intervals(names)
+        for state, values in zip((determined, lower, upper), intervals, strict=True):
+            discrete_state.set_value(state, values)
         discrete_state.set_value(families, positions.ravel())
 
     def _calc_positions(self, context: Context, output: BasicVector) -> None:

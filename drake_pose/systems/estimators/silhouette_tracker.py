@@ -11,10 +11,10 @@ from pydrake.systems.sensors import ImageRgba8U
 from drake_pose.camera.models import Camera
 from drake_pose.errors import UnknownNameError
 from drake_pose.filtering.tracking.contour_tracker import Track, TrackingSettings
-from drake_pose.filtering.tracking.match_and_track import TRACKED, Followed, MatchAndTrack
+from drake_pose.filtering.tracking.match_and_track import Followed, MatchAndTrack
 from drake_pose.fit.colours import Picture
-from drake_pose.search.pose_search import PoseSearch
-from drake_pose.search.result import MatchResult, View
+from drake_pose.search.estimates import TRACKED, PoseEstimate, View
+from drake_pose.search.scoring import PoseSearch
 from drake_pose.systems.estimators.filter_packing import FilterPacking, require_time_forward
 from drake_pose.systems.estimators.silhouette_matcher import SilhouetteMatcher
 
@@ -203,7 +203,7 @@ class SilhouetteTracker(SilhouetteMatcher):
         discrete_state: DiscreteValues,
         views: Sequence[View],
         root_position: Array | None,
-    ) -> MatchResult:
+    ) -> PoseEstimate:
         last_time = context.get_discrete_state(self._record).value()[-1]
         require_time_forward(self, context, last_time)
         now, result = self._follower.next(

@@ -8,9 +8,9 @@ from drake_pose.body.model import load_model
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.tracking.contour_tracker import ContourTracker, TrackingSettings
-from drake_pose.filtering.tracking.match_and_track import TRACKED, Followed, MatchAndTrack
+from drake_pose.filtering.tracking.match_and_track import Followed, MatchAndTrack
+from drake_pose.search.estimates import TRACKED, View
 from drake_pose.search.kameda.search import PaperSearch
-from drake_pose.search.result import View
 from drake_pose.search.settings import PaperSearchSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.filtering.measurements.test_contour import pinhole

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from drake_pose.filtering.measurements.contour import ContourObservation
-from drake_pose.filtering.tracking.match_and_track import TRACKED, Followed, MatchAndTrack
+from drake_pose.filtering.tracking.match_and_track import Followed, MatchAndTrack
 from drake_pose.filtering.truncation.inequalities import from_model
 from drake_pose.search.continuous.search import ContinuousSearch
-from drake_pose.search.result import View
+from drake_pose.search.estimates import TRACKED, View
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.jobs.scenes import camera
 from tests.search.turning import crane

@@ -6,8 +6,8 @@ import pytest
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.tracking.contour_tracker import ContourTracker, TrackingSettings
-from drake_pose.filtering.tracking.match_and_track import TRACKED, Followed, MatchAndTrack
-from drake_pose.search.result import PlacedMatch, View
+from drake_pose.filtering.tracking.match_and_track import Followed, MatchAndTrack
+from drake_pose.search.estimates import TRACKED, PoseEstimate, View
 from tests.filtering.measurements.test_contour import pinhole
 from tests.filtering.tracking.test_match_and_track import PERIOD, swings
 from tests.search.bodies import forked_body, front_camera
@@ -25,8 +25,8 @@ class KnownPoses:
         self.calls += 1
         q, X_WB, scale, p_WR = self.answers[self.frame]
         values = tuple(self.tree.values_from_positions(q, X_WB))
-        found = True, q, X_WB, values, 0.0, 0.2, 0.2, 1, (), {}, "end", 0.0
-        return PlacedMatch(*found, root_position=p_WR, scale=scale)
+        found = True, q, X_WB, values, 20.0, 100.0, "end"
+        return PoseEstimate(*found, root_position=p_WR, scale=scale)
 
 
 @pytest.fixture

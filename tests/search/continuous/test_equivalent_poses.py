@@ -12,8 +12,7 @@ from drake_pose.fit.levenberg_marquardt import Round
 from drake_pose.fit.surfaces import few_triangles
 from drake_pose.search.continuous.equivalent_poses import RobustFamilies, RobustFamilySettings
 from drake_pose.search.continuous.views_fit import ViewsFit
-from drake_pose.search.pose_families import PoseSet
-from drake_pose.search.result import View
+from drake_pose.search.estimates import PoseSet, View
 from drake_pose.search.starts.self_motions import flips
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_view, split

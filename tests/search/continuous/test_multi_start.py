@@ -8,8 +8,8 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.errors import SettingsError
 from drake_pose.search.continuous.multi_start import MultiStartSearch
 from drake_pose.search.continuous.multi_start_settings import MultiStartSettings
+from drake_pose.search.estimates import PoseEstimate, View
 from drake_pose.search.grid.settings import BeamSearchSettings
-from drake_pose.search.result import MatchResult, View
 from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_pose, draw_view, split
 
 GRID = np.radians(20.0)
@@ -34,7 +34,7 @@ def clean_views(tree: PoseTree, values: np.ndarray) -> list[View]:
     return [draw_view(tree, values, camera) for camera in arm_cameras()]
 
 
-def all_values(result: MatchResult) -> np.ndarray:
+def all_values(result: PoseEstimate) -> np.ndarray:
     return np.concatenate(result.node_values)
 
 
@@ -44,13 +44,13 @@ def joint_ends(tree: PoseTree, values: np.ndarray) -> np.ndarray:
     return np.vstack([X_WN[:, :3, 3], X_WN[-1, :3, 3] + 0.15 * X_WN[-1, :3, 2]])
 
 
-def worst_place(tree: PoseTree, result: MatchResult, values: np.ndarray) -> float:
+def worst_place(tree: PoseTree, result: PoseEstimate, values: np.ndarray) -> float:
     """How far any of these is from where it should be [m]."""
     gaps = joint_ends(tree, all_values(result)) - joint_ends(tree, values)
     return float(np.linalg.norm(gaps, axis=1).max())
 
 
-def recount(tree: PoseTree, result: MatchResult, views: list[View]) -> int:
+def recount(tree: PoseTree, result: PoseEstimate, views: list[View]) -> int:
     """J by its definition (1): pixels that differ."""
     drawn = [draw_view(tree, all_values(result), view.camera) for view in views]
     return sum(int((one.mask ^ view.mask).sum()) for one, view in zip(drawn, views, strict=True))

@@ -16,9 +16,9 @@ from drake_pose.papers.kameda.experiment import (
     experiment_camera,
     experiment_search,
 )
+from drake_pose.search.estimates import View
 from drake_pose.search.grid.beam.search import BeamSearch
 from drake_pose.search.grid.settings import BeamSearchSettings, Stage
-from drake_pose.search.result import View
 from drake_pose.search.scoring import SampledTree, Scoring
 from drake_pose.search.settings import PaperSearchSettings
 from drake_pose.silhouette.areas.bending import TreeSurfaces
@@ -179,7 +179,7 @@ def test_equal_input_equal_answer(tmp_path: Path) -> None:
     view = picture(tree, cameras(1)[0], random_values(tree, np.random.default_rng(8)))
     one, other = search(tree).match([view]), search(tree).match([view])
     assert np.array_equal(one.q, other.q)
-    assert (one.J, one.runs, one.stopped_by) == (other.J, other.runs, other.stopped_by)
+    assert (one.J, one.stopped_by, one.statistics) == (other.J, other.stopped_by, other.statistics)
 
 
 def test_a_turned_over_tree_matches_as_well(tmp_path: Path) -> None:

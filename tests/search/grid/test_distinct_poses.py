@@ -9,10 +9,10 @@ import pytest
 
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.errors import SettingsError
+from drake_pose.search.estimates import View
 from drake_pose.search.grid.beam.distinct_poses import GridPoses
 from drake_pose.search.grid.beam.search import BeamSearch
 from drake_pose.search.grid.settings import BeamSearchSettings
-from drake_pose.search.result import View
 from drake_pose.search.scoring import SampledTree, Scoring
 from drake_pose.search.settings import PaperSearchSettings
 from drake_pose.silhouette.areas.outline import outline_from_mesh

@@ -12,6 +12,7 @@ from drake_pose.papers.kameda.experiment import (
     draw_values,
     experiment_camera,
 )
+from drake_pose.search.estimates import JointEstimate, View
 from drake_pose.search.grid.beam.limb_search import poses_at
 from drake_pose.search.grid.families.joint_estimates import estimate_joints, grid_steps
 from drake_pose.search.grid.families.search import (
@@ -22,8 +23,6 @@ from drake_pose.search.grid.families.search import (
     samples_at,
 )
 from drake_pose.search.grid.families.split import cluster_samples
-from drake_pose.search.pose_families import JointEstimate
-from drake_pose.search.result import View
 from drake_pose.search.scoring import Scoring
 from tests.search.bodies import box_link, forked_body, joint, load_body, swinging_chain
 from tests.search.grid_problems import GridProblem, ProblemMaker, show_pose

@@ -8,11 +8,11 @@ import pytest
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.camera.models import ParallelCamera
+from drake_pose.search.estimates import View
 from drake_pose.search.grid.beam.limb_search import poses_at
 from drake_pose.search.grid.beam.search import BeamSearch
 from drake_pose.search.grid.settings import BeamSearchSettings
 from drake_pose.search.kameda.search import PaperSearch
-from drake_pose.search.result import View
 from drake_pose.search.scoring import SampledTree, Scoring
 from drake_pose.search.settings import PaperSearchSettings
 from drake_pose.silhouette.areas.bending import TreeSurfaces
@@ -74,7 +74,7 @@ def test_the_papers_search_is_that_of_plain_pictures(limb: ArticulatedModel, see
     result = search.match([view])
     naive = NaiveSearch(search, view.camera, view.mask, 8.0, 3).run()
     assert result.found == (naive.best is not None)
-    assert result.runs == naive.runs
+    assert result.statistics.runs == naive.runs
     if naive.best is not None:
         assert result.J == naive.best[0]
 

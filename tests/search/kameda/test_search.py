@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from drake_pose.errors import MaskError, SettingsError
+from drake_pose.search.estimates import View
 from drake_pose.search.kameda.search import NodeList, PaperSearch
-from drake_pose.search.result import View
 from drake_pose.search.scoring import Scoring
 from drake_pose.search.settings import PaperSearchSettings
 from drake_pose.silhouette.areas.scoring import draw_mask
@@ -74,12 +74,12 @@ def test_step_3_keeps_what_stays_inside_and_step_4_scores_it(sliders):
     assert result.J == 0
     np.testing.assert_allclose(result.q, [0.05, 0.08])
     # Kept at r = 60: 5 (score 200), 0 and 10 (150 each): nearest to zero first among equals.
-    np.testing.assert_allclose(result.untried["wide"].values[:, 0], [0.0, 0.10])
-    np.testing.assert_allclose(result.untried["wide"].scores, [150, 150])
+    np.testing.assert_allclose(result.statistics.untried["wide"].values[:, 0], [0.0, 0.10])
+    np.testing.assert_allclose(result.statistics.untried["wide"].scores, [150, 150])
     # The small box at 0 is hidden, at 4 shows 3 rows of 6, at 8 shows 7 rows of 6.
-    np.testing.assert_allclose(result.untried["small"].values[:, 0], [0.04, 0.0])
-    np.testing.assert_allclose(result.untried["small"].scores, [18, 0])
-    assert result.runs == 2
+    np.testing.assert_allclose(result.statistics.untried["small"].values[:, 0], [0.04, 0.0])
+    np.testing.assert_allclose(result.statistics.untried["small"].scores, [18, 0])
+    assert result.statistics.runs == 2
 
 
 def test_step_5_keeps_the_best_K(sliders):
@@ -87,7 +87,7 @@ def test_step_5_keeps_the_best_K(sliders):
     search = slider_search(sliders, r=60.0, K=2)
     mask = silhouette(search, camera, [np.array([0.05]), np.array([0.08])])
     result = search.match([View(camera, mask)])
-    assert len(result.untried["wide"].values) == 1
+    assert len(result.statistics.untried["wide"].values) == 1
 
 
 def test_step_6_goes_back_to_the_nearest_ancestor_with_an_untried_candidate(tmp_path):
@@ -113,7 +113,7 @@ def test_step_6_goes_back_to_the_nearest_ancestor_with_an_untried_candidate(tmp_
     result = search.match([View(camera, mask)])
     np.testing.assert_allclose(result.q, [0.2, 0.0])
     # Step 3 for the box, for the arm in vain, and for the arm again.
-    assert result.runs == 3
+    assert result.statistics.runs == 3
     assert result.J == 20 + 100
 
 
@@ -124,7 +124,7 @@ def test_no_pose_is_an_answer(sliders):
     result = slider_search(sliders, r=0.0).match([View(camera, mask)])
     assert not result.found
     assert np.isnan(result.q).all()
-    assert result.runs == 1
+    assert result.statistics.runs == 1
     assert result.stopped_by == "end"
 
 
@@ -136,8 +136,8 @@ def test_automatic_threshold_doubles_until_a_pose_is_found(sliders):
     result = PaperSearch(sliders, settings).match([View(camera, mask)])
     # 12.6 % of the mean of 200 and 48 pixels is 15.6; the wide box leaves the mask by 56.
     assert result.found
-    assert result.outside_limit[0] == pytest.approx(0.126 * 124 * 4)
-    assert result.runs == 1 + 1 + 2
+    assert result.statistics.outside_limit[0] == pytest.approx(0.126 * 124 * 4)
+    assert result.statistics.runs == 1 + 1 + 2
 
 
 def test_leaf_combination_helps_where_leaves_overlap(tmp_path):
@@ -183,7 +183,7 @@ def test_search_does_what_the_paper_says(tmp_path, body, K, outside_weight):
         mask = random_silhouette(search, camera, generator)
         naive = NaiveSearch(search, camera, mask, r, K, outside_weight).run()
         result = search.match([View(camera, mask)])
-        assert result.runs == naive.runs
+        assert result.statistics.runs == naive.runs
         assert result.found == (naive.best is not None)
         if result.found:
             assert result.J == naive.best[0]
@@ -235,7 +235,7 @@ def test_several_views_are_one_search(tmp_path):
     result = search.match(views)
     np.testing.assert_allclose(result.q, turn[0])
     assert result.J == 0
-    assert len(result.outside_limit) == 2
+    assert len(result.statistics.outside_limit) == 2
 
 
 def test_the_search_is_deterministic(tmp_path):
@@ -244,7 +244,7 @@ def test_the_search_is_deterministic(tmp_path):
     mask = random_silhouette(search, camera, np.random.default_rng(3))
     first, second = (search.match([View(camera, mask)]) for _ in range(2))
     np.testing.assert_array_equal(first.q, second.q)
-    assert (first.J, first.runs) == (second.J, second.runs)
+    assert (first.J, first.statistics.runs) == (second.J, second.statistics.runs)
 
 
 def test_run_limit_stops_and_says_so(tmp_path):
@@ -253,7 +253,7 @@ def test_run_limit_stops_and_says_so(tmp_path):
     camera = front_camera()
     mask = random_silhouette(search, camera, np.random.default_rng(3))
     result = search.match([View(camera, mask)])
-    assert (result.found, result.runs, result.stopped_by) == (False, 2, "run_limit")
+    assert (result.found, result.statistics.runs, result.stopped_by) == (False, 2, "run_limit")
 
 
 def test_bad_input_is_refused(sliders):

@@ -14,6 +14,7 @@ from drake_pose.search.continuous.intervals import (
     IntervalSettings,
     find_intervals,
 )
+from drake_pose.search.estimates import View
 from drake_pose.search.raster_fit.body import RefinementBody
 from drake_pose.search.raster_fit.passes import (
     COARSE_PASSES,
@@ -24,7 +25,6 @@ from drake_pose.search.raster_fit.passes import (
     limited_step,
 )
 from drake_pose.search.raster_fit.problem import RefinementProblem
-from drake_pose.search.result import View
 from drake_pose.search.starts.depth_reflections import find_reflections
 from drake_pose.search.starts.neighbourhood import NeighbourhoodSearch, NeighbourhoodSettings
 from drake_pose.search.starts.part_placement import PartSearch, find_parts

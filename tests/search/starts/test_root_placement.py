@@ -9,9 +9,9 @@ from drake_pose.body.tree.root import RootRotation
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.errors import SettingsError
 from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
+from drake_pose.search.estimates import View
 from drake_pose.search.grid.sampled_body import SampledBody
 from drake_pose.search.grid.settings import BeamSearchSettings
-from drake_pose.search.result import View
 from drake_pose.search.starts.root_placement import (
     PlacementSettings,
     choose_root_samples,

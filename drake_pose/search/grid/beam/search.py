@@ -10,11 +10,13 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.errors import SettingsError
+from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
 from drake_pose.search.grid.beam.distinct_poses import Gathering, GridPoses, check_choice
 from drake_pose.search.grid.beam.hypotheses import Beam, Hypotheses
 from drake_pose.search.grid.beam.limb_search import (
@@ -26,7 +28,6 @@ from drake_pose.search.grid.families.examination import ExaminationSettings, exa
 from drake_pose.search.grid.node_poses import Pictures, PoseStore, coarsen
 from drake_pose.search.grid.sampled_body import SampledBody
 from drake_pose.search.grid.settings import BeamSearchSettings, Stage
-from drake_pose.search.result import MatchResult, View
 from drake_pose.search.scoring import Scoring
 
 # A body that is the object itself needs far less.
@@ -57,7 +58,7 @@ class BeamSearch:
         self.body = SampledBody(tree, self.settings)
         self.sampled = self.body.sampled
 
-    def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> MatchResult:
+    def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
         """Estimate the pose that the views show.
 
         Args:
@@ -83,7 +84,7 @@ class BeamSearch:
 
     def match_exactly(
         self, views: Sequence[View], root_position: np.ndarray | None = None
-    ) -> MatchResult | None:
+    ) -> PoseEstimate | None:
         """Run the stages that let nothing lie outside; they end at once where nothing fits.
 
         Where so much fits roughly that its poses fill a gigabyte, as in a picture of another body
@@ -296,32 +297,15 @@ class _Run:
             if self.gathering is not None:
                 self.gathering.add(samples[None], np.array([J / self.scoring.silhouette_area]))
 
-    def _values(self, samples: np.ndarray) -> list[np.ndarray]:
-        return [values[t] for values, t in zip(self.body.sampled.values, samples, strict=True)]
-
-    def result(self, seconds: float) -> MatchResult:
+    def result(self, seconds: float) -> PoseEstimate:
         """What the search found."""
-        tree, area = self.body.sampled.tree, self.scoring.silhouette_area
+        tree, grids = self.body.sampled.tree, self.body.sampled.values
+        told: dict[str, Any] = {
+            "stopped_by": self.stopped_by,
+            "seconds": seconds,
+            "statistics": SearchStatistics(self.runs, self.first_J),
+        }
         if self.samples is None:
-            missing = np.full(len(tree.model.position_names), np.nan)
-            nothing = float("nan")
-            return MatchResult(
-                False, missing, np.eye(4), (), nothing, nothing, nothing, self.runs, (), {},
-                self.stopped_by, seconds,
-            )  # fmt: skip
-        values = self._values(self.samples)
-        q, X_WB = tree.positions_from(values)
-        return MatchResult(
-            found=True,
-            q=q,
-            X_WB=X_WB,
-            node_values=tuple(values),
-            J=self.J,
-            E_total=self.J / area,
-            first_E_total=self.first_J / area,
-            runs=self.runs,
-            outside_limit=(),
-            untried={},
-            stopped_by=self.stopped_by,
-            seconds=seconds,
-        )
+            return PoseEstimate.nothing(tree, **told)
+        values = [grid[t] for grid, t in zip(grids, self.samples, strict=True)]
+        return PoseEstimate.of_values(tree, values, self.J, self.scoring.silhouette_area, **told)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_pose.camera.models import Camera
+from drake_pose.search.estimates import View
 from drake_pose.search.grid.node_poses import Pictures, PoseStore
 from drake_pose.search.grid.sampled_body import SampledBody
-from drake_pose.search.result import View
 from drake_pose.silhouette.contours.direction_cells import CelledOutline
 
 # Masks of more words than these get narrower bands, but none narrower than this many pixels.

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from drake_pose.search.estimates import View
 from drake_pose.search.grid.branch_and_bound.full_detail import BoundLimits
 from drake_pose.search.grid.branch_and_bound.search import branch_and_bound
 from drake_pose.search.grid.sampled_body import SampledBody
-from drake_pose.search.result import View
 
 _FIRST_LIMIT = 8.0
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from drake_pose.search.estimates import View
 from drake_pose.search.grid.branch_and_bound.full_detail import (
     BoundedPoses,
     BoundLimits,
@@ -33,7 +34,6 @@ from drake_pose.search.grid.branch_and_bound.partial_pose_graph import (
 from drake_pose.search.grid.branch_and_bound.reachable_area import SubtreeReaches
 from drake_pose.search.grid.pair_kernel import Reaches
 from drake_pose.search.grid.sampled_body import SampledBody
-from drake_pose.search.result import View
 
 # What lies outside counts so much where partial poses must be ranked: it stays outside, while what
 # is not covered yet may be covered by a later node.

@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drake_pose.errors import SettingsError
+from drake_pose.search.estimates import PoseEstimate, View
 from drake_pose.search.grid.branch_and_bound.full_detail import BoundLimits
 from drake_pose.search.grid.branch_and_bound.proof import prove_optimal
 from drake_pose.search.grid.families.search import FamilySettings, find_families, samples_at
 from drake_pose.search.grid.sampled_body import SampledBody
-from drake_pose.search.result import MatchResult, View
 
 
 @dataclass(frozen=True)
@@ -71,10 +71,10 @@ class ExaminationSettings:
 def examine(
     body: SampledBody,
     views: Sequence[View],
-    result: MatchResult,
+    result: PoseEstimate,
     settings: ExaminationSettings,
     root_position: np.ndarray | None = None,
-) -> MatchResult:
+) -> PoseEstimate:
     """Examine what a search on a body's grid found.
 
     Args:
@@ -85,7 +85,7 @@ def examine(
         root_position: (3,) as the search was given it [m].
 
     Returns:
-        The result with ``proved_optimal``, ``lower_bound``, ``budget_spent`` and ``pose_set``; a
+        The result with ``lower_bound``, ``budget_spent`` and ``pose_set``; a
         better pose in place of the one found if the proof met one. Nothing found stays as it is.
 
     Raises:
@@ -115,16 +115,13 @@ def examine(
     best = answer.families[0]
     J = min(J, best.J)
     if J < result.J:
-        area = sum(int(np.count_nonzero(view.mask)) for view in views)
         q, X_WB, values = best.q, best.X_WB, best.node_values
-        result = replace(result, q=q, X_WB=X_WB, node_values=values, J=J, E_total=J / area)
+        result = replace(result, q=q, X_WB=X_WB, node_values=values, J=J)
     # A complete set has all that is as good or better.
     lower_bound = J if answer.complete else min(lower_bound, J)
-    proved = lower_bound >= J
     return replace(
         result,
-        proved_optimal=proved,
         lower_bound=lower_bound,
-        budget_spent=answer.budget_spent or (spent and not proved),
+        budget_spent=answer.budget_spent or (spent and lower_bound < J),
         pose_set=answer,
     )

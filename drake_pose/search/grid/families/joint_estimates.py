@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from drake_pose.search.pose_families import JointEstimate
+from drake_pose.search.estimates import JointEstimate
 from drake_pose.search.scoring import SampledTree
 
 _ROUNDING = 1e-6

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drake_pose.errors import SettingsError
+from drake_pose.search.estimates import PoseFamily, PoseSet, View
 from drake_pose.search.grid.branch_and_bound.full_detail import BoundLimits
 from drake_pose.search.grid.branch_and_bound.partial_pose_graph import (
     PartialPoseGraph,
@@ -20,8 +21,6 @@ from drake_pose.search.grid.families.split import (
     split_into_families,
 )
 from drake_pose.search.grid.sampled_body import SampledBody
-from drake_pose.search.pose_families import PoseFamily, PoseSet
-from drake_pose.search.result import View
 from drake_pose.search.scoring import SampledTree
 
 

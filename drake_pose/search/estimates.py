@@ -1,0 +1,309 @@
+"""What a search is given and what every search and tracker answers.
+
+A silhouette seldom has one explanation: a forearm may point towards the camera or away from it, a
+hand may be anywhere behind the trunk. The answer is therefore a set of poses in families: members
+of one family differ by small steps, those of two families do not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.camera.models import Camera
+from drake_pose.errors import MaskError
+
+UNEXPLAINED = 0.5
+"""From this E_total on, the pose is no explanation of the silhouettes."""
+
+TRACKED = "tracked"
+"""``PoseEstimate.stopped_by`` of a pose that was tracked from the frame before."""
+
+
+@dataclass(frozen=True)
+class View:
+    """What one calibrated camera sees of the body.
+
+    Args:
+        camera: the camera.
+        mask: the silhouette S, (height, width) bool.
+
+    Raises:
+        MaskError: if the mask is not of the camera's size, or is empty.
+    """
+
+    camera: Camera
+    mask: np.ndarray
+
+    def __post_init__(self) -> None:
+        expected = (self.camera.height, self.camera.width)
+        if self.mask.shape != expected:
+            raise MaskError(
+                f"mask of camera '{self.camera.name}' is {self.mask.shape[::-1]} pixels (width, "
+                f"height), but the camera's picture is {expected[::-1]}; give the mask at the "
+                "size the camera was calibrated for"
+            )
+        if not self.mask.any():
+            raise MaskError(
+                f"mask of camera '{self.camera.name}' is empty; leave this view out, or give a "
+                "mask that shows the body"
+            )
+
+
+@dataclass(frozen=True)
+class JointEstimate:
+    """What the silhouettes say about one value of the pose tree.
+
+    Args:
+        name: of the position (or of the root's angle).
+        node: the node that the value belongs to.
+        determined: True: it lies between low and high; False: it is free, and low and high are
+            the ends of what was seen.
+        low, high: the interval or the range [rad or m]; of an angle that turns around it may go
+            beyond its limits, as the same directions a full turn before or after.
+        values: (n,) the different values seen, smallest first [rad or m].
+        turns_around: whether it is an angle that can take every direction.
+    """
+
+    name: str
+    node: int
+    determined: bool
+    low: float
+    high: float
+    values: np.ndarray
+    turns_around: bool = False
+
+    def holds(self, value: float, margin: float = 1e-9) -> bool:
+        """Whether a value lies in the interval or range; full turns make no difference."""
+        if self.turns_around:
+            value -= 2.0 * math.pi * round((value - 0.5 * (self.low + self.high)) / (2.0 * math.pi))
+        return self.low - margin <= value <= self.high + margin
+
+
+@dataclass(frozen=True)
+class PoseFamily:
+    """Poses that differ by small steps, with one that stands for all.
+
+    Args:
+        q: (nq,) the representative's positions in the plant's order [rad, m].
+        X_WB: (4, 4) pose of the plant's world frame B in the world W.
+        node_values: its values for each node of the pose tree.
+        J: its objective (1) [pixel].
+        joints: each value of the pose tree, node after node, as far as this family goes.
+        size: how many poses were found in it.
+    """
+
+    q: np.ndarray
+    X_WB: np.ndarray
+    node_values: tuple[np.ndarray, ...]
+    J: float
+    joints: tuple[JointEstimate, ...]
+    size: float
+
+
+@dataclass(frozen=True)
+class PoseSet:
+    """All poses found that are as good as the best within the noise.
+
+    Args:
+        families: best first; of equals the larger one first.
+        joints: each value of the pose tree, node after node, over all families.
+        tolerance: what the search ranks poses by, J or a cost of the edges, may be so much above
+            the best pose's [pixel].
+        complete: whether no pose within the tolerance was left out (on the grid, for a search on
+            a grid).
+        family_count: how many families there are; ``families`` may hold only the first of them.
+    """
+
+    families: tuple[PoseFamily, ...]
+    joints: tuple[JointEstimate, ...]
+    tolerance: float
+    complete: bool
+    family_count: int
+
+    @property
+    def determined(self) -> tuple[bool, ...]:
+        """For each value of the pose tree whether it is determined."""
+        return tuple(joint.determined for joint in self.joints)
+
+    def within_intervals(self, node_values: Sequence[np.ndarray]) -> bool:
+        """Whether every value of a pose lies in some one family's intervals and ranges.
+
+        Necessary for a member, not sufficient: values of a family may depend on each other.
+        """
+        values = np.concatenate([np.ravel(value) for value in node_values])
+        return any(
+            all(joint.holds(float(v)) for joint, v in zip(family.joints, values, strict=True))
+            for family in self.families
+        )
+
+    def position_intervals(self, names: Sequence[str]) -> np.ndarray:
+        """``determined``, ``low`` and ``high``, (3, nq), of a plant's positions by their names.
+
+        NaN where the pose tree has no such value.
+        """
+        known = {joint.name: (joint.determined, joint.low, joint.high) for joint in self.joints}
+        return np.array([known.get(name, (np.nan,) * 3) for name in names], dtype=float).T
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Joint angle candidates JAC_i(t) of one node that were not adopted.
+
+    Args:
+        value_names: the k positions that the values are of (or a root's angles).
+        values: (n, k), the candidates in the order of the list [rad or m].
+        scores: (n,), their scores e_i(t) [pixel] when the list was made (5).
+    """
+
+    value_names: tuple[str, ...]
+    values: np.ndarray
+    scores: np.ndarray
+
+
+@dataclass(frozen=True)
+class SearchStatistics:
+    """How a search went; a tracker has none.
+
+    Args:
+        runs: how often a node was placed (step 3 of Kameda's search).
+        first_J: of the first whole pose, before the re-estimation of section 5.2 [pixel]; None: of
+            the answer.
+        outside_limit: the paper's threshold r in each view [pixel].
+        untried: the paper's candidates not adopted in the answer, by node name.
+        interval_seconds: wall time of the intervals, which ``seconds`` leaves out.
+    """
+
+    runs: int = 0
+    first_J: float | None = None
+    outside_limit: tuple[float, ...] = ()
+    untried: Mapping[str, Candidates] = field(default_factory=dict)
+    interval_seconds: float = 0.0
+
+
+@dataclass(frozen=True)
+class PoseEstimate:
+    """The pose that a search or a tracker found.
+
+    Args:
+        found: False if there is no pose (q is NaN then), or none that can be relied on.
+        q: (nq,), the positions in the plant's order [rad, m].
+        X_WB: (4, 4), pose of the plant's world frame B in the scene's world W; the identity
+            unless the plant's own joints cannot place the body.
+        node_values: the values of each node of the pose tree.
+        J: area of the exclusive or of body and silhouette, summed over the views (1) [pixel].
+        area: the silhouettes' area [pixel].
+        stopped_by: "end" if a search ran to its end, "exact" if J = 0 ended it, or the limit that
+            stopped it; TRACKED for a pose that no search found.
+        seconds: wall time [s].
+        root_position: (3,) the root's origin in the world [m] where it was estimated; of a parallel
+            camera's single picture the part along its axis is arbitrary.
+        scale: a parallel camera has so many times the pixels a metre that it was given with, and
+            the body its own size; 1 where the scale was known.
+        covariance: (m, m) of the pose tree's values about this pose, where it is known.
+        pose_set: all poses found that are as good, and what is known of each joint; None if the
+            search did not ask.
+        lower_bound: no pose of the search's grid has a smaller J than this [pixel].
+        budget_spent: whether a limit on poses, time or memory ended the proof, or the search for
+            poses as good, before all was settled.
+        statistics: how the search went.
+    """
+
+    found: bool
+    q: np.ndarray
+    X_WB: np.ndarray
+    node_values: tuple[np.ndarray, ...]
+    J: float
+    area: float
+    stopped_by: str
+    seconds: float = 0.0
+    root_position: np.ndarray | None = None
+    scale: float = 1.0
+    covariance: np.ndarray | None = None
+    pose_set: PoseSet | None = None
+    lower_bound: float = 0.0
+    budget_spent: bool = False
+    statistics: SearchStatistics = SearchStatistics()
+
+    @classmethod
+    def of_values(
+        cls, tree: PoseTree, node_values: Sequence[np.ndarray], J: float, area: float, **more: Any
+    ) -> PoseEstimate:
+        """The estimate with a pose tree's values, (k_i,) of each node; ``more``: other fields."""
+        q, X_WB = tree.positions_from(node_values)
+        return cls(True, q, X_WB, tuple(node_values), J, area, **more)
+
+    @classmethod
+    def nothing(cls, tree: PoseTree, **more: Any) -> PoseEstimate:
+        """The answer where no pose was found; ``more``: other fields."""
+        missing = np.full(len(tree.model.position_names), np.nan)
+        return cls(False, missing, np.eye(4), (), math.nan, math.nan, **more)
+
+    @property
+    def E_total(self) -> float:
+        """J over the silhouettes' area (9)."""
+        return self.J / self.area
+
+    @property
+    def first_E_total(self) -> float:
+        """E_total of the first whole pose, before any re-estimation; E_total where it is that."""
+        first_J = self.statistics.first_J
+        return (self.J if first_J is None else first_J) / self.area
+
+    @property
+    def explained(self) -> bool:
+        """Whether the pose explains the silhouettes at least roughly (UNEXPLAINED)."""
+        return bool(self.found and self.E_total < UNEXPLAINED)
+
+    @property
+    def proved_optimal(self) -> bool:
+        """Whether it is proved that no pose of the search's grid has a smaller J."""
+        return bool(self.found and self.lower_bound >= self.J)
+
+    def turned(self, tree: PoseTree, turns: Sequence[np.ndarray]) -> PoseEstimate:
+        """The same pose with angles in other turns.
+
+        Args:
+            tree: the pose tree that was searched.
+            turns: (k_i,) for each node what is added to its values, full turns [rad].
+        """
+        pose_set = self.pose_set
+        if pose_set is not None:
+            families = [
+                replace(
+                    family,
+                    joints=_turned_joints(family.joints, turns),
+                    **_turned_pose(family, tree, turns),
+                )
+                for family in pose_set.families
+            ]
+            joints = _turned_joints(pose_set.joints, turns)
+            pose_set = replace(pose_set, families=tuple(families), joints=joints)
+        return replace(self, pose_set=pose_set, **_turned_pose(self, tree, turns))
+
+
+def _turned_pose(
+    pose: PoseFamily | PoseEstimate, tree: PoseTree, turns: Sequence[np.ndarray]
+) -> dict[str, Any]:
+    """``q`` and ``node_values`` with turns added to them."""
+    q = np.array(pose.q)
+    for node, added in zip(tree.nodes, turns, strict=True):
+        # The values of a root that is turned by a RootRotation are no positions.
+        if node.positions:
+            q[list(node.positions)] += added
+    values = tuple(value + added for value, added in zip(pose.node_values, turns, strict=True))
+    return {"q": q, "node_values": values}
+
+
+def _turned_joints(
+    joints: Sequence[JointEstimate], turns: Sequence[np.ndarray]
+) -> tuple[JointEstimate, ...]:
+    return tuple(
+        replace(joint, low=joint.low + turn, high=joint.high + turn, values=joint.values + turn)
+        for joint, turn in zip(joints, np.concatenate(turns).tolist(), strict=True)
+    )

@@ -52,7 +52,7 @@ python_maximum_signature_line_length = 80
 nitpick_ignore_regex = [
     (
         "py:.*",
-        r"(np|numpy|pydrake|rich|typer|distributed|pathlib|collections|enum|jinja2|numba|cv2|scipy|trimesh|asyncio|http|socketserver|PIL)\..*",
+        r"(np|numpy|pydrake|rich|cyclopts|distributed|pathlib|collections|enum|jinja2|numba|cv2|scipy|trimesh|asyncio|http|socketserver|PIL)\..*",
     ),
     # Drake's classes that are imported for type checkers alone.
     ("py:class", "ColorRenderCamera|DepthRenderCamera|RenderCameraCore|CameraInfo"),

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from drake_pose.jobs.masks.masks import SceneMasks, make_masks
     from drake_pose.jobs.masks.settings import MaskSettings
     from drake_pose.jobs.registration.audit import SceneAudit, audit_scene
-    from drake_pose.jobs.registration.inputs import RegistrationSettings
     from drake_pose.jobs.registration.register import SceneRegistration, register_scene
+    from drake_pose.jobs.registration.settings import RegistrationSettings
     from drake_pose.results.settings import EstimateSettings
     from drake_pose.search.continuous.multi_start import MultiStartSearch
     from drake_pose.search.estimates import View
@@ -51,7 +51,7 @@ _HOMES = {
     "ParallelCamera": "camera.models",
     "PersonTracker": "systems.person.person_tracker",
     "PinholeCamera": "camera.models",
-    "RegistrationSettings": "jobs.registration.inputs",
+    "RegistrationSettings": "jobs.registration.settings",
     "Scene": "silhouette.pictures.scenes",
     "SceneAudit": "jobs.registration.audit",
     "SceneEstimate": "jobs.estimate.scene",

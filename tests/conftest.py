@@ -9,8 +9,8 @@ import shutil
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
+from tests.cli import CliRunner
 from tests.jobs.scenes import TinyScene, write_scene
 
 

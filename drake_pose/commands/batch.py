@@ -1,55 +1,123 @@
-"""The command `drake-pose batch`."""
+"""The command `drake-pose batch`, and what it shows."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import typer
+from cyclopts import Parameter
+from rich.markup import escape
+from rich.table import Table
 
-from drake_pose.commands.cluster_options import SchedulerOption, WorkersOption, workers_of
-from drake_pose.commands.estimate_options import JsonOption
-from drake_pose.commands.terminal import FAILED, errors_as_messages, print_json, say
+from drake_pose.commands.options import Json, Out, Resume, Scheduler, within, workers_of
+from drake_pose.commands.terminal import output_console, print_json, progress_bar, say, warn
+from drake_pose.errors import SceneError
+from drake_pose.results.texts import percent
+
+if TYPE_CHECKING:
+    from drake_pose.jobs.batch.state import BatchResult, SceneState
+
+# Of what contradicts in a scene as many are shown.
+_NAMED = 4
 
 
 def batch(
-    jobs: Annotated[Path, typer.Argument(help="The job file (YAML): scenes, models, settings.")],
-    out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for the results.")
-    ],
-    workers: WorkersOption = None,
-    scheduler: SchedulerOption = None,
-    chunk: Annotated[
-        int | None,
-        typer.Option(
-            min=1, metavar="FRAMES", help="Frames in a chunk. Default: that of the job file."
-        ),
-    ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Continue an interrupted batch in --out.")
-    ] = False,
-    json: JsonOption = False,
+    jobs: Path,
+    /,
+    *,
+    out: Out,
+    workers: Annotated[int | None, within(0)] = None,
+    scheduler: Scheduler = None,
+    chunk: Annotated[int | None, within(1), Parameter(metavar="FRAMES")] = None,
+    resume: Resume = False,
+    json: Json = False,
 ) -> None:
-    """See help_texts.BATCH."""
-    if workers is not None and scheduler is not None:
-        raise typer.BadParameter("give --workers or --scheduler, not both")
-    with errors_as_messages(out):
-        from drake_pose.commands.batch_report import BatchProgress, print_batch
-        from drake_pose.jobs.batch.batch import run_batch
-        from drake_pose.jobs.batch.job import read_job
-        from drake_pose.jobs.batch.workers import ClusterPool
+    """Estimate or audit many scenes on several worker processes, long scenes in chunks of frames.
 
-        read = read_job(jobs, chunk)
-        with workers_of(workers, scheduler, out.absolute().parent) as client:
-            pool = None if client is None else ClusterPool(client)
-            with BatchProgress() as progress:
-                result = run_batch(read, out, pool, resume, progress)
-        if json:
-            print_json(result.as_json())
-        else:
-            print_batch(result)
-        for name in result.failed:
-            for error in result.scenes[name].errors:
-                say(f"drake-pose: error: scene '{name}': {error}")
-        if result.failed:
-            raise typer.Exit(FAILED)
+    The result of each scene is that of estimate. A scene that fails is named and does not stop the
+    others. Ctrl-C keeps the finished chunks. The workers of a Dask scheduler must have the same
+    version of drake_pose, and find scenes, models and DIR under the same paths.
+
+    The job file has the settings of estimate by their names in Python (EstimateSettings):
+
+        chunk: 100
+        defaults: {replay: false}
+        scenes:
+          monday: {scene: recordings/monday, model: arm.urdf, interval: 15}
+          walker: {scene: recordings/walker}
+          robot: {scene: recordings/robot, model: arm.urdf, audit: recordings/robot/joints.csv}
+
+    A scene that has audit is audited; what contradicts is in DIR/contradictions.csv.
+
+        drake-pose batch jobs.yaml --out results/all --workers 2
+
+    Args:
+        jobs: The job file (YAML).
+        workers: Number of worker processes on this machine; 0: none. Default: one for each core.
+        chunk: Frames in a chunk. Default: that of the job file.
+    """
+    from drake_pose.jobs.batch.batch import run_batch
+    from drake_pose.jobs.batch.job import read_job
+    from drake_pose.jobs.batch.workers import ClusterPool
+
+    read = read_job(jobs, chunk)
+    with workers_of(workers, scheduler, out.absolute().parent) as client:
+        pool = None if client is None else ClusterPool(client)
+        with progress_bar() as bar:
+            task = bar.add_task("reading", total=None)
+
+            def show(done: int, total: int, message: str) -> None:
+                bar.update(task, description="frames", completed=done, total=total)
+                if message:
+                    warn(message)
+
+            result = run_batch(read, out, pool, resume, show)
+    if json:
+        print_json(result.as_json())
+    else:
+        _print_batch(result)
+    for name in result.failed:
+        for error in result.scenes[name].errors:
+            say(f"drake-pose: error: scene '{name}': {error}")
+    if result.failed:
+        raise SceneError(f"{len(result.failed)} of {len(result.scenes)} scenes failed")
+
+
+def _print_batch(result: BatchResult) -> None:
+    """A row a scene, and where the results are."""
+    estimates = {n: one for n, one in result.scenes.items() if one.job.audit is None}
+    audits = {n: one for n, one in result.scenes.items() if one.job.audit is not None}
+    console = output_console()
+    if estimates:
+        table = Table(
+            "scene", "state", "found", "E_total", "chunks", "tries", "seconds", title="Batch"
+        )
+        for name, state in estimates.items():
+            table.add_row(
+                escape(name),
+                state.state,
+                f"{state.totals.get('found_count')} of {state.frame_count}" if state.totals else "",
+                percent(state.totals.get("mean_E_total")),
+                f"{len(state.done)} of {len(state.tasks)}",
+                str(state.attempts),
+                f"{state.seconds:.1f}",
+            )
+        console.print(table)
+    if audits:
+        console.print(_audits_table(audits))
+    frames = sum(state.frames_done for state in result.scenes.values())
+    console.print(f"frames         {frames} in {result.seconds:.1f} s")
+    console.print(f"results        {escape(str(result.out))}", soft_wrap=True)
+
+
+def _audits_table(audits: Mapping[str, SceneState]) -> Table:
+    """A row an audited scene; texts stand in contradictions.csv."""
+    table = Table("scene", "state", "agree", "contradicts the rest", "seconds", title="Audits")
+    for name, state in audits.items():
+        named = [f"{one['what']} {one['name']}" for one in state.totals.get("contradictions", ())]
+        more = [f"and {len(named) - _NAMED} more"] if len(named) > _NAMED else []
+        totals, text = state.totals, escape(", ".join([*named[:_NAMED], *more]))
+        agree = f"{totals['agreeing_count']} of {state.frame_count}" if totals else ""
+        table.add_row(escape(name), state.state, agree, text, f"{state.seconds:.1f}")
+    return table

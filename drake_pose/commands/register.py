@@ -1,4 +1,4 @@
-"""The command `drake-pose register`."""
+"""The commands `drake-pose register` and `drake-pose audit`."""
 
 from __future__ import annotations
 
@@ -6,189 +6,118 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from cyclopts import Parameter
+from rich.markup import escape
+from rich.table import Table
 
-from drake_pose.commands.estimate_options import (
-    FrameOption,
-    HoldOption,
-    JsonOption,
-    ModelOption,
-    OutOption,
-    OverlayOption,
-    PackageOption,
-)
-from drake_pose.commands.terminal import (
-    errors_as_messages,
-    print_result,
-    usage_errors,
-)
-from drake_pose.results.options import parse_assignments, parse_box, parse_packages
+from drake_pose.commands.options import SPREAD, Json, Model, Out, Overlay
+from drake_pose.commands.terminal import count_progress, output_console, print_result, say
+from drake_pose.jobs.registration.settings import AuditSettings, RegistrationSettings
+from drake_pose.results.texts import percent
 
 if TYPE_CHECKING:
+    from drake_pose.jobs.registration.audit import SceneAudit
     from drake_pose.jobs.registration.register import SceneRegistration
-
-RegisteredSceneArgument = Annotated[
-    Path,
-    typer.Argument(
-        help="Folder with cameras.yaml, in which X_WC may be missing, and "
-        "masks/<camera>/<frame>.png."
-    ),
-]
-_OF_FRAMES = (
-    r"Joint positions of every frame \[rad or m]: a CSV file with the column frame and one for "
-    "each joint."
-)
-JointsOption = Annotated[Path, typer.Option("--joints", "-j", metavar="FILE", help=_OF_FRAMES)]
-MeasuredJointsOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--joints",
-        "-j",
-        metavar="FILE",
-        help=f"{_OF_FRAMES} Default: they are estimated from the cameras that have an X_WC.",
-    ),
-]
-SearchedCameraOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--camera",
-        metavar="NAME",
-        help="Find this camera, and do not use its X_WC if it has one; repeat for several. "
-        "Default: all without X_WC.",
-        rich_help_panel="Input",
-    ),
-]
-ZerosOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--zeros",
-        metavar="NAME",
-        help="Find the zero of this joint, too, a constant that is added to its positions in all "
-        "frames; all: of every joint; repeat for several. A URDF with the zeros is written.",
-        rich_help_panel="Estimation",
-    ),
-]
-LengthsOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--lengths",
-        metavar="LINK",
-        help="Find how long this link is, too: a factor, the same in all frames, of the distances "
-        "of the joints that it carries from its own; all: of every link; repeat for several. A "
-        "URDF with the lengths is written.",
-        rich_help_panel="Estimation",
-    ),
-]
-FocalOption = Annotated[
-    bool,
-    typer.Option(
-        "--focal",
-        help="Find the cameras' focal lengths, too.",
-        rich_help_panel="Estimation",
-    ),
-]
-OnOption = Annotated[
-    str | None,
-    typer.Option(
-        "--on",
-        metavar="LINK",
-        help="The cameras to be found ride on this link (eye in hand): their pose X_LC in its "
-        "frame is found, from masks of the robot's base, which is what no joint moves, or of a "
-        "--target.",
-        rich_help_panel="Input",
-    ),
-]
-TargetOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--target",
-        metavar="FILE",
-        help="With --on: the masks show another, rigid object (URDF, SDFormat, MJCF), which stands "
-        "anywhere in the world; where is found, too.",
-        rich_help_panel="Input",
-    ),
-]
-SuggestOption = Annotated[
-    bool,
-    typer.Option(
-        "--suggest",
-        help="Where several poses of a camera fit equally well: joint positions inside the limits "
-        "that would tell them apart.",
-        rich_help_panel="Estimation",
-    ),
-]
-KeepOutOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--keep-out",
-        metavar="X,Y,Z:X,Y,Z",
-        help=r"With --suggest: the corners of a box in the world that the robot must not touch "
-        r"\[m]; repeat for several.",
-        rich_help_panel="Estimation",
-    ),
-]
 
 
 def register(
-    scene: RegisteredSceneArgument,
-    model: ModelOption,
-    out: OutOption,
-    joints: MeasuredJointsOption = None,
-    package: PackageOption = None,
-    camera: SearchedCameraOption = None,
-    on: OnOption = None,
-    target: TargetOption = None,
-    frame: FrameOption = None,
-    hold: HoldOption = None,
-    zeros: ZerosOption = None,
-    lengths: LengthsOption = None,
-    focal: FocalOption = False,
-    suggest: SuggestOption = False,
-    keep_out: KeepOutOption = None,
-    overlay: OverlayOption = True,
-    json: JsonOption = False,
+    scene: Path,
+    /,
+    *,
+    model: Model,
+    out: Out,
+    joints: Annotated[Path | None, Parameter(alias="-j")] = None,
+    settings: Annotated[RegistrationSettings | None, SPREAD] = None,
+    overlay: Overlay = True,
+    json: Json = False,
 ) -> None:
-    """See help_texts.REGISTER."""
-    with usage_errors():
-        packages = parse_packages(package or ())
-        held = parse_assignments(hold or (), "--hold")
-        corners = [parse_box(text) for text in keep_out or ()]
-    with errors_as_messages():
-        from drake_pose.commands.report import count_progress
-        from drake_pose.jobs.registration.inputs import RegistrationSettings
-        from drake_pose.jobs.registration.register import register_scene
-        from drake_pose.registration.suggestions import Box
+    r"""Find where cameras stand, from masks of a robot or a person: no board, no guess.
 
-        settings = RegistrationSettings(
-            tuple(camera or ()),
-            tuple(frame or ()),
-            on,
-            target,
-            held,
-            tuple(zeros or ()),
-            tuple(lengths or ()),
-            focal,
-            suggest,
-            tuple(Box(*ends) for ends in corners),
-            packages,
+    All rotations of a camera are tried; the best are fitted by the robot's contour, in the end only
+    to what fits. The answer has a standard deviation for place and rotation, other poses that fit
+    no worse, and the frames that contradict the others. The focal length and principal point of
+    each camera must be known, and the pictures be free of distortion. The world is the model's: the
+    robot's base, in most files. Five poses that differ much are enough. Cameras that have an X_WC
+    are held, and compared with the robot.
+
+    Without --joints the body's poses are estimated from the cameras that have an X_WC: one for a
+    robot on its base, two for a person; then the poses and the missing cameras are fitted together.
+    --joints may also be the poses.csv of an estimate, in which the base may move.
+
+    Files in DIR: cameras.yaml, which estimate reads; report.html, which shows all of it;
+    registration.yaml (6 x 6 covariance, other poses); summary.json; overlay/.
+
+    A robot arm whose camera nobody measured:
+
+        drake-pose register ../shared/data/arm_one_view --out results/camera \
+          --model ../shared/data/arm_two_views/med7/med7.urdf \
+          --joints ../shared/data/arm_one_view/joint_angles.csv
+
+    Args:
+        scene: Folder with cameras.yaml, in which X_WC may be missing, and
+            masks/<camera>/<frame>.png.
+        joints: Joint positions of every frame [rad or m]: a CSV file with the column frame and one
+            for each joint. Default: they are estimated from the cameras that have an X_WC.
+    """
+    from drake_pose.jobs.registration.register import register_scene
+
+    with count_progress("cameras", None) as advance:
+        result = register_scene(
+            scene, model, joints, out, settings, overlay=overlay, on_camera=advance
         )
-        with count_progress("cameras", None) as advance:
-            result = register_scene(
-                scene, model, joints, out, settings, overlay=overlay, on_camera=advance
-            )
-        print_result(result, json, _print)
+    print_result(result, json, _print_registration)
 
 
-def _print(result: SceneRegistration) -> None:
+def audit(
+    scene: Path,
+    /,
+    *,
+    model: Model,
+    joints: Annotated[Path, Parameter(alias="-j")],
+    out: Annotated[Path | None, Parameter(alias="-o")] = None,
+    settings: Annotated[AuditSettings | None, SPREAD] = None,
+    cameras: Path | None = None,
+    overlay: Overlay = True,
+    json: Json = False,
+) -> None:
+    r"""Say which frames, cameras or joints contradict the rest.
+
+    Each frame is fitted by itself with its joints and cameras free to move a little. What all
+    frames are off alike is the fault of a joint's zero, of a camera or of the base; a frame is
+    named that is off from the others. Named is what is significant, errors of masks and surfaces
+    counted, and moves outlines by a pixel or more. Of causes that explain the masks equally well
+    all are told: with one camera, a base that has moved looks like a camera that has.
+
+    Files in DIR: summary.json; overlay/ of the frames that contradict the others.
+
+    Whose positions are not those of the pictures:
+
+        drake-pose audit ../shared/data/franka_one_view \
+          --model ../shared/data/franka_one_view/panda/panda.urdf \
+          --cameras ../shared/data/franka_one_view/cameras_reference.yaml \
+          --joints ../shared/data/franka_one_view/joint_angles.csv
+
+    Args:
+        scene: Folder with cameras.yaml and masks/<camera>/<frame>.png.
+        joints: Joint positions of every frame [rad or m]: a CSV file with the column frame and one
+            for each joint.
+        out: Folder for the result; new or empty.
+        cameras: Camera file in place of the scene's cameras.yaml.
+    """
+    from drake_pose.jobs.registration.audit import audit_scene
+
+    with count_progress("frames", None) as advance:
+        result = audit_scene(
+            scene, model, joints, out, settings, cameras=cameras, overlay=overlay, on_frame=advance
+        )
+    print_result(result, json, _print_audit)
+
+
+def _print_registration(result: SceneRegistration) -> None:
     """A row a frame and camera, then where each camera stands and how sure that is."""
-    from rich.markup import escape
-    from rich.table import Table
-
-    from drake_pose.commands.report import output_console
     from drake_pose.jobs.registration.report import PARAMETERS, parameter_rows
     from drake_pose.jobs.registration.result import CAMERAS
     from drake_pose.results.folder import REPORT
-    from drake_pose.results.texts import percent
 
     console = output_console()
     frames = Table("camera", "frame", "E_total", "IoU", "", title="Masks and robot")
@@ -244,3 +173,20 @@ def _say_target(target: Mapping[str, Any]) -> str:
         f"target at {place} m in the robot's world, sd {target['translation_sd_mm']:.2f} mm, "
         f"{target['rotation_sd_deg']:.3f} deg; poses that look alike: {len(target['families'])}"
     )
+
+
+def _print_audit(result: SceneAudit) -> None:
+    """A row for each contradiction, then how many frames agree."""
+    console = output_console()
+    contradictions = result.summary["contradictions"]
+    if contradictions:
+        table = Table("contradicts the rest", title="Masks, cameras and joint positions")
+        for one in contradictions:
+            table.add_row(escape(one["text"]))
+        console.print(table)
+    count, agree = result.summary["frame_count"], result.summary["agreeing_count"]
+    console.print(f"{agree} of {count} frames agree")
+    if not contradictions:
+        say("drake-pose: nothing contradicts the rest")
+    if result.folder is not None:
+        console.print(f"result         {escape(str(result.folder))}", soft_wrap=True)

@@ -1,19 +1,24 @@
-"""How commands speak: results on stdout, all else on stderr, exit status 0, 1 or 2."""
+"""How commands speak: results on stdout, all else on stderr."""
 
 from __future__ import annotations
 
 import json
-import math
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Any, NoReturn, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
-import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from drake_pose.errors import DrakePoseError
+if TYPE_CHECKING:
+    from drake_pose.results.summary import FrameRecord
 
-FAILED = 1
+_LIMITS = {"run_limit": "run limit", "time_limit": "time limit"}
+
+
+class UsageError(Exception):
+    """Options that do not go together; exit status 2."""
 
 
 class _Result(Protocol):
@@ -29,47 +34,9 @@ class _Result(Protocol):
 _R = TypeVar("_R", bound=_Result)
 
 
-@contextmanager
-def errors_as_messages(folder: Path | None = None) -> Iterator[None]:
-    """Turns what may go wrong inside a command into a message and exit status 1.
-
-    Args:
-        folder: where --resume goes on after Ctrl-C; None: there is nothing to go on with.
-    """
-    try:
-        yield
-    except DrakePoseError as error:
-        _fail(str(error))
-    except KeyboardInterrupt:
-        if folder is None:
-            _fail("interrupted")
-        if not folder.is_dir():
-            _fail("interrupted before anything was written")
-        _fail(f"interrupted; what is finished is in {folder}; go on with --resume")
-    except SystemExit as error:
-        # Drake raises SystemExit where one of its C++ demands fails, and exits without a word.
-        _fail(f"Drake stopped with a failed demand: {error}")
-
-
-@contextmanager
-def usage_errors() -> Iterator[None]:
-    """Turns errors in the texts of options into usage errors, exit status 2."""
-    try:
-        yield
-    except DrakePoseError as error:
-        raise typer.BadParameter(str(error)) from None
-
-
-def finite(number: float | None) -> float | None:
-    """Refuses nan and inf, which an option's range lets pass; its callback."""
-    if number is not None and not math.isfinite(number):
-        raise typer.BadParameter(f"{number} is not a finite number")
-    return number
-
-
 def say(message: str) -> None:
     """Writes a line to stderr."""
-    typer.echo(message, err=True)
+    print(message, file=sys.stderr, flush=True)
 
 
 def warn(message: str) -> None:
@@ -81,7 +48,7 @@ def print_json(value: Mapping[str, Any]) -> None:
     """Writes JSON to stdout; numbers that are not finite become null."""
     from drake_pose.results.folder import without_nan
 
-    typer.echo(json.dumps(without_nan(value), indent=2, ensure_ascii=False, allow_nan=False))
+    print(json.dumps(without_nan(value), indent=2, ensure_ascii=False, allow_nan=False))
 
 
 def print_result(result: _R, json: bool, print_text: Callable[[_R], None]) -> None:
@@ -94,6 +61,71 @@ def print_result(result: _R, json: bool, print_text: Callable[[_R], None]) -> No
         print_text(result)
 
 
-def _fail(message: str) -> NoReturn:
-    say(f"drake-pose: error: {message}")
-    raise typer.Exit(FAILED)
+def output_console() -> Console:
+    """Returns the console for results; a file or pipe gets lines that are not folded."""
+    console = Console(highlight=False)
+    return console if console.is_terminal else Console(highlight=False, width=160)
+
+
+def progress_bar() -> Progress:
+    """A bar on stderr; nothing where stderr is no terminal."""
+    console = Console(stderr=True)
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=console,
+        disable=not console.is_terminal,
+    )
+
+
+@contextmanager
+def count_progress(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
+    """A progress bar; the value is a function to call with how many are done."""
+    with progress_bar() as progress:
+        task = progress.add_task(what, total=total)
+        yield lambda done: progress.update(task, completed=done)
+
+
+class FrameProgress:
+    """A progress bar over frames that also says where no pose was found."""
+
+    def __init__(self) -> None:
+        self._progress = progress_bar()
+        self._stage = "reading"
+        self._task = self._progress.add_task(self._stage, total=None)
+
+    def __enter__(self) -> FrameProgress:
+        """Show the bar."""
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Take the bar away."""
+        self._progress.stop()
+
+    def show_stage(self, stage: str, done: int, total: int | None) -> None:
+        """Show what is done before the first frame is finished, each stage by a bar of its own."""
+        if stage != self._stage:
+            self._progress.remove_task(self._task)
+            self._task = self._progress.add_task(stage, total=total)
+            self._stage = stage
+        self._progress.update(self._task, completed=done, total=total)
+
+    def __call__(self, finished: int, total: int, frame: str, record: FrameRecord | None) -> None:
+        """Show that a frame is finished."""
+        from drake_pose.results.texts import percent
+
+        self.show_stage("frames", finished, total)
+        if record is None:
+            return
+        if not record.found:
+            warn(f"frame '{frame}': no pose was found")
+        elif not record.explained:
+            warn(
+                f"frame '{frame}': no pose explains the silhouettes: E_total is "
+                f"{percent(record.E_total)} at best"
+            )
+        elif record.stopped_by in _LIMITS:
+            warn(f"frame '{frame}': the search was stopped by the {_LIMITS[record.stopped_by]}")

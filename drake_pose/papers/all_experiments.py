@@ -132,7 +132,7 @@ def _kameda_pictures(experiment: str, short: bool, folder: Path, count: Count) -
         )
         for method, name in METHODS.items()
     ]
-    figures = {result.method: result.as_json() for result in results}
+    figures: dict[str, Any] = {result.method: result.as_json() for result in results}
     warnings = [
         Text(f"Warning: {METHODS[result.method]}: {text}")
         for result in results

@@ -21,20 +21,9 @@ _WIDTH = 160
 _TURN = np.pi
 
 
-@dataclass(frozen=True)
-class Box:
-    """A part of the world that the body must not touch.
-
-    Args:
-        low, high: (3,) its corners along the world's axes [m].
-    """
-
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
-
-    def holds_any(self, points: Array) -> bool:
-        """Whether one of some points (n, 3) is inside."""
-        return bool(np.any(np.all((points >= self.low) & (points <= self.high), axis=1)))
+Corner = tuple[float, float, float]
+Box = tuple[Corner, Corner]
+"""The least and the largest corner along the world's axes [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +72,7 @@ def suggest_pose(
         X_WN = kinematics.poses(values)
         placed = zip(body.very_few, X_WN, strict=True)
         points = np.concatenate([one.vertices @ X[:3, :3].T + X[:3, 3] for one, X in placed])
-        if any(box.holds_any(points) for box in keep_out):
+        if any(np.all((points >= low) & (points <= high), axis=1).any() for low, high in keep_out):
             continue
         masks = [draw_mask(body.very_few, one.X_CW @ X_WN, one) for one in cameras]
         if not all(mask.any() for mask in masks):

@@ -1,11 +1,14 @@
-"""Command line texts to plain values: `NAME=VALUE`, `X,Y,Z`, frame ranges, root rotations."""
+"""Texts of options and of job files to plain values: `NAME=VALUE`, `X,Y,Z`, frame ranges, ..."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
+
+from cyclopts import Parameter, Token
 
 from drake_pose.errors import SettingsError, UnknownNameError
 
@@ -16,54 +19,93 @@ Corner = tuple[float, float, float]
 """x, y, z [m]."""
 
 
-def parse_number(text: str, what: str) -> float:
+@dataclass(frozen=True)
+class FromText:
+    """Reads a setting from the texts given with its option; its converter.
+
+    Args:
+        parse: of one text, or where the option may be repeated of all of them.
+        repeated: whether it may be.
+    """
+
+    parse: Callable[[Any], Any]
+    repeated: bool = False
+
+    def __call__(self, hint: object, tokens: Sequence[Token]) -> Any:
+        """Returns the value; a SettingsError begins with the option's name."""
+        texts = [token.value for token in tokens]
+        try:
+            return self.parse(texts if self.repeated else texts[0])
+        except SettingsError as error:
+            raise SettingsError(f"{tokens[0].keyword}: {error}") from None
+
+
+def from_text(
+    parse: Callable[[Any], Any], metavar: str, *, name: str | None = None, repeated: bool = False
+) -> Parameter:
+    """Returns how an option is read whose text ``parse`` understands."""
+    return Parameter(
+        name,
+        converter=FromText(parse, repeated),
+        metavar=metavar,
+        accepts_keys=False,
+        allow_leading_hyphen=True,
+        n_tokens=-1 if repeated else 1,
+    )
+
+
+def parse_number(text: str) -> float:
     """Returns a finite number.
 
     Raises:
-        SettingsError: naming ``what`` the text was given for.
+        SettingsError: it is none.
     """
     try:
         number = float(text)
     except ValueError:
-        raise SettingsError(f"{what}: '{text}' is not a number") from None
+        raise SettingsError(f"'{text}' is not a number") from None
     if not math.isfinite(number):
-        raise SettingsError(f"{what}: '{text}' is not a finite number")
+        raise SettingsError(f"'{text}' is not a finite number")
     return number
 
 
-def parse_assignments(texts: Iterable[str], option: str) -> dict[str, float]:
+def parse_assignments(texts: Iterable[str]) -> dict[str, float]:
     """Returns the values of ``NAME=NUMBER`` texts by name.
 
     Raises:
-        SettingsError: if a text has another form, or a name is given twice.
+        SettingsError: a text has another form, or a name is given twice.
     """
     values: dict[str, float] = {}
     for text in texts:
         name, equals, number = text.rpartition("=")
         if not equals or not name:
-            raise SettingsError(f"{option}: '{text}' must have the form NAME=NUMBER")
+            raise SettingsError(f"'{text}' must have the form NAME=NUMBER")
         if name in values:
-            raise SettingsError(f"{option}: '{name}' is given twice")
-        values[name] = parse_number(number, f"{option} {name}")
+            raise SettingsError(f"'{name}' is given twice")
+        values[name] = parse_number(number)
     return values
 
 
-def parse_box(text: str) -> tuple[Corner, Corner]:
-    """Returns the least and the largest corner of a text ``X,Y,Z:X,Y,Z`` of two corners [m].
+def parse_packages(texts: Iterable[str]) -> dict[str, Path]:
+    """Returns the absolute folders of ``NAME=FOLDER`` texts by package.
 
     Raises:
-        SettingsError: the text has another form.
+        SettingsError: a text has another form, a name is given twice, or there is no folder.
     """
-    corners = [part.split(",") for part in text.split(":")]
-    if [len(corner) for corner in corners] != [3, 3]:
-        raise SettingsError(f"--keep-out: '{text}' must have the form X,Y,Z:X,Y,Z")
-    a, b = ([parse_number(one, "--keep-out") for one in corner] for corner in corners)
-    low = (min(a[0], b[0]), min(a[1], b[1]), min(a[2], b[2]))
-    high = (max(a[0], b[0]), max(a[1], b[1]), max(a[2], b[2]))
-    return low, high
+    folders: dict[str, Path] = {}
+    for text in texts:
+        name, equals, folder = text.partition("=")
+        if not (name and equals and folder):
+            raise SettingsError(f"'{text}' must have the form NAME=FOLDER")
+        if name in folders:
+            raise SettingsError(f"'{name}' is given twice")
+        if not Path(folder).is_dir():
+            raise SettingsError(f"{name}: there is no folder {folder}")
+        folders[name] = Path(folder).absolute()
+    return folders
 
 
-def parse_numbers(text: str, count: int, option: str) -> tuple[float, ...]:
+def parse_numbers(text: str, count: int) -> tuple[float, ...]:
     """Returns so many numbers of a text ``A,B,...``.
 
     Raises:
@@ -71,60 +113,54 @@ def parse_numbers(text: str, count: int, option: str) -> tuple[float, ...]:
     """
     parts = text.split(",")
     if len(parts) != count:
-        raise SettingsError(f"{option}: '{text}' must be {count} numbers with commas between them")
-    return tuple(parse_number(part, option) for part in parts)
+        raise SettingsError(f"'{text}' must be {count} numbers with commas between them")
+    return tuple(map(parse_number, parts))
 
 
-def parse_size(text: str, option: str) -> tuple[int, ...]:
+def parse_size(text: str) -> tuple[int, ...]:
     """Returns width and height of a text ``W,H`` [pixel].
 
     Raises:
         SettingsError: the text has another form.
     """
-    sides = parse_numbers(text, 2, option)
+    sides = parse_numbers(text, 2)
     if any(side < 1 or side != int(side) for side in sides):
-        raise SettingsError(f"{option}: '{text}' must be two whole numbers of pixels")
-    return tuple(int(side) for side in sides)
+        raise SettingsError(f"'{text}' must be two whole numbers of pixels")
+    return tuple(map(int, sides))
 
 
-def parse_packages(texts: Iterable[str]) -> dict[str, Path]:
-    """Returns the absolute folders of ``NAME=FOLDER`` texts by package.
+def parse_boxes(texts: Iterable[str]) -> tuple[tuple[Corner, Corner], ...]:
+    """Returns the least and the largest corner of each text ``X,Y,Z:X,Y,Z`` of two corners [m].
 
     Raises:
-        SettingsError: if a text has another form, a name is given twice, or there is no folder.
+        SettingsError: a text has another form.
     """
-    folders: dict[str, Path] = {}
+    boxes = []
     for text in texts:
-        name, equals, folder = text.partition("=")
-        if not (name and equals and folder):
-            raise SettingsError(f"--package: '{text}' must have the form NAME=FOLDER")
-        if name in folders:
-            raise SettingsError(f"--package: '{name}' is given twice")
-        if not Path(folder).is_dir():
-            raise SettingsError(f"--package {name}: there is no folder {folder}")
-        folders[name] = Path(folder).absolute()
-    return folders
+        corners = text.split(":")
+        if [len(corner.split(",")) for corner in corners] != [3, 3]:
+            raise SettingsError(f"'{text}' must have the form X,Y,Z:X,Y,Z")
+        (ax, ay, az), (bx, by, bz) = (parse_numbers(corner, 3) for corner in corners)
+        low = (min(ax, bx), min(ay, by), min(az, bz))
+        boxes.append((low, (max(ax, bx), max(ay, by), max(az, bz))))
+    return tuple(boxes)
 
 
-def parse_root_position(
-    text: str,
-) -> tuple[float, float, float] | tuple[Path, str] | Literal["unknown"]:
+def parse_root_position(text: str) -> Corner | tuple[Path, str] | Literal["unknown"]:
     """Returns a position ``X,Y,Z`` [m], file and joint of ``FILE.csv:JOINT``, or ``unknown``.
 
     Raises:
-        SettingsError: if the text has none of these forms.
+        SettingsError: the text has none of these forms.
     """
     if text == "unknown":
         return "unknown"
-    parts = text.split(",")
-    if len(parts) == 3:
-        x, y, z = (parse_number(part, "--root-position") for part in parts)
+    if text.count(",") == 2:
+        x, y, z = parse_numbers(text, 3)
         return x, y, z
     file, colon, joint = text.rpartition(":")
     if not (colon and file and joint):
         raise SettingsError(
-            f"--root-position: '{text}' must be X,Y,Z in metres, FILE.csv:JOINT for one "
-            "position a frame, or unknown"
+            f"'{text}' must be X,Y,Z in metres, FILE.csv:JOINT for one position a frame, or unknown"
         )
     return Path(file), joint
 
@@ -135,7 +171,7 @@ def parse_root_rotation(text: str) -> Literal["fixed", "free"] | RotationLimits:
     The limits' text is like ``y=-180:180,z=-10:10``; the order is the order of rotation.
 
     Raises:
-        SettingsError: if the text has another form, or a lower limit exceeds the upper one.
+        SettingsError: the text has another form, or a lower limit exceeds the upper one.
     """
     if text == "fixed":
         return "fixed"
@@ -148,13 +184,12 @@ def parse_root_rotation(text: str) -> Literal["fixed", "free"] | RotationLimits:
         axis = next((axis for axis in AXES if axis == letter), None)
         if axis is None or axis in limits or not (equals and colon):
             raise SettingsError(
-                f"--root-rotation: '{text}' must be fixed, free, or limits in degrees about the "
-                "axes x, y, z in the order of rotation, like y=-180:180,z=-10:10"
+                f"'{text}' must be fixed, free, or limits in degrees about the axes x, y, z in "
+                "the order of rotation, like y=-180:180,z=-10:10"
             )
-        what = f"--root-rotation {axis}"
-        lower, upper = parse_number(lower_text, what), parse_number(upper_text, what)
+        lower, upper = parse_number(lower_text), parse_number(upper_text)
         if lower > upper:
-            raise SettingsError(f"{what}: the lower limit {lower:g} exceeds the upper {upper:g}")
+            raise SettingsError(f"{axis}: the lower limit {lower:g} exceeds the upper {upper:g}")
         limits[axis] = (lower, upper)
     return limits
 
@@ -169,8 +204,8 @@ def select_frames(known: Sequence[str], wanted: Sequence[str], where: str) -> tu
         where: the scene, for messages.
 
     Raises:
-        UnknownNameError: if there is no such frame.
-        SettingsError: if a range ends before it begins.
+        UnknownNameError: there is no such frame.
+        SettingsError: a range ends before it begins.
     """
     if not wanted:
         return tuple(known)

@@ -1,98 +1,133 @@
-"""What an estimate of a scene is made with; plain values only."""
+"""What an estimate of a scene is made with: the command's options, a job file's keys, in Python.
 
-from __future__ import annotations
+A settings class is written once. Its fields are the options of the command (cyclopts; the text
+below a field is the option's help), the keys of a job file, and the arguments in Python.
+"""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, asdict, dataclass, field, fields
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+
+from cyclopts import Parameter
 
 from drake_pose.errors import SettingsError
-from drake_pose.results.options import Axis
+from drake_pose.results.options import (
+    Axis,
+    from_text,
+    parse_assignments,
+    parse_packages,
+    parse_root_position,
+    parse_root_rotation,
+)
 
-METHODS = ("auto", "beam", "paper", "person")
-ANGLES = ("continuous", "grid")
 # What a search for the pose heeds, and one who is followed by all silhouettes at once does not.
 _OF_THE_SEARCH = (
     "root", "root_position", "root_rotation", "interval", "length_interval", "joint_intervals",
     "outside_limit", "candidates", "run_limit", "time_limit", "hold", "unseen", "angles",
 )  # fmt: skip
 RootTurns = Literal["fixed", "free"] | Mapping[Axis, tuple[float, float]]
+Names = Annotated[tuple[str, ...], Parameter(metavar="NAME")]
+Positions = Annotated[
+    Mapping[str, float], from_text(parse_assignments, "NAME=VALUE", repeated=True)
+]
+Packages = Annotated[
+    Mapping[str, Path],
+    from_text(parse_packages, "NAME=FOLDER", name="--package", repeated=True),
+    Parameter(
+        help="Folder of the package of package://NAME/... files; repeat for several. Others are "
+        "searched for in the folders above the model's file and in ROS_PACKAGE_PATH."
+    ),
+]
 
 
-@dataclass(frozen=True)
-class EstimateSettings:
-    """Settings of an estimate.
+@dataclass(frozen=True, kw_only=True)
+class SceneSettings:
+    """Which part of a scene is used, and where the model's packages are."""
 
-    Args:
-        cameras: names of the cameras to match together; all where empty.
-        frames: the frames: names, or ranges ``FIRST:LAST``; all where empty.
-        root: the link the pose tree begins at; the model's own root where None.
-        root_position: where the root's origin is in the world [m], or the file of joint centres
-            and the joint in it that is the root in each frame; ``unknown``: searched; the model's
-            own where None, but searched where the cameras are not known.
-        root_rotation: ``fixed``, ``free``, or limits of the angles about the root's axes by name,
-            in the order of rotation [deg]. At angles of zero the root stands in the world as it
-            does at the model's default positions. None: the model's own joints tell, or free.
-        interval: sampling interval of every angle [deg]; the paper took 10 for real pictures.
-        length_interval: sampling interval of every length [m].
-        joint_intervals: sampling intervals of single positions by name [deg or m].
-        outside_limit: the paper's r, the area of a segment that may lie outside the silhouette
-            [pixel]; None: found automatically. Of the method ``paper`` alone.
-        candidates: the paper's K, how many candidates of a segment are kept; ``paper`` alone.
-        run_limit: after this many runs of step 3 the search of a frame returns its best pose;
-            ``paper`` alone.
-        time_limit: after this time [s] the search of a frame returns its best pose; None: no
-            limit. Of the method ``beam`` alone.
-        hold: positions that are known, by name [deg or m].
-        unseen: links that are not in the pictures, such as the forearm of a hand cut off at the
-            wrist; their joints are held.
-        method: ``beam``: many hypotheses side by side; ``paper``: the search as it was published;
-            ``person``: one person is followed by the silhouettes of several cameras at once;
-            ``auto``: ``person`` where model and scene allow it and no setting concerns a search,
-            else ``beam``.
-        angles: ``continuous``: refined between the samples; ``grid``: multiples of the interval
-            alone, as always with the method ``paper``. Of the method ``beam`` alone.
-        track: whether frames of a sequence are tracked; else every one is matched on its own.
-        start: a file of the joint positions in the first frame of a sequence, in the columns
-            `frame` and positions' names; rows of other frames say where the body is after a loss.
-        packages: folders of packages that the model's ``package://`` names mean, by name.
+    cameras: Annotated[Names, Parameter("--camera")] = ()
+    """Use this camera; repeat for several. Default: all, used together."""
+    frames: Annotated[Names, Parameter("--frame")] = ()
+    """Use this frame, or frames FIRST:LAST; repeat for several. Default: all."""
+    packages: Packages = field(default_factory=dict)
+
+    def as_json(self) -> dict[str, Any]:
+        """Returns the settings as plain JSON values."""
+        return {one.name: plain(getattr(self, one.name)) for one in fields(self)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureSettings(SceneSettings):
+    """What the capture of a person heeds."""
+
+    track: Annotated[bool, Parameter(negative="--no-track")] = True
+    """Track the body through the frames of a sequence, searching only in the first frame and after
+    a loss; or search in every frame."""
+    start: Path | None = None
+    """Joint positions in the first frame of a sequence: CSV with the columns frame and positions'
+    names [rad or m]. Rows of other frames are used after a loss."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EstimateSettings(CaptureSettings):
+    """How a scene is estimated.
 
     Raises:
-        SettingsError: if there is no such method, an option belongs to the other one, or a count
-            is below 1.
+        SettingsError: there is no such method, an option belongs to another one, or a number is out
+            of its range.
     """
 
-    cameras: tuple[str, ...] = ()
-    frames: tuple[str, ...] = ()
-    root: str | None = None
-    root_position: tuple[float, float, float] | tuple[Path, str] | Literal["unknown"] | None = None
-    root_rotation: RootTurns | None = None
-    interval: float = 10.0
-    length_interval: float = 0.05
-    joint_intervals: Mapping[str, float] = field(default_factory=dict)
-    outside_limit: float | None = None
-    candidates: int = 5
-    run_limit: int = 10_000
-    time_limit: float | None = None
-    hold: Mapping[str, float] = field(default_factory=dict)
-    unseen: Sequence[str] = ()
-    method: str = "auto"
-    angles: str = "continuous"
-    track: bool = True
-    start: Path | None = None
-    packages: Mapping[str, Path] = field(default_factory=dict)
+    hold: Positions = field(default_factory=dict)
+    """Hold this joint at a known position [deg or m]; repeat for several."""
+    unseen: Annotated[tuple[str, ...], Parameter(metavar="LINK")] = ()
+    """This link is not in the pictures, as the forearm of a hand cut off; repeat for several. Its
+    joints are held. URDF models alone."""
+    root: Annotated[str | None, Parameter(metavar="LINK")] = None
+    """The link that is placed first; any link. Default: the model's own root."""
+    root_position: Annotated[
+        tuple[float, float, float] | tuple[Path, str] | Literal["unknown"] | None,
+        from_text(parse_root_position, "POINT"),
+    ] = None
+    """Position of the root's origin in the world: X,Y,Z [m]; or FILE.csv:JOINT, a CSV file with the
+    columns frame,joint,x,y,z and a row of that joint for each frame; or unknown, and it is searched
+    (default if the scene has no cameras.yaml)."""
+    root_rotation: Annotated[RootTurns | None, from_text(parse_root_rotation, "ROTATION")] = None
+    """Rotation of the root: fixed, free, or limits [deg] about its axes in the order of rotation,
+    like y=-180:180,z=-10:10; zero is as at the model's default positions. Default: the model's own
+    root moves as its joints allow, any other link is free."""
+    interval: Annotated[float, Parameter(metavar="DEG")] = 10.0
+    """Sampling interval of all angles [deg]."""
+    length_interval: Annotated[float, Parameter(metavar="M")] = 0.05
+    """Sampling interval of all prismatic joints [m]."""
+    joint_intervals: Annotated[Positions, Parameter("--joint-interval")] = field(
+        default_factory=dict
+    )
+    """Sampling interval of one joint [deg or m]; repeat for several."""
+    outside_limit: Annotated[float | None, Parameter(metavar="R")] = None
+    """The paper's r: area of a segment that may lie outside the silhouette [pixel]. Default: the
+    smallest that gives a pose, found by doubling. Method paper only."""
+    candidates: Annotated[int, Parameter(metavar="K")] = 5
+    """The paper's K: number of candidates kept for each segment. Method paper only."""
+    run_limit: Annotated[int, Parameter(metavar="N")] = 10_000
+    """Stop the search of a frame after placing this many segments. Method paper only."""
+    time_limit: Annotated[float | None, Parameter(metavar="SECONDS")] = None
+    """Stop the search of a frame after this time [s] and return the best pose so far. Method beam
+    only."""
+    method: Literal["auto", "beam", "paper", "person"] = "auto"
+    """beam: beam search and continuous fit; paper: Kameda, Minoh and Ikeda's search as published;
+    person: one person, fitted to all cameras' silhouettes at once; auto: person if model, cameras
+    and options allow it, else beam."""
+    angles: Literal["continuous", "grid"] = "continuous"
+    """continuous: poses are refined between the samples; grid: multiples of the sampling interval
+    only. Method beam only."""
 
     def __post_init__(self) -> None:
-        if self.method not in METHODS:
-            raise SettingsError(
-                f"there is no method '{self.method}'; there is: {', '.join(METHODS)}"
-            )
-        if self.angles not in ANGLES:
-            raise SettingsError(f"angles must be {' or '.join(ANGLES)}, not '{self.angles}'")
+        require_choices(self)
         for name in ("candidates", "run_limit"):
             if getattr(self, name) < 1:
                 raise SettingsError(f"{name} must be 1 or more, not {getattr(self, name)}")
+        if self.time_limit is not None and not self.time_limit >= 0.0:
+            raise SettingsError(f"time_limit must be 0 or more, not {self.time_limit}")
         if self.method in ("auto", "beam") and self.outside_limit is not None:
             raise SettingsError("the beam search has no outside limit r; leave it out")
         if self.method == "person" and self.search_settings:
@@ -106,25 +141,43 @@ class EstimateSettings:
     @property
     def search_settings(self) -> tuple[str, ...]:
         """The names of those that only a search heeds and that are not at their defaults."""
-        return tuple(
-            one.name
-            for one in fields(self)
-            if one.name in _OF_THE_SEARCH
-            and getattr(self, one.name) != ({} if one.default is MISSING else one.default)
-        )
+        return tuple(name for name in changed(self) if name in _OF_THE_SEARCH)
 
     def as_json(self) -> dict[str, Any]:
         """Returns the settings as plain JSON values."""
-        values = asdict(self)
-        if isinstance(self.root_position, tuple):
-            values["root_position"] = [
-                str(part) if isinstance(part, Path) else part for part in self.root_position
-            ]
-        if isinstance(self.root_rotation, Mapping):
-            values["root_rotation"] = [
-                [axis, lower, upper] for axis, (lower, upper) in self.root_rotation.items()
-            ]
-        values["start"] = None if self.start is None else str(self.start)
-        values["packages"] = {name: str(folder) for name, folder in self.packages.items()}
-        lists = {name: list(getattr(self, name)) for name in ("cameras", "frames", "unseen")}
-        return values | lists
+        turns = self.root_rotation
+        if isinstance(turns, Mapping):
+            listed = [[axis, *limits] for axis, limits in turns.items()]
+            return super().as_json() | {"root_rotation": listed}
+        return super().as_json()
+
+
+def changed(settings: Any) -> tuple[str, ...]:
+    """Returns the names of the settings that are not at their defaults."""
+    return tuple(
+        one.name
+        for one in fields(settings)
+        if getattr(settings, one.name) != ({} if one.default is MISSING else one.default)
+    )
+
+
+def require_choices(settings: Any) -> None:
+    """Refuses what is none of a setting's choices.
+
+    Raises:
+        SettingsError: names those that there are.
+    """
+    for name, hint in get_type_hints(type(settings)).items():
+        value = getattr(settings, name)
+        if get_origin(hint) is Literal and value not in get_args(hint):
+            choices = ", ".join(get_args(hint))
+            raise SettingsError(f"there is no {name} '{value}'; there is: {choices}")
+
+
+def plain(value: Any) -> Any:
+    """Returns a setting's value as JSON has it: paths as texts, tuples as lists."""
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Mapping):
+        return {key: plain(one) for key, one in value.items()}
+    return [plain(one) for one in value] if isinstance(value, tuple | list) else value

@@ -23,7 +23,8 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from drake_pose.errors import RegistrationError
-from drake_pose.jobs.registration.inputs import RegistrationSettings, read_inputs
+from drake_pose.jobs.registration.inputs import read_inputs
+from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.registration.joint_zeros import calibrate_joints
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import CameraSearch, RegistrationBody

@@ -10,10 +10,10 @@ import time
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 import drake_pose
 from drake_pose.commands.main import app
+from tests.cli import CliRunner
 from tests.jobs.scenes import TinyScene, read_rows, write_scene
 
 PROGRAM = [sys.executable, "-m", "drake_pose.commands.main"]

@@ -5,55 +5,49 @@ import pytest
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.results.options import (
     parse_assignments,
+    parse_boxes,
     parse_root_position,
     parse_root_rotation,
+    parse_size,
     select_frames,
 )
+from tests.cli import run_command
 
 FRAMES = ("0001", "0002", "0010", "still")
 
 
-def test_assignments_keep_equals_signs_in_names() -> None:
-    assert parse_assignments(["a=1", "b=c=-2.5"], "--hold") == {"a": 1.0, "b=c": -2.5}
-
-
-@pytest.mark.parametrize("text", ["a", "=1", "a=", "a=x", "a=nan", "a=inf"])
-def test_bad_assignments_name_the_option(text: str) -> None:
-    with pytest.raises(SettingsError, match="--hold"):
-        parse_assignments([text], "--hold")
-
-
-def test_a_name_given_twice_is_refused() -> None:
-    with pytest.raises(SettingsError, match="'a' is given twice"):
-        parse_assignments(["a=1", "a=2"], "--hold")
-
-
-def test_root_position() -> None:
+def test_texts_become_values() -> None:
+    assert parse_assignments(["a=1", "b=c=-2.5"]) == {"a": 1.0, "b=c": -2.5}
     assert parse_root_position("1,-2,0.5") == (1.0, -2.0, 0.5)
-    assert parse_root_position("dir/centres.csv:left_ankle") == (
-        Path("dir/centres.csv"),
-        "left_ankle",
-    )
+    assert parse_root_position("a/centres.csv:toe") == (Path("a/centres.csv"), "toe")
     assert parse_root_position("unknown") == "unknown"
-
-
-@pytest.mark.parametrize("text", ["1,2", "1,2,x", "centres.csv", ":joint", "centres.csv:"])
-def test_bad_root_position(text: str) -> None:
-    with pytest.raises(SettingsError, match="--root-position"):
-        parse_root_position(text)
-
-
-def test_root_rotation_keeps_the_order_of_the_axes() -> None:
     assert parse_root_rotation("fixed") == "fixed"
     assert parse_root_rotation("free") == "free"
     limits = parse_root_rotation("y=-180:180, x=-10:10")
     assert list(limits.items()) == [("y", (-180.0, 180.0)), ("x", (-10.0, 10.0))]
+    assert parse_boxes(["1,2,9:4,-5,6"]) == (((1.0, -5.0, 6.0), (4.0, 2.0, 9.0)),)
+    assert parse_size("640,480") == (640, 480)
 
 
-@pytest.mark.parametrize("text", ["", "w=0:1", "x=1", "x=0:1,x=0:1", "x=2:1", "x=a:b", "x=0:nan"])
-def test_bad_root_rotation(text: str) -> None:
-    with pytest.raises(SettingsError, match="--root-rotation"):
-        parse_root_rotation(text)
+BAD = {
+    "--hold": ["a", "=1", "a=", "a=x", "a=nan", "a=inf"],
+    "--root-position": ["1,2", "1,2,x", "centres.csv", ":joint", "centres.csv:"],
+    "--root-rotation": ["", "w=0:1", "x=1", "x=0:1,x=0:1", "x=2:1", "x=a:b", "x=0:nan"],
+    "--package": ["a", "=b", "a=nowhere"],
+}
+
+
+@pytest.mark.parametrize(("option", "text"), [(one, text) for one in BAD for text in BAD[one]])
+def test_bad_texts_name_the_option_in_one_line(option: str, text: str) -> None:
+    done = run_command(["estimate", "a", "-m", "b", "-o", "c", option, text])
+    assert done.exit_code == 2
+    assert done.stderr.startswith(f"drake-pose: error: {option}: ")
+    assert done.output.count("\n") == 1
+
+
+def test_a_name_given_twice_is_refused() -> None:
+    with pytest.raises(SettingsError, match="'a' is given twice"):
+        parse_assignments(["a=1", "a=2"])
 
 
 @pytest.mark.parametrize(

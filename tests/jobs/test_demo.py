@@ -3,7 +3,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import load_model
@@ -11,6 +10,7 @@ from drake_pose.commands.main import app
 from drake_pose.jobs.demo import demo_scene, demo_settings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import load_scene
+from tests.cli import CliRunner
 from tests.jobs.scenes import read_rows
 
 

@@ -2,7 +2,6 @@ import html
 import json
 
 import pytest
-from typer.testing import CliRunner
 
 from drake_pose.commands.main import app
 from drake_pose.errors import OutputError
@@ -17,6 +16,7 @@ from drake_pose.papers.all_experiments import (
     reproduce_all,
 )
 from drake_pose.papers.paper_figures import Beside
+from tests.cli import CliRunner
 
 
 def quiet(_what, _total):

@@ -1,7 +1,6 @@
 import cv2
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import load_model
@@ -16,6 +15,7 @@ from drake_pose.papers.date.experiment import (
 from drake_pose.papers.date.pictures import save_pictures
 from drake_pose.person.date.skeleton import load_skeleton
 from drake_pose.person.date.walking_motion import MOTIONS, REGISTERED, make_motion
+from tests.cli import CliRunner
 
 KEYS = {
     "joint_error_mm",

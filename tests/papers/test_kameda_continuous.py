@@ -3,7 +3,6 @@ import json
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from drake_pose.commands.main import app
 from drake_pose.errors import SettingsError
@@ -16,6 +15,7 @@ from drake_pose.papers.kameda.continuous import (
     experiment_cameras,
     run_continuous_experiment,
 )
+from tests.cli import CliRunner
 
 
 @pytest.fixture(scope="module")

@@ -1,12 +1,12 @@
 import json
 
 import pytest
-from typer.testing import CliRunner
 
 from drake_pose.commands.main import app
 from drake_pose.errors import SceneError
 from drake_pose.jobs.demo import stored_scene
 from drake_pose.papers.kameda.real_pictures import picture_names
+from tests.cli import CliRunner
 
 
 def reproduce(*options):

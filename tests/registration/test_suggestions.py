@@ -4,12 +4,12 @@ import numpy as np
 
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.registration.register import RegistrationBody
-from drake_pose.registration.suggestions import Box, suggest_pose
+from drake_pose.registration.suggestions import suggest_pose
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.registration.arm_pictures import looking_at
 
 MIDDLE = np.array([0.0, 0.0, 0.4])
-BEHIND = Box((-2.0, -2.0, -1.0), (-0.2, 2.0, 2.0))
+BEHIND = ((-2.0, -2.0, -1.0), (-0.2, 2.0, 2.0))
 
 
 class TestSuggestPose:
@@ -27,7 +27,7 @@ class TestSuggestPose:
         X_WN = kinematics.poses(found.values)
         for outline, X in zip(body.all, X_WN, strict=True):
             # Its surfaces' points, but for what the coarse ones leave out.
-            assert (outline.vertices @ X[0, :3] + X[0, 3]).min() > BEHIND.high[0] - 0.02
+            assert (outline.vertices @ X[0, :3] + X[0, 3]).min() > BEHIND[1][0] - 0.02
         q, X_WB = body.tree.positions_from(kinematics.split(found.values))
         masks = [LabelRenderer(model, camera).mask(q, X_WB) for camera in cameras]
         area = np.mean([np.count_nonzero(mask) for mask in masks])
@@ -37,5 +37,5 @@ class TestSuggestPose:
 
     def test_no_room_no_pose(self, body: RegistrationBody) -> None:
         camera = looking_at(np.array([1.8, 0.0, 0.4]), MIDDLE, 0.0)
-        everywhere = Box((-9.0, -9.0, -9.0), (9.0, 9.0, 9.0))
+        everywhere = ((-9.0, -9.0, -9.0), (9.0, 9.0, 9.0))
         assert suggest_pose(body, camera, [camera.X_WC] * 2, [everywhere], tried=5) is None

@@ -3,33 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import typer
+from cyclopts import Parameter
 
-from drake_pose.commands.estimate_options import JsonOption, PicturesOption
+from drake_pose.commands.options import SPREAD, Json, Pictures, within
 from drake_pose.commands.terminal import (
-    errors_as_messages,
-    finite,
+    UsageError,
+    count_progress,
+    output_console,
     print_json,
     say,
-    usage_errors,
     warn,
 )
-from drake_pose.results.settings import EstimateSettings
 
 if TYPE_CHECKING:
     from drake_pose.papers.kameda.continuous import ContinuousResult
     from drake_pose.papers.kameda.experiment import ExperimentResult
     from drake_pose.search.scoring import PoseSearch
 
-# What is about experiment A alone.
-_OF_A = (
-    "seed", "seeds", "method", "angles", "outside_limit", "outside_weight", "candidates",
-    "interval", "views", "mismatch", "edges", "edge_noise",
-)  # fmt: skip
 # What is about the grid of angles, which continuous ones have none of.
 _OF_GRID = (
     "seeds", "method", "outside_limit", "outside_weight", "candidates", "interval", "edges",
@@ -37,147 +31,92 @@ _OF_GRID = (
 )  # fmt: skip
 
 
-ExperimentOption = Annotated[
-    str,
-    typer.Option(
-        help="A: random poses, drawn; B: six pictures of a person; C: two pictures of a hand."
-    ),
-]
-ImagesOption = Annotated[
-    int, typer.Option(min=1, help="Number of silhouettes; of B and C all that there are or fewer.")
-]
-SeedOption = Annotated[int, typer.Option(min=0, help="Seed of the random poses.")]
-SeedsOption = Annotated[
-    int, typer.Option(min=1, help="Run this many seeds, and show how far the figures spread.")
-]
-MethodOption = Annotated[
-    str, typer.Option(help="paper: the paper's alone; beam: beam search beside it.")
-]
-AnglesOption = Annotated[
-    str,
-    typer.Option(
-        help="grid: true angles and samples are multiples of 20 degrees, as in the paper; "
-        "continuous: any true angles, and poses are refined between the samples."
-    ),
-]
-OutsideLimitOption = Annotated[
-    float,
-    typer.Option(
-        min=0.0,
-        callback=finite,
-        help=r"The paper's r: area of a segment that may lie outside \[pixel].",
-        metavar="R",
-    ),
-]
-OutsideWeightOption = Annotated[
-    float,
-    typer.Option(
-        min=0.0,
-        callback=finite,
-        help="Run the paper's method once more, its lists ordered by e - W * (area outside): not "
-        "in the paper, but 10 meets most of its figures.",
-        metavar="W",
-    ),
-]
-CandidatesOption = Annotated[
-    int,
-    typer.Option(min=1, help="The paper's K: candidates kept for each segment.", metavar="K"),
-]
-IntervalOption = Annotated[
-    float,
-    typer.Option(min=1.0, max=90.0, callback=finite, help=r"Sampling interval \[deg]."),
-]
-ViewsOption = Annotated[
-    int, typer.Option(min=1, help="With --angles continuous: number of cameras.")
-]
-MismatchOption = Annotated[
-    bool,
-    typer.Option(
-        "--mismatch",
-        help="With --angles continuous: also a body whose widths and joints differ from the "
-        "model's.",
-    ),
-]
-EdgesOption = Annotated[
-    bool,
-    typer.Option(
-        "--edges",
-        help="With --method beam: resolve ambiguous silhouettes by the edges inside them (some "
-        "seconds for each).",
-    ),
-]
+@dataclass(frozen=True, kw_only=True)
+class KamedaOptions:
+    """Options of experiment A, of which some are refused where they mean nothing."""
 
-
-EdgeNoiseOption = Annotated[
-    float,
-    typer.Option(
-        min=0.0, max=0.9, callback=finite,
-        help="With --edges: this share of them is missing, the others are a pixel off, and a "
-        "quarter as many are wrong.",
-    ),
-]  # fmt: skip
+    seed: Annotated[int | None, within(0)] = None
+    """Seed of the random poses. Default: 0."""
+    seeds: Annotated[int | None, within(1)] = None
+    """Run this many seeds, and show how far the figures spread. Default: 1."""
+    method: Literal["paper", "beam"] | None = None
+    """paper: the paper's alone; beam: beam search beside it. Default: paper."""
+    angles: Literal["grid", "continuous"] | None = None
+    """grid: true angles and samples are multiples of 20 degrees, as in the paper; continuous: any
+    true angles, and poses are refined between the samples. Default: grid."""
+    outside_limit: Annotated[float | None, within(0.0), Parameter(metavar="R")] = None
+    """The paper's r: area of a segment that may lie outside [pixel]. Default: 200."""
+    outside_weight: Annotated[float | None, within(0.0), Parameter(metavar="W")] = None
+    """Run the paper's method once more, its lists ordered by e - W * (area outside): not in the
+    paper, but 10 meets most of its figures. Default: 0."""
+    candidates: Annotated[int | None, within(1), Parameter(metavar="K")] = None
+    """The paper's K: candidates kept for each segment. Default: 5."""
+    interval: Annotated[float | None, within(1.0, 90.0)] = None
+    """Sampling interval [deg]. Default: 20."""
+    views: Annotated[int | None, within(1)] = None
+    """With --angles continuous: number of cameras. Default: 1."""
+    mismatch: bool | None = None
+    """With --angles continuous: also a body whose widths and joints differ from the model's."""
+    edges: bool | None = None
+    """With --method beam: resolve ambiguous silhouettes by the edges inside them (some seconds for
+    each)."""
+    edge_noise: Annotated[float | None, within(0.0, 0.9)] = None
+    """With --edges: this share of them is missing, the others are a pixel off, and a quarter as
+    many are wrong. Default: 0."""
+    out: Pictures = None
 
 
 def kameda(
-    context: typer.Context,
-    experiment: ExperimentOption = "A",
-    images: ImagesOption = 219,
-    seed: SeedOption = 0,
-    seeds: SeedsOption = 1,
-    method: MethodOption = "paper",
-    angles: AnglesOption = "grid",
-    outside_limit: OutsideLimitOption = 200.0,
-    outside_weight: OutsideWeightOption = 0.0,
-    candidates: CandidatesOption = 5,
-    interval: IntervalOption = 20.0,
-    views: ViewsOption = 1,
-    mismatch: MismatchOption = False,
-    edges: EdgesOption = False,
-    edge_noise: EdgeNoiseOption = 0.0,
-    out: PicturesOption = None,
-    json: JsonOption = False,
+    *,
+    experiment: Literal["A", "B", "C"] = "A",
+    images: Annotated[int, within(1)] = 219,
+    options: Annotated[KamedaOptions | None, SPREAD] = None,
+    json: Json = False,
 ) -> None:
-    """See help_texts.KAMEDA."""
-    if experiment not in ("A", "B", "C"):
-        raise typer.BadParameter("must be A, B or C", param_hint="--experiment")
+    """Kameda, Minoh and Ikeda: poses of a woman (A), real silhouettes of a man (B), a hand (C).
+
+    The pose is searched given nothing but the position of the head (A), an ankle (B) or the wrist
+    (C). The table shows the paper's figures beside ours.
+
+        drake-pose reproduce kameda --images 20
+
+    Args:
+        experiment: A: random poses, drawn; B: six pictures of a person; C: two pictures of a hand.
+        images: Number of silhouettes; of B and C all that there are or fewer.
+    """
+    one = options or KamedaOptions()
     if experiment != "A":
-        _refuse(context, _OF_A, "needs --experiment A")
-        with errors_as_messages(out):
-            _run_on_pictures(experiment, images, out, json)
+        _refuse(one, [f.name for f in fields(one) if f.name != "out"], "--experiment A")
+        _run_on_pictures(experiment, images, one.out, json)
         return
-    with usage_errors():
-        EstimateSettings(method=method)
-    if angles not in ("grid", "continuous"):
-        raise typer.BadParameter("must be grid or continuous", param_hint="--angles")
-    if edges and method != "beam":
-        raise typer.BadParameter("needs --method beam", param_hint="--edges")
-    if edge_noise and not edges:
-        raise typer.BadParameter("needs --edges", param_hint="--edge-noise")
-    if angles == "continuous":
-        _refuse(context, _OF_GRID, "needs --angles grid")
-    else:
-        _refuse(context, ("views", "mismatch"), "needs --angles continuous")
-    if angles == "grid":
-        with errors_as_messages():
-            runs = GridRuns(
-                images, seed, seeds, method, interval, outside_limit, candidates, outside_weight
-            )
-            _run_on_grid(runs, edge_noise if edges else None, out, json)
+    if one.edges and one.method != "beam":
+        raise UsageError("--edges needs --method beam")
+    if one.edge_noise and not one.edges:
+        raise UsageError("--edge-noise needs --edges")
+    seed = one.seed or 0
+    if one.angles == "continuous":
+        _refuse(one, _OF_GRID, "--angles grid")
+        results = _run_beside(images, seed, one.views or 1, bool(one.mismatch))
+        _print_continuous(results, json)
         return
-    with errors_as_messages():
-        _print_continuous(_run_beside(images, seed, views, mismatch), json)
+    _refuse(one, ("views", "mismatch"), "--angles continuous")
+    runs = GridRuns(
+        images, seed, one.seeds or 1, one.method or "paper", one.interval or 20.0,
+        200.0 if one.outside_limit is None else one.outside_limit, one.candidates or 5,
+        one.outside_weight or 0.0,
+    )  # fmt: skip
+    _run_on_grid(runs, (one.edge_noise or 0.0) if one.edges else None, one.out, json)
 
 
-def _refuse(context: typer.Context, names: Sequence[str], why: str) -> None:
+def _refuse(options: KamedaOptions, names: Sequence[str], needed: str) -> None:
     """Refuses options that were given and mean nothing here."""
     for name in names:
-        if str(getattr(context.get_parameter_source(name), "name", "")) == "COMMANDLINE":
-            raise typer.BadParameter(why, param_hint=f"--{name.replace('_', '-')}")
+        if getattr(options, name) is not None:
+            raise UsageError(f"--{name.replace('_', '-')} needs {needed}")
 
 
 def _run_on_pictures(experiment: str, images: int, out: Path | None, json: bool) -> None:
     """Run both methods on the stored pictures, and print what they found; shows progress."""
-    from drake_pose.commands.report import count_progress, output_console
     from drake_pose.papers.kameda.real_pictures import (
         METHODS,
         picture_names,
@@ -214,7 +153,6 @@ def _run_beside(images: int, seed: int, views: int, mismatch: bool) -> dict[str,
     Returns:
         The figures, by what was in the pictures.
     """
-    from drake_pose.commands.report import count_progress
     from drake_pose.papers.kameda.continuous import (
         continuous_search,
         run_continuous_experiment,
@@ -233,7 +171,6 @@ def _run_beside(images: int, seed: int, views: int, mismatch: bool) -> dict[str,
 
 def _print_continuous(results: Mapping[str, ContinuousResult], json: bool) -> None:
     """Print the figures of ``_run_beside`` as a table or as JSON."""
-    from drake_pose.commands.report import output_console
     from drake_pose.papers.kameda.continuous import continuous_table
 
     if json:
@@ -248,7 +185,6 @@ def _run_on_grid(runs: GridRuns, edges: float | None, out: Path | None, json: bo
 
     edges: the noise of the edges inside the silhouettes; None: they are not used.
     """
-    from drake_pose.commands.report import count_progress, output_console
     from drake_pose.papers.kameda.inner_edges import edge_lines, settle_by_edges
     from drake_pose.papers.kameda.pictures import save_pictures
     from drake_pose.papers.kameda.table import experiment_table
@@ -329,7 +265,6 @@ class GridRuns:
         return columns
 
     def _run_seeds(self, name: str, search: PoseSearch, images: int) -> list[ExperimentResult]:
-        from drake_pose.commands.report import count_progress
         from drake_pose.papers.kameda.experiment import run_experiment
 
         results: list[ExperimentResult] = []

@@ -4,36 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
-from pathlib import Path
-from typing import Annotated
 
-import typer
-
-from drake_pose.commands.terminal import errors_as_messages, say
+from drake_pose.commands.options import Out, Resume
+from drake_pose.commands.terminal import count_progress, say
 
 
-def reproduce_all(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")],
-    short: Annotated[
-        bool, typer.Option("--short", help="A few images and runs only, to see that it works.")
-    ] = False,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with an interrupted result in --out.")
-    ] = False,
-) -> None:
-    """See help_texts.REPRODUCE_ALL."""
-    with errors_as_messages(out), ExitStack() as bars:
-        from drake_pose.commands.report import count_progress
-        from drake_pose.papers.all_experiments import reproduce_all as run
-        from drake_pose.results.folder import require_empty
+def reproduce_all(*, out: Out, short: bool = False, resume: Resume = False) -> None:
+    """Run the experiments of the three papers, and make one page about them, report.html.
 
-        if not resume:
-            require_empty(out)
+    An experiment that is finished is kept: after Ctrl-C, --resume goes on with the others.
+
+        drake-pose reproduce all --out results/papers
+
+    Args:
+        short: A few images and runs only, to see that it works.
+    """
+    from drake_pose.papers.all_experiments import reproduce_all as run
+    from drake_pose.results.folder import require_empty
+
+    if not resume:
+        require_empty(out)
+    with ExitStack() as bars:
 
         def count(what: str, total: int) -> Callable[[int], None]:
             bars.close()
             return bars.enter_context(count_progress(what, total))
 
         page = run(out, short, count, lambda text: say(f"drake-pose: {text}"))
-        bars.close()
-        say(f"drake-pose: wrote {page}")
+    say(f"drake-pose: wrote {page}")

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import typer
+from cyclopts import Parameter
 
-from drake_pose.commands.estimate_options import JsonOption, PicturesOption
-from drake_pose.commands.terminal import errors_as_messages, print_json, say
+from drake_pose.commands.options import Json, Pictures, Seed, within
+from drake_pose.commands.terminal import (
+    UsageError,
+    count_progress,
+    output_console,
+    print_json,
+    say,
+)
 
 if TYPE_CHECKING:
     from drake_pose.papers.shimada.experiment import ComparedTruncations, ExperimentResult
@@ -18,95 +24,61 @@ if TYPE_CHECKING:
 _ALL = "all"
 
 
-RunsOption = Annotated[
-    int, typer.Option(min=1, help="Number of sequences for each of r_13 = 35 and 40.")
-]
-SeedOption = Annotated[int, typer.Option(min=0, help="Seed of the random sequences.")]
-TruncationOption = Annotated[
-    str | None,
-    typer.Option(
-        help="sequential (the paper's), joint, clip, none; or all of these. Default: joint; with "
-        "--hypotheses sequential."
-    ),
-]
-ObservedOption = Annotated[
-    str | None,
-    typer.Option(
-        help="What is measured. lines: the knuckles are hidden, as in the paper; full: all points. "
-        "Default: lines; with --static full."
-    ),
-]
-IterationsOption = Annotated[
-    int | None,
-    typer.Option(
-        min=1,
-        help="Linearisations of an update at most; the paper's filter has 1. Default: 20, fewer "
-        "where the update stands still before; with --hypotheses 1.",
-    ),
-]
-StaticOption = Annotated[
-    int | None,
-    typer.Option(
-        min=1,
-        metavar="FRAMES",
-        help="Another experiment: one unchanging view for this many frames, then new views.",
-    ),
-]
-HypothesesOption = Annotated[
-    bool,
-    typer.Option(
-        "--hypotheses",
-        help="Another experiment, figure 9: fingers bend through the image plane; which "
-        "hypotheses are made, and what rejects the wrong ones.",
-    ),
-]
-StartOption = Annotated[
-    str,
-    typer.Option(help="With --static: guess (the view first) or learned (first the sequence)."),
-]
-
-
 def shimada(
-    runs: RunsOption = 50,
-    seed: SeedOption = 0,
-    truncation: TruncationOption = None,
-    observed: ObservedOption = None,
-    iterations: IterationsOption = None,
-    static: StaticOption = None,
-    start: StartOption = "guess",
-    hypotheses: HypothesesOption = False,
-    out: PicturesOption = None,
-    json: JsonOption = False,
+    *,
+    runs: Annotated[int, within(1)] = 50,
+    seed: Seed = 0,
+    truncation: Literal["sequential", "joint", "clip", "none", "all"] | None = None,
+    observed: Literal["lines", "full"] | None = None,
+    iterations: Annotated[int | None, within(1)] = None,
+    static: Annotated[int | None, within(1), Parameter(metavar="FRAMES")] = None,
+    start: Literal["guess", "learned"] = "guess",
+    hypotheses: bool = False,
+    out: Pictures = None,
+    json: Json = False,
 ) -> None:
-    """See help_texts.SHIMADA."""
-    if static is not None and out is not None:
-        raise typer.BadParameter("makes no plots; leave --out away", param_hint="--static")
-    if static is not None and hypotheses:
-        raise typer.BadParameter("is another experiment than --static", param_hint="--hypotheses")
-    if truncation == _ALL and (static is not None or hypotheses or out is not None):
-        raise typer.BadParameter(
-            "all goes without --static, --hypotheses and --out", param_hint="--truncation"
-        )
-    if truncation is None:
-        truncation = "sequential" if hypotheses else "joint"
-    if observed is None:
-        observed = "lines" if static is None else "full"
-    with errors_as_messages():
-        from drake_pose.commands.report import output_console
+    """Shimada, Shirai, Kuno and Miura: joint angles and lengths of a synthetic hand, one camera.
 
-        result: ExperimentResult | ComparedTruncations | StaticResult | HypothesesResult
-        if hypotheses:
-            result = _run_hypotheses(runs, seed, truncation, observed, iterations or 1, out)
-        elif static is not None:
-            result = _run_static(runs, seed, truncation, observed, static, start, iterations)
-        elif truncation == _ALL:
-            result = _compare_truncations(runs, seed, observed, iterations)
-        else:
-            result = _run_experiment(runs, seed, truncation, observed, iterations, out)
-        if json:
-            print_json(result.as_json())
-        else:
-            output_console().print(result.table())
+    A two-finger hand moves, turns and flexes for 55 frames, measured with noise. A Kalman filter
+    starts from wrong angles and lengths and corrects both, its belief truncated by the limits and
+    couplings of the paper's table 1.
+
+        drake-pose reproduce shimada --runs 20 --out results/shimada
+
+    Args:
+        runs: Number of sequences for each of r_13 = 35 and 40.
+        truncation: sequential (the paper's), joint, clip, none; or all of these. Default: joint;
+            with --hypotheses sequential.
+        observed: What is measured. lines: the knuckles are hidden, as in the paper; full: all
+            points. Default: lines; with --static full.
+        iterations: Linearisations of an update at most; the paper's filter has 1. Default: 20,
+            fewer where the update stands still before; with --hypotheses 1.
+        static: Another experiment: one unchanging view for this many frames, then new views.
+        start: With --static: guess (the view first) or learned (first the sequence).
+        hypotheses: Another experiment, figure 9: fingers bend through the image plane; which
+            hypotheses are made, and what rejects the wrong ones.
+    """
+    if static is not None and out is not None:
+        raise UsageError("--static makes no plots; leave --out away")
+    if static is not None and hypotheses:
+        raise UsageError("--hypotheses is another experiment than --static")
+    if truncation == _ALL and (static is not None or hypotheses or out is not None):
+        raise UsageError("--truncation all goes without --static, --hypotheses and --out")
+    truncation = truncation or ("sequential" if hypotheses else "joint")
+    observed = observed or ("lines" if static is None else "full")
+    result: ExperimentResult | ComparedTruncations | StaticResult | HypothesesResult
+    if hypotheses:
+        result = _run_hypotheses(runs, seed, truncation, observed, iterations or 1, out)
+    elif static is not None:
+        result = _run_static(runs, seed, truncation, observed, static, start, iterations)
+    elif truncation == _ALL:
+        result = _compare_truncations(runs, seed, observed, iterations)
+    else:
+        result = _run_experiment(runs, seed, truncation, observed, iterations, out)
+    if json:
+        print_json(result.as_json())
+    else:
+        output_console().print(result.table())
 
 
 def _run_static(
@@ -119,7 +91,6 @@ def _run_static(
     iterations: int | None,
 ) -> StaticResult:
     """One unchanging view for this many frames."""
-    from drake_pose.commands.report import count_progress
     from drake_pose.papers.shimada.static_view import MARKS, run_static_experiment
 
     marks = (*(mark for mark in MARKS if mark < frames), frames)
@@ -133,7 +104,6 @@ def _run_hypotheses(
     runs: int, seed: int, truncation: str, observed: str, iterations: int, out: Path | None
 ) -> HypothesesResult:
     """What becomes of each hypothesis, and a picture of two."""
-    from drake_pose.commands.report import count_progress
     from drake_pose.papers.shimada.hypotheses import run_hypotheses_experiment
     from drake_pose.papers.shimada.pictures import save_hypotheses
     from drake_pose.results.folder import require_empty
@@ -151,7 +121,6 @@ def _compare_truncations(
     runs: int, seed: int, observed: str, iterations: int | None
 ) -> ComparedTruncations:
     """The same sequences with each truncation."""
-    from drake_pose.commands.report import count_progress
     from drake_pose.filtering.kalman.truncated_filter import TRUNCATIONS
     from drake_pose.papers.shimada.experiment import CASES, compare_truncations
 
@@ -168,7 +137,6 @@ def _run_experiment(
     out: Path | None,
 ) -> ExperimentResult:
     """The paper's experiment, and its plots."""
-    from drake_pose.commands.report import count_progress
     from drake_pose.papers.shimada.experiment import CASES, run_experiment
     from drake_pose.papers.shimada.pictures import save_pictures
     from drake_pose.results.folder import require_empty

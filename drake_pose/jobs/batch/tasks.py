@@ -30,7 +30,7 @@ from drake_pose.jobs.estimate.person_choice import follows_person
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.jobs.estimate.scene_checks import frame_ranges
 from drake_pose.jobs.registration.audit import audit_scene
-from drake_pose.jobs.registration.inputs import RegistrationSettings
+from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.results.folder import (
     OVERLAY,
     POSES,
@@ -253,8 +253,8 @@ def _audit(task: Task, part: Path) -> None:
     """Audits a scene."""
     job, given = task.job, task.job.settings
     assert job.audit is not None
-    settings = RegistrationSettings(
-        given.cameras, given.frames, hold=given.hold, packages=given.packages
+    settings = AuditSettings(
+        cameras=given.cameras, frames=given.frames, hold=given.hold, packages=given.packages
     )
     audit_scene(
         job.scene, job.model, job.audit, part, settings, cameras=job.camera_file,

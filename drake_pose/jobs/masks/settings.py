@@ -1,75 +1,82 @@
-"""How masks are found; plain values only."""
-
-from __future__ import annotations
+"""How masks are found: options, and arguments in Python."""
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter
 
 from drake_pose.errors import SettingsError
-from drake_pose.silhouette.segmentation.mask_pictures import MEANINGS, PixelMeaning
+from drake_pose.results.options import from_text, parse_numbers, parse_size
+from drake_pose.results.settings import Packages, Positions, changed, plain, require_choices
 
 MEDIAN = "median"
 
 _COUNTS = {"box": 4, "network_size": 2, "network_mean": 3, "network_std": 3}
 _WAYS = ("background", "box", "strokes", "draw", "model", "network")
+_Colour = Annotated[tuple[float, ...], from_text(partial(parse_numbers, count=3), "R,G,B")]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class MaskSettings:
     """How masks are found; where no way is given, the source holds masks of another tool.
-
-    Args:
-        pixels: what the pixels of such masks' pictures mean, see ``read_mask_picture``.
-        classes: which of their classes, or of a network's, are the object: names or numbers;
-            ``all``: each but the background.
-        background: pictures of the empty room: a file, or a folder with ``<camera>.png`` or
-            ``<camera>/<frame>.png``; ``median``: each pixel's median over the source's pictures.
-        box: x, y, width and height of a box around the object in all pictures [pixel].
-        strokes: a file of boxes and lines by camera and frame, see ``read_strokes``.
-        draw: whether boxes and lines are drawn on a page in the browser.
-        port: of that page; any free one where not given.
-        model: the object's own model: pose and mask in turn, from ``start``.
-        start: a table of rough joint positions of each frame [rad or m].
-        start_error: standard deviation of its angles [deg].
-        hold: joints of the model that are held, by name [deg or m].
-        packages: folders of packages that the model's ``package://`` names mean, by name.
-        network: an ONNX file of a network that segments pictures.
-        network_size: width and height that it takes [pixel]; None: pictures stay as they are.
-        network_mean, network_std: of red, green and blue, 0 to 1, by which they are normalised.
-        network_bgr: whether it takes blue, green, red.
-        largest: whether only the largest patch of each mask is kept.
-        cameras: a camera file; that of the source where not given, if it has one.
 
     Raises:
         SettingsError: an unknown meaning, several ways at once, or options of another way.
     """
 
-    pixels: PixelMeaning = "auto"
-    classes: tuple[str, ...] = ()
-    background: Path | str | None = None
-    box: tuple[float, ...] | None = None
-    strokes: Path | None = None
-    draw: bool = False
-    port: int | None = None
-    model: Path | None = None
-    start: Path | None = None
-    start_error: float = 5.0
-    hold: Mapping[str, float] = field(default_factory=dict)
-    packages: Mapping[str, Path] = field(default_factory=dict)
-    network: Path | None = None
-    network_size: tuple[int, ...] | None = None
-    network_mean: tuple[float, ...] = (0.0, 0.0, 0.0)
-    network_std: tuple[float, ...] = (1.0, 1.0, 1.0)
-    network_bgr: bool = False
-    largest: bool = False
     cameras: Path | None = None
+    """Camera file that the scene gets. Default: SOURCE/cameras.yaml, if it exists."""
+    classes: Annotated[tuple[str, ...], Parameter("--class", metavar="NAME")] = ()
+    """Class that is the object, by name or number; repeat for several; all: each but the
+    background. Default: the only one. Of masks of other tools, and of networks."""
+    pixels: Literal["auto", "classes", "alpha", "probability"] = "auto"
+    """What pixels of other tools' masks mean: classes, alpha, probability (from one half on); auto:
+    as the file tells."""
+    background: str | Path | None = None
+    """Empty room: a picture, or a folder with <camera>.png or <camera>/<frame>.png; median: of the
+    pictures themselves, in which the body moves. Default: SOURCE/background, if it exists."""
+    box: Annotated[
+        tuple[float, ...] | None, from_text(partial(parse_numbers, count=4), "X,Y,W,H")
+    ] = None
+    """Box around the object in all pictures: left, top, width, height [pixel]."""
+    strokes: Path | None = None
+    """Boxes and lines on the object and beside it, by camera and frame (YAML)."""
+    draw: bool = False
+    """Draw boxes and lines on a page in the browser, on this machine alone; they are kept in
+    strokes.yaml."""
+    port: int | None = None
+    """Port of that page. Default: any free one."""
+    model: Annotated[Path | None, Parameter(alias="-m")] = None
+    """The object: URDF, SDFormat, MJCF or .dmd.yaml; pose and mask are found in turn."""
+    start: Path | None = None
+    """Rough joint positions of every frame [rad or m]: a CSV file with the column frame and one for
+    each joint."""
+    start_error: Annotated[float, Parameter(metavar="DEG")] = 5.0
+    """How far off their angles are: standard deviation [deg]."""
+    hold: Positions = field(default_factory=dict)
+    """Hold this joint at a known position [deg or m]; repeat for several."""
+    packages: Packages = field(default_factory=dict)
+    network: Path | None = None
+    """ONNX file of a segmentation network; --class NUMBER is the object."""
+    network_size: Annotated[tuple[int, ...] | None, from_text(parse_size, "W,H")] = None
+    """Size that the network takes [pixel]. Default: the pictures'."""
+    network_mean: _Colour = (0.0, 0.0, 0.0)
+    """It takes (colour / 255 - mean) / std."""
+    network_std: _Colour = (1.0, 1.0, 1.0)
+    """See --network-mean."""
+    network_bgr: bool = False
+    """It takes blue, green, red."""
+    largest: bool = False
+    """Keep only the largest patch of each mask."""
 
     def __post_init__(self) -> None:
-        if self.pixels not in MEANINGS:
-            raise SettingsError(f"pixels must be {', '.join(MEANINGS)}, not '{self.pixels}'")
+        require_choices(self)
+        if self.port is not None and not 1 <= self.port <= 65535:
+            raise SettingsError(f"--port must be 1 to 65535, not {self.port}")
         for name, count in _COUNTS.items():
             values = getattr(self, name)
             if values is not None and (len(values) != count or not all(map(math.isfinite, values))):
@@ -87,19 +94,9 @@ class MaskSettings:
             raise SettingsError("--model and --start need each other: rough joint positions")
         if not (math.isfinite(self.start_error) and self.start_error > 0.0):
             raise SettingsError("--start-error must be a positive number of degrees")
-        if "network" not in ways and any(name.startswith("network") for name in self._own()):
+        if "network" not in ways and any(name.startswith("network") for name in changed(self)):
             raise SettingsError("options of a network need --network FILE")
 
     def as_json(self) -> Mapping[str, Any]:
         """The settings that are not the default's, as plain JSON values."""
-        values = asdict(self)
-        values["packages"] = {name: str(folder) for name, folder in self.packages.items()}
-        return {
-            name: str(values[name]) if isinstance(values[name], Path) else values[name]
-            for name in self._own()
-        }
-
-    def _own(self) -> list[str]:
-        """The names of those that are not the default's."""
-        default = {one.name: one.default for one in fields(self)} | {"hold": {}, "packages": {}}
-        return [name for name, value in default.items() if getattr(self, name) != value]
+        return {name: plain(getattr(self, name)) for name in changed(self)}

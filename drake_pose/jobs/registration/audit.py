@@ -19,8 +19,8 @@ from drake_pose.errors import MaskError, SceneError
 from drake_pose.jobs.estimate.inputs import make_tree, select_cameras, select_seen_frames
 from drake_pose.jobs.estimate.scene_checks import check_scene, frame_ranges, texts_of
 from drake_pose.jobs.registration.audit_result import summarize, write_result
-from drake_pose.jobs.registration.inputs import RegistrationSettings
 from drake_pose.jobs.registration.known_positions import KnownPositions, read_known_positions
+from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.registration.contradictions import Audit, audit_frames
 from drake_pose.registration.freed_frames import FrameFreer, SeenFrame
 from drake_pose.registration.register import RegistrationBody
@@ -91,7 +91,7 @@ def audit_scene(
     model: Path | str,
     joints: Path | str,
     out: Path | str | None = None,
-    settings: RegistrationSettings | None = None,
+    settings: AuditSettings | None = None,
     *,
     cameras: Path | str | None = None,
     overlay: bool = True,
@@ -113,7 +113,7 @@ def audit_scene(
     Raises:
         DrakePoseError: names the file, camera, frame or joint at fault.
     """
-    settings = settings or RegistrationSettings()
+    settings = settings or AuditSettings()
     folder = None if out is None else Path(out)
     if folder is not None:
         require_empty(folder)
@@ -144,7 +144,7 @@ def audit_scene(
 
 
 def _read_inputs(
-    paths: tuple[Path, Path, Path], camera_file: Path | None, settings: RegistrationSettings
+    paths: tuple[Path, Path, Path], camera_file: Path | None, settings: AuditSettings
 ) -> AuditInputs:
     scene_path, model_path, joints_path = paths
     cameras = None if camera_file is None else load_cameras(camera_file)

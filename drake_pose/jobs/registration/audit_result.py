@@ -12,7 +12,7 @@ from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
-from drake_pose.jobs.registration.inputs import RegistrationSettings
+from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.registration.contradictions import Audit, Finding, FrameAudit
 from drake_pose.registration.freed_frames import SeenFrame
 from drake_pose.results.folder import OVERLAY, ResultFolder
@@ -42,7 +42,7 @@ def describe_contradictions(found: Audit) -> list[dict[str, Any]]:
 def summarize(
     found: Audit,
     paths: tuple[Path, Path, Path, Path | None],
-    settings: RegistrationSettings,
+    settings: AuditSettings,
     warnings: Sequence[str],
     seconds: float,
 ) -> dict[str, Any]:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,10 +32,10 @@ from drake_pose.jobs.registration.known_positions import (
     put_on_base,
     read_known_positions,
 )
+from drake_pose.jobs.registration.settings import ALL, RegistrationSettings
 from drake_pose.registration.joint_zeros import links_with_length, require_known
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.standing_object import StandingObject, require_turns
-from drake_pose.registration.suggestions import Box
 from drake_pose.results.options import select_frames
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.silhouette.pictures.scenes import Scene, load_scene
@@ -53,51 +52,6 @@ _OF_A_PERSON = (
     "a person's clothes and hair are not the model's surface, which turns a camera about the "
     "person: on a real recording cameras were off by up to three of their standard deviations"
 )
-
-ALL = "all"
-"""In place of names: of every joint, or of every link."""
-
-
-@dataclass(frozen=True)
-class RegistrationSettings:
-    """What is registered; plain values only.
-
-    Args:
-        cameras: the cameras to find, also where the camera file has their X_WC; all that have none
-            where empty.
-        frames: names, or ranges ``FIRST:LAST``; all where empty.
-        on: the link on which the cameras ride that are to be found; None: they stand still.
-        target: the model file of a rigid object that they see from there, which stands somewhere in
-            the world; None: they see the robot's base.
-        hold: joints that are not in the table, by name [deg or m].
-        zeros: joints whose zeros are asked for, too; "all": those of all that move.
-        lengths: links whose lengths are asked for, too; "all": those of all that have one.
-        focal: whether focal lengths are asked for, too.
-        suggest: whether a further pose of the robot is asked for where several poses of a camera
-            fit equally well.
-        keep_out: what the robot must not touch in it.
-        packages: folders of packages that the model's ``package://`` names mean, by name.
-    """
-
-    cameras: tuple[str, ...] = ()
-    frames: tuple[str, ...] = ()
-    on: str | None = None
-    target: Path | None = None
-    hold: Mapping[str, float] = field(default_factory=dict)
-    zeros: tuple[str, ...] = ()
-    lengths: tuple[str, ...] = ()
-    focal: bool = False
-    suggest: bool = False
-    keep_out: tuple[Box, ...] = ()
-    packages: Mapping[str, Path] = field(default_factory=dict)
-
-    def as_json(self) -> dict[str, Any]:
-        """Returns the settings as plain JSON values."""
-        packages = {name: str(folder) for name, folder in self.packages.items()}
-        names = ("cameras", "frames", "zeros", "lengths")
-        lists = {name: list(getattr(self, name)) for name in names}
-        target = None if self.target is None else str(self.target)
-        return {**asdict(self), **lists, "packages": packages, "target": target}
 
 
 @dataclass(frozen=True)

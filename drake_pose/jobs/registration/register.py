@@ -17,7 +17,6 @@ from drake_pose.jobs.estimate.scene_checks import frame_ranges
 from drake_pose.jobs.registration.adjustment import adjust_bundle
 from drake_pose.jobs.registration.inputs import (
     RegistrationInputs,
-    RegistrationSettings,
     read_inputs,
 )
 from drake_pose.jobs.registration.misfit import (
@@ -27,6 +26,7 @@ from drake_pose.jobs.registration.misfit import (
     require_explained,
 )
 from drake_pose.jobs.registration.result import describe_camera, summarize, write_result
+from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.jobs.registration.zeros import (
     corrected_urdf,
     describe_lengths,

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.files import dump_cameras
 from drake_pose.camera.models import Camera
-from drake_pose.jobs.registration.inputs import RegistrationInputs, RegistrationSettings
+from drake_pose.jobs.registration.inputs import RegistrationInputs
 from drake_pose.jobs.registration.report import make_registration_report
+from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.registration.register import ObjectPose, RegisteredCamera
 from drake_pose.results.folder import OVERLAY, REPORT, ResultFolder, without_nan
 from drake_pose.results.overlay import draw_overlay, encode_png

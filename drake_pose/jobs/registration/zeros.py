@@ -16,9 +16,9 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.jobs.registration.inputs import (
     RegistrationInputs,
-    RegistrationSettings,
     make_registration_tree,
 )
+from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.registration.joint_zeros import (
     JointCalibration,
     calibrate_joints,

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from rich.table import Table
 
@@ -18,7 +18,8 @@ from drake_pose.results.settings import EstimateSettings
 from drake_pose.results.summary import FrameRecord
 from drake_pose.silhouette.pictures.scenes import load_scene
 
-METHODS = {"paper": "the paper's method", "beam": "multi-start search"}
+Method = Literal["paper", "beam"]
+METHODS: Mapping[Method, str] = {"paper": "the paper's method", "beam": "multi-start search"}
 """What is compared, and what tables call it."""
 
 
@@ -75,7 +76,7 @@ class RealResult:
     """
 
     experiment: str
-    method: str
+    method: Method
     records: Mapping[str, FrameRecord]
     cpu_seconds: float
     warnings: tuple[str, ...]
@@ -104,7 +105,7 @@ def picture_names(experiment: str) -> tuple[str, ...]:
 
 def run_real_experiment(
     experiment: str,
-    method: str,
+    method: Method,
     frames: tuple[str, ...] = (),
     out: Path | None = None,
     progress: Callable[[int], None] | None = None,

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from typer.testing import CliRunner, Result
 
 from drake_pose.camera.files import save_cameras
 from drake_pose.commands.main import app
 from drake_pose.errors import SettingsError
 from drake_pose.jobs.batch.job import read_job
+from tests.cli import CliRunner, Result
 from tests.jobs.registration.arm_scenes import ArmScene, write_arm_scene
 
 

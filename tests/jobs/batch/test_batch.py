@@ -16,17 +16,17 @@ from pathlib import Path
 import psutil
 import pytest
 import yaml
-from typer.testing import CliRunner
 
 from drake_pose.commands.main import app
 from drake_pose.errors import ClusterError, OutputError, SettingsError
 from drake_pose.jobs.batch.batch import run_batch
-from drake_pose.jobs.batch.job import SETTINGS, SceneJob, read_job
+from drake_pose.jobs.batch.job import SceneJob, read_job
 from drake_pose.jobs.batch.tasks import WORK, Outcome, Task, perform
 from drake_pose.jobs.batch.workers import ClusterPool
 from drake_pose.jobs.cluster.scheduler import open_cluster, require_fit_workers
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.results.settings import EstimateSettings
+from tests.cli import CliRunner
 from tests.jobs.scenes import write_scene
 
 MOTION = [(20.0 + 5.0 * k, -40.0 - 4.0 * k) for k in range(5)]
@@ -309,10 +309,6 @@ def test_job_of_other_chunks_is_not_resumed(jobs, alone):
     other = [dataclasses.replace(job, chunk=3) for job in jobs]
     with pytest.raises(OutputError, match="chunk = 2, not 3"):
         run_batch(other, alone, resume=True)
-
-
-def test_every_setting_can_be_given():
-    assert set(SETTINGS) == {field.name for field in dataclasses.fields(EstimateSettings)}
 
 
 def test_job_file_gives_the_settings(tmp_path):

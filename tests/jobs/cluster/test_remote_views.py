@@ -7,7 +7,6 @@ from contextlib import nullcontext
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from drake_pose.camera.sources.frame_source import SourceSpecification
 from drake_pose.commands.main import app
@@ -19,6 +18,7 @@ from drake_pose.jobs.live.run import FrameWatch, run_live
 from drake_pose.jobs.live.scene import load_live_scene
 from drake_pose.person.recordings.known_shape import tracker_of_person
 from drake_pose.systems.person.live_capture import build_live_capture
+from tests.cli import CliRunner
 from tests.jobs.live_scenes import RATE_HZ, load_person, standing, write_studio
 
 FRAMES = 40

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import yaml
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner
 
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.landmarks import landmark_positions, load_landmarks
@@ -21,6 +20,7 @@ from drake_pose.camera.models import Camera
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.commands.main import app
 from drake_pose.silhouette.pictures.masks import write_mask
+from tests.cli import CliRunner
 from tests.jobs.scenes import read_rows
 from tests.person.persons_in_view import see, stepping
 

@@ -12,10 +12,9 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from typer.testing import CliRunner, Result
 
 from drake_pose.commands.main import app
-from drake_pose.errors import DrakePoseError
+from tests.cli import CliRunner, Result
 from tests.jobs.scenes import NAMES, URDF, TinyScene, read_rows
 
 Spoil = Callable[[TinyScene], None]
@@ -31,15 +30,12 @@ def run(runner: CliRunner, scene: TinyScene, *more: str, model: Path | None = No
 
 def assert_refused(result: Result, *parts: str, status: int = 1) -> None:
     assert result.exit_code == status, result.output
-    assert isinstance(result.exception, SystemExit), result.exception
-    # Usage errors are drawn in a box that folds lines.
-    message = " ".join(result.stderr.replace("│", " ").split())
+    message = " ".join(result.stderr.split())
     for part in parts:
         assert part in message
     assert "Traceback" not in result.output
     assert result.stdout == ""
-    if status == 1:
-        assert "drake-pose: error: " in message
+    assert "drake-pose: error: " in message
 
 
 def edit_camera(scene: TinyScene, **fields: object) -> None:
@@ -274,7 +270,7 @@ BAD_VALUES = {
     "no runs": (["--method", "paper", "--run-limit", "0"], "run_limit", 2),
     "angles": (["--angles", "round"], "angles", 2),
     "time limit of the other method": (["--method", "paper", "--time-limit", "9"], "time limit", 2),
-    "negative time": (["--time-limit", "-1"], "--time-limit", 2),
+    "negative time": (["--time-limit", "-1"], "time_limit", 2),
 }
 
 
@@ -356,9 +352,8 @@ def test_any_other_error_is_a_bug_and_stays_visible(
         raise ZeroDivisionError
 
     monkeypatch.setattr("drake_pose.jobs.estimate.scene.read_inputs", fail)
-    result = run(runner, own_scene)
-    assert isinstance(result.exception, ZeroDivisionError)
-    assert not isinstance(result.exception, DrakePoseError)
+    with pytest.raises(ZeroDivisionError):
+        run(runner, own_scene)
 
 
 @pytest.mark.slow

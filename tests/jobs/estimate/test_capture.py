@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.landmarks import landmark_positions, load_landmarks
@@ -20,6 +19,7 @@ from drake_pose.person.recordings.person_capture import PersonCapture
 from drake_pose.person.recordings.person_recording import ViewFaults
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.silhouette.pictures.masks import write_mask
+from tests.cli import CliRunner
 from tests.jobs.bvh_reader import read_bvh
 from tests.jobs.persons import PersonScene, record_person
 from tests.jobs.scenes import read_rows

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from typer.testing import CliRunner
 
 from drake_pose.body.model import load_model
 from drake_pose.camera.models import Camera
@@ -18,6 +17,7 @@ from drake_pose.results.settings import EstimateSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.silhouette.pictures.scenes import load_scene
+from tests.cli import CliRunner
 from tests.jobs.scenes import URDF, TinyScene, camera, write_scene
 
 ANGLES = ((20.0, -40.0), (-40.0, -80.0))

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 import trimesh
 import yaml
-from typer.testing import CliRunner, Result
 
 from drake_pose.commands.main import app
 from drake_pose.errors import SettingsError
 from drake_pose.results.options import parse_packages
+from tests.cli import CliRunner, Result
 from tests.jobs.scenes import LINK, TinyScene
 
 BOOM = LINK.format(name="boom", z=0.25, size="0.1 0.12 0.5")

@@ -6,7 +6,6 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.camera.files import load_cameras
@@ -15,6 +14,7 @@ from drake_pose.errors import SceneError
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from tests.cli import CliRunner
 from tests.jobs.persons import record_person
 
 FRAMES = 5

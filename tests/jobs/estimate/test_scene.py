@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
-from typer.testing import CliRunner
 
 from drake_pose.body.model import load_model
 from drake_pose.commands.main import app
@@ -17,6 +16,7 @@ from drake_pose.results.overlay import AGREEMENT_RGB, EXCESS_RGB, MISSING_RGB
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import load_scene
+from tests.cli import CliRunner
 from tests.jobs.scenes import NAMES, URDF, TinyScene, read_rows, write_scene, write_truth
 
 

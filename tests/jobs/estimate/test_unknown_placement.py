@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from drake_pose.commands.main import app
+from tests.cli import CliRunner
 from tests.jobs.scenes import NAMES, TinyScene, camera, read_rows
 
 BEAM = ("--method", "beam", "--interval", "20", "--frame", "0", "--no-replay")

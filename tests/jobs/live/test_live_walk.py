@@ -3,7 +3,6 @@ import math
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from drake_pose.commands.main import app
 from drake_pose.errors import SettingsError
@@ -13,6 +12,7 @@ from drake_pose.jobs.live.scene import load_live_scene
 from drake_pose.jobs.live.walk import open_page
 from drake_pose.person.date.walk_commands import WalkSettings
 from drake_pose.systems.walk.garden import START
+from tests.cli import CliRunner
 from tests.jobs.live_scenes import RATE_HZ, absent, load_person, standing, write_studio
 
 REST, AHEAD, AWAY = round(1.4 * RATE_HZ), round(1.0 * RATE_HZ), round(0.6 * RATE_HZ)

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from typer.testing import CliRunner
 
 from drake_pose.commands.main import app
 from drake_pose.errors import SceneError, SettingsError
@@ -17,6 +16,7 @@ from drake_pose.jobs.live.paper_capture import METHOD, capture_paper
 from drake_pose.jobs.live.scene import load_live_scene
 from drake_pose.person.date.recognition import registered_positions
 from drake_pose.person.date.skeleton import load_skeleton
+from tests.cli import CliRunner
 from tests.jobs.live_scenes import RATE_HZ, load_person, standing, write_studio
 
 PLACE = (0.12, -0.1, 1.55)

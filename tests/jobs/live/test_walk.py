@@ -10,7 +10,6 @@ import time
 import cv2
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import load_model
@@ -32,6 +31,7 @@ from drake_pose.jobs.live.walk import (
 from drake_pose.person.date.walk_commands import WalkSettings
 from drake_pose.results.folder import PoseRow, ResultFolder
 from drake_pose.systems.walk.garden import START
+from tests.cli import CliRunner
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 WIDTH, HEIGHT, VIEW_DEGREES = 640, 480, 75.0

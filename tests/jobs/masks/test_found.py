@@ -9,12 +9,12 @@ import onnx
 import pytest
 import yaml
 from onnx import TensorProto, helper, numpy_helper
-from typer.testing import CliRunner
 
 from drake_pose import MaskSettings, load_scene, make_masks
 from drake_pose.commands.main import app
 from drake_pose.errors import DrakePoseError, MaskError, SceneError, SettingsError
 from drake_pose.jobs.masks.strokes import read_strokes
+from tests.cli import CliRunner
 from tests.jobs.masks.rooms import iou, moving, write_pictures
 from tests.jobs.scenes import NAMES, read_rows
 

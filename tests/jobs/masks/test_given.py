@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 from pycocotools import mask as coco
-from typer.testing import CliRunner
 
 from drake_pose import MaskSettings, load_scene, make_masks
 from drake_pose.commands.main import app
 from drake_pose.errors import CameraError, DrakePoseError, MaskError, OutputError, SceneError
+from tests.cli import CliRunner
 from tests.jobs.scenes import write_scene
 
 POLYGON = [60.0, 40.0, 120.0, 40.0, 120.0, 100.0, 60.0, 100.0]

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
 
 from drake_pose.camera.files import save_cameras
 from drake_pose.commands.main import app
 from drake_pose.errors import CameraError, MaskError, SceneError
 from drake_pose.jobs.registration.audit import audit_scene
 from drake_pose.silhouette.pictures.masks import write_mask
+from tests.cli import CliRunner, Result
 from tests.jobs.registration.arm_scenes import JOINTS, ArmScene, write_arm_scene
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
+from tests.cli import CliRunner
 from tests.jobs.estimate.test_bad_input import assert_refused
 from tests.jobs.registration.arm_scenes import ArmScene
 from tests.jobs.registration.test_register import run

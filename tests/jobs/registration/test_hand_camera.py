@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from typer.testing import CliRunner
 
 from drake_pose.body.model import load_model
 from drake_pose.camera.files import load_camera_file, load_cameras
 from drake_pose.commands.main import app
 from drake_pose.errors import CameraError
+from tests.cli import CliRunner
 from tests.jobs.registration.arm_scenes import ArmScene, pose_errors
 from tests.jobs.registration.hand_camera import X_LC, write_hand_camera
 

@@ -10,17 +10,17 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from typer.testing import CliRunner, Result
 
 from drake_pose.body.model import load_model
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.camera.files import load_cameras
 from drake_pose.commands.main import app
-from drake_pose.jobs.registration.inputs import RegistrationSettings
 from drake_pose.jobs.registration.register import register_scene, say_common
+from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.registration.register import FrameMisfit, RegisteredCamera
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import load_scene
+from tests.cli import CliRunner, Result
 from tests.jobs.registration.arm_scenes import ArmScene, pose_errors
 from tests.search.arms import arm_cameras
 

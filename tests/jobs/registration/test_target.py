@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from typer.testing import CliRunner
 
 from drake_pose.camera.files import load_camera_file
 from drake_pose.commands.main import app
+from tests.cli import CliRunner
 from tests.jobs.registration.arm_scenes import pose_errors
 from tests.jobs.registration.hand_camera import X_LC
 from tests.jobs.registration.target_scenes import (

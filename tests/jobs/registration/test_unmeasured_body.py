@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import yaml
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner, Result
 
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import load_model
@@ -17,6 +16,7 @@ from drake_pose.camera.files import load_cameras
 from drake_pose.commands.main import app
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask
+from tests.cli import CliRunner, Result
 from tests.jobs.estimate.test_bad_input import assert_refused
 from tests.jobs.registration.arm_scenes import JOINTS, ArmScene, pose_errors
 

@@ -1,0 +1,109 @@
+"""Options that several commands have, and who works: this process, others, other machines."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from math import inf, isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from drake_pose.commands.terminal import UsageError
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+
+def within(low: float, high: float = inf) -> Parameter:
+    """Returns the check of an option: a finite number in this range."""
+
+    def check(hint: object, value: float | None) -> None:
+        if value is not None and not (isfinite(value) and low <= value <= high):
+            wanted = f"{low:g} or more" if high == inf else f"{low:g} to {high:g}"
+            raise ValueError(f"It must be {wanted}.")
+
+    return Parameter(validator=check)
+
+
+SPREAD = Parameter("*")
+"""The fields of a settings class are options."""
+
+Model = Annotated[
+    Path, Parameter(["--model", "-m"], help="The body: URDF, SDFormat, MJCF or .dmd.yaml.")
+]
+Out = Annotated[Path, Parameter(["--out", "-o"], help="Folder for the result; new or empty.")]
+Pictures = Annotated[
+    Path | None, Parameter(["--out", "-o"], help="Folder for pictures. Default: none are written.")
+]
+Resume = Annotated[bool, Parameter(help="Continue an interrupted result in --out.")]
+Replay = Annotated[bool, Parameter(negative="--no-replay", help="Write replay.html.")]
+Overlay = Annotated[
+    bool, Parameter(negative="--no-overlay", help="Write overlay/<camera>/<frame>.png.")
+]
+Browser = Annotated[bool, Parameter(negative="--no-browser", help="Open the page in the browser.")]
+Json = Annotated[bool, Parameter(help="Print the result as JSON.")]
+Truth = Annotated[
+    Path | None,
+    Parameter(
+        help="Measured joint positions [rad or m] to compare with: a CSV file with the column "
+        "frame and one for each joint. Default: SCENE/joint_angles.csv, if it exists."
+    ),
+]
+Shape = Annotated[
+    Path | None,
+    Parameter(
+        metavar="RESULT",
+        help="Take lengths and girths from this result of capture with the same person. Live "
+        "capture (sources.yaml) only.",
+    ),
+]
+Seconds = Annotated[float | None, within(0.01)]
+Seed = Annotated[int, within(0), Parameter(help="Seed of the random numbers.")]
+CaptureWorkers = Annotated[
+    int,
+    within(0),
+    Parameter(
+        "--workers",
+        metavar="N",
+        help="Number of worker processes on this machine that process the pictures of a "
+        "sources.yaml, each those of its own cameras; 0: none, this process does it.",
+    ),
+]
+Scheduler = Annotated[
+    str | None,
+    Parameter(
+        metavar="ADDRESS",
+        help="Address of a Dask scheduler whose workers are used instead, like "
+        "tcp://10.0.0.7:8786.",
+    ),
+]
+
+
+@contextmanager
+def workers_of(
+    workers: int | None, scheduler: str | None, shared: Path | None = None
+) -> Iterator[Client | None]:
+    """The workers that were asked for; None: this process works.
+
+    Args:
+        workers: how many on this machine; None: one for each core.
+        scheduler: address of a scheduler instead.
+        shared: a folder that a scheduler's workers must see; None: none.
+
+    Raises:
+        UsageError: both were asked for.
+        ClusterError: they cannot be had, or are not fit.
+    """
+    if workers and scheduler is not None:
+        raise UsageError("give --workers or --scheduler, not both")
+    if workers == 0 and scheduler is None:
+        yield None
+        return
+    from drake_pose.jobs.cluster.scheduler import open_cluster, require_fit_workers
+
+    with open_cluster(workers, scheduler) as client:
+        if scheduler is not None:
+            require_fit_workers(client, shared)
+        yield client

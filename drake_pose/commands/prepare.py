@@ -1,0 +1,109 @@
+"""The commands `drake-pose check`, `calibrate` and `undistort`: what comes before an estimate."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from drake_pose.commands.options import Json
+from drake_pose.commands.terminal import output_console, print_json, say, warn
+from drake_pose.errors import ModelError
+from drake_pose.results.settings import Packages
+
+
+def check(file: Path, /, *, package: Packages | None = None, json: Json = False) -> None:
+    """Check whether a model is fit for pose estimation, and if not, why.
+
+    A fit model has visual geometry, and limits on every prismatic joint that is searched. The
+    table shows the pose tree in the order of the search: each link, its parent, the joints between
+    them in the order of rotation with their limits, and the link's number of triangles. Exit
+    status 1: not fit.
+
+    Collision geometry, transmissions and plugins are not read. Mimic joints and other couplings
+    are named in a warning and not enforced. Expand xacro macros first.
+
+        drake-pose check urdf/woman/woman.urdf
+        drake-pose check arm.urdf --package arm_description=ros/arm_description
+
+    Args:
+        file: The model: URDF, SDFormat, MJCF or .dmd.yaml.
+    """
+    from drake_pose.body.report import describe_model
+    from drake_pose.jobs.check import report_as_json, report_as_table
+
+    report = describe_model(file, package_paths=package or {})
+    if json:
+        print_json(report_as_json(report))
+    elif report.usable:
+        output_console().print(report_as_table(report))
+    for text in report.warnings:
+        warn(text)
+    if report.errors:
+        raise ModelError("; ".join(report.errors))
+    say("drake-pose: fit for use")
+
+
+def calibrate(
+    folder: Path,
+    /,
+    *,
+    board: Path,
+    out: Annotated[Path, Parameter(alias="-o")],
+    world: str = "",
+    lens: Literal["none", "standard", "full"] = "standard",
+    leave_out: tuple[str, ...] = (),
+    drop_spoilt: bool = False,
+    json: Json = False,
+) -> None:
+    """Calibrate one camera or several from pictures of a checkerboard or a ChArUco board.
+
+    Intrinsics and distortion are found for each camera from its own pictures, extrinsics from
+    instants at which two or more cameras saw the board; a bundle adjustment then refines all of
+    them. The written cameras have no distortion: remove it from the pictures with undistort.
+
+        drake-pose calibrate CALIBRATION --board board.yaml --out SCENE/cameras.yaml
+
+    Args:
+        folder: Folder with images/<camera>/<frame>.png; the same frame is the same instant.
+        board: The board's YAML file.
+        out: Camera file to write; the lens file is written beside it.
+        world: World frame: board:FRAME or camera:NAME. Default: the first camera.
+        lens: Distortion: none, standard (k1, k2, p1, p2) or full (also k3).
+        leave_out: Leave out a camera, or a picture CAMERA/FRAME; repeat for several.
+        drop_spoilt: Leave out pictures that spoil the calibration.
+    """
+    from drake_pose.camera.calibration.calibrate import CalibrationSettings
+    from drake_pose.jobs.calibrate import calibrate_folder
+
+    settings = CalibrationSettings(
+        world=world, lens=lens, drop_spoilt=drop_spoilt, leave_out=leave_out
+    )
+    report = calibrate_folder(folder, board, out, settings)
+    if json:
+        print_json(report.as_json())
+    else:
+        output_console().print(report.table())
+    for text in report.warnings:
+        warn(text)
+    say(f"drake-pose: wrote {', '.join(str(path) for path in report.files)}")
+
+
+def undistort(
+    folder: Path, /, *, lenses: Path, out: Annotated[Path, Parameter(alias="-o")]
+) -> None:
+    """Remove the lenses' distortion from pictures.
+
+        drake-pose undistort RECORDING --lenses SCENE/cameras_lenses.yaml --out SCENE
+
+    Args:
+        folder: Folder with images/<camera>/<frame>.png or .jpg.
+        lenses: The lens file that calibrate wrote.
+        out: Folder for the pictures.
+    """
+    from drake_pose.camera.calibration.lens import load_lenses
+    from drake_pose.jobs.calibrate import undistort_pictures
+
+    written = undistort_pictures(folder, load_lenses(lenses), out)
+    say(f"drake-pose: {len(written)} pictures written to {out}")

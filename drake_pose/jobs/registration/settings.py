@@ -1,0 +1,59 @@
+"""What a registration or an audit of a scene is made with: options, and arguments in Python."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+from drake_pose.results.options import Corner, from_text, parse_boxes
+from drake_pose.results.settings import Names, Positions, SceneSettings
+
+ALL = "all"
+"""In place of names: of every joint, or of every link."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AuditSettings(SceneSettings):
+    """How a scene is audited."""
+
+    hold: Positions = field(default_factory=dict)
+    """Hold this joint at a known position [deg or m]; repeat for several."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegistrationSettings(AuditSettings):
+    """How cameras are registered."""
+
+    cameras: Annotated[Names, Parameter("--camera")] = ()
+    """Find this camera, and do not use its X_WC if it has one; repeat for several. Default: all
+    without X_WC."""
+    on: Annotated[str | None, Parameter(metavar="LINK")] = None
+    """The cameras to be found ride on this link (eye in hand): their pose X_LC in its frame is
+    found, from masks of the robot's base, which is what no joint moves, or of a --target."""
+    target: Path | None = None
+    """With --on: the masks show another, rigid object (URDF, SDFormat, MJCF), which stands anywhere
+    in the world; where is found, too."""
+    zeros: Names = ()
+    """Find the zero of this joint, too, a constant that is added to its positions in all frames;
+    all: of every joint; repeat for several. A URDF with the zeros is written."""
+    lengths: Annotated[tuple[str, ...], Parameter(metavar="LINK")] = ()
+    """Find how long this link is, too: a factor, the same in all frames, of the distances of the
+    joints that it carries from its own; all: of every link; repeat for several. A URDF with the
+    lengths is written."""
+    focal: bool = False
+    """Find the cameras' focal lengths, too."""
+    suggest: bool = False
+    """Where several poses of a camera fit equally well: joint positions inside the limits that
+    would tell them apart."""
+    keep_out: Annotated[
+        tuple[tuple[Corner, Corner], ...],
+        from_text(parse_boxes, "X,Y,Z:X,Y,Z", repeated=True),
+    ] = ()
+    """With --suggest: the corners of a box in the world that the robot must not touch [m]; repeat
+    for several."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Returns the settings as plain JSON values."""
+        boxes = [{"low": low, "high": high} for low, high in self.keep_out]
+        return super().as_json() | {"keep_out": boxes}

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from drake_pose.fit.evidence import EdgePoints, Evidence, pack_evidence
 from drake_pose.fit.kernel import compare_contours
-from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import Placement
 from drake_pose.silhouette.areas.outline import PackedOutlines
 
@@ -54,7 +54,7 @@ class CameraSum(NamedTuple):
     sums: Array
 
 
-AddUp = Callable[[Placement, Round], CameraSum]
+AddUp = Callable[[Placement, AnnealingStage], CameraSum]
 """Compares a body's contours with all cameras' edges, wherever these are, and adds up."""
 
 

@@ -17,7 +17,7 @@ from drake_pose.errors import SettingsError
 from drake_pose.fit.colour_lines import COLOURS, compare_lines, learn_colours
 from drake_pose.fit.contour_fit import Comparison, Noise, camera_weights, pack_cameras
 from drake_pose.fit.kernel import COMPARED, SQUARES, WEIGHT
-from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import Placement
 
 Array = NDArray[np.float64]
@@ -107,7 +107,7 @@ def add_pictures(
     cameras: Sequence[Camera],
     pictures: Sequence[Picture | None],
     histograms: Histograms,
-    step: Round,
+    step: AnnealingStage,
     noise: Noise,
     pixels: int,
 ) -> None:

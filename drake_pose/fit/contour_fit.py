@@ -22,8 +22,8 @@ from drake_pose.fit.camera_sums import (
 from drake_pose.fit.evidence import EdgePoints, pack_evidence
 from drake_pose.fit.kernel import CLOSE, COMPARED, COST, FITTING, collect
 from drake_pose.fit.levenberg_marquardt import (
+    AnnealingStage,
     Equations,
-    Round,
     StepSettings,
     minimise,
 )
@@ -85,9 +85,9 @@ class Comparison(NamedTuple):
         return add_cameras(self.A, self.b, self.sums)
 
     @property
-    def share(self) -> float:
+    def inlier_ratio(self) -> float:
         """Of both contours' lengths, what fits, 0 to 1."""
-        return fitting_share(self.sums)
+        return inlier_ratio_of(self.sums)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,9 +107,9 @@ class PoseFit:
     evaluations: int
 
     @property
-    def share(self) -> float:
+    def inlier_ratio(self) -> float:
         """Of both contours' lengths, what fits, 0 to 1."""
-        return fitting_share(self.sums)
+        return inlier_ratio_of(self.sums)
 
     @property
     def closeness(self) -> float:
@@ -118,7 +118,7 @@ class PoseFit:
         return float(total[CLOSE] / max(total[COMPARED], 1e-9))
 
 
-def fitting_share(sums: Array) -> float:
+def inlier_ratio_of(sums: Array) -> float:
     """Of both contours' lengths, what fits, 0 to 1; sums (..., 6) of `compare_contours`."""
     total = sums.reshape(-1, sums.shape[-1]).sum(axis=0)
     return float(total[FITTING] / max(total[COMPARED], 1e-9))
@@ -182,7 +182,7 @@ class ContourFit:
         cameras: Sequence[Camera],
         edges: Sequence[EdgePoints],
         values: Array,
-        rounds: Sequence[Round],
+        rounds: Sequence[AnnealingStage],
         prior: Prior | None = None,
         held: Mask | None = None,
     ) -> PoseFit:
@@ -202,13 +202,13 @@ class ContourFit:
         self,
         views: Views,
         values: Array,
-        rounds: Sequence[Round],
+        rounds: Sequence[AnnealingStage],
         prior: Prior | None = None,
         held: Mask | None = None,
     ) -> PoseFit:
         """As fit, of views that are packed."""
 
-        def add_up(placement: Placement, step: Round) -> CameraSum:
+        def add_up(placement: Placement, step: AnnealingStage) -> CameraSum:
             return add_cameras(*self.compare_placed(views, placement, step))
 
         return self.fit_sums(add_up, values, rounds, prior, held)
@@ -217,7 +217,7 @@ class ContourFit:
         self,
         add_up: AddUp,
         values: Array,
-        rounds: Sequence[Round],
+        rounds: Sequence[AnnealingStage],
         prior: Prior | None = None,
         held: Mask | None = None,
     ) -> PoseFit:
@@ -227,7 +227,7 @@ class ContourFit:
         current[index] = np.clip(values, self.lower, self.upper)[index]
         sums = np.zeros((len(self.outlines) + 1, 6))
 
-        def evaluate(own: Array, _: Array, step: Round) -> Equations:
+        def evaluate(own: Array, _: Array, step: AnnealingStage) -> Equations:
             nonlocal sums
             theta = current.copy()
             theta[index] = own[0]
@@ -249,23 +249,27 @@ class ContourFit:
         return PoseFit(fitted, sums, found.cost, found.evaluations)
 
     def compare(
-        self, cameras: Sequence[Camera], edges: Sequence[EdgePoints], theta: Array, step: Round
+        self,
+        cameras: Sequence[Camera],
+        edges: Sequence[EdgePoints],
+        theta: Array,
+        step: AnnealingStage,
     ) -> Comparison:
         """The contours at values (m,) compared with all cameras' edges; arguments as in fit."""
         return self.compare_views(pack_views(cameras, edges), theta, step)
 
-    def compare_views(self, views: Views, theta: Array, step: Round) -> Comparison:
+    def compare_views(self, views: Views, theta: Array, step: AnnealingStage) -> Comparison:
         """The contours at values (m,), or at all parameters, compared with all cameras' edges."""
         return compare_views(self.body, views, theta, step, self.noise, self._pixels)
 
     def compare_placed(
-        self, views: Views, placement: Placement, step: Round
+        self, views: Views, placement: Placement, step: AnnealingStage
     ) -> tuple[Array, Array, Array]:
         """A, b and sums of each camera, as of `compare_contours`, where the body stands."""
         weights = self.weights(views.cameras, placement, step)
         return compare_placed(placement.packed, placement.X_WN, views, weights)
 
-    def piece_costs(self, views: Views, theta: Array, step: Round, side: float) -> Array:
+    def piece_costs(self, views: Views, theta: Array, step: AnnealingStage, side: float) -> Array:
         """(cameras, k, k) the cost at values (m,) by squares of the pictures of a side [pixel]."""
         placement = self.body.place(theta)
         weights = self.weights(views.cameras, placement, step)
@@ -273,7 +277,9 @@ class ContourFit:
         compare_placed(placement.packed, placement.X_WN, views, weights, pieces, side)
         return pieces
 
-    def weights(self, cameras: tuple[Array, Array], placement: Placement, step: Round) -> Array:
+    def weights(
+        self, cameras: tuple[Array, Array], placement: Placement, step: AnnealingStage
+    ) -> Array:
         """(c, 4) of cameras, as `compare_contours` takes them."""
         return camera_weights(cameras, placement, step, self.noise, self._pixels)
 
@@ -282,7 +288,7 @@ def compare_views(
     body: BodyParameters,
     views: Views,
     theta: Array,
-    step: Round,
+    step: AnnealingStage,
     noise: Noise,
     pixels: float | None = None,
 ) -> Comparison:
@@ -304,7 +310,7 @@ def compare_views(
 def camera_weights(
     cameras: tuple[Array, Array],
     placement: Placement,
-    step: Round,
+    step: AnnealingStage,
     noise: Noise,
     pixels: float | None = None,
 ) -> Array:

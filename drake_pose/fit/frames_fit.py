@@ -15,9 +15,9 @@ from drake_pose.fit.contour_fit import Noise, compare_views, project
 from drake_pose.fit.evidence import Evidence
 from drake_pose.fit.kernel import COMPARED, COST, FITTING
 from drake_pose.fit.levenberg_marquardt import (
+    AnnealingStage,
     Coupling,
     Equations,
-    Round,
     StepSettings,
     minimise,
 )
@@ -40,7 +40,7 @@ class FittedFrames:
         shared: (q,) those of all frames.
         parameters: (frames, n) all parameters of the frames.
         costs: (frames, cameras) what does not fit.
-        shares: (frames, cameras) of both contours' lengths, what fits.
+        inlier_ratios: (frames, cameras) of both contours' lengths, what fits.
         cost: of all frames at the end, with what is known without pictures.
         equations: the normal equations at the end, priors included but for the coupling.
         coupling: what was known of the frames' own unknowns together.
@@ -50,7 +50,7 @@ class FittedFrames:
     shared: Array
     parameters: Array
     costs: Array
-    shares: Array
+    inlier_ratios: Array
     cost: float
     equations: Equations
     coupling: Coupling | None = None
@@ -133,7 +133,7 @@ class FramesFit:
         held: Array,
         own: Array,
         shared: Array,
-        rounds: Sequence[Round],
+        rounds: Sequence[AnnealingStage],
         *,
         expected: tuple[Array, Array] | None = None,
         shared_information: Array | None = None,
@@ -165,7 +165,7 @@ class FramesFit:
         base[:, : held.shape[1]] = held
         about = (own.copy(), shared.copy()) if expected is None else expected
 
-        def evaluate(own: Array, shared: Array, step: Round) -> Equations:
+        def evaluate(own: Array, shared: Array, step: AnnealingStage) -> Equations:
             return self._equations(frames, base, (own, shared), about, step, shared_information)[0]
 
         limits = self.unknowns.lower, self.unknowns.upper
@@ -189,7 +189,12 @@ class FramesFit:
         )
 
     def equations(
-        self, frames: Sequence[Evidence], held: Array, own: Array, shared: Array, step: Round
+        self,
+        frames: Sequence[Evidence],
+        held: Array,
+        own: Array,
+        shared: Array,
+        step: AnnealingStage,
     ) -> Equations:
         """The normal equations at some unknowns; arguments as in fit."""
         base = np.zeros((len(frames), len(self.names)))
@@ -202,7 +207,7 @@ class FramesFit:
         base: Array,
         at: tuple[Array, Array],
         about: tuple[Array, Array],
-        step: Round,
+        step: AnnealingStage,
         shared_information: Array | None,
     ) -> tuple[Equations, Array, Array]:
         unknowns = self.unknowns
@@ -236,7 +241,9 @@ class FramesFit:
             np.array(shares),
         )
 
-    def _frame(self, evidence: Evidence, theta: Array, step: Round) -> tuple[Array, Array, Array]:
+    def _frame(
+        self, evidence: Evidence, theta: Array, step: AnnealingStage
+    ) -> tuple[Array, Array, Array]:
         """A frame's equations of all its parameters, and its sums."""
         size = len(self._body.names)
         X_CW, kernel, motions = self._cameras.place(theta[size:])

@@ -29,7 +29,7 @@ _STANDSTILL = 1e-3
 
 
 @dataclass(frozen=True)
-class Round:
+class AnnealingStage:
     """A part of a fit at one scale; lengths in m, or in the unit that the fit is told.
 
     Args:
@@ -124,11 +124,11 @@ class Minimum:
 
 
 def minimise(
-    evaluate: Callable[[Array, Array, Round], Equations],
+    evaluate: Callable[[Array, Array, AnnealingStage], Equations],
     own: Array,
     shared: Array,
     limits: tuple[Array, Array],
-    rounds: Sequence[Round],
+    rounds: Sequence[AnnealingStage],
     settings: StepSettings | None = None,
     coupling: Coupling | None = None,
 ) -> Minimum:
@@ -176,11 +176,11 @@ def minimise(
 
 
 def _coupled(
-    evaluate: Callable[[Array, Array, Round], Equations], coupling: Coupling
-) -> Callable[[Array, Array, Round], Equations]:
+    evaluate: Callable[[Array, Array, AnnealingStage], Equations], coupling: Coupling
+) -> Callable[[Array, Array, AnnealingStage], Equations]:
     """The same equations with a coupling's slope and cost; its curvature is no frame's own."""
 
-    def evaluate_coupled(own: Array, shared: Array, step: Round) -> Equations:
+    def evaluate_coupled(own: Array, shared: Array, step: AnnealingStage) -> Equations:
         found = evaluate(own, shared, step)
         slope, cost = coupling.slope_and_cost(own)
         g = found.g.copy()

@@ -23,7 +23,7 @@ from drake_pose.camera.models import Camera
 from drake_pose.fit.contour_fit import Noise
 from drake_pose.fit.evidence import EdgePoints, pack_evidence
 from drake_pose.fit.frames_fit import FramesFit
-from drake_pose.fit.levenberg_marquardt import Coupling, Round
+from drake_pose.fit.levenberg_marquardt import AnnealingStage, Coupling
 from drake_pose.fit.parameters import (
     ROOT_NAMES,
     BodyParameters,
@@ -335,7 +335,11 @@ class ProportionSettings:
     angle_deviation: float = 0.3
     shift_deviation: float = 0.03
     growth_deviation: float = 0.02
-    rounds: tuple[Round, ...] = (Round(15.0, 3.0, 6), Round(6.0, 3.0, 6), Round(3.0, 3.0, 8))
+    rounds: tuple[AnnealingStage, ...] = (
+        AnnealingStage(15.0, 3.0, 6),
+        AnnealingStage(6.0, 3.0, 6),
+        AnnealingStage(3.0, 3.0, 8),
+    )
     noise: Noise = field(default_factory=lambda: Noise(2.0, 12.0))
 
 

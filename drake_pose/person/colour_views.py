@@ -25,7 +25,7 @@ from drake_pose.fit.contour_fit import (
     pack_cameras,
     pixels_per_metre,
 )
-from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import Placement
 
 Array = NDArray[np.float64]
@@ -104,7 +104,7 @@ class ColourViews:
         self.known, self._settings = known, settings or PersonColourSettings()
         self._packed = pack_cameras(cameras)
 
-    def compare(self, fit: ContourFit, placement: Placement, step: Round) -> Comparison:
+    def compare(self, fit: ContourFit, placement: Placement, step: AnnealingStage) -> Comparison:
         """What each camera says of a body where it stands."""
         count, nodes = len(self.cameras), len(placement.X_WN)
         weights = fit.weights(
@@ -124,7 +124,7 @@ class ColourViews:
     def add_up(self, fit: ContourFit) -> AddUp:
         """What compares a body with all pictures and adds up."""
 
-        def total(placement: Placement, step: Round) -> CameraSum:
+        def total(placement: Placement, step: AnnealingStage) -> CameraSum:
             return self.compare(fit, placement, step).total
 
         return total

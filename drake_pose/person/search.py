@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from drake_pose.errors import SettingsError
 from drake_pose.fit.contour_fit import ContourFit, PoseFit, Prior
 from drake_pose.fit.kernel import COMPARED, FITTING
-from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.person.body_plan import BodyPlan, PlannedLimb, crowding
 from drake_pose.person.frame_views import FrameViews
 from drake_pose.person.limb_placement import score_limb_placements, worth_of_pixels
@@ -50,13 +50,13 @@ class SearchSettings:
         mended: where nothing is known yet, for how many of these all doubtful limbs are searched.
     """
 
-    rounds: tuple[Round, ...] = (
-        Round(0.15, 0.06),
-        Round(0.10, 0.06),
-        Round(0.07, 0.06),
-        Round(0.05, 0.06),
-        Round(0.03, 0.05),
-        Round(0.02, 0.05),
+    rounds: tuple[AnnealingStage, ...] = (
+        AnnealingStage(0.15, 0.06),
+        AnnealingStage(0.10, 0.06),
+        AnnealingStage(0.07, 0.06),
+        AnnealingStage(0.05, 0.06),
+        AnnealingStage(0.03, 0.05),
+        AnnealingStage(0.02, 0.05),
     )
     limb_fits: float = 0.8
     limb_gain: float = 0.15
@@ -136,7 +136,7 @@ class PersonSearch:
             limbs: how many limbs are searched; None: all that are doubtful.
         """
         best = _better(fitted, self._refine(fitted.values, frame_views))
-        if best.share >= enough:
+        if best.inlier_ratio >= enough:
             return best
         doubtful = self._doubtful(best, frame_views)
         begin = first % len(doubtful)
@@ -154,7 +154,7 @@ class PersonSearch:
                 guesses[-1][limb.values] = pose
             for values in guesses:
                 best = _better(best, self._refine(values, frame_views))
-            if best.share >= enough:
+            if best.inlier_ratio >= enough:
                 break
         return best
 

@@ -18,7 +18,7 @@ from drake_pose.errors import ModelError
 from drake_pose.fit.contour_fit import ContourFit, Noise
 from drake_pose.fit.evidence import NO_EDGE, EdgePoints, Evidence, pack_evidence
 from drake_pose.fit.frames_fit import FramesFit
-from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import GIRTH_PREFIX, BodyParameters
 from drake_pose.fit.surfaces import with_girths
 from drake_pose.fit.unknowns import Unknowns, choose, join
@@ -44,15 +44,15 @@ class ShapeSettings:
         pose_deviation: how far a frame's angles are off where they were [rad].
     """
 
-    rounds: tuple[Round, ...] = (
-        Round(0.10, 0.04),
-        Round(0.08, 0.04),
-        Round(0.06, 0.04),
-        Round(0.05, 0.04),
-        Round(0.04, 0.04),
-        Round(0.04, 0.04),
-        Round(0.03, 0.04),
-        Round(0.03, 0.04),
+    rounds: tuple[AnnealingStage, ...] = (
+        AnnealingStage(0.10, 0.04),
+        AnnealingStage(0.08, 0.04),
+        AnnealingStage(0.06, 0.04),
+        AnnealingStage(0.05, 0.04),
+        AnnealingStage(0.04, 0.04),
+        AnnealingStage(0.04, 0.04),
+        AnnealingStage(0.03, 0.04),
+        AnnealingStage(0.03, 0.04),
     )
     length_deviation: float = 0.03
     side_deviation: float = 0.005

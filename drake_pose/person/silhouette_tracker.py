@@ -18,7 +18,7 @@ from drake_pose.errors import SettingsError
 from drake_pose.fit.camera_sums import AddUp
 from drake_pose.fit.contour_fit import ContourFit, PoseFit, Prior
 from drake_pose.fit.kernel import COMPARED, FITTING, SQUARES, WEIGHT
-from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.person.body_plan import BodyPlan
 from drake_pose.person.colour_views import ColourViews
 from drake_pose.person.frame_views import FrameViews
@@ -52,10 +52,10 @@ class TrackerSettings:
         search: how limbs and persons are searched.
     """
 
-    rounds: tuple[Round, ...] = (
-        Round(0.08, 0.06),
-        Round(0.04, 0.06),
-        Round(0.02, 0.05),
+    rounds: tuple[AnnealingStage, ...] = (
+        AnnealingStage(0.08, 0.06),
+        AnnealingStage(0.04, 0.06),
+        AnnealingStage(0.02, 0.05),
     )
     carry: float = 0.7
     angle_deviation: float = 0.3
@@ -214,12 +214,12 @@ class SilhouetteTracker:
             still = np.zeros(len(self._held))
             if found is None:
                 return None
-            return TrackState(found.values, still, found.share, _USUAL)
+            return TrackState(found.values, still, found.inlier_ratio, _USUAL)
         fitted = self._fitted(last, frame_views.add_up(self.fit))
         settings, search = self.settings, self.settings.search
         enough = last.usual - settings.retry_below
-        lost = fitted.share < settings.lost_below * last.usual
-        due = fitted.share < enough and _is_due(last.troubled)
+        lost = fitted.inlier_ratio < settings.lost_below * last.usual
+        due = fitted.inlier_ratio < enough and _is_due(last.troubled)
         if due and not lost:
             fitted = self._search.mended(
                 fitted,
@@ -232,11 +232,14 @@ class SilhouetteTracker:
         state = TrackState(
             fitted.values,
             fitted.values - last.values if last.troubled == 0 else np.zeros(len(last.values)),
-            fitted.share,
-            max(fitted.share, last.usual + (fitted.share - last.usual) / settings.memory),
-            last.troubled + 1 if doubted or fitted.share < enough else 0,
+            fitted.inlier_ratio,
+            max(
+                fitted.inlier_ratio,
+                last.usual + (fitted.inlier_ratio - last.usual) / settings.memory,
+            ),
+            last.troubled + 1 if doubted or fitted.inlier_ratio < enough else 0,
         )
-        hopeless = due and fitted.share < enough and last.troubled > 0
+        hopeless = due and fitted.inlier_ratio < enough and last.troubled > 0
         return self._restarted(state, last, frame_views) if lost or doubted or hopeless else state
 
     def follow_by_colour(self, last: TrackState, colours: ColourViews) -> TrackState:
@@ -252,7 +255,7 @@ class SilhouetteTracker:
         step = fitted.values - last.values
         lengths, fitting = fitted.sums[:-1, [COMPARED, FITTING]].T
         worst = np.min(fitting / np.maximum(lengths, 1e-9), where=lengths >= _TELLING, initial=1.0)
-        return TrackState(fitted.values, step, fitted.share, last.usual, worst=float(worst))
+        return TrackState(fitted.values, step, fitted.inlier_ratio, last.usual, worst=float(worst))
 
     def distance_by_colour(self, values: Array, colours: ColourViews) -> float:
         """How far the contour at values (m,) is from the one that colours show, typically [pixel].
@@ -283,11 +286,13 @@ class SilhouetteTracker:
         search = self.settings.search
         turns = search.turns(last.troubled)
         found = self._search.found(frame_views, turns, last.values, last.usual)
-        if found is None or found.share <= state.share:
+        if found is None or found.inlier_ratio <= state.share:
             return state
         left = last.troubled + 1 if last.troubled < 0 else 1 - search.cycle
         still = np.zeros(len(found.values))
-        return replace(state, values=found.values, step=still, share=found.share, troubled=left)
+        return replace(
+            state, values=found.values, step=still, share=found.inlier_ratio, troubled=left
+        )
 
     def _fitted(self, last: TrackState, add_up: AddUp) -> PoseFit:
         """The frame fitted from where the last ones point to."""

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.registration.calibration_fit import Calibration, CalibrationFit
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-TOLD_APART = Round(0.025, 0.01)
+TOLD_APART = AnnealingStage(0.025, 0.01)
 """At this scale frames are told apart that agree and that contradict."""
 
 # A frame agrees of which this share fits of what fits in the two that fit best.
@@ -30,7 +30,7 @@ def frame_shares(fit: CalibrationFit, found: Calibration, camera: int = 0) -> Ar
                 float(width),
                 fit.values(found, camera, k),
                 float(found.log_focal[camera]),
-            ).share
+            ).inlier_ratio
             for k, width in enumerate(found.widths[camera])
         ]
     )

@@ -25,7 +25,7 @@ from drake_pose.fit.covariance import (
 )
 from drake_pose.fit.evidence import NO_EDGE, Evidence, find_edge_points, pack_evidence
 from drake_pose.fit.frames_fit import FittedFrames, FramesFit
-from drake_pose.fit.levenberg_marquardt import Round, StepSettings
+from drake_pose.fit.levenberg_marquardt import AnnealingStage, StepSettings
 from drake_pose.fit.parameters import (
     CAMERA_NAMES,
     GIRTH_PREFIX,
@@ -41,7 +41,7 @@ from drake_pose.silhouette.areas.outline import Outline
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_FIRST = (Round(0.08, 0.02), Round(0.06, 0.02, 3))
+_FIRST = (AnnealingStage(0.08, 0.02), AnnealingStage(0.06, 0.02, 3))
 # Then as fine as the model is like the body: the finest at which so much of the contours fits.
 _SCALES, _FITS = (0.04, 0.03, 0.02, 0.01, 0.005), 0.7
 _SPACING, _ITERATIONS = 0.015, 6
@@ -55,7 +55,7 @@ _POINT_ERROR, _ERROR_LENGTH = 4.0, 100.0
 # The covariance is that of so many frames, and so many distances in them, several an unknown: a
 # surface that is not the body's is so in all frames. How far it is off shows at a scale at which
 # nothing is left out because it is off.
-_TELLING_FRAMES, _MOST_DISTANCES, _UNCUT = 4, 1000, Round(0.08, 0.015)
+_TELLING_FRAMES, _MOST_DISTANCES, _UNCUT = 4, 1000, AnnealingStage(0.08, 0.015)
 # Sizes of errors are known beforehand to a factor of twenty; the contours tell them.
 _PRIOR_DEVIATION = 3.0
 
@@ -136,10 +136,10 @@ class BundleAdjustment:
 
     def fit(self) -> AdjustedBundle:
         """Fits all, in the end as finely as the model is like the body."""
-        found = self._fitted([*_FIRST, Round(_SCALES[0], _SPACING, _ITERATIONS)], None)
+        found = self._fitted([*_FIRST, AnnealingStage(_SCALES[0], _SPACING, _ITERATIONS)], None)
         for scale in _SCALES[1:]:
-            tried = self._fitted([Round(scale, _SPACING, _ITERATIONS)], found)
-            if tried.shares[tried.shares > 0.0].mean() < _FITS:
+            tried = self._fitted([AnnealingStage(scale, _SPACING, _ITERATIONS)], found)
+            if tried.inlier_ratios[tried.inlier_ratios > 0.0].mean() < _FITS:
                 break
             found = tried
         count = len(self._body.names)
@@ -189,7 +189,7 @@ class BundleAdjustment:
             [NO_EDGE if mask is None else find_edge_points(mask, spacing) for mask in masks]
         )
 
-    def _fitted(self, rounds: Sequence[Round], found: FittedFrames | None) -> FittedFrames:
+    def _fitted(self, rounds: Sequence[AnnealingStage], found: FittedFrames | None) -> FittedFrames:
         """Fitted from where an earlier fit ended, or from the start."""
         held, lengths = self._start.copy(), np.flatnonzero(self._shape.lengths)
         held[:, self._own] = held[:, lengths] = 0.0

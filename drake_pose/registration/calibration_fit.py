@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from drake_pose.body.model import OBJECT_POSITIONS
 from drake_pose.fit.contour_fit import Comparison
 from drake_pose.fit.kernel import COST, WEIGHT
-from drake_pose.fit.levenberg_marquardt import Equations, Round, StepSettings, minimise
+from drake_pose.fit.levenberg_marquardt import AnnealingStage, Equations, StepSettings, minimise
 from drake_pose.fit.parameters import CAMERA_NAMES
 from drake_pose.registration.camera_fit import POSE_NAMES, CameraFit
 
@@ -23,11 +23,11 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 ROUNDS_WITH_CONSTANTS = (
-    *(Round(scale, 0.02) for scale in (0.12, 0.09, 0.07, 0.05, 0.03, 0.02)),
-    Round(0.01, 0.01),
+    *(AnnealingStage(scale, 0.02) for scale in (0.12, 0.09, 0.07, 0.05, 0.03, 0.02)),
+    AnnealingStage(0.01, 0.01),
     # Again and again, for what hardly shows, such as a zero that turns with the camera, gains so
     # little in a step that a round ends before it is there.
-    *(Round(0.005, 0.005, 6) for _ in range(5)),
+    *(AnnealingStage(0.005, 0.005, 6) for _ in range(5)),
 )
 """Parts of a fit that has constants to find beside cameras."""
 
@@ -119,7 +119,7 @@ class CalibrationFit:
         ]
         self.information = np.array([*cameras, *(one**-2 for one in known)])
 
-    def fit(self, start: Calibration, rounds: Sequence[Round]) -> Calibration:
+    def fit(self, start: Calibration, rounds: Sequence[AnnealingStage]) -> Calibration:
         """Fits all from where it starts.
 
         Args:
@@ -128,7 +128,7 @@ class CalibrationFit:
         """
         rows = [(c, int(k)) for c, frames in enumerate(self.which) for k in frames]
 
-        def evaluate(own: Array, shared: Array, step: Round) -> Equations:
+        def evaluate(own: Array, shared: Array, step: AnnealingStage) -> Equations:
             now = self._moved(start, shared)
             parts = [
                 self._equations(now, c, k, float(w), step)
@@ -152,7 +152,7 @@ class CalibrationFit:
             fitted[c][k] = width
         return Calibration(now.X_CW, tuple(fitted), now.log_focal, now.constants)
 
-    def bend(self, found: Calibration, by: Array, step: Round) -> tuple[float, float]:
+    def bend(self, found: Calibration, by: Array, step: AnnealingStage) -> tuple[float, float]:
         """How much the cost bends upwards to either side, and how much it should.
 
         Args:
@@ -215,13 +215,13 @@ class CalibrationFit:
         return np.concatenate([cameras.ravel(), now.constants])
 
     def _compare(
-        self, now: Calibration, camera: int, frame: int, width: float, step: Round
+        self, now: Calibration, camera: int, frame: int, width: float, step: AnnealingStage
     ) -> Comparison:
         values, focal = self.values(now, camera, frame), float(now.log_focal[camera])
         return self.fits[camera].compare(now.X_CW[camera], frame, step, width, values, focal)
 
     def _equations(
-        self, now: Calibration, camera: int, frame: int, width: float, step: Round
+        self, now: Calibration, camera: int, frame: int, width: float, step: AnnealingStage
     ) -> tuple[Array, Array, float]:
         """H, g and cost of a frame: its width first, then what is shared.
 

@@ -16,7 +16,7 @@ from drake_pose.fit.contour_fit import Comparison, ContourFit, Noise, pack_camer
 from drake_pose.fit.evidence import widened
 from drake_pose.fit.frames_fit import FramesFit
 from drake_pose.fit.lengthened_body import LengthenedBody
-from drake_pose.fit.levenberg_marquardt import Round, StepSettings
+from drake_pose.fit.levenberg_marquardt import AnnealingStage, StepSettings
 from drake_pose.fit.parameters import CAMERA_NAMES, CameraParameters
 from drake_pose.fit.unknowns import choose
 from drake_pose.registration.posed_frames import PosedFrames
@@ -59,7 +59,7 @@ class CameraFit:
         )
         self._evidence = frames.evidence(max(1.0, round(spacing * frames.size)))
 
-    def fit(self, X_CW: Array, rounds: Sequence[Round]) -> Array:
+    def fit(self, X_CW: Array, rounds: Sequence[AnnealingStage]) -> Array:
         """X_CW (4, 4) fitted to all frames from where it starts, silhouettes as wide as they are.
 
         Args:
@@ -79,7 +79,7 @@ class CameraFit:
         self,
         X_CW: Array,
         frame: int,
-        step: Round,
+        step: AnnealingStage,
         width: float = 0.0,
         values: Array | None = None,
         log_focal: float = 0.0,
@@ -98,7 +98,7 @@ class CameraFit:
         values = self.values[frame] if values is None else values
         return self.contours.compare_views(views, values, step)
 
-    def piece_costs(self, X_CW: Array, widths: Array, step: Round, side: float) -> Array:
+    def piece_costs(self, X_CW: Array, widths: Array, step: AnnealingStage, side: float) -> Array:
         """(frames, k, k) costs by squares of the pictures of a side [pixel].
 
         Args:

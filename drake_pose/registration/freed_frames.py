@@ -20,7 +20,7 @@ from drake_pose.fit.contour_fit import (
     Comparison,
     ContourFit,
     Noise,
-    fitting_share,
+    inlier_ratio_of,
     pixels_per_metre,
 )
 from drake_pose.fit.covariance import Picture
@@ -33,7 +33,7 @@ from drake_pose.fit.evidence import (
 )
 from drake_pose.fit.frames_fit import FramesFit
 from drake_pose.fit.kernel import COST, WEIGHT
-from drake_pose.fit.levenberg_marquardt import Round, StepSettings
+from drake_pose.fit.levenberg_marquardt import AnnealingStage, StepSettings
 from drake_pose.fit.parameters import CAMERA_NAMES, CameraParameters
 from drake_pose.fit.unknowns import choose
 from drake_pose.registration.agreement import TOLD_APART
@@ -43,7 +43,9 @@ from drake_pose.silhouette.areas.outline import Outline
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_ROUNDS = tuple(Round(scale, 0.02) for scale in (0.12, 0.09, 0.07, 0.05, 0.04, 0.03, 0.025))
+_ROUNDS = tuple(
+    AnnealingStage(scale, 0.02) for scale in (0.12, 0.09, 0.07, 0.05, 0.04, 0.03, 0.025)
+)
 _STEPS = StepSettings(longest=0.2, damping=1e-3, even_damping=1e-6)
 # From one point of a silhouette's edge to the next [root of the silhouettes' area].
 _SPACING = 1.0 / 100.0
@@ -206,7 +208,7 @@ class FrameFreer:
 
     def _shares(self, compared: Comparison, frame: SeenFrame) -> dict[str, float]:
         return {
-            camera.name: fitting_share(compared.sums[c])
+            camera.name: inlier_ratio_of(compared.sums[c])
             for c, camera in enumerate(self._cameras)
             if camera.name in frame.masks
         }

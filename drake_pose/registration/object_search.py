@@ -17,7 +17,7 @@ from drake_pose.body.model import OBJECT_POSITIONS
 from drake_pose.body.tree.joint_map import inverse_transforms
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
-from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.registration.calibration_fit import (
     ROUNDS_WITH_CONSTANTS,
     Calibration,
@@ -192,7 +192,7 @@ class ObjectSearch:
         return fit, [fit.names.index(name) for name in OBJECT_POSITIONS]
 
     def _calibrate(
-        self, fit: CameraFit, look: Look, constants: Sequence[int], rounds: Sequence[Round]
+        self, fit: CameraFit, look: Look, constants: Sequence[int], rounds: Sequence[AnnealingStage]
     ) -> Calibration:
         start = start_calibration([fit], [inverse_transforms(look[0])], len(constants))
         every = np.arange(len(fit.values))

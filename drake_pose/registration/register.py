@@ -21,7 +21,7 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, SettingsError
-from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.significance import excess
 from drake_pose.fit.surfaces import FEW, VERY_FEW, few_triangles, with_girths
 from drake_pose.registration.agreement import TOLD_APART, agreeing, frame_shares
@@ -46,9 +46,14 @@ from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-COARSE = tuple(Round(s, 0.05) for s in (0.25, 0.2, 0.15, 0.12, 0.09, 0.07, 0.05, 0.04))
-FINE = (Round(0.05, 0.02), Round(0.03, 0.015), Round(0.02, 0.0125), Round(0.01, 0.0125, 4))
-LAST = (Round(0.02, 0.01), Round(0.01, 0.005), Round(0.005, 0.005, 6))
+COARSE = tuple(AnnealingStage(s, 0.05) for s in (0.25, 0.2, 0.15, 0.12, 0.09, 0.07, 0.05, 0.04))
+FINE = (
+    AnnealingStage(0.05, 0.02),
+    AnnealingStage(0.03, 0.015),
+    AnnealingStage(0.02, 0.0125),
+    AnnealingStage(0.01, 0.0125, 4),
+)
+LAST = (AnnealingStage(0.02, 0.01), AnnealingStage(0.01, 0.005), AnnealingStage(0.005, 0.005, 6))
 # Spacing of silhouettes' edge points in each of these [root of the silhouettes' area].
 COARSE_SPACING, FINE_SPACING, LAST_SPACING = 1.0 / 40.0, 1.0 / 80.0, 1.0 / 300.0
 # Sides of silhouettes in the pictures in which poses are compared [pixel].

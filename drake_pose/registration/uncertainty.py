@@ -27,7 +27,7 @@ from drake_pose.fit.covariance import (
     values_covariance,
     widening,
 )
-from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.registration.agreement import TOLD_APART
 from drake_pose.registration.calibration_fit import Calibration, CalibrationFit
 
@@ -37,7 +37,7 @@ KNOWN_BEFOREHAND = 20
 """The scale of frames' errors is known beforehand as well as so many distances tell it."""
 
 # At this scale a calibration was fitted in the end.
-_FITTED = Round(0.005, 0.005)
+_FITTED = AnnealingStage(0.005, 0.005)
 # Sizes of errors are known beforehand to a factor of twenty; frames tell them.
 _PRIOR_DEVIATION = 3.0
 # What a picture tells of a direction is nothing below this share of what it tells best.
@@ -85,7 +85,7 @@ def calibration_uncertainty(fit: CalibrationFit, found: Calibration) -> Uncertai
     )
 
 
-def _distances(fit: CalibrationFit, found: Calibration, step: Round) -> Distances:
+def _distances(fit: CalibrationFit, found: Calibration, step: AnnealingStage) -> Distances:
     """The distances in all pictures; their values are what is shared, then each mask's width."""
     rows = [(c, int(k)) for c, frames in enumerate(fit.which) for k in frames]
     shared = len(fit.names)

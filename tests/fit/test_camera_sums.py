@@ -21,10 +21,10 @@ from drake_pose.fit.camera_sums import (
 )
 from drake_pose.fit.contour_fit import ContourFit, Prior, pack_cameras
 from drake_pose.fit.evidence import NO_EDGE, find_edge_points, pack_evidence
-from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.silhouette.areas.scoring import draw_mask
 
-STEPS = (Round(0.08, 0.06), Round(0.04, 0.06), Round(0.02, 0.05))
+STEPS = (AnnealingStage(0.08, 0.06), AnnealingStage(0.04, 0.06), AnnealingStage(0.02, 0.05))
 GROUPS = ((0, 2, 5), (1,), (3, 4))
 
 
@@ -77,7 +77,7 @@ def test_the_fit_of_groups_is_that_of_all_cameras(world):
     apart = world.fit.fit_sums(world.grouped, world.start, STEPS, prior)
     assert np.abs(together.values - world.start).max() > 0.05
     np.testing.assert_allclose(apart.values, together.values, rtol=0.0, atol=1e-9)
-    assert apart.share == pytest.approx(together.share, abs=1e-12)
+    assert apart.inlier_ratio == pytest.approx(together.inlier_ratio, abs=1e-12)
 
 
 def test_nothing_is_lost_on_the_way(world):

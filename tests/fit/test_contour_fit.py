@@ -7,11 +7,16 @@ from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.fit.contour_fit import ContourFit, Prior
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.kernel import collect, nearest_alike
-from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import affine_motions
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
-STEPS = (Round(0.08, 0.06), Round(0.04, 0.06), Round(0.02, 0.05), Round(0.02, 0.05))
+STEPS = (
+    AnnealingStage(0.08, 0.06),
+    AnnealingStage(0.04, 0.06),
+    AnnealingStage(0.02, 0.05),
+    AnnealingStage(0.02, 0.05),
+)
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +144,7 @@ class TestFit:
         found = fit.fit(cameras, edges, start, (*STEPS, *STEPS), prior)
         off = fit.kinematics.poses(found.values) - fit.kinematics.poses(true[order])
         assert 1e3 * np.linalg.norm(off[:, :3, 3], axis=1).max() < 12.0
-        assert found.share > 0.9
+        assert found.inlier_ratio > 0.9
         assert (found.values >= fit.lower).all()
         assert (found.values <= fit.upper).all()
 

@@ -11,7 +11,7 @@ from drake_pose.fit.covariance import (
     estimate_sizes,
     values_covariance,
 )
-from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import few_triangles
 from drake_pose.search.continuous.views_fit import ViewsFit
 from drake_pose.search.estimates import View
@@ -19,8 +19,8 @@ from drake_pose.silhouette.areas.bending import TreeSurfaces
 from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_pose, draw_view
 from tests.search.mask_damage import nudge_camera
 
-FINE = tuple(Round(scale, 0.0125, 8) for scale in (0.025, 0.0125))
-STEP = Round(0.025, 0.0125)
+FINE = tuple(AnnealingStage(scale, 0.0125, 8) for scale in (0.025, 0.0125))
+STEP = AnnealingStage(0.025, 0.0125)
 ANGLES = np.ones(3, dtype=bool)
 ALL = np.arange(3)
 

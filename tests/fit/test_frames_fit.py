@@ -13,7 +13,7 @@ from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.fit.evidence import find_edge_points, pack_evidence
 from drake_pose.fit.frames_fit import FittedFrames, FramesFit
-from drake_pose.fit.levenberg_marquardt import Coupling, Equations, Round
+from drake_pose.fit.levenberg_marquardt import AnnealingStage, Coupling, Equations
 from drake_pose.fit.parameters import (
     CAMERA_NAMES,
     GIRTH_PREFIX,
@@ -27,7 +27,11 @@ from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask
 
-ROUNDS = (Round(0.08, 0.04, 3), Round(0.04, 0.03, 3), Round(0.01, 0.02, 8))
+ROUNDS = (
+    AnnealingStage(0.08, 0.04, 3),
+    AnnealingStage(0.04, 0.03, 3),
+    AnnealingStage(0.01, 0.02, 8),
+)
 BENT = ("left_forearm_x", "right_forearm_x", "left_shin_x", "right_shin_x")
 
 
@@ -125,7 +129,7 @@ class TestKnownAnswers:
         found = fit.fit(frames, held, np.zeros((2, 7)), np.zeros(0), ROUNDS)
         np.testing.assert_allclose(found.own[:, :4], wanted[:, :4], atol=0.06)
         np.testing.assert_allclose(found.own[:, 4:], wanted[:, 4:], atol=0.004)
-        assert found.shares.min() > 0.9
+        assert found.inlier_ratios.min() > 0.9
 
     def test_camera_pose_where_the_poses_are_known(self, body, rig):
         truth = poses(body, 4, 2)
@@ -221,7 +225,7 @@ def test_equations_are_the_slope_of_the_cost(body, rig):
     fit = FramesFit(body, cameras, choose(all_names, all_names))
     evidence = [draw(body, cameras, truth[0])]
     base = np.pad(truth, ((0, 0), (0, 14)))
-    step = Round(0.1, 0.002)
+    step = AnnealingStage(0.1, 0.002)
     generator = np.random.default_rng(0)
     base += 0.015 * generator.uniform(-1, 1, base.shape)
     none = np.zeros(0)

@@ -6,9 +6,9 @@ from scipy.optimize import lsq_linear
 from scipy.sparse import csr_array
 
 from drake_pose.fit.levenberg_marquardt import (
+    AnnealingStage,
     Coupling,
     Equations,
-    Round,
     StepSettings,
     minimise,
 )
@@ -53,7 +53,7 @@ def test_minimum_of_a_linear_problem_inside_limits(frames, p, q):
         np.zeros((frames, p)),
         np.zeros(q),
         limits,
-        [Round(1.0, 1.0, 40)] * 20,
+        [AnnealingStage(1.0, 1.0, 40)] * 20,
         StepSettings(damping=1e-4, even_damping=0.0),
     )
     matrix, right = whole(A, b)(p)
@@ -72,7 +72,7 @@ def test_step_of_all_frames_is_that_of_the_whole_system(frames, p, q):
         np.zeros((frames, p)),
         np.zeros(q),
         (np.full(p + q, -np.inf), np.full(p + q, np.inf)),
-        [Round(1.0, 1.0)],
+        [AnnealingStage(1.0, 1.0)],
         StepSettings(longest=1e3, damping=share, even_damping=0.0),
     )
     matrix, right = whole(A, b)(p)
@@ -102,7 +102,7 @@ def test_minimum_of_frames_whose_own_unknowns_couple(q, bound):
         np.zeros((frames, p)),
         np.zeros(q),
         limits,
-        [Round(1.0, 1.0, 40)] * 20,
+        [AnnealingStage(1.0, 1.0, 40)] * 20,
         StepSettings(longest=10.0, damping=1e-4, even_damping=0.0),
         Coupling(csr_array(rows), mean, information),
     )

@@ -5,7 +5,7 @@ import pytest
 
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.errors import SettingsError
-from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import few_triangles
 from drake_pose.search.continuous.views_fit import FittedPose, ViewsFit, distinct
 from drake_pose.search.estimates import View
@@ -13,7 +13,7 @@ from drake_pose.search.starts.coarse_search import signed_distances
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from tests.search.arms import arm_cameras, arm_tree, draw_pose, draw_view
 
-FINE = tuple(Round(scale, 0.0125, 8) for scale in (0.05, 0.025, 0.0125))
+FINE = tuple(AnnealingStage(scale, 0.0125, 8) for scale in (0.05, 0.025, 0.0125))
 
 
 @pytest.fixture(scope="module")
@@ -87,4 +87,4 @@ def test_distinct_keeps_the_best_of_those_alike() -> None:
 @pytest.mark.parametrize(("name", "value"), [("scale", 0.0), ("iterations", 0), ("spacing", 0.0)])
 def test_settings_out_of_range(name: str, value: float) -> None:
     with pytest.raises(SettingsError, match=name):
-        Round(**{"scale": 1.0, "iterations": 1, "spacing": 1.0, name: value})
+        AnnealingStage(**{"scale": 1.0, "iterations": 1, "spacing": 1.0, name: value})

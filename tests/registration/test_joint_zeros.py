@@ -7,7 +7,7 @@ import pytest
 
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.errors import RegistrationError, UnknownNameError
-from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.registration.calibration_fit import CalibrationFit, start_calibration
 from drake_pose.registration.camera_fit import CameraFit
 from drake_pose.registration.joint_zeros import calibrate_joints
@@ -144,6 +144,6 @@ def test_the_cost_bends_as_the_normal_equations_say(
     fit = CalibrationFit([own], [np.arange(len(frames))], [zero])
     by = np.append(np.zeros(6), np.radians(0.1))
     found = start_calibration([own], [camera.X_CW], 1)
-    bends, said = fit.bend(found, by, Round(0.005, 0.005))
+    bends, said = fit.bend(found, by, AnnealingStage(0.005, 0.005))
     assert said > 0.0
     assert bends == pytest.approx(said, rel=0.5)

@@ -48,7 +48,7 @@ from drake_pose.fit.contour_fit import (
 )
 from drake_pose.fit.evidence import NO_EDGE, find_edge_points
 from drake_pose.fit.kernel import COMPARED, FITTING, SQUARES, WEIGHT
-from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import BodyParameters
 from drake_pose.fit.surfaces import MANY, few_rigid_triangles
 from drake_pose.search.starts.root_placement import slide_root
@@ -519,12 +519,12 @@ class ContourObservation:
         self, seen: Seen, x: Array, width: float, number: int
     ) -> tuple[Comparison, float] | None:
         """Contours compared with so wide a scale [pixel], and how far they are apart [pixel]."""
-        step = Round(width, self.settings.spacing)
+        step = AnnealingStage(width, self.settings.spacing)
         compared = compare_views(self._body, seen.views, self.parameters(x), step, _PLAIN, 1.0)
         if seen.colours is not None and seen.has_pictures:
             pixels = self.colours.step(number)
             # Coarse lines are so wide that they would say the same.
-            lines = Round(width, self.colours.spacing * min(pixels, 2))
+            lines = AnnealingStage(width, self.colours.spacing * min(pixels, 2))
             correlation = _PLAIN.correlation * self.colours.correlation / self.settings.correlation
             noise = replace(_PLAIN, correlation=correlation)
             add_pictures(compared, self.cameras, seen.pictures, seen.colours, lines, noise, pixels)

@@ -20,7 +20,7 @@ from drake_pose.filtering.measurements.contour import Mask
 from drake_pose.filtering.tracking.contour_tracker import ContourTracker
 from drake_pose.fit.contour_fit import Noise
 from drake_pose.fit.evidence import find_edge_points
-from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.proportions import (
     FittedProportions,
     ProportionedBody,
@@ -42,7 +42,7 @@ _SAME = 0.1
 # Triangles of each rigid part, and the distance of the silhouettes' points [pixel].
 _TRIANGLES, _SPACING = 160, 2.0
 # The parts of a fit [pixel].
-_ROUNDS = (Round(15.0, 3.0, 6), Round(6.0, 3.0, 8), Round(3.0, 3.0, 20))
+_ROUNDS = (AnnealingStage(15.0, 3.0, 6), AnnealingStage(6.0, 3.0, 8), AnnealingStage(3.0, 3.0, 20))
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from drake_pose.compiled import is_stored
 from drake_pose.fit.kernel import collect
 from drake_pose.fit.surfaces import few_triangles
 from drake_pose.search.continuous.multi_start import MultiStartSearch
-from drake_pose.search.continuous.multi_start_settings import HALFWAY
+from drake_pose.search.continuous.multi_start_settings import MEDIUM
 from drake_pose.search.continuous.views_fit import ViewsFit
 from drake_pose.search.estimates import View
 
@@ -55,7 +55,7 @@ def main() -> None:
     surfaces = search.sampled.surfaces
     fit = ViewsFit(TreeKinematics(tree), few_triangles(surfaces), [view])
     values = fit.kinematics.flatten(tree.default_values())
-    fit.refine(values, HALFWAY)
+    fit.refine(values, MEDIUM)
     search.match([view])
 
 

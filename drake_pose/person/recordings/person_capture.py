@@ -18,7 +18,7 @@ from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.fit.evidence import EdgePoints
-from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.person.search import SearchSettings
 from drake_pose.person.shape import PersonShape, fit_shape, shape_noise, shape_values
 from drake_pose.person.silhouette_tracker import (
@@ -43,10 +43,17 @@ _SURE = 0.97
 
 def _lenient() -> TrackerSettings:
     """A model that is only like the person fits to within centimetres."""
-    ends = (Round(0.07, 0.05), Round(0.05, 0.05), Round(0.04, 0.04))
+    ends = (AnnealingStage(0.07, 0.05), AnnealingStage(0.05, 0.05), AnnealingStage(0.04, 0.04))
     return TrackerSettings(
-        rounds=(Round(0.10, 0.06), *ends),
-        search=SearchSettings((Round(0.20, 0.06), Round(0.15, 0.06), Round(0.10, 0.06), *ends)),
+        rounds=(AnnealingStage(0.10, 0.06), *ends),
+        search=SearchSettings(
+            (
+                AnnealingStage(0.20, 0.06),
+                AnnealingStage(0.15, 0.06),
+                AnnealingStage(0.10, 0.06),
+                *ends,
+            )
+        ),
     )
 
 

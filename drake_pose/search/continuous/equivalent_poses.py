@@ -19,17 +19,17 @@ from scipy.special import stdtrit
 
 from drake_pose.errors import SettingsError
 from drake_pose.fit.covariance import ErrorSizes, estimate_sizes, values_covariance
-from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.significance import excess
 from drake_pose.search.continuous.views_fit import FittedPose, ViewsFit
 from drake_pose.search.estimates import JointEstimate, PoseFamily, PoseSet
 from drake_pose.search.starts.self_motions import Flip, flips
 
-_LOOK = Round(0.0125, 0.026, 2)
+_LOOK = AnnealingStage(0.0125, 0.026, 2)
 # What follows a value that is moved.
-_FOLLOW = (Round(0.025, 0.026, 2), Round(0.0125, 0.026, 2))
+_FOLLOW = (AnnealingStage(0.025, 0.026, 2), AnnealingStage(0.0125, 0.026, 2))
 # Distances that count less in the fit tell of errors, too.
-_FINE = Round(0.025, 0.0125)
+_FINE = AnnealingStage(0.025, 0.0125)
 # The longest step of a value that is moved, angle [rad] and length [m].
 _LONGEST_STEPS = 0.5, 0.1
 # Each step of a value that is moved is longer by this factor.

@@ -18,14 +18,14 @@ import numpy as np
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.errors import SettingsError
-from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import few_triangles
 from drake_pose.search.continuous.equivalent_poses import RobustFamilies
 from drake_pose.search.continuous.mask_noise import without_specks
 from drake_pose.search.continuous.multi_start_settings import (
-    FROM_AFAR,
-    HALFWAY,
-    IN_THE_END,
+    COARSE,
+    FINAL,
+    MEDIUM,
     MultiStartSettings,
 )
 from drake_pose.search.continuous.views_fit import (
@@ -154,7 +154,7 @@ class _MultiStartRun:
         pool = refine_best(
             self.fit,
             self._values(starts),
-            [(FROM_AFAR, settings.survivors), (HALFWAY, settings.survivors)],
+            [(COARSE, settings.survivors), (MEDIUM, settings.survivors)],
             self._proceed,
         )
         self.first = pool[0]
@@ -170,7 +170,7 @@ class _MultiStartRun:
         refined = refine_best(
             self.fit,
             [pose.values for pose in pool[: settings.finalists]],
-            [(IN_THE_END, settings.finalists)],
+            [(FINAL, settings.finalists)],
             self._proceed,
         )
         turned = [self.kinematics.nearest_turns(pose.values) for pose in refined]
@@ -198,12 +198,12 @@ class _MultiStartRun:
             found = search.find_again(X_WN, nodes)
             best = search.choose_distinct(found, settings.tried, settings.apart)
             tried += self._values(best, values)
-        look = Round(HALFWAY[0].scale, FROM_AFAR[0].spacing)
+        look = AnnealingStage(MEDIUM[0].scale, COARSE[0].spacing)
         best_looks = []
         for group, count in ((flipped, settings.flipped), (tried, settings.tried)):
             looks = [FittedPose(one, self.fit.cost(one, look)) for one in group]
             best_looks += distinct(looks, count, kinematics.turns_around, 0.5 * interval)
-        return [self.fit.refine(look.values, HALFWAY) for look in best_looks if self._proceed()]
+        return [self.fit.refine(look.values, MEDIUM) for look in best_looks if self._proceed()]
 
     def _limbs(self) -> list[list[int]]:
         """The subtrees of no more than half of the nodes."""

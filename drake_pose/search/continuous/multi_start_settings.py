@@ -4,15 +4,15 @@ import math
 from dataclasses import dataclass, field
 
 from drake_pose.errors import SettingsError
-from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.search.continuous.equivalent_poses import RobustFamilySettings
 from drake_pose.search.grid.families.examination import ExaminationSettings
 from drake_pose.search.grid.settings import BeamSearchSettings
 from drake_pose.search.starts.coarse_search import CoarseSettings
 
-FROM_AFAR = (Round(0.1, 0.04, 3), Round(0.05, 0.04, 3))
-HALFWAY = (Round(0.05, 0.026, 4), Round(0.025, 0.026, 4))
-IN_THE_END = (Round(0.0125, 0.0125, 6),)
+COARSE = (AnnealingStage(0.1, 0.04, 3), AnnealingStage(0.05, 0.04, 3))
+MEDIUM = (AnnealingStage(0.05, 0.026, 4), AnnealingStage(0.025, 0.026, 4))
+FINAL = (AnnealingStage(0.0125, 0.0125, 6),)
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from drake_pose.fit.contour_fit import (
 from drake_pose.fit.covariance import Distances, distances
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.kernel import COST
-from drake_pose.fit.levenberg_marquardt import Round, StepSettings
+from drake_pose.fit.levenberg_marquardt import AnnealingStage, StepSettings
 from drake_pose.search.estimates import View
 from drake_pose.silhouette.areas.outline import Outline
 
@@ -82,27 +82,27 @@ class ViewsFit:
         self.camera_count = len(views)
         self.evaluations = 0
 
-    def cost(self, values: np.ndarray, step: Round) -> float:
+    def cost(self, values: np.ndarray, step: AnnealingStage) -> float:
         """What does not fit at values (m,) [pixel]."""
         self.evaluations += 1
         sums = self._fit.compare_views(self._views, values, step).sums
         return float(sums[..., COST].sum()) / self._scale(step) ** 2
 
-    def distances(self, values: np.ndarray, step: Round) -> Distances:
+    def distances(self, values: np.ndarray, step: AnnealingStage) -> Distances:
         """What is left of the contours' distances at values (m,)."""
         self.evaluations += 1
         compared = self._fit.compare_views(self._views, values, step)
         unit = max(1.0, _ERROR_UNIT * self.size)
         return distances(self._fit, self._views, compared, unit)
 
-    def piece_costs(self, values: np.ndarray, step: Round) -> np.ndarray:
+    def piece_costs(self, values: np.ndarray, step: AnnealingStage) -> np.ndarray:
         """What does not fit at values (m,), by pieces of the pictures that err on their own."""
         self.evaluations += 1
         side = max(1.0, _PIECE * self.size)
         return self._fit.piece_costs(self._views, values, step, side) / self._scale(step) ** 2
 
     def refine(
-        self, values: np.ndarray, rounds: Sequence[Round], held: Sequence[int] = ()
+        self, values: np.ndarray, rounds: Sequence[AnnealingStage], held: Sequence[int] = ()
     ) -> FittedPose:
         """Refine values (m,), but for some that are held, by indices."""
         fixed = self.kinematics.upper <= self.kinematics.lower
@@ -111,14 +111,14 @@ class ViewsFit:
         self.evaluations += found.evaluations
         return FittedPose(found.values, found.cost / self._scale(rounds[-1]) ** 2)
 
-    def _scale(self, step: Round) -> float:
+    def _scale(self, step: AnnealingStage) -> float:
         return max(FINEST_SCALE, step.scale * self.size)
 
 
 def refine_best(
     fit: ViewsFit,
     starts: Sequence[np.ndarray],
-    parts: Sequence[tuple[Sequence[Round], int]],
+    parts: Sequence[tuple[Sequence[AnnealingStage], int]],
     proceed: Callable[[], bool],
 ) -> list[FittedPose]:
     """Refine many poses, after each pass only the best of those that still differ.

@@ -22,7 +22,7 @@ from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
 from drake_pose.fit.contour_fit import ContourFit, Prior
 from drake_pose.fit.evidence import NO_EDGE, find_edge_points
-from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import VERY_FEW, few_triangles
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import Outline
@@ -282,7 +282,10 @@ class PoseAndMask:
         edges = [NO_EDGE if mask is None else find_edge_points(mask, 2.0) for mask in masks]
         scale = max(_SPACING, _WIDE * float(share))
         # Rounds are in hundreds of pixels.
-        rounds = [Round(one * size / 200.0, _SPACING, 8) for one in np.geomspace(scale, _NARROW, 4)]
+        rounds = [
+            AnnealingStage(one * size / 200.0, _SPACING, 8)
+            for one in np.geomspace(scale, _NARROW, 4)
+        ]
         known = np.where(self._spread > 0.0, 1.0 / np.maximum(self._spread, 1e-9) ** 2, 0.0)
         prior = Prior(start, known)
         held = self._spread <= 0.0

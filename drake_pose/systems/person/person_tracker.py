@@ -28,7 +28,7 @@ from drake_pose.body.model import ArticulatedModel
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.fit.colour_lines import COLOURS
-from drake_pose.fit.contour_fit import ContourFit, fitting_share
+from drake_pose.fit.contour_fit import ContourFit, inlier_ratio_of
 from drake_pose.person.colour_views import ColourViews
 from drake_pose.person.frame_views import FrameViews
 from drake_pose.person.recordings.other_persons import keep_views
@@ -363,7 +363,7 @@ class PersonTracker(LeafSystem):
         fit = self._tracker.fit
         add_up = FrameViews([c for c, _ in clean], [view for _, view in clean]).add_up(fit)
         total = add_up(fit.body.place(found.values), self._tracker.settings.rounds[-1])
-        return replace(found, share=fitting_share(total.sums))
+        return replace(found, share=inlier_ratio_of(total.sums))
 
     def _calc_positions(self, context: Context, output: BasicVector) -> None:
         vector = context.get_discrete_state(self._state).value()

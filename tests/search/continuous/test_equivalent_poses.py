@@ -8,7 +8,7 @@ import pytest
 from drake_pose.body.model import load_model
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.errors import SettingsError
-from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import few_triangles
 from drake_pose.search.continuous.equivalent_poses import RobustFamilies, RobustFamilySettings
 from drake_pose.search.continuous.views_fit import ViewsFit
@@ -18,7 +18,7 @@ from drake_pose.silhouette.areas.bending import TreeSurfaces
 from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_view, split
 
 TRUTH = np.array([0.6, 0.7, -0.7, 0.9, 0.3])
-FINE = tuple(Round(scale, 0.0125, 8) for scale in (0.025, 0.0125))
+FINE = tuple(AnnealingStage(scale, 0.0125, 8) for scale in (0.025, 0.0125))
 
 
 def find(

@@ -213,6 +213,15 @@ def with_room(array: np.ndarray, used: int, rows: int) -> np.ndarray:
     return wider
 
 
+@compiled
+def multiply(X_AB: np.ndarray, X_BC: np.ndarray, X_AC: np.ndarray) -> None:
+    """Writes the upper three rows of the product of two transforms (3 or 4, 4) into a third."""
+    for i in range(3):
+        for j in range(4):
+            total = X_AB[i, 0] * X_BC[0, j] + X_AB[i, 1] * X_BC[1, j] + X_AB[i, 2] * X_BC[2, j]
+            X_AC[i, j] = total + (X_AB[i, 3] if j == 3 else 0.0)
+
+
 def is_stored(kernel: Callable[..., Any]) -> bool:
     """Whether a kernel was compiled before, for whatever arguments, and is stored."""
     cache = getattr(kernel, "_cache", None)

@@ -11,7 +11,7 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import Camera
 from drake_pose.search.estimates import PoseEstimate, View
 from drake_pose.search.settings import PaperSearchSettings
-from drake_pose.silhouette.areas.bending import TreeSurfaces, score_bending
+from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import Outline
 from drake_pose.silhouette.areas.scoring import draw_mask, prefix_sums, score_bodies, subtract_body
 
@@ -110,7 +110,7 @@ class SampledTree:
             return score_bodies(self.outlines_at(nodes, None), X_CN, camera, prefixes)
         surfaces = [self.surfaces.whole(node) for node in nodes]
         placed = [band[samples[:, column]] for column, band in bent]
-        return score_bending(surfaces, placed, X_CN, camera, prefixes)
+        return score_bodies(surfaces, X_CN, camera, prefixes, placed)
 
     def with_root_position(self, root_position: np.ndarray) -> "SampledTree":
         """The same with the root at another position (3,) [m]; all but the root is shared."""

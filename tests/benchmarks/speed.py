@@ -38,9 +38,9 @@ from drake_pose.papers.kameda.experiment import (
     run_experiment,
 )
 from drake_pose.papers.kameda.table import experiment_table
-from drake_pose.silhouette.areas.agreement import measure_agreement
 from drake_pose.silhouette.areas.outline import outline_from_mesh
-from drake_pose.silhouette.areas.scoring import prefix_sums, score_candidates
+from drake_pose.silhouette.areas.scoring import prefix_sums, score_bodies
+from tests.silhouette.agreement import measure_agreement
 
 _RENDERER = "benchmark"
 _SIDE = 700
@@ -91,7 +91,7 @@ def measure_kernel(columns: int = 14, rows: int = 16, seed: int = 0) -> KernelFi
     X_CN[:, :3, 3] = rng.uniform(-1.0, 1.0, (_CANDIDATES, 3))
     prefixes = np.array([prefix_sums(rng.random((_SIDE, _SIDE)) < 0.5) for _ in range(2)])
     outline = outline_from_mesh(mesh)
-    kernel = _fastest(lambda: score_candidates(outline, X_CN, camera, prefixes), 20)
+    kernel = _fastest(lambda: score_bodies([outline], X_CN[:, None], camera, prefixes), 20)
     render = _label_images(mesh, camera, X_CN[:_IMAGES])
     images = _fastest(render, 3)
     return KernelFigures(len(mesh.triangles), kernel / _CANDIDATES * 1e6, images / _IMAGES * 1e6)

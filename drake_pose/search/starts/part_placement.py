@@ -24,7 +24,7 @@ from drake_pose.search.raster_fit.lines import Border, clear_spans
 from drake_pose.search.raster_fit.problem import RefinementProblem
 from drake_pose.search.starts.depth_reflections import Reflection, find_reflections
 from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh, pack
-from drake_pose.silhouette.areas.prefix_sums import sum_rows
+from drake_pose.silhouette.areas.scoring import prefix_sums
 from drake_pose.silhouette.areas.span_kernel import score
 
 _TRIANGLES = 200
@@ -188,9 +188,10 @@ class PartSearch:
         """The area that nodes at poses X_WN (n, k, 4, 4) cover rightly less that wrongly, (n,)."""
         packed = pack(tuple(self._outlines[i] for i in nodes))
         total = np.zeros(len(X_WN))
+        no_parts, no_bands = np.zeros((0, 4), dtype=np.int64), np.zeros((0, 0, 3))
         for region in regions:
             X_CN = np.ascontiguousarray((region.X_CW @ X_WN)[:, :, :3])
-            areas = score(packed, X_CN, region.camera, region.sets)
+            areas = score(packed, no_parts, no_bands, X_CN, region.camera, region.sets)
             total += areas[:, 1] - areas[:, 2]
         return total
 
@@ -345,7 +346,7 @@ def _find_regions(problem: RefinementProblem, still: Sequence[Border]) -> list[_
         clear_spans(border, step, free)
         sets = np.empty((2, mask.shape[0], mask.shape[1] + 1), dtype=np.int32)
         for index, region in enumerate((mask & free, ~mask & free)):
-            sum_rows(region.view(np.uint8), sets[index], 0, len(mask))
+            sets[index] = prefix_sums(region)
         regions.append(_Regions(np.asarray(view.camera.X_CW), camera, sets))
     return regions
 

@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drake_pose.camera.models import Camera
-from drake_pose.silhouette.areas.bending_kernel import bend, score_bent
 from drake_pose.silhouette.areas.outline import (
     Outline,
     PackedOutlines,
@@ -18,7 +16,7 @@ from drake_pose.silhouette.areas.outline import (
     outline_from_mesh,
     pack,
 )
-from drake_pose.silhouette.areas.scoring import check_body, check_prefixes
+from drake_pose.silhouette.areas.projection import bend
 
 if TYPE_CHECKING:
     from drake_pose.body.surfaces.mesh import TriangleMesh
@@ -151,48 +149,3 @@ class PackedSurfaces:
         for part, skin in self._bands:
             bend(own, part, skin.vertices(values[part[0]][None])[0])
         return own
-
-
-def score_bending(
-    surfaces: Sequence[Outline | BendingOutline],
-    bands: Sequence[np.ndarray],
-    X_CN: np.ndarray,
-    camera: Camera,
-    prefixes: np.ndarray,
-) -> np.ndarray:
-    """As score_bodies, for surfaces whose bands are different at every pose.
-
-    Args:
-        surfaces: the body's surfaces.
-        bands: for each of the bending ones (n, v, 3) its band's vertices in its frame N at each
-            pose [m].
-        X_CN: (n, nodes, 4, 4) the poses in the camera.
-        camera: the camera.
-        prefixes: (k, H, W + 1) int32 prefix sums of the sets; k may be 0.
-
-    Returns:
-        (n, 1 + k) int64 area of the union inside the picture, then of its intersection with each
-        set [pixel].
-    """
-    outlines = tuple(s.rest if isinstance(s, BendingOutline) else s for s in surfaces)
-    packed, poses = check_body(outlines, X_CN)
-    parts, sizes = [], [0]
-    for node, surface in enumerate(surfaces):
-        if isinstance(surface, BendingOutline):
-            rigid = surface.rigid
-            parts.append((node, len(rigid.vertices), len(rigid.triangles), sum(sizes)))
-            sizes.append(len(surface.rest.vertices) - len(rigid.vertices))
-    given = [band.shape for band in bands]
-    if given != [(len(poses), size, 3) for size in sizes[1:]]:
-        raise ValueError(f"bands of {sizes[1:]} vertices at {len(poses)} poses, not {given}")
-    vertices = np.concatenate([np.empty((len(poses), 0, 3)), *bands], axis=1)
-    if not np.all(np.isfinite(vertices)):
-        raise ValueError("bands must be finite")
-    return score_bent(
-        packed,
-        np.array(parts, dtype=np.int64).reshape(-1, 4),
-        vertices,
-        poses,
-        camera.kernel_parameters(),
-        check_prefixes(prefixes, camera),
-    )

@@ -14,15 +14,8 @@ import numpy as np
 
 from drake_pose.compiled import compiled
 from drake_pose.silhouette.areas.outline import PackedOutlines
-from drake_pose.silhouette.areas.span_kernel import (
-    _FIRST_CAPACITY,
-    _fill_safely,
-    _find_facings,
-    _find_spans,
-    _make_work,
-    _project,
-    _Work,
-)
+from drake_pose.silhouette.areas.projection import clip_triangle, find_facings, project
+from drake_pose.silhouette.areas.span_kernel import Rows, fill_rows, find_spans, make_rows
 
 # Contested pixels are noted by tiles of 8 x 8, too: most triangles are far from any.
 _TILE = 3
@@ -69,25 +62,30 @@ def paint_labels(
         for column in range(width):
             image[row, column] = empty
     # The first row and column stay zero, for sums.
-    tiles = np.zeros(((height >> _TILE) + 2, (width >> _TILE) + 2), dtype=np.int32)
+    sums = np.zeros(((height >> _TILE) + 2, (width >> _TILE) + 2), dtype=np.int32)
     bounds = np.array([height, 0, width, 0])
-    boxes = np.zeros((X_CN.shape[0], 4), dtype=np.int64)
-    work = _make_work(packed, camera)
-    _paint_spans(packed, labels, X_CN, camera, empty, image, tiles, bounds, boxes, work)
+    rows, crossings = make_rows(packed, camera)
+    for node in range(X_CN.shape[0]):
+        crossings = fill_rows(packed, node, node + 1, X_CN, camera, crossings, rows)
+        for row in range(rows.reach[0], rows.reach[1]):
+            for k in range(find_spans(row, crossings, rows.counts, rows.changes, rows.spans)):
+                a, b = rows.spans[k, 0], rows.spans[k, 1]
+                _paint_span(image, row, a, b, labels[node], empty, sums, bounds)
     if bounds[0] >= bounds[1]:
         return
-    for i in range(1, tiles.shape[0]):
+    for i in range(1, sums.shape[0]):
         along = 0
-        for j in range(1, tiles.shape[1]):
-            along += tiles[i, j]
-            tiles[i, j] = tiles[i - 1, j] + along
-    contest = _Contest(tiles, bounds, _begin_depths(image, bounds))
+        for j in range(1, sums.shape[1]):
+            along += sums[i, j]
+            sums[i, j] = sums[i - 1, j] + along
+    top, left = bounds[0], bounds[2]
+    depths = np.empty((bounds[1] - top, bounds[3] - left), dtype=np.float32)
+    for i in range(depths.shape[0]):
+        for j in range(depths.shape[1]):
+            depths[i, j] = -np.inf if image[top + i, left + j] < 0 else np.inf
+    contest = _Contest(sums, bounds, depths)
     for node in range(X_CN.shape[0]):
-        box = boxes[node]
-        top, bottom = box[0] >> _TILE, (box[1] - 1) >> _TILE
-        left, right = box[2] >> _TILE, (box[3] - 1) >> _TILE
-        if box[0] < box[1] and _is_contested(tiles, top, bottom, left, right):
-            _draw_node(packed, node, labels[node], closed[node], X_CN, camera, image, contest, work)
+        _draw_node(packed, node, labels[node], closed[node], X_CN, camera, image, contest, rows)
     for row in range(bounds[0], bounds[1]):
         for column in range(bounds[2], bounds[3]):
             if image[row, column] < 0:  # By rounding no triangle covers it.
@@ -95,66 +93,25 @@ def paint_labels(
 
 
 @compiled
-def _paint_spans(
-    packed: PackedOutlines,
-    labels: np.ndarray,
-    X_CN: np.ndarray,
-    camera: np.ndarray,
-    empty: int,
+def _paint_span(
     image: np.ndarray,
+    row: int,
+    a: int,
+    b: int,
+    label: int,
+    empty: int,
     tiles: np.ndarray,
     bounds: np.ndarray,
-    boxes: np.ndarray,
-    work: _Work,
 ) -> None:
-    """Paints all surfaces, and marks where they contend.
-
-    Writes the rows and columns (first, after the last, first, after the last) of each surface to
-    boxes (nodes, 4). Adds 1 to tiles where there are contested pixels.
-    """
-    crossings = np.empty((int(camera[7]), _FIRST_CAPACITY), dtype=np.int32)
-    spans = work.spans
-    for node in range(X_CN.shape[0]):
-        one = PackedOutlines(
-            packed.points,
-            packed.planes,
-            packed.balls[node : node + 1],
-            packed.triangles,
-            packed.edges,
-            packed.sides,
-            packed.starts[node : node + 2],
-            packed.ordinary_ends[node : node + 1],
-        )
-        crossings = _fill_safely(one, X_CN[node : node + 1], camera, crossings, work)
-        first, last = image.shape[1], 0
-        for row in range(work.reach[0], work.reach[1]):
-            for k in range(_find_spans(row, crossings, work.counts, work.changes, spans)):
-                a, b = spans[k, 0], spans[k, 1]
-                first, last = min(first, a), max(last, b)
-                if _paint_span(image[row], a, b, labels[node], empty):
-                    _note_contested(image, row, a, b, tiles, bounds)
-        if first < last:
-            boxes[node, 0], boxes[node, 1] = work.reach[0], work.reach[1]
-            boxes[node, 2], boxes[node, 3] = first, last
-
-
-@compiled
-def _paint_span(image: np.ndarray, a: int, b: int, label: int, empty: int) -> bool:
-    """Writes a label to a row's pixels [a, b); returns whether another was there."""
+    """Writes a label to a row's pixels [a, b), and 1 to the tiles of those that had another."""
     met = False
     for column in range(a, b):
-        before = image[column]
+        before = image[row, column]
         other = (before != empty) & (before != label)
-        image[column] = np.int16(-1 - label) if other else np.int16(label)
+        image[row, column] = np.int16(-1 - label) if other else np.int16(label)
         met |= other
-    return met
-
-
-@compiled
-def _note_contested(
-    image: np.ndarray, row: int, a: int, b: int, tiles: np.ndarray, bounds: np.ndarray
-) -> None:
-    """Notes which of a row's pixels [a, b) are contested, some of which are."""
+    if not met:
+        return
     while image[row, a] >= 0:
         a += 1
     while image[row, b - 1] >= 0:
@@ -167,30 +124,6 @@ def _note_contested(
 
 
 @compiled
-def _begin_depths(image: np.ndarray, bounds: np.ndarray) -> np.ndarray:
-    """Returns depths within bounds that anything beats where an image is contested."""
-    top, left = bounds[0], bounds[2]
-    depths = np.empty((bounds[1] - top, bounds[3] - left), dtype=np.float32)
-    for i in range(depths.shape[0]):
-        for j in range(depths.shape[1]):
-            depths[i, j] = -np.inf if image[top + i, left + j] < 0 else np.inf
-    return depths
-
-
-@compiled(inline="always")
-def _is_contested(sums: np.ndarray, top: int, bottom: int, left: int, right: int) -> bool:
-    """Whether tiles top to bottom, left to right, the last included, hold contested pixels."""
-    below, beside = bottom + 1, right + 1
-    return sums[below, beside] - sums[top, beside] - sums[below, left] + sums[top, left] != 0
-
-
-@compiled(inline="always")
-def _tile(place: float, size: int) -> int:
-    """The tile of a place [pixel] along a picture's side of some size; the nearest to others."""
-    return int(min(max(place, 0.0), size - 1.0)) >> _TILE
-
-
-@compiled
 def _draw_node(
     packed: PackedOutlines,
     node: int,
@@ -200,21 +133,22 @@ def _draw_node(
     camera: np.ndarray,
     image: np.ndarray,
     contest: _Contest,
-    work: _Work,
+    rows: Rows,
 ) -> None:
     """Draws the triangles of one surface where pixels are contested."""
-    _project(packed, node, X_CN, camera, work)
-    _find_facings(packed, node, X_CN, camera, work)
-    u, v, facings, X = work.u, work.v, work.facings, X_CN[node]
+    u, v, facings, X, sums = rows.u, rows.v, rows.facings, X_CN[node], contest.sums
+    project(packed, node, X_CN, camera, u, v)
+    find_facings(packed, node, X_CN, camera, facings)
     begin = packed.starts[node, 0]
     count = packed.starts[node + 1, 0] - begin
     x, y, z = packed.points[0, begin:], packed.points[1, begin:], packed.points[2, begin:]
     nearness = np.empty(count)
-    rows, columns = np.empty(count, dtype=np.int32), np.empty(count, dtype=np.int32)
+    down, right = np.empty(count, dtype=np.int32), np.empty(count, dtype=np.int32)
     height, width = image.shape
     lowest = np.inf
     for i in range(count):
-        rows[i], columns[i] = _tile(v[i], height), _tile(u[i], width)
+        down[i] = int(min(max(v[i], 0.0), height - 1.0)) >> _TILE
+        right[i] = int(min(max(u[i], 0.0), width - 1.0)) >> _TILE
         nearness[i] = X[2, 0] * x[i] + X[2, 1] * y[i] + X[2, 2] * z[i] + X[2, 3]
         lowest = min(lowest, nearness[i])
     parallel = camera[0] == 1.0
@@ -232,60 +166,18 @@ def _draw_node(
         if whole:
             a, b = packed.triangles[first + t, 0], packed.triangles[first + t, 1]
             c = packed.triangles[first + t, 2]
-            top, bottom = min(rows[a], rows[b], rows[c]), max(rows[a], rows[b], rows[c])
-            left = min(columns[a], columns[b], columns[c])
-            right = max(columns[a], columns[b], columns[c])
-            if not _is_contested(contest.sums, top, bottom, left, right):
+            above, below = min(down[a], down[b], down[c]), max(down[a], down[b], down[c]) + 1
+            left = min(right[a], right[b], right[c])
+            beside = max(right[a], right[b], right[c]) + 1
+            if sums[below, beside] - sums[above, beside] == sums[below, left] - sums[above, left]:
                 continue
             for k in range(3):
                 i = packed.triangles[first + t, k]
                 corners[k, 0], corners[k, 1], corners[k, 2] = u[i], v[i], nearness[i]
         else:
-            size = _clip(packed, begin, first + t, X, camera, corners)
+            size = clip_triangle(packed, node, t, X_CN, camera, corners)
         for k in range(2, size):
             _draw_triangle(corners, k - 1, k, label, image, contest)
-
-
-@compiled
-def _clip(
-    packed: PackedOutlines,
-    begin: int,
-    t: int,
-    X: np.ndarray,
-    camera: np.ndarray,
-    pixels: np.ndarray,
-) -> int:
-    """Writes pixel and nearness of the corners of a triangle's part beyond the near plane.
-
-    Returns:
-        How many of the four rows of pixels (4, 3) are written.
-    """
-    near, size = camera[5], 0
-    p_C = np.empty((3, 3))
-    for k in range(3):
-        i = begin + packed.triangles[t, k]
-        x, y, z = packed.points[0, i], packed.points[1, i], packed.points[2, i]
-        for j in range(3):
-            p_C[k, j] = X[j, 0] * x + X[j, 1] * y + X[j, 2] * z + X[j, 3]
-    for a in range(3):
-        b = (a + 1) % 3
-        visible = p_C[a, 2] >= near
-        if visible:
-            pixels[size, 0] = camera[1] * p_C[a, 0] / p_C[a, 2] + camera[3]
-            pixels[size, 1] = camera[2] * p_C[a, 1] / p_C[a, 2] + camera[4]
-            pixels[size, 2] = 1.0 / p_C[a, 2]
-            size += 1
-        if visible != (p_C[b, 2] >= near):
-            # From the visible end to the hidden one, as the span kernel does.
-            i, o = (a, b) if visible else (b, a)
-            share = (near - p_C[i, 2]) / (p_C[o, 2] - p_C[i, 2])
-            x = p_C[i, 0] + share * (p_C[o, 0] - p_C[i, 0])
-            y = p_C[i, 1] + share * (p_C[o, 1] - p_C[i, 1])
-            pixels[size, 0] = camera[1] * x / near + camera[3]
-            pixels[size, 1] = camera[2] * y / near + camera[4]
-            pixels[size, 2] = 1.0 / near
-            size += 1
-    return size
 
 
 @compiled(inline="always")

@@ -7,61 +7,69 @@ from collections.abc import Sequence
 import numpy as np
 
 from drake_pose.camera.models import Camera
+from drake_pose.silhouette.areas.bending import BendingOutline
 from drake_pose.silhouette.areas.label_kernel import paint_labels
 from drake_pose.silhouette.areas.outline import Outline, PackedOutlines, pack
-from drake_pose.silhouette.areas.prefix_sums import sum_rows
 from drake_pose.silhouette.areas.span_kernel import paint, score
 
 
 def prefix_sums(mask: np.ndarray) -> np.ndarray:
     """Returns (H, W + 1) int32: how many pixels of a mask (H, W) lie left of each pixel."""
     pixels = _as_bytes(mask)
-    prefix = np.empty((pixels.shape[0], pixels.shape[1] + 1), dtype=np.int32)
-    sum_rows(pixels, prefix, 0, pixels.shape[0])
+    prefix = np.zeros((pixels.shape[0], pixels.shape[1] + 1), dtype=np.int32)
+    np.cumsum(pixels != 0, axis=1, out=prefix[:, 1:])
     return prefix
 
 
-def score_candidates(
-    outline: Outline, X_CN: np.ndarray, camera: Camera, prefixes: np.ndarray
-) -> np.ndarray:
-    """Returns the areas of one surface at many poses, and of its intersections with sets.
-
-    Args:
-        outline: the surface, in its frame N.
-        X_CN: (n, 4, 4) its poses in the camera.
-        camera: the camera.
-        prefixes: (k, H, W + 1) int32 prefix sums of the sets; k may be 0.
-
-    Returns:
-        (n, 1 + k) int64 area inside the picture, then of the intersection with each set [pixel].
-    """
-    poses = np.asarray(X_CN)
-    return score_bodies([outline], poses.reshape(-1, 1, *poses.shape[-2:]), camera, prefixes)
-
-
 def score_bodies(
-    outlines: Sequence[Outline], X_CN: np.ndarray, camera: Camera, prefixes: np.ndarray
+    surfaces: Sequence[Outline | BendingOutline],
+    X_CN: np.ndarray,
+    camera: Camera,
+    prefixes: np.ndarray,
+    bands: Sequence[np.ndarray] = (),
 ) -> np.ndarray:
-    """As score_candidates for whole bodies, whose surfaces are united exactly.
+    """Areas of a body at many poses, its surfaces united exactly, and of intersections with sets.
 
     Args:
-        outlines: the body's surfaces.
+        surfaces: the body's surfaces.
         X_CN: (n, nodes, 4, 4) their poses in the camera.
         camera: the camera.
         prefixes: (k, H, W + 1) int32 prefix sums of the sets; k may be 0.
+        bands: for each of the bending surfaces (n, v, 3) its band's vertices in its frame N at each
+            pose [m].
 
     Returns:
-        (n, 1 + k) int64 area of the union inside the picture, then of its intersection with each
-        set [pixel].
+        (n, 1 + k) int64 area inside the picture, then of the intersection with each set [pixel].
+
+    Raises:
+        ValueError: when poses, bands or sums have the wrong shape, or are not finite.
     """
-    packed, poses = check_body(outlines, X_CN)
-    sums = check_prefixes(prefixes, camera)
-    return score(packed, poses, camera.kernel_parameters(), sums)
+    packed, poses = _check_body(surfaces, X_CN)
+    parts, sizes = [], [0]
+    for node, surface in enumerate(surfaces):
+        if isinstance(surface, BendingOutline):
+            rigid = surface.rigid
+            parts.append((node, len(rigid.vertices), len(rigid.triangles), sum(sizes)))
+            sizes.append(len(surface.rest.vertices) - len(rigid.vertices))
+    given = [band.shape for band in bands]
+    if given != [(len(poses), size, 3) for size in sizes[1:]]:
+        raise ValueError(f"bands of {sizes[1:]} vertices at {len(poses)} poses, not {given}")
+    vertices = np.concatenate([np.empty((len(poses), 0, 3)), *bands], axis=1)
+    if not np.all(np.isfinite(vertices)):
+        raise ValueError("bands must be finite")
+    sums = np.require(prefixes, dtype=np.int32, requirements=["C", "W"])
+    if sums.ndim != 3 or sums.shape[1:] != (camera.height, camera.width + 1):
+        raise ValueError(
+            f"prefixes of camera '{camera.name}' must be (k, {camera.height}, {camera.width + 1}), "
+            f"not {sums.shape}"
+        )
+    numbers = np.array(parts, dtype=np.int64).reshape(-1, 4)
+    return score(packed, numbers, vertices, poses, camera.kernel_parameters(), sums)
 
 
 def draw_mask(outlines: Sequence[Outline], X_CN: np.ndarray, camera: Camera) -> np.ndarray:
     """Returns the mask (H, W) bool of a body at poses X_CN (nodes, 4, 4) in the camera."""
-    packed, poses = check_body(outlines, np.asarray(X_CN)[None])
+    packed, poses = _check_body(outlines, np.asarray(X_CN)[None])
     return draw_packed(packed, poses[0], camera)
 
 
@@ -89,7 +97,7 @@ def draw_labels(
         camera: the camera.
         empty: the label of pixels that show none.
     """
-    packed, poses = check_body(outlines, np.asarray(X_CN)[None])
+    packed, poses = _check_body(outlines, np.asarray(X_CN)[None])
     image = np.empty((camera.height, camera.width), dtype=np.int16)
     numbers = np.asarray(labels, dtype=np.int16)
     closed = np.array([outline.is_closed for outline in outlines], dtype=np.bool_)
@@ -118,7 +126,7 @@ def subtract_body(
     """
     surfaces = [outlines] if isinstance(outlines, Outline) else outlines
     poses = np.asarray(X_CN)
-    packed, poses = check_body(surfaces, poses.reshape(1, len(surfaces), *poses.shape[-2:]))
+    packed, poses = _check_body(surfaces, poses.reshape(1, len(surfaces), *poses.shape[-2:]))
     size = (camera.height, camera.width)
     for name, array, shape in (("mask", mask, size), ("prefix", prefix, (size[0], size[1] + 1))):
         if array.shape != shape or not (array.flags.c_contiguous and array.flags.writeable):
@@ -127,38 +135,21 @@ def subtract_body(
             )
     if prefix.dtype != np.int32:
         raise ValueError(f"prefix of camera '{camera.name}' must be int32, not {prefix.dtype}")
-    pixels = _as_bytes(mask)
-    first, end = paint(packed, poses[0], camera.kernel_parameters(), pixels, 0)
-    sum_rows(pixels, prefix, first, end)
+    first, end = paint(packed, poses[0], camera.kernel_parameters(), _as_bytes(mask), 0)
+    prefix[first:end] = prefix_sums(mask[first:end])
 
 
-def check_prefixes(prefixes: np.ndarray, camera: Camera) -> np.ndarray:
-    """Returns prefix sums (k, H, W + 1) int32 as the kernel wants them.
-
-    Raises:
-        ValueError: when they are of another size than the camera's pictures.
-    """
-    sums = np.require(prefixes, dtype=np.int32, requirements=["C", "W"])
-    if sums.ndim != 3 or sums.shape[1:] != (camera.height, camera.width + 1):
-        raise ValueError(
-            f"prefixes of camera '{camera.name}' must be (k, {camera.height}, {camera.width + 1}), "
-            f"not {sums.shape}"
-        )
-    return sums
-
-
-def check_body(outlines: Sequence[Outline], X_CN: np.ndarray) -> tuple[PackedOutlines, np.ndarray]:
-    """Returns the kernel's arrays, and poses (n, nodes, 4, 4) as (n, nodes, 3, 4).
-
-    Raises:
-        ValueError: when the poses have the wrong shape or are not finite.
-    """
+def _check_body(
+    surfaces: Sequence[Outline | BendingOutline], X_CN: np.ndarray
+) -> tuple[PackedOutlines, np.ndarray]:
+    """The kernel's arrays, and poses (n, nodes, 4, 4) as (n, nodes, 3, 4)."""
     poses = np.asarray(X_CN)
-    if poses.ndim != 4 or poses.shape[1] != len(outlines) or poses.shape[2:] != (4, 4):
-        raise ValueError(f"poses must be (n, {len(outlines)}, 4, 4), not {poses.shape}")
+    if poses.ndim != 4 or poses.shape[1] != len(surfaces) or poses.shape[2:] != (4, 4):
+        raise ValueError(f"poses must be (n, {len(surfaces)}, 4, 4), not {poses.shape}")
     if not np.all(np.isfinite(poses)):
         raise ValueError("poses must be finite")
-    return pack(tuple(outlines)), np.array(poses[:, :, :3], dtype=np.float64, order="C")
+    outlines = tuple(s.rest if isinstance(s, BendingOutline) else s for s in surfaces)
+    return pack(outlines), np.array(poses[:, :, :3], dtype=np.float64, order="C")
 
 
 def _as_bytes(mask: np.ndarray) -> np.ndarray:

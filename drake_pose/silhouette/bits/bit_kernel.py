@@ -1,7 +1,7 @@
 """Bit masks of one surface at many poses.
 
 The pixels are those of the span kernel, decided by the same arithmetic; only the contour edges are
-looked for among the few that can be on the contour (contour_cells).
+looked for among the few that can be on the contour (direction_cells).
 """
 
 from __future__ import annotations
@@ -11,24 +11,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_pose.compiled import compiled, with_room
-from drake_pose.silhouette.areas.bending_kernel import bend, own_copy
-from drake_pose.silhouette.areas.outline import PackedOutlines
+from drake_pose.compiled import compiled, multiply, with_room
+from drake_pose.silhouette.areas.projection import bend, own_copy, viewpoint_in_node
 from drake_pose.silhouette.areas.span_kernel import (
-    _BIAS,
-    _SHIFT,
-    _fill_safely,
-    _find_facings,
-    _find_spans,
-    _make_work,
-    _project,
-    _walk_contour,
-    _Work,
+    BIAS,
+    SHIFT,
+    Rows,
+    add_surface,
+    fill_rows,
+    find_spans,
+    make_rows,
 )
 from drake_pose.silhouette.bits.bit_view import WORD, BitView
 from drake_pose.silhouette.contours.direction_cells import CelledOutline, find_cell
 
-_FIRST_CAPACITY = 8
 _FULL = np.uint64(0xFFFFFFFFFFFFFFFF)
 
 
@@ -45,29 +41,6 @@ class _Scratch(NamedTuple):
     lines: np.ndarray
     firsts: np.ndarray
     lasts: np.ndarray
-
-
-@compiled
-def _make_scratch(edges: int) -> _Scratch:
-    """Returns room for a surface of this many edges."""
-    return _Scratch(
-        np.empty(edges + 1, dtype=np.int32),
-        np.empty(edges + 1, dtype=np.int32),
-        np.empty((edges + 1, 4)),
-        np.empty(edges + 1, dtype=np.int32),
-        np.empty(edges + 1, dtype=np.int32),
-    )
-
-
-@compiled
-def multiply(X_AB: np.ndarray, X_BC: np.ndarray, X_AC: np.ndarray) -> None:
-    """Writes the upper three rows of X_AB X_BC."""
-    for i in range(3):
-        for j in range(4):
-            total = X_AB[i, 0] * X_BC[0, j]
-            for k in range(1, 4):
-                total += X_AB[i, k] * X_BC[k, j]
-            X_AC[i, j] = total
 
 
 @compiled
@@ -97,13 +70,18 @@ def draw_bits(
         both; runs (m', 2, 3) int64 for the silhouette and the band the first word, the number of
         words, and where they begin in words; words (n,) uint64.
     """
-    packed, camera = celled.packed, view.camera
-    bends = celled.bands.shape[0] > 0
-    work, scratch = _make_work(celled.whole, camera), _make_scratch(packed.edges.shape[1])
-    band, whole = celled.band, celled.whole
+    camera, e = view.camera, celled.packed.edges.shape[1] + 1
+    rows, crossings = make_rows(celled.whole, camera)
+    scratch = _Scratch(
+        np.empty(e, dtype=np.int32),
+        np.empty(e, dtype=np.int32),
+        np.empty((e, 4)),
+        np.empty(e, dtype=np.int32),
+        np.empty(e, dtype=np.int32),
+    )
+    bends, band, whole = celled.bands.shape[0] > 0, celled.band, celled.whole
     if bends:
         band, whole = own_copy(band), own_copy(whole)
-    crossings = np.empty((int(camera[7]), _FIRST_CAPACITY), dtype=np.int32)
     X_WN, X_CN = np.zeros((4, 4)), np.empty((1, 3, 4))
     X_WN[3, 3] = 1.0
     kept = np.zeros(pairs.shape[0], dtype=np.bool_)
@@ -119,22 +97,25 @@ def draw_bits(
             continue
         multiply(X_WP[pairs[i, 0]], X_PN[pairs[i, 1]], X_WN)
         multiply(view.X_CW, X_WN, X_CN[0])
-        filled = _fill_celled(celled, X_CN, camera, crossings, work, scratch)
+        rows.reach[0], rows.reach[1], rows.reach[2] = rows.counts.shape[0], 0, 0
+        filled = _walk_cell(celled, X_CN[0], camera, crossings, rows, scratch)
         if bends and filled:
             bend(band, np.zeros(4, dtype=np.int64), celled.bands[pairs[i, 1]])
-            filled = _add_band(band, X_CN, camera, crossings, work)
-        if not filled:
+            add_surface(band, 0, X_CN, camera, crossings, rows)
+        if rows.reach[2] != 0 or not filled:
+            for row in range(rows.reach[0], rows.reach[1]):
+                rows.counts[row] = 0
             if bends:
                 bend(whole, celled.part, celled.bands[pairs[i, 1]])
-            crossings = _fill_safely(whole, X_CN, camera, crossings, work)
-        count, spans = _gather_spans(view, crossings, work, limit, spans, areas[found])
+            crossings = fill_rows(whole, 0, 1, X_CN, camera, crossings, rows)
+        count, spans = _gather_spans(view, crossings, rows, limit, spans, areas[found])
         if count < 0:
             continue
         if words.shape[0] < used + inside_size + band_size:
             words = with_room(words, used, 2 * words.shape[0] + inside_size + band_size)
-        used = write_runs(view.inside, view.window, spans, count, words, used, runs[found, 0])
+        used = write_runs(view.inside, spans, count, words, used, runs[found, 0])
         if band_size:
-            used = write_runs(view.band, view.window, spans, count, words, used, runs[found, 1])
+            used = write_runs(view.band, spans, count, words, used, runs[found, 1])
         kept[i] = True
         found += 1
         if one_enough[pairs[i, 0]]:
@@ -143,99 +124,38 @@ def draw_bits(
 
 
 @compiled
-def _fill_celled(
-    celled: CelledOutline,
-    X_CN: np.ndarray,
-    camera: np.ndarray,
-    crossings: np.ndarray,
-    work: _Work,
-    scratch: _Scratch,
-) -> bool:
-    """As the kernel's _fill_rows; False (and nothing done) where the cell's edges will not do."""
-    packed = celled.packed
-    work.reach[0], work.reach[1], work.reach[2] = int(camera[7]), 0, 0
-    if packed.planes.shape[1] == 0:
-        return True
-    X, ball, parallel = X_CN[0], packed.balls[0], camera[0] == 1.0
-    e0, e1, e2, share = X[2, 0], X[2, 1], X[2, 2], 0.0
-    d0, d1, d2 = e0, e1, e2
-    if not parallel:
-        t0, t1, t2, share = X[0, 3], X[1, 3], X[2, 3], 1.0
-        e0 = -(X[0, 0] * t0 + X[1, 0] * t1 + X[2, 0] * t2)
-        e1 = -(X[0, 1] * t0 + X[1, 1] * t1 + X[2, 1] * t2)
-        e2 = -(X[0, 2] * t0 + X[1, 2] * t1 + X[2, 2] * t2)
-        d0, d1, d2 = e0 - ball[0], e1 - ball[1], e2 - ball[2]
-        distance = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
-        depth = X[2, 0] * ball[0] + X[2, 1] * ball[1] + X[2, 2] * ball[2] + X[2, 3]
-        if depth - 1.000001 * ball[3] < camera[5] or ball[3] > celled.reach[0] * distance:
-            return False
-    facing = (e0, e1, e2, share)
-    view_matrix = _picture_rows(X, camera)
-    cell = find_cell(d0, d1, d2)
-    begin, end = celled.cell_starts[cell], celled.cell_starts[cell + 1]
-    _walk_cell(
-        celled, begin, end, facing, view_matrix, camera, crossings, work.counts, work.reach, scratch
-    )
-    if work.reach[2] != 0:
-        for row in range(work.reach[0], work.reach[1]):
-            work.counts[row] = 0
-        return False
-    return True
-
-
-@compiled
-def _add_band(
-    band: PackedOutlines, X_CN: np.ndarray, camera: np.ndarray, crossings: np.ndarray, work: _Work
-) -> bool:
-    """Adds a surface's crossings to those in the rows; False (and the rows empty) if it cannot."""
-    possible = True
-    if camera[0] == 0.0:
-        X, ball = X_CN[0], band.balls[0]
-        depth = X[2, 0] * ball[0] + X[2, 1] * ball[1] + X[2, 2] * ball[2] + X[2, 3]
-        possible = depth - 1.000001 * ball[3] >= camera[5]
-    if possible:
-        _project(band, 0, X_CN, camera, work)
-        _find_facings(band, 0, X_CN, camera, work)
-        _walk_contour(band, 0, camera, crossings, work)
-        possible = work.reach[2] == 0
-    if not possible:
-        for row in range(work.reach[0], work.reach[1]):
-            work.counts[row] = 0
-    return possible
-
-
-@compiled
-def _picture_rows(X: np.ndarray, camera: np.ndarray) -> np.ndarray:
-    """Returns (3, 4): a point's u and v [pixel], before the division by the third of a pinhole."""
-    rows = np.empty((3, 4))
-    for j in range(4):
-        rows[0, j], rows[1, j], rows[2, j] = camera[1] * X[0, j], camera[2] * X[1, j], X[2, j]
-    if camera[0] == 1.0:
-        rows[0, 3] += camera[3]
-        rows[1, 3] += camera[4]
-    return rows
-
-
-@compiled
 def _walk_cell(
     celled: CelledOutline,
-    begin: int,
-    end: int,
-    facing: tuple[float, float, float, float],
-    rows: np.ndarray,
+    X: np.ndarray,
     camera: np.ndarray,
     crossings: np.ndarray,
-    counts: np.ndarray,
-    reach: np.ndarray,
+    rows: Rows,
     scratch: _Scratch,
-) -> None:
-    """Walks the contour edges among cell_edges[begin:end] exactly as the span kernel does."""
-    parallel, cx, cy = camera[0] == 1.0, camera[3], camera[4]
+) -> bool:
+    """Walks the contour edges of the cell exactly as the span kernel does.
+
+    False, and nothing done, where the cell's edges will not do.
+    """
+    packed, counts, reach = celled.packed, rows.counts, rows.reach
+    if packed.planes.shape[1] == 0:
+        return True
+    ball, parallel, cx, cy = packed.balls[0], camera[0] == 1.0, camera[3], camera[4]
+    e0, e1, e2, share = viewpoint_in_node(X, camera)
+    d0, d1, d2 = e0 - share * ball[0], e1 - share * ball[1], e2 - share * ball[2]
+    c0, c1, c2, c3 = X[2, 0], X[2, 1], X[2, 2], X[2, 3]
+    if not parallel:
+        distance = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
+        depth = c0 * ball[0] + c1 * ball[1] + c2 * ball[2] + c3
+        if depth - 1.000001 * ball[3] < camera[5] or ball[3] > celled.reach[0] * distance:
+            return False
+    cell = find_cell(d0, d1, d2)
+    begin, end = celled.cell_starts[cell], celled.cell_starts[cell + 1]
     width, height, capacity = camera[6], camera[7], crossings.shape[1]
-    a0, a1, a2, a3 = rows[0, 0], rows[0, 1], rows[0, 2], rows[0, 3]
-    b0, b1, b2, b3 = rows[1, 0], rows[1, 1], rows[1, 2], rows[1, 3]
-    c0, c1, c2, c3 = rows[2, 0], rows[2, 1], rows[2, 2], rows[2, 3]
-    e0, e1, e2, share = facing
+    fx, fy = camera[1], camera[2]
+    a0, a1, a2, a3 = fx * X[0, 0], fx * X[0, 1], fx * X[0, 2], fx * X[0, 3]
+    b0, b1, b2, b3 = fy * X[1, 0], fy * X[1, 1], fy * X[1, 2], fy * X[1, 3]
+    if parallel:
+        a3, b3 = a3 + cx, b3 + cy
     planes, edges, points, chosen = celled.planes, celled.edges, celled.points, celled.cell_edges
     # Three passes without unforeseeable branches in the first two: a mispredicted branch costs as
     # much as all the arithmetic of an edge.
@@ -278,25 +198,26 @@ def _walk_cell(
     for k in range(crossing):
         u0, v0 = lines[k, 0], lines[k, 1]
         slope = (lines[k, 2] - u0) / (lines[k, 3] - v0)
-        first, last, mark = firsts[k], lasts[k], weights[k] + _BIAS
+        first, last, mark = firsts[k], lasts[k], weights[k] + BIAS
         lowest, highest = min(lowest, first), max(highest, last)
         for row in range(first, last):
             u = u0 + (row - v0) * slope
             pixel = math.ceil(min(max(u, 0.0), width))
             count = counts[row]
             if count < capacity:
-                crossings[row, count] = (pixel << _SHIFT) + mark
+                crossings[row, count] = (pixel << SHIFT) + mark
             else:
                 reach[2] = 1
             counts[row] = count + 1
     reach[0], reach[1] = lowest, highest
+    return True
 
 
 @compiled
 def _gather_spans(
     view: BitView,
     crossings: np.ndarray,
-    work: _Work,
+    rows: Rows,
     limit: float,
     spans: np.ndarray,
     areas: np.ndarray,
@@ -312,12 +233,12 @@ def _gather_spans(
     first_column, width = window[1], window[3]
     has_band = band.shape[0] > 0
     covered, near, total, count = 0, 0, 0, 0
-    for row in range(work.reach[0], work.reach[1]):
-        number = _find_spans(row, crossings, work.counts, work.changes, work.spans)
+    for row in range(rows.reach[0], rows.reach[1]):
+        number = find_spans(row, crossings, rows.counts, rows.changes, rows.spans)
         if count + number > spans.shape[0]:
             spans = with_room(spans, count, 2 * spans.shape[0] + number)
         for k in range(number):
-            a, b = work.spans[k, 0], work.spans[k, 1]
+            a, b = rows.spans[k, 0], rows.spans[k, 1]
             total += b - a
             if row < first_row or row >= end_row:
                 continue
@@ -330,8 +251,8 @@ def _gather_spans(
                 spans[count, 0], spans[count, 1], spans[count, 2] = r, a, b
                 count += 1
         if total - covered > limit:
-            for later in range(row + 1, work.reach[1]):
-                work.counts[later] = 0
+            for later in range(row + 1, rows.reach[1]):
+                rows.counts[later] = 0
             return -1, spans
     areas[0], areas[1], areas[2] = covered, near, total - covered - near
     return count, spans
@@ -340,7 +261,6 @@ def _gather_spans(
 @compiled
 def write_runs(
     numbers: np.ndarray,
-    window: np.ndarray,
     spans: np.ndarray,
     count: int,
     words: np.ndarray,

@@ -6,11 +6,9 @@ import math
 
 import numpy as np
 
-from drake_pose.compiled import compiled
-from drake_pose.silhouette.bits.bit_kernel import multiply, write_runs
-from drake_pose.silhouette.bits.bit_view import WORD, BitView
-
-_WIDTH_LIMIT = 32768
+from drake_pose.compiled import compiled, multiply
+from drake_pose.silhouette.bits.bit_kernel import write_runs
+from drake_pose.silhouette.bits.bit_view import NEAREST_STRIDE, WORD, BitView
 
 
 @compiled
@@ -62,26 +60,24 @@ def sift_by_balls(
             if not (-0.5 < u < camera[6] - 0.5 and -0.5 < v < camera[7] - 0.5):
                 continue
             if limit < 1.0:
-                if _disc_leaves(view.nearest, window, u, v, radius - 1e-6):
-                    left[i] = False
-                    break
-            elif _square_outside(view.sums, window, camera, u, v, 0.7071 * radius) > limit:
+                outside = _leaves(view.nearest, window, u, v, radius - 1e-6)
+            else:
+                outside = _square_outside(view.sums, window, camera, u, v, 0.7071 * radius) > limit
+            if outside:
                 left[i] = False
                 break
     return left
 
 
 @compiled
-def _disc_leaves(
-    nearest: np.ndarray, window: np.ndarray, u: float, v: float, radius: float
-) -> bool:
+def _leaves(nearest: np.ndarray, window: np.ndarray, u: float, v: float, radius: float) -> bool:
     """Returns whether a disc whose centre is in the picture surely leaves the silhouette."""
     row, column = round(v), round(u)
     r, c = row - window[0], column - window[1]
     if 0 <= r < window[2] and 0 <= c < window[3]:
         place = nearest[r, c]
         if place >= 0:
-            row, column = place // _WIDTH_LIMIT, place % _WIDTH_LIMIT
+            row, column = place // NEAREST_STRIDE, place % NEAREST_STRIDE
     return (u - column) ** 2 + (v - row) ** 2 < radius * radius and radius > 0.0
 
 
@@ -147,5 +143,5 @@ def draw_discs(
             if a < b:
                 spans[count, 0], spans[count, 1], spans[count, 2] = row, a, b
                 count += 1
-        used = write_runs(view.inside, window, spans, count, words, used, runs[i])
+        used = write_runs(view.inside, spans, count, words, used, runs[i])
     return runs, words[:used].copy()

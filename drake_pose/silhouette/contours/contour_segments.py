@@ -8,7 +8,8 @@ import numpy as np
 
 from drake_pose.compiled import compiled, with_room
 from drake_pose.silhouette.areas.outline import PackedOutlines
-from drake_pose.silhouette.areas.viewpoint import viewpoint_in_node
+from drake_pose.silhouette.areas.projection import find_facings, project
+from drake_pose.silhouette.areas.span_kernel import make_rows
 
 # Slits and overlaps narrower than this [pixel] are rounding where surfaces touch.
 _SLIT = 1e-6
@@ -30,82 +31,47 @@ class Segments(NamedTuple):
 
 
 @compiled
-def _project_node(
-    packed: PackedOutlines, node: int, X: np.ndarray, camera: np.ndarray, uvz: np.ndarray
-) -> None:
-    """Writes u, v and depth (3, points) of one surface; depth 1 for a parallel camera."""
-    begin, end = packed.starts[node, 0], packed.starts[node + 1, 0]
-    for i in range(end - begin):
-        x, y, z = (
-            packed.points[0, begin + i],
-            packed.points[1, begin + i],
-            packed.points[2, begin + i],
-        )
-        across = X[0, 0] * x + X[0, 1] * y + X[0, 2] * z + X[0, 3]
-        down = X[1, 0] * x + X[1, 1] * y + X[1, 2] * z + X[1, 3]
-        depth = 1.0
-        if camera[0] == 0.0:
-            depth = X[2, 0] * x + X[2, 1] * y + X[2, 2] * z + X[2, 3]
-        uvz[0, i] = camera[1] * across / depth + camera[3]
-        uvz[1, i] = camera[2] * down / depth + camera[4]
-        uvz[2, i] = depth
-
-
-@compiled
-def _find_facings(
-    packed: PackedOutlines,
-    node: int,
-    X: np.ndarray,
-    camera: np.ndarray,
-    uvz: np.ndarray,
-    facings: np.ndarray,
-) -> None:
-    """Writes which side of each triangle is seen: +1, 0 or -1; 0 after the last and too near."""
-    e0, e1, e2, share = viewpoint_in_node(X, camera)
-    begin, end = packed.starts[node, 1], packed.starts[node + 1, 1]
-    for i in range(end - begin):
-        t = begin + i
-        side = packed.planes[0, t] * e0 + packed.planes[1, t] * e1 + packed.planes[2, t] * e2
-        side -= packed.planes[3, t] * share
-        facings[i] = np.int64(side > 0.0) - np.int64(side < 0.0)
-        if camera[0] == 0.0:
-            for k in range(3):
-                if not uvz[2, packed.triangles[t, k]] >= camera[5]:
-                    facings[i] = 0
-    facings[end - begin] = 0
-
-
-@compiled
 def find_segments(packed: PackedOutlines, X_CN: np.ndarray, camera: np.ndarray) -> Segments:
-    """Returns the projected contour edges of all surfaces at poses X_CN (nodes, 4, 4)."""
-    most_points, most_triangles = 0, 0
-    for node in range(X_CN.shape[0]):
-        most_points = max(most_points, packed.starts[node + 1, 0] - packed.starts[node, 0])
-        most_triangles = max(most_triangles, packed.starts[node + 1, 1] - packed.starts[node, 1])
-    uvz = np.empty((3, most_points))
-    facings = np.empty(most_triangles + 1, dtype=np.int64)
+    """Returns the projected contour edges of all surfaces at poses X_CN (nodes, 4, 4).
+
+    Triangles that reach nearer than a pinhole's near plane are left out.
+    """
+    rows, _ = make_rows(packed, camera)
     capacity, count = 1024, 0
     ends, depths = np.empty((capacity, 4)), np.empty((capacity, 2))
     labels = np.empty((capacity, 4), dtype=np.int64)
-    edges = packed.edges
+    u, v, facings, edges, points = rows.u, rows.v, rows.facings, packed.edges, packed.points
     for node in range(X_CN.shape[0]):
-        _project_node(packed, node, X_CN[node], camera, uvz)
-        _find_facings(packed, node, X_CN[node], camera, uvz, facings)
-        first = packed.starts[node, 0]
+        project(packed, node, X_CN, camera, u, v)
+        find_facings(packed, node, X_CN, camera, facings)
+        X, ball = X_CN[node], packed.balls[node]
+        first, t0 = packed.starts[node, 0], packed.starts[node, 1]
+        depth = X[2, 0] * ball[0] + X[2, 1] * ball[1] + X[2, 2] * ball[2] + X[2, 3]
+        radius = 1.000001 * ball[3] * np.sqrt(X[2, 0] ** 2 + X[2, 1] ** 2 + X[2, 2] ** 2)
+        if camera[0] == 0.0 and not depth - radius > camera[5]:
+            for t in range(packed.starts[node + 1, 1] - t0):
+                for k in range(3):
+                    i = first + packed.triangles[t0 + t, k]
+                    depth = X[2, 0] * points[0, i] + X[2, 1] * points[1, i]
+                    if not depth + X[2, 2] * points[2, i] + X[2, 3] >= camera[5]:
+                        facings[t] = 0
         for e in range(packed.starts[node, 2], packed.starts[node + 1, 2]):
-            weight = facings[edges[2, e]] + np.int64(packed.sides[e]) * facings[edges[3, e]]
+            weight = int(facings[edges[2, e]]) + int(packed.sides[e]) * int(facings[edges[3, e]])
             if weight == 0:
                 continue
             if count == capacity:
                 capacity *= 2
                 ends, depths = with_room(ends, count, capacity), with_room(depths, count, capacity)
                 labels = with_room(labels, count, capacity)
-            a, b = np.int64(edges[0, e]), np.int64(edges[1, e])
-            ends[count, 0], ends[count, 1] = uvz[0, a], uvz[1, a]
-            ends[count, 2], ends[count, 3] = uvz[0, b], uvz[1, b]
-            depths[count, 0], depths[count, 1] = uvz[2, a], uvz[2, b]
             labels[count, 0], labels[count, 1] = weight, node
-            labels[count, 2], labels[count, 3] = first + a, first + b
+            for k in range(2):
+                i = np.int64(edges[k, e])
+                ends[count, 2 * k], ends[count, 2 * k + 1] = u[i], v[i]
+                i += first
+                labels[count, 2 + k], depths[count, k] = i, 1.0
+                if camera[0] == 0.0:
+                    depth = X[2, 0] * points[0, i] + X[2, 1] * points[1, i]
+                    depths[count, k] = depth + X[2, 2] * points[2, i] + X[2, 3]
             count += 1
     return Segments(
         ends[:count], depths[:count], labels[:count, 0], labels[:count, 1], labels[:count, 2:]

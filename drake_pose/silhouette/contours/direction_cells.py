@@ -9,13 +9,14 @@ the same contour, so three faces of the cube are enough.
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import NamedTuple
 
 import numpy as np
 
 from drake_pose.body.surfaces.mesh import TriangleMesh
-from drake_pose.compiled import compiled, with_room
+from drake_pose.compiled import compiled
 from drake_pose.silhouette.areas.bending import BendingOutline
 from drake_pose.silhouette.areas.outline import Outline, PackedOutlines, outline_from_mesh, pack
 
@@ -104,48 +105,39 @@ def find_cell(x: float, y: float, z: float) -> int:
     return (face * _CELLS_A_SIDE + row) * _CELLS_A_SIDE + column
 
 
-@compiled
-def _cell_direction(face: int, s: float, t: float) -> np.ndarray:
-    """Returns the unit direction (3,) of a point (s, t) of a face."""
-    direction = np.ones(3)
-    direction[1 if face == 0 else 0] = s
-    direction[1 if face == 2 else 2] = t
-    return direction / np.sqrt((direction**2).sum())
-
-
-@compiled
 def _find_cell_edges(
     packed: PackedOutlines, side: int, spread: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns CelledOutline's cell_starts and cell_edges."""
-    planes, edges = packed.planes, packed.edges
-    triangles = planes.shape[1]
-    lengths = np.sqrt(planes[0] ** 2 + planes[1] ** 2 + planes[2] ** 2)
-    starts = np.zeros(3 * side * side + 1, dtype=np.int64)
-    found = np.empty(edges.shape[1] * 64, dtype=np.int32)
-    facings = np.zeros(triangles + 1, dtype=np.int8)
-    count = 0
-    for cell in range(3 * side * side):
-        face, row, column = cell // (side * side), cell // side % side, cell % side
-        s, t = (2 * column + 1) / side - 1.0, (2 * row + 1) / side - 1.0
-        middle = _cell_direction(face, s, t)
-        lowest = 1.0
-        for corner in range(4):
-            ds, dt = (2 * (corner % 2) - 1) / side, (2 * (corner // 2) - 1) / side
-            lowest = min(lowest, (middle * _cell_direction(face, s + ds, t + dt)).sum())
-        angle = math.acos(min(1.0, lowest)) + spread + _MARGIN
-        limit = math.sin(angle) if angle < 0.5 * math.pi else 2.0
-        for i in range(triangles):
-            height = planes[0, i] * middle[0] + planes[1, i] * middle[1] + planes[2, i] * middle[2]
-            sure = abs(height) > limit * lengths[i]
-            facings[i] = 0 if not sure else (1 if height > 0.0 else -1)
-        if count + edges.shape[1] > found.shape[0]:
-            found = with_room(found, count, 2 * found.shape[0])
-        for e in range(edges.shape[1]):
-            one, other = facings[edges[2, e]], facings[edges[3, e]]
-            # An edge of one triangle, or of two that run the same way, is always a contour.
-            if one == 0 or packed.sides[e] != -1 or one != other:
-                found[count] = e
-                count += 1
-        starts[cell + 1] = count
-    return starts, found[:count].copy()
+    """CelledOutline's cell_starts and cell_edges."""
+    normals, edges = packed.planes[:3].T, packed.edges
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    middles = (2.0 * np.arange(side) + 1.0) / side - 1.0
+    # An edge of one triangle, or of two that run the same way, is always a contour.
+    always = packed.sides[:, None] != -1
+    counts, found = [0], [np.zeros(0, dtype=np.int64)]
+    for face, t in itertools.product(range(3), middles):
+        directions = _directions(face, middles, t)
+        lowest = np.ones(side)
+        for ds, dt in itertools.product((-1.0 / side, 1.0 / side), repeat=2):
+            corners = _directions(face, middles + ds, t + dt)
+            lowest = np.minimum(lowest, (directions * corners).sum(axis=1))
+        angles = np.arccos(lowest) + spread + _MARGIN
+        limits = np.where(angles < 0.5 * math.pi, np.sin(angles), 2.0)
+        heights = normals @ directions.T
+        surely = limits * lengths
+        facings = np.zeros((len(normals) + 1, side), dtype=np.int8)
+        np.subtract(heights > surely, heights < -surely, out=facings[:-1], dtype=np.int8)
+        one, other = facings[edges[2]], facings[edges[3]]
+        apart = (one == 0) | always | (one != other)
+        cells, chosen = np.nonzero(np.ascontiguousarray(apart.T))
+        counts += np.bincount(cells, minlength=side).tolist()
+        found.append(chosen)
+    return np.cumsum(counts), np.concatenate(found).astype(np.int32)
+
+
+def _directions(face: int, s: np.ndarray, t: float) -> np.ndarray:
+    """Unit directions (n, 3) of points (s, t) of a face, s (n,)."""
+    columns = [s, np.full_like(s, t)]
+    columns.insert(face, np.ones_like(s))
+    directions = np.stack(columns, axis=1)
+    return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))

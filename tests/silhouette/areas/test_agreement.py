@@ -11,10 +11,10 @@ from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.camera.files import load_cameras
 from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
-from drake_pose.silhouette.areas.agreement import measure_agreement
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from tests.silhouette.agreement import measure_agreement
 
 SHAPES = {
     "box": '<box size="0.3 0.2 0.5"/>',

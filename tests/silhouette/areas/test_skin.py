@@ -10,8 +10,7 @@ from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
-from drake_pose.silhouette.areas.agreement import measure_agreement
-from drake_pose.silhouette.areas.bending import BendingOutline, TreeSurfaces, score_bending
+from drake_pose.silhouette.areas.bending import BendingOutline, TreeSurfaces
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask, prefix_sums, score_bodies, subtract_body
 from drake_pose.silhouette.areas.visibility import require_visible
@@ -20,6 +19,7 @@ from drake_pose.silhouette.bits.bit_view import make_bit_view
 from drake_pose.silhouette.contours.direction_cells import divide_outline
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.body.skins import HALF, load_limb
+from tests.silhouette.agreement import measure_agreement
 from tests.silhouette.shapes import brute_force_mask
 
 SIDE = 160
@@ -86,7 +86,7 @@ def test_many_poses_at_once_are_scored_as_one_by_one(tmp_path: Path) -> None:
             if node.skin is not None
         ]
         whole = [surfaces.whole(i) for i in range(3)]
-        found = score_bending(whole, bands, X_CN, camera, prefixes)
+        found = score_bodies(whole, X_CN, camera, prefixes, bands)
         for areas, (values, X) in zip(found, posed, strict=True):
             outlines = surfaces.at(values)
             np.testing.assert_array_equal(
@@ -201,7 +201,7 @@ def test_a_band_cut_by_the_near_plane(tmp_path: Path) -> None:
         if node.skin is not None
     ]
     whole = [surfaces.whole(i) for i in range(3)]
-    assert score_bending(whole, bands, X_CN[None], camera, prefixes)[0, 0] == drawn.sum()
+    assert score_bodies(whole, X_CN[None], camera, prefixes, bands)[0, 0] == drawn.sum()
 
 
 def test_without_a_band_nothing_is_new(tmp_path: Path) -> None:
@@ -213,7 +213,7 @@ def test_without_a_band_nothing_is_new(tmp_path: Path) -> None:
     camera = cameras(np.random.default_rng(3))[0]
     values, X_CN = pose(model, np.zeros(5), camera)
     prefixes = np.zeros((0, SIDE, SIDE + 1), dtype=np.int32)
-    found = score_bending(surfaces.rigid, [], X_CN[None], camera, prefixes)
+    found = score_bodies(surfaces.rigid, X_CN[None], camera, prefixes)
     np.testing.assert_array_equal(found, score_bodies(surfaces.rigid, X_CN[None], camera, prefixes))
     require_visible(surfaces.at(values), X_CN, camera)
 
@@ -229,9 +229,9 @@ def test_wrong_bands_are_refused() -> None:
     X_CN = np.eye(4)[None, None]
     for bands in ([], [np.zeros((1, 3, 3))], [np.zeros((2, 4, 3))]):
         with pytest.raises(ValueError, match="bands of"):
-            score_bending([bending], bands, X_CN, camera, prefixes)
+            score_bodies([bending], X_CN, camera, prefixes, bands)
     with pytest.raises(ValueError, match="finite"):
-        score_bending([bending], [np.full((1, 4, 3), np.nan)], X_CN, camera, prefixes)
+        score_bodies([bending], X_CN, camera, prefixes, [np.full((1, 4, 3), np.nan)])
 
 
 def woman_with_skin() -> ArticulatedModel:

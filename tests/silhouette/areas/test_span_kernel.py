@@ -8,7 +8,6 @@ from drake_pose.silhouette.areas.scoring import (
     draw_mask,
     prefix_sums,
     score_bodies,
-    score_candidates,
     subtract_body,
 )
 from tests.silhouette.shapes import box, brute_force_mask, random_pose, soup
@@ -78,7 +77,7 @@ def test_scores_are_sums_over_masks(camera: Camera) -> None:
         [[random_pose(rng, (*rng.uniform(-0.5, 0.5, 2), 2.0)) for _ in outlines] for _ in range(15)]
     )
     whole = score_bodies(outlines, X_CN, camera, prefixes)
-    single = score_candidates(outlines[1], X_CN[:, 1], camera, prefixes)
+    single = score_bodies([outlines[1]], X_CN[:, 1:2], camera, prefixes)
     assert whole.dtype == single.dtype == np.int64
     for n in range(len(X_CN)):
         parts = [draw_mask([o], X[None], camera) for o, X in zip(outlines, X_CN[n], strict=True)]
@@ -124,7 +123,7 @@ def test_far_outside_the_picture(far: float) -> None:
     X_CN = np.tile(np.eye(4), (5, 1, 1))
     X_CN[:4, :2, 3] = [[far, 0], [-far, 0], [0, far], [0, -far]]
     full = np.ones((1, camera.height, camera.width), dtype=bool)
-    areas = score_candidates(outline, X_CN, camera, np.array([prefix_sums(m) for m in full]))
+    areas = score_bodies([outline], X_CN[:, None], camera, np.array([prefix_sums(m) for m in full]))
     assert (areas[:4] == 0).all()
     assert areas[4, 0] == areas[4, 1] > 3000
 
@@ -156,7 +155,7 @@ def test_empty_surfaces() -> None:
     both = draw_mask([empty, cube], np.tile(np.eye(4), (2, 1, 1)), camera)
     np.testing.assert_array_equal(both, draw_mask([cube], np.eye(4)[None], camera))
     none = np.zeros((0, camera.height, camera.width + 1), dtype=np.int32)
-    assert score_candidates(cube, np.zeros((0, 4, 4)), camera, none).shape == (0, 1)
+    assert score_bodies([cube], np.zeros((0, 1, 4, 4)), camera, none).shape == (0, 1)
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=name_of)
@@ -180,9 +179,9 @@ def test_wrong_shapes_are_refused() -> None:
     outline = outline_from_mesh(box(1.0))
     none = np.zeros((0, camera.height, camera.width + 1), dtype=np.int32)
     with pytest.raises(ValueError, match="prefixes of camera 'parallel'"):
-        score_candidates(outline, np.eye(4)[None], camera, none[:, :-1])
+        score_bodies([outline], np.eye(4)[None, None], camera, none[:, :-1])
     with pytest.raises(ValueError, match="poses"):
-        score_candidates(outline, np.eye(4)[None, :3, :3], camera, none)
+        score_bodies([outline], np.eye(4)[None, None, :3, :3], camera, none)
     with pytest.raises(ValueError, match="poses"):
         draw_mask([outline], np.tile(np.eye(4), (2, 1, 1)), camera)
     with pytest.raises(ValueError, match="finite"):

@@ -58,7 +58,7 @@ nitpick_ignore_regex = [
     ("py:class", "ColorRenderCamera|DepthRenderCamera|RenderCameraCore|CameraInfo"),
     ("py:class", "RigidTransform|Diagram|OutputPort|Meshcat"),
     # Names of types.
-    ("py:class", "Array|Turning|Motions|PackedBand"),
+    ("py:class", "Array|Turning|Motions"),
 ]
 
 

@@ -1,6 +1,15 @@
-"""Gives the bands that a model declares to the nodes of a pose tree, and poses them for Drake."""
+"""Bands of skin of a pose tree's nodes, and of a model for Drake.
+
+A vertex of weight w lies where it would lie if it belonged to the child and the joints had gone
+only w of their way: p_A(values) = X_AB(w values) p_B, with A the parent's frame, B the child's and
+p_B its place at rest. For one joint that is the blend of dual quaternions; for several it never
+collapses or jumps, however far they turn.
+"""
 
 from collections.abc import Collection
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +19,73 @@ from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.body.surfaces.skin_file import SkinBand, skin_file
 from drake_pose.body.tree.joint_map import ChainStep, chain_transforms, inverse_transforms
 from drake_pose.body.tree.link_graph import LinkGraph, PlantKinematics, build_link_graph
-from drake_pose.body.tree.skin_motion import NodeSkin
-from drake_pose.errors import ModelError
+from drake_pose.errors import ModelError, SettingsError
+
+if TYPE_CHECKING:
+    from drake_pose.body.tree.joint_kernel import PackedBand
+
+
+@dataclass(frozen=True, eq=False)
+class NodeSkin:
+    """The band of skin between a node and its parent, in the node's frame N.
+
+    Attributes:
+        mesh: the closed band at rest (all joints at zero).
+        weights: (v,) float64 read-only in 0..1: how far each vertex goes with the link that is
+            farther from the plant's world: the node, or its parent where ``turned``.
+        colour: (r, g, b) in 0..1.
+        turned: whether the tree is turned over here, so that the node is the one nearer to the
+            plant's world. The band is the same.
+        steps: the joints from the node's parent to the node.
+    """
+
+    mesh: TriangleMesh
+    weights: NDArray[np.float64]
+    colour: tuple[float, float, float]
+    turned: bool
+    steps: tuple[ChainStep, ...]
+
+    @property
+    def triangles(self) -> NDArray[np.int32]:
+        """(m, 3) int32, read-only, indices into the vertices, the same at all values."""
+        return self.mesh.triangles
+
+    def vertices(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The vertices (n, v, 3) [m] in the node's frame at its values (n, k) [rad or m]."""
+        from drake_pose.body.tree.joint_kernel import place_band  # Slow to import: it needs numba.
+
+        count = sum(step.joint_map.position_count for step in self.steps)
+        values = np.ascontiguousarray(values, dtype=np.float64)
+        if values.ndim != 2 or values.shape[1] != count:
+            raise SettingsError(f"values of shape (n, {count}) expected, got {values.shape}")
+        placed = np.empty((len(values), len(self.weights), 3))
+        place_band(self.packed, values, placed)
+        return placed
+
+    @cached_property
+    def packed(self) -> "PackedBand":
+        """The band in the kernel's arrays."""
+        from drake_pose.body.tree.joint_kernel import PackedBand, pack_steps
+
+        points = self.mesh.vertices
+        if self.turned:
+            X_PN = _pose_at_rest(self.steps)
+            points = points @ X_PN[:3, :3].T + X_PN[:3, 3]
+        levels, which = np.unique(self.weights, return_inverse=True)
+        return PackedBand(
+            steps=pack_steps(self.steps),
+            levels=levels,
+            which=which.reshape(-1).astype(np.int64),
+            points=np.array(points, dtype=np.float64, order="C"),
+            turned=np.array([self.turned]),
+        )
+
+
+def _pose_at_rest(steps: tuple[ChainStep, ...]) -> NDArray[np.float64]:
+    """A chain's transform (4, 4) with all its positions at zero."""
+    count = sum(step.joint_map.position_count for step in steps)
+    rest: NDArray[np.float64] = chain_transforms(steps, np.zeros((1, count)))[0]
+    return rest
 
 
 def find_skin(
@@ -36,8 +110,7 @@ def find_skin(
         turned = ends != (parent, group)
         mesh = band.mesh.transformed(_pose_in_group(model, graph, band.child))
         if turned:
-            count = sum(step.joint_map.position_count for step in steps)
-            mesh = mesh.transformed(_inverse_at_rest(steps, count))
+            mesh = mesh.transformed(inverse_transforms(_pose_at_rest(steps)))
         return NodeSkin(mesh, band.weights, band.colour, turned, steps)
     return None
 
@@ -70,12 +143,6 @@ def _pose_in_group(model: ParsedModel, graph: LinkGraph, link: str) -> NDArray[n
     kinematics = PlantKinematics(model)
     body = graph.groups[graph.group_of(link)].body
     return inverse_transforms(kinematics.pose(body)) @ kinematics.pose(model.link_index(link))
-
-
-def _inverse_at_rest(steps: tuple[ChainStep, ...], count: int) -> NDArray[np.float64]:
-    """The inverse of a chain's transform (4, 4) with all its positions at zero."""
-    rest: NDArray[np.float64] = chain_transforms(steps, np.zeros((1, count)))[0]
-    return inverse_transforms(rest)
 
 
 class ModelSkin:

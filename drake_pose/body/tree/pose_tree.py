@@ -19,9 +19,9 @@ from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.body.tree.base_pose import BasePose
 from drake_pose.body.tree.joint_map import ChainStep, chain_transforms
 from drake_pose.body.tree.link_graph import PlantKinematics
+from drake_pose.body.tree.node_skin import NodeSkin
 from drake_pose.body.tree.root import RootRotation, even_rotations
 from drake_pose.body.tree.sampling import axis_samples, product_grid
-from drake_pose.body.tree.skin_motion import NodeSkin, join_surfaces
 from drake_pose.errors import SettingsError, UnknownNameError
 
 DEFAULT_LENGTH_INTERVAL = 0.05
@@ -59,7 +59,13 @@ class PoseTreeNode:
 
     def surface(self, values: NDArray[np.float64]) -> TriangleMesh:
         """The node's whole surface in frame N at its values (k,): the rigid part, then the band."""
-        return join_surfaces(self.mesh, self.skin, values)
+        if self.skin is None:
+            return self.mesh
+        bent = self.skin.vertices(np.asarray(values)[None])[0]
+        return TriangleMesh(
+            np.concatenate([self.mesh.vertices, bent]),
+            np.concatenate([self.mesh.triangles, self.skin.triangles + len(self.mesh.vertices)]),
+        )
 
 
 @dataclass(frozen=True, eq=False)

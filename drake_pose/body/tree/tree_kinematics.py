@@ -14,32 +14,27 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_pose.body.limits import nearest_turn
+from drake_pose.body.tree.joint_kernel import PackedSteps, find_joint, pack_steps
+from drake_pose.body.tree.joint_map import ChainStep, JointMap
 from drake_pose.body.tree.pose_tree import PoseTree
-from drake_pose.compiled import compiled, copy_into
+from drake_pose.compiled import compiled, multiply
 from drake_pose.errors import SettingsError
-
-_BY_JOINTS, _FREE, _LIMITED = 0, 1, 2
 
 
 class PackedTree(NamedTuple):
     """A pose tree in the arrays that the kernel walks.
 
     parents: (n,); X_PA: (n, 4, 4) constant parts, R_W0 of turned roots included; value_starts:
-    (n + 1,); kinds: (n,) how a node's first values turn it; axes: (n, 3) axes of limited roots,
-    -1 where there are fewer; step_starts: (n + 1,); inverted: (s,); sizes: (s,) the positions of
-    each joint; coefficient_starts: (s,); coefficients: (r, 16) those of JointMap.
+    (n + 1,); free: (n,) bool which begin with a rotation vector; step_starts: (n + 1,); steps: all
+    joints.
     """
 
     parents: np.ndarray
     X_PA: np.ndarray
     value_starts: np.ndarray
-    kinds: np.ndarray
-    axes: np.ndarray
+    free: np.ndarray
     step_starts: np.ndarray
-    inverted: np.ndarray
-    sizes: np.ndarray
-    coefficient_starts: np.ndarray
-    coefficients: np.ndarray
+    steps: PackedSteps
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,101 +181,40 @@ class TreeKinematics:
 
 
 def _pack_tree(tree: PoseTree) -> PackedTree:
-    """The tree in arrays."""
-    X_PA, kinds, axes = [], [], []
-    steps = [step for placement in tree.placements for step in placement.steps]
+    """The tree in arrays; turns of a root about its axes are joints like others."""
+    X_PA, free, chains = [], [], []
     for placement in tree.placements:
-        X, kind, letters = np.array(placement.X_PA), _BY_JOINTS, [-1, -1, -1]
-        rotation = placement.rotation
+        X, rotation = np.array(placement.X_PA), placement.rotation
+        turns: tuple[ChainStep, ...] = ()
         if rotation is not None:
             X[:3, :3] = X[:3, :3] @ rotation.R_W0
-            if rotation.kind == "free":
-                kind = _FREE
-            elif rotation.kind == "limited":
-                kind = _LIMITED
-                letters[: len(rotation.axes)] = ["xyz".index(axis) for axis in rotation.axes]
+            turns = tuple(ChainStep(_turn_about(axis), inverted=False) for axis in rotation.axes)
         X_PA.append(X)
-        kinds.append(kind)
-        axes.append(letters)
-    rows = [len(step.joint_map.coefficients) for step in steps]
-    counts = [len(node.value_names) for node in tree.nodes]
+        free.append(rotation is not None and rotation.kind == "free")
+        chains.append(turns + placement.steps)
     return PackedTree(
         parents=np.array([node.parent for node in tree.nodes], dtype=np.int64),
         X_PA=np.array(X_PA),
-        value_starts=np.cumsum([0, *counts]),
-        kinds=np.array(kinds, dtype=np.int64),
-        axes=np.array(axes, dtype=np.int64),
-        step_starts=np.cumsum([0, *(len(one.steps) for one in tree.placements)]),
-        inverted=np.array([step.inverted for step in steps], dtype=np.bool_),
-        sizes=np.array([step.joint_map.position_count for step in steps], dtype=np.int64),
-        coefficient_starts=np.cumsum([0, *rows])[:-1].astype(np.int64),
-        coefficients=np.vstack(
-            [np.zeros((0, 16)), *(step.joint_map.coefficients for step in steps)]
-        ),
+        value_starts=np.cumsum([0, *(len(node.value_names) for node in tree.nodes)]),
+        free=np.array(free, dtype=np.bool_),
+        step_starts=np.cumsum([0, *(len(chain) for chain in chains)]),
+        steps=pack_steps([step for chain in chains for step in chain]),
     )
 
 
-@compiled
-def _joint_transform(
-    packed: PackedTree, step: int, values: np.ndarray, first: int, changed: int
-) -> np.ndarray:
-    """A joint's transform (4, 4), or its derivative by its position ``changed`` (-1: none)."""
-    size = packed.sizes[step]
-    begin = packed.coefficient_starts[step]
-    X = np.zeros((4, 4))
-    for row in range(4**size):
-        product, rest = 1.0, row
-        for k in range(size - 1, -1, -1):
-            basis, rest = rest % 4, rest // 4
-            q = values[first + k]
-            if k == changed:
-                if basis == 0:
-                    product = 0.0
-                elif basis == 1:
-                    product *= -math.sin(q)
-                elif basis == 2:
-                    product *= math.cos(q)
-            elif basis == 1:
-                product *= math.cos(q)
-            elif basis == 2:
-                product *= math.sin(q)
-            elif basis == 3:
-                product *= q
-        if product != 0.0:
-            for i in range(3):
-                for j in range(4):
-                    X[i, j] += product * packed.coefficients[begin + row, 4 * i + j]
-    if changed < 0:
-        X[3, 3] = 1.0
-    return X
-
-
-@compiled
-def _multiply(A: np.ndarray, B: np.ndarray) -> np.ndarray:
-    """The product of two (4, 4)."""
-    C = np.zeros((4, 4))
-    for i in range(4):
-        for j in range(4):
-            for k in range(4):
-                C[i, j] += A[i, k] * B[k, j]
-    return C
-
-
-@compiled
-def _inverse(X: np.ndarray) -> np.ndarray:
-    """The inverse of a rigid transform (4, 4)."""
-    Y = np.zeros((4, 4))
-    for i in range(3):
-        for j in range(3):
-            Y[i, j] = X[j, i]
-            Y[i, 3] -= X[j, i] * X[j, 3]
-    Y[3, 3] = 1.0
-    return Y
+def _turn_about(axis: str) -> JointMap:
+    """A rotation about a letter's axis."""
+    e = np.eye(3)["xyz".index(axis)]
+    rows = np.zeros((4, 4, 4))
+    rows[0, :3, :3], rows[0, 3, 3] = np.outer(e, e), 1.0
+    rows[1, :3, :3] = np.eye(3) - np.outer(e, e)
+    rows[2, :3, :3] = np.cross(e, -np.eye(3))
+    return JointMap(rows.reshape(4, 16), 1)
 
 
 @compiled
 def _write_twist(X_WA: np.ndarray, M: np.ndarray, twist: np.ndarray) -> None:
-    """Writes the world's twist (6,) of a twist matrix M (4, 4) in frame A."""
+    """Writes the world's twist (6,) of a twist matrix M (3, 4) in frame A."""
     w0, w1, w2 = M[2, 1], M[0, 2], M[1, 0]
     for i in range(3):
         twist[i] = X_WA[i, 0] * w0 + X_WA[i, 1] * w1 + X_WA[i, 2] * w2
@@ -292,19 +226,10 @@ def _write_twist(X_WA: np.ndarray, M: np.ndarray, twist: np.ndarray) -> None:
 
 
 @compiled
-def _cross_matrix(x: float, y: float, z: float) -> np.ndarray:
-    """The twist matrix (4, 4) of a turn about the origin."""
-    M = np.zeros((4, 4))
-    M[0, 1], M[0, 2], M[1, 2] = -z, y, -x
-    M[1, 0], M[2, 0], M[2, 1] = z, -y, x
-    return M
+def _turn_freely(X_WA: np.ndarray, r: np.ndarray, X: np.ndarray, twists: np.ndarray) -> None:
+    """Writes the rotation X (3, 4) of a vector (3,), and the twists (3, 6) of its components.
 
-
-@compiled
-def _turn_freely(X_WA: np.ndarray, r: np.ndarray, twists: np.ndarray) -> np.ndarray:
-    """X_WA times the rotation of a vector (3,), and the twists (3, 6) of its components.
-
-    The rotation is Rodrigues's formula, its derivative the left Jacobian of SO(3).
+    Rodrigues's formula; its derivative is the left Jacobian of SO(3), J = I + b K + c K^2.
     """
     angle = math.sqrt(r[0] ** 2 + r[1] ** 2 + r[2] ** 2)
     if angle > 1e-4:
@@ -312,62 +237,58 @@ def _turn_freely(X_WA: np.ndarray, r: np.ndarray, twists: np.ndarray) -> np.ndar
         c = (1.0 - a) / angle**2
     else:
         a, b, c = 1.0 - angle**2 / 6.0, 0.5 - angle**2 / 24.0, 1.0 / 6.0 - angle**2 / 120.0
-    K = _cross_matrix(r[0], r[1], r[2])
-    KK = _multiply(K, K)
-    X = np.eye(4)
+    J, M = np.empty((3, 3)), np.zeros((3, 4))
     for i in range(3):
         for j in range(3):
-            X[i, j] += a * K[i, j] + b * KK[i, j]
+            # K has the entries of the cross product, K^2 = r r^T - |r|^2 I.
+            K = 0.0 if i == j else (r[3 - i - j] if (i - j) % 3 == 1 else -r[3 - i - j])
+            KK = r[i] * r[j] - (angle**2 if i == j else 0.0)
+            X[i, j] = (1.0 if i == j else 0.0) + a * K + b * KK
+            J[i, j] = (1.0 if i == j else 0.0) + b * K + c * KK
+        X[i, 3] = 0.0
     for k in range(3):
-        omega = np.zeros(3)
-        omega[k] = 1.0
-        for i in range(3):
-            omega[i] += b * K[i, k] + c * KK[i, k]
-        _write_twist(X_WA, _cross_matrix(omega[0], omega[1], omega[2]), twists[k])
-    return _multiply(X_WA, X)
-
-
-@compiled
-def _turn_about_axis(X_WA: np.ndarray, axis: int, angle: float, twist: np.ndarray) -> np.ndarray:
-    """X_WA times the rotation about one of its axes, and its twist (6,)."""
-    e = np.zeros(3)
-    e[axis] = 1.0
-    _write_twist(X_WA, _cross_matrix(e[0], e[1], e[2]), twist)
-    X = np.eye(4)
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    X[i, i] = X[j, j] = math.cos(angle)
-    X[j, i] = math.sin(angle)
-    X[i, j] = -X[j, i]
-    return _multiply(X_WA, X)
+        M[2, 1], M[0, 2], M[1, 0] = J[0, k], J[1, k], J[2, k]
+        _write_twist(X_WA, M, twists[k])
 
 
 @compiled
 def find_motions(packed: PackedTree, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns X_WN (n, 4, 4) and the twists (m, 6) of all values."""
-    count = packed.parents.shape[0]
-    X_WN = np.empty((count, 4, 4))
-    twists = np.zeros((values.shape[0], 6))
+    count, steps = packed.parents.shape[0], packed.steps
+    X_WN, twists = np.zeros((count, 4, 4)), np.zeros((values.shape[0], 6))
+    basis, Y, dT = np.empty((3, 4)), np.empty((3, 4)), np.empty((3, 4))
+    M, product = np.empty((3, 4)), np.empty((3, 4))
+    world = np.eye(4)
     for node in range(count):
-        X = packed.X_PA[node]
-        if packed.parents[node] >= 0:
-            X = _multiply(X_WN[packed.parents[node]], X)
-        value = packed.value_starts[node]
-        if packed.kinds[node] == _FREE:
-            X = _turn_freely(X, values[value : value + 3], twists[value : value + 3])
-            value += 3
-        elif packed.kinds[node] == _LIMITED:
-            for k in range(3):
-                if packed.axes[node, k] >= 0:
-                    X = _turn_about_axis(X, packed.axes[node, k], values[value], twists[value])
-                    value += 1
-        for step in range(packed.step_starts[node], packed.step_starts[node + 1]):
-            T = _joint_transform(packed, step, values, value, -1)
-            inverse = _inverse(T)
-            for k in range(packed.sizes[step]):
-                dT = _joint_transform(packed, step, values, value, k)
-                M = -_multiply(inverse, dT) if packed.inverted[step] else _multiply(dT, inverse)
-                _write_twist(X, M, twists[value + k])
-            X = _multiply(X, inverse if packed.inverted[step] else T)
-            value += packed.sizes[step]
-        copy_into(X_WN[node], X)
+        parent, X, value = packed.parents[node], X_WN[node], packed.value_starts[node]
+        multiply(X_WN[parent] if parent >= 0 else world, packed.X_PA[node], X)
+        X[3, 3] = 1.0
+        first, end = packed.step_starts[node], packed.step_starts[node + 1]
+        if packed.free[node]:
+            first -= 1  # Its turn comes before its joints.
+        for step in range(first, end):
+            if step < packed.step_starts[node]:
+                _turn_freely(X, values[value:], Y, twists[value:])
+                value += 3
+            else:
+                find_joint(steps, step, values[value:], 1.0, -1, basis, Y)
+                for k in range(steps.sizes[step]):
+                    find_joint(steps, step, values[value:], 1.0, k, basis, dT)
+                    # Outwards dT T^-1 with T = Y, inwards -T^-1 dT with T^-1 = Y.
+                    for i in range(3):
+                        for j in range(4):
+                            M[i, j] = dT[i, 3] if j == 3 and not steps.inverted[step] else 0.0
+                            for n in range(3):
+                                if steps.inverted[step]:
+                                    M[i, j] -= Y[i, n] * dT[n, j]
+                                elif j < 3:
+                                    M[i, j] += dT[i, n] * Y[j, n]
+                        if not steps.inverted[step]:
+                            M[i, 3] -= M[i, 0] * Y[0, 3] + M[i, 1] * Y[1, 3] + M[i, 2] * Y[2, 3]
+                    _write_twist(X, M, twists[value + k])
+                value += steps.sizes[step]
+            multiply(X, Y, product)
+            for i in range(3):
+                for j in range(4):
+                    X[i, j] = product[i, j]
     return X_WN, twists

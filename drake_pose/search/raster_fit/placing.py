@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_pose.body.tree.skin_kernel import PackedBand, place_band
-from drake_pose.body.tree.skin_motion import NodeSkin
+from drake_pose.body.tree.joint_kernel import PackedBand, PackedSteps, place_band
+from drake_pose.body.tree.node_skin import NodeSkin
 from drake_pose.body.tree.tree_kinematics import PackedTree, find_motions
 from drake_pose.compiled import compiled, copy_into
 from drake_pose.silhouette.contours.contour_body import move_surface
@@ -62,22 +62,24 @@ def pack_bands(skins: Mapping[int, NodeSkin], columns: Sequence[np.ndarray]) -> 
     packed = [skin.packed for skin in skins.values()]
     triangles = [np.zeros((0, 3), dtype=np.int32), *(skin.triangles for skin in skins.values())]
     counts = [
-        (len(band.sizes), len(band.levels), len(band.which), len(skin.triangles))
+        (len(band.steps.sizes), len(band.levels), len(band.which), len(skin.triangles))
         for band, skin in zip(packed, skins.values(), strict=True)
     ]
-    rows = np.cumsum([0, *(len(band.coefficients) for band in packed)])
+    rows = np.cumsum([0, *(len(band.steps.coefficients) for band in packed)])
     values = [(columns[node][0], columns[node][-1] + 1) for node in skins]
     empty = np.zeros(0, dtype=np.int64)
     return PackedBands(
         starts=np.cumsum([(0, 0, 0, 0), *counts], axis=0).astype(np.int64),
         values=np.array(values, dtype=np.int64).reshape(-1, 2),
         triangles=np.concatenate(triangles),
-        sizes=np.concatenate([empty, *(band.sizes for band in packed)]),
-        inverted=np.concatenate([empty.astype(np.bool_), *(band.inverted for band in packed)]),
-        coefficient_starts=np.concatenate(
-            [empty, *(b.coefficient_starts + n for b, n in zip(packed, rows, strict=False))]
+        sizes=np.concatenate([empty, *(band.steps.sizes for band in packed)]),
+        inverted=np.concatenate(
+            [empty.astype(np.bool_), *(band.steps.inverted for band in packed)]
         ),
-        coefficients=np.vstack([np.zeros((0, 16)), *(band.coefficients for band in packed)]),
+        coefficient_starts=np.concatenate(
+            [empty, *(b.steps.starts + n for b, n in zip(packed, rows, strict=False))]
+        ),
+        coefficients=np.vstack([np.zeros((0, 16)), *(band.steps.coefficients for band in packed)]),
         levels=np.concatenate([np.zeros(0), *(band.levels for band in packed)]),
         which=np.concatenate([empty, *(band.which for band in packed)]),
         points=np.vstack([np.zeros((0, 3)), *(band.points for band in packed)]),
@@ -148,8 +150,11 @@ def place_surfaces(
             s_end, level_end, v_end, t_end = bands.starts[b + 1]
             placed = np.empty((1, v_end - v, 3))
             band = PackedBand(
-                bands.sizes[s:s_end], bands.inverted[s:s_end], bands.coefficient_starts[s:s_end],
-                bands.coefficients, bands.levels[level:level_end], bands.which[v:v_end],
+                PackedSteps(
+                    bands.sizes[s:s_end], bands.inverted[s:s_end],
+                    bands.coefficient_starts[s:s_end],
+                    bands.coefficients,
+                ), bands.levels[level:level_end], bands.which[v:v_end],
                 bands.points[v:v_end], bands.turned[b : b + 1],
             )  # fmt: skip
             place_band(band, parameters[first:end].copy().reshape(1, end - first), placed)

@@ -1,0 +1,142 @@
+"""Joints' transforms at their values, and the bands of skin that follow them, compiled."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from drake_pose.body.tree.joint_map import ChainStep
+from drake_pose.compiled import compiled, multiply
+
+
+class PackedSteps(NamedTuple):
+    """Joints in the arrays that kernels walk.
+
+    sizes: (s,) int64 how many positions each has; inverted: (s,) bool; starts: (s,) int64 the first
+    of its coefficients; coefficients: (r, 16) those of JointMap.
+    """
+
+    sizes: np.ndarray
+    inverted: np.ndarray
+    starts: np.ndarray
+    coefficients: np.ndarray
+
+
+class PackedBand(NamedTuple):
+    """A band of skin in the arrays that the kernel walks.
+
+    steps: the joints from the node's parent to the node; levels: (l,) the different weights; which:
+    (v,) int64 the level of each vertex; points: (v, 3) the band at rest, in the node's frame or,
+    where turned over, in the parent's; turned: (1,) bool.
+    """
+
+    steps: PackedSteps
+    levels: np.ndarray
+    which: np.ndarray
+    points: np.ndarray
+    turned: np.ndarray
+
+
+def pack_steps(steps: Sequence[ChainStep]) -> PackedSteps:
+    """Joints in arrays."""
+    rows = [len(step.joint_map.coefficients) for step in steps]
+    return PackedSteps(
+        sizes=np.array([step.joint_map.position_count for step in steps], dtype=np.int64),
+        inverted=np.array([step.inverted for step in steps], dtype=np.bool_),
+        starts=np.cumsum([0, *rows])[:-1].astype(np.int64),
+        coefficients=np.vstack(
+            [np.zeros((0, 16)), *(step.joint_map.coefficients for step in steps)]
+        ),
+    )
+
+
+@compiled
+def find_joint(
+    steps: PackedSteps,
+    step: int,
+    values: np.ndarray,
+    share: float,
+    changed: int,
+    basis: np.ndarray,
+    X: np.ndarray,
+) -> None:
+    """Writes the upper rows of a joint's transform as it is walked, or a derivative.
+
+    Args:
+        steps: the joints.
+        step: which of them.
+        values: its values and any after them [rad or m].
+        share: how far it goes of its way to them.
+        changed: -1, or the position by which the transform, walked outwards, is derived.
+        basis: (3, 4) scratch.
+        X: (3 or 4, 4) written.
+    """
+    size, begin, coefficients = steps.sizes[step], steps.starts[step], steps.coefficients
+    for k in range(size):
+        q = share * values[k]
+        cosine, sine = np.cos(q), np.sin(q)
+        if k == changed:
+            basis[k, 0], basis[k, 1], basis[k, 2], basis[k, 3] = 0.0, -sine, cosine, 1.0
+        else:
+            basis[k, 0], basis[k, 1], basis[k, 2], basis[k, 3] = 1.0, cosine, sine, q
+    for i in range(3):
+        for j in range(4):
+            X[i, j] = 0.0
+    for row in range(4**size):
+        factor, rest = 1.0, row
+        for k in range(size - 1, -1, -1):
+            factor *= basis[k, rest % 4]
+            rest //= 4
+        if factor != 0.0:
+            for i in range(3):
+                for j in range(4):
+                    X[i, j] += factor * coefficients[begin + row, 4 * i + j]
+    if changed < 0 and steps.inverted[step]:
+        x, y, z = X[0, 3], X[1, 3], X[2, 3]
+        X[0, 1], X[1, 0] = X[1, 0], X[0, 1]
+        X[0, 2], X[2, 0] = X[2, 0], X[0, 2]
+        X[1, 2], X[2, 1] = X[2, 1], X[1, 2]
+        for i in range(3):
+            X[i, 3] = -(X[i, 0] * x + X[i, 1] * y + X[i, 2] * z)
+
+
+@compiled
+def place_band(band: PackedBand, values: np.ndarray, placed: np.ndarray) -> None:
+    """Writes the vertices (n, v, 3) in the node's frame at values (n, k)."""
+    levels, steps = band.levels, band.steps
+    basis, joint, product = np.empty((3, 4)), np.empty((3, 4)), np.empty((3, 4))
+    # The last one is that of the whole way.
+    X_PN = np.zeros((levels.shape[0] + 1, 3, 4))
+    for level in range(levels.shape[0] + 1):
+        X_PN[level, 0, 0] = X_PN[level, 1, 1] = X_PN[level, 2, 2] = 1.0
+    x = np.empty(3)
+    for n in range(values.shape[0]):
+        for level in range(levels.shape[0] + 1):
+            share = levels[level] if level < levels.shape[0] else 1.0
+            first = 0
+            for step in range(steps.sizes.shape[0]):
+                if step == 0:
+                    find_joint(steps, step, values[n], share, -1, basis, X_PN[level])
+                else:
+                    find_joint(steps, step, values[n, first:], share, -1, basis, joint)
+                    multiply(X_PN[level], joint, product)
+                    for i in range(3):
+                        for j in range(4):
+                            X_PN[level, i, j] = product[i, j]
+                first += steps.sizes[step]
+        whole = X_PN[levels.shape[0]]
+        for vertex in range(band.points.shape[0]):
+            p, X = band.points[vertex], X_PN[band.which[vertex]]
+            if band.turned[0]:
+                for i in range(3):
+                    x[i] = p[i] - X[i, 3]
+                for i in range(3):
+                    placed[n, vertex, i] = X[0, i] * x[0] + X[1, i] * x[1] + X[2, i] * x[2]
+                continue
+            for i in range(3):
+                x[i] = X[i, 0] * p[0] + X[i, 1] * p[1] + X[i, 2] * p[2] + X[i, 3] - whole[i, 3]
+            for i in range(3):
+                total = whole[0, i] * x[0] + whole[1, i] * x[1] + whole[2, i] * x[2]
+                placed[n, vertex, i] = total

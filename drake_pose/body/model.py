@@ -214,7 +214,7 @@ class ArticulatedModel(ParsedModel):
 
     def _changed(self, text: str, skin: Sequence[SkinBand]) -> "ArticulatedModel":
         """The same read from another text."""
-        source = replace(self._source, text=text)
+        source = self._source.with_text(text)
         plant, scene_graph, _, _ = _parse(self.path, source)
         plant.Finalize()
         return replace(
@@ -262,7 +262,7 @@ def read_model(
     path: Path, packages: Mapping[str, str], limits: Mapping[str, tuple[float, float]]
 ) -> ArticulatedModel:
     """As load_model, in this process and without the check."""
-    source = ModelSource.open(path, packages)
+    source = ModelSource(path, packages)
     plant, scene_graph, instances, warnings = _parse(path, source)
     try:
         plant.Finalize()

@@ -5,6 +5,10 @@ Drake 1.51 puts all but the last joint of a body at the parent's origin
 MuJoCo applies the joints of a body one after the other, each about its ``pos`` in the body's frame;
 that is the same as nested bodies with one joint each, which Drake reads rightly.
 
+Drake forgets inherited settings of an element that an inner class does not mention, ignores unknown
+classes, and starts again with ``autolimits`` at every <compiler>: here every element says all of
+itself. Source: MuJoCo's XML reference, sections "default" and "compiler", tried with MuJoCo 4.0.
+
 Collision is left out: it is never drawn, and Drake refuses meshes it cannot make a convex hull of.
 """
 
@@ -15,29 +19,22 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_pose.body.files.mjcf_assets import write_out_meshes
-from drake_pose.body.files.mjcf_defaults import merge_compilers, write_out_defaults
-from drake_pose.body.files.mjcf_poses import numbers, write_out_poses
+from drake_pose.body.files.mjcf_geometry import (
+    ORIENTATIONS,
+    numbers,
+    write_out_meshes,
+    write_out_poses,
+)
 from drake_pose.body.files.xml_files import read_xml, xml_text
 from drake_pose.errors import ModelError
 
 # Elements that make bodies, joints or shapes and that Drake ignores.
 _IGNORED_BY_DRAKE = ("composite", "flexcomp", "attach", "replicate")
 # What neither moves a body nor is a part of one; Drake refuses or remarks on some of it.
-_WITHOUT_EFFECT = frozenset(
-    (
-        "camera",
-        "light",
-        "site",
-        "texture",
-        "contact",
-        "sensor",
-        "keyframe",
-        "visual",
-        "statistic",
-        "option",
-    )
-)
+_WITHOUT_EFFECT = (
+    "camera", "light", "site", "texture", "contact", "sensor", "keyframe", "visual", "statistic",
+    "option",
+)  # fmt: skip
 # Attributes about contact and forces: Drake remarks on each of them that it does not use it.
 _FORCES = {
     "joint": (
@@ -53,6 +50,7 @@ _FORCES = {
 }  # fmt: skip
 _ALMOST_MASSLESS = {"pos": "0 0 0", "mass": "1e-6", "diaginertia": "1e-9 1e-9 1e-9"}
 _MAXIMUM_INCLUDE_DEPTH = 20
+_Settings = dict[str, dict[str, str]]
 
 
 def cure_mjcf(path: Path) -> str:
@@ -79,9 +77,10 @@ def cure_mjcf(path: Path) -> str:
     root.set("model", root.get("model") or path.stem)
     try:
         _refuse_ignored(root)
-        compiler = merge_compilers(root)
-        write_out_defaults(root)
-        _remove(root, _WITHOUT_EFFECT)
+        compiler = _merge_compilers(root)
+        _write_out_defaults(root)
+        for element in list(root.iter()):
+            element[:] = [child for child in element if child.tag not in _WITHOUT_EFFECT]
         _choose_geoms(root, compiler)
         for worldbody in root.iter("worldbody"):
             write_out_poses(worldbody, compiler)
@@ -90,8 +89,15 @@ def cure_mjcf(path: Path) -> str:
         # With this setting Drake and MuJoCo refuse a body that states no inertia.
         needs_inertia = compiler.get("inertiafromgeom") == "false"
         _write_out_joints(root, compiler)
-        _give_masses(root)
-        _remove_forces(root)
+        for inertial in root.iter("inertial"):
+            # Drake refuses bodies without a mass, and MuJoCo takes fixed ones.
+            if not numbers(inertial, "mass", 1, "0")[0] > 0.0:
+                inertial.attrib.pop("fullinertia", None)
+                inertial.attrib.update(_ALMOST_MASSLESS)
+        for tag, names in _FORCES.items():
+            for element in root.iter(tag):
+                for name in names:
+                    element.attrib.pop(name, None)
         for body in list(root.iter("body")):
             _nest_joints(body, needs_inertia=needs_inertia)
     except ModelError as error:
@@ -135,11 +141,74 @@ def _refuse_ignored(root: ElementTree.Element) -> None:
                 )
 
 
-def _remove(element: ElementTree.Element, tags: frozenset[str]) -> None:
-    """Remove elements of some kinds at any depth."""
-    element[:] = [child for child in element if child.tag not in tags]
+def _merge_compilers(root: ElementTree.Element) -> dict[str, str]:
+    """Leave one <compiler> with what all of them say, the last one winning; returns it."""
+    settings: dict[str, str] = {}
+    for compiler in root.findall("compiler"):
+        if "assetdir" in compiler.attrib:
+            settings |= dict.fromkeys(("meshdir", "texturedir"), compiler.attrib["assetdir"])
+        settings |= compiler.attrib
+        root.remove(compiler)
+    root.insert(0, ElementTree.Element("compiler", settings))
+    return settings
+
+
+def _write_out_defaults(root: ElementTree.Element) -> None:
+    """Give every element what its class says and it does not; remove the classes.
+
+    Raises:
+        ModelError: a class that no <default> defines.
+    """
+    classes: dict[str, _Settings] = {"main": {}}
+    for default in root.findall("default"):
+        _read_class(default, classes["main"], classes)
+        root.remove(default)
+    _apply(root, "main", classes)
+
+
+def _read_class(
+    default: ElementTree.Element, settings: _Settings, classes: dict[str, _Settings]
+) -> None:
+    """Add what a <default> says to its class's settings, and the classes inside it."""
+    for element in default:
+        if element.tag != "default":
+            outer = settings.get(element.tag, {})
+            settings[element.tag] = _completed(element.attrib, outer)
+    for inner in default.findall("default"):
+        copy = {tag: dict(attributes) for tag, attributes in settings.items()}
+        _read_class(inner, copy, classes)
+        classes[inner.get("class", "")] = copy
+
+
+def _apply(element: ElementTree.Element, childclass: str, classes: dict[str, _Settings]) -> None:
+    """Complete an element and everything inside it."""
+    childclass = element.attrib.pop("childclass", "") or childclass
+    name = element.attrib.pop("class", "") or childclass
+    for class_name in {name, childclass} - classes.keys():
+        raise ModelError(
+            f"<{element.tag}> '{element.get('name', '(unnamed)')}': no <default> defines "
+            f"class '{class_name}'"
+        )
+    if element.tag in classes[name]:
+        completed = _completed(element.attrib, classes[name][element.tag])
+        element.attrib.clear()
+        element.attrib.update(completed)
     for child in element:
-        _remove(child, tags)
+        _apply(child, childclass, classes)
+
+
+def _completed(own: dict[str, str], outer: dict[str, str]) -> dict[str, str]:
+    """An element's attributes with those of its class that it does not say itself."""
+    oriented = not own.keys().isdisjoint(ORIENTATIONS)
+    inherited = {
+        name: value for name, value in outer.items() if not (oriented and name in ORIENTATIONS)
+    }
+    completed = inherited | own
+    if "size" in own and "size" in inherited:
+        # Sizes of fewer numbers take the further ones from the class.
+        numbers = own["size"].split()
+        completed["size"] = " ".join(numbers + inherited["size"].split()[len(numbers) :])
+    return completed
 
 
 def _choose_geoms(root: ElementTree.Element, compiler: dict[str, str]) -> None:
@@ -215,22 +284,6 @@ def _write_out_joints(root: ElementTree.Element, compiler: dict[str, str]) -> No
         for element in list(actuator):
             if "joint" in element.attrib and element.get("joint") not in movable:
                 actuator.remove(element)
-
-
-def _give_masses(root: ElementTree.Element) -> None:
-    """Give a mass to bodies that state none: Drake refuses those, and MuJoCo takes fixed ones."""
-    for inertial in root.iter("inertial"):
-        if not numbers(inertial, "mass", 1, "0")[0] > 0.0:
-            inertial.attrib.pop("fullinertia", None)
-            inertial.attrib.update(_ALMOST_MASSLESS)
-
-
-def _remove_forces(root: ElementTree.Element) -> None:
-    """Remove what neither places nor shows anything."""
-    for tag, names in _FORCES.items():
-        for element in root.iter(tag):
-            for name in names:
-                element.attrib.pop(name, None)
 
 
 def _nest_joints(body: ElementTree.Element, *, needs_inertia: bool) -> None:

@@ -1,11 +1,15 @@
-"""One model file into one Drake plant, with every failure turned into a ModelError."""
+"""One model file into one Drake plant, with every failure turned into a ModelError.
 
+Drake parses a cured text instead of the file, and cured stand-ins of the files that it names.
+"""
+
+import copy
 import logging
 import re
+import tempfile
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 from pydrake.geometry import SceneGraph
@@ -13,10 +17,25 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
-from drake_pose.body.files.curing import Curing
-from drake_pose.body.files.xml_checks import read_limits
+from drake_pose.body.files.directives import cure_directives
+from drake_pose.body.files.mjcf import cure_mjcf
+from drake_pose.body.files.packages import FileFinder
+from drake_pose.body.files.sdf import Limits, cure_sdf
+from drake_pose.body.files.urdf import cure_urdf
+from drake_pose.body.files.xml_files import read_limits
+from drake_pose.body.surfaces.mesh_files import workspace
 from drake_pose.errors import ModelError
 
+# What Drake's parser calls each kind of file.
+_KINDS = {
+    ".urdf": "urdf",
+    ".sdf": "sdf",
+    ".xml": "xml",
+    ".mjcf": "xml",
+    ".yaml": "dmd.yaml",
+    ".yml": "dmd.yaml",
+}
+_MAXIMUM_DEPTH = 20
 _MOST_ALIKE = 10
 # Names in quotes, and numbers.
 _VARIABLE = re.compile(r"'[^']*'|-?\d[\d.e+-]*")
@@ -26,7 +45,6 @@ _ABOUT_INERTIA = ("invalid inertia", "parsing inertia matrix", "as central inert
 _LONGEST_REASON = 1000
 
 
-@dataclass(frozen=True)
 class ModelSource:
     """A model file and the cured text that is parsed in its place.
 
@@ -34,32 +52,36 @@ class ModelSource:
         path: the file.
         text: what Drake parses.
         kind: what Drake's parser calls that kind of text.
-        warnings: what of the file is not read, or not enforced.
+        warnings: what of the file is not read, or not enforced, each once.
         limits: limits (lower, upper) [rad] by position name that Drake's parser passes over.
+
+    Args:
+        path: the file.
+        package_paths: packages, name to folder.
+
+    Raises:
+        ModelError: missing, unreadable, of an unknown kind, or it cannot be cured; the message
+            names the file and the link, joint or mesh.
     """
 
-    path: Path
-    text: str
-    kind: str
-    warnings: tuple[str, ...]
-    limits: Mapping[str, tuple[float, float]]
-    _curing: Curing
-
-    @staticmethod
-    def open(path: Path, package_paths: Mapping[str, str]) -> "ModelSource":
-        """Look at a file before Drake does.
-
-        Raises:
-            ModelError: missing, unreadable, of an unknown kind, or it cannot be cured; the message
-                names link, joint or mesh.
-        """
+    def __init__(self, path: Path, package_paths: Mapping[str, str]) -> None:
         if not path.exists():
             raise ModelError(f"model file {path} does not exist")
         if not path.is_file():
             raise ModelError(f"model file {path} is not a file")
-        curing = Curing(package_paths)
-        text, kind = curing.cure(path)
-        return ModelSource(path, text, kind, tuple(curing.warnings), curing.limits, curing)
+        self.path = path
+        self.warnings: list[str] = []
+        self.limits: Limits = {}
+        self._finder = FileFinder(package_paths)
+        self._stand_ins: dict[Path, Path] = {}
+        self._under_way: list[Path] = []
+        self.text, self.kind = self._cure(path)
+
+    def with_text(self, text: str) -> "ModelSource":
+        """The same file with another text."""
+        other = copy.copy(self)
+        other.text = text
+        return other
 
     def parse(
         self, plant: MultibodyPlant, scene_graph: SceneGraph | None, prefix: str = ""
@@ -89,24 +111,83 @@ class ModelSource:
             # Drake ends the process, which Python sees as SystemExit, at some values.
             except (RuntimeError, ValueError, SystemExit) as error:
                 raise ModelError(self._explain(str(error), warnings)) from error
-        where = str(self.path)
         remarks = [
-            self._curing.name_originals(warning, where)
+            self._name_originals(warning, str(self.path))
             for warning in warnings
             if not any(mark in warning for mark in _ABOUT_INERTIA)
         ]
         return list(instances), [*self.warnings, *remarks]
 
+    def _cure(self, path: Path) -> tuple[str, str]:
+        """The text that is parsed in place of a file, and the kind of it."""
+        kind = _KINDS.get(path.suffix.lower())
+        if kind is None:
+            what = "use .urdf, .sdf, .xml (MJCF) or .dmd.yaml"
+            if path.suffix.lower() == ".xacro":
+                what = f"expand it first: xacro {path.name} > {path.stem} (PyPI: xacro)"
+            raise ModelError(
+                f"model file {path}: '{path.suffix}' is not a kind of file that Drake's Parser "
+                f"reads; {what}"
+            )
+        if path in self._under_way or len(self._under_way) > _MAXIMUM_DEPTH:
+            raise ModelError(f"{path} includes itself")
+        self._under_way.append(path)
+        try:
+            if kind == "urdf":
+                text = cure_urdf(path, self._finder, self._warn)
+            elif kind == "xml":
+                text = cure_mjcf(path)
+            elif kind == "sdf":
+                text, limits = cure_sdf(path, self._finder, self._warn, self._stand_in)
+                if len(self._under_way) == 1:
+                    self.limits = limits
+            else:
+                text = cure_directives(path, self._finder, self._stand_in)
+            return text, kind
+        except ModelError as error:
+            reason = str(error)
+            raise ModelError(reason if str(path) in reason else f"{path}: {reason}") from error
+        finally:
+            self._under_way.pop()
+
+    def _stand_in(self, path: Path) -> Path:
+        """A file with the cured text of another one."""
+        path = path.resolve()
+        if path not in self._stand_ins:
+            text, kind = self._cure(path)
+            folder = Path(tempfile.mkdtemp(prefix="model_", dir=workspace()))
+            stand_in = folder / f"{path.name.partition('.')[0]}.{kind}"
+            stand_in.write_text(text, encoding="utf-8")
+            self._stand_ins[path] = stand_in
+        return self._stand_ins[path]
+
+    def _warn(self, text: str) -> None:
+        if text not in self.warnings:
+            self.warnings.append(text)
+
+    def _name_originals(self, text: str, where: str) -> str:
+        """A message of Drake's with the files' own names; ``where`` is the main file's."""
+        for path, stand_in in self._stand_ins.items():
+            text = re.sub(re.escape(str(stand_in)) + r"(:\d+)?", str(path).replace("\\", "/"), text)
+        # Lines are those of the cured text, which help nobody.
+        return re.sub(
+            r"<(literal|data)-string>(\.[\w.]+\w)?(:\d+)?", where.replace("\\", "/"), text
+        )
+
     def _explain(self, reason: str, warnings: list[str]) -> str:
         """Why the file cannot be used, with the joint whose limits are at fault, if one is."""
         if self.kind == "xml":
-            joint = find_bad_limits(self.text)
-            if joint is not None:
-                return f"{self.path}: {joint}"
+            for joint in ElementTree.fromstring(self.text).iter("joint"):
+                values = joint.get("range", "").split()
+                try:
+                    if len(values) == 2:
+                        read_limits(values[0], values[1], joint.get("name", "(unnamed)"))
+                except ModelError as error:
+                    return f"{self.path}: {error}"
         # SDFormat's reader says where in its error, and what in a warning before it.
         remarks = [text.split("Msg: ")[-1] for text in warnings if "Error" in text]
         text = "; ".join([*remarks, reason.strip()])[:_LONGEST_REASON]
-        text = self._curing.name_originals(text, self.path.name)
+        text = self._name_originals(text, self.path.name)
         return f"{self.path}: {text or 'Drake refuses this model without saying why'}"
 
 
@@ -144,20 +225,3 @@ def captured_warnings() -> Iterator[list[str]]:
         yield texts
     finally:
         logger.handlers, logger.propagate = handlers, propagate
-
-
-def find_bad_limits(text: str) -> str | None:
-    """The first joint of an MJCF file's text whose limits are not numbers or crossed.
-
-    Returns:
-        A sentence that names the joint, or None.
-    """
-    for joint in ElementTree.fromstring(text).iter("joint"):
-        values = joint.get("range", "").split()
-        if len(values) != 2:
-            continue
-        try:
-            read_limits(values[0], values[1], joint.get("name", "(unnamed)"))
-        except ModelError as error:
-            return str(error)
-    return None

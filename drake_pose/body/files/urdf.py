@@ -12,16 +12,17 @@ from contextlib import suppress
 from pathlib import Path
 
 from drake_pose.body.files.packages import FileFinder
-from drake_pose.body.files.xml_checks import (
+from drake_pose.body.files.xml_files import (
     OLD_XACRO_ELEMENTS,
     close_loops,
     leave_out,
     read_limits,
     read_numbers,
+    read_xml,
     refuse_macros,
     require_size,
+    xml_text,
 )
-from drake_pose.body.files.xml_files import read_xml, xml_text
 from drake_pose.errors import ModelError
 
 _READ = {

@@ -9,6 +9,7 @@ from __future__ import annotations
 import multiprocessing
 import pickle
 import secrets
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -27,9 +28,8 @@ from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecification, TimedPicture
 from drake_pose.errors import ClusterError
 from drake_pose.fit.surfaces import FEW, few_triangles
-from drake_pose.jobs.cluster.camera_worker import PackedView, WatchReply, WatchRequest
-from drake_pose.jobs.cluster.edge_server import POLLS, EdgeServer, EdgeStore
-from drake_pose.jobs.cluster.lines import LineReply, open_line
+from drake_pose.jobs.cluster.camera_worker import EdgeServer, WatchReply, WatchRequest
+from drake_pose.jobs.cluster.lines import Answer, Line, Listening, serve
 from drake_pose.jobs.cluster.remote_keeper import RemoteKeeper
 from drake_pose.jobs.live.run import FrameWatch, LiveFrame
 from drake_pose.person.date.skeleton import load_skeleton
@@ -168,26 +168,38 @@ def measure_polls(groups: int, cameras: int, view_bytes: float) -> float:
         view_bytes: of one view.
     """
     names = [str(k) for k in range(cameras // groups)]
-    view = PackedView(0.0, "0", secrets.token_bytes(round(view_bytes)))
+    view = (0.0, "0", secrets.token_bytes(round(view_bytes)))
     counts = dict.fromkeys(names, 0)
     rates: dict[str, float | None] = dict.fromkeys(names, _RATE_HZ)
-    reply = WatchReply(dict.fromkeys(names, (view,)), (), (), counts, rates, 0, 0.0, 1)
+    reply = WatchReply(dict.fromkeys(names, (view,)), dropped=counts, rates=rates)
     specifications = tuple(SourceSpecification(name, "folder", "", 640, 480) for name in names)
     after = dict.fromkeys(names, 0.0)
     request = WatchRequest("", specifications, after, after, 1, 0.0)
-    key = secrets.token_bytes()
-    with _child(_serve_polls, key, groups, pickle.dumps(reply)) as ports:
-        lines = [open_line((_HOST, port), key, [POLLS]) for port in ports]
-        connections = [line.result(_PATIENCE) for line in lines]
+    with _child(_serve_polls, groups, pickle.dumps(reply)) as listening:
+        lines = [Line(_HOST, port, listening.key) for port in listening.ports]
+        _ask_all(lines, request)
         begin = time.process_time()
         for _ in range(_TASKS):
-            replies = [LineReply(connection, request) for connection in connections]
-            while not all([one.done() for one in replies]):
-                time.sleep(_POLL_PAUSE)
+            _ask_all(lines, request)
         seconds = (time.process_time() - begin) / _TASKS
-        for connection in connections:
-            connection.close()
+        for line in lines:
+            line.close()
     return seconds
+
+
+def _ask_all(lines: Sequence[Line], request: WatchRequest) -> None:
+    """Asks all workers, as soon as they are connected, and takes their replies."""
+    for line in lines:
+        while not line.send(pickle.dumps(request)):
+            time.sleep(_POLL_PAUSE)
+    waiting = list(lines)
+    while waiting:
+        replies = [line.receive() for line in waiting]
+        for data in replies:
+            if data is not None:
+                pickle.loads(data)
+        waiting = [line for line, data in zip(waiting, replies, strict=True) if data is None]
+        time.sleep(_POLL_PAUSE)
 
 
 def _follow(
@@ -231,13 +243,12 @@ def _keepers(views: SimulatedViews, groups: int) -> Iterator[Mapping[str, Remote
         return
     names = [list(part) for part in np.array_split(np.array(list(views.cameras)), groups)]
     names = [[str(name) for name in group] for group in names]
-    key = secrets.token_bytes()
     packed = [{name: views.packed[name] for name in group} for group in names]
     keepers = {}
-    with _child(_serve, key, packed) as ports:
-        for group, port in zip(names, ports, strict=True):
-            keeper = RemoteKeeper(group, key, print)
-            keeper.move_to(_HOST, port)
+    with _child(_serve_sums, packed) as listening:
+        for group, port in zip(names, listening.ports, strict=True):
+            keeper = RemoteKeeper(group, print)
+            keeper.move_to(Line(_HOST, port, listening.key))
             keepers.update(dict.fromkeys(group, keeper))
         try:
             _connect(views, keepers)
@@ -248,8 +259,8 @@ def _keepers(views: SimulatedViews, groups: int) -> Iterator[Mapping[str, Remote
 
 
 @contextmanager
-def _child(function: Callable[..., None], *arguments: object) -> Iterator[list[int]]:
-    """Another process, and the ports at which it listens."""
+def _child(function: Callable[..., None], *arguments: object) -> Iterator[Listening]:
+    """Another process, and where it listens."""
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
     process = context.Process(target=function, args=(there, *arguments), daemon=True)
@@ -276,30 +287,28 @@ def _connect(views: SimulatedViews, keepers: Mapping[str, RemoteKeeper]) -> None
         tracker.follow(last, list(views.cameras.values()), seen)
 
 
-def _serve(pipe: Connection, key: bytes, groups: Sequence[Mapping[str, Sequence[bytes]]]) -> None:
+def _serve_sums(pipe: Connection, groups: Sequence[Mapping[str, Sequence[bytes]]]) -> None:
     """Serves the edges of all groups until the pipe is closed."""
-    servers = []
-    for group in groups:
-        store = EdgeStore(group)
-        for name, views in group.items():
+    servers = [EdgeServer(len(group)) for group in groups]
+    for server, group in zip(servers, groups, strict=True):
+        for number, views in enumerate(group.values()):
             for k, data in enumerate(views):
-                store.put(name, _time(k), unpack_view(data).edge)
-        servers.append(EdgeServer(_HOST, key, store))
-    _wait(pipe, servers)
+                server.put(number, _time(k), unpack_view(data).edge)
+    _serve(pipe, [server.answer for server in servers])
 
 
-def _serve_polls(pipe: Connection, key: bytes, groups: int, reply: bytes) -> None:
+def _serve_polls(pipe: Connection, groups: int, reply: bytes) -> None:
     """Answers every poll alike until the pipe is closed."""
-    _wait(pipe, [EdgeServer(_HOST, key, EdgeStore(()), lambda _: reply) for _ in range(groups)])
+    _serve(pipe, [lambda _: reply] * groups)
 
 
-def _wait(pipe: Connection, servers: Sequence[EdgeServer]) -> None:
-    """Says where servers listen, and waits until the pipe is closed."""
-    pipe.send([server.port for server in servers])
+def _serve(pipe: Connection, answers: Sequence[Answer]) -> None:
+    """Says where it listens, and answers until the pipe is closed."""
+    closed = threading.Event()
+    pipe.send(serve(_HOST, answers, closed))
     with suppress(EOFError):
         pipe.recv()
-    for server in servers:
-        server.close()
+    closed.set()
 
 
 def _time(frame: int) -> float:

@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 import asyncio
+import pickle
 import time
 import uuid
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from concurrent import futures
-from concurrent.futures import Future as OpeningFuture
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
-from multiprocessing.connection import Connection
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecification, TimedPicture
 from drake_pose.errors import ClusterError, DrakePoseError
-from drake_pose.fit.camera_sums import EdgeKeeper
 from drake_pose.jobs.cluster import camera_worker
-from drake_pose.jobs.cluster.camera_assignment import CameraAssignment, assign_cameras, host_of
-from drake_pose.jobs.cluster.camera_worker import WatchReply, WatchRequest
-from drake_pose.jobs.cluster.edge_server import POLLS
-from drake_pose.jobs.cluster.lines import LineReply, hang_up, open_line
+from drake_pose.jobs.cluster.camera_worker import WatchReply, WatchRequest, host_of
+from drake_pose.jobs.cluster.lines import Line, Listening
 from drake_pose.jobs.cluster.remote_keeper import RemoteKeeper
 from drake_pose.jobs.cluster.worker import worker_resources
 
@@ -44,10 +40,58 @@ _SILENCE = 3.0
 _POLL_PAUSE = 0.0005
 
 
+@dataclass(frozen=True)
+class CameraAssignment:
+    """Cameras that one worker looks through. hosts: where; empty: anywhere."""
+
+    specifications: tuple[SourceSpecification, ...]
+    hosts: frozenset[str] = frozenset()
+
+    def allows(self, address: str) -> bool:
+        """Whether the worker of an address can look through them."""
+        return not self.hosts or host_of(address) in self.hosts
+
+
+def assign_cameras(
+    specifications: Sequence[SourceSpecification], workers: Mapping[str, Collection[str]]
+) -> list[CameraAssignment]:
+    """Shares cameras out among workers.
+
+    Recordings and cameras in a network can be opened anywhere. A camera that hangs on a machine is
+    looked through by the workers there: where workers run on several machines, those that were
+    started with a resource of the camera's name (``workers``: those names by address).
+
+    Raises:
+        ClusterError: there is no worker, or nobody says where a camera is.
+    """
+    if not workers:
+        raise ClusterError("there are no workers to watch cameras; start some")
+    all_hosts = sorted({host_of(address) for address in workers})
+    groups: dict[frozenset[str], list[SourceSpecification]] = {}
+    for one in specifications:
+        hosts: frozenset[str] = frozenset()
+        if len(all_hosts) > 1 and one.live and "://" not in one.location:
+            hosts = frozenset(host_of(a) for a, names in workers.items() if one.camera in names)
+            if not hosts:
+                raise ClusterError(
+                    f"camera '{one.camera}' hangs on one of {', '.join(all_hosts)}, and nobody "
+                    f'says on which: start a worker there with --resources "{one.camera}=1"'
+                )
+        groups.setdefault(hosts, []).append(one)
+    assignments = []
+    for hosts, group in groups.items():
+        count = sum(not hosts or host_of(address) in hosts for address in workers)
+        # Neighbours stay together.
+        for part in np.array_split(np.arange(len(group)), min(count, len(group))):
+            assignments.append(CameraAssignment(tuple(group[k] for k in part), hosts))
+    return assignments
+
+
 class Watchers:
     """Workers that watch cameras.
 
     Attributes:
+        client: of the cluster.
         groups: of cameras, one for each worker.
         reports: what the user should know and was not told yet.
         overdue: says up to which time stamp a camera's pictures come too late [s].
@@ -56,7 +100,7 @@ class Watchers:
         client: of the cluster.
         specifications: of the cameras' sources.
         spacings: from edge point to edge point, by camera [pixel].
-        waits: whether a recording waits for a worker that does not answer; live, it goes on.
+        waits: whether a worker that does not answer is waited for, as a recording can.
 
     Raises:
         ClusterError: there is no worker, or they do not get ready.
@@ -70,7 +114,7 @@ class Watchers:
         spacings: Mapping[str, float],
         waits: bool,
     ) -> None:
-        self._client, self.waits = client, waits
+        self.client, self.waits = client, waits
         self.reports: list[str] = []
         self.overdue: Callable[[str], float] = lambda _: -np.inf
         self._addresses: tuple[str, ...] = ()
@@ -87,15 +131,10 @@ class Watchers:
             self.close()
             raise
 
-    @property
-    def client(self) -> Client:
-        """Of the cluster."""
-        return self._client
-
     def addresses(self) -> tuple[str, ...]:
         """The workers that are there, looked up a few times a second."""
         if time.monotonic() - self._looked > _ALIVE_PERIOD:
-            self._addresses = tuple(sorted(self._client.nthreads()))
+            self._addresses = tuple(sorted(self.client.nthreads()))
             self._looked = time.monotonic()
         return self._addresses
 
@@ -110,7 +149,7 @@ class Watchers:
     def is_warm(self, address: str) -> bool:
         """Whether a worker has imported what it needs; it begins to where it has not."""
         if address not in self._warm:
-            self._warm[address] = self._client.submit(
+            self._warm[address] = self.client.submit(
                 camera_worker.warm, workers=[address], pure=False
             )
         return bool(self._warm[address].done())
@@ -118,12 +157,11 @@ class Watchers:
     def pump(self) -> None:
         """Takes what came, and asks for more."""
         now = time.monotonic()
-        if now - self._pumped < _POLL_PAUSE:
-            # Every camera calls, a hundred of them at once.
-            return
-        self._pumped = now
-        for group in self.groups:
-            group.pump()
+        # Every camera calls, a hundred of them at once.
+        if now - self._pumped >= _POLL_PAUSE:
+            self._pumped = now
+            for group in self.groups:
+                group.pump()
 
     def close(self) -> None:
         """Lets go of the cameras."""
@@ -132,57 +170,38 @@ class Watchers:
 
 
 class WatchedGroup:
-    """Cameras that one worker watches.
+    """Cameras that one worker, of an address, watches.
 
     Attributes:
-        assignment: the cameras, and where they can be looked through.
-        address: of the worker.
-        specifications: by camera, of the cameras' sources.
         queues: by camera, what came and was not read yet.
         ended: the cameras that will give nothing any more.
-        rates: by camera, pictures a second, where known.
-        dropped: by camera, pictures that could not be used.
+        rates, dropped: by camera, pictures a second, where known; pictures that were unusable.
         keeper: asks the worker for sums over its cameras.
         views, view_bytes, seconds: how many views came, of how many bytes, and the work for them.
-
-    Args:
-        watchers: all of them.
-        assignment: the cameras, and where they can be looked through.
-        spacings: from edge point to edge point, by camera [pixel].
     """
 
     def __init__(
-        self,
-        watchers: Watchers,
-        assignment: CameraAssignment,
-        spacings: Mapping[str, float],
+        self, watchers: Watchers, assignment: CameraAssignment, spacings: Mapping[str, float]
     ) -> None:
-        self.assignment = assignment
+        self.assignment, self.address = assignment, ""
         self.specifications = {one.camera: one for one in assignment.specifications}
-        self.address = ""
-        self.queues: dict[str, deque[TimedPicture]] = {
-            name: deque() for name in self.specifications
-        }
+        names = tuple(self.specifications)
+        self.queues: dict[str, deque[TimedPicture]] = {name: deque() for name in names}
         self.ended: set[str] = set()
-        self.rates: dict[str, float | None] = dict.fromkeys(self.specifications)
-        self.dropped = dict.fromkeys(self.specifications, 0)
+        self.rates: dict[str, float | None] = dict.fromkeys(names)
+        self.dropped = dict.fromkeys(names, 0)
         self.views, self.view_bytes, self.seconds = 0, 0, 0.0
+        self.keeper = RemoteKeeper(names, lambda text: watchers.reports.append(text))
         self._watchers, self._spacings = watchers, spacings
+        self._names = ", ".join(f"'{name}'" for name in names)
         self._key = uuid.uuid4().hex
-        self.keeper = RemoteKeeper(
-            self.specifications, self._key.encode(), lambda text: watchers.reports.append(text)
-        )
-        self._after = dict.fromkeys(self.specifications, -np.inf)
-        self._future: Future | LineReply | None = None
-        self._line: OpeningFuture[Connection] | None = None
-        self._listening = "", 0
-        self._asked = 0.0
+        self._after = dict.fromkeys(names, -np.inf)
+        # Who was asked: the worker by the connection beside Dask, or by a task.
+        self._future: Future | None = None
+        self._line: Line | None = None
+        self._listening: Listening | None = None
+        self._asked: float | None = None
         self._silent = self._given_up = False
-
-    @property
-    def names(self) -> str:
-        """The cameras, for messages."""
-        return ", ".join(f"'{name}'" for name in self.specifications)
 
     def prepare(self) -> None:
         """Begins to open the sources."""
@@ -190,40 +209,38 @@ class WatchedGroup:
         self._ask(0)
 
     def require_ready(self) -> None:
-        """Waits until the sources are open.
-
-        Raises:
-            SceneError: a source cannot be opened.
-            ClusterError: the worker does not get ready.
-        """
-        begin = time.monotonic()
-        while self._future is not None:
-            if time.monotonic() - begin > _OPENING:
-                raise ClusterError(f"the worker of camera {self.names} does not get ready")
-            time.sleep(_POLL_PAUSE)
-            if self._future.done():
-                future, self._future = self._future, None
-                self._take(future.result())
+        """Waits until the sources are open, or raises why they cannot be."""
+        future, self._future, self._asked = self._future, None, None
+        if future is None:
+            return
+        try:
+            self._take(future.result(timeout=_OPENING))
+        except asyncio.TimeoutError:
+            raise ClusterError(f"the worker of camera {self._names} does not get ready") from None
 
     def pump(self) -> None:
         """Takes what came, asks for more, and looks for another worker where this one died."""
-        if self._future is None:
+        if self._asked is None:
             self._settle()
             waiting = [len(q) for name, q in self.queues.items() if name not in self.ended]
             if self.address and min(waiting, default=_COUNT) < _COUNT:
                 self._ask(_COUNT)
-        elif self.address not in self._watchers.addresses():
-            self._future.cancel()
+            return
+        elapsed = time.monotonic() - self._asked
+        if self.address not in self._watchers.addresses():
             self._lose("was lost")
-        elif self._future.done():
-            self._note(self._future)
-        elif time.monotonic() - self._asked > _SILENCE:
+        elif (reply := self._reply()) is not None:
+            self._asked = self._future = None
+            if isinstance(reply, WatchReply):
+                self._take(reply)
+            else:
+                self._lose(f"failed ({reply})")
+        elif elapsed > _SILENCE:
             self._report_silence("does not answer")
-            if isinstance(self._future, LineReply) and time.monotonic() - self._asked > _PATIENCE:
-                # The line may be dead and the worker alive: Dask finds out.
-                self._future.cancel()
+            if self._future is None and elapsed > _PATIENCE:
+                # The connection may be dead and the worker alive: Dask finds out.
                 self._hang_up()
-                self._future = None
+                self._asked = None
 
     def await_camera(self, camera: str) -> None:
         """Waits until there is something of a camera, or nothing is to be expected."""
@@ -236,19 +253,11 @@ class WatchedGroup:
 
     def close(self) -> None:
         """Lets go of the sources."""
-        self.keeper.close()
         self._hang_up()
-        if self._future is not None:
-            self._future.cancel()
-            self._future = None
         self.ended.update(self.specifications)
         if self.address in self._watchers.addresses():
             with suppress(asyncio.TimeoutError):
                 self._close_watch().exception(timeout=_PATIENCE)
-
-    @property
-    def _client(self) -> Client:
-        return self._watchers.client
 
     def _ask(self, count: int) -> None:
         request = WatchRequest(
@@ -260,55 +269,53 @@ class WatchedGroup:
             _LIVE_PATIENCE,
         )
         self._asked = time.monotonic()
-        connection = self._line_to_worker() if count else None
-        if connection is not None:
-            self._future = LineReply(connection, request)
-            return
-        self._future = self._client.submit(
-            camera_worker.poll, request, workers=[self.address], pure=False
-        )
+        if not count or self._line is None or not self._line.send(pickle.dumps(request)):
+            self._future = self._watchers.client.submit(
+                camera_worker.poll, request, workers=[self.address], pure=False
+            )
 
-    def _line_to_worker(self) -> Connection | None:
-        """The connection beside Dask, where there is one by now: Dask costs milliseconds a task."""
-        if self._line is None or not self._line.done() or self._line.exception() is not None:
+    def _reply(self) -> WatchReply | DrakePoseError | str | None:
+        """What the worker answers or has raised; None: nothing yet."""
+        if self._future is None:
+            data = None if self._line is None else self._line.receive()
+            return None if data is None else pickle.loads(data)
+        if not self._future.done():
             return None
-        return self._line.result()
+        error = self._future.exception() if self._future.status == "error" else None
+        if self._future.status == "finished":
+            with suppress(asyncio.TimeoutError, asyncio.CancelledError):
+                return self._future.result(timeout=_ALIVE_PERIOD)
+            return None
+        return error if isinstance(error, DrakePoseError) else "its task was lost"
 
-    def _move_to(self, address: tuple[str, int]) -> None:
-        """Connects to where the worker listens; port 0: nowhere."""
-        self.keeper.move_to(*address)
-        if address == self._listening:
+    def _move_to(self, listening: Listening | None) -> None:
+        """Connects to where the worker listens beside Dask; None: nowhere."""
+        if listening == self._listening:
             return
         self._hang_up()
-        self._listening = address
-        if address[1]:
-            self._line = open_line(address, self._key.encode(), [POLLS])
+        self._listening = listening
+        if listening is not None:
+            host = host_of(self.address)
+            self._line, sums = (Line(host, port, listening.key) for port in listening.ports)
+            self.keeper.move_to(sums)
 
     def _hang_up(self) -> None:
-        line, self._line, self._listening = self._line, None, ("", 0)
-        if line is not None:
-            hang_up(line)
-
-    def _note(self, future: Future | LineReply) -> None:
-        """Takes a reply; it may have died with its worker."""
-        error = future.exception() if future.status == "error" else None
-        if future.status != "finished":
-            self._lose(f"failed ({error})" if isinstance(error, DrakePoseError) else "was lost")
-            return
-        with suppress(asyncio.TimeoutError, asyncio.CancelledError, futures.CancelledError):
-            reply = future.result(timeout=_ALIVE_PERIOD)
-            self._future = None
-            self._take(reply)
+        self.keeper.close()
+        if self._line is not None:
+            self._line.close()
+        if self._future is not None:
+            self._future.cancel()
+        self._line = self._listening = self._future = None
 
     def _lose(self, how: str) -> None:
         self._report_silence(how)
         self._hang_up()
-        self._future, self.address = None, ""
+        self._asked, self.address = None, ""
 
     def _report_silence(self, how: str) -> None:
         if not self._silent:
             self._watchers.reports.append(
-                f"the worker of camera {self.names} {how}; the others go on without"
+                f"the worker of camera {self._names} {how}; the others go on without"
             )
         self._silent = True
 
@@ -324,26 +331,26 @@ class WatchedGroup:
             self.address = free
         elif self.address in taken and free not in taken and self._watchers.is_warm(free):
             fire_and_forget(self._close_watch())
-            self._watchers.reports.append(f"camera {self.names} moves to a worker of its own")
+            self._watchers.reports.append(f"camera {self._names} moves to a worker of its own")
             self._hang_up()
             self.address = free
 
     def _close_watch(self) -> Future:
-        return self._client.submit(
+        return self._watchers.client.submit(
             camera_worker.close, self._key, workers=[self.address], pure=False
         )
 
     def _take(self, reply: WatchReply) -> None:
         if self._silent:
-            self._watchers.reports.append(f"a worker goes on with camera {self.names}")
+            self._watchers.reports.append(f"a worker goes on with camera {self._names}")
         self._silent = self._given_up = False
-        self._move_to((host_of(self.address), reply.port))
+        self._move_to(reply.listening)
         for name, views in reply.views.items():
-            for one in views:
-                packed = np.frombuffer(one.packed, dtype=np.uint8)
-                self.queues[name].append(TimedPicture(one.time, one.frame, packed))
-                self._after[name] = one.time
-                self.view_bytes += len(one.packed)
+            for stamp, frame, view in views:
+                packed = np.frombuffer(view, dtype=np.uint8)
+                self.queues[name].append(TimedPicture(stamp, frame, packed))
+                self._after[name] = stamp
+                self.view_bytes += len(view)
             self.views += len(views)
         self.ended.update(reply.ended)
         self.rates.update(reply.rates)
@@ -353,44 +360,31 @@ class WatchedGroup:
 
 
 class WatchedSource(FrameSource):
-    """A camera whose pictures stay where they are: gives packed views in their place.
-
-    Args:
-        specification: where the pictures come from.
-        group: to which the camera belongs.
-        watchers: all of them.
-    """
+    """A camera whose pictures stay where they are: gives packed views in their place."""
 
     def __init__(
         self, specification: SourceSpecification, group: WatchedGroup, watchers: Watchers
     ) -> None:
         super().__init__(specification)
-        self._group, self._watchers = group, watchers
+        self._name, self._group, self._watchers = specification.camera, group, watchers
 
     @property
     def ended(self) -> bool:
         """Whether nothing will come any more."""
-        name = self.specification.camera
-        return name in self._group.ended and not self._group.queues[name]
+        return self._name in self._group.ended and not self._group.queues[self._name]
 
     @property
     def rate_hz(self) -> float | None:
         """As the source says where it is open."""
-        return self._group.rates[self.specification.camera]
-
-    @property
-    def keeper(self) -> EdgeKeeper:
-        """Who has the edges of the camera's pictures."""
-        return self._group.keeper
+        return self._group.rates[self._name]
 
     def close(self) -> None:
         """Nothing is held open here."""
 
     def _read(self) -> TimedPicture | None:
-        name = self.specification.camera
         self._watchers.pump()
         if self._watchers.waits:
-            self._group.await_camera(name)
-        self.dropped = self._group.dropped[name]
-        queue = self._group.queues[name]
+            self._group.await_camera(self._name)
+        self.dropped = self._group.dropped[self._name]
+        queue = self._group.queues[self._name]
         return queue.popleft() if queue else None

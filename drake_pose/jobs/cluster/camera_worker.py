@@ -1,18 +1,16 @@
 """What a worker does for live capture: it opens some cameras' sources and says what they see.
 
-The sources stay open from one poll to the next. Pictures do not leave the machine; what leaves it
-is a few kilobytes a camera.
+Sources stay open from one poll to the next. Pictures do not leave the machine; what leaves it is a
+few kilobytes a camera, and sums over its cameras where the fit asks for them.
 """
 
 from __future__ import annotations
 
-import os
 import pickle
 import threading
 import time
-from collections.abc import Mapping
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -21,10 +19,19 @@ from drake_pose.camera.sources.files import load_background_pictures
 from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecification
 from drake_pose.camera.sources.opening import open_source
 from drake_pose.errors import DrakePoseError
-from drake_pose.jobs.cluster.camera_assignment import host_of
-from drake_pose.jobs.cluster.edge_server import EdgeServer, EdgeStore
+from drake_pose.fit.camera_sums import (
+    Views,
+    answer_request,
+    compare_placed,
+    pack_sum,
+    unpack_surfaces,
+)
+from drake_pose.fit.evidence import NO_EDGE, EdgePoints, pack_evidence
+from drake_pose.jobs.cluster.lines import Listening, serve
+from drake_pose.jobs.cluster.remote_keeper import SURFACES
 from drake_pose.person.silhouette_view import see_silhouette
 from drake_pose.person.view_packing import pack_view
+from drake_pose.silhouette.areas.outline import PackedOutlines
 from drake_pose.silhouette.segmentation.background import (
     Background,
     learn_background,
@@ -35,6 +42,8 @@ from drake_pose.silhouette.segmentation.background import (
 _IDLE = 30.0
 # Between two checks whether a live camera has a new picture [s].
 _POLL_PAUSE = 0.002
+# How many of each camera's last pictures are kept: who follows the person is a few of them behind.
+_KEPT = 64
 
 
 @dataclass(frozen=True)
@@ -42,12 +51,10 @@ class WatchRequest:
     """What a worker is asked for.
 
     Args:
-        key: of the watch: the same sources stay open under it.
-        specifications: of the cameras' sources.
+        key: the same sources stay open under it.
         spacings: from edge point to edge point, by camera [pixel].
-        after: by camera, the time stamp up to which nobody wants a picture any more [s]: they came
-            already, or would come too late.
-        count: how many pictures of each camera at most.
+        after: by camera, the time stamp up to which pictures came already or come too late [s].
+        count: how many pictures of each camera at most; 0: the sources are opened, no more.
         patience: how long at most until a live camera gives a picture [s].
     """
 
@@ -60,37 +67,71 @@ class WatchRequest:
 
 
 @dataclass(frozen=True, eq=False)
-class PackedView:
-    """What a camera said. time: stamp [s]; frame: its name; packed: of pack_view."""
-
-    time: float
-    frame: str
-    packed: bytes
-
-
-@dataclass(frozen=True, eq=False)
 class WatchReply:
     """What a worker saw.
 
     Args:
-        views: by camera.
+        views: by camera, time stamps [s], names of frames, and views as of pack_view.
         ended: the cameras that will give nothing any more.
         problems: what was wrong.
         dropped: by camera, pictures that could not be used since the sources were opened.
         rates: by camera, pictures a second, where known.
-        process: the worker's process.
         seconds: of its processor's time, for views and sums [s].
-        port: where it answers with sums, at the address where Dask reaches it; 0: it does not.
+        listening: the ports for polls and sums, at the address where Dask reaches the worker.
     """
 
-    views: Mapping[str, tuple[PackedView, ...]]
-    ended: tuple[str, ...]
-    problems: tuple[str, ...]
-    dropped: Mapping[str, int]
-    rates: Mapping[str, float | None]
-    process: int
-    seconds: float
-    port: int = 0
+    views: Mapping[str, Sequence[tuple[float, str, bytes]]]
+    ended: tuple[str, ...] = ()
+    problems: tuple[str, ...] = ()
+    dropped: Mapping[str, int] = field(default_factory=dict)
+    rates: Mapping[str, float | None] = field(default_factory=dict)
+    seconds: float = 0.0
+    listening: Listening | None = None
+
+
+class EdgeServer:
+    """Compares contours with the edges of some cameras' last pictures.
+
+    A camera's number is its place among them. seconds: of the processor's time [s].
+    """
+
+    def __init__(self, cameras: int) -> None:
+        self._edges: list[dict[float, EdgePoints]] = [{} for _ in range(cameras)]
+        self._surfaces: PackedOutlines | None = None
+        self.seconds = 0.0
+
+    def put(self, number: int, time_stamp: float, edge: EdgePoints) -> None:
+        """Keeps a picture's edge."""
+        edges = self._edges[number]
+        edges[time_stamp] = edge
+        if len(edges) > _KEPT:
+            del edges[next(iter(edges))]
+
+    def find(self, number: int, time_stamp: float) -> EdgePoints | None:
+        """The edge of a picture; None where it is not kept, or not any more."""
+        return self._edges[number].get(time_stamp)
+
+    def answer(self, parts: Sequence[bytes]) -> bytes:
+        """Takes a body's surfaces, or adds up; nothing where edges are not kept any more."""
+        begin = time.thread_time()
+        kind, data = parts
+        if kind == SURFACES:
+            self._surfaces = unpack_surfaces(data)
+            _load_kernels(self._surfaces)
+            return b""
+        total = None
+        if self._surfaces is not None:
+            total = answer_request(data, self._surfaces, self.find)
+        reply = b"" if total is None else pack_sum(total)
+        self.seconds += time.thread_time() - begin
+        return reply
+
+
+def _load_kernels(surfaces: PackedOutlines) -> None:
+    """Compares with nothing once: kernels are loaded by their first call."""
+    nodes = len(surfaces.ordinary_ends)
+    views = Views((np.eye(4)[None], np.ones((1, 8))), pack_evidence([NO_EDGE]))
+    compare_placed(surfaces, np.tile(np.eye(4), (nodes, 1, 1)), views, np.ones((1, 4)))
 
 
 class _Watch:
@@ -99,10 +140,11 @@ class _Watch:
     def __init__(self, request: WatchRequest) -> None:
         self.lock = threading.Lock()
         self.used = time.monotonic()
+        self._closed = threading.Event()
         self._sources: dict[str, FrameSource] = {}
         self._backgrounds: dict[str, Background] = {}
-        self._store = EdgeStore(one.camera for one in request.specifications)
-        self._server: EdgeServer | None = None
+        self._edges = EdgeServer(len(request.specifications))
+        self._seconds = 0.0
         warm()
         try:
             for one in request.specifications:
@@ -110,57 +152,54 @@ class _Watch:
                     self._backgrounds[one.camera] = learn_background(load_background_pictures(one))
                 # Machines share no other clock than that of the day.
                 self._sources[one.camera] = open_source(one, time.time)
-            self._server = _open_server(request.key, self._store)
         except DrakePoseError:
             self.close()
             raise
+        host = _own_host()
+        answers = (_poll_pickled, self._edges.answer)
+        self._listening = None if host is None else serve(host, answers, self._closed)
 
     def poll(self, request: WatchRequest) -> WatchReply:
         """What the cameras see now, or next."""
-        self.used = time.monotonic()
-        seconds = 0.0
-        views: dict[str, list[PackedView]] = {name: [] for name in self._sources}
+        sources = self._sources
+        views: dict[str, list[tuple[float, str, bytes]]] = {name: [] for name in sources}
         end = time.monotonic() + request.patience
-        while request.count and not self.ended:
+        while request.count and not all(source.ended for source in sources.values()):
             begin = time.thread_time()
-            for name, source in self._sources.items():
-                self._see(source, views[name], request.after.get(name, -np.inf), request)
-            seconds += time.thread_time() - begin
-            live = any(one.specification.live for one in self._sources.values())
+            for number, (name, source) in enumerate(sources.items()):
+                self._see(number, source, views[name], request)
+            self._seconds += time.thread_time() - begin
+            live = any(one.specification.live for one in sources.values())
             if not live or any(views.values()) or time.monotonic() > end:
                 break
             time.sleep(_POLL_PAUSE)
         self.used = time.monotonic()
-        problems = [text for one in self._sources.values() for text in one.problems]
-        for source in self._sources.values():
+        problems = tuple(text for one in sources.values() for text in one.problems)
+        for source in sources.values():
             source.problems.clear()
+        seconds, self._seconds, self._edges.seconds = self._seconds + self._edges.seconds, 0.0, 0.0
         return WatchReply(
-            views={name: tuple(seen) for name, seen in views.items()},
-            ended=tuple(name for name, source in self._sources.items() if source.ended),
-            problems=tuple(problems),
-            dropped={name: source.dropped for name, source in self._sources.items()},
-            rates={name: source.rate_hz for name, source in self._sources.items()},
-            process=os.getpid(),
-            seconds=seconds + (self._server.take_seconds() if self._server else 0.0),
-            port=self._server.port if self._server else 0,
+            views,
+            tuple(name for name, source in sources.items() if source.ended),
+            problems,
+            {name: source.dropped for name, source in sources.items()},
+            {name: source.rate_hz for name, source in sources.items()},
+            seconds,
+            self._listening,
         )
 
-    @property
-    def ended(self) -> bool:
-        """Whether no camera will give anything any more."""
-        return all(source.ended for source in self._sources.values())
-
     def _see(
-        self, source: FrameSource, views: list[PackedView], after: float, request: WatchRequest
+        self,
+        number: int,
+        source: FrameSource,
+        views: list[tuple[float, str, bytes]],
+        request: WatchRequest,
     ) -> None:
         """The next views of one camera."""
         name = source.specification.camera
-        while len(views) < request.count:
-            one = source.read()
-            if one is None:
-                return
+        while len(views) < request.count and (one := source.read()) is not None:
             # A recording that is opened again begins at its beginning.
-            if one.time <= after:
+            if one.time <= request.after.get(name, -np.inf):
                 continue
             if source.specification.gives_masks:
                 region = np.asarray(one.picture, dtype=np.bool_)
@@ -168,34 +207,29 @@ class _Watch:
                 picture = np.asarray(one.picture, dtype=np.uint8)
                 region = person_region(picture, self._backgrounds[name])
             view = see_silhouette(region, request.spacings[name])
-            self._store.put(name, one.time, view.edge)
-            views.append(PackedView(one.time, one.frame, pack_view(view)))
+            self._edges.put(number, one.time, view.edge)
+            views.append((one.time, one.frame, pack_view(view)))
 
     def close(self) -> None:
         """Lets go of the sources."""
-        if self._server is not None:
-            self._server.close()
+        self._closed.set()
         for source in self._sources.values():
             source.close()
 
 
-def _open_server(key: str, store: EdgeStore) -> EdgeServer | None:
-    """Answers with sums where the worker listens to Dask; None where that cannot be.
-
-    The connection is not encrypted: where Dask's are, there is none.
-    """
+def _own_host() -> str | None:
+    """Where this worker listens to Dask; None where it is no worker."""
     from distributed import get_worker
 
     try:
-        address = get_worker().address
+        return host_of(get_worker().address)
     except ValueError:
-        # Not called by a worker.
         return None
-    if not address.startswith("tcp://"):
-        return None
-    with suppress(OSError):
-        return EdgeServer(host_of(address), key.encode(), store, _poll_pickled)
-    return None
+
+
+def host_of(address: str) -> str:
+    """The machine of a worker's address."""
+    return address.split("://")[-1].rsplit(":", 1)[0]
 
 
 _watches: dict[str, _Watch] = {}
@@ -212,11 +246,7 @@ def warm() -> None:
 
 
 def poll(request: WatchRequest) -> WatchReply:
-    """Opens the cameras' sources if they are not open yet, and says what they see.
-
-    Raises:
-        SceneError: a source cannot be opened.
-    """
+    """Opens the sources if they are not open yet (SceneError), and says what the cameras see."""
     with _watches_lock:
         watch = _watches.get(request.key)
         if watch is None:
@@ -228,10 +258,10 @@ def poll(request: WatchRequest) -> WatchReply:
         return watch.poll(request)
 
 
-def _poll_pickled(data: bytes) -> bytes:
+def _poll_pickled(parts: Sequence[bytes]) -> bytes:
     """As poll, of a request that came by a connection of its own."""
     try:
-        return pickle.dumps(poll(pickle.loads(data)))
+        return pickle.dumps(poll(pickle.loads(parts[0])))
     except DrakePoseError as error:
         return pickle.dumps(error)
 

@@ -1,101 +1,83 @@
-"""Connections to a worker beside Dask's: opened by a thread, so that the dead hold nobody up."""
+"""Encrypted connections to a worker beside Dask's, whose tasks cost milliseconds each (ZeroMQ)."""
 
 from __future__ import annotations
 
-import os
-import pickle
-import socket
 import threading
-from collections.abc import Sequence
-from concurrent.futures import Future
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from multiprocessing import AuthenticationError
-from multiprocessing.connection import Client, Connection
-from typing import Any
+from typing import NamedTuple
+
+import zmq
+
+# How often a server looks whether it was closed [ms].
+_LOOK = 200
 
 
-def send_at_once(connection: Connection) -> None:
-    """Lets a connection's small messages go at once; else they wait for others, 40 ms long."""
-    with socket.socket(fileno=os.dup(connection.fileno())) as same:
-        same.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+class Listening(NamedTuple):
+    """Where a server listens. key: to be kept secret: who does not know it is not answered."""
+
+    key: bytes
+    ports: tuple[int, ...]
 
 
-def open_line(address: tuple[str, int], key: bytes, words: Sequence[bytes]) -> Future[Connection]:
-    """Begins to connect to an EdgeServer.
+class Line:
+    """The asking end of a connection: one request at a time; nothing waits for a dead peer."""
 
-    Args:
-        address: the server's.
-        key: the server's.
-        words: what is said first; then the server says that it is ready.
+    def __init__(self, host: str, port: int, key: bytes) -> None:
+        self._socket: zmq.Socket = zmq.Context.instance().socket(zmq.REQ)
+        # A request whose reply did not come may be followed by another, whose reply is told apart;
+        # without a connection nothing is sent.
+        for option in (zmq.REQ_RELAXED, zmq.REQ_CORRELATE, zmq.IMMEDIATE):
+            self._socket.setsockopt(option, 1)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.curve_publickey, self._socket.curve_secretkey = zmq.curve_keypair()
+        self._socket.curve_serverkey = key
+        self._socket.connect(f"tcp://{host}:{port}")
 
-    Returns:
-        The connection, or the reason why there is none.
+    def send(self, *parts: bytes) -> bool:
+        """Sends a request; False where there is no connection, yet or any more."""
+        with suppress(zmq.Again):
+            self._socket.send_multipart(parts, zmq.NOBLOCK)
+            return True
+        return False
+
+    def receive(self, patience: float = 0.0) -> bytes | None:
+        """The reply to the last request; None where it does not come in this time [s]."""
+        if not self._socket.poll(max(0, round(1e3 * patience))):
+            return None
+        return self._socket.recv()
+
+    def close(self) -> None:
+        """Hangs up."""
+        self._socket.close()
+
+
+Answer = Callable[[Sequence[bytes]], bytes]
+"""The reply to a request's parts."""
+
+
+def serve(host: str, answers: Sequence[Answer], closed: threading.Event) -> Listening | None:
+    """Answers requests, each kind at a port and in a thread of its own, until it is closed.
+
+    None: the host's address cannot be listened at.
     """
-    opening: Future[Connection] = Future()
-
-    def connect() -> None:
+    key, secret = zmq.curve_keypair()
+    ports = []
+    for answer in answers:
+        socket: zmq.Socket = zmq.Context.instance().socket(zmq.REP)
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.curve_server, socket.curve_publickey, socket.curve_secretkey = True, key, secret
         try:
-            connection = Client(address, authkey=key)
-            send_at_once(connection)
-            for word in words:
-                connection.send_bytes(word)
-            connection.recv_bytes()
-        except (OSError, EOFError, AuthenticationError) as error:
-            opening.set_exception(error)
-        else:
-            opening.set_result(connection)
-
-    threading.Thread(target=connect, daemon=True).start()
-    return opening
+            ports.append(socket.bind_to_random_port(f"tcp://{host}"))
+        except zmq.ZMQError:
+            closed.set()
+            return None
+        threading.Thread(target=_serve, args=(socket, answer, closed), daemon=True).start()
+    return Listening(key, tuple(ports))
 
 
-def hang_up(opening: Future[Connection]) -> None:
-    """Closes a connection as soon as it is there."""
-
-    def close(done: Future[Connection]) -> None:
-        if done.exception() is None:
-            done.result().close()
-
-    opening.add_done_callback(close)
-
-
-class LineReply:
-    """What will come by a connection, as a Future of Dask shows it: its status, its result.
-
-    Args:
-        connection: to a worker.
-        request: to be pickled and sent.
-    """
-
-    def __init__(self, connection: Connection, request: object) -> None:
-        self.status = "pending"
-        self._connection, self._reply = connection, None
-        try:
-            connection.send_bytes(pickle.dumps(request))
-        except OSError:
-            self.status = "lost"
-
-    def done(self) -> bool:
-        """Whether the reply came, or will not come any more."""
-        if self.status == "pending":
-            try:
-                if self._connection.poll():
-                    self._reply = pickle.loads(self._connection.recv_bytes())
-                    self.status = "error" if isinstance(self._reply, Exception) else "finished"
-            except (OSError, EOFError, pickle.UnpicklingError):
-                self.status = "lost"
-        return self.status != "pending"
-
-    def exception(self) -> Exception | None:
-        """What the worker has raised."""
-        return self._reply if isinstance(self._reply, Exception) else None
-
-    def result(self, timeout: float | None = None) -> Any:
-        """The reply, when it is done."""
-        return self._reply
-
-    def cancel(self) -> None:
-        """Nobody waits for it any more; the connection cannot be used again."""
-        self.status = "cancelled"
-        with suppress(OSError):
-            self._connection.close()
+def _serve(socket: zmq.Socket, answer: Answer, closed: threading.Event) -> None:
+    with socket:
+        while not closed.is_set():
+            if socket.poll(_LOOK):
+                socket.send(answer(socket.recv_multipart()))

@@ -11,10 +11,9 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_pose.camera.sources.frame_source import Clock
 from drake_pose.jobs.cluster.camera_groups import WatchedSource, Watchers
 from drake_pose.jobs.live.scene import LiveScene
-from drake_pose.systems.person.live_capture import SensorPorts
+from drake_pose.systems.person.live_capture import LocalSensors, SensorPorts
 from drake_pose.systems.person.remote_sensors import RemoteSensors
 from drake_pose.systems.person.silhouette_sensor import edge_spacing
-from drake_pose.systems.pictures.picture_capture import CameraCount
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -25,16 +24,12 @@ def opener(client: Client, tolerance: float | None = None) -> Callable[[LiveScen
     return lambda scene: ClusterSensors(client, scene, tolerance=tolerance)
 
 
-class ClusterSensors:
+class ClusterSensors(LocalSensors):
     """Sensors on the workers of a cluster, one worker for each group of cameras; see LiveSensors.
 
     Pictures stay where they are: a worker says in a few kilobytes what its cameras see, and adds up
     what they say of a pose, as often as a fit asks. A worker that dies costs the others nothing;
     another one, or itself when it was started again, goes on with its cameras.
-
-    Attributes:
-        watchers: the workers.
-        capture: what brings the views together.
 
     Args:
         client: of the cluster.
@@ -57,29 +52,24 @@ class ClusterSensors:
         tolerance: float | None = None,
         clock: Clock = time.time,
     ) -> None:
-        specifications = list(scene.specifications.values())
-        devices = any(one.live for one in specifications)
+        specifications = scene.specifications
         spacings = {name: edge_spacing(camera) for name, camera in scene.cameras.items()}
-        by_clock = devices if live is None else live
-        self.watchers = Watchers(client, specifications, spacings, waits=not by_clock)
-        sources = {
-            name: WatchedSource(one, group, self.watchers)
-            for group in self.watchers.groups
-            for name, one in group.specifications.items()
-        }
-        ordered = {one.camera: sources[one.camera] for one in specifications}
-        keepers = {name: one.keeper for name, one in sources.items()}
-        self.capture = RemoteSensors(
-            ordered, scene.cameras, keepers=keepers, live=live, tolerance=tolerance, clock=clock
+        by_clock = any(one.live for one in specifications.values()) if live is None else live
+        self.watchers = Watchers(
+            client, list(specifications.values()), spacings, waits=not by_clock
         )
-        if self.capture.live:
-            self.watchers.overdue = self.capture.overdue
-        self.period, self.live = self.capture.period, self.capture.live
-
-    @property
-    def skipped(self) -> int:
-        """How many moments were not shown, as newer ones had come."""
-        return self.capture.skipped
+        groups = {name: group for group in self.watchers.groups for name in group.specifications}
+        sources = {
+            name: WatchedSource(one, groups[name], self.watchers)
+            for name, one in specifications.items()
+        }
+        keepers = {name: group.keeper for name, group in groups.items()}
+        capture = RemoteSensors(
+            sources, scene.cameras, keepers=keepers, live=live, tolerance=tolerance, clock=clock
+        )
+        super().__init__(capture, scene.cameras, {})
+        if self.live:
+            self.watchers.overdue = capture.overdue
 
     def add(self, builder: DiagramBuilder) -> SensorPorts:
         """Adds the systems that see to a diagram under construction."""
@@ -95,10 +85,6 @@ class ClusterSensors:
         """What the user should know and was not told yet."""
         reports, self.watchers.reports = self.watchers.reports, []
         return reports + self.capture.take_reports()
-
-    def counts(self) -> dict[str, CameraCount]:
-        """How each camera did so far."""
-        return self.capture.counts()
 
     def close(self) -> None:
         """Lets go of the cameras."""

@@ -3,27 +3,24 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import logging
 import os
-import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
+from drake_pose import version
 from drake_pose.errors import ClusterError
-from drake_pose.jobs.cluster.worker import WorkerFacts, worker_facts
 
 if TYPE_CHECKING:
     from distributed import Client
 
 _TIMEOUT = 5.0
 """How long a scheduler and its workers may take to answer [s]."""
-
-# More than that, for the connection to say by itself what is wrong [s].
-_GRACE = 0.5
 
 TRIES = 3
 """A task that has killed its process or its worker this often is given up."""
@@ -40,19 +37,6 @@ _CONFIGURATION = {
 }
 
 
-def require_distributed() -> None:
-    """Refuses to go on without Dask distributed.
-
-    Raises:
-        ClusterError: says how to install it.
-    """
-    if find_spec("distributed") is None:
-        raise ClusterError(
-            'workers need Dask distributed: pip install "drake_pose[cluster]"; or do without them: '
-            "--workers 0"
-        )
-
-
 @contextmanager
 def open_cluster(workers: int | None = None, scheduler: str | None = None) -> Iterator[Client]:
     """Workers, for as long as the context lasts.
@@ -66,26 +50,27 @@ def open_cluster(workers: int | None = None, scheduler: str | None = None) -> It
         ClusterError: distributed is not installed, or the scheduler cannot be reached or has no
             workers, or these have another drake_pose.
     """
-    require_distributed()
-    with _quiet():
-        if scheduler is not None:
-            with _connected(scheduler) as client:
-                yield client
-            return
-        with _embedded(workers) as client:
-            yield client
+    if find_spec("distributed") is None:
+        raise ClusterError(
+            'workers need Dask distributed: pip install "drake_pose[cluster]"; or do without them: '
+            "--workers 0"
+        )
+    opened = _embedded(workers) if scheduler is None else _connected(scheduler)
+    with _quiet(), opened as client:
+        yield client
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
     """What Dask says of workers that die is for its developers; users hear it in other words."""
-    import distributed
-
-    loggers = [logging.getLogger(name) for name in (distributed.__name__, "asyncio")]
+    loggers = [logging.getLogger(name) for name in ("distributed", "asyncio")]
     levels = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.CRITICAL)
     try:
+        # Importing it sets the level.
+        import distributed  # noqa: F401
+
+        for logger in loggers:
+            logger.setLevel(logging.CRITICAL)
         yield
     finally:
         for logger, level in zip(loggers, levels, strict=True):
@@ -101,23 +86,22 @@ def _embedded(workers: int | None) -> Iterator[Client]:
     count = len(os.sched_getaffinity(0)) if workers is None else workers
     if count < 1:
         raise ClusterError(f"a cluster has one worker or more, not {count}")
-    scratch = tempfile.mkdtemp(prefix="drake_pose_")
-    try:
-        with config.set(_CONFIGURATION):
-            cluster = LocalCluster(
-                n_workers=count,
-                threads_per_worker=1,
-                processes=True,
-                host=_LOOPBACK,
-                dashboard_address=None,
-                scheduler_kwargs={"dashboard_address": f"{_LOOPBACK}:0"},
-                local_directory=scratch,
-                silence_logs=logging.CRITICAL,
-            )
-            with cluster, Client(cluster, set_as_default=False) as client:
-                yield client
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+    with (
+        tempfile.TemporaryDirectory(prefix="drake_pose_", ignore_cleanup_errors=True) as scratch,
+        config.set(_CONFIGURATION),
+        LocalCluster(
+            n_workers=count,
+            threads_per_worker=1,
+            processes=True,
+            host=_LOOPBACK,
+            dashboard_address=None,
+            scheduler_kwargs={"dashboard_address": f"{_LOOPBACK}:0"},
+            local_directory=scratch,
+            silence_logs=logging.CRITICAL,
+        ) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        yield client
 
 
 @contextmanager
@@ -152,8 +136,30 @@ async def _shake_hands(address: str) -> None:
     from distributed.comm import connect
 
     # Its own timeout does not hold where somebody listens and says nothing.
-    comm = await asyncio.wait_for(connect(address, timeout=_TIMEOUT), _TIMEOUT + _GRACE)
+    comm = await asyncio.wait_for(connect(address, timeout=_TIMEOUT), _TIMEOUT + 0.5)
     await comm.close()
+
+
+class WorkerFacts(NamedTuple):
+    """What must be the same here and there.
+
+    version: of drake_pose; code: a digest of its source files, as development versions differ in
+    nothing else; sees: whether a file is there.
+    """
+
+    version: str
+    code: str
+    sees: bool
+
+
+def worker_facts(file: Path | None = None) -> WorkerFacts:
+    """The facts of the process that is asked; ``file``: one that it should see."""
+    digest = hashlib.sha256()
+    package = Path(version.__file__).parent
+    for path in sorted(package.rglob("*.py")):
+        digest.update(path.relative_to(package).as_posix().encode())
+        digest.update(path.read_bytes())
+    return WorkerFacts(version.VERSION, digest.hexdigest(), file is None or file.is_file())
 
 
 def require_fit_workers(client: Client, out: Path | None = None) -> None:
@@ -183,7 +189,21 @@ def require_fit_workers(client: Client, out: Path | None = None) -> None:
                 f"here, {here.version}"
             ) from error
     for address, facts in there.items():
-        _require_same(address, here, facts, out)
+        if facts.version != here.version:
+            raise ClusterError(
+                f"the worker {address} has drake_pose {facts.version}, but here is {here.version}; "
+                "install the same version on both"
+            )
+        if facts.code != here.code:
+            raise ClusterError(
+                f"the worker {address} has another development version of drake_pose "
+                f"{facts.version}; install the same one on both, and start the worker again"
+            )
+        if not facts.sees:
+            raise ClusterError(
+                f"the worker {address} does not see the folder {out}; scenes, models and results "
+                "must lie where all machines find them under the same path"
+            )
 
 
 def address_of(client: Client) -> str:
@@ -203,21 +223,3 @@ def _shown_file(out: Path | None) -> Iterator[Path | None]:
             yield Path(file.name).absolute()
     except OSError as error:
         raise ClusterError(f"{out}: cannot be written: {error.strerror}") from error
-
-
-def _require_same(address: str, here: WorkerFacts, there: WorkerFacts, out: Path | None) -> None:
-    if there.version != here.version:
-        raise ClusterError(
-            f"the worker {address} has drake_pose {there.version}, but here is {here.version}; "
-            "install the same version on both"
-        )
-    if there.code != here.code:
-        raise ClusterError(
-            f"the worker {address} has another development version of drake_pose "
-            f"{there.version}; install the same one on both, and start the worker again"
-        )
-    if not there.sees:
-        raise ClusterError(
-            f"the worker {address} does not see the folder {out}; scenes, models and results must "
-            "lie where all machines find them under the same path"
-        )

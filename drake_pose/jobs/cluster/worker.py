@@ -1,47 +1,35 @@
-"""What runs on a worker: a light process that has a child for the heavy work."""
+"""A worker's child: a process that does heavy work in its main thread, as no worker's thread can.
+
+A worker's tasks run in a thread beside the one that talks to the scheduler. Drake's renderer and
+Meshcat belong to the thread that made them, and Python's garbage collector takes them apart in
+whichever thread it happens to run; so a worker has a child, and whatever crashes the child (a
+broken model, too little memory) leaves the worker alive.
+
+Run as ``python -m drake_pose.jobs.cluster.worker MEMORY_LIMIT``: reads pickled pairs of a function
+and its argument, and writes the pickled results. When its parent ends, so does it.
+"""
 
 from __future__ import annotations
 
-import hashlib
+import os
+import pickle
+import queue
+import signal
+import subprocess
+import sys
+import tempfile
 import threading
-from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING
+from contextlib import suppress
+from typing import TYPE_CHECKING, BinaryIO
 
-from drake_pose import version
 from drake_pose.errors import ClusterError
-from drake_pose.jobs.cluster.child_process import Child
 
 if TYPE_CHECKING:
     from distributed import Worker
 
+# How much of what a child said last is looked at [byte].
+_TAIL = 4096
 _local = threading.local()
-
-
-@dataclass(frozen=True)
-class WorkerFacts:
-    """What must be the same here and there.
-
-    Args:
-        version: of drake_pose.
-        code: a digest of its source files; development versions differ in nothing else.
-        sees: whether a file is there.
-    """
-
-    version: str
-    code: str
-    sees: bool
-
-
-def worker_facts(file: Path | None = None) -> WorkerFacts:
-    """The facts of the process that is asked; ``file``: one that it should see."""
-    digest = hashlib.sha256()
-    package = Path(version.__file__).parent
-    for path in sorted(package.rglob("*.py")):
-        digest.update(path.relative_to(package).as_posix().encode())
-        digest.update(path.read_bytes())
-    sees = file is None or file.is_file()
-    return WorkerFacts(version.VERSION, digest.hexdigest(), sees)
 
 
 def worker_resources(dask_worker: Worker) -> tuple[str, ...]:
@@ -54,17 +42,14 @@ def call_in_child(payload: bytes, tries: int) -> bytes:
 
     Args:
         payload: the pickled pair of a function and its argument.
-        tries: how many children may die of it.
+        tries: how many children may die of it, before ClusterError.
 
     Returns:
         The pickled result.
-
-    Raises:
-        ClusterError: they died.
     """
     reason = ""
     for _ in range(tries):
-        child = getattr(_local, "child", None) or Child(_memory_limit())
+        child = getattr(_local, "child", None) or _Child(_memory_limit())
         _local.child = child
         try:
             return child.call(payload)
@@ -82,3 +67,77 @@ def _memory_limit() -> int:
     except ValueError:
         # Not called by a worker.
         return 0
+
+
+class _Child:
+    """The child, as its parent sees it. memory_limit: of its data [byte]; 0: none."""
+
+    def __init__(self, memory_limit: int = 0) -> None:
+        paths = os.pathsep.join(path for path in sys.path if path)
+        # Whatever it says to stderr may tell why it died.
+        self._remarks = tempfile.TemporaryFile()  # noqa: SIM115
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", __name__, str(memory_limit)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._remarks,
+            env={**os.environ, "PYTHONPATH": paths},
+        )
+
+    def call(self, payload: bytes) -> bytes:
+        """As call_in_child; ClusterError: the child died and cannot be used again."""
+        process = self._process
+        assert process.stdin is not None, "it is a pipe"
+        assert process.stdout is not None, "it is a pipe"
+        try:
+            process.stdin.write(payload)
+            process.stdin.flush()
+            return pickle.dumps(pickle.load(process.stdout))
+        except (OSError, EOFError, pickle.UnpicklingError):
+            raise ClusterError(self._why_dead()) from None
+
+    def _why_dead(self) -> str:
+        code = self._process.wait()
+        with self._remarks as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL))
+            remarks = file.read().decode("utf-8", "replace").strip()
+        how = f"exit status {code}" if code >= 0 else signal.Signals(-code).name
+        return f"its process died ({how}){': ' + remarks.splitlines()[-1] if remarks else ''}"
+
+
+def main() -> None:
+    """Do what the parent asks for until it ends."""
+    # Ctrl-C is the parent's business.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _limit_memory(int(sys.argv[1]))
+    requests, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    # What a task prints must not mix with the answers.
+    os.dup2(2, 1)
+    waiting: queue.SimpleQueue = queue.SimpleQueue()
+    threading.Thread(target=_listen, args=(requests, waiting), daemon=True).start()
+    while True:
+        function, argument = waiting.get()
+        pickle.dump(function(argument), answers)
+        answers.flush()
+
+
+def _listen(requests: BinaryIO, waiting: queue.SimpleQueue) -> None:
+    """Passes requests on; a parent that ends takes this process with it, whatever it does."""
+    with suppress(EOFError):
+        while True:
+            waiting.put(pickle.load(requests))
+    os._exit(0)
+
+
+def _limit_memory(limit: int) -> None:
+    """Lets this process fail, rather than the machine, when a task takes too much memory."""
+    if limit > 0:
+        with suppress(ImportError, ValueError, OSError):
+            import resource  # Absent on Windows.
+
+            resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
+            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,37 +1,40 @@
 """Sums over cameras by a connection: the same answer, whoever adds up; no waiting for the dead."""
 
+import os
 import threading
 import time
-from multiprocessing.connection import Listener
 
 import numpy as np
+import psutil
 import pytest
+import zmq
 
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.camera.rigs import circle_of_cameras
-from drake_pose.fit.camera_sums import SumRequest
-from drake_pose.fit.contour_fit import ContourFit, pack_cameras
-from drake_pose.jobs.cluster.edge_server import READY, SUMS, EdgeServer, EdgeStore
+from drake_pose.fit.contour_fit import ContourFit
+from drake_pose.jobs.cluster.camera_worker import EdgeServer
+from drake_pose.jobs.cluster.lines import Line, serve
 from drake_pose.jobs.cluster.remote_keeper import RemoteKeeper
 from drake_pose.person.silhouette_tracker import SilhouetteTracker
-from drake_pose.person.silhouette_view import KeptEdge, SilhouetteView, see_silhouette
+from drake_pose.person.silhouette_view import KeptEdge, see_silhouette
 from drake_pose.person.view_packing import pack_view, unpack_view
 from drake_pose.silhouette.areas.scoring import draw_mask
 
-HOST, KEY = "127.0.0.1", b"of the watch"
+HOST = "127.0.0.1"
 TIME = 1.0 / 3.0
 
 
 class World:
-    """A person before six cameras, and the person a moment before."""
+    """A person before four cameras, and the person a moment before."""
 
     def __init__(self):
         self.tracker = SilhouetteTracker(
             ContourFit(load_model(bundled_model("person"), check=False).pose_tree())
         )
         fit = self.tracker.fit
-        self.cameras = list(circle_of_cameras(6, size=(320, 240), face_camera=False).values())
+        self.cameras = list(circle_of_cameras(4, size=(160, 120), face_camera=False).values())
+        self.names = [camera.name for camera in self.cameras]
         self.before = fit.kinematics.flatten(fit.tree.default_values())
         now = self.before + np.random.default_rng(0).uniform(-0.03, 0.03, len(self.before))
         X_WN = fit.kinematics.poses(np.clip(now, fit.lower, fit.upper))
@@ -42,30 +45,31 @@ class World:
     def follow(self, views):
         return self.tracker.follow(self.tracker.start(self.before), self.cameras, views)
 
-    def kept(self, keepers):
-        """The views, whose edges keepers of two cameras each have; None: nobody else has them."""
-        kept = []
-        for k, view in enumerate(self.views):
-            keeper = keepers[k // 2]
-            whose = None if keeper is None else KeptEdge(keeper, self.cameras[k].name, TIME)
-            kept.append(SilhouetteView(view.region, view.edge, whose))
-        return kept
+    def kept(self, *keepers):
+        """Packed views whose edges are kept: of the first two cameras, and of the others."""
+        return [
+            unpack_view(
+                pack_view(view),
+                None if keepers[k // 2] is None else KeptEdge(keepers[k // 2], self.names[k], TIME),
+            )
+            for k, view in enumerate(self.views)
+        ]
 
-    def names(self, group):
-        return [camera.name for camera in self.cameras[2 * group : 2 * group + 2]]
-
-    def serve(self, group, key=KEY):
+    def server(self, group):
         """A server that has the edges of two cameras."""
-        store = EdgeStore(self.names(group))
-        for k in (2 * group, 2 * group + 1):
-            store.put(self.cameras[k].name, TIME, self.views[k].edge)
-        return EdgeServer(HOST, key, store)
+        server = EdgeServer(2)
+        for k in range(2):
+            server.put(k, TIME, self.views[2 * group + k].edge)
+        return server
 
-    def connected(self, group, server, reports):
-        keeper = RemoteKeeper(self.names(group), KEY, reports.append)
-        keeper.move_to(HOST, server.port)
+    def keeper(self, group, answer, closed, reports):
+        """Who asks for two cameras' sums, when it is answered for the first time or gives up."""
+        listening = serve(HOST, [answer], closed)
+        keeper = RemoteKeeper(self.names[2 * group : 2 * group + 2], reports.append)
+        keeper.move_to(Line(HOST, listening.ports[0], listening.key))
+        groups = [keeper if k == group else None for k in range(2)]
         for _ in range(2000):
-            self.follow(self.kept([keeper if k == group else None for k in range(3)]))
+            self.follow(self.kept(*groups))
             if keeper.answers or reports:
                 return keeper
             time.sleep(0.01)
@@ -81,125 +85,103 @@ def world():
     return World()
 
 
-def test_the_answer_is_that_of_one_process(world):
+@pytest.fixture
+def closed():
+    event = threading.Event()
+    yield event
+    event.set()
+
+
+def test_the_answer_is_that_of_one_process_which_unpacks_nothing(world, closed):
     reports = []
-    servers = [world.serve(group) for group in range(2)]
-    keepers = [world.connected(group, server, reports) for group, server in enumerate(servers)]
+    keepers = [world.keeper(k, world.server(k).answer, closed, reports) for k in range(2)]
     asked = [keeper.answers for keeper in keepers]
-    # One group's edges are in this process.
-    world.same(world.follow(world.kept([*keepers, None])))
-    rounds = len(world.tracker.settings.rounds)
-    assert [keeper.answers - n for keeper, n in zip(keepers, asked, strict=True)] == [rounds] * 2
-    assert not reports
-    for one in (*keepers, *servers):
-        one.close()
-
-
-def test_who_adds_up_elsewhere_unpacks_nothing(world):
-    reports = []
-    servers = [world.serve(group) for group in range(3)]
-    keepers = [world.connected(group, server, reports) for group, server in enumerate(servers)]
-    views = [
-        unpack_view(pack_view(view), KeptEdge(keepers[k // 2], world.cameras[k].name, TIME))
-        for k, view in enumerate(world.views)
-    ]
+    views = world.kept(*keepers)
     world.same(world.follow(views))
     assert not any({"region", "edge"} & set(vars(view)) for view in views)
-    for one in (*keepers, *servers):
-        one.close()
+    rounds = len(world.tracker.settings.rounds)
+    assert [keeper.answers - n for keeper, n in zip(keepers, asked, strict=True)] == [rounds] * 2
+    # One group's edges are in this process.
+    world.same(world.follow(world.kept(keepers[0], None)))
+    assert not reports
+    for keeper in keepers:
+        keeper.close()
 
 
-def test_a_moment_that_is_not_kept_any_more_is_compared_here(world):
+def test_moments_that_are_not_kept_are_compared_here_and_old_ones_are_forgotten(world, closed):
     reports = []
-    server = world.serve(0)
-    keeper = world.connected(0, server, reports)
-    server._store = EdgeStore(world.names(0))
+    server = world.server(0)
+    keeper = world.keeper(0, server.answer, closed, reports)
+    for k in range(100):
+        server.put(1, 10.0 + k, world.views[0].edge)
+    assert server.find(1, 109.0) is world.views[0].edge
+    assert server.find(1, TIME) is None
     before = keeper.answers
-    world.same(world.follow(world.kept([keeper, None, None])))
+    world.same(world.follow(world.kept(keeper, None)))
     assert keeper.answers == before
     assert not reports
     keeper.close()
-    server.close()
 
 
-def test_an_answer_that_nobody_took_is_not_taken_for_another(world):
-    server = world.serve(0)
-    keeper = world.connected(0, server, [])
-    placement = world.tracker.fit.body.place(world.before)
-    step = world.tracker.settings.rounds[0]
-    index = slice(0, 2)
-    cameras = pack_cameras(world.cameras[index])
-    weights = world.tracker.fit.weights(cameras, placement, step)
-    times = np.full(2, TIME)
-    request = SumRequest(world.names(0), times, cameras, weights, placement.packed, placement.X_WN)
-    assert keeper.ask(request), "of another pose than the next one's; something fails then"
-    world.same(world.follow(world.kept([keeper, None, None])))
-    keeper.close()
-    server.close()
+def test_an_answer_that_nobody_took_is_not_taken_for_another(closed):
+    def echo(parts):
+        time.sleep(0.2 if parts[0] == b"late" else 0.0)
+        return parts[0]
+
+    listening = serve(HOST, [echo], closed)
+    line = Line(HOST, listening.ports[0], listening.key)
+    while not line.send(b"late"):
+        time.sleep(0.01)
+    assert line.receive(0.02) is None
+    end = time.monotonic() + 10.0
+    while not line.send(b"next") and time.monotonic() < end:
+        time.sleep(0.01)
+    assert line.receive(5.0) == b"next"
+    line.close()
 
 
-class Silent:
-    """Has the surfaces, and answers so many requests; then it is silent, or hangs up."""
+def test_nobody_waits_for_the_silent(world, closed):
+    reports, server = [], world.server(1)
+    silent = threading.Event()
 
-    def __init__(self, hangs_up):
-        self.listener = Listener((HOST, 0), authkey=KEY)
-        self.port = self.listener.address[1]
-        self.asked = threading.Event()
-        self.connected = threading.Event()
-        threading.Thread(target=self.run, args=(hangs_up,), daemon=True).start()
+    def answer(parts):
+        if silent.is_set():
+            closed.wait()
+        return server.answer(parts)
 
-    def run(self, hangs_up):
-        connection = self.listener.accept()
-        assert connection.recv_bytes() == SUMS
-        connection.recv_bytes()
-        connection.send_bytes(READY)
-        self.connected.set()
-        connection.recv_bytes()
-        self.asked.set()
-        if hangs_up:
-            connection.close()
-        else:
-            self.kept = connection
-
-
-@pytest.mark.parametrize("hangs_up", [False, True])
-def test_nobody_waits_for_the_dead(world, hangs_up):
-    reports = []
-    silent = Silent(hangs_up)
-    keeper = RemoteKeeper(world.names(1), KEY, reports.append)
-    keeper.move_to(HOST, silent.port)
-    views = world.kept([None, keeper, None])
-    world.same(world.follow(views))
-    assert silent.connected.wait(20.0)
-    time.sleep(0.2)
+    keeper = world.keeper(1, answer, closed, reports)
+    silent.set()
+    views = world.kept(None, keeper)
     begin = time.monotonic()
     world.same(world.follow(views))
-    assert silent.asked.is_set()
-    assert time.monotonic() - begin < 5.0
-    # Who watches a worker says himself that it died.
-    assert len(reports) == (not hangs_up)
+    assert time.monotonic() - begin > 0.4
+    assert len(reports) == 1
+    assert "sums of camera 'camera_2', 'camera_3' do not come in time" in reports[0]
     begin = time.monotonic()
     world.same(world.follow(views))
-    assert time.monotonic() - begin < 0.5, "it is not asked again at once"
+    assert time.monotonic() - begin < 0.4, "it is not asked again at once"
     keeper.close()
 
 
-def test_who_does_not_know_the_key_is_not_answered(world):
-    reports = []
-    server = world.serve(2, b"another")
-    keeper = world.connected(2, server, reports)
-    assert not keeper.answers
-    assert "camera 'camera_4', 'camera_5' cannot be asked for" in reports[0]
-    world.same(world.follow(world.kept([None, None, keeper])))
-    server.close()
+def test_who_does_not_know_the_key_is_not_answered(world, closed, monkeypatch):
+    monkeypatch.setattr("drake_pose.jobs.cluster.remote_keeper._CONNECTING", 0.3)
+    asked, reports = [], []
+    listening = serve(HOST, [asked.append], closed)
+    keeper = RemoteKeeper(world.names[:2], reports.append)
+    keeper.move_to(Line(HOST, listening.ports[0], zmq.curve_keypair()[0]))
+    while not reports:
+        world.same(world.follow(world.kept(keeper, None)))
+    assert "camera 'camera_0', 'camera_1' cannot be asked for" in reports[0]
+    assert not asked
+    keeper.close()
 
 
-def test_old_pictures_are_forgotten(world):
-    store = EdgeStore(["left", "right"])
-    edge = world.views[0].edge
-    for k in range(100):
-        store.put("right", 0.1 * k, edge)
-    assert store.find(1, 0.1 * 99) is edge
-    assert store.find(1, 0.0) is None
-    assert store.find(0, 0.1 * 99) is None
-    assert store.find(2, 0.1 * 99) is None
+def test_a_server_listens_at_its_own_address_alone(closed):
+    listening = serve(HOST, [lambda parts: b"", lambda parts: b""], closed)
+    open_at = {
+        one.laddr.port: one.laddr.ip
+        for one in psutil.Process(os.getpid()).net_connections(kind="inet")
+        if one.status == psutil.CONN_LISTEN
+    }
+    assert [open_at[port] for port in listening.ports] == [HOST, HOST]
+    assert serve("192.0.2.1", [lambda parts: b""], threading.Event()) is None

@@ -11,7 +11,7 @@ import pytest
 from drake_pose.camera.sources.frame_source import SourceSpecification
 from drake_pose.commands.main import app
 from drake_pose.errors import ClusterError, SceneError
-from drake_pose.jobs.cluster.camera_assignment import assign_cameras
+from drake_pose.jobs.cluster.camera_groups import assign_cameras
 from drake_pose.jobs.cluster.remote_views import ClusterSensors
 from drake_pose.jobs.cluster.scheduler import open_cluster
 from drake_pose.jobs.live.run import FrameWatch, run_live

@@ -8,7 +8,6 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Protocol
 
 from drake_pose.errors import DrakePoseError
 from drake_pose.jobs.batch.job import SceneJob
@@ -18,18 +17,17 @@ from drake_pose.jobs.batch.state import (
     BatchResult,
     SceneState,
     check_same_batch,
-    write_batch,
 )
 from drake_pose.jobs.batch.tasks import (
     Outcome,
     Task,
     count_attempts,
     finishing_task,
-    perform,
     plan_scene,
     remove_parts,
     work_folder,
 )
+from drake_pose.jobs.batch.workers import OwnProcess, WorkerPool
 from drake_pose.results.folder import require_empty
 
 # A scene of which this many chunks have failed is given up.
@@ -41,48 +39,12 @@ OnProgress = Callable[[int, int, str], None]
 """Called with the number of frames done, that of all frames, and what went wrong just now or ""."""
 
 
-class WorkerPool(Protocol):
-    """Who does the tasks."""
-
-    @property
-    def size(self) -> int:
-        """How many tasks can be under way at once."""
-
-    def start(self, task: Task) -> None:
-        """Begins a task."""
-
-    def next(self) -> tuple[Task, Outcome]:
-        """Waits for a task that was begun.
-
-        Raises:
-            ClusterError: the workers are gone.
-        """
-
-
-class OwnProcess:
-    """A pool of one worker: this process, which does a task when it is waited for."""
-
-    size = 1
-
-    def __init__(self) -> None:
-        self._tasks: deque[Task] = deque()
-
-    def start(self, task: Task) -> None:
-        """Begins a task."""
-        self._tasks.append(task)
-
-    def next(self) -> tuple[Task, Outcome]:
-        """Does the task that was begun first."""
-        task = self._tasks.popleft()
-        return task, perform(task)
-
-
 def run_batch(
     jobs: Sequence[SceneJob],
     out: Path,
     pool: WorkerPool | None = None,
     resume: bool = False,
-    on_progress: OnProgress | None = None,
+    on_progress: OnProgress = lambda *_: None,
 ) -> BatchResult:
     """Estimates many scenes; each gets a result folder in ``out``.
 
@@ -93,7 +55,7 @@ def run_batch(
         out: the batch's folder, empty or not there.
         pool: who works; this process where None.
         resume: go on with what is in ``out``, and try failed scenes again.
-        on_progress: hears how far it is.
+        on_progress: called with how far it is.
 
     Raises:
         OutputError: the folder cannot be used, or holds another job.
@@ -117,7 +79,7 @@ def run_batch(
 class _Batch:
     """A batch under way."""
 
-    def __init__(self, jobs: Sequence[SceneJob], out: Path, on_progress: OnProgress | None) -> None:
+    def __init__(self, jobs: Sequence[SceneJob], out: Path, on_progress: OnProgress) -> None:
         self._out, self._on_progress = out, on_progress
         self._scenes = {job.name: SceneState(job, job.describe()) for job in jobs}
         self._waiting: deque[Task] = deque()
@@ -131,17 +93,14 @@ class _Batch:
             try:
                 state.tasks = plan_scene(state.job, self._out)
             except DrakePoseError as error:
-                self._fail(state, None, str(error))
+                self._fail(state, "", str(error))
                 continue
             whole = finishing_task(state.tasks)
-            missing = [] if whole.place.is_dir() else list(state.tasks)
-            for task in state.tasks:
-                if task not in missing or task.place.is_dir():
-                    state.done.add(task.index)
-            self._waiting.extend(task for task in missing if task.index not in state.done)
-            if len(state.done) == len(state.tasks):
-                self._waiting.append(whole)
-        self._report("")
+            is_whole = whole.place.is_dir()
+            missing = [task for task in state.tasks if not (is_whole or task.place.is_dir())]
+            state.done.update({task.index for task in state.tasks if task not in missing})
+            self._waiting.extend(missing or [whole])
+        self._report()
 
     def run(self, pool: WorkerPool) -> None:
         """Does what is missing."""
@@ -161,53 +120,48 @@ class _Batch:
 
     def write(self) -> None:
         """Writes batch.json."""
-        write_batch(self.result())
+        self.result().write()
         self._written = time.monotonic()
 
     def _note(self, task: Task, outcome: Outcome) -> None:
-        state = self._scenes[task.job.name]
+        state, work = self._scenes[task.job.name], work_folder(self._out, task.job)
         state.seconds += outcome.seconds
         if outcome.error is not None:
-            self._fail(state, task, outcome.error)
+            self._fail(state, task.extent, outcome.error)
         elif task.index is None:
             self._finish(state, outcome)
         else:
             state.done.add(task.index)
             if len(state.done) == len(state.tasks):
                 self._waiting.appendleft(finishing_task(state.tasks))
-        state.attempts = max(state.attempts, count_attempts(work_folder(self._out, state.job)))
+        state.attempts = max(state.attempts, count_attempts(work))
         if state.state == FINISHED:
-            shutil.rmtree(work_folder(self._out, state.job), ignore_errors=True)
+            shutil.rmtree(work, ignore_errors=True)
             with suppress(OSError):
                 # The last scene leaves it empty.
-                work_folder(self._out, state.job).parent.rmdir()
-        self._report("")
+                work.parent.rmdir()
+        self._report()
 
     def _finish(self, state: SceneState, outcome: Outcome) -> None:
         state.totals = outcome.totals or {}
         count, place = state.totals.get("frame_count"), self._out / state.job.name
         if count != state.frame_count:
             what = f"{place}: has {count} frames, but the scene has {state.frame_count} by now"
-            self._fail(state, None, f"{what}; remove that folder to have it estimated again")
+            self._fail(state, "", f"{what}; remove that folder to have it estimated again")
             return
         state.state = FINISHED
         state.done.update(task.index for task in state.tasks)
 
-    def _fail(self, state: SceneState, task: Task | None, error: str) -> None:
+    def _fail(self, state: SceneState, extent: str, error: str) -> None:
         """Notes what went wrong; the scene's other chunks go on, unless it seems hopeless."""
         state.state = FAILED
-        extent = "" if task is None else task.extent
         state.errors.setdefault(error, []).append(extent)
         if not extent or sum(map(len, state.errors.values())) >= _HOPELESS:
             self._waiting = deque(one for one in self._waiting if one.job is not state.job)
         where = f", {extent}" if extent else ""
         self._report(f"scene '{state.job.name}'{where}: {error}")
 
-    def _report(self, message: str) -> None:
-        if self._on_progress is not None:
-            states = self._scenes.values()
-            done, total = (
-                sum(one.frames_done for one in states),
-                sum(one.frame_count for one in states),
-            )
-            self._on_progress(done, total, message)
+    def _report(self, message: str = "") -> None:
+        states = self._scenes.values()
+        done = sum(one.frames_done for one in states)
+        self._on_progress(done, sum(one.frame_count for one in states), message)

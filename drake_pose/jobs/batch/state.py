@@ -59,23 +59,21 @@ class SceneState:
 
     def as_json(self) -> dict[str, Any]:
         """Plain JSON values."""
+        is_audit = self.job.audit is not None
+        names = (
+            ("agreeing_count", "contradictions") if is_audit else ("found_count", "mean_E_total")
+        )
         return {
             "state": self.state,
             "errors": [{"error": text, "frames": frames} for text, frames in self.errors.items()],
             "frame_count": self.frame_count,
-            **self._outcome(),
+            **{name: self.totals.get(name) for name in names},
             "chunks": len(self.tasks),
             "chunks_done": len(self.done),
             "attempts": self.attempts,
             "worker_seconds": self.seconds,
             "job": self.described,
         }
-
-    def _outcome(self) -> dict[str, Any]:
-        names = ("found_count", "mean_E_total")
-        if self.job.audit is not None:
-            names = ("agreeing_count", "contradictions")
-        return {name: self.totals.get(name) for name in names}
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,35 +98,32 @@ class BatchResult:
             "scenes": {name: one.as_json() for name, one in self.scenes.items()},
         }
 
+    def write(self) -> None:
+        """Writes batch.json all at once, and of audits contradictions.csv.
 
-def write_batch(result: BatchResult) -> None:
-    """Writes batch.json all at once, and of audits contradictions.csv.
+        Raises:
+            OutputError: it cannot be written.
+        """
+        text = json.dumps(without_nan(self.as_json()), indent=2, ensure_ascii=False)
+        self._write(BATCH, text + "\n")
+        if any(state.job.audit is not None for state in self.scenes.values()):
+            table = io.StringIO()
+            rows = csv.writer(table, lineterminator="\n")
+            rows.writerow(("scene", "what", "name", "text"))
+            for name, state in self.scenes.items():
+                for one in state.totals.get("contradictions", ()):
+                    rows.writerow((name, one["what"], one["name"], one["text"]))
+            self._write(CONTRADICTIONS, table.getvalue())
 
-    Raises:
-        OutputError: it cannot be written.
-    """
-    text = json.dumps(without_nan(result.as_json()), indent=2, ensure_ascii=False)
-    _write(result, BATCH, text + "\n")
-    if any(state.job.audit is not None for state in result.scenes.values()):
-        table = io.StringIO()
-        rows = csv.writer(table, lineterminator="\n")
-        rows.writerow(("scene", "what", "name", "text"))
-        for name, state in result.scenes.items():
-            for one in state.totals.get("contradictions", ()):
-                rows.writerow((name, one["what"], one["name"], one["text"]))
-        _write(result, CONTRADICTIONS, table.getvalue())
-
-
-def _write(result: BatchResult, name: str, text: str) -> None:
-    """Writes a file of the batch's folder all at once."""
-    path = result.out / name
-    part = path.with_name(path.name + ".part")
-    try:
-        result.out.mkdir(parents=True, exist_ok=True)
-        part.write_text(text, encoding="utf-8")
-        os.replace(part, path)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
+    def _write(self, name: str, text: str) -> None:
+        path = self.out / name
+        part = path.with_name(path.name + ".part")
+        try:
+            self.out.mkdir(parents=True, exist_ok=True)
+            part.write_text(text, encoding="utf-8")
+            os.replace(part, path)
+        except OSError as error:
+            raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
 
 
 def check_same_batch(jobs: Sequence[SceneJob], out: Path) -> None:

@@ -1,9 +1,8 @@
 """What the workers of `drake-pose batch` do: a chunk of frames, a capture, a scene put together.
 
-A task finds its input and leaves its result on the disk that all machines share; only names go to
-a worker, and a few numbers come back. Whatever it makes lies beside its place until it is whole,
-and is then moved there in one step. So a task that is done twice does no harm, and one that was
-done is not done again.
+A task finds its input and leaves its result on the disk that all machines share. Whatever it makes
+lies beside its place until it is whole, and is then moved there in one step: a task that is done
+twice does no harm, and one that was done is not done again.
 """
 
 from __future__ import annotations
@@ -31,13 +30,8 @@ from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.jobs.estimate.scene_checks import frame_ranges
 from drake_pose.jobs.registration.audit import audit_scene
 from drake_pose.jobs.registration.settings import AuditSettings
-from drake_pose.results.folder import (
-    OVERLAY,
-    POSES,
-    SUMMARY,
-    read_summary,
-    without_nan,
-)
+from drake_pose.results.folder import OVERLAY, POSES, SUMMARY, read_summary, without_nan
+from drake_pose.results.settings import EstimateSettings
 from drake_pose.results.summary import FrameRecord, describe_job, mask_digests, summarize
 from drake_pose.silhouette.pictures.scenes import Scene, load_scene
 
@@ -99,8 +93,7 @@ class Outcome:
     Args:
         error: why it failed; None where it did not.
         seconds: how long it took [s]; 0 where its result lay there already.
-        totals: frame_count, found_count and mean_E_total of a whole scene; of an audit
-            frame_count, agreeing_count and contradictions.
+        totals: of a whole scene, numbers of its summary.
     """
 
     error: str | None
@@ -126,14 +119,13 @@ def plan_scene(job: SceneJob, out: Path) -> tuple[Task, ...]:
     scene = _load(job)
     cameras = select_cameras(scene, job.settings.cameras)
     frames = select_seen_frames(scene, cameras, job.settings.frames)
-    if job.audit is not None:
-        return (Task(job, out, None, frames),)
+    is_whole = job.audit is not None
     # A model is read only where it may be a person's: that takes seconds.
-    maybe = landmarks_file(job.model).is_file() or job.settings.method == "person"
-    if maybe:
+    if landmarks_file(job.model).is_file() or job.settings.method == "person":
         model = load_model(job.model, package_paths=job.settings.packages)
-        if follows_person(scene, cameras, model, job.settings):
-            return (Task(job, out, None, frames),)
+        is_whole = is_whole or follows_person(scene, cameras, model, job.settings)
+    if is_whole:
+        return (Task(job, out, None, frames),)
     cuts = range(0, len(frames), job.chunk)
     return tuple(
         Task(job, out, index, frames[cut : cut + job.chunk]) for index, cut in enumerate(cuts)
@@ -186,11 +178,7 @@ def remove_parts(out: Path) -> None:
 
 
 def _require_same_masks(task: Task) -> None:
-    """Refuses a finished scene whose masks were replaced; a chunk's are seen to when it is joined.
-
-    Raises:
-        OutputError: names the frames.
-    """
+    """Refuses a finished scene whose masks were replaced; joining chunks sees to theirs."""
     if task.index is not None:
         return
     scene = _load(task.job)
@@ -225,9 +213,16 @@ def _make(task: Task) -> None:
     """Makes a task's result beside its place and moves it there."""
     job = task.job
     part = work_folder(task.out, job) / f"{task.place.name}{_PART}{uuid.uuid4().hex[:12]}"
-    work = _audit if job.audit is not None else _join_chunks if task.chunks else _estimate
     try:
-        work(task, part)
+        if job.audit is not None:
+            _audit(job, job.audit, part)
+        elif task.chunks:
+            _join_chunks(task, part)
+        else:
+            of_chunk = task.index is not None
+            settings = replace(job.settings, frames=task.frames) if of_chunk else job.settings
+            replay = job.replay and not of_chunk
+            _estimate(job, part, settings, replay)
         try:
             os.replace(part, task.place)
         except OSError as error:
@@ -238,28 +233,23 @@ def _make(task: Task) -> None:
         shutil.rmtree(part, ignore_errors=True)
 
 
-def _estimate(task: Task, part: Path) -> None:
-    """Estimates a chunk, or the whole recording of a person who is followed."""
-    job, settings = task.job, task.job.settings
-    if task.index is not None:
-        settings = replace(settings, frames=task.frames)
-    replay = job.replay and task.index is None
+def _estimate(
+    job: SceneJob, part: Path, settings: EstimateSettings, replay: bool, resume: bool = False
+) -> None:
     estimate_scene(
-        job.scene, job.model, part, settings, truth=job.truth, replay=replay, overlay=job.overlay
-    )
+        job.scene, job.model, part, settings, truth=job.truth, resume=resume, replay=replay,
+        overlay=job.overlay,
+    )  # fmt: skip
 
 
-def _audit(task: Task, part: Path) -> None:
-    """Audits a scene."""
-    job, given = task.job, task.job.settings
-    assert job.audit is not None
+def _audit(job: SceneJob, joints: Path, part: Path) -> None:
+    given = job.settings
     settings = AuditSettings(
         cameras=given.cameras, frames=given.frames, hold=given.hold, packages=given.packages
     )
     audit_scene(
-        job.scene, job.model, job.audit, part, settings, cameras=job.camera_file,
-        overlay=job.overlay,
-    )  # fmt: skip
+        job.scene, job.model, joints, part, settings, cameras=job.camera_file, overlay=job.overlay
+    )
 
 
 def _join_chunks(task: Task, part: Path) -> None:
@@ -280,10 +270,7 @@ def _join_chunks(task: Task, part: Path) -> None:
     known = {name: FrameRecord.from_json(record) for name, record in records.items()}
     summary = without_nan(summarize(described, known, False))
     (part / SUMMARY).write_text(json.dumps(summary), encoding="utf-8")
-    estimate_scene(
-        job.scene, job.model, part, job.settings, truth=job.truth, resume=True, replay=job.replay,
-        overlay=job.overlay,
-    )  # fmt: skip
+    _estimate(job, part, job.settings, job.replay, resume=True)
 
 
 def _link(source: str, target: str) -> None:
@@ -300,12 +287,11 @@ def _totals(task: Task) -> Mapping[str, Any] | None:
         return None
     summary = read_summary(task.place)
     if task.job.audit is not None:
+        names = ("what", "name", "text")
+        found = [{name: one[name] for name in names} for one in summary["contradictions"]]
         return {
             "frame_count": summary["frame_count"] + len(summary["unseen"]),
             "agreeing_count": summary["agreeing_count"],
-            "contradictions": [
-                {name: one[name] for name in ("what", "name", "text")}
-                for one in summary["contradictions"]
-            ],
+            "contradictions": found,
         }
     return {name: summary.get(name) for name in ("frame_count", "found_count", "mean_E_total")}

@@ -1,10 +1,11 @@
-"""The workers of a cluster as the pool of a batch."""
+"""Who does the tasks of a batch: this process, or the workers of a cluster."""
 
 from __future__ import annotations
 
 import pickle
+from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from drake_pose.errors import ClusterError
 from drake_pose.jobs.batch.tasks import Outcome, Task, describe_failure, perform
@@ -15,8 +16,40 @@ if TYPE_CHECKING:
     from distributed import Client
 
 
+class WorkerPool(Protocol):
+    """Who does the tasks."""
+
+    @property
+    def size(self) -> int:
+        """How many tasks can be under way at once."""
+
+    def start(self, task: Task) -> None:
+        """Begins a task."""
+
+    def next(self) -> tuple[Task, Outcome]:
+        """Waits for a task that was begun; ClusterError: the workers are gone."""
+
+
+class OwnProcess:
+    """A pool of one worker: this process, which does a task when it is waited for."""
+
+    size = 1
+
+    def __init__(self) -> None:
+        self._tasks: deque[Task] = deque()
+
+    def start(self, task: Task) -> None:
+        """Begins a task."""
+        self._tasks.append(task)
+
+    def next(self) -> tuple[Task, Outcome]:
+        """Does the task that was begun first."""
+        task = self._tasks.popleft()
+        return task, perform(task)
+
+
 class ClusterPool:
-    """The workers of a cluster, as a batch needs them.
+    """The workers of a cluster.
 
     At most one task a thread is under way, so that none waits at a worker that may die.
 
@@ -46,11 +79,7 @@ class ClusterPool:
         self._completed.add(future)
 
     def next(self) -> tuple[Task, Outcome]:
-        """Waits for a task.
-
-        Raises:
-            ClusterError: the scheduler has gone.
-        """
+        """Waits for a task; ClusterError: the scheduler has gone."""
         from distributed import KilledWorker
 
         future = next(self._completed)

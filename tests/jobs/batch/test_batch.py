@@ -112,18 +112,14 @@ def test_results_do_not_depend_on_who_works(jobs, alone, cluster, scenes, tmp_pa
 
 
 @pytest.mark.slow
-def test_one_chunk_of_a_sequence_is_an_estimate(scenes, jobs, tmp_path):
-    whole = dataclasses.replace(jobs[1], chunk=100)
-    run_batch([whole], tmp_path / "batch")
-    estimate_scene(whole.scene, whole.model, tmp_path / "plain", whole.settings, replay=False)
-    assert rows(tmp_path / "batch" / "motion") == rows(tmp_path / "plain")
-
-
 def test_replaced_masks_are_named_when_a_batch_is_resumed(scenes, jobs, tmp_path):
     shutil.copytree(scenes / "motion", tmp_path / "motion")
     job = dataclasses.replace(jobs[1], scene=tmp_path / "motion", chunk=100)
     run_batch([job], tmp_path / "batch")
     before = rows(tmp_path / "batch" / "motion")
+    # One chunk of a sequence is an estimate.
+    estimate_scene(job.scene, job.model, tmp_path / "plain", job.settings, replay=False)
+    assert before == rows(tmp_path / "plain")
     assert not run_batch([job], tmp_path / "batch", resume=True).failed
     masks = tmp_path / "motion" / "masks" / "front"
     shutil.copyfile(masks / "0002.png", masks / "0001.png")
@@ -305,10 +301,12 @@ def test_missing_extra_is_named(jobs, scenes, tmp_path, monkeypatch):
     assert 'pip install "drake_pose[cluster]"' in result.stderr
 
 
-def test_job_of_other_chunks_is_not_resumed(jobs, alone):
-    other = [dataclasses.replace(job, chunk=3) for job in jobs]
+def test_job_of_other_chunks_is_not_resumed(jobs, tmp_path):
+    gone = [dataclasses.replace(job, scene=tmp_path / "gone") for job in jobs]
+    assert run_batch(gone, tmp_path / "out").failed == ("stills", "motion")
+    other = [dataclasses.replace(job, chunk=3) for job in gone]
     with pytest.raises(OutputError, match="chunk = 2, not 3"):
-        run_batch(other, alone, resume=True)
+        run_batch(other, tmp_path / "out", resume=True)
 
 
 def test_job_file_gives_the_settings(tmp_path):
@@ -316,6 +314,8 @@ def test_job_file_gives_the_settings(tmp_path):
         "scene": "a", "model": "m.urdf", "cameras": ["left"], "frames": "0:9", "root": "base",
         "root_position": [1, 2, 3], "root_rotation": "y=-180:180", "interval": 5,
         "hold": {"lift": 10}, "method": "beam", "truth": "t.csv", "replay": False,
+        "packages": {"arms": "robots"}, "start": "first.csv", "track": False, "candidates": 3,
+        "unseen": "hand", "time_limit": 2,
     }  # fmt: skip
     path = tmp_path / "jobs.yaml"
     path.write_text(yaml.safe_dump({"scenes": {"a": entry}}))
@@ -323,6 +323,8 @@ def test_job_file_gives_the_settings(tmp_path):
     settings = EstimateSettings(
         cameras=("left",), frames=("0:9",), root="base", root_position=(1.0, 2.0, 3.0),
         root_rotation={"y": (-180.0, 180.0)}, interval=5.0, hold={"lift": 10.0}, method="beam",
+        packages={"arms": tmp_path / "robots"}, start=tmp_path / "first.csv", track=False,
+        candidates=3, unseen=("hand",), time_limit=2.0,
     )  # fmt: skip
     truth = tmp_path / "t.csv"
     assert job == SceneJob(
@@ -339,6 +341,10 @@ def test_job_file_gives_the_settings(tmp_path):
         ("scenes: {1: {scene: a}}", "quotes"),
         ("scenes: {a: {scene: a, intervall: 3}}", "no setting intervall; there is: scene, model"),
         ("scenes: {a: {scene: a, interval: wide}}", "interval: must be a number"),
+        ("scenes: {a: {scene: a, interval: true}}", "interval: must be a number"),
+        ("scenes: {a: {scene: a, track: 1}}", "track: must be true or false"),
+        ("scenes: {a: {scene: a, hold: {lift: low}}}", "hold: lift: must be a number"),
+        ("scenes: {a: {scene: a, packages: [b]}}", "packages: expected NAME: VALUE"),
         ("scenes: {a: {scene: a, frames: [1]}}", "put numbers in quotes"),
         ("scenes: {a: {scene: a, method: best}}", "scene 'a': there is no method 'best'"),
         ("scenes: {a: {scene: a, root_position: here}}", "scene 'a': root_position"),

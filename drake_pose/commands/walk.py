@@ -164,8 +164,9 @@ def _opener(client: Client | None, scene: LiveScene) -> Callable[[], LiveSensors
 def _open_page(options: WalkOptions, waits: bool = False) -> Meshcat:
     """The page, shown in the browser where there is one; waits until it is, or says it is not."""
     from drake_pose.jobs.live import walk as walking
+    from drake_pose.jobs.live.local_proxy import open_page
 
-    page = walking.open_page(options.port)
+    page = open_page(options.port)
     say(f"drake-pose: {page.web_url()} - arrow keys walk and turn, Ctrl-C ends")
     shown = options.browser and walking.show(page)
     if waits and not shown:

@@ -30,8 +30,11 @@ class Line:
         for option in (zmq.REQ_RELAXED, zmq.REQ_CORRELATE, zmq.IMMEDIATE):
             self._socket.setsockopt(option, 1)
         self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.curve_publickey, self._socket.curve_secretkey = zmq.curve_keypair()
-        self._socket.curve_serverkey = key
+        own, secret = zmq.curve_keypair()
+        for option, value in (
+            (zmq.CURVE_PUBLICKEY, own), (zmq.CURVE_SECRETKEY, secret), (zmq.CURVE_SERVERKEY, key),
+        ):  # fmt: skip
+            self._socket.setsockopt(option, value)
         self._socket.connect(f"tcp://{host}:{port}")
 
     def send(self, *parts: bytes) -> bool:
@@ -66,7 +69,8 @@ def serve(host: str, answers: Sequence[Answer], closed: threading.Event) -> List
     for answer in answers:
         socket: zmq.Socket = zmq.Context.instance().socket(zmq.REP)
         socket.setsockopt(zmq.LINGER, 0)
-        socket.curve_server, socket.curve_publickey, socket.curve_secretkey = True, key, secret
+        socket.setsockopt(zmq.CURVE_SERVER, 1)
+        socket.setsockopt(zmq.CURVE_SECRETKEY, secret)
         try:
             ports.append(socket.bind_to_random_port(f"tcp://{host}"))
         except zmq.ZMQError:

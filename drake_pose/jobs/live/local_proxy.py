@@ -1,30 +1,42 @@
-"""A reverse proxy that lets only a page's own requests through to a server on this machine.
+"""A reverse proxy (aiohttp) that lets only a page's own requests through to Drake's Meshcat.
 
-Drake's Meshcat answers whoever reaches its port, and any web page that a browser shows may open a
-WebSocket to this machine. Browsers send the name that a page asked for as ``Host``, and with each
-WebSocket the page's own origin as ``Origin``; a page of another origin cannot change either. Every
-head of a request is read and checked; all else passes unread.
+Meshcat answers whoever reaches its port, and any web page that a browser shows may open a WebSocket
+to this machine. Browsers send the name that a page asked for as ``Host``, and with each WebSocket
+the page's own origin as ``Origin``; a page of another origin cannot change either.
 """
 
 from __future__ import annotations
 
 import asyncio
-import http.client
-import io
+import ipaddress
+import logging
+import secrets
 import socket
 import threading
-from collections.abc import Callable
+import weakref
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from email.message import Message
+
+from aiohttp import (
+    ClientSession,
+    ClientWebSocketResponse,
+    ClientWSTimeout,
+    TCPConnector,
+    WSMsgType,
+    web,
+)
+from pydrake.geometry import Meshcat, MeshcatParams
+
+from drake_pose.errors import SettingsError
 
 PORTS = range(7000, 8000)
 """Where a page listens if not told otherwise; Meshcat's."""
 
 _NAMES = ("localhost", "127.0.0.1")
-_END = b"\r\n\r\n"
-_CHUNK = 1 << 16
-# A server that was told that no more will come may still answer for this long [s].
-_PATIENCE = 5.0
+# How long either side may take to close a connection [s].
+_GOODBYE = 0.5
+# Headers of an answer that tell what it is; the others are of one connection.
+_PASSED = ("Content-Type", "Content-Encoding", "Content-Disposition", "Cache-Control")
 
 
 def listen(port: int | None = None) -> socket.socket:
@@ -42,130 +54,128 @@ def listen(port: int | None = None) -> socket.socket:
     return socket.create_server(("127.0.0.1", PORTS[-1] if port is None else port))
 
 
-def refuse(head: bytes, port: int) -> str | None:
-    """Why the head of a request is refused; None: it is a page's own.
-
-    Args:
-        head: request line and headers, up to the empty line.
-        port: the proxy's.
-    """
-    try:
-        headers = http.client.parse_headers(io.BytesIO(head.partition(b"\n")[2]))
-    except http.client.HTTPException:
-        return "its head is no HTTP"
-    return refuse_headers(headers, port)
-
-
-def refuse_headers(headers: Message, port: int) -> str | None:
-    """Why the headers of a request to a port are refused; None: they are a page's own."""
+def refuse(hosts: Sequence[str], origins: Sequence[str], port: int) -> str | None:
+    """Why a request to a port, with these headers, is refused; None: it is a page's own."""
     own = [f"{name}:{port}" for name in _NAMES]
-    hosts = headers.get_all("Host", [])
     if len(hosts) != 1 or hosts[0].strip().lower() not in own:
         return f"Host is {', '.join(hosts) or 'missing'}, not {own[0]}"
-    for origin in headers.get_all("Origin", []):
+    for origin in origins:
         if origin.strip().lower() not in [f"http://{host}" for host in own]:
             return f"Origin is {origin}, not http://{own[0]}"
     return None
 
 
-def serve(listening: socket.socket, target: tuple[str, int]) -> Callable[[], None]:
-    """Passes what comes to a socket on to a server, in a thread of its own.
+def open_page(port: int | None = None) -> Meshcat:
+    """A Meshcat page for this machine's browsers, without Drake's own message.
+
+    Meshcat listens behind the proxy at one of 2^24 loopback addresses, which no web page can find
+    by trying; where the system has but one of them (macOS), at a port that one could find among
+    2^16.
 
     Args:
-        listening: of ``listen``.
-        target: the server's address and port.
+        port: where the page is; a free one where not given.
 
-    Returns:
-        What ends it, and closes the socket.
+    Raises:
+        SettingsError: no page can be opened at the port.
     """
-    loop = asyncio.new_event_loop()
-    port = listening.getsockname()[1]
-    started = threading.Event()
+    logger = logging.getLogger("drake")
+    level = logger.level
+    logger.setLevel(logging.WARNING)
+    try:
+        listening = listen(port)
+        number = listening.getsockname()[1]
+        page, host = _hidden_meshcat(f"http://localhost:{number}")
+    except (OSError, RuntimeError) as error:
+        where = f"port {port}" if port is not None else f"ports {PORTS[0]} to {PORTS[-1]}"
+        raise SettingsError(f"no page can be opened at {where}: {error}") from error
+    finally:
+        logger.setLevel(level)
+    weakref.finalize(page, _serve(listening, f"{host}:{page.port()}", number))
+    return page
 
-    async def connected(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        # It is cancelled when the page is gone.
-        with suppress(OSError, asyncio.LimitOverrunError, asyncio.CancelledError):
-            await _pass_on(reader, writer, target, port)
-        writer.close()
 
-    def run() -> None:
-        asyncio.set_event_loop(loop)
-        server = loop.run_until_complete(asyncio.start_server(connected, sock=listening))
-        started.set()
-        loop.run_forever()
-        server.close()
-        tasks = asyncio.all_tasks(loop)
-        for task in tasks:
-            task.cancel()
-        loop.run_until_complete(asyncio.gather(*tasks, return_exceptions=True))
-        loop.close()
+def _hidden_meshcat(url: str) -> tuple[Meshcat, str]:
+    """A Meshcat that says it is at a URL, and the loopback address at which it is."""
+    # Neither the network's own address, nor its last one, which is for broadcasts.
+    hidden = ipaddress.ip_address((127 << 24) + 1 + secrets.randbelow((1 << 24) - 2))
+    for host in (str(hidden), "127.0.0.1"):
+        with suppress(RuntimeError):
+            params = MeshcatParams(host=host, port=0, show_stats_plot=False, web_url_pattern=url)
+            return Meshcat(params), host
+    raise RuntimeError("Meshcat cannot listen at any loopback address")
 
-    thread = threading.Thread(target=run, name="local_proxy", daemon=True)
+
+def _serve(listening: socket.socket, target: str, port: int) -> Callable[[], None]:
+    """Passes a page's requests on to a server, in a thread of its own; returns what ends it."""
+    loop, ended, started = asyncio.new_event_loop(), asyncio.Event(), threading.Event()
+
+    async def run() -> None:
+        # Meshcat waits for connections that are kept.
+        connector = TCPConnector(force_close=True)
+        async with ClientSession(connector=connector, auto_decompress=False) as session:
+
+            async def handle(request: web.BaseRequest) -> web.StreamResponse:
+                headers = request.headers
+                why = refuse(headers.getall("Host", []), headers.getall("Origin", []), port)
+                if why is not None:
+                    text = f"Refused: {why}. Open this page at http://localhost:{port}\n"
+                    refused = web.Response(status=403, text=text)
+                    refused.force_close()
+                    return refused
+                return await _pass_on(request, session, target)
+
+            runner = web.ServerRunner(web.Server(handle, access_log=None), shutdown_timeout=0.0)
+            await runner.setup()
+            await web.SockSite(runner, listening).start()
+            started.set()
+            await ended.wait()
+            await runner.cleanup()
+
+    thread = threading.Thread(
+        target=lambda: loop.run_until_complete(run()), name="local_proxy", daemon=True
+    )
     thread.start()
     started.wait()
 
     def close() -> None:
-        loop.call_soon_threadsafe(loop.stop)
+        loop.call_soon_threadsafe(ended.set)
         thread.join()
+        loop.close()
 
     return close
 
 
 async def _pass_on(
-    reader: asyncio.StreamReader,
-    writer: asyncio.StreamWriter,
-    target: tuple[str, int],
-    port: int,
-) -> None:
-    """Serves one connection, until either side ends it."""
-    inner_reader, inner_writer = await asyncio.open_connection(*target)
-    tasks = [
-        asyncio.ensure_future(_ask(reader, inner_writer, port)),
-        asyncio.ensure_future(_copy(inner_reader, writer)),
-    ]
-    try:
-        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        refusal = tasks[0].result() if tasks[0].done() else None
-        if refusal is not None:
-            tasks[1].cancel()
-            text = f"Refused: {refusal}. Open this page at http://localhost:{port}\n".encode()
-            head = "HTTP/1.1 403 Forbidden\r\nContent-Type: text/plain; charset=utf-8\r\n"
-            head += f"Content-Length: {len(text)}\r\nConnection: close\r\n\r\n"
-            writer.write(head.encode() + text)
-            await writer.drain()
-        elif not tasks[1].done():
-            inner_writer.write_eof()
-            await asyncio.wait(tasks[1:], timeout=_PATIENCE)
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-        inner_writer.close()
-
-
-async def _ask(
-    reader: asyncio.StreamReader, inner_writer: asyncio.StreamWriter, port: int
-) -> str | None:
-    """Passes requests on until no more come; why one is refused, None if none is."""
-    while True:
+    request: web.BaseRequest, session: ClientSession, target: str
+) -> web.StreamResponse:
+    """What the server answers to a request."""
+    url = f"http://{target}{request.rel_url}"
+    outer = web.WebSocketResponse(timeout=_GOODBYE, max_msg_size=0, compress=False)
+    if not outer.can_prepare(request).ok:
+        async with session.get(url) as answer:
+            headers = {name: answer.headers[name] for name in _PASSED if name in answer.headers}
+            return web.Response(body=await answer.read(), status=answer.status, headers=headers)
+    timeout = ClientWSTimeout(ws_close=_GOODBYE)
+    async with session.ws_connect(url, timeout=timeout, max_msg_size=0) as inner:
+        await outer.prepare(request)
+        copies = [asyncio.ensure_future(_copy(*pair)) for pair in ((inner, outer), (outer, inner))]
         try:
-            head = await reader.readuntil(_END)
-        except asyncio.IncompleteReadError:
-            return None
-        refusal = refuse(head, port)
-        if refusal is not None:
-            return refusal
-        inner_writer.write(head)
-        await inner_writer.drain()
-        # What follows a WebSocket's head is its own; bodies are not among what Meshcat takes, and
-        # would be refused as the head of a request.
-        if b"\r\nupgrade:" in head.lower():
-            await _copy(reader, inner_writer)
-            return None
+            await asyncio.wait(copies, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for copy in copies:
+                copy.cancel()
+            await asyncio.gather(*copies, return_exceptions=True)
+        await outer.close()
+    return outer
 
 
-async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    """Passes bytes on until no more come."""
-    while chunk := await reader.read(_CHUNK):
-        writer.write(chunk)
-        await writer.drain()
+_Socket = web.WebSocketResponse | ClientWebSocketResponse
+
+
+async def _copy(source: _Socket, target: _Socket) -> None:
+    """Passes messages on until no more come."""
+    async for message in source:
+        if message.type is WSMsgType.BINARY:
+            await target.send_bytes(message.data)
+        elif message.type is WSMsgType.TEXT:
+            await target.send_str(message.data)

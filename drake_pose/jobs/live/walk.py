@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import csv
-import ipaddress
-import logging
 import math
-import secrets
 import time
-import weakref
 import webbrowser
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import Meshcat, MeshcatParams
+from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram
 from pydrake.trajectories import PiecewisePolynomial
@@ -26,7 +21,6 @@ from pydrake.trajectories import PiecewisePolynomial
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.errors import OutputError, SettingsError
-from drake_pose.jobs.live.local_proxy import PORTS, listen, serve
 from drake_pose.person.date.skeleton import load_skeleton
 from drake_pose.person.date.walk_commands import WalkSettings
 from drake_pose.person.date.walking_motion import make_motion
@@ -136,47 +130,6 @@ def stride_positions(model: ArticulatedModel) -> Array:
         if name in model.position_names:
             stride[:, model.position_index(name)] = walking[:, index]
     return stride
-
-
-def open_page(port: int | None = None) -> Meshcat:
-    """A Meshcat page for this machine's browsers, without Drake's own message.
-
-    Meshcat itself would send what it shows to any web page that asks for it, so that a proxy stands
-    before it, at the page's address. Meshcat listens at one of 2^24 loopback addresses, which no
-    web page can find by trying; where the system has but one of them (macOS), at a port that one
-    could find among 2^16.
-
-    Args:
-        port: where it listens; a free one where not given.
-
-    Raises:
-        SettingsError: no page can be opened at the port.
-    """
-    logger = logging.getLogger("drake")
-    level = logger.level
-    logger.setLevel(logging.WARNING)
-    try:
-        listening = listen(port)
-        url = f"http://localhost:{listening.getsockname()[1]}"
-        page, host = _hidden_meshcat(url)
-    except (OSError, RuntimeError) as error:
-        where = f"port {port}" if port is not None else f"ports {PORTS[0]} to {PORTS[-1]}"
-        raise SettingsError(f"no page can be opened at {where}: {error}") from error
-    finally:
-        logger.setLevel(level)
-    weakref.finalize(page, serve(listening, (host, page.port())))
-    return page
-
-
-def _hidden_meshcat(url: str) -> tuple[Meshcat, str]:
-    """A Meshcat that says it is at a URL, and the loopback address at which it is."""
-    # Neither the network's own address, nor its last one, which is for broadcasts.
-    hidden = ipaddress.ip_address((127 << 24) + 1 + secrets.randbelow((1 << 24) - 2))
-    for host in (str(hidden), "127.0.0.1"):
-        with suppress(RuntimeError):
-            params = MeshcatParams(host=host, port=0, show_stats_plot=False, web_url_pattern=url)
-            return Meshcat(params), host
-    raise RuntimeError("Meshcat cannot listen at any loopback address")
 
 
 def walk(

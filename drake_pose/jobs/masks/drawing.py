@@ -16,7 +16,7 @@ import numpy as np
 
 from drake_pose.camera.picture_files import Picture
 from drake_pose.errors import DrakePoseError, SettingsError
-from drake_pose.jobs.live.local_proxy import listen, refuse_headers
+from drake_pose.jobs.live.local_proxy import listen, refuse
 from drake_pose.jobs.masks.sources import Source
 from drake_pose.jobs.masks.strokes import ANY_CAMERA, read_entry
 from drake_pose.silhouette.segmentation.grab_cut import Strokes, cut_out
@@ -189,7 +189,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _refused(self, origin: bool = False) -> bool:
         """Whether a request is not the page's own, and was answered so."""
-        refusal = refuse_headers(self.headers, self.port)
+        hosts, origins = (self.headers.get_all(name, []) for name in ("Host", "Origin"))
+        refusal = refuse(hosts, origins, self.port)
         if refusal is None and origin and "Origin" not in self.headers:
             refusal = "Origin is missing"
         if refusal is not None:

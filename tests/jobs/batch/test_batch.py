@@ -315,7 +315,7 @@ def test_job_file_gives_the_settings(tmp_path):
         "root_position": [1, 2, 3], "root_rotation": "y=-180:180", "interval": 5,
         "hold": {"lift": 10}, "method": "beam", "truth": "t.csv", "replay": False,
         "packages": {"arms": "robots"}, "start": "first.csv", "track": False, "candidates": 3,
-        "unseen": "hand", "time_limit": 2,
+        "time_limit": 2,
     }  # fmt: skip
     path = tmp_path / "jobs.yaml"
     path.write_text(yaml.safe_dump({"scenes": {"a": entry}}))
@@ -324,7 +324,7 @@ def test_job_file_gives_the_settings(tmp_path):
         cameras=("left",), frames=("0:9",), root="base", root_position=(1.0, 2.0, 3.0),
         root_rotation={"y": (-180.0, 180.0)}, interval=5.0, hold={"lift": 10.0}, method="beam",
         packages={"arms": tmp_path / "robots"}, start=tmp_path / "first.csv", track=False,
-        candidates=3, unseen=("hand",), time_limit=2.0,
+        candidates=3, time_limit=2.0,
     )  # fmt: skip
     truth = tmp_path / "t.csv"
     assert job == SceneJob(

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from drake_pose.jobs.live.local_proxy import refuse
-from drake_pose.jobs.live.walk import open_page
+from drake_pose.jobs.live.local_proxy import open_page, refuse
 
 UPGRADE = (
     "Connection: keep-alive, Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
@@ -114,19 +113,23 @@ def test_every_request_of_a_connection_is_looked_at(page):
 
 
 @pytest.mark.parametrize(
-    "head",
+    ("hosts", "origins"),
     [
-        b"GET / HTTP/1.1\r\n\r\n",
-        b"GET / HTTP/1.1\r\nHost: localhost:7000\r\nHost: a.example\r\n\r\n",
-        b"GET / HTTP/1.1\r\nHost: localhost:7000\r\nOrigin: http://localhost:7000\r\n"
-        b"origin: http://a.example\r\n\r\n",
-        b"GET / HTTP/1.1\r\nHost: localhost:7000\r\nORIGIN: http://localhost:7000.a.example\r\n\r\n",
-        b"\x16\x03\x01\x02\x00\r\n\r\n",
+        ([], []),
+        (["localhost:7000", "a.example"], []),
+        (["localhost:7000"], ["http://localhost:7000", "http://a.example"]),
+        (["localhost:7000"], ["http://localhost:7000.a.example"]),
     ],
 )
-def test_heads_of_no_page_are_refused(head):
-    assert refuse(head, 7000) is not None
-    assert refuse(b"GET / HTTP/1.1\r\nhost: localhost:7000\r\n\r\n", 7000) is None
+def test_heads_of_no_page_are_refused(hosts, origins):
+    assert refuse(hosts, origins, 7000) is not None
+    assert refuse(["localhost:7000"], [], 7000) is None
+
+
+def test_what_is_no_http_is_refused(page):
+    with connection(page) as opened:
+        opened.sendall(b"\x16\x03\x01\x02\x00\r\n\r\n")
+        assert answer(opened)[0].startswith(b"HTTP/1.0 400 ")
 
 
 @pytest.mark.skipif(not SOCKETS.is_file(), reason="the system lists no sockets")

@@ -15,12 +15,12 @@ from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.commands.main import app
 from drake_pose.errors import OutputError, SettingsError
+from drake_pose.jobs.live.local_proxy import open_page
 from drake_pose.jobs.live.walk import (
     REPLAY,
     Player,
     _walk_once,
     key_player,
-    open_page,
     recorded_player,
     show,
     simulated_player,
@@ -162,7 +162,8 @@ def test_recording_waits_for_a_browser_and_is_played_again(tmp_path, monkeypatch
     record(tmp_path, [0.0] * 5)
     pages, browsers = [], contextlib.ExitStack()
     monkeypatch.setattr(
-        "drake_pose.jobs.live.walk.open_page", lambda _: pages.append(open_page()) or pages[0]
+        "drake_pose.jobs.live.local_proxy.open_page",
+        lambda _: pages.append(open_page()) or pages[0],
     )
     urls, begun, presses = [], [], []
 

@@ -16,7 +16,7 @@ def reproduce(*options):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (("--experiment", "D"), ("A, B or C",)),
+        (("--experiment", "D"), ('"A", "B", "C"',)),
         (("--experiment", "B", "--seed", "1"), ("--seed", "--experiment A")),
         (("--experiment", "C", "--outside-limit", "9"), ("--outside-limit", "--experiment A")),
     ],

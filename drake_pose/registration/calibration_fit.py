@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,11 @@ ROUNDS_WITH_CONSTANTS = (
 )
 """Parts of a fit that has constants to find beside cameras."""
 
+TOLD_APART = AnnealingStage(0.025, 0.01)
+"""At this scale frames are told apart that agree and that contradict."""
+
+# A frame agrees whose inlier ratio is this share of that of the two that fit best.
+_AGREES = 0.7
 _STEPS = StepSettings(longest=0.3, damping=1e-2, even_damping=1e-6)
 # Masks are wider or narrower by no more [pixel], and their width is varied by this.
 _WIDEST, _WIDTH_STEP = 6.0, 0.25
@@ -48,12 +54,12 @@ class Calibration:
     """What is unknown of cameras and of a body.
 
     Args:
-        X_CW: (cameras, 4, 4) the world's poses in the cameras.
-        widths: for each camera (frames,) by how much each frame's silhouette is too wide on all
-            sides [pixel]; 0 for frames that did not count.
+        X_CW: (cameras, 4, 4).
+        widths: for each camera (frames,) by how much each silhouette is too wide on all sides
+            [pixel]; 0 for frames that did not count.
         log_focal: (cameras,) the logarithms of the focal lengths' growth.
-        constants: (k,) what is added to the encoders' positions of some joints [rad or m], and to
-            the logarithms of some links' lengths, in all frames.
+        constants: (k,) added in all frames to some joints' positions [rad or m] and to the
+            logarithms of some links' lengths.
     """
 
     X_CW: Array
@@ -78,9 +84,6 @@ class CalibrationFit:
     """Fits what frames of several cameras share.
 
     Attributes:
-        fits: the cameras.
-        which: for each camera the frames that count.
-        constants: (k,) the body's parameters to which an unknown constant is added in all frames.
         per_camera: so many unknowns each camera has.
         names: of the shared unknowns: those of each camera, then the constants.
 
@@ -88,7 +91,7 @@ class CalibrationFit:
         fits: the cameras.
         which: for each camera the frames that count.
         constants: (k,) the body's parameters to which an unknown constant is added in all frames:
-            values of the pose tree, whose zeros are unknown, and lengths.
+            values of the pose tree, and lengths.
         focal: whether the cameras' focal lengths are unknown.
     """
 
@@ -120,31 +123,13 @@ class CalibrationFit:
         self.information = np.array([*cameras, *(one**-2 for one in known)])
 
     def fit(self, start: Calibration, rounds: Sequence[AnnealingStage]) -> Calibration:
-        """Fits all from where it starts.
-
-        Args:
-            start: where to start.
-            rounds: the parts of the fit.
-        """
-        rows = [(c, int(k)) for c, frames in enumerate(self.which) for k in frames]
-
-        def evaluate(own: Array, shared: Array, step: AnnealingStage) -> Equations:
-            now = self._moved(start, shared)
-            parts = [
-                self._equations(now, c, k, float(w), step)
-                for (c, k), w in zip(rows, own[:, 0], strict=True)
-            ]
-            H, g, costs = (list(part) for part in zip(*parts, strict=True))
-            off = self._off(now)
-            H[0][1:, 1:] += np.diag(self.information)
-            g[0][1:] += self.information * off
-            known = float(self.information @ off**2)
-            return Equations(np.array(H), np.array(g), float(sum(costs)) + known)
-
+        """Fits all from where it starts."""
+        rows = self._rows()
         count = 1 + len(self.names)
         lower, upper = np.full(count, -np.inf), np.full(count, np.inf)
         lower[0], upper[0] = -_WIDEST, _WIDEST
         widths = np.array([start.widths[c][k] for c, k in rows]).reshape(-1, 1)
+        evaluate = partial(self.equations, start)
         found = minimise(evaluate, widths, np.zeros(count - 1), (lower, upper), rounds, _STEPS)
         now = self._moved(start, found.shared)
         fitted = [np.zeros(len(fit.values)) for fit in self.fits]
@@ -152,36 +137,48 @@ class CalibrationFit:
             fitted[c][k] = width
         return Calibration(now.X_CW, tuple(fitted), now.log_focal, now.constants)
 
-    def bend(self, found: Calibration, by: Array, step: AnnealingStage) -> tuple[float, float]:
-        """How much the cost bends upwards to either side, and how much it should.
+    def equations(
+        self, start: Calibration, own: Array, shared: Array, step: AnnealingStage
+    ) -> Equations:
+        """The normal equations, what is known beforehand in those of the first frame.
 
         Args:
-            found: the unknowns, fitted.
-            by: (u,) how far what is shared is moved.
+            start: from where the unknowns count.
+            own: (frames that count, 1) their widths [pixel].
+            shared: (u,) what is shared.
             step: scale and spacing.
-
-        Returns:
-            what the slopes on both sides say, and what the normal equations do.
         """
+        now = self._moved(start, shared)
+        parts = [
+            self._equations(now, c, k, float(width), step)
+            for (c, k), width in zip(self._rows(), own[:, 0], strict=True)
+        ]
+        H, g, costs = (list(part) for part in zip(*parts, strict=True))
+        off = self._off(now)
+        H[0][1:, 1:] += np.diag(self.information)
+        g[0][1:] += self.information * off
+        known = float(self.information @ off**2)
+        return Equations(np.array(H), np.array(g), float(sum(costs)) + known)
+
+    def _rows(self) -> list[tuple[int, int]]:
+        """Camera and frame of all that counts."""
+        return [(c, int(k)) for c, frames in enumerate(self.which) for k in frames]
+
+    def bend(self, found: Calibration, by: Array, step: AnnealingStage) -> tuple[float, float]:
+        """How much the cost bends upwards as what is shared moves by (u,), by slopes and by H."""
         less, more = (self._moved(found, sign * by) for sign in (-1.0, 1.0))
         bends, said = 0.0, 0.0
-        for c, frames in enumerate(self.which):
-            for k in frames.tolist():
-                width = float(found.widths[c][k])
-                said += float(by @ self._equations(found, c, k, width, step)[0][1:, 1:] @ by)
-                g_less, g_more = (
-                    self._equations(one, c, k, width, step)[1][1:] for one in (less, more)
-                )
-                bends += 0.5 * float(by @ (g_more - g_less))
+        for c, k in self._rows():
+            width = float(found.widths[c][k])
+            said += float(by @ self._equations(found, c, k, width, step)[0][1:, 1:] @ by)
+            slopes = [self._equations(one, c, k, width, step)[1][1:] for one in (less, more)]
+            bends += 0.5 * float(by @ (slopes[1] - slopes[0]))
         return bends, said
 
     def motions(self, now: Calibration, camera: int, dense: Array) -> Array:
         """(nodes, u, 12) the affine motions that the shared unknowns give to the nodes.
 
-        Args:
-            now: the unknowns.
-            camera: in whose picture.
-            dense: (nodes, n, 12) those that the body's parameters give.
+        dense: (nodes, n, 12) those that the body's parameters give.
         """
         fit = self.fits[camera]
         found = np.zeros((len(dense), len(self.names), 12))
@@ -214,9 +211,10 @@ class CalibrationFit:
             cameras[:, _POSE] = now.log_focal
         return np.concatenate([cameras.ravel(), now.constants])
 
-    def _compare(
+    def compare(
         self, now: Calibration, camera: int, frame: int, width: float, step: AnnealingStage
     ) -> Comparison:
+        """A frame's contours compared with its silhouette, which is too wide by a width."""
         values, focal = self.values(now, camera, frame), float(now.log_focal[camera])
         return self.fits[camera].compare(now.X_CW[camera], frame, step, width, values, focal)
 
@@ -228,7 +226,7 @@ class CalibrationFit:
         What follows the width is told by differences: edges that are shifted along their normals.
         """
         less, here, more = (
-            self._compare(now, camera, frame, width + off, step)
+            self.compare(now, camera, frame, width + off, step)
             for off in (-_WIDTH_STEP, 0.0, _WIDTH_STEP)
         )
         motions = self.motions(
@@ -248,3 +246,18 @@ class CalibrationFit:
 
 def _sum(compared: Comparison, column: int) -> float:
     return float(compared.sums[..., column].sum())
+
+
+def inlier_ratios(fit: CalibrationFit, found: Calibration, camera: int = 0) -> Array:
+    """(frames,) of both contours' lengths, what fits in each frame of a camera."""
+    return np.array(
+        [
+            fit.compare(found, camera, k, float(width), TOLD_APART).inlier_ratio
+            for k, width in enumerate(found.widths[camera])
+        ]
+    )
+
+
+def agreeing(ratios: Array) -> NDArray[np.bool_]:
+    """(frames,) which frames fit nearly as well as the two that fit best."""
+    return np.asarray(ratios >= _AGREES * np.sort(ratios)[-2:].mean())

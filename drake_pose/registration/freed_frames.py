@@ -36,7 +36,7 @@ from drake_pose.fit.kernel import COST, WEIGHT
 from drake_pose.fit.levenberg_marquardt import AnnealingStage, StepSettings
 from drake_pose.fit.parameters import CAMERA_NAMES, CameraParameters
 from drake_pose.fit.unknowns import choose
-from drake_pose.registration.agreement import TOLD_APART
+from drake_pose.registration.calibration_fit import TOLD_APART
 from drake_pose.registration.camera_fit import POSE_NAMES
 from drake_pose.silhouette.areas.outline import Outline
 

@@ -23,12 +23,13 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, UnknownNameError
 from drake_pose.fit.lengthened_body import length_name
-from drake_pose.registration.agreement import agreeing, frame_shares
 from drake_pose.registration.calibration_fit import (
     CONSTANT_DEVIATION,
     ROUNDS_WITH_CONSTANTS,
     Calibration,
     CalibrationFit,
+    agreeing,
+    inlier_ratios,
     start_calibration,
 )
 from drake_pose.registration.camera_fit import CameraFit
@@ -228,7 +229,7 @@ def _as_the_cost_bends(fit: CalibrationFit, found: Calibration, covariance: Arra
 
 def _shares(fit: CalibrationFit, found: Calibration) -> list[Array]:
     """For each camera (frames,) what fits."""
-    return [frame_shares(fit, found, c) for c in range(len(fit.fits))]
+    return [inlier_ratios(fit, found, c) for c in range(len(fit.fits))]
 
 
 def _describe(

@@ -24,10 +24,12 @@ from drake_pose.errors import RegistrationError, SettingsError
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.significance import excess
 from drake_pose.fit.surfaces import FEW, VERY_FEW, few_triangles, with_girths
-from drake_pose.registration.agreement import TOLD_APART, agreeing, frame_shares
 from drake_pose.registration.calibration_fit import (
+    TOLD_APART,
     Calibration,
     CalibrationFit,
+    agreeing,
+    inlier_ratios,
     start_calibration,
 )
 from drake_pose.registration.camera_fit import CameraFit
@@ -322,7 +324,7 @@ def describe_fitted(
     order = np.argsort([one.sum() for one in pieces], kind="stable")
     fit, best = fitted[order[0]]
     X_CW = best.X_CW[0]
-    shares = frame_shares(CalibrationFit([fit], [], constants), best)
+    shares = inlier_ratios(CalibrationFit([fit], [], constants), best)
     agree = agreeing(shares)
     found = areas(fit.frames, best.X_CW, np.inf)[0]
     iou = intersection_over_union(found)
@@ -372,6 +374,6 @@ def with_widths(fit: CameraFit, X_CW: Array, constants: Sequence[int] = ()) -> C
     found = start_calibration([fit], [X_CW], len(constants))
     every = CalibrationFit([fit], [], constants)
     for _ in range(_AGAIN):
-        which = np.flatnonzero(agreeing(frame_shares(every, found)))
+        which = np.flatnonzero(agreeing(inlier_ratios(every, found)))
         found = CalibrationFit([fit], [which], constants).fit(found, LAST)
     return found

@@ -60,7 +60,9 @@ def place_by_bounds(frames: PosedFrames, R_CW: Array) -> Array:
     for k in range(_PLACING_STEPS):
         H, g = np.zeros((len(R_CW), 3, 3)), np.zeros((len(R_CW), 3))
         for body, bound, sides in zip(bodies, bounds, shown, strict=True):
-            _add_sides(frames, body + p_CW[:, None], (bound, sides), k >= _ROBUST_FROM, H, g)
+            add_bound_equations(
+                frames, body + p_CW[:, None], (bound, sides), k >= _ROBUST_FROM, H, g
+            )
         H += 1e-3 / 3.0 * np.einsum("nii->n", H)[:, None, None] * np.eye(3) + 1e-9 * np.eye(3)
         step = -np.linalg.solve(H, g[..., None])[..., 0]
         length = np.maximum(np.linalg.norm(step, axis=1), 1e-12)
@@ -80,7 +82,7 @@ def _place_by_sizes(frames: PosedFrames, bodies: Sequence[Array], bounds: Sequen
     return np.column_stack([(middle - c) / f * depth[:, None], depth])
 
 
-def _add_sides(
+def add_bound_equations(
     frames: PosedFrames,
     p_C: Array,
     bound: tuple[Array, NDArray[np.bool_]],

@@ -28,8 +28,7 @@ from drake_pose.fit.covariance import (
     widening,
 )
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
-from drake_pose.registration.agreement import TOLD_APART
-from drake_pose.registration.calibration_fit import Calibration, CalibrationFit
+from drake_pose.registration.calibration_fit import TOLD_APART, Calibration, CalibrationFit
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from tests.search.arms import arm_urdf
 def model(tmp_path_factory: pytest.TempPathFactory) -> ArticulatedModel:
     path = tmp_path_factory.mktemp("arm") / "arm.urdf"
     path.write_text(arm_urdf())
-    return load_model(path)
+    return load_model(path, check=False)
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,172 @@
+"""Laws of the parts that a registration is made of; each is a matter of milliseconds."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body.tree.root import RootRotation
+from drake_pose.errors import MaskError
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
+from drake_pose.registration.calibration_fit import (
+    CONSTANT_DEVIATION,
+    FOCAL_DEVIATION,
+    CalibrationFit,
+    start_calibration,
+)
+from drake_pose.registration.camera_fit import CameraFit
+from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
+from drake_pose.registration.register import RegistrationBody
+from drake_pose.registration.standing_object import StandingObject
+from drake_pose.registration.start_poses import add_bound_equations, place_by_bounds
+from tests.registration.arm_pictures import looking_at, see
+
+MIDDLE = np.array([0.0, 0.0, 0.4])
+PLACE = np.array([1.6, 0.4, 0.5])
+STEP = AnnealingStage(0.02, 0.02)
+
+
+@pytest.fixture(scope="module")
+def posed(model: ArticulatedModel, body: RegistrationBody) -> PosedFrames:
+    camera = looking_at(PLACE, MIDDLE, 0.1)
+    return PosedFrames(body.kinematics, body.very_few, camera, see(model, body, camera, 2, 4))
+
+
+def test_what_is_known_beforehand_pulls_by_what_it_says(posed: PosedFrames) -> None:
+    fit = CalibrationFit([CameraFit(posed, 0.05)], [np.arange(2)], [3], focal=True)
+    free = CalibrationFit(fit.fits, fit.which, [3], focal=True)
+    free.information = np.zeros_like(free.information)
+    start = start_calibration(fit.fits, [posed.camera.X_CW], 1)
+    shared = np.array([0.01, 0.0, -0.01, 0.002, 0.003, 0.0, 0.04, -0.03])
+    with_prior, without = (
+        one.equations(start, np.zeros((2, 1)), shared, STEP) for one in (fit, free)
+    )
+    known = np.array([0.0] * 6 + [FOCAL_DEVIATION**-2, CONSTANT_DEVIATION**-2])
+    H, g = with_prior.H - without.H, with_prior.g - without.g
+    np.testing.assert_allclose(H.sum(axis=0)[1:, 1:], np.diag(known), atol=1e-6)
+    np.testing.assert_allclose(g.sum(axis=0)[1:], known * shared, atol=1e-6)
+    assert with_prior.cost - without.cost == pytest.approx(known @ shared**2)
+
+
+def test_slopes_of_the_cost_are_those_of_the_equations(posed: PosedFrames) -> None:
+    """g is half the derivative of the cost: of a pose, the focal length, a zero and a width."""
+    fit = CalibrationFit([CameraFit(posed, 0.02)], [np.arange(2)], [3], focal=True)
+    start = start_calibration(fit.fits, [posed.camera.X_CW], 1)
+    own, at = np.zeros((2, 1)), np.array([0.02, -0.01, 0.02, 0.01, 0.01, 0.01, 0.02, 0.03])
+    wide = AnnealingStage(0.2, 0.01)
+    g = fit.equations(start, own, at, wide).g.sum(axis=0)[1:]
+    for k, slope in enumerate(g):
+        by = 2e-3 * np.eye(8)[k]
+        more, less = (fit.equations(start, own, at + s * by, wide).cost for s in (1.0, -1.0))
+        assert (more - less) / 8e-3 == pytest.approx(slope, abs=0.1 * np.abs(g).max()), k
+    wider, narrower = (fit.equations(start, own + w, at, wide).cost for w in (0.25, -0.25))
+    widths = fit.equations(start, own, at, wide).g[:, 0]
+    assert (wider - narrower) / 1.0 == pytest.approx(float(widths.sum()))
+
+
+def test_bounds_pull_along_the_derivative_of_how_far_they_are_off(posed: PosedFrames) -> None:
+    bound = (np.array([[200.0, 100.0], [400.0, 380.0]]), np.ones((2, 2), bool))
+    X_CW = posed.camera.X_CW
+    p_C = (posed.points[0] @ X_CW[:3, :3].T + X_CW[:3, 3])[None]
+
+    def equations(shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        H, g = np.zeros((1, 3, 3)), np.zeros((1, 3))
+        add_bound_equations(posed, p_C + shift, bound, False, H, g)
+        return H[0], g[0]
+
+    def cost(shift: np.ndarray) -> float:
+        uv, _ = posed.camera.with_pose(np.eye(4)).project(p_C[0] + shift)
+        off = np.array([uv.min(axis=0), uv.max(axis=0)]) - bound[0]
+        return 0.5 * float((off**2).sum())
+
+    H, g = equations(np.zeros(3))
+    steps = 1e-5 * np.eye(3)
+    slopes = [(cost(one) - cost(-one)) / 2e-5 for one in steps]
+    np.testing.assert_allclose(g, slopes, rtol=1e-4)
+    # Of four sides three unknowns follow.
+    assert np.linalg.matrix_rank(H) == 3
+
+
+def test_a_body_is_placed_where_its_bounds_are_the_silhouettes(posed: PosedFrames) -> None:
+    camera = posed.camera
+    p_CW = place_by_bounds(posed, camera.X_CW[None, :3, :3])[0]
+    assert np.linalg.norm(p_CW - camera.X_CW[:3, 3]) < 0.03
+
+
+SIDES = "0.2 0.12 0.08"
+LOOKS = {
+    "box": (f'<box size="{SIDES}"/>', 4, 0, 4),
+    "square": ('<box size="0.1 0.1 0.2"/>', 8, 0, 8),
+    "can": ('<cylinder radius="0.06" length="0.18"/>', 48, 1, 2),
+}
+
+
+@pytest.fixture
+def standing(model: ArticulatedModel, tmp_path: Path) -> Callable[[str], StandingObject]:
+    def stand(looks: str) -> StandingObject:
+        path = tmp_path / "thing.urdf"
+        shape = f'<visual><origin xyz="0.3 0 0.1"/><geometry>{looks}</geometry></visual>'
+        path.write_text(f'<robot name="thing"><link name="thing">{shape}</link></robot>')
+        tree = load_model(path, check=False).pose_tree(
+            "thing", root_position=np.zeros(3), root_rotation=RootRotation.fixed()
+        )
+        return StandingObject(model, "roll", {}, tree)
+
+    return stand
+
+
+@pytest.mark.parametrize("name", LOOKS)
+def test_turns_after_which_an_object_looks_alike(
+    name: str, standing: Callable[[str], StandingObject]
+) -> None:
+    looks, turns, axes, apart = LOOKS[name]
+    thing = standing(looks)
+    found = thing.symmetry
+    assert (len(found.turns), len(found.axes), len(found.told_apart)) == (turns, axes, apart)
+    np.testing.assert_allclose(found.turns[0], np.eye(4), atol=1e-12)
+    points = thing.alone.all[0].vertices
+    corners = np.abs(points - thing.middle).max(axis=0)
+    for X in found.turns:
+        turned = points @ X[:3, :3].T + X[:3, 3] - thing.middle
+        # About its middle, and no corner leaves the box around it.
+        assert (np.abs(turned) < corners + 0.02 * thing.radius).all()
+
+
+def test_an_object_that_is_round_may_be_turned_about_its_axis_by_anything(
+    standing: Callable[[str], StandingObject],
+) -> None:
+    X_WT = looking_at(PLACE, MIDDLE, 0.4).X_WC
+    box, can = (
+        standing(LOOKS[name][0]).pose_covariance(X_WT, 1e-6 * np.eye(6)) for name in ("box", "can")
+    )
+    axis = X_WT[:3, 2]
+    assert axis @ box[:3, :3] @ axis == pytest.approx(1e-6)
+    assert axis @ can[:3, :3] @ axis == pytest.approx(np.pi**2 / 3.0, rel=1e-3)
+    others = np.linalg.svd(axis[None])[2][1:]
+    np.testing.assert_allclose(np.diag(others @ can[:3, :3] @ others.T), 1e-6, rtol=1e-3)
+
+
+def test_an_object_s_covariance_is_that_of_its_moves(
+    standing: Callable[[str], StandingObject],
+) -> None:
+    """J sigma J^T, J the derivative of the pose by OBJECT_POSITIONS."""
+    thing, X_WT = standing(LOOKS["box"][0]), looking_at(PLACE, MIDDLE, 0.4).X_WC
+    J = np.zeros((6, 6))
+    for k in range(6):
+        X = thing.moved(X_WT, 1e-6 * np.eye(6)[k])
+        turn = X[:3, :3] @ X_WT[:3, :3].T
+        J[:, k] = [turn[2, 1], turn[0, 2], turn[1, 0], *(X[:3, 3] - X_WT[:3, 3])]
+    covariance = np.diag([1.0, 4.0, 9.0, 0.1, 0.2, 0.3])
+    expected = (J / 1e-6) @ covariance @ (J / 1e-6).T
+    np.testing.assert_allclose(thing.pose_covariance(X_WT, covariance), expected, atol=1e-4)
+
+
+def test_masks_of_another_size_and_empty_ones_are_refused(
+    body: RegistrationBody, posed: PosedFrames
+) -> None:
+    for mask in (np.ones((10, 10), bool), np.zeros((480, 640), bool)):
+        frame = PosedFrame("0007", posed.frames[0].values, mask)
+        with pytest.raises(MaskError, match="camera 'eye', frame '0007'"):
+            PosedFrames(body.kinematics, body.few, posed.camera, [frame])

@@ -34,7 +34,7 @@ def read_picture(path: Path, error_type: type[DrakePoseError]) -> Picture:
     Raises:
         error_type: names the file; when it is no whole picture.
     """
-    picture = _decode(_read(path, error_type), cv2.IMREAD_COLOR, path, error_type)
+    picture = _decode(read_picture_file(path, error_type), cv2.IMREAD_COLOR, path, error_type)
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
@@ -49,7 +49,7 @@ def read_person_mask(path: Path, error_type: type[DrakePoseError]) -> Mask:
     Raises:
         error_type: names the file; when it is no whole picture, or no mask.
     """
-    data = _read(path, error_type)
+    data = read_picture_file(path, error_type)
     picture = _decode(data, cv2.IMREAD_UNCHANGED, path, error_type)
     if picture.ndim == 3 and picture.shape[2] == 4 and np.ptp(picture[:, :, 3]) == 0:
         picture = np.ascontiguousarray(picture[:, :, :3])  # An alpha channel that says nothing.
@@ -82,6 +82,25 @@ def mask_of_picture(picture: Picture) -> Mask:
     return np.asarray(grey >= _HALF, dtype=np.bool_)
 
 
+def read_picture_file(path: Path, error_type: type[DrakePoseError]) -> bytes:
+    """The content of a file that is a whole PNG or JPEG picture as far as its frame tells.
+
+    Raises:
+        error_type: names the file.
+    """
+    try:
+        data = read_regular(path)
+    except OSError as error:
+        raise error_type(f"{path}: cannot read the picture: {error.strerror}") from error
+    if data.startswith(_JPEG):
+        if not data.rstrip(b"\0").endswith(_JPEG_END):
+            raise error_type(f"{path}: the JPEG picture is cut short")
+        return data
+    if max(check_png(data, path, error_type)) > LARGEST_SIDE:
+        raise error_type(f"{path}: has more than {LARGEST_SIDE} pixels a side")
+    return data
+
+
 def check_png(data: bytes, path: Path, error_type: type[DrakePoseError]) -> tuple[int, int]:
     """A PNG picture's width and height; one that is cut short or damaged is refused.
 
@@ -109,21 +128,6 @@ def check_png(data: bytes, path: Path, error_type: type[DrakePoseError]) -> tupl
         position = end + 4
     width, height = struct.unpack(">II", data[16:24])
     return width, height
-
-
-def _read(path: Path, error_type: type[DrakePoseError]) -> bytes:
-    """A file's content, a whole PNG or JPEG picture as far as its frame tells."""
-    try:
-        data = read_regular(path)
-    except OSError as error:
-        raise error_type(f"{path}: cannot read the picture: {error.strerror}") from error
-    if data.startswith(_JPEG):
-        if not data.rstrip(b"\0").endswith(_JPEG_END):
-            raise error_type(f"{path}: the JPEG picture is cut short")
-        return data
-    if max(check_png(data, path, error_type)) > LARGEST_SIDE:
-        raise error_type(f"{path}: has more than {LARGEST_SIDE} pixels a side")
-    return data
 
 
 def _decode(data: bytes, how: int, path: Path, error_type: type[DrakePoseError]) -> Picture:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 from rich.markup import escape
 
-from drake_pose.commands.options import SPREAD, Browser, Json
-from drake_pose.commands.terminal import count_progress, output_console, print_result, say
+from drake_pose.commands.options import SPREAD, Json
+from drake_pose.commands.terminal import count_progress, output_console, print_result
 from drake_pose.jobs.masks.settings import MaskSettings
 
 if TYPE_CHECKING:
@@ -22,18 +22,16 @@ def masks(
     *,
     out: Annotated[Path, Parameter(alias="-o", metavar="SCENE")],
     settings: Annotated[MaskSettings | None, SPREAD] = None,
-    browser: Browser = True,
     overlay: Annotated[bool, Parameter(negative="--no-overlay")] = True,
     json: Json = False,
 ) -> None:
     """Make a scene of masks: of masks that other tools wrote, or of pictures.
 
-    Masks of other tools are COCO files, labelme files, PNG pictures with a palette, with an alpha
-    channel or with probabilities, and black and white videos. In pictures and videos an object is
-    found by the empty room (--background), a box or strokes (--box, --strokes, or --draw, a page
-    in the browser), a network of yours (--network), or the object's own model (--model with
-    --start): pose and mask are found in turn. A median of the pictures stands for the empty room
-    only where the body leaves every place; the command says where it does not.
+    Masks of other tools are COCO files, PNG pictures with a palette, with an alpha channel or with
+    probabilities, and black and white videos. In pictures and videos an object is found by the
+    empty room (--background), a box (--box), a network of yours (--network), or the object's own
+    model (--model with --start): pose and mask are found in turn. A median of the pictures stands
+    for the empty room only where the body leaves every place; the command says where it does not.
 
     Files in SCENE: masks/; cameras.yaml and scene.yaml; overlay/, the pictures with the masks'
     outlines: look at them; summary.json, each mask's area, refusal and warnings.
@@ -44,21 +42,14 @@ def masks(
 
     Args:
         source: Folder with images/<camera>/<frame>.png or .jpg, or videos/<camera>.mp4, or pictures
-            of a single camera; a picture, a video; annotations of COCO or labelme (.json).
+            of a single camera; a picture, a video; a COCO file (.json).
         out: Folder for the scene; new or empty.
         overlay: Write the pictures with the masks' outlines, overlay/<camera>/<frame>.jpg.
     """
     from drake_pose.jobs.masks.masks import make_masks
 
-    def show(address: str) -> None:
-        say(f"drake-pose: draw at {address}")
-        if browser:
-            import webbrowser
-
-            webbrowser.open(address)
-
     with count_progress("masks", None) as advance:
-        result = make_masks(source, out, settings, overlay=overlay, on_mask=advance, on_page=show)
+        result = make_masks(source, out, settings, overlay=overlay, on_mask=advance)
     print_result(result, json, _print)
 
 

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drake_pose.body.model import load_model
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
 from drake_pose.errors import CameraError, SceneError
 from drake_pose.jobs.estimate.inputs import make_tree
-from drake_pose.jobs.masks.found import FoundMask, FoundMasks
 from drake_pose.jobs.masks.settings import MaskSettings
-from drake_pose.jobs.masks.sources import CAMERAS, Source
+from drake_pose.jobs.masks.sources import CAMERAS, FoundMask, Source
 from drake_pose.jobs.registration.known_positions import read_known_positions
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.search.segmentation.pose_and_mask import (
@@ -26,15 +24,13 @@ from drake_pose.search.segmentation.pose_and_mask import (
 )
 from drake_pose.silhouette.pictures.scene_files import natural_key
 
-Picture = NDArray[np.uint8]
-
 # Pose and colours that overlap less do not agree, or hardly.
 _REFUSED, _DOUBTED = 0.85, 0.9
 # A value so many standard deviations from its start is suspicious.
 _FAR = 3.0
 
 
-def find_by_model(source: Source, model: Path, settings: MaskSettings) -> FoundMasks:
+def find_by_model(source: Source, model: Path, settings: MaskSettings) -> Iterator[FoundMask]:
     """The masks of a body whose pose is about known in each frame.
 
     Args:
@@ -79,11 +75,7 @@ def find_by_model(source: Source, model: Path, settings: MaskSettings) -> FoundM
 
 
 def _placed_cameras(source: Source) -> list[Camera]:
-    """The cameras of all pictures.
-
-    Raises:
-        CameraError: one has no X_WC.
-    """
+    """The cameras of all pictures, which have an X_WC."""
     if source.cameras is None:
         raise CameraError(
             f"{source.path}: a model's silhouette needs to know the cameras: {CAMERAS} or --cameras"

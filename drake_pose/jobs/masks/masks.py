@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,19 +16,19 @@ import yaml
 from drake_pose.camera.picture_files import Picture
 from drake_pose.errors import DrakePoseError, MaskError, OutputError, SceneError
 from drake_pose.jobs.masks.by_model import find_by_model
-from drake_pose.jobs.masks.drawing import draw_strokes
-from drake_pose.jobs.masks.empty_room import BACKGROUND, compare_with_empty_room
-from drake_pose.jobs.masks.found import FoundMask, FoundMasks
-from drake_pose.jobs.masks.given import read_given_masks
-from drake_pose.jobs.masks.network import segment_by_network
+from drake_pose.jobs.masks.finding import (
+    compare_with_empty_room,
+    cut_boxes,
+    read_given_masks,
+    segment_by_network,
+)
 from drake_pose.jobs.masks.settings import MaskSettings
-from drake_pose.jobs.masks.sources import CAMERAS, SCENE, UNNAMED, Source, open_source
-from drake_pose.jobs.masks.strokes import cut_marked, dump_strokes, read_strokes
-from drake_pose.results.folder import SUMMARY, require_empty
+from drake_pose.jobs.masks.sources import CAMERAS, SCENE, UNNAMED, FoundMask, Source, open_source
+from drake_pose.results.folder import OVERLAY, SUMMARY, require_empty
 from drake_pose.silhouette.pictures.masks import write_mask
-from drake_pose.silhouette.segmentation.judging import judge_mask, largest_patch
+from drake_pose.silhouette.segmentation.judging import doubt_mask, largest_patch, refuse_mask
 
-MASKS, OVERLAY, STROKES = "masks", "overlay", "strokes.yaml"
+BACKGROUND, MASKS = "background", "masks"
 _PARTIAL = "masks.part"
 # Of the mask's outline in an overlay, (red, green, blue): Okabe and Ito's vermilion.
 _OUTLINE_RGB = (213, 94, 0)
@@ -59,7 +59,6 @@ def make_masks(
     *,
     overlay: bool = True,
     on_mask: Callable[[int], None] = lambda _: None,
-    on_page: Callable[[str], None] = lambda _: None,
 ) -> SceneMasks:
     """Writes a scene whose masks are those of another tool, or are found in pictures.
 
@@ -69,12 +68,11 @@ def make_masks(
     empty or full gets none, and a warning. Until all are there, masks lie in ``masks.part``.
 
     Args:
-        source: pictures, videos or annotations, see ``open_source``.
+        source: see ``open_source``.
         out: the scene's folder; new or empty.
         settings: how masks are found.
         overlay: whether overlays are written, where there are pictures.
-        on_mask: is told how many pictures are done.
-        on_page: is told the address of the page on which boxes and lines are drawn.
+        on_mask: called after each picture with the number of those done.
 
     Raises:
         DrakePoseError: names the file, camera or frame at fault; no picture has a good mask.
@@ -84,13 +82,7 @@ def make_masks(
     opened = open_source(Path(source), settings.cameras)
     writer = _Writer(folder, opened, settings, overlay)
     try:
-        if settings.draw:
-            marks = draw_strokes(opened, settings.port, on_page)
-            masks = cut_marked(opened, None, marks)
-            writer.keep(STROKES, dump_strokes(marks))
-        else:
-            masks = _find(opened, settings)
-        for k, found in enumerate(masks, 1):
+        for k, found in enumerate(_find(opened, settings), 1):
             writer.add(found)
             on_mask(k)
         return writer.finish()
@@ -99,24 +91,22 @@ def make_masks(
         raise
 
 
-def _find(source: Source, settings: MaskSettings) -> FoundMasks:
+def _find(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
     """The masks, one by one."""
     background = settings.background
     if settings == MaskSettings(largest=settings.largest, cameras=settings.cameras):
         # Beside its pictures a scene may have those of the empty room, which say what is meant.
         room = source.path / BACKGROUND
-        background = room if source.path.is_dir() and room.is_dir() else None
-    marked = settings.box is not None or settings.strokes is not None
-    found = background is not None or marked or settings.model or settings.network
-    if found and source.annotated:
+        background = room if room.is_dir() else None
+    ways = (background, settings.box, settings.model, settings.network)
+    if source.annotated and any(way is not None for way in ways):
         raise SceneError(
             f"{source.path}: has annotations, but the object is to be found in pictures"
         )
     if background is not None:
         return compare_with_empty_room(source, background)
-    if marked:
-        marks = {} if settings.strokes is None else read_strokes(settings.strokes)
-        return cut_marked(source, settings.box, marks)
+    if settings.box is not None:
+        return cut_boxes(source, settings.box)
     if settings.model is not None:
         return find_by_model(source, settings.model, settings)
     if settings.network is not None:
@@ -139,9 +129,8 @@ class _Writer:
         """Judges a mask, and writes it where it is good."""
         if self._settings.largest:
             found = replace(found, mask=largest_patch(found.mask))
-        judged = judge_mask(found.mask)
-        refusal = found.refusal or judged.refusal
-        warnings = (*found.warnings, *(() if refusal else judged.warnings))
+        refusal = found.refusal or refuse_mask(found.mask)
+        warnings = (*found.warnings, *(() if refusal else doubt_mask(found.mask)))
         entry: dict[str, Any] = {"refusal": refusal} if refusal else {"area": int(found.mask.sum())}
         entry |= {"warnings": list(warnings)} if warnings else {}
         self._summary.setdefault(found.camera, {})[found.frame] = entry
@@ -199,14 +188,6 @@ class _Writer:
             rate = self._source.frame_rate_hz()
             content = {"sequence": True} | ({} if rate is None else {"frame_rate_hz": rate})
             (self._folder / SCENE).write_text(yaml.safe_dump(content), encoding="utf-8")
-
-    def keep(self, name: str, text: str) -> None:
-        """Writes a file beside the masks."""
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            (self._folder / name).write_text(text, encoding="utf-8")
-        except OSError as error:
-            raise OutputError(f"{self._folder}: cannot be written: {error.strerror}") from error
 
     def discard(self) -> None:
         """Removes what was written; the folder was new or empty."""

@@ -16,7 +16,7 @@ from drake_pose.results.settings import Packages, Positions, changed, plain, req
 MEDIAN = "median"
 
 _COUNTS = {"box": 4, "network_size": 2, "network_mean": 3, "network_std": 3}
-_WAYS = ("background", "box", "strokes", "draw", "model", "network")
+_WAYS = ("background", "box", "model", "network")
 _Colour = Annotated[tuple[float, ...], from_text(partial(parse_numbers, count=3), "R,G,B")]
 
 
@@ -43,13 +43,6 @@ class MaskSettings:
         tuple[float, ...] | None, from_text(partial(parse_numbers, count=4), "X,Y,W,H")
     ] = None
     """Box around the object in all pictures: left, top, width, height [pixel]."""
-    strokes: Path | None = None
-    """Boxes and lines on the object and beside it, by camera and frame (YAML)."""
-    draw: bool = False
-    """Draw boxes and lines on a page in the browser, on this machine alone; they are kept in
-    strokes.yaml."""
-    port: int | None = None
-    """Port of that page. Default: any free one."""
     model: Annotated[Path | None, Parameter(alias="-m")] = None
     """The object: URDF, SDFormat, MJCF or .dmd.yaml; pose and mask are found in turn."""
     start: Path | None = None
@@ -75,14 +68,12 @@ class MaskSettings:
 
     def __post_init__(self) -> None:
         require_choices(self)
-        if self.port is not None and not 1 <= self.port <= 65535:
-            raise SettingsError(f"--port must be 1 to 65535, not {self.port}")
         for name, count in _COUNTS.items():
             values = getattr(self, name)
             if values is not None and (len(values) != count or not all(map(math.isfinite, values))):
                 raise SettingsError(f"{name} must be {count} numbers, not {values}")
-        ways = [name for name in _WAYS if getattr(self, name) not in (None, False)]
-        if len(ways) > 1 and set(ways) != {"box", "strokes"}:
+        ways = [name for name in _WAYS if getattr(self, name) is not None]
+        if len(ways) > 1:
             raise SettingsError(f"--{ways[0]} and --{ways[1]} are two ways to find masks: give one")
         if ways and self.pixels != "auto":
             raise SettingsError(f"--pixels is for masks of other tools, not for --{ways[0]}")

@@ -10,23 +10,20 @@ from typing import Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from drake_pose.camera.checks import LARGEST_SIDE
-from drake_pose.camera.picture_files import check_png
+from drake_pose.camera.picture_files import read_picture_file
 from drake_pose.errors import MaskError
-from drake_pose.regular_files import read_regular
 
 Mask = NDArray[np.bool_]
 Layer = NDArray[np.integer]
 
 PixelMeaning = Literal["auto", "classes", "alpha", "probability"]
-MEANINGS: tuple[PixelMeaning, ...] = ("auto", "classes", "alpha", "probability")
 
 ALL = "all"
 """Stands for every class but the background."""
 
-_PNG, _JPEG = b"\x89PNG", b"\xff\xd8"
 # A grey picture that has no more values, and is no mask, may hold classes as well.
 _FEW_VALUES = 16
 # More classes than this are not listed.
@@ -71,22 +68,17 @@ def read_mask_picture(
         return np.asarray(alpha >= 128)
     layer = _single_layer(picture, path)
     if meaning == "probability":
-        most = 65535 if layer.dtype.itemsize > 1 else 255
         if picture.mode == "P":
             raise MaskError(f"{path}: has a palette, so its pixels are classes, not probabilities")
-        return np.asarray(2 * layer.astype(np.int64) > most)
+        return np.asarray(layer > np.iinfo(layer.dtype).max // 2)
     return _select_classes(layer, path, classes)
 
 
 def mask_of_video_picture(picture: NDArray[np.uint8], where: str) -> Mask:
     """The mask (H, W) in a video's picture (H, W, 3): what is light.
 
-    Args:
-        picture: red, green, blue.
-        where: names it in messages.
-
     Raises:
-        MaskError: it is no mask: much of it is neither dark nor light.
+        MaskError: names the picture by `where`: much of it is neither dark nor light.
     """
     grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     between = float(((grey > 64) & (grey < 192)).mean())
@@ -99,35 +91,25 @@ def mask_of_video_picture(picture: NDArray[np.uint8], where: str) -> Mask:
 
 
 def _open(path: Path) -> Image.Image:
-    """A whole PNG or JPEG picture."""
-    try:
-        data = read_regular(path)
-    except OSError as error:
-        raise MaskError(f"{path}: cannot read the mask: {error.strerror}") from error
-    if not data.startswith((_PNG, _JPEG)):
-        raise MaskError(f"{path}: not a PNG or JPEG picture")
-    if data.startswith(_PNG) and max(check_png(data, path, MaskError)) > LARGEST_SIDE:
-        raise MaskError(f"{path}: has more than {LARGEST_SIDE} pixels a side")
+    data = read_picture_file(path, MaskError)
     try:
         picture = Image.open(io.BytesIO(data))
         if max(picture.size) > LARGEST_SIDE:
             raise MaskError(f"{path}: has more than {LARGEST_SIDE} pixels a side")
         picture.load()
-    except (OSError, UnidentifiedImageError, SyntaxError, ValueError) as error:
+    except (OSError, SyntaxError, ValueError) as error:
         raise MaskError(f"{path}: not a whole PNG or JPEG picture") from error
     return picture
 
 
 def _guess(picture: Image.Image, path: Path, classes: Sequence[str]) -> PixelMeaning:
-    """What a picture's pixels mean."""
     if picture.mode == "P" or classes:
         return "classes"
     if _alpha(picture) is not None:
         return "alpha"
-    layer = _single_layer(picture, path)
+    values = np.unique(_single_layer(picture, path))
     if picture.format == "JPEG":
         return "probability"
-    values = np.unique(layer)
     if len(values) <= 2 and values[0] == 0:
         return "classes"
     if len(values) <= _FEW_VALUES:
@@ -147,13 +129,11 @@ def _alpha(picture: Image.Image) -> Layer | None:
 
 
 def _single_layer(picture: Image.Image, path: Path) -> Layer:
-    """The one value (H, W) of each pixel."""
-    if picture.mode == "1":
-        return np.asarray(picture).astype(np.uint8)
+    """The one value (H, W) of each pixel, of 8 or 16 bits."""
     layers = np.asarray(picture)
     if layers.ndim == 2:
         # Pillow reads grey pictures of 16 bits as 32, too.
-        return layers if layers.dtype == np.uint8 else layers.astype(np.uint16)
+        return layers.astype(np.uint8 if layers.dtype in (np.uint8, np.bool_) else np.uint16)
     colours = layers[:, :, : 1 if picture.mode in ("LA", "PA") else 3]
     if (colours == colours[:, :, :1]).all():
         return np.asarray(colours[:, :, 0])
@@ -169,27 +149,23 @@ def _single_layer(picture: Image.Image, path: Path) -> Layer:
 
 def _select_classes(layer: Layer, path: Path, classes: Sequence[str]) -> Mask:
     """Where the pixel's class is one of those."""
-    present = [int(value) for value in np.unique(layer) if value]
-    if ALL in classes:
+    present = np.unique(layer[layer > 0])
+    if not classes and len(present) > 1:
+        raise MaskError(
+            f"{path}: has the classes {_listed(present)}; say which are the object: "
+            f"--class {present[0]}, or --class all"
+        )
+    if not classes or ALL in classes:
         return np.asarray(layer > 0)
-    if not classes:
-        if len(present) > 1:
-            raise MaskError(
-                f"{path}: has the classes {_listed(present)}; say which are the object: "
-                f"--class {present[0]}, or --class all"
-            )
-        return np.asarray(layer > 0)
-    numbers = []
     for name in classes:
         if not name.isdecimal():
             raise MaskError(
                 f"{path}: its classes are numbers ({_listed(present)}), not names: '{name}'"
             )
-        numbers.append(int(name))
-    return np.isin(layer, numbers)
+    return np.isin(layer, [int(name) for name in classes])
 
 
-def _listed(values: Sequence[int] | NDArray[np.integer]) -> str:
+def _listed(values: NDArray[np.integer]) -> str:
     """A few numbers."""
-    some = ", ".join(str(int(value)) for value in values[:_LISTED])
+    some = ", ".join(str(value) for value in values[:_LISTED])
     return f"{some} and more" if len(values) > _LISTED else some or "none"

@@ -59,14 +59,11 @@ class SegmentationNetwork:
         SettingsError: OpenCV cannot read the file, or a class is no number.
     """
 
-    def __init__(
-        self, file: Path, taken: NetworkInput | None = None, classes: Sequence[str] = ()
-    ) -> None:
-        self._file, self._taken = file, taken or NetworkInput()
+    def __init__(self, file: Path, taken: NetworkInput, classes: Sequence[str] = ()) -> None:
+        self._file, self._taken, self._classes = file, taken, tuple(classes)
         for name in classes:
             if name != ALL and not name.isdecimal():
                 raise SettingsError(f"{file}: a network's classes are numbers, not '{name}'")
-        self._classes = tuple(classes)
         if not file.is_file():
             raise SettingsError(f"{file}: there is no such network")
         try:
@@ -94,10 +91,10 @@ class SegmentationNetwork:
                 f"{self._file}: does not take a picture of {values.shape[1]} x {values.shape[0]} "
                 f"pixels (give its size with --network-size): {error.err}"
             ) from error
-        score = self._score(output)
         # Scores are brought to the picture's size, not classes: the edge lies between pixels.
         height, width = picture.shape[:2]
-        return np.asarray(cv2.resize(score, (width, height), interpolation=cv2.INTER_LINEAR) > 0.0)
+        score = cv2.resize(self._score(output), (width, height), interpolation=cv2.INTER_LINEAR)
+        return np.asarray(score > 0.0)
 
     def _score(self, output: NDArray[np.generic]) -> Array:
         """(h, w) positive where the object is more likely than anything else."""
@@ -106,43 +103,35 @@ class SegmentationNetwork:
                 f"{self._file}: its output has the shape {output.shape}, but must be (1, classes, "
                 "height, width) or (1, height, width)"
             )
-        layers = output[0] if output.ndim == 4 else output
-        if not np.isfinite(layers.astype(np.float64)).all():
+        layers = (output[0] if output.ndim == 4 else output).astype(np.float32)
+        if not np.isfinite(layers).all():
             raise SettingsError(
                 f"{self._file}: its output is not finite; is the input as it must be?"
             )
         if len(layers) > 1:
-            return self._best(layers.astype(np.float32))
+            mine = np.isin(np.arange(len(layers)), self._numbers(len(layers)))
+            if mine.all():
+                raise SettingsError(
+                    f"{self._file}: all of its {len(layers)} classes are said to be the object"
+                )
+            return np.asarray(layers[mine].max(axis=0) - layers[~mine].max(axis=0))
         layer = layers[0]
-        whole = np.issubdtype(layer.dtype, np.integer) or (layer == np.rint(layer)).all()
-        if whole and layer.min() >= 0 and (self._classes or layer.max() > 1):
-            chosen = layer > 0 if ALL in self._classes else np.isin(layer, self._numbers())
-            return np.where(chosen, 0.5, -0.5).astype(np.float32)
-        probable = layer.min() >= 0.0 and layer.max() <= 1.0
-        return np.asarray(layer - (0.5 if probable else 0.0), dtype=np.float32)
+        least, most = layer.min(), layer.max()
+        if (layer == np.rint(layer)).all() and least >= 0.0 and (self._classes or most > 1.0):
+            return np.isin(layer, self._numbers(int(most) + 1, "several")).astype(np.float32) - 0.5
+        return np.asarray(layer - (0.5 if least >= 0.0 and most <= 1.0 else 0.0))
 
-    def _best(self, layers: Array) -> Array:
-        """The object's best score less the others' best, of scores (classes, h, w)."""
-        count = len(layers)
-        numbers = range(1, count) if ALL in self._classes else self._numbers(count)
-        mine = np.isin(np.arange(count), list(numbers))
-        if mine.all():
+    def _numbers(self, count: int, known: str = "") -> list[int]:
+        """The chosen classes' numbers, of this many classes, or of several."""
+        if ALL in self._classes:
+            return list(range(1, count))
+        if not self._classes and (known or count != 2):
             raise SettingsError(
-                f"{self._file}: all of its {count} classes are said to be the object"
+                f"{self._file}: has {known or count} classes; say which is the object: "
+                "--class NUMBER"
             )
-        return np.asarray(layers[mine].max(axis=0) - layers[~mine].max(axis=0), dtype=np.float32)
-
-    def _numbers(self, count: int | None = None) -> list[int]:
-        """The chosen classes' numbers."""
-        if not self._classes and count == 2:
-            return [1]
-        if not self._classes:
-            known = f"{count} classes" if count else "several classes"
-            raise SettingsError(
-                f"{self._file}: has {known}; say which is the object: --class NUMBER"
-            )
-        numbers = [int(name) for name in self._classes]
-        if count is not None and max(numbers) >= count:
+        numbers = [int(name) for name in self._classes] or [1]
+        if not known and max(numbers) >= count:
             raise SettingsError(
                 f"{self._file}: has the classes 0 to {count - 1}, not {max(numbers)}"
             )

@@ -1,4 +1,4 @@
-"""Masks found in pictures: by the empty room, by boxes and strokes, by a network."""
+"""Masks found in pictures: by the empty room, by a box, by a network."""
 
 import json
 import shutil
@@ -7,13 +7,11 @@ import cv2
 import numpy as np
 import onnx
 import pytest
-import yaml
 from onnx import TensorProto, helper, numpy_helper
 
 from drake_pose import MaskSettings, load_scene, make_masks
 from drake_pose.commands.main import app
 from drake_pose.errors import DrakePoseError, MaskError, SceneError, SettingsError
-from drake_pose.jobs.masks.strokes import read_strokes
 from tests.cli import CliRunner
 from tests.jobs.masks.rooms import iou, moving, write_pictures
 from tests.jobs.scenes import NAMES, read_rows
@@ -163,40 +161,6 @@ def test_box_cuts_a_still_out(still, tmp_path, runner: CliRunner):
         assert done.exit_code == 1
         assert "still.png: the box" in done.stderr
     assert runner.invoke(app, ["masks", str(path), "-o", "x", "--box", "1,2,3"]).exit_code == 2
-
-
-def test_strokes_say_what_belongs_to_the_object(still, tmp_path):
-    path, true = still
-    file = tmp_path / "strokes.yaml"
-    inside = [[[45, 35], [100, 35], [100, 80], [45, 80]]]
-    beside = [[[10, 10], [150, 10], [150, 110]], [[62, 55], [78, 55]]]
-    marks = {"camera": {"still": {"object": inside, "background": beside, "width": 4}}}
-    file.write_text(yaml.safe_dump(marks))
-    make_masks(path, tmp_path / "out", MaskSettings(strokes=file))
-    assert iou(load_scene(tmp_path / "out").read("camera", "still"), true) > 0.97
-    marks["camera"]["other"] = {"box": [1, 2, 30, 40]}
-    file.write_text(yaml.safe_dump(marks))
-    with pytest.raises(SceneError, match="no picture of camera 'camera', frame 'other'"):
-        make_masks(path, tmp_path / "none", MaskSettings(strokes=file))
-
-
-@pytest.mark.parametrize(
-    ("entry", "words"),
-    [
-        ({"box": [1, 2, 3]}, "box: expected 4 numbers"),
-        ({"box": [1, 2, 3, float("nan")]}, "box: expected 4 numbers"),
-        ({"object": [[1, 2]]}, "object"),
-        ({"object": 3}, "object must be a list"),
-        ({"lines": []}, "unknown field lines"),
-        ({"width": 0, "box": [1, 2, 3, 4]}, "width must be positive"),
-        ({}, "expected box"),
-    ],
-)
-def test_damaged_strokes_are_refused(tmp_path, entry, words):
-    file = tmp_path / "strokes.yaml"
-    file.write_text(yaml.safe_dump({"left": {"0001": entry}}))
-    with pytest.raises(SceneError, match=f"camera 'left', frame '0001'.*{words}"):
-        read_strokes(file)
 
 
 def network(path, kind):

@@ -1,6 +1,5 @@
 """Masks of other tools become a scene."""
 
-import base64
 import json
 import shutil
 
@@ -148,38 +147,6 @@ def test_annotations_of_another_size_or_camera_are_refused(tmp_path, two_views):
         make_masks(file, tmp_path / "out", MaskSettings(cameras=cameras))
     with pytest.raises(CameraError):
         make_masks(file, tmp_path / "out", MaskSettings(cameras=tmp_path / "none.yaml"))
-
-
-def test_labelme_files_beside_their_pictures(tmp_path):
-    drawn = np.zeros((20, 30), np.uint8)
-    drawn[4:15, 5:25] = 1
-    part = base64.b64encode(cv2.imencode(".png", drawn[4:15, 5:25])[1]).decode()
-    shapes = [
-        {"label": "a", "shape_type": "polygon", "points": [[1, 2], [9, 2], [9, 7], [1, 7]]},
-        {"label": "a", "shape_type": "rectangle", "points": [[9, 7], [1, 2]]},
-        {"label": "a", "shape_type": "circle", "points": [[15, 10], [15, 16]]},
-        {"label": "a", "shape_type": "mask", "points": [[5, 4], [24, 14]], "mask": part},
-    ]
-    areas = (40, 40, np.pi * 36, 220)
-    folder = tmp_path / "source" / "left"
-    folder.mkdir(parents=True)
-    for k, shape in enumerate(shapes):
-        content = {
-            "imagePath": f"..\\pictures\\{k}.jpg", "imageWidth": 30, "imageHeight": 20,
-            "shapes": [shape, {"label": "a", "shape_type": "point", "points": [[3, 3]]}],
-        }  # fmt: skip
-        (folder / f"{k}.json").write_text(json.dumps(content))
-    result = make_masks(tmp_path / "source", tmp_path / "out")
-    assert any("1 shapes of the kind point have no area" in text for text in result.warnings)
-    for k, area in enumerate(areas):
-        mask = cv2.imread(str(tmp_path / "out" / "masks" / "left" / f"{k}.png"), 0) > 0
-        assert mask.sum() == pytest.approx(area, rel=0.03)
-        y, x = np.argwhere(mask).mean(axis=0) + 0.5
-        assert (x, y) == pytest.approx([(5, 4.5), (5, 4.5), (15, 10), (15, 9.5)][k], abs=0.1)
-    shapes[3]["points"][0] = [15, 4]
-    (folder / "3.json").write_text(json.dumps({**content, "shapes": [shapes[3]]}))
-    with pytest.raises(MaskError, match=r"3\.jpg': shape 0 \('a'\).*reaches beyond"):
-        make_masks(tmp_path / "source", tmp_path / "again")
 
 
 def test_probabilities_of_an_unknown_camera_are_estimated_at_once(tmp_path, two_views):

@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from drake_pose.errors import MaskError
-from drake_pose.silhouette.segmentation.judging import judge_mask, largest_patch
+from drake_pose.silhouette.segmentation.judging import doubt_mask, largest_patch, refuse_mask
 from drake_pose.silhouette.segmentation.mask_pictures import (
     mask_of_video_picture,
     read_mask_picture,
@@ -117,12 +117,13 @@ def test_a_video_of_pictures_is_no_video_of_masks(classes):
 
 
 def test_judgement(classes):
-    assert judge_mask(classes == 1) == ("", ())
-    assert "not found" in judge_mask(classes > 9).refusal
-    assert "fills" in judge_mask(classes < 9).refusal
-    (text,) = judge_mask(classes > 0).warnings
+    assert refuse_mask(classes == 1) == ""
+    assert doubt_mask(classes == 1) == []
+    assert "not found" in refuse_mask(classes > 9)
+    assert "fills" in refuse_mask(classes < 9)
+    (text,) = doubt_mask(classes > 0)
     assert "two objects" in text
     assert "(20, 12)" in text
-    assert "background" in judge_mask(classes == 0).warnings[0]
+    assert "background" in doubt_mask(classes == 0)[0]
     assert (largest_patch(classes > 0) == (classes == 1)).all()
     assert not largest_patch(classes > 9).any()

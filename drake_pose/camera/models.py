@@ -47,7 +47,7 @@ class PinholeCamera:
     @property
     def X_CW(self) -> np.ndarray:
         """(4, 4) the world's pose in the camera."""
-        return _inverse(self.X_WC)
+        return inverse_pose(self.X_WC)
 
     def project(self, p_W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Projects points of the world.
@@ -124,7 +124,7 @@ class ParallelCamera:
     @property
     def X_CW(self) -> np.ndarray:
         """(4, 4) the world's pose in the camera."""
-        return _inverse(self.X_WC)
+        return inverse_pose(self.X_WC)
 
     def project(self, p_W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Projects points (n, 3) [m] of the world to (n, 2) pixels and (n,) depths [m]."""
@@ -156,8 +156,8 @@ def _set_sides_and_center(camera: Camera, where: str) -> None:
     object.__setattr__(camera, "X_WC", check_pose(camera.X_WC, "X_WC", where))
 
 
-def _inverse(X_AB: np.ndarray) -> np.ndarray:
-    """Returns X_BA of a rigid transform (4, 4)."""
+def inverse_pose(X_AB: np.ndarray) -> np.ndarray:
+    """Returns X_BA of a pose X_AB (4, 4)."""
     X_BA = np.eye(4)
     X_BA[:3, :3] = X_AB[:3, :3].T
     X_BA[:3, 3] = -X_AB[:3, :3].T @ X_AB[:3, 3]

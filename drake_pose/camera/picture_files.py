@@ -34,7 +34,9 @@ def read_picture(path: Path, error_type: type[DrakePoseError]) -> Picture:
     Raises:
         error_type: names the file; when it is no whole picture.
     """
-    picture = _decode(read_picture_file(path, error_type), cv2.IMREAD_COLOR, path, error_type)
+    picture = decode_picture(
+        read_picture_file(path, error_type), cv2.IMREAD_COLOR, path, error_type
+    )
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
@@ -50,7 +52,7 @@ def read_person_mask(path: Path, error_type: type[DrakePoseError]) -> Mask:
         error_type: names the file; when it is no whole picture, or no mask.
     """
     data = read_picture_file(path, error_type)
-    picture = _decode(data, cv2.IMREAD_UNCHANGED, path, error_type)
+    picture = decode_picture(data, cv2.IMREAD_UNCHANGED, path, error_type)
     if picture.ndim == 3 and picture.shape[2] == 4 and np.ptp(picture[:, :, 3]) == 0:
         picture = np.ascontiguousarray(picture[:, :, :3])  # An alpha channel that says nothing.
     if data.startswith(_JPEG):
@@ -65,6 +67,21 @@ def read_person_mask(path: Path, error_type: type[DrakePoseError]) -> Mask:
     if mask.all():
         raise error_type(f"{path}: the mask is full (no black pixel): no background to be seen")
     return np.asarray(mask, dtype=np.bool_)
+
+
+def list_pictures(folder: Path, error_type: type[DrakePoseError]) -> dict[str, Path]:
+    """The picture files of a folder, by frame, in the order of the names; there may be none.
+
+    Raises:
+        error_type: a frame is there twice.
+    """
+    files: dict[str, Path] = {}
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() in SUFFIXES:
+            if path.stem in files:
+                raise error_type(f"{path}: the folder has frame {path.stem} twice; remove one")
+            files[path.stem] = path
+    return files
 
 
 def split_colours(picture: NDArray[np.integer]) -> tuple[Mask, bool]:
@@ -130,8 +147,12 @@ def check_png(data: bytes, path: Path, error_type: type[DrakePoseError]) -> tupl
     return width, height
 
 
-def _decode(data: bytes, how: int, path: Path, error_type: type[DrakePoseError]) -> Picture:
-    """A picture as OpenCV gives it."""
+def decode_picture(data: bytes, how: int, path: Path, error_type: type[DrakePoseError]) -> Picture:
+    """A picture as OpenCV gives it.
+
+    Raises:
+        error_type: names the file; when it is no picture, or too large.
+    """
     try:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), how)
     except cv2.error:

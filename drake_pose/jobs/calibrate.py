@@ -12,16 +12,16 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from drake_pose.camera.calibration.board import load_board
-from drake_pose.camera.calibration.calibrate import Calibration, CalibrationSettings, calibrate
-from drake_pose.camera.calibration.lens import COEFFICIENTS, Lens, save_lenses
-from drake_pose.camera.calibration.pictures import (
+from drake_pose.camera.calibration.board import (
     BoardDetections,
     Picture,
     find_boards,
     find_pictures,
-    read_picture,
+    load_board,
+    read_board_picture,
 )
+from drake_pose.camera.calibration.calibrate import Calibration, CalibrationSettings, calibrate
+from drake_pose.camera.calibration.lens import COEFFICIENTS, Lens, save_lenses
 from drake_pose.camera.files import save_cameras
 from drake_pose.errors import CameraError, OutputError
 
@@ -43,7 +43,7 @@ class CalibrationReport:
     @property
     def warnings(self) -> list[str]:
         """What the user should look at, a line each."""
-        unreadable = self.seen.unreadable or {}
+        unreadable = self.seen.unreadable
         lines = [reason for reason in unreadable.values()]
         for camera in self.seen.detections:
             blank = [frame for name, frame in self.seen.not_found if name == camera]
@@ -80,7 +80,7 @@ class CalibrationReport:
             "error_pixels": overall_error(found),
             "cameras": cameras,
             "not_found": [list(picture) for picture in self.seen.not_found],
-            "unreadable": [list(picture) for picture in self.seen.unreadable or {}],
+            "unreadable": [list(picture) for picture in self.seen.unreadable],
             "left_out": [
                 {"camera": camera, "picture": frame, "reason": reason}
                 for (camera, frame), reason in found.left_out.items()
@@ -180,7 +180,7 @@ def undistort_pictures(
     for name, frames in pictures.items():
         place = Path(out) / "images" / name
         for frame, path in frames.items():
-            straight = lenses[name].undistort(read_picture(path))
+            straight = lenses[name].undistort(read_board_picture(path))
             target = place / f"{frame}.png"
             try:
                 place.mkdir(parents=True, exist_ok=True)

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from drake_pose.camera.calibration.board import Board, Detection
-from drake_pose.camera.calibration.pictures import BoardDetections
+from drake_pose.camera.calibration.board import Board, BoardDetections, Detection
 
 CHECKERBOARD = Board("checkerboard", 8, 5, 0.12)
 CHARUCO = Board("charuco", 8, 5, 0.12, marker_length=0.09, dictionary="4X4_50")

@@ -97,17 +97,6 @@ def test_undistorted_pictures_fit_the_written_cameras(taken, report, tmp_path):
     assert checked >= 4
 
 
-def test_board_as_the_world(taken, tmp_path):
-    folder, cameras, poses = taken
-    settings = CalibrationSettings(world="board:0001")
-    found = calibrate_folder(folder, folder / "board.yaml", settings=settings)
-    assert found.files == ()
-    X_BW = np.linalg.inv(poses["0001"])
-    for name, true in cameras.items():
-        expected = (X_BW @ true.X_WC)[:3, 3]
-        assert np.linalg.norm(found.calibration.cameras[name].X_WC[:3, 3] - expected) < 0.05
-
-
 def test_spoilt_picture_is_named_and_dropped_on_request(taken, tmp_path):
     folder, _, _ = taken
     for name in ("c0", "c1"):

@@ -1,4 +1,4 @@
-"""Calibration boards: checkerboards and ChArUco boards, and where their corners are in a picture.
+"""Calibration boards: checkerboards and ChArUco boards, and where their corners are in pictures.
 
 The board's frame B: origin at the lower left corner of the squares of the upright board, x to the
 right, y up, z out of the printed side. A board that lies on the floor has z up. A checkerboard is
@@ -7,7 +7,8 @@ upright when its top left square is black; a ChArUco board when marker 0 is in i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,31 +17,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.camera.checks import check_number
+from drake_pose.camera.picture_files import decode_picture, list_pictures
 from drake_pose.errors import CameraError
+from drake_pose.regular_files import read_regular
 from drake_pose.yaml_files import read_yaml
 
 Array = NDArray[np.float64]
+Picture = tuple[str, str]
+"""A camera's name and a frame's name; pictures of the same frame were taken at the same instant."""
 
-KINDS = ("checkerboard", "charuco")
 _FIELDS = {
     "checkerboard": ("kind", "squares", "square_length"),
-    "charuco": (
-        *("kind", "squares", "square_length", "marker_length", "dictionary"),
-        "legacy_pattern",
-    ),
+    "charuco": ("kind", "squares", "square_length", "marker_length", "dictionary"),
 }
+_LEGACY = "legacy_pattern"
 _MOST_SQUARES = 100
 _FEWEST_CORNERS = 8
 
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """The corners of a board that were found in a picture.
-
-    Args:
-        corners: (n,) which corners of the board, increasing.
-        uv: (n, 2) where they are [pixel], pixel centres at integers.
-    """
+    """Which corners of a board (n,), increasing, were found in a picture, and where (n, 2)."""
 
     corners: NDArray[np.int64]
     uv: Array
@@ -72,10 +69,9 @@ class Board:
     legacy_pattern: bool = False
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise CameraError(f"board: kind must be one of {', '.join(KINDS)}, not '{self.kind}'")
-        for field in ("columns", "rows"):
-            count = getattr(self, field)
+        if self.kind not in _FIELDS:
+            raise CameraError(f"board: kind must be one of {', '.join(_FIELDS)}, not '{self.kind}'")
+        for count in (self.columns, self.rows):
             if not isinstance(count, int) or not 3 <= count <= _MOST_SQUARES:
                 raise CameraError(
                     f"board: squares must be two whole numbers from 3 to {_MOST_SQUARES} (across "
@@ -86,7 +82,7 @@ class Board:
             length = check_number(self.marker_length, "marker_length", "board", positive=True)
             if length >= self.square_length:
                 raise CameraError("board: marker_length must be less than square_length")
-            _dictionary(self.dictionary)
+            self.opencv_charuco_board()
 
     @property
     def points(self) -> Array:
@@ -101,10 +97,7 @@ class Board:
         return self.kind == "checkerboard" and (self.columns + self.rows) % 2 == 0
 
     def find(self, picture: NDArray[np.uint8]) -> Detection | None:
-        """Finds the board in a picture.
-
-        Args:
-            picture: (H, W) grey or (H, W, 3) blue, green, red.
+        """Finds the board in a picture: grey (H, W), or (H, W, 3) blue, green, red.
 
         Returns:
             The corners; None where the board is not found (a checkerboard must be seen whole, of a
@@ -118,21 +111,23 @@ class Board:
 
     def _find_checkerboard(self, grey: NDArray[np.uint8]) -> Detection | None:
         size = (self.columns - 1, self.rows - 1)
-        found, pixels = cv2.findChessboardCorners(
-            grey, size, flags=cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-        )
+        flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+        found, pixels = cv2.findChessboardCorners(grey, size, flags=flags)
         if found:
-            pixels = _refined(grey, np.asarray(pixels), size)
+            # To a fraction of a pixel, from a window well inside each corner's neighbours.
+            grid = np.reshape(pixels, (size[1], size[0], 2))
+            steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1)]
+            half = int(np.clip(0.3 * min(steps), 2, 15))
+            stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-3)
+            pixels = cv2.cornerSubPix(grey, np.asarray(pixels), (half, half), (-1, -1), stop)
         else:
             # Slower by a factor of forty, but it bears blur and uneven light.
-            found, pixels = cv2.findChessboardCornersSB(
-                grey, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE
-            )
+            flags = cv2.CALIB_CB_NORMALIZE_IMAGE
+            found, pixels = cv2.findChessboardCornersSB(grey, size, flags=flags)
         if not found:
             return None
-        grid = np.asarray(pixels, dtype=np.float64).reshape(self.rows - 1, self.columns - 1, 2)
-        across, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
-        if across[0] * down[1] - across[1] * down[0] < 0.0:
+        grid = np.asarray(pixels, dtype=np.float64).reshape(size[1], size[0], 2)
+        if np.linalg.det([grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]]) < 0.0:
             grid = grid[:, ::-1]
         if not self.looks_the_same_turned and _top_left_is_white(grey, grid):
             grid = grid[::-1, ::-1]
@@ -146,23 +141,33 @@ class Board:
             return None
         corners = np.asarray(identities, dtype=np.int64).ravel()
         order = np.argsort(corners)
-        corners = corners[order]
-        uv = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)[order]
         row, column = np.divmod(corners, self.columns - 1)
         if min(len(np.unique(row)), len(np.unique(column))) < 2:
             return None
-        return Detection(corners, uv)
+        uv = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+        return Detection(corners[order], uv[order])
 
     def opencv_charuco_board(self) -> Any:
         """OpenCV's object of a ChArUco board, with which it can be drawn and printed."""
-        board = cv2.aruco.CharucoBoard(
-            (self.columns, self.rows),
-            self.square_length,
-            float(self.marker_length or 0.0),
-            _dictionary(self.dictionary),
-        )
+        known = {k[len("DICT_") :].upper(): k for k in vars(cv2.aruco) if k.startswith("DICT_")}
+        plain = str(self.dictionary).upper().removeprefix("DICT_")
+        if plain not in known:
+            listed = ", ".join(sorted(known))
+            raise CameraError(f"board: dictionary must be one of {listed}, not '{self.dictionary}'")
+        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, known[plain]))
+        size, marker_length = (self.columns, self.rows), float(self.marker_length or 0.0)
+        board = cv2.aruco.CharucoBoard(size, self.square_length, marker_length, dictionary)
         board.setLegacyPattern(self.legacy_pattern)
         return board
+
+
+def _top_left_is_white(grey: NDArray[np.uint8], grid: Array) -> bool:
+    """Whether the square outside the first corner is white, judged by all inner squares."""
+    middles = 0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])
+    u, v = np.rint(middles).astype(int).clip(0, np.array(grey.shape)[::-1] - 1).transpose(2, 0, 1)
+    brightness = cv2.blur(grey, (3, 3))[v, u].astype(np.float64)
+    like_top_left = np.indices(brightness.shape).sum(axis=0) % 2 == 0
+    return bool(brightness[like_top_left].mean() > brightness[~like_top_left].mean())
 
 
 def load_board(path: str | Path) -> Board:
@@ -176,67 +181,122 @@ def load_board(path: str | Path) -> Board:
     """
     path = Path(path)
     content = read_yaml(path, CameraError)
-    if not isinstance(content, dict) or content.get("kind") not in KINDS:
-        raise CameraError(f"{path}: a board needs kind: {' or '.join(KINDS)}")
-    known = _FIELDS[content["kind"]]
-    unknown = [str(field)[:40] for field in content if field not in known]
-    missing = [field for field in known if field not in content and field != "legacy_pattern"]
+    if not isinstance(content, dict) or content.get("kind") not in _FIELDS:
+        raise CameraError(f"{path}: a board needs kind: {' or '.join(_FIELDS)}")
+    kind = content["kind"]
+    known = (*_FIELDS[kind], *([_LEGACY] if kind == "charuco" else []))
+    unknown = [str(name)[:40] for name in content if name not in known]
+    missing = [name for name in _FIELDS[kind] if name not in content]
     if unknown or missing:
         wrong = f"unknown field {', '.join(unknown)}" if unknown else f"lacks {', '.join(missing)}"
-        raise CameraError(f"{path}: {wrong}; a {content['kind']} has: {', '.join(known)}")
-    squares = content["squares"]
+        raise CameraError(f"{path}: {wrong}; a {kind} has: {', '.join(known)}")
+    squares = content.pop("squares")
     if not isinstance(squares, list) or len(squares) != 2:
         raise CameraError(f"{path}: squares must be two whole numbers, across and down")
-    legacy = content.get("legacy_pattern", False)
-    if not isinstance(legacy, bool):
+    if not isinstance(content.get(_LEGACY, False), bool):
         raise CameraError(f"{path}: legacy_pattern must be true or false")
-    where = str(path)
-    marker_length = None
-    if content["kind"] == "charuco":
-        marker_length = check_number(content["marker_length"], "marker_length", where)
+    for name in {"square_length", "marker_length"} & set(content):
+        content[name] = check_number(content[name], name, str(path))
     try:
-        return Board(
-            kind=content["kind"],
-            columns=squares[0],
-            rows=squares[1],
-            square_length=check_number(content["square_length"], "square_length", where),
-            marker_length=marker_length,
-            dictionary=content.get("dictionary"),
-            legacy_pattern=legacy,
-        )
+        return Board(columns=squares[0], rows=squares[1], **content)
     except CameraError as error:
         raise CameraError(f"{path}: {error}") from error
 
 
-def _dictionary(name: str | None) -> Any:
-    """Returns OpenCV's marker dictionary of a name."""
-    known = sorted(key[len("DICT_") :] for key in vars(cv2.aruco) if key.startswith("DICT_"))
-    plain = str(name).removeprefix("DICT_").upper()
-    by_upper = {key.upper(): key for key in known}
-    if plain not in by_upper:
-        raise CameraError(f"board: dictionary must be one of {', '.join(known)}, not '{name}'")
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{by_upper[plain]}"))
+@dataclass(frozen=True, eq=False)
+class BoardDetections:
+    """What a set of calibration pictures shows.
+
+    Args:
+        board: the board.
+        sizes: width and height of each camera's pictures [pixel].
+        detections: by camera, then by frame: where the board's corners are.
+        not_found: pictures in which the board was not found.
+        unreadable: pictures that could not be read, with the reason.
+        mirrored: cameras in whose pictures the board is found when they are turned left to right.
+    """
+
+    board: Board
+    sizes: Mapping[str, tuple[int, int]]
+    detections: Mapping[str, Mapping[str, Detection]]
+    not_found: tuple[Picture, ...] = ()
+    unreadable: Mapping[Picture, str] = field(default_factory=dict)
+    mirrored: tuple[str, ...] = ()
 
 
-def _refined(
-    grey: NDArray[np.uint8], pixels: NDArray[np.float32], size: tuple[int, int]
-) -> NDArray[np.float32]:
-    """The corners to a fraction of a pixel, from a window well inside their neighbours."""
-    grid = np.reshape(pixels, (size[1], size[0], 2))
-    steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1)]
-    half = int(np.clip(0.3 * min(steps), 2, 15))
-    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-3)
-    refined = cv2.cornerSubPix(grey, pixels, (half, half), (-1, -1), stop)
-    return np.asarray(refined, dtype=np.float32)
+def find_pictures(folder: str | Path) -> dict[str, dict[str, Path]]:
+    """The picture files of a folder's `images/<camera>/<frame>.png` or .jpg, or of its own.
+
+    Raises:
+        CameraError: when there are none, or a camera has two files of one frame.
+    """
+    root = Path(folder)
+    root = root / "images" if (root / "images").is_dir() else root
+    if not root.is_dir():
+        raise CameraError(f"{folder}: no such folder; it needs images/<camera>/<frame>.png")
+    cameras = sorted(path for path in root.iterdir() if path.is_dir())
+    found = {camera.name: list_pictures(camera, CameraError) for camera in cameras}
+    found = {camera: files for camera, files in found.items() if files}
+    if not found:
+        raise CameraError(f"{root}: holds no picture <camera>/<frame>.png or .jpg")
+    return found
 
 
-def _top_left_is_white(grey: NDArray[np.uint8], grid: Array) -> bool:
-    """Whether the square outside the first corner is white, judged by all inner squares."""
-    middles = 0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])
-    height, width = grey.shape
-    u = np.clip(np.rint(middles[..., 0]).astype(int), 0, width - 1)
-    v = np.clip(np.rint(middles[..., 1]).astype(int), 0, height - 1)
-    brightness = cv2.blur(grey, (3, 3))[v, u].astype(np.float64)
-    row, column = np.indices(brightness.shape)
-    like_top_left = (row + column) % 2 == 0
-    return bool(brightness[like_top_left].mean() > brightness[~like_top_left].mean())
+def find_boards(
+    files: Mapping[str, Mapping[str, Path]],
+    board: Board,
+    on_picture: Callable[[str, str], None] | None = None,
+) -> BoardDetections:
+    """Searches pictures for the board; a bad picture is noted and harms no other.
+
+    Args:
+        files: by camera, then by frame.
+        board: what to look for.
+        on_picture: called with camera and frame before each picture.
+
+    Raises:
+        CameraError: when a camera's pictures differ in size, or none of them can be read.
+    """
+    sizes: dict[str, tuple[int, int]] = {}
+    detections: dict[str, dict[str, Detection]] = {camera: {} for camera in files}
+    not_found: list[Picture] = []
+    unreadable: dict[Picture, str] = {}
+    mirrored: dict[str, bool] = {}
+    for camera, frame, path in ((c, f, path) for c in files for f, path in files[c].items()):
+        if on_picture is not None:
+            on_picture(camera, frame)
+        try:
+            grey = read_board_picture(path, cv2.IMREAD_GRAYSCALE)
+        except CameraError as error:
+            unreadable[camera, frame] = str(error)
+            continue
+        size = (grey.shape[1], grey.shape[0])
+        if sizes.setdefault(camera, size) != size:
+            raise CameraError(
+                f"{path}: {size[0]} x {size[1]} pixels (width x height), but camera "
+                f"'{camera}' began with {sizes[camera][0]} x {sizes[camera][1]}"
+            )
+        detection = board.find(grey)
+        if detection is not None:
+            detections[camera][frame] = detection
+            continue
+        not_found.append((camera, frame))
+        if board.kind == "charuco" and not detections[camera] and not mirrored.get(camera):
+            mirrored[camera] = board.find(grey[:, ::-1]) is not None
+    for camera in files:
+        if camera not in sizes:
+            raise CameraError(f"camera '{camera}': none of its pictures can be read")
+    turned = tuple(name for name, is_so in mirrored.items() if is_so and not detections[name])
+    return BoardDetections(board, sizes, detections, tuple(not_found), unreadable, turned)
+
+
+def read_board_picture(path: Path, how: int = cv2.IMREAD_COLOR) -> NDArray[np.uint8]:
+    """Reads a picture (H, W, 3) blue, green, red, or as OpenCV's flag says.
+
+    Raises:
+        CameraError: names the file; when it cannot be read or is no picture.
+    """
+    try:
+        return decode_picture(read_regular(path), how, path, CameraError)
+    except OSError as error:
+        raise CameraError(f"{path}: cannot read the picture: {error.strerror}") from error

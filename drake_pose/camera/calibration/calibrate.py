@@ -1,37 +1,35 @@
-"""Calibration of one camera or several from pictures of a board.
-
-Each camera's lens by Zhang's method; poses in one shared world from instants at which several
-cameras saw the board: pairs, chained, then everything adjusted at once.
-"""
+"""Calibration of one camera or several from pictures of a board, and what spoils it."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.camera.calibration.board import Detection
-from drake_pose.camera.calibration.bundle_adjustment import Rig, adjust_rig
-from drake_pose.camera.calibration.initial_poses import (
-    board_poses,
-    chain_cameras,
+from drake_pose.camera.calibration.board import BoardDetections, Detection, Picture
+from drake_pose.camera.calibration.lens import Lens
+from drake_pose.camera.calibration.rig import (
+    FREE_COEFFICIENTS,
+    Detections,
+    LensEstimate,
+    Rig,
+    adjust_rig,
+    chain_rig,
+    estimate_lens,
+    pair_pose,
     require_shared_pictures,
 )
-from drake_pose.camera.calibration.intrinsics import (
-    LENS_MODELS,
-    LensEstimate,
-    estimate_lens,
-    inverse_pose,
-)
-from drake_pose.camera.calibration.lens import Lens
-from drake_pose.camera.calibration.mirrored_pictures import find_mirrored
-from drake_pose.camera.calibration.pictures import BoardDetections, Picture
-from drake_pose.camera.models import PinholeCamera
+from drake_pose.camera.models import PinholeCamera, inverse_pose
 from drake_pose.errors import CameraError, UnknownNameError
 
 Array = NDArray[np.float64]
+
+_LARGEST_FOCAL_DEVIATION = 0.05
+# Mirrored pictures agree with the other cameras this much better once they are turned.
+_BETTER = 0.25
 
 
 @dataclass(frozen=True)
@@ -61,8 +59,10 @@ class CalibrationSettings:
     largest_error: float = 2.0
 
     def __post_init__(self) -> None:
-        if self.lens not in LENS_MODELS:
-            raise CameraError(f"lens must be one of {', '.join(LENS_MODELS)}, not '{self.lens}'")
+        if self.lens not in FREE_COEFFICIENTS:
+            raise CameraError(
+                f"lens must be one of {', '.join(FREE_COEFFICIENTS)}, not '{self.lens}'"
+            )
         kind, _, name = self.world.partition(":")
         if self.world and (kind not in ("board", "camera") or not name):
             raise CameraError(f"world must be board:FRAME or camera:NAME, not '{self.world}'")
@@ -113,12 +113,16 @@ def calibrate(seen: BoardDetections, settings: CalibrationSettings | None = None
     points = seen.board.points
     lenses = {}
     for name in detections:
-        lenses[name], spoilt = _lens_without_spoilt(name, points, detections, seen, settings)
+        lenses[name], spoilt = _own_lens(name, points, detections[name], seen.sizes[name], settings)
         left_out |= spoilt
     rig, spoilt = _adjusted_rig(points, detections, lenses, settings)
     left_out |= spoilt
     errors = rig.errors(points, detections)
-    camera_errors = _camera_errors(errors, detections)
+    camera_errors = {}
+    for name, frames in detections.items():
+        counts = [len(detection.corners) for detection in frames.values()]
+        squares = [errors[name, frame] ** 2 for frame in frames]
+        camera_errors[name] = float(np.sqrt(np.average(squares, weights=counts)))
     worst = max(camera_errors, key=lambda name: camera_errors[name])
     if camera_errors[worst] > settings.largest_error:
         raise CameraError(
@@ -126,7 +130,13 @@ def calibrate(seen: BoardDetections, settings: CalibrationSettings | None = None
             f"{settings.largest_error:g}: is the board flat, still, and as its file says? Has the "
             "camera or its lens (focus, zoom) moved? Leave it out, or allow a larger error"
         )
-    X_WR, world = _world(rig, settings.world)
+    world = settings.world or f"camera:{next(iter(rig.X_RC))}"
+    kind, _, name = world.partition(":")
+    poses = rig.X_RB if kind == "board" else rig.X_RC
+    if name not in poses:
+        what = "picture of the board" if kind == "board" else "camera"
+        raise UnknownNameError(what, name, poses, "the calibration")
+    X_WR = inverse_pose(poses[name])
     cameras = {n: rig.lenses[n].camera(n, X_WR @ rig.X_RC[n]) for n in detections}
     X_WB = {frame: X_WR @ X for frame, X in rig.X_RB.items()}
     return Calibration(cameras, rig.lenses, X_WB, errors, camera_errors, left_out, world)
@@ -137,27 +147,27 @@ def _chosen(
 ) -> tuple[dict[str, dict[str, Detection]], dict[Picture, str]]:
     """The detections to use, in dictionaries of our own, and what was left out on request."""
     unwanted = set(settings.leave_out)
-    known = {*seen.detections} | {
-        f"{camera}/{frame}" for camera, frames in seen.detections.items() for frame in frames
-    }
-    known |= {f"{camera}/{frame}" for camera, frame in seen.not_found}
+    pictures = [(camera, frame) for camera, frames in seen.detections.items() for frame in frames]
+    known = {*seen.detections, *("/".join(picture) for picture in (*pictures, *seen.not_found))}
     for name in sorted(unwanted - known):
         raise UnknownNameError("camera or picture", name, sorted(known), "the calibration")
     left_out: dict[Picture, str] = {}
-    detections: dict[str, dict[str, Detection]] = {}
-    for camera, frames in seen.detections.items():
+    detections: dict[str, dict[str, Detection]] = {
+        camera: {} for camera in seen.detections if camera not in unwanted
+    }
+    for camera, frame in pictures:
         if camera in unwanted:
-            left_out |= {(camera, frame): "the camera was left out" for frame in frames}
-            continue
-        detections[camera] = {f: s for f, s in frames.items() if f"{camera}/{f}" not in unwanted}
-        asked = {f for f in frames if f not in detections[camera]}
-        left_out |= {(camera, frame): "left out on request" for frame in sorted(asked)}
+            left_out[camera, frame] = "the camera was left out"
+        elif f"{camera}/{frame}" in unwanted:
+            left_out[camera, frame] = "left out on request"
+        else:
+            detections[camera][frame] = seen.detections[camera][frame]
     if not detections:
         raise CameraError("no camera is left to be calibrated")
     return detections, left_out
 
 
-def _check_board(seen: BoardDetections, detections: Mapping[str, Mapping[str, Detection]]) -> None:
+def _check_board(seen: BoardDetections, detections: Detections) -> None:
     for camera in seen.mirrored:
         if camera in detections:
             raise CameraError(
@@ -172,24 +182,24 @@ def _check_board(seen: BoardDetections, detections: Mapping[str, Mapping[str, De
         )
 
 
-def _lens_without_spoilt(
+def _own_lens(
     name: str,
     points: Array,
-    detections: dict[str, dict[str, Detection]],
-    seen: BoardDetections,
+    frames: dict[str, Detection],
+    size: tuple[int, int],
     settings: CalibrationSettings,
 ) -> tuple[LensEstimate, dict[Picture, str]]:
-    """A camera's lens; spoilt pictures are taken out of `detections` or refused."""
+    """A camera's lens; spoilt pictures are taken out of `frames` or refused."""
     spoilt: dict[Picture, str] = {}
     while True:
-        estimate = estimate_lens(name, points, detections[name], seen.sizes[name], settings.lens)
+        estimate = estimate_lens(name, points, frames, size, settings.lens)
         worst = max(estimate.errors, key=lambda frame: estimate.errors[frame])
         # One spoilt picture also harms the others' errors: the worst goes first, then look again.
-        if estimate.errors[worst] <= _limit(list(estimate.errors.values()), settings):
+        if estimate.errors[worst] <= _limit(estimate.errors.values(), settings):
             break
         reason = f"its corners are {estimate.errors[worst]:.2f} pixel off the camera's own lens"
         spoilt[name, worst] = reason
-        del detections[name][worst]
+        del frames[worst]
     _refuse(spoilt, settings)
     if not estimate.focal_deviation < _LARGEST_FOCAL_DEVIATION:
         raise CameraError(
@@ -199,9 +209,6 @@ def _lens_without_spoilt(
     return estimate, spoilt
 
 
-_LARGEST_FOCAL_DEVIATION = 0.05
-
-
 def _adjusted_rig(
     points: Array,
     detections: dict[str, dict[str, Detection]],
@@ -209,44 +216,37 @@ def _adjusted_rig(
     settings: CalibrationSettings,
 ) -> tuple[Rig, dict[Picture, str]]:
     """Everything at once; spoilt pictures are taken out of `detections` or refused."""
-    X_RC = chain_cameras(points, detections, lenses)
-    start = Rig(
-        {name: estimate.lens for name, estimate in lenses.items()},
-        X_RC,
-        board_poses(points, detections, lenses, X_RC),
-    )
+    rig = chain_rig(points, detections, lenses)
     original = {name: dict(frames) for name, frames in detections.items()}
     spoilt: dict[Picture, str] = {}
     while len(detections) > 1:
-        start = adjust_rig(points, detections, start, settings.lens, robust=True)
-        worst = _disagreeing(start.errors(points, detections), detections, settings)
+        rig = adjust_rig(points, detections, rig, settings.lens, robust=True)
+        worst = _disagreeing(rig.errors(points, detections), settings)
         if not worst:
             break
         spoilt |= worst
         _require_true_cameras(points, spoilt, original, lenses)
         for camera, frame in worst:
             del detections[camera][frame]
-        frames = {frame for frames in detections.values() for frame in frames}
-        start = Rig(start.lenses, start.X_RC, {f: X for f, X in start.X_RB.items() if f in frames})
+        left = {frame for frames in detections.values() for frame in frames}
+        rig = replace(rig, X_RB={frame: X for frame, X in rig.X_RB.items() if frame in left})
     _refuse(spoilt, settings)
     require_shared_pictures(detections)
-    return adjust_rig(points, detections, start, settings.lens, robust=False), spoilt
+    return adjust_rig(points, detections, rig, settings.lens, robust=False), spoilt
 
 
 def _disagreeing(
-    errors: Mapping[Picture, float],
-    detections: Mapping[str, Mapping[str, Detection]],
-    settings: CalibrationSettings,
+    errors: Mapping[Picture, float], settings: CalibrationSettings
 ) -> dict[Picture, str]:
     """At each instant the picture that contradicts the other cameras' most, if one does.
 
     One at a time: it has drawn the board away from where the others saw it. Of two cameras that
     disagree both pictures are in doubt.
     """
-    limit = _limit(list(errors.values()), settings)
+    limit = _limit(errors.values(), settings)
     spoilt: dict[Picture, str] = {}
     for frame in {frame for _, frame in errors}:
-        seers = [name for name in detections if frame in detections[name]]
+        seers = [camera for camera, one in errors if one == frame]
         worst = max(seers, key=lambda name: errors[name, frame])
         if errors[worst, frame] <= limit:
             continue
@@ -266,23 +266,22 @@ def _disagreeing(
 
 def _require_true_cameras(
     points: Array,
-    spoilt: Mapping[Picture, str],
-    detections: Mapping[str, Mapping[str, Detection]],
+    spoilt: Collection[Picture],
+    detections: Detections,
     lenses: Mapping[str, LensEstimate],
 ) -> None:
     """Refuses a camera most of whose shared pictures contradict the others, and says why."""
+    counts = Counter(camera for camera, _ in spoilt)
     for name, frames in detections.items():
-        shared = [
-            frame
-            for frame in frames
-            if any(frame in others for camera, others in detections.items() if camera != name)
-        ]
+        others = {frame for other in detections if other != name for frame in detections[other]}
+        shared = [frame for frame in frames if frame in others]
         bad = sum((name, frame) in spoilt for frame in shared)
-        if 2 * bad <= len(shared) or _blamed_more(name, bad, spoilt):
+        blamed_more = any(count > bad for other, count in counts.items() if other != name)
+        if 2 * bad <= len(shared) or blamed_more:
             continue
         # Of two cameras nobody can say which is wrong.
         who = " or ".join(f"camera '{n}'" for n in (detections if len(detections) == 2 else [name]))
-        if find_mirrored(points, detections, lenses, name):
+        if _is_mirrored(points, detections, lenses, name):
             raise CameraError(
                 f"{who}: its pictures are mirrored: they agree with the other cameras only when "
                 "left and right are exchanged; switch mirroring off"
@@ -294,17 +293,39 @@ def _require_true_cameras(
         )
 
 
-def _blamed_more(name: str, bad: int, spoilt: Mapping[Picture, str]) -> bool:
-    """Whether another camera has more spoilt pictures than this one."""
-    counts: dict[str, int] = {}
-    for camera, _ in spoilt:
-        counts[camera] = counts.get(camera, 0) + 1
-    return any(count > bad for camera, count in counts.items() if camera != name)
+def _is_mirrored(
+    points: Array, detections: Detections, lenses: Mapping[str, LensEstimate], name: str
+) -> bool:
+    """Whether a camera agrees with the others once its pictures are turned left to right.
+
+    A checkerboard looks like a board in a mirror too, but moves the wrong way.
+    """
+    lens = lenses[name].lens
+    # The colours of a board of an even number of columns fit only where rows are exchanged, with
+    # an odd number columns; squares are one more than corners.
+    numbers = np.arange(len(points)).reshape(len(np.unique(points[:, 1])), -1)
+    numbers = numbers[::-1] if len(numbers) % 2 == 0 else numbers[:, ::-1]
+    turned = {}
+    for frame, seen in detections[name].items():
+        corners = numbers.ravel()[seen.corners]
+        order = np.argsort(corners)
+        uv = [lens.width - 1.0, 0.0] + seen.uv * [-1.0, 1.0]
+        turned[frame] = Detection(corners[order], uv[order])
+    try:
+        estimate = estimate_lens(name, points, turned, (lens.width, lens.height))
+    except CameraError:
+        return False
+    others = [other for other in detections if {*detections[other]} & {*turned}]
+    others.remove(name)
+    straight = [pair_pose(points, detections, lenses, other, name)[1] for other in others]
+    detections, lenses = {**detections, name: turned}, {**lenses, name: estimate}
+    exchanged = [pair_pose(points, detections, lenses, other, name)[1] for other in others]
+    return bool(np.median(exchanged) < _BETTER * np.median(straight))
 
 
-def _limit(errors: list[float], settings: CalibrationSettings) -> float:
+def _limit(errors: Iterable[float], settings: CalibrationSettings) -> float:
     """Above which error a picture is spoilt [pixel]."""
-    return max(settings.spoilt_pixels, settings.spoilt_factor * float(np.median(errors)))
+    return max(settings.spoilt_pixels, settings.spoilt_factor * float(np.median([*errors])))
 
 
 def _refuse(spoilt: Mapping[Picture, str], settings: CalibrationSettings) -> None:
@@ -321,26 +342,3 @@ def _refuse(spoilt: Mapping[Picture, str], settings: CalibrationSettings) -> Non
         f"{listing}. This spoils the calibration: leave out {names}, or drop spoilt pictures."
         f"{moved}"
     )
-
-
-def _camera_errors(
-    errors: Mapping[Picture, float], detections: Mapping[str, Mapping[str, Detection]]
-) -> dict[str, float]:
-    """Root mean square distance over all corners of each camera [pixel]."""
-    found = {}
-    for name, frames in detections.items():
-        counts = np.array([len(detection.corners) for detection in frames.values()])
-        squares = np.array([errors[name, frame] ** 2 for frame in frames])
-        found[name] = float(np.sqrt(np.sum(counts * squares) / np.sum(counts)))
-    return found
-
-
-def _world(rig: Rig, world: str) -> tuple[Array, str]:
-    """The rig's pose (4, 4) in the world, and what the world is."""
-    world = world or f"camera:{next(iter(rig.X_RC))}"
-    kind, _, name = world.partition(":")
-    poses = rig.X_RB if kind == "board" else rig.X_RC
-    if name not in poses:
-        what = "picture of the board" if kind == "board" else "camera"
-        raise UnknownNameError(what, name, poses, "the calibration")
-    return inverse_pose(poses[name]), world

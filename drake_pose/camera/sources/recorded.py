@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from drake_pose.camera.picture_files import (
-    SUFFIXES,
+    list_pictures,
     mask_of_picture,
     read_person_mask,
     read_picture,
@@ -214,12 +214,7 @@ def find_picture_files(folder: Path, camera: str) -> dict[str, Path]:
     """
     if not folder.is_dir():
         raise SceneError(f"{folder}: no such folder of camera '{camera}'s pictures")
-    files: dict[str, Path] = {}
-    for path in sorted(folder.iterdir()):
-        if path.suffix.lower() in SUFFIXES:
-            if path.stem in files:
-                raise SceneError(f"{path}: the folder has frame {path.stem} twice; remove one")
-            files[path.stem] = path
+    files = list_pictures(folder, SceneError)
     if not files:
         raise SceneError(f"{folder}: holds no picture <frame>.png or .jpg of camera '{camera}'")
     return files

@@ -7,8 +7,10 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from drake_pose.errors import ModelError
 
@@ -32,48 +34,86 @@ def check_in_child(
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:
         raise ModelError(f"model file {path} cannot be read: {error.strerror}") from error
-    arguments = (str(path), json.dumps(dict(packages)), json.dumps(dict(limits)))
-    _ask_child(arguments, digest)
+    _check(str(path), json.dumps(dict(packages)), json.dumps(dict(limits)), digest)
 
 
 @functools.lru_cache(maxsize=64)
-def _ask_child(arguments: tuple[str, ...], digest: str) -> None:
+def _check(path: str, packages: str, limits: str, digest: str) -> None:
     """Raise why the model cannot be used; digest only tells versions of the file apart.
 
     A refusal is not remembered: a missing mesh or package may have been put in place since.
     """
-    library_folder = str(Path(__file__).resolve().parents[3])
-    environment = dict(os.environ)
-    search_path = [library_folder, environment.get("PYTHONPATH", "")]
-    environment["PYTHONPATH"] = os.pathsep.join(part for part in search_path if part)
-    environment["LP_NUM_THREADS"] = "0"
-    command = [sys.executable, "-m", "drake_pose.body.check_child", *arguments]
-    path = arguments[0]
-    try:
-        child = subprocess.run(
-            command,
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            timeout=TIME_LIMIT_SECONDS,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
+    end = _CHECKER.ask({"path": path, "packages": packages, "limits": limits})
+    if end["status"] is None:
         raise ModelError(
             f"{path}: reading it takes more than {TIME_LIMIT_SECONDS:g} s; does it include itself?"
-        ) from None
-    lines = child.stdout.decode("utf-8", "replace").strip().splitlines()
-    if child.returncode == 0 and lines:
-        answer = json.loads(lines[-1])
-        if answer["usable"]:
+        )
+    if end["status"] == 0 and "usable" in end:
+        if end["usable"]:
             return
-        raise ModelError(str(answer["reason"]))
-    if child.returncode < 0:
-        what = f"crashed Drake ({signal.Signals(-child.returncode).name})"
+        raise ModelError(str(end["reason"]))
+    if end["status"] < 0:
+        what = f"crashed Drake ({signal.Signals(-end['status']).name})"
     else:
-        remarks = child.stderr.decode("utf-8", "replace").strip().splitlines()
-        what = f"failed ({remarks[-1] if remarks else f'exit status {child.returncode}'})"
+        what = f"failed ({end['remark'] or 'exit status ' + str(end['status'])})"
     raise ModelError(
         f"{path}: reading it {what}; it or a file it names is broken, includes itself, or needs "
         f"more than {MEMORY_LIMIT_BYTES // 2**30} GiB of memory"
     )
+
+
+class _Checker:
+    """A process that has loaded Drake, and forks a child for each model: Drake is loaded once.
+
+    It ends by itself when it is not asked for a while, or when this process ends.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._process: subprocess.Popen[str] | None = None
+        self._owner = 0
+
+    def ask(self, question: dict[str, str]) -> dict[str, Any]:
+        """How the child ended: status (None: out of time), its answer or its last remark."""
+        environment = {**os.environ, "LP_NUM_THREADS": "0"}
+        more = {"time_limit": TIME_LIMIT_SECONDS, "environment": environment, "folder": os.getcwd()}
+        line = json.dumps(question | more)
+        with self._lock:
+            # One that has just ended, for want of questions, is asked in vain.
+            return self._exchange(line) or self._exchange(line) or _NO_ANSWER
+
+    def _exchange(self, line: str) -> dict[str, Any] | None:
+        process = self._running()
+        assert process.stdin is not None
+        assert process.stdout is not None
+        try:
+            process.stdin.write(line + "\n")
+            process.stdin.flush()
+            answer = process.stdout.readline()
+        except BrokenPipeError:
+            answer = ""
+        if answer:
+            return dict(json.loads(answer))
+        self._process = None
+        return None
+
+    def _running(self) -> subprocess.Popen[str]:
+        # A process that was forked must not read its parent's answers.
+        if self._process is None or self._process.poll() is not None or self._owner != os.getpid():
+            library_folder = str(Path(__file__).resolve().parents[3])
+            paths = [library_folder, os.environ.get("PYTHONPATH", "")]
+            search_path = os.pathsep.join(part for part in paths if part)
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "drake_pose.body.check_child"],
+                env={**os.environ, "PYTHONPATH": search_path, "LP_NUM_THREADS": "0"},
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                text=True,
+            )
+            self._owner = os.getpid()
+        return self._process
+
+
+_NO_ANSWER: dict[str, Any] = {"status": 1, "remark": "the process that reads models cannot start"}
+_CHECKER = _Checker()

@@ -208,8 +208,8 @@ def _agreement_table() -> Table:
     for name in ("woman", "man"):
         model = load_model(bundled_model(name))
         for projection, camera in cameras.items():
-            agreement = measure_agreement(model, camera, held=held)
-            worst, mean = f"{agreement.worst:.3%}", f"{agreement.mean:.4%}"
+            share, differing, _ = measure_agreement(model, camera, held=held)
+            worst, mean = f"{share:.3%}", f"{differing:.4%}"
             table.add_row(name, projection, worst, mean)
     return table
 

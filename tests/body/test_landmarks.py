@@ -1,6 +1,5 @@
 """Landmarks: the bundled models' against Drake, in pose trees, and files that are wrong."""
 
-import csv
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,6 @@ from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.landmarks import (
     Landmark,
     landmark_positions,
-    landmarks_file,
     landmarks_of_nodes,
     load_landmarks,
 )
@@ -64,12 +62,6 @@ def test_bundled_landmarks_are_where_drake_puts_them(path: Path) -> None:
         q = rng.uniform(model.lower, model.upper)
         found = landmark_positions(model, landmarks, q)
         np.testing.assert_allclose(found, list(by_drake(path, q).values()), atol=1e-12)
-
-
-def test_names_are_those_of_the_recorded_truth(shared_data: Path) -> None:
-    with (shared_data / "human_four_views" / "joint_centres.csv").open() as file:
-        recorded = {row["joint"] for row in csv.DictReader(file)}
-    assert recorded == JOINT_CENTRES
 
 
 @pytest.mark.parametrize("path", BODIES, ids=lambda path: path.stem)
@@ -172,9 +164,3 @@ def test_bad_files_are_named(text: str, complaint: str, tmp_path: Path) -> None:
     with pytest.raises(ModelError, match=complaint) as caught:
         load_landmarks(tmp_path / "thing.urdf")
     assert str(file) in str(caught.value)
-
-
-def test_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match=r"landmarks.yaml: cannot read it: No such"):
-        load_landmarks(tmp_path / "thing.urdf")
-    assert landmarks_file("a/thing.urdf") == Path("a/landmarks.yaml")

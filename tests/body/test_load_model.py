@@ -76,14 +76,6 @@ def test_every_mesh_format_shows_the_same_cube(tmp_path, extension):
     np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [2, 2, 3], atol=1e-6)
 
 
-def test_split_vertices_are_merged(tmp_path):
-    (tmp_path / "cube.obj").write_text(cube_obj(normals=True))
-    model = load_model(write(tmp_path, mesh_urdf("cube.obj")), check=False)
-    mesh = model.link_meshes["a"]
-    assert len(mesh.vertices) == 8
-    assert is_watertight(mesh)
-
-
 def test_merging_drops_what_has_no_area_and_is_not_used():
     vertices = np.array([[0.0, 0, 0], [9, 9, 9], [1, 0, 0], [0, 1, 0], [0, 0, 0]])
     mesh = TriangleMesh(vertices, np.array([[0, 2, 3], [4, 0, 2], [4, 2, 3]], dtype=np.int32))
@@ -252,10 +244,3 @@ def test_report_says_what_may_surprise(tmp_path):
     assert "nod" in warnings
     assert "<mimic>" in warnings
     assert "'follow' turns" not in warnings
-
-
-def test_woman_has_no_warnings():
-    report = describe_model(bundled_model("woman"))
-    assert report.usable
-    assert report.warnings == ()
-    assert all(node.watertight for node in report.nodes)

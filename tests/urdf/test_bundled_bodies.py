@@ -1,33 +1,40 @@
-"""The bundled woman and man: reproducible, closed, mirrored, jointed as in table 2, no gaps."""
+"""The bundled models: reproducible, closed, mirrored, jointed as in the papers, no gaps."""
 
-import subprocess
-import sys
+from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import trimesh
-from pydrake.geometry import (
-    ClippingRange,
-    ColorRenderCamera,
-    MakeRenderEngineVtk,
-    RenderCameraCore,
-    RenderEngineVtkParams,
-    RenderLabel,
-)
-from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
-from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.sensors import CameraInfo
+from pydrake.math import RotationMatrix
 
-from tests.urdf.surfaces import winding_numbers
+from drake_pose.body.model import ArticulatedModel, load_model
+from tests.urdf.surfaces import (
+    URDF,
+    Silhouettes,
+    assert_closed,
+    committed,
+    pieces,
+    read_obj,
+    sphere_points,
+    winding_numbers,
+    written_again,
+)
 from tests.written_files import assert_same_files
 
-URDF = Path(__file__).resolve().parents[2] / "urdf"
 BODIES = ("woman", "man")
 PIXELS_PER_METRE = 226.0  # Kameda: 1 cm = 2.26 pixels
+# Total mass [kg], and what of the space around the origin a picture of any pose shows [m].
+MODELS = {
+    "woman/woman": (67.76, 3.2),
+    "man/man": (85.52, 3.2),
+    "hand/hand": (1.804, 0.7),
+    "hand/right_hand": (1.804, 0.7),
+    "person/person": (76.64, 3.6),
+    "person/person_shape": (76.64, 3.6),
+}
+MESHES = sorted(URDF.glob("*/meshes/*.obj"))
 
 # Kameda, Minoh and Ikeda, table 2: axes in order of rotation, limits in degrees.
 TABLE_2 = {
@@ -75,64 +82,33 @@ JOINT_BALLS = {
     "shin": 0.042,
     "foot": 0.022,
 }
+FINGERS = ("index", "middle", "ring", "little")
+HAND_JOINTS = {
+    "palm": ("forearm", 0.017),
+    "thumb_metacarpal": ("palm", 0.010),
+    "thumb_proximal": ("thumb_metacarpal", 0.009),
+    "thumb_distal": ("thumb_proximal", 0.009),
+    **{f"{finger}_proximal": ("palm", 0.004) for finger in FINGERS},
+    **{f"{finger}_middle": (f"{finger}_proximal", 0.006) for finger in FINGERS},
+    **{f"{finger}_distal": (f"{finger}_middle", 0.005) for finger in FINGERS},
+}
+BALLS = [
+    *(
+        (name, child, parent, JOINT_BALLS[child.removeprefix("left_").removeprefix("right_")])
+        for name in BODIES
+        for child, parent in PARENTS.items()
+    ),
+    *(("hand", child, parent, radius) for child, (parent, radius) in HAND_JOINTS.items()),
+]
 
 
-class Figure:
-    """A body in a scene graph with a renderer."""
-
-    def __init__(self, name: str):
-        builder = DiagramBuilder()
-        self.plant, self.scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
-        Parser(self.plant).AddModels(str(URDF / name / f"{name}.urdf"))
-        self.plant.Finalize()
-        self.scene_graph.AddRenderer("vtk", MakeRenderEngineVtk(RenderEngineVtkParams()))
-        self.diagram = builder.Build()
-        self.context = self.diagram.CreateDefaultContext()
-        self.plant_context = self.plant.GetMyContextFromRoot(self.context)
-
-    def labels(self, q: np.ndarray, towards: np.ndarray, target: np.ndarray) -> np.ndarray:
-        """Return labels (500, 500), seen from far away in direction towards (3,), 160 px/m."""
-        self.plant.SetPositions(self.plant_context, q)
-        z = -towards / np.linalg.norm(towards)
-        x = np.cross(z, [0.0, 0.0, 1.0])
-        x /= np.linalg.norm(x)
-        X_WC = RigidTransform(RotationMatrix(np.column_stack([x, np.cross(z, x), z])))
-        X_WC.set_translation(target - 1000.0 * z)
-        info = CameraInfo(500, 500, 160e3, 160e3, 249.5, 249.5)
-        core = RenderCameraCore("vtk", info, ClippingRange(998.0, 1002.0), RigidTransform())
-        query = self.scene_graph.get_query_output_port().Eval(
-            self.scene_graph.GetMyContextFromRoot(self.context)
-        )
-        image = query.RenderLabelImage(
-            ColorRenderCamera(core), self.scene_graph.world_frame_id(), X_WC
-        )
-        return image.data[:, :, 0].copy()
-
-
-@pytest.fixture(scope="module", params=BODIES)
-def figure(request: pytest.FixtureRequest) -> tuple[str, Figure]:
-    return request.param, Figure(request.param)
-
-
-def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return vertices, normals and triangles of an OBJ that indexes both alike."""
-    vertices, normals, triangles = [], [], []
-    for line in path.read_text().splitlines():
-        kind, *rest = line.split()
-        if kind == "v":
-            vertices.append([float(value) for value in rest])
-        elif kind == "vn":
-            normals.append([float(value) for value in rest])
-        elif kind == "f":
-            corners = [corner.split("//") for corner in rest]
-            assert all(vertex == normal for vertex, normal in corners)
-            triangles.append([int(vertex) - 1 for vertex, _ in corners])
-    return np.array(vertices), np.array(normals), np.array(triangles)
+@cache
+def load(name: str) -> ArticulatedModel:
+    return load_model(URDF / f"{name}.urdf", check=False)
 
 
 def mesh_of(name: str, link: str) -> trimesh.Trimesh:
-    vertices, _, triangles = read_obj(URDF / name / "meshes" / f"{link}.obj")
-    return trimesh.Trimesh(vertices, triangles, process=False)
+    return read_obj(URDF / name / "meshes" / f"{link}.obj")
 
 
 def silhouette_area_changed(mesh: trimesh.Trimesh, first: float, second: float) -> float:
@@ -149,55 +125,85 @@ def silhouette_area_changed(mesh: trimesh.Trimesh, first: float, second: float) 
     return float(np.count_nonzero(masks[0] != masks[1])) / fine**2
 
 
-@pytest.mark.parametrize("name", BODIES)
+@pytest.mark.parametrize("name", [*BODIES, "hand", "person"])
 def test_script_writes_the_committed_files(name: str, tmp_path: Path) -> None:
-    script = URDF / name / f"make_{name}.py"
-    subprocess.run([sys.executable, "-B", str(script), "--out", str(tmp_path)], check=True)
-    written = {p.relative_to(tmp_path) for p in tmp_path.rglob("*") if p.is_file()}
-    committed = {p.relative_to(URDF / name) for p in (URDF / name).glob(f"{name}.*")}
-    committed |= {p.relative_to(URDF / name) for p in (URDF / name / "meshes").iterdir()}
-    assert written == committed
+    assert written_again(name, tmp_path) == committed(name)
     assert_same_files(tmp_path, URDF / name)
 
 
 @pytest.mark.slow
-def test_stature_scales_the_body(tmp_path: Path) -> None:
-    script = URDF / "woman" / "make_woman.py"
-    command = [sys.executable, "-B", str(script), "--out", str(tmp_path), "--stature", "1.8"]
-    subprocess.run(command, check=True)
-    tall = read_obj(tmp_path / "meshes" / "left_shin.obj")[0]
-    mean = read_obj(URDF / "woman" / "meshes" / "left_shin.obj")[0]
-    np.testing.assert_allclose(tall, mean * 1.8 / 1.6285, atol=2e-5)
+@pytest.mark.parametrize(
+    ("name", "link", "option", "factor"),
+    [
+        ("woman", "left_shin", ("--stature", "1.8"), 1.8 / 1.6285),
+        ("hand", "left_palm", ("--handlength", "0.21"), 0.21 / 0.1872),
+    ],
+)
+def test_size_scales_everything(
+    name: str, link: str, option: tuple[str, str], factor: float, tmp_path: Path
+) -> None:
+    written_again(name, tmp_path, *option)
+    scaled = read_obj(tmp_path / "meshes" / f"{link}.obj").vertices
+    np.testing.assert_allclose(scaled, mesh_of(name, link).vertices * factor, atol=2e-5)
+
+
+@pytest.mark.parametrize("path", MESHES, ids=lambda path: f"{path.parts[-3]}-{path.stem}")
+def test_surfaces_are_closed_small_and_mirrored(path: Path) -> None:
+    mesh = read_obj(path)
+    assert_closed(mesh)
+    if path.parts[-3] != "person":
+        assert 200 <= len(mesh.faces) <= 1500
+        if path.stem.startswith("left_"):
+            right = read_obj(path.with_name(path.name.replace("left_", "right_")))
+            np.testing.assert_array_equal(right.vertices, mesh.vertices * [-1.0, 1.0, 1.0])
+            assert right.volume == pytest.approx(mesh.volume)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_masses_make_a_valid_simulation(name: str) -> None:
+    plant = load(name).plant
+    context = plant.CreateDefaultContext()
+    assert plant.CalcTotalMass(context) == pytest.approx(MODELS[name][0], rel=0.01)
+    plant.SetPositions(context, np.zeros(plant.num_positions()))
+    assert np.linalg.eigvalsh(plant.CalcMassMatrix(context))[0] > 0.0
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_no_pose_falls_apart(name: str) -> None:
+    model, size = load(name), MODELS[name][1]
+    silhouettes = Silhouettes(model)
+    target = np.array([0.0, 0.0, 0.0 if "hand" in name else -0.5])
+    rng = np.random.default_rng(7)
+    for index in range(24):
+        q = rng.uniform(model.lower, model.upper)
+        if index < 4:  # The ends of what is said of lengths, one way and the other.
+            ends = model.upper if index % 2 else model.lower
+            stretched = [name.endswith("_stretch") for name in model.position_names]
+            q = np.where(stretched, ends, q)
+        q[: 6 if "hand" in name else 3] = 0.0
+        mask = silhouettes.mask(q, rng.normal(size=3) * [1, 1, 0.3], target, size)
+        assert pieces(mask) == 1
+        assert not np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).any()
+
+
+@pytest.mark.parametrize(("name", "child", "parent", "radius"), BALLS)
+def test_a_ball_round_each_joint_is_in_both_links(
+    name: str, child: str, parent: str, radius: float
+) -> None:
+    plant = load(f"{name}/{name}").plant
+    context = plant.CreateDefaultContext()
+    plant.SetPositions(context, np.zeros(plant.num_positions()))
+    frame = plant.GetBodyByName(parent).body_frame()
+    X_PC = plant.GetBodyByName(child).body_frame().CalcPose(context, frame)
+    ball, side = sphere_points(radius), "left_" if name == "hand" else ""
+    assert winding_numbers(mesh_of(name, side + child), ball).min() > 0.5
+    in_parent = ball + X_PC.translation()
+    assert winding_numbers(mesh_of(name, side + parent), in_parent).min() > 0.5
 
 
 @pytest.mark.parametrize("name", BODIES)
-@pytest.mark.parametrize("link", TABLE_2)
-def test_shells_are_closed_and_face_outwards(name: str, link: str) -> None:
-    vertices, normals, triangles = read_obj(URDF / name / "meshes" / f"{link}.obj")
-    assert 300 <= len(triangles) <= 1500
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=2e-3)
-    mesh = trimesh.Trimesh(vertices, triangles, process=False)
-    assert np.all(mesh.area_faces > 0.0)
-    for shell in mesh.split(only_watertight=False):
-        assert shell.is_watertight
-        assert shell.is_winding_consistent
-        assert shell.volume > 0.0
-    corner_normals = normals[triangles].mean(axis=1)
-    agree = np.einsum("ij,ij->i", corner_normals, mesh.face_normals) > 0.0
-    assert agree.mean() > 0.99
-
-
-@pytest.mark.parametrize("name", BODIES)
-@pytest.mark.parametrize("link", [link for link in TABLE_2 if link.startswith("left_")])
-def test_right_is_the_mirror_image_of_left(name: str, link: str) -> None:
-    left = mesh_of(name, link)
-    right = mesh_of(name, link.replace("left_", "right_"))
-    np.testing.assert_array_equal(right.vertices, left.vertices * [-1.0, 1.0, 1.0])
-    assert right.volume == pytest.approx(left.volume)
-
-
-def test_limits_are_those_of_table_2(figure: tuple[str, Figure]) -> None:
-    plant = figure[1].plant
+def test_limits_are_those_of_table_2(name: str) -> None:
+    plant = load(f"{name}/{name}").plant
     assert plant.num_positions() == 3 + sum(len(row.split()) // 3 for row in TABLE_2.values())
     for link, row in TABLE_2.items():
         words = row.split()
@@ -213,9 +219,10 @@ def test_limits_are_those_of_table_2(figure: tuple[str, Figure]) -> None:
         assert parent == link
 
 
-def test_link_axes_are_the_papers_when_standing(figure: tuple[str, Figure]) -> None:
-    name, body = figure
-    plant, context = body.plant, body.plant_context
+@pytest.mark.parametrize("name", BODIES)
+def test_link_axes_are_the_papers_when_standing(name: str) -> None:
+    plant = load(f"{name}/{name}").plant
+    context = plant.CreateDefaultContext()
     plant.SetPositions(context, np.zeros(plant.num_positions()))
     for link in TABLE_2:
         R_WL = plant.EvalBodyPoseInWorld(context, plant.GetBodyByName(link)).rotation().matrix()
@@ -230,52 +237,6 @@ def test_link_axes_are_the_papers_when_standing(figure: tuple[str, Figure]) -> N
     assert np.max(points[0][:, 0]) > 0.10  # the nose points along the world's x
     left_hand = plant.EvalBodyPoseInWorld(context, plant.GetBodyByName("left_hand"))
     assert left_hand.translation()[1] > 0.15
-
-
-def test_masses_make_a_valid_simulation(figure: tuple[str, Figure]) -> None:
-    name, body = figure
-    mass = body.plant.CalcTotalMass(body.plant_context)
-    assert mass == pytest.approx({"woman": 67.76, "man": 85.52}[name], rel=0.01)
-    for link in TABLE_2:
-        inertia = body.plant.GetBodyByName(link).default_spatial_inertia()
-        assert inertia.IsPhysicallyValid()
-    body.plant.SetPositions(body.plant_context, np.zeros(body.plant.num_positions()))
-    mass_matrix = body.plant.CalcMassMatrix(body.plant_context)
-    assert np.linalg.eigvalsh(mass_matrix)[0] > 0.0
-
-
-@pytest.mark.parametrize("name", BODIES)
-@pytest.mark.parametrize("link", PARENTS)
-def test_a_ball_round_each_joint_is_in_both_segments(name: str, link: str) -> None:
-    plant = Figure(name).plant
-    context = plant.CreateDefaultContext()
-    plant.SetPositions(context, np.zeros(plant.num_positions()))
-    parent = plant.GetBodyByName(PARENTS[link]).body_frame()
-    X_PL = plant.GetBodyByName(link).body_frame().CalcPose(context, parent)
-    rng = np.random.default_rng(3)
-    directions = rng.normal(size=(60, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    ball = JOINT_BALLS[link.removeprefix("left_").removeprefix("right_")] * directions
-    assert np.min(winding_numbers(mesh_of(name, link), ball)) > 0.5
-    in_parent = winding_numbers(mesh_of(name, PARENTS[link]), ball + X_PL.translation())
-    assert np.min(in_parent) > 0.5
-
-
-def test_no_pose_falls_apart(figure: tuple[str, Figure]) -> None:
-    _, body = figure
-    rng = np.random.default_rng(5)
-    lower, upper = body.plant.GetPositionLowerLimits(), body.plant.GetPositionUpperLimits()
-    for _ in range(25):
-        q = rng.uniform(lower, upper)
-        q[:3] = 0.0
-        towards = rng.normal(size=3) * [1.0, 1.0, 0.3]
-        labels = body.labels(q, towards, np.array([0.0, 0.0, -0.5]))
-        assert len(np.unique(labels)) > 5
-        mask = (labels != int(RenderLabel.kEmpty)).astype(np.uint8)
-        assert not mask[0].any()
-        assert not mask[-1].any()
-        count, _ = cv2.connectedComponents(mask, connectivity=8)
-        assert count == 2  # the background and one body
 
 
 @pytest.mark.parametrize("name", BODIES)

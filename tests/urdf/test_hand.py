@@ -1,27 +1,13 @@
-"""The bundled hands: reproducible, closed, of published size, jointed like a hand, no gaps."""
-
-from pathlib import Path
+"""The bundled hands: of published size, jointed like a hand."""
 
 import numpy as np
 import pytest
 
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.filtering.truncation.couplings import model_inequalities
-from tests.urdf.surfaces import (
-    URDF,
-    Silhouettes,
-    assert_closed,
-    committed,
-    pieces,
-    read_obj,
-    spans,
-    sphere_points,
-    winding_numbers,
-    written_again,
-)
-from tests.written_files import assert_same_files
+from tests.urdf.surfaces import URDF, Silhouettes, pieces, spans
+from tests.urdf.test_bundled_bodies import FINGERS, HAND_JOINTS
 
-FINGERS = ("index", "middle", "ring", "little")
 HANDS = ("hand", "right_hand")
 HAND_LENGTH, HAND_BREADTH = 0.1872, 0.08325  # ANSUR II, mean of women's and men's means [m]
 LIMITS = {
@@ -41,16 +27,6 @@ LIMITS = {
     **{f"{finger}_mcp_flexion": (-30, 90) for finger in FINGERS},
     **{f"{finger}_pip_flexion": (-10, 110) for finger in FINGERS},
     **{f"{finger}_dip_flexion": (-10, 90) for finger in FINGERS},
-}
-# Child -> parent, radius [m] of a ball round the joint that lies in both.
-JOINTS = {
-    "palm": ("forearm", 0.017),
-    "thumb_metacarpal": ("palm", 0.010),
-    "thumb_proximal": ("thumb_metacarpal", 0.009),
-    "thumb_distal": ("thumb_proximal", 0.009),
-    **{f"{finger}_proximal": ("palm", 0.004) for finger in FINGERS},
-    **{f"{finger}_middle": (f"{finger}_proximal", 0.006) for finger in FINGERS},
-    **{f"{finger}_distal": (f"{finger}_middle", 0.005) for finger in FINGERS},
 }
 SPREAD = {
     "index_mcp_abduction": 15,
@@ -88,41 +64,15 @@ def tip(model: ArticulatedModel, finger: str, q: np.ndarray) -> np.ndarray:
     return model.plant.CalcPointsPositions(context, link, point, palm).ravel()
 
 
-def test_script_writes_the_committed_files(tmp_path: Path) -> None:
-    written = written_again("hand", tmp_path)
-    assert written == committed("hand")
-    assert_same_files(tmp_path, URDF / "hand")
-
-
-@pytest.mark.slow
-def test_hand_length_scales_everything(tmp_path: Path) -> None:
-    written_again("hand", tmp_path, "--handlength", "0.21")
-    large = read_obj(tmp_path / "meshes" / "left_palm.obj").vertices
-    mean = read_obj(URDF / "hand" / "meshes" / "left_palm.obj").vertices
-    np.testing.assert_allclose(large, mean * 0.21 / HAND_LENGTH, atol=2e-5)
-
-
-@pytest.mark.parametrize("link", ["forearm", *JOINTS])
-def test_surfaces_are_closed_and_mirrored(link: str) -> None:
-    left = read_obj(URDF / "hand" / "meshes" / f"left_{link}.obj")
-    right = read_obj(URDF / "hand" / "meshes" / f"right_{link}.obj")
-    for mesh in (left, right):
-        assert 200 <= len(mesh.faces) <= 800
-        assert_closed(mesh)
-    np.testing.assert_array_equal(right.vertices, left.vertices * [-1.0, 1.0, 1.0])
-    assert right.volume == pytest.approx(left.volume)
-
-
 def test_joints_and_limits(hand: ArticulatedModel) -> None:
     assert set(hand.position_names) == {"position_x", "position_y", "position_z", *LIMITS}
     for name, (lower, upper) in LIMITS.items():
         index = hand.position_index(name)
         limits = np.degrees([hand.lower[index], hand.upper[index]])
         np.testing.assert_allclose(limits, [lower, upper], atol=1e-12)
-    for child, (parent, _) in JOINTS.items():
-        tree = hand.pose_tree()
-        node = tree.nodes[tree.node_index(child)]
-        assert tree.nodes[node.parent].name == parent
+    tree = hand.pose_tree()
+    for child, (parent, _) in HAND_JOINTS.items():
+        assert tree.nodes[tree.nodes[tree.node_index(child)].parent].name == parent
 
 
 def test_size_is_the_published_one(both: tuple[ArticulatedModel, ArticulatedModel]) -> None:
@@ -196,34 +146,6 @@ def test_thumb_reaches_the_index_and_the_little_finger(
         assert nearest < 0.025, finger
 
 
-@pytest.mark.parametrize("child", JOINTS)
-def test_a_ball_round_each_joint_is_in_both_links(
-    both: tuple[ArticulatedModel, ArticulatedModel], child: str
-) -> None:
-    left = both[0]
-    parent, radius = JOINTS[child]
-    context = left.plant.CreateDefaultContext()
-    left.plant.SetPositions(context, posed(left, {}))
-    frame = left.plant.GetBodyByName(parent).body_frame()
-    X_PC = left.plant.GetBodyByName(child).body_frame().CalcPose(context, frame)
-    ball = sphere_points(radius)
-    meshes = URDF / "hand" / "meshes"
-    assert winding_numbers(read_obj(meshes / f"left_{child}.obj"), ball).min() > 0.5
-    in_parent = ball + X_PC.translation()
-    assert winding_numbers(read_obj(meshes / f"left_{parent}.obj"), in_parent).min() > 0.5
-
-
-def test_no_pose_falls_apart(hand: ArticulatedModel) -> None:
-    silhouettes = Silhouettes(hand)
-    rng = np.random.default_rng(4)
-    for _ in range(40):
-        q = rng.uniform(hand.lower, hand.upper)
-        q[:6] = 0.0
-        mask = silhouettes.mask(q, rng.normal(size=3), np.zeros(3), 0.7)
-        assert mask.any()
-        assert pieces(mask) == 1
-
-
 def test_spread_fingers_are_seen_apart_down_to_the_webs(hand: ArticulatedModel) -> None:
     mask = Silhouettes(hand).mask(
         posed(hand, SPREAD), np.array([1.0, 0, 0]), np.array([0, 0, 0.1]), 0.25, 500
@@ -253,10 +175,3 @@ def test_couplings_allow_a_fist_and_forbid_what_no_hand_does(hand: ArticulatedMo
     assert not allowed({"index_dip_flexion": 60})
     assert not allowed({"index_mcp_abduction": -10, "middle_mcp_abduction": 10})
     assert not allowed({"ring_mcp_flexion": 85})
-
-
-def test_masses_make_a_valid_simulation(hand: ArticulatedModel) -> None:
-    context = hand.plant.CreateDefaultContext()
-    assert 1.2 < hand.plant.CalcTotalMass(context) < 2.6  # forearm and hand [kg]
-    hand.plant.SetPositions(context, posed(hand, {}))
-    assert np.linalg.eigvalsh(hand.plant.CalcMassMatrix(context))[0] > 0.0

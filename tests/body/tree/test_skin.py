@@ -152,15 +152,6 @@ def test_a_surface_is_the_rigid_part_and_the_band(tmp_path: Path) -> None:
     assert len(surface.triangles) == len(node.mesh.triangles) + len(node.skin.triangles)
 
 
-def test_a_model_without_a_skin_file_has_none(tmp_path: Path) -> None:
-    model = load_limb(tmp_path, "")
-    assert model.skin == ()
-    tree = model.pose_tree()
-    assert all(node.skin is None for node in tree.nodes)
-    assert tree.nodes[1].surface(np.zeros(1)) is tree.nodes[1].mesh
-    assert ModelSkin(model).vertices(np.zeros(5)) == []
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

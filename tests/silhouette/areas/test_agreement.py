@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.camera.files import load_cameras
 from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from tests.silhouette.agreement import measure_agreement
+from tests.silhouette.agreement import LARGEST_SHARE, measure_agreement
 
 SHAPES = {
     "box": '<box size="0.3 0.2 0.5"/>',
@@ -98,8 +97,8 @@ def test_every_shape_looks_as_drake_draws_it(tmp_path: Path, shape: str) -> None
     model = model_of(tmp_path, [shape, shape])
     for seed in range(3):
         for camera in cameras(np.random.default_rng(seed)):
-            agreement = measure_agreement(model, camera, 8, seed)
-            assert agreement.holds, (shape, camera.name, agreement.worst)
+            share, _, _ = measure_agreement(model, camera, 8, seed)
+            assert share <= LARGEST_SHARE, (shape, camera.name, share)
 
 
 def test_a_body_of_all_shapes(tmp_path: Path) -> None:
@@ -107,9 +106,9 @@ def test_a_body_of_all_shapes(tmp_path: Path) -> None:
     visible = 0
     for seed in range(3):
         for camera in cameras(np.random.default_rng(10 + seed)):
-            agreement = measure_agreement(model, camera, 10, seed)
-            assert agreement.holds, (camera.name, agreement.worst)
-            visible += (agreement.areas > 2000).sum()
+            share, _, areas = measure_agreement(model, camera, 10, seed)
+            assert share <= LARGEST_SHARE, (camera.name, share)
+            visible += (areas > 2000).sum()
     assert visible > 60
 
 
@@ -155,20 +154,11 @@ def test_the_plants_world_can_be_moved(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_woman() -> None:
-    model = load_model(bundled_model("woman"), check=False)
-    at_origin = {"position_x": 0.0, "position_y": 0.0, "position_z": 0.5}
-    for camera in cameras(np.random.default_rng(4)):
-        agreement = measure_agreement(model, camera, 200, 4, at_origin)
-        assert agreement.holds, (camera.name, agreement.worst)
-
-
-@pytest.mark.slow
 def test_the_arm_of_many_triangles(shared_data: Path) -> None:
     folder = shared_data / "arm_two_views"
     model = load_model(folder / "med7" / "med7.urdf", check=False)
     left = load_cameras(folder / "cameras.yaml")["left"]
     parallel = ParallelCamera("parallel", 700, 700, 300.0, 350.0, 350.0, left.X_WC)
     for camera in (left, parallel):
-        agreement = measure_agreement(model, camera, 200, 5)
-        assert agreement.holds, (camera.name, agreement.worst)
+        share, _, _ = measure_agreement(model, camera, 200, 5)
+        assert share <= LARGEST_SHARE, (camera.name, share)

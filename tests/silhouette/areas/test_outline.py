@@ -31,12 +31,6 @@ def test_records_hold_every_use_of_an_edge_once() -> None:
         assert uses_of_records(outline.edges) == directed_edges(outline.triangles)
 
 
-def test_a_closed_mesh_has_one_record_an_edge() -> None:
-    outline = outline_from_mesh(box(1.0))
-    assert len(outline.edges) == 18
-    assert (outline.edges[:, 5] == -1).all()
-
-
 def test_records_are_as_few_as_can_be() -> None:
     # Three triangles on one edge, two of them running the same way.
     triangles = np.array([[0, 1, 2], [0, 1, 3], [1, 0, 4]], dtype=np.int32)

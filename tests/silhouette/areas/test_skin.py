@@ -18,8 +18,8 @@ from drake_pose.silhouette.bits.bit_kernel import draw_bits
 from drake_pose.silhouette.bits.bit_view import make_bit_view
 from drake_pose.silhouette.contours.direction_cells import divide_outline
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from tests.body.skins import HALF, load_limb
-from tests.silhouette.agreement import measure_agreement
+from tests.body.skins import load_limb
+from tests.silhouette.agreement import LARGEST_SHARE, measure_agreement
 from tests.silhouette.shapes import brute_force_mask
 
 SIDE = 160
@@ -132,9 +132,9 @@ def test_drake_draws_the_same(tmp_path: Path, seed: int) -> None:
     model = load_limb(tmp_path)
     rng = np.random.default_rng(10 + seed)
     for camera in cameras(rng):
-        agreement = measure_agreement(model, camera, 8, seed)
-        assert agreement.holds, (camera.name, agreement.worst)
-        assert (agreement.areas > 500).all()
+        share, _, areas = measure_agreement(model, camera, 8, seed)
+        assert share <= LARGEST_SHARE, (camera.name, share)
+        assert (areas > 500).all()
     # The band is drawn as its child link, wherever the plant's own world is.
     renderer = LabelRenderer(model, camera)
     q = rng.uniform(model.lower, model.upper)
@@ -145,38 +145,6 @@ def test_drake_draws_the_same(tmp_path: Path, seed: int) -> None:
     assert np.count_nonzero(moved != there) <= 0.004 * (there >= 0).sum()
     names = {renderer.link_names[label] for label in np.unique(there) if label >= 0}
     assert names <= {"upper", "lower", "hand"}
-
-
-def gap_at_elbow(model: ArticulatedModel, *, skin: bool) -> tuple[int, int]:
-    """Background pixels in the corner outside a right-angled elbow, and the corner's pixels.
-
-    Seen along the elbow's axis, the corner is the quarter of a disc, as wide as the limb, that
-    lies neither over the upper prism's end nor over the lower one's.
-    """
-    scale, side = 2000.0, 400
-    camera = ParallelCamera(
-        "side", side, side, scale, side / 2 + 0.3, side / 2 + 0.3, looking_along([1.0, 0, 0], 1.0)
-    )
-    values, X_CN = pose(model, np.array([0.0, np.pi / 2, 0, 0, 0]), camera)
-    surfaces = TreeSurfaces(model.pose_tree())
-    mask = draw_mask(surfaces.at(values) if skin else surfaces.rigid, X_CN, camera)
-    v, u = np.mgrid[:side, :side]
-    elbow = camera.project(np.array([[0.0, 0.0, 0.1]]))[0][0]
-    corner = np.hypot(u - elbow[0], v - elbow[1]) < 0.95 * HALF * scale
-    lower = camera.project(np.array([[0.0, 0.05, 0.1], [0.0, -0.05, 0.1]]))[0]
-    forward = max(lower, key=lambda uv: mask[int(uv[1]), int(uv[0])])
-    corner &= (u - elbow[0]) * np.sign(forward[0] - elbow[0]) < -1
-    corner &= v - elbow[1] > 1
-    return int((corner & ~mask).sum()), int(corner.sum())
-
-
-def test_the_band_closes_the_gap_at_a_right_angle(tmp_path: Path) -> None:
-    model = load_limb(tmp_path)
-    before, corner = gap_at_elbow(model, skin=False)
-    after, _ = gap_at_elbow(model, skin=True)
-    assert before == corner
-    assert corner > 2000
-    assert after == 0
 
 
 def test_a_band_cut_by_the_near_plane(tmp_path: Path) -> None:
@@ -240,19 +208,6 @@ def woman_with_skin() -> ArticulatedModel:
     return model
 
 
-def test_the_standing_womans_silhouette_is_that_of_her_segments() -> None:
-    model = woman_with_skin()
-    surfaces = TreeSurfaces(model.pose_tree())
-    for direction in ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (-0.6, 0.7, 0.2)):
-        X = looking_along(np.array(direction), 5.0)
-        X[2, 3] -= 0.75
-        camera = ParallelCamera("woman", 700, 700, 226.0, 350.2, 350.3, X)
-        values, X_CN = pose(model, np.zeros(len(model.lower)), camera)
-        mask = draw_mask(surfaces.at(values), X_CN, camera)
-        assert mask.sum() > 10_000
-        assert np.count_nonzero(mask != draw_mask(surfaces.rigid, X_CN, camera)) <= 2
-
-
 def test_drake_draws_the_same_woman() -> None:
     model = woman_with_skin()
     held = {f"position_{axis}": 0.0 for axis in "xyz"}
@@ -260,5 +215,5 @@ def test_drake_draws_the_same_woman() -> None:
         camera = ParallelCamera(
             "woman", 700, 700, 226.0, 350.2, 350.3, looking_along(np.array(direction), 5.0)
         )
-        agreement = measure_agreement(model, camera, 10, 6, held)
-        assert agreement.holds, agreement.worst
+        share, _, _ = measure_agreement(model, camera, 10, 6, held)
+        assert share <= LARGEST_SHARE, share

@@ -16,6 +16,9 @@ Array = NDArray[np.float64]
 FACE_CAMERA = "face"
 """The name of the camera that looks at the face."""
 
+# As high as a grown person's face; a narrow view, for the face should fill the picture.
+_FACE_HEIGHT, _FACE_VIEW = 1.6, math.radians(22.0)
+
 
 def circle_of_cameras(
     count: int = 8,
@@ -35,8 +38,7 @@ def circle_of_cameras(
     Args:
         count: cameras on the circle, camera_0, camera_1 ... counterclockwise from above; the x
             axis, where the face camera stands, lies half-way between the last and the first.
-        radius: of the circle [m].
-        height: of the cameras [m].
+        radius, height: where the cameras of the circle are [m].
         target: (3,) the point they look at [m].
         field_of_view: of a camera on the circle, upright [rad].
         size: width and height of the pictures [pixel].
@@ -56,26 +58,16 @@ def circle_of_cameras(
         name = f"camera_{k}"
         cameras[name] = _camera(name, look_at(eye, target), field_of_view, size)
     if face_camera:
-        # As high as a grown person's face; a narrow view, for the face should fill the picture.
         face = [target[0], target[1], _FACE_HEIGHT]
         eye = [target[0] + radius, target[1], _FACE_HEIGHT]
         cameras[FACE_CAMERA] = _camera(FACE_CAMERA, look_at(eye, face), _FACE_VIEW, size)
     return cameras
 
 
-_FACE_HEIGHT = 1.6
-_FACE_VIEW = math.radians(22.0)
-
-
 def look_at(
     eye: Sequence[float] | Array, target: Sequence[float] | Array, up: Sequence[float] = (0, 0, 1)
 ) -> Array:
-    """The pose X_WC (4, 4) of a camera that looks from one point (3,) at another [m].
-
-    Args:
-        eye: where the camera is.
-        target: what is in the picture's middle.
-        up: (3,) what is upwards in the picture.
+    """The pose X_WC (4, 4) of a camera at `eye` (3,) that looks at `target` (3,) [m].
 
     Raises:
         CameraError: when both points coincide, or the camera looks along `up`.
@@ -95,13 +87,5 @@ def look_at(
 def _camera(name: str, X_WC: Array, field_of_view: float, size: tuple[int, int]) -> PinholeCamera:
     width, height = size
     focal = 0.5 * height / math.tan(0.5 * field_of_view)
-    return PinholeCamera(
-        name=name,
-        width=width,
-        height=height,
-        focal_x=focal,
-        focal_y=focal,
-        center_x=0.5 * (width - 1),
-        center_y=0.5 * (height - 1),
-        X_WC=X_WC,
-    )
+    center = 0.5 * (width - 1), 0.5 * (height - 1)
+    return PinholeCamera(name, width, height, focal, focal, *center, X_WC)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -11,8 +12,19 @@ from drake_pose.camera.checks import check_number
 from drake_pose.camera.files import load_cameras
 from drake_pose.camera.models import Camera
 from drake_pose.camera.picture_files import Picture, read_picture
-from drake_pose.camera.sources.frame_source import KINDS, SourceSpecification
-from drake_pose.camera.sources.recorded import TIME_STAMPS, find_picture_files
+from drake_pose.camera.sources.frame_source import (
+    KINDS,
+    Clock,
+    FrameSource,
+    SourceSpecification,
+)
+from drake_pose.camera.sources.live import DeviceSource
+from drake_pose.camera.sources.recorded import (
+    TIME_STAMPS,
+    FolderSource,
+    VideoSource,
+    find_picture_files,
+)
 from drake_pose.errors import CameraError, SceneError
 from drake_pose.yaml_files import read_yaml
 
@@ -65,6 +77,22 @@ def load_sources(
     return _with_folders_beside(found)
 
 
+def open_source(specification: SourceSpecification, clock: Clock = time.monotonic) -> FrameSource:
+    """Opens a source.
+
+    Args:
+        specification: where the pictures come from.
+        clock: gives the time stamps of a live camera's pictures [s].
+
+    Raises:
+        SceneError: a folder or video that cannot be read, is empty, or whose pictures are not of
+            the calibrated size. A live camera that cannot be opened is tried again and again.
+    """
+    if specification.live:
+        return DeviceSource(specification, clock)
+    return (FolderSource if specification.kind == "folder" else VideoSource)(specification)
+
+
 def load_background_pictures(specification: SourceSpecification) -> list[Picture]:
     """The pictures (H, W, 3) of the empty room that a camera's specification names.
 
@@ -101,8 +129,8 @@ def _read_entry(camera: Camera, entry: Any, path: Path) -> SourceSpecification:
     strange = [str(field)[:40] for field in entry if field not in _FIELDS]
     if strange:
         raise SceneError(f"{where}: unknown field {strange[0]}; a source has {', '.join(_FIELDS)}")
-    kind = next((kind for kind in KINDS if kind == entry.get("kind")), None)
-    if kind is None:
+    kind = entry.get("kind")
+    if kind not in KINDS:
         raise SceneError(f"{where}: kind must be one of {', '.join(KINDS)}")
     location = entry.get("location")
     if isinstance(location, bool) or not isinstance(location, str | int) or location == "":
@@ -127,32 +155,20 @@ def _read_entry(camera: Camera, entry: Any, path: Path) -> SourceSpecification:
         offset = check_number(offset, "offset", where)
     except CameraError as error:
         raise SceneError(str(error)) from None
-    return SourceSpecification(
-        camera.name,
-        kind,
-        str(location),
-        camera.width,
-        camera.height,
-        rate,
-        background,
-        offset,
-    )
+    size = camera.width, camera.height
+    return SourceSpecification(camera.name, kind, str(location), *size, rate, background, offset)
 
 
-def _with_folders_beside(
-    found: dict[str, SourceSpecification],
-) -> dict[str, SourceSpecification]:
+def _with_folders_beside(found: dict[str, SourceSpecification]) -> dict[str, SourceSpecification]:
     """Folders without time stamps share their frames' names with others of the same rate."""
+    counted = {
+        name: one.rate_hz
+        for name, one in found.items()
+        if one.kind == "folder" and not (Path(one.location) / TIME_STAMPS).is_file()
+    }
 
-    def counts(one: SourceSpecification) -> bool:
-        return one.kind == "folder" and not (Path(one.location) / TIME_STAMPS).is_file()
+    def beside(name: str) -> tuple[str, ...]:
+        others = [other for other in counted if name in counted and other != name]
+        return tuple(found[other].location for other in others if counted[other] == counted[name])
 
-    result = {}
-    for name, one in found.items():
-        beside = tuple(
-            other.location
-            for other in found.values()
-            if counts(one) and counts(other) and other is not one and other.rate_hz == one.rate_hz
-        )
-        result[name] = replace(one, beside=beside)
-    return result
+    return {name: replace(one, beside=beside(name)) for name, one in found.items()}

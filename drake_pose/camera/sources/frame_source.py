@@ -1,8 +1,6 @@
 """Where a camera's pictures come from: a folder, a video file, or a live camera.
 
-A specification is plain and picklable, so that a source can be opened on another machine; what is
-opened gives pictures one after another, each with its time stamp. What is wrong with one picture
-costs only that picture, and is said in `problems`.
+What is wrong with one picture costs only that picture, and is said in `problems`.
 """
 
 from __future__ import annotations
@@ -11,25 +9,18 @@ import abc
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
+from drake_pose.camera.picture_files import Mask, Picture
 from drake_pose.errors import SettingsError
 
-Picture = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
-
-SourceKind = Literal["folder", "video", "device"]
-KINDS: tuple[SourceKind, ...] = ("folder", "video", "device")
+KINDS = ("folder", "video", "device")
 
 Clock = Callable[[], float]
 
 
 @dataclass(frozen=True)
 class SourceSpecification:
-    """Where a camera's pictures come from.
+    """Where a camera's pictures come from; plain values, so that another machine may open it.
 
     Args:
         camera: the camera's name.
@@ -48,7 +39,7 @@ class SourceSpecification:
     """
 
     camera: str
-    kind: SourceKind
+    kind: str
     location: str
     width: int
     height: int
@@ -99,9 +90,6 @@ class FrameSource(abc.ABC):
         specification: where they come from.
         problems: what was wrong so far, each with the camera's name; a reader may empty the list.
         dropped: how many pictures were lost for that.
-
-    Args:
-        specification: where they come from.
     """
 
     def __init__(self, specification: SourceSpecification) -> None:
@@ -145,9 +133,9 @@ class FrameSource(abc.ABC):
             self.drop(f"frame {one.frame} has {what} frame {self._last.frame}: {one.time:g} s")
         return None
 
-    def drop(self, reason: str) -> None:
-        """Notes that a picture was lost."""
-        self.dropped += 1
+    def drop(self, reason: str, count: int = 1) -> None:
+        """Notes that pictures were lost."""
+        self.dropped += count
         self.report(f"{reason}; it is left out")
 
     def report(self, problem: str) -> None:
@@ -156,8 +144,7 @@ class FrameSource(abc.ABC):
 
     def wrong_size(self, picture: Picture | Mask) -> str:
         """What is wrong with a picture's size; "" where it is the calibrated one."""
-        height, width = picture.shape[:2]
-        wanted = self.specification
+        (height, width), wanted = picture.shape[:2], self.specification
         if (width, height) == (wanted.width, wanted.height):
             return ""
         return (

@@ -89,16 +89,17 @@ class DeviceSource(FrameSource):
     def _open(self) -> cv2.VideoCapture | None:
         """The camera, asked for pictures of the calibrated size."""
         given = self.specification
-        place: int | str = int(given.location) if given.location.isdigit() else given.location
         try:
-            capture = cv2.VideoCapture(place)
+            if not given.location.isdigit():
+                capture = cv2.VideoCapture(given.location)
+                return capture if capture.isOpened() else None
+            capture = cv2.VideoCapture(int(given.location))
             if not capture.isOpened():
                 return None
-            if isinstance(place, int):
-                capture.set(cv2.CAP_PROP_FRAME_WIDTH, given.width)
-                capture.set(cv2.CAP_PROP_FRAME_HEIGHT, given.height)
-                if given.rate_hz is not None:
-                    capture.set(cv2.CAP_PROP_FPS, given.rate_hz)
+            capture.set(cv2.CAP_PROP_FRAME_WIDTH, given.width)
+            capture.set(cv2.CAP_PROP_FRAME_HEIGHT, given.height)
+            if given.rate_hz is not None:
+                capture.set(cv2.CAP_PROP_FPS, given.rate_hz)
         except cv2.error:
             return None
         return capture

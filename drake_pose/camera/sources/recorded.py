@@ -12,6 +12,8 @@ import cv2
 import numpy as np
 
 from drake_pose.camera.picture_files import (
+    Mask,
+    Picture,
     list_pictures,
     mask_of_picture,
     read_person_mask,
@@ -19,8 +21,6 @@ from drake_pose.camera.picture_files import (
 )
 from drake_pose.camera.sources.frame_source import (
     FrameSource,
-    Mask,
-    Picture,
     SourceSpecification,
     TimedPicture,
 )
@@ -39,32 +39,36 @@ class FolderSource(FrameSource):
     frames follow each other in the order of their names at the given rate, and frames of the same
     name in the folders `beside` are of the same time; a number in a name means nothing.
 
-    Args:
-        specification: of kind folder.
-
     Raises:
         SceneError: names the folder; no picture, no times, or pictures of another size.
     """
 
     def __init__(self, specification: SourceSpecification) -> None:
         super().__init__(specification)
-        self._folder = Path(specification.location)
-        files = find_picture_files(self._folder, specification.camera)
-        stamped = self._folder / TIME_STAMPS
-        times = read_time_stamps(stamped) if stamped.is_file() else self._counted(files)
-        missing = [frame for frame, _ in times if frame not in files]
+        folder = Path(specification.location)
+        files = find_picture_files(folder, specification.camera)
+        stamped = folder / TIME_STAMPS
+        times = read_time_stamps(stamped) if stamped.is_file() else self._counted(folder, files)
+        missing = [frame for frame in times if frame not in files]
         if missing:
-            self.drop(f"{self._folder}: has no picture of {_listed(missing)}")
-            self.dropped += len(missing) - 1
-        strangers = sorted(set(files) - {frame for frame, _ in times})
+            self.drop(f"{folder}: has no picture of {_listed(missing)}", len(missing))
+        strangers = [frame for frame in files if frame not in times]
         if strangers:
-            self.drop(f"{stamped}: has no time of {_listed(strangers)}")
-            self.dropped += len(strangers) - 1
-        self._rows = [(files[frame], frame, time) for frame, time in times if frame in files]
+            self.drop(f"{stamped}: has no time of {_listed(strangers)}", len(strangers))
+        self._rows = [(files[frame], frame, times[frame]) for frame in times if frame in files]
         if not self._rows:
-            raise SceneError(f"{stamped}: has no time of any picture in {self._folder}")
+            raise SceneError(f"{stamped}: has no time of any picture in {folder}")
         self._next = 0
-        self._check_first()
+        # Pictures of a wrong size are refused before work begins.
+        for path, _, _ in self._rows:
+            try:
+                wrong = self.wrong_size(self._picture(path))
+            except SceneError:
+                continue  # It is named when its turn comes.
+            if wrong:
+                raise SceneError(f"{path}: camera '{specification.camera}' {wrong}")
+            return
+        raise SceneError(f"{folder}: not one of its pictures can be read")
 
     @property
     def ended(self) -> bool:
@@ -81,41 +85,28 @@ class FolderSource(FrameSource):
     def close(self) -> None:
         """Nothing is held open."""
 
-    def _counted(self, files: dict[str, Path]) -> list[tuple[str, float]]:
+    def _counted(self, folder: Path, files: dict[str, Path]) -> dict[str, float]:
         """The frames' times by their rate."""
         given = self.specification
         if given.rate_hz is None:
             raise SceneError(
-                f"{self._folder}: has no {TIME_STAMPS} (frame,time), so the source of camera "
+                f"{folder}: has no {TIME_STAMPS} (frame,time), so the source of camera "
                 f"'{given.camera}' needs rate_hz, its pictures a second"
             )
         names = set(files)
-        for folder in given.beside:
-            names |= set(find_picture_files(Path(folder), given.camera))
+        for other in given.beside:
+            names |= set(find_picture_files(Path(other), given.camera))
         ordered = sorted(names)
         if ordered != sorted(names, key=_by_number):
             raise SceneError(
-                f"{self._folder}: the frames' names are numbers of different lengths, so their "
+                f"{folder}: the frames' names are numbers of different lengths, so their "
                 f"order is unclear; fill them with zeros (0009, 0010) or give a {TIME_STAMPS}"
             )
-        return [(frame, k / given.rate_hz) for k, frame in enumerate(ordered)]
-
-    def _check_first(self) -> None:
-        """Refuses pictures of a wrong size before work begins."""
-        for path, _, _ in self._rows:
-            try:
-                picture = self._picture(path)
-            except SceneError:
-                continue  # It is named when its turn comes.
-            if wrong := self.wrong_size(picture):
-                raise SceneError(f"{path}: camera '{self.specification.camera}' {wrong}")
-            return
-        raise SceneError(f"{self._folder}: not one of its pictures can be read")
+        return {frame: k / given.rate_hz for k, frame in enumerate(ordered)}
 
     def _picture(self, path: Path) -> Picture | Mask:
-        if self.specification.gives_masks:
-            return read_person_mask(path, SceneError)
-        return read_picture(path, SceneError)
+        read = read_person_mask if self.specification.gives_masks else read_picture
+        return read(path, SceneError)
 
     def _read(self) -> TimedPicture | None:
         while self._next < len(self._rows):
@@ -136,31 +127,26 @@ class FolderSource(FrameSource):
 class VideoSource(FrameSource):
     """The pictures of a video file; those of masks are white on the person.
 
-    Args:
-        specification: of kind video.
-
     Raises:
         SceneError: names the file; when it is no video, or of another size.
     """
 
     def __init__(self, specification: SourceSpecification) -> None:
         super().__init__(specification)
-        self._path = Path(specification.location)
-        if not self._path.is_file():
-            raise SceneError(f"{self._path}: no such video file of camera '{specification.camera}'")
-        self._capture = cv2.VideoCapture(str(self._path))
+        path = specification.location
+        if not Path(path).is_file():
+            raise SceneError(f"{path}: no such video file of camera '{specification.camera}'")
+        self._capture = cv2.VideoCapture(path)
         self._count = 0
-        self._ahead: Picture | None = None
-        self._time = 0.0
-        self._advance()
+        self._ahead = self._advance()
         if self._ahead is None:
             raise SceneError(
-                f"{self._path}: not a video that OpenCV can read, though the source of camera "
+                f"{path}: not a video that OpenCV can read, though the source of camera "
                 f"'{specification.camera}'"
             )
-        if wrong := self.wrong_size(self._ahead):
+        if wrong := self.wrong_size(self._ahead.picture):
             self.close()
-            raise SceneError(f"{self._path}: camera '{specification.camera}' {wrong}")
+            raise SceneError(f"{path}: camera '{specification.camera}' {wrong}")
 
     @property
     def ended(self) -> bool:
@@ -179,31 +165,28 @@ class VideoSource(FrameSource):
         self._ahead = None
 
     def _read(self) -> TimedPicture | None:
-        if self._ahead is None:
-            return None
-        picture, time, frame = self._ahead, self._time, f"{self._count - 1:06d}"
-        self._advance()
-        seen = mask_of_picture(picture) if self.specification.gives_masks else picture
-        return TimedPicture(time + self.specification.offset, frame, seen)
+        taken = self._ahead
+        if taken is not None:
+            self._ahead = self._advance()
+        return taken
 
-    def _advance(self) -> None:
+    def _advance(self) -> TimedPicture | None:
         """Reads one picture ahead, so that the end is known."""
-        self._ahead = None
+        given = self.specification
         found, picture = self._capture.read()
         if not found or picture is None:
             promised = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
             if 0 < self._count < promised:
-                lost = promised - self._count
-                self.drop(f"{self._path}: ends after {self._count} of {promised} pictures")
-                self.dropped += lost - 1
-            return
-        rate = self.specification.rate_hz
-        if rate is None:
-            self._time = 1e-3 * self._capture.get(cv2.CAP_PROP_POS_MSEC)
-        else:
-            self._time = self._count / rate
+                reason = f"{given.location}: ends after {self._count} of {promised} pictures"
+                self.drop(reason, promised - self._count)
+            return None
+        time = 1e-3 * self._capture.get(cv2.CAP_PROP_POS_MSEC)
+        if given.rate_hz is not None:
+            time = self._count / given.rate_hz
         self._count += 1
-        self._ahead = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+        rgb = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+        seen = mask_of_picture(rgb) if given.gives_masks else rgb
+        return TimedPicture(time + given.offset, f"{self._count - 1:06d}", seen)
 
 
 def find_picture_files(folder: Path, camera: str) -> dict[str, Path]:
@@ -220,8 +203,8 @@ def find_picture_files(folder: Path, camera: str) -> dict[str, Path]:
     return files
 
 
-def read_time_stamps(path: Path) -> list[tuple[str, float]]:
-    """The frames and times [s] of a `timestamps.csv`, in its order.
+def read_time_stamps(path: Path) -> dict[str, float]:
+    """The times [s] by frame of a `timestamps.csv`, in its order.
 
     Raises:
         SceneError: names the file and the line.
@@ -245,7 +228,7 @@ def read_time_stamps(path: Path) -> list[tuple[str, float]]:
         if not math.isfinite(time):
             raise SceneError(f"{path}: line {line}: the time must be a number of seconds")
         found[frame] = time
-    return list(found.items())
+    return found
 
 
 def _by_number(name: str) -> tuple[str, int]:

@@ -15,11 +15,9 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True, eq=False)
 class Moment(Generic[Item]):
-    """What the cameras saw at one moment.
+    """What the cameras saw at one moment: its earliest time stamp [s], and the items by camera.
 
-    Args:
-        time: the earliest of its time stamps [s].
-        items: by camera, in the synchroniser's order; a camera that saw nothing then is missing.
+    A camera that saw nothing then is missing.
     """
 
     time: float
@@ -48,10 +46,7 @@ class Synchroniser(Generic[Item]):
     one, if that is at most the tolerance later. A moment is complete when every camera has given
     its picture or a later one. A camera that gives none is waited for a while; then it is left out
     of this moment and waited for no more until it gives a picture again. A picture that comes
-    after its moment is dropped.
-
-    Attributes:
-        late: by camera, how many pictures came too late.
+    after its moment is dropped, and counted in `late` by camera.
 
     Args:
         cameras: their names.
@@ -75,10 +70,8 @@ class Synchroniser(Generic[Item]):
             )
         self.tolerance, self.patience = tolerance, patience
         self.late = dict.fromkeys(self.cameras, 0)
-        self._queues: dict[str, deque[tuple[float, Item]]] = {
-            name: deque() for name in self.cameras
-        }
-        self._last_times = dict.fromkeys(self.cameras, -math.inf)
+        self._queues = {name: deque[tuple[float, Item]]() for name in self.cameras}
+        self._last_times: dict[str, float] = {}
         self._newest = -math.inf
         self._moment_time = -math.inf
         self._moment_cameras: set[str] = set()
@@ -96,12 +89,7 @@ class Synchroniser(Generic[Item]):
         return len(self._queues[camera])
 
     def add(self, camera: str, time: float, item: Item) -> bool:
-        """Takes a camera's next picture.
-
-        Args:
-            camera: its name.
-            time: its time stamp [s], after those of the camera's earlier pictures.
-            item: the picture, or what stands for it.
+        """Takes a camera's next picture with its time stamp [s].
 
         Returns:
             Whether it can still be part of a moment.
@@ -112,7 +100,7 @@ class Synchroniser(Generic[Item]):
         if camera not in self._queues:
             raise UnknownNameError("camera", camera, self.cameras, "the synchroniser")
         missed = time <= self._moment_time + self.tolerance and camera not in self._moment_cameras
-        if missed or time <= self._moment_time or time <= self._last_times[camera]:
+        if missed or time <= self._moment_time or time <= self._last_times.get(camera, -math.inf):
             self.late[camera] += 1
             return False
         if camera in self._left_out:
@@ -128,13 +116,10 @@ class Synchroniser(Generic[Item]):
         self._finished.add(camera)
 
     def take(self, now: float | None = None) -> Moment[Item] | None:
-        """The next moment.
+        """The next moment; None where there is none, or one that still waits for a camera.
 
         Args:
             now: the time [s]; the newest time stamp where not given.
-
-        Returns:
-            None where there is none, or one that still waits for a camera.
         """
         heads = {name: queue[0][0] for name, queue in self._queues.items() if queue}
         if not heads:
@@ -148,11 +133,10 @@ class Synchroniser(Generic[Item]):
         if awaited:
             if (self._newest if now is None else max(now, self._newest)) < begin + self.patience:
                 return None
+            self._left_out.update(awaited)
             for name in awaited:
-                self._left_out.add(name)
-                last = self._last_times[name]
-                seen = last if math.isfinite(last) else math.nan
-                self._changes.append(CameraChange(name, seen, stopped=True))
+                last = self._last_times.get(name, math.nan)
+                self._changes.append(CameraChange(name, last, stopped=True))
         items = {
             name: self._queues[name].popleft()[1]
             for name in self.cameras

@@ -15,9 +15,8 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from drake_pose.camera.sources.files import load_background_pictures
+from drake_pose.camera.sources.files import load_background_pictures, open_source
 from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecification
-from drake_pose.camera.sources.opening import open_source
 from drake_pose.errors import DrakePoseError
 from drake_pose.fit.camera_sums import (
     Views,

@@ -7,13 +7,12 @@ from pathlib import Path
 
 import cv2
 
-from drake_pose.camera.sources.files import load_sources
+from drake_pose.camera.sources.files import load_sources, open_source
 from drake_pose.camera.sources.frame_source import (
     FrameSource,
     Picture,
     SourceSpecification,
 )
-from drake_pose.camera.sources.opening import open_source
 from drake_pose.errors import OutputError, SceneError
 
 # How long it is waited for a camera [s].

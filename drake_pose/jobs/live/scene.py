@@ -16,9 +16,9 @@ from drake_pose.camera.sources.files import (
     SOURCES,
     load_background_pictures,
     load_sources,
+    open_source,
 )
 from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecification
-from drake_pose.camera.sources.opening import open_source
 from drake_pose.errors import DrakePoseError, SceneError
 from drake_pose.silhouette.segmentation.background import Background, learn_background
 from drake_pose.systems.person.live_capture import LocalSensors

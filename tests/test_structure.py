@@ -29,7 +29,6 @@ WITH_SYSTEMS = {"systems", "results", "jobs", "papers", "commands"}
 # Drake keeps three plain value types, ImageLabel16I, CameraInfo and CameraConfig, in
 # pydrake.systems.sensors.
 VALUE_TYPES = {
-    "camera/config_files.py",
     "camera/drake.py",
     "silhouette/pictures/label_images.py",
 }

@@ -37,16 +37,17 @@ def check_number(value: Any, field: str, where: str, *, positive: bool = False) 
     Raises:
         CameraError: when it is none.
     """
-    kind = "a finite positive number" if positive else "a finite number"
-    accepted = isinstance(value, int | float | str | np.integer | np.floating)
-    if not accepted or isinstance(value, bool):
-        raise CameraError(f"{where}: {field} must be {kind}, not {_short(value)}")
     try:
+        if isinstance(value, bool) or not isinstance(
+            value, int | float | str | np.integer | np.floating
+        ):
+            raise ValueError
         number = float(value)
+        if not math.isfinite(number) or (positive and number <= 0.0):
+            raise ValueError
     except (ValueError, OverflowError):
+        kind = "a finite positive number" if positive else "a finite number"
         raise CameraError(f"{where}: {field} must be {kind}, not {_short(value)}") from None
-    if not math.isfinite(number) or (positive and number <= 0.0):
-        raise CameraError(f"{where}: {field} must be {kind}, not {_short(value)}")
     return number
 
 
@@ -88,18 +89,13 @@ def check_pose(value: Any, field: str, where: str) -> np.ndarray:
 
 def _read_matrix(value: Any, field: str, where: str) -> np.ndarray:
     """Returns the 4 x 4 numbers as a fresh array; lists from a file are checked entry by entry."""
+    rows = value if isinstance(value, list | tuple) else ()
     if isinstance(value, np.ndarray):
         if value.shape == (4, 4) and value.dtype.kind in "fiu":
             return np.array(value, dtype=np.float64)
-    elif _is_list_of_four(value) and all(_is_list_of_four(row) for row in value):
-        rows = [[check_number(entry, field, where) for entry in row] for row in value]
-        return np.array(rows, dtype=np.float64)
+    elif len(rows) == 4 and all(isinstance(row, list | tuple) and len(row) == 4 for row in rows):
+        return np.array([[check_number(entry, field, where) for entry in row] for row in rows])
     raise CameraError(f"{where}: {field} must be a 4 x 4 matrix of numbers, not {_short(value)}")
-
-
-def _is_list_of_four(value: Any) -> bool:
-    """Whether a value is a list or tuple of four entries."""
-    return isinstance(value, list | tuple) and len(value) == 4
 
 
 def _short(value: Any) -> str:

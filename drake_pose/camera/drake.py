@@ -1,16 +1,19 @@
-"""Cameras to and from Drake's render cameras and CameraConfig.
+"""Cameras to and from Drake's render cameras, CameraConfig and Scenario files.
 
-Drake's value types CameraInfo and CameraConfig live in pydrake.systems.sensors; they alone are
-taken from there.
 Drake puts pixel centres at i + 0.5, drake_pose at i: principal points differ by half a pixel.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import yaml
 from pydrake.common.schema import Rotation, Transform
+from pydrake.common.yaml import yaml_dump, yaml_dump_typed, yaml_load, yaml_load_typed
 from pydrake.geometry import (
     ClippingRange,
     ColorRenderCamera,
@@ -21,8 +24,11 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraConfig, CameraInfo
 
-from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
+from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError
+
+# What yaml_load_typed raises, and some values of CameraConfig end a process that does not ask.
+_BAD_CONFIG = (RuntimeError, ValueError, TypeError, KeyError, AttributeError, SystemExit)
 
 HALF_PIXEL = 0.5
 """What Drake's principal point has more than ours [pixel]."""
@@ -53,55 +59,37 @@ def camera_to_drake(
         CameraError: when the principal point of a pinhole lies outside the picture (Drake refuses
             it), or the depth range is not finite, positive and increasing.
     """
+    X_CT = RigidTransform()
     if isinstance(camera, PinholeCamera):
-        return _pinhole_to_drake(camera, renderer_name, depth_range)
-    return _parallel_to_drake(camera, renderer_name, depth_range or _PARALLEL_DEPTHS)
-
-
-def _pinhole_to_drake(
-    camera: PinholeCamera, renderer_name: str, depth_range: tuple[float, float] | None
-) -> tuple[ColorRenderCamera, DepthRenderCamera, RigidTransform]:
-    """See camera_to_drake."""
-    near, far = (camera.near, max(_FARTHEST, 2.0 * camera.near))
-    if depth_range is not None:
-        near, far = depth_range
-    center_x, center_y = camera.center_x + HALF_PIXEL, camera.center_y + HALF_PIXEL
-    if not (0.0 < center_x < camera.width and 0.0 < center_y < camera.height):
+        near, far = depth_range or (camera.near, max(_FARTHEST, 2.0 * camera.near))
+        center_x, center_y = camera.center_x + HALF_PIXEL, camera.center_y + HALF_PIXEL
+        if not (0.0 < center_x < camera.width and 0.0 < center_y < camera.height):
+            raise CameraError(
+                f"camera '{camera.name}': Drake's renderer needs the principal point inside the "
+                f"picture, but it is at ({camera.center_x:g}, {camera.center_y:g}) of "
+                f"{camera.width} x {camera.height}"
+            )
+        numbers = camera.focal_x, camera.focal_y, center_x, center_y
+    else:
+        nearest, farthest = depth_range or _PARALLEL_DEPTHS
+        middle, half = 0.5 * (nearest + farthest), 0.5 * (farthest - nearest)
+        distance = max(_TELE_DISTANCE, 10.0 * half)
+        near, far = distance - half, distance + half
+        focal = camera.pixels_per_metre * distance
+        # Drake's principal point must lie inside the picture: stand behind the picture's middle.
+        center_x, center_y = 0.5 * camera.width, 0.5 * camera.height
+        aside = np.array([center_x - camera.center_x, center_y - camera.center_y]) - HALF_PIXEL
+        X_CT = RigidTransform(np.array([*(aside / camera.pixels_per_metre), middle - distance]))
+        numbers = focal, focal, center_x, center_y
+    if not (math.isfinite(far) and 0.0 < near < far):
         raise CameraError(
-            f"camera '{camera.name}': Drake's renderer needs the principal point inside the "
-            f"picture, but it is at ({camera.center_x:g}, {camera.center_y:g}) of "
-            f"{camera.width} x {camera.height}"
+            f"camera '{camera.name}': the depth range must be finite, positive and increasing, "
+            f"not {near:g} to {far:g} m"
         )
-    intrinsics = CameraInfo(
-        camera.width, camera.height, camera.focal_x, camera.focal_y, center_x, center_y
-    )
-    color, depth = _render_cameras(camera.name, renderer_name, intrinsics, near, far)
-    return color, depth, _rigid_transform(camera.X_WC)
-
-
-def _parallel_to_drake(
-    camera: ParallelCamera, renderer_name: str, depth_range: tuple[float, float]
-) -> tuple[ColorRenderCamera, DepthRenderCamera, RigidTransform]:
-    """See camera_to_drake."""
-    nearest, farthest = depth_range
-    middle, half = 0.5 * (nearest + farthest), 0.5 * (farthest - nearest)
-    distance = max(_TELE_DISTANCE, 10.0 * half)
-    focal = camera.pixels_per_metre * distance
-    # Drake's principal point must lie inside the picture: stand behind the picture's middle.
-    intrinsics = CameraInfo(
-        camera.width, camera.height, focal, focal, 0.5 * camera.width, 0.5 * camera.height
-    )
-    p_CT = np.array(
-        [
-            (0.5 * camera.width - HALF_PIXEL - camera.center_x) / camera.pixels_per_metre,
-            (0.5 * camera.height - HALF_PIXEL - camera.center_y) / camera.pixels_per_metre,
-            middle - distance,
-        ]
-    )
-    color, depth = _render_cameras(
-        camera.name, renderer_name, intrinsics, distance - half, distance + half
-    )
-    return color, depth, _rigid_transform(camera.X_WC) @ RigidTransform(p_CT)
+    intrinsics = CameraInfo(camera.width, camera.height, *numbers)
+    core = RenderCameraCore(renderer_name, intrinsics, ClippingRange(near, far), RigidTransform())
+    depth = DepthRenderCamera(core, DepthRange(near, far))
+    return ColorRenderCamera(core), depth, _rigid_transform(camera.X_WC) @ X_CT
 
 
 def camera_from_drake(
@@ -187,12 +175,11 @@ def camera_to_config(camera: Camera) -> CameraConfig:
     pose = Transform()
     pose.rotation = rotation
     pose.translation = camera.X_WC[:3, 3].tolist()
-    focal = CameraConfig.FocalLength(x=camera.focal_x, y=camera.focal_y)
     config = CameraConfig(
         name=camera.name,
         width=camera.width,
         height=camera.height,
-        focal=focal,
+        focal=CameraConfig.FocalLength(x=camera.focal_x, y=camera.focal_y),
         center_x=camera.center_x + HALF_PIXEL,
         center_y=camera.center_y + HALF_PIXEL,
         clipping_near=camera.near,
@@ -206,17 +193,67 @@ def camera_to_config(camera: Camera) -> CameraConfig:
     return config
 
 
-def _render_cameras(
-    name: str, renderer_name: str, intrinsics: CameraInfo, near: float, far: float
-) -> tuple[ColorRenderCamera, DepthRenderCamera]:
-    """Returns Drake's two render cameras of the same intrinsics and clipping range [m]."""
-    if not (math.isfinite(far) and 0.0 < near < far):
-        raise CameraError(
-            f"camera '{name}': the depth range must be finite, positive and increasing, "
-            f"not {near:g} to {far:g} m"
+def read_configs(entries: Mapping[str, Any], path: Path) -> dict[str, PinholeCamera]:
+    """Returns the cameras of CameraConfig entries as ``read_yaml`` gives them with their tags.
+
+    An entry's key is the camera's name unless its ``name`` says another.
+
+    Raises:
+        CameraError: names the file, the camera and what is wrong.
+    """
+    cameras: dict[str, PinholeCamera] = {}
+    for key, entry in entries.items():
+        where = f"{path}: camera '{key}'"
+        content = {} if entry is None else entry
+        if not isinstance(content, dict):
+            raise CameraError(f"{where}: expected the fields of a CameraConfig")
+        try:
+            config = yaml_load_typed(schema=CameraConfig, data=yaml_dump(content))
+        except (*_BAD_CONFIG, yaml.YAMLError) as error:
+            raise CameraError(
+                f"{where}: no CameraConfig: {' '.join(str(error).split())}"
+            ) from error
+        if "name" not in content:
+            config.name = str(key)
+        try:
+            camera = camera_from_config(config)
+        except CameraError as error:
+            raise CameraError(f"{path}: {error}") from error
+        if camera.name in cameras:
+            raise CameraError(f"{path}: camera '{camera.name}' is given twice")
+        cameras[camera.name] = camera
+    return cameras
+
+
+def dump_scenario(cameras: Mapping[str, Camera] | Iterable[Camera]) -> str:
+    """The text of a Scenario with these cameras, which Drake's ``LoadScenario`` and we read.
+
+    Label images are on, which an estimator needs, and Drake's default is that they are not.
+
+    Raises:
+        CameraError: a parallel camera, or one whose principal point lies outside its picture.
+    """
+    listed = cameras.values() if isinstance(cameras, Mapping) else cameras
+    content = {}
+    for camera in listed:
+        config = camera_to_config(camera)
+        content[camera.name] = yaml_load(
+            data=yaml_dump_typed(config, schema=CameraConfig, defaults=CameraConfig())
         )
-    core = RenderCameraCore(renderer_name, intrinsics, ClippingRange(near, far), RigidTransform())
-    return ColorRenderCamera(core), DepthRenderCamera(core, DepthRange(near, far))
+    return str(yaml_dump({"cameras": content}))
+
+
+def save_scenario(path: str | Path, cameras: Mapping[str, Camera] | Iterable[Camera]) -> None:
+    """Writes the ``cameras`` of a Drake Scenario, which ``load_cameras`` reads, too.
+
+    Raises:
+        CameraError: as ``dump_scenario``; and when the file cannot be written.
+    """
+    text = dump_scenario(cameras)
+    try:
+        Path(path).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise CameraError(f"{path}: cannot write the cameras: {error.strerror}") from error
 
 
 def _rigid_transform(X_AB: np.ndarray) -> RigidTransform:

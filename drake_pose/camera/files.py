@@ -93,7 +93,7 @@ def load_camera_file(path: str | Path) -> CameraFile:
     configs = _find_configs(content, path)
     if configs is not None:
         # Drake takes a while to load, and our own files do not need it.
-        from drake_pose.camera.config_files import read_configs
+        from drake_pose.camera.drake import read_configs
 
         found = read_configs(configs, path)
         return CameraFile({_check_name(name, path): found[name] for name in found}, ())

@@ -4,14 +4,52 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 from drake_pose.camera.checks import check_number, check_pose, check_side
 
 
+class _PosedCamera:
+    """What both cameras have: a name, a picture's size and principal point, and a pose."""
+
+    name: str
+    X_WC: np.ndarray
+
+    def __post_init__(self) -> None:
+        where = f"camera '{self.name}'"
+        for field in dataclasses.fields(self):  # type: ignore[arg-type]
+            value = getattr(self, field.name)
+            if field.name in ("width", "height"):
+                value = check_side(value, field.name, where)
+            elif field.name == "X_WC":
+                value = check_pose(value, field.name, where)
+            elif field.name != "name":
+                positive = not field.name.startswith("center")
+                value = check_number(value, field.name, where, positive=positive)
+            object.__setattr__(self, field.name, value)
+
+    @property
+    def X_CW(self) -> np.ndarray:
+        """(4, 4) the world's pose in the camera."""
+        return inverse_pose(self.X_WC)
+
+    def _in_camera(self, p_W: np.ndarray) -> np.ndarray:
+        """Points (n, 3) of the world in the camera's frame."""
+        X_CW = self.X_CW
+        return np.asarray(p_W, dtype=np.float64).reshape(-1, 3) @ X_CW[:3, :3].T + X_CW[:3, 3]
+
+    def with_pose(self: _Camera, X_WC: np.ndarray) -> _Camera:
+        """Returns the same camera at another pose (4, 4)."""
+        return dataclasses.replace(self, X_WC=X_WC)  # type: ignore[type-var]
+
+
+_Camera = TypeVar("_Camera", bound=_PosedCamera)
+
+
 @dataclass(frozen=True, eq=False)
-class PinholeCamera:
+class PinholeCamera(_PosedCamera):
     """A pinhole camera without distortion.
 
     Args:
@@ -37,38 +75,17 @@ class PinholeCamera:
     X_WC: np.ndarray
     near: float = 0.01
 
-    def __post_init__(self) -> None:
-        where = f"camera '{self.name}'"
-        _set_sides_and_center(self, where)
-        for field in ("focal_x", "focal_y", "near"):
-            number = check_number(getattr(self, field), field, where, positive=True)
-            object.__setattr__(self, field, number)
-
-    @property
-    def X_CW(self) -> np.ndarray:
-        """(4, 4) the world's pose in the camera."""
-        return inverse_pose(self.X_WC)
-
     def project(self, p_W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Projects points of the world.
+        """Projects points (n, 3) [m] of the world to (n, 2) pixels and (n,) depths [m].
 
-        Args:
-            p_W: (n, 3) points [m].
-
-        Returns:
-            (n, 2) pixels and (n,) depths along the camera's z [m]. A point whose depth is not
-            positive has no picture: its pixel is NaN.
+        A point whose depth is not positive has no picture: its pixel is NaN.
         """
-        p_C = _in_camera(self.X_CW, p_W)
+        p_C = self._in_camera(p_W)
         depth = p_C[:, 2]
         visible = np.where(depth > 0.0, depth, np.nan)
         u = self.center_x + self.focal_x * p_C[:, 0] / visible
         v = self.center_y + self.focal_y * p_C[:, 1] / visible
         return np.column_stack([u, v]), depth
-
-    def with_pose(self, X_WC: np.ndarray) -> PinholeCamera:
-        """Returns the same camera at another pose (4, 4)."""
-        return dataclasses.replace(self, X_WC=X_WC)
 
     def resized(self, width: int, height: int) -> PinholeCamera:
         """Returns the camera of the same pictures at another size [pixel]."""
@@ -90,21 +107,11 @@ class PinholeCamera:
 
 
 @dataclass(frozen=True, eq=False)
-class ParallelCamera:
+class ParallelCamera(_PosedCamera):
     """A camera of parallel rays (Kameda, Minoh and Ikeda, section 6: 2.26 pixels a centimetre).
 
-    u = center_x + pixels_per_metre * x_C, v = center_y + pixels_per_metre * y_C.
-
-    Args:
-        name: the camera's name.
-        width, height: the picture's size [pixel].
-        pixels_per_metre: the scale.
-        center_x, center_y: the picture of the camera's origin [pixel], pixel centres at integers.
-        X_WC: (4, 4) the camera's pose in the world, x right, y down, z forward [m]; read-only.
-
-    Raises:
-        CameraError: when a parameter is not finite, has the wrong sign or size, or X_WC is not a
-            rigid transform.
+    u = center_x + pixels_per_metre * x_C, v = center_y + pixels_per_metre * y_C; the other
+    parameters, and what is raised, are those of a PinholeCamera.
     """
 
     name: str
@@ -115,26 +122,11 @@ class ParallelCamera:
     center_y: float
     X_WC: np.ndarray
 
-    def __post_init__(self) -> None:
-        where = f"camera '{self.name}'"
-        _set_sides_and_center(self, where)
-        scale = check_number(self.pixels_per_metre, "pixels_per_metre", where, positive=True)
-        object.__setattr__(self, "pixels_per_metre", scale)
-
-    @property
-    def X_CW(self) -> np.ndarray:
-        """(4, 4) the world's pose in the camera."""
-        return inverse_pose(self.X_WC)
-
     def project(self, p_W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Projects points (n, 3) [m] of the world to (n, 2) pixels and (n,) depths [m]."""
-        p_C = _in_camera(self.X_CW, p_W)
+        p_C = self._in_camera(p_W)
         uv = np.array([self.center_x, self.center_y]) + self.pixels_per_metre * p_C[:, :2]
         return uv, p_C[:, 2]
-
-    def with_pose(self, X_WC: np.ndarray) -> ParallelCamera:
-        """Returns the same camera at another pose (4, 4)."""
-        return dataclasses.replace(self, X_WC=X_WC)
 
     def kernel_parameters(self) -> np.ndarray:
         """Returns (8,) kind (1: parallel), f_x, f_y, c_x, c_y, near (unused), width, height."""
@@ -147,23 +139,9 @@ Camera = PinholeCamera | ParallelCamera
 """A camera of either kind."""
 
 
-def _set_sides_and_center(camera: Camera, where: str) -> None:
-    """Checks the fields that both cameras have, and stores them as plain Python numbers."""
-    for field in ("width", "height"):
-        object.__setattr__(camera, field, check_side(getattr(camera, field), field, where))
-    for field in ("center_x", "center_y"):
-        object.__setattr__(camera, field, check_number(getattr(camera, field), field, where))
-    object.__setattr__(camera, "X_WC", check_pose(camera.X_WC, "X_WC", where))
-
-
 def inverse_pose(X_AB: np.ndarray) -> np.ndarray:
     """Returns X_BA of a pose X_AB (4, 4)."""
     X_BA = np.eye(4)
     X_BA[:3, :3] = X_AB[:3, :3].T
     X_BA[:3, 3] = -X_AB[:3, :3].T @ X_AB[:3, 3]
     return X_BA
-
-
-def _in_camera(X_CW: np.ndarray, p_W: np.ndarray) -> np.ndarray:
-    """Returns points (n, 3) of the world in the camera's frame."""
-    return np.asarray(p_W, dtype=np.float64).reshape(-1, 3) @ X_CW[:3, :3].T + X_CW[:3, 3]

@@ -46,7 +46,7 @@ class PlannedLimb:
         poses: (n, k) values all over its limits; the first is at rest.
         stretched: (s,) in which of them the limb is stretched out.
         samples_T: (n, m, 3) points along it in the trunk's frame at these [m].
-        weights: (n, m) their shares: less where others are beside them, as on a folded limb.
+        weights: (n, m) of the points, see crowding.
         length: from its root to its end, stretched out [m].
     """
 
@@ -64,13 +64,9 @@ class BodyPlan:
     """A person's limbs and trunk in a pose tree.
 
     Attributes:
-        kinematics: the pose tree's.
         landmarks: the anatomical joint centres.
         trunk: the node that the limbs hang on.
         heading: the value that turns all of the body freely, about the vertical; None: no such.
-
-    Args:
-        kinematics: the pose tree's kinematics.
 
     Raises:
         ModelError: the model has no landmarks, or not those of trunk, arms and legs.
@@ -124,11 +120,9 @@ class BodyPlan:
         chosen = np.arange(_POSES // _STRETCHED)
         poses[np.ix_(chosen, stretched)] = poses[0, stretched]
         joints = np.array([self.landmarks.names.index(name) for name in (root, middle, end)])
-        X_WN = np.empty((_POSES, len(moves), 4, 4))
-        for k, pose in enumerate(poses):
-            posed = rest.copy()
-            posed[values] = pose
-            X_WN[k] = kinematics.poses(posed)
+        posed = np.tile(rest, (_POSES, 1))
+        posed[:, values] = poses
+        X_WN = np.array([kinematics.poses(one) for one in posed])
         samples_W = self._samples(joints, X_WN)
         R_WT, p_WT = X_WN[:, self.trunk, :3, :3], X_WN[:, self.trunk, :3, 3]
         samples_T = np.einsum("nji,nmj->nmi", R_WT, samples_W - p_WT[:, None])
@@ -152,7 +146,7 @@ class BodyPlan:
 
 
 def crowding(samples: Array) -> Array:
-    """(n, m) what each of points (n, m, 3) counts: one over the points around it, and over m."""
+    """(n, m) weights of points (n, m, 3): one over the points about each, over m."""
     off = samples[:, :, None] - samples[:, None]
     near = np.einsum("nabi,nabi->nab", off, off) < _APART**2
     return np.asarray(1.0 / (near.sum(axis=2) * samples.shape[1]))

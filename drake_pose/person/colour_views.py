@@ -1,21 +1,19 @@
 """What cameras' pictures say of a person where there is no silhouette: colours along lines.
 
-The lines are those of `colour_lines`, as wide as the fit's scale: a model that is only like the
-person is off by centimetres, and colours are counted on both sides of the edge that is seen, not
-of the model's contour.
+The lines are as wide as the fit's scale: a model that is only like the person is off by
+centimetres, and colours are counted on both sides of the edge that is seen, not of the contour.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.camera.models import Camera
-from drake_pose.errors import SettingsError
 from drake_pose.fit.camera_sums import AddUp, CameraSum
 from drake_pose.fit.colour_lines import COLOURS, compare_lines, learn_colours
 from drake_pose.fit.colours import NO_REGION, Picture, check_picture
@@ -33,42 +31,18 @@ Mask = NDArray[np.bool_]
 # By camera (nodes, 3, COLOURS): what is known of the colours on a body's parts and beside them.
 KnownColours = Mapping[str, NDArray[np.float32]]
 
+# Lengths [m] are those seen at the body's root. Of lines along the contour; colours are counted so
+# far inside of the edge, and outside of it, from offset to offset.
+_SPACING, _WIDTHS, _COUNTED = 0.015, (0.05, 0.10), 0.006
+# Lines on which the edge seems to be further from the contour than this teach nothing.
+_AGREEING = 0.03
+# The share of a frame's colours in what is known after it.
+_RATE = 0.1
 # From offset to offset of a line, as a share of the fit's scale: the window is as wide as that.
 _STEP = 0.2
 # In small pictures colours are counted so far inside and outside all the same, and edges that are
 # so far off are believed [pixel].
 _LEAST_WIDTHS, _LEAST_AGREEING = (6.0, 12.0), 2.5
-
-
-@dataclass(frozen=True)
-class PersonColourSettings:
-    """How colours are counted and compared; lengths [m] are those seen at the body's root.
-
-    Args:
-        spacing: of lines along the contour.
-        inside, outside: colours are counted so far inside of the edge, and outside of it.
-        rate: the share of a frame's colours in what is known after it, 0 to 1.
-        agreeing: lines on which the edge seems to be further from the contour than this teach
-            nothing: something else is there.
-        step: from offset to offset of lines where colours are counted.
-
-    Raises:
-        SettingsError: a number that is not positive, or a rate above 1.
-    """
-
-    spacing: float = 0.015
-    inside: float = 0.05
-    outside: float = 0.10
-    rate: float = 0.1
-    agreeing: float = 0.03
-    step: float = 0.006
-
-    def __post_init__(self) -> None:
-        for name in ("spacing", "inside", "outside", "rate", "agreeing", "step"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise SettingsError(f"{name} must be positive, not {getattr(self, name)}")
-        if self.rate > 1.0:
-            raise SettingsError(f"the rate of colours must be at most 1, not {self.rate}")
 
 
 class ColourViews:
@@ -77,13 +51,11 @@ class ColourViews:
     Attributes:
         cameras: those that have a picture.
         pictures: (H, W, 3 or 4) of each, red, green, blue.
-        known: what is known of the colours.
+        known: of the colours on the body's parts and beside them.
 
     Args:
         cameras, pictures: as above.
-        known: by camera (nodes, 3, COLOURS) what is known of the colours on a body's parts and
-            beside them; a camera that is not in it says nothing.
-        settings: how.
+        known: a camera that is not in it says nothing.
 
     Raises:
         SettingsError: pictures that do not fit the cameras.
@@ -94,22 +66,19 @@ class ColourViews:
         cameras: Sequence[Camera],
         pictures: Sequence[Picture],
         known: KnownColours,
-        settings: PersonColourSettings | None = None,
     ) -> None:
         self.cameras = tuple(cameras)
         self.pictures = [
             check_picture(camera, picture)
             for camera, picture in zip(cameras, pictures, strict=True)
         ]
-        self.known, self._settings = known, settings or PersonColourSettings()
+        self.known = known
         self._packed = pack_cameras(cameras)
 
     def compare(self, fit: ContourFit, placement: Placement, step: AnnealingStage) -> Comparison:
         """What each camera says of a body where it stands."""
         count, nodes = len(self.cameras), len(placement.X_WN)
-        weights = fit.weights(
-            self._packed, placement, replace(step, spacing=self._settings.spacing)
-        )
+        weights = fit.weights(self._packed, placement, replace(step, spacing=_SPACING))
         A, b = np.zeros((count, nodes, 12, 12)), np.zeros((count, nodes, 12))
         sums = np.zeros((count, nodes + 1, 6))
         for c, camera in enumerate(self.cameras):
@@ -137,15 +106,14 @@ class ColourViews:
         Args:
             fit: of the person.
             values: (m,) of the pose tree.
-            regions: (H, W) the person by camera, where they are known. Other cameras of which
-                nothing is known yet learn on both sides of the contour.
+            regions: (H, W) the person by camera, where known; other cameras of which nothing is
+                known yet learn on both sides of the contour.
         """
-        settings, regions = self._settings, regions or {}
         placement = fit.body.place(values)
         scales = pixels_per_metre(self._packed, placement.X_WN[0, :3, 3])
         learned = dict(self.known)
         for c, camera in enumerate(self.cameras):
-            region = regions.get(camera.name)
+            region = (regions or {}).get(camera.name)
             known = learned.get(camera.name)
             size = float(scales[c])
             surely = known is None or region is not None
@@ -156,11 +124,11 @@ class ColourViews:
             )
             learn_colours(
                 placement.packed, placement.X_WN, self._camera(c), self.pictures[c], histograms,
-                max(2.0, settings.spacing * size),
-                np.maximum([settings.inside * size, settings.outside * size], _LEAST_WIDTHS),
-                1.0 if surely else settings.rate,
-                math.inf if surely else max(settings.agreeing * size, _LEAST_AGREEING),
-                max(1, round(settings.step * size)),
+                max(2.0, _SPACING * size),
+                np.maximum(np.multiply(_WIDTHS, size), _LEAST_WIDTHS),
+                1.0 if surely else _RATE,
+                math.inf if surely else max(_AGREEING * size, _LEAST_AGREEING),
+                max(1, round(_COUNTED * size)),
                 NO_REGION if region is None else np.ascontiguousarray(region),
             )  # fmt: skip
             learned[camera.name] = histograms

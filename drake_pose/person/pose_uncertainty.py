@@ -1,13 +1,12 @@
 """How sure a pose is that was fitted to silhouettes.
 
-Two things make the contours of body and regions differ: the pictures' noise, and that the person's
-surface is not the model's. Both are estimated from what is left of the contours' distances in the
-frame itself. The surface: each part's may be shifted, turned and stretched by as much as makes the
-distances, common to all cameras, likeliest (variance components by restricted maximum likelihood,
-Patterson and Thompson 1971). The noise: what the distances of one part in one camera amount to; a
-part errs together in a camera, so no length of correlation has to be known.
-
-What the silhouettes do not tell is as unsure as anything inside the limits.
+Contours of body and regions differ by the pictures' noise and because the person's surface is not
+the model's; both are estimated from what is left of the contours' distances in the frame itself.
+Surface: each part's may be shifted, turned and stretched by as much as makes the distances, common
+to all cameras, likeliest (variance components by restricted maximum likelihood, Patterson and
+Thompson 1971). Noise: what the distances of one part in one camera amount to; a part errs together
+in a camera, so no length of correlation has to be known. What the silhouettes do not tell is as
+unsure as anything inside the limits.
 """
 
 from __future__ import annotations
@@ -38,8 +37,7 @@ class PoseUncertainty:
 
     Args:
         covariance: (m, m) of the pose tree's values [rad, m].
-        information: (m, m) what the silhouettes tell of all values, held ones included, and nothing
-            else does.
+        information: (m, m) by the silhouettes alone, of all values, held ones included.
         noise: the variance of the contours' distances, 1 as the fit's noise says.
         surface: how far the parts' surfaces are off the model's [m].
     """
@@ -58,13 +56,12 @@ def pose_uncertainty(
 ) -> PoseUncertainty:
     """The uncertainty of a fitted pose, as far as the pictures and the limits tell.
 
-    What is expected from the last frame does not count, so nothing gets sure by being looked at in
-    the same way for long.
+    What is expected from the last frame does not count: nothing gets sure by being looked at long.
 
     Args:
         fit: what fitted it.
         compared: what the cameras say of the pose at the scale of the last step.
-        held: (m,) values that were held, such as lengths; None: none.
+        held: (m,) values that were held, such as lengths.
         held_covariance: (h, h) of these; None: they are exact.
     """
     size = len(fit.lower)
@@ -105,13 +102,7 @@ def _limits_information(fit: ContourFit) -> Array:
 
 
 def _noise(A: Array, b: Array, Q: Array) -> float:
-    """The variance of the distances, 1 as the fit's noise says.
-
-    Args:
-        A: (cameras, nodes, 12, 12) and b: (cameras, nodes, 12) as of `ContourFit.compare`, where
-            everything fits best.
-        Q: (nodes, 12, 12) covariance of the nodes' affine motions.
-    """
+    """The variance of distances (A, b of a comparison); Q (nodes, 12, 12): motions' covariance."""
     shares = Q @ A
     # What was fitted follows the distances: they are as much smaller as it has freedom.
     freedom = np.einsum("cnii->", shares) - np.einsum("cnij,cnji->", shares, shares)
@@ -159,16 +150,7 @@ def _with_surfaces(
     free: NDArray[np.intp],
     apriori: Array,
 ) -> tuple[float, Array]:
-    """How likely the distances are where surfaces are so far off, and (m, m) what they tell then.
-
-    Args:
-        parts: of _parts.
-        noise: the variance of the distances.
-        surface: standard deviation [m].
-        moves: (nodes, m, 12) what each value does to each node.
-        free: which values were fitted.
-        apriori: (m,) information.
-    """
+    """The likelihood of the distances where surfaces are so far off, and the information (m, m)."""
     information = parts.information / noise
     pulls = np.einsum("nij,ni->nj", parts.directions, parts.b) / noise
     share = 1.0 / (information + surface**-2)

@@ -1,4 +1,4 @@
-"""Viewing rays of pixels, and where two of them meet (Date et al., 3.1.2)."""
+"""Viewing rays of pixels, where they meet (Date et al., 3.1.2), and pictures at points in space."""
 
 from __future__ import annotations
 
@@ -9,20 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.camera.models import Camera, ParallelCamera
+from drake_pose.compiled import compiled
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 
 def viewing_rays(camera: Camera, uv: Array) -> tuple[Array, Array]:
-    """The rays on which pixels lie.
-
-    Args:
-        camera: the camera.
-        uv: (n, 2) pixels.
-
-    Returns:
-        Origins (n, 3) [m] and directions (n, 3) of length 1, in the world.
-    """
+    """Origins (n, 3) [m] and unit directions (n, 3) in the world of the rays of pixels (n, 2)."""
     pixels = np.asarray(uv, dtype=np.float64).reshape(-1, 2)
     R, p = camera.X_WC[:3, :3], camera.X_WC[:3, 3]
     off = pixels - [camera.center_x, camera.center_y]
@@ -37,12 +31,8 @@ def viewing_rays(camera: Camera, uv: Array) -> tuple[Array, Array]:
 
 def nearest_points(
     origins_a: Array, directions_a: Array, origins_b: Array, directions_b: Array
-) -> tuple[Array, Array, NDArray[np.bool_]]:
+) -> tuple[Array, Array, Mask]:
     """Where pairs of rays come nearest to each other.
-
-    Args:
-        origins_a, directions_a: (n, 3) the first rays; directions of length 1.
-        origins_b, directions_b: (n, 3) the second rays.
 
     Returns:
         Middles (n, 3) of the nearest points, their distances (n,) [m], and whether (n,) both points
@@ -64,37 +54,36 @@ def nearest_points(
 
 
 def meeting_points(
-    cameras: Sequence[Camera], centroids: Sequence[Array], threshold: float
+    cameras: Sequence[Camera],
+    pixels: Sequence[Array],
+    threshold: float,
+    free: Sequence[Mask] | None = None,
 ) -> Array:
-    """3-D points where rays of blobs in two views meet.
-
-    For all pairs of views, all pairs of blobs: rays nearer than a threshold are taken for the same
-    skin, and the middle of their nearest points for its place.
+    """The points (m, 3) [m] where rays of two views pass each other by less than a threshold [m].
 
     Args:
-        cameras: the cameras.
-        centroids: (n_k, 2) the blobs' centroids in each camera [pixel].
-        threshold: largest distance of two rays [m].
-
-    Returns:
-        (m, 3) points [m].
+        cameras: one for each view.
+        pixels: (n_k, 2) in each view; all pairs of pixels of all pairs of views are tried.
+        threshold: of the rays' distance.
+        free: (n_k,) pairs of which neither pixel is free are left out; None: all are.
     """
-    rays = [viewing_rays(camera, uv) for camera, uv in zip(cameras, centroids, strict=True)]
-    firsts, seconds = [], []
+    rays = [viewing_rays(camera, uv) for camera, uv in zip(cameras, pixels, strict=True)]
+    sides: list[list[Array]] = [[], [], [], []]
     for a, b in combinations(range(len(rays)), 2):
         i, j = np.indices((len(rays[a][0]), len(rays[b][0]))).reshape(2, -1)
-        firsts.append((rays[a][0][i], rays[a][1][i]))
-        seconds.append((rays[b][0][j], rays[b][1][j]))
-    if not firsts:
+        if free is not None:
+            wanted = free[a][i] | free[b][j]
+            i, j = i[wanted], j[wanted]
+        ends = rays[a][0][i], rays[a][1][i], rays[b][0][j], rays[b][1][j]
+        for side, end in zip(sides, ends, strict=True):
+            side.append(end)
+    if not sides[0]:
         return np.empty((0, 3))
-    parts = [
-        np.concatenate([pair[k] for pair in side]) for side in (firsts, seconds) for k in (0, 1)
-    ]
-    points, distance, usable = nearest_points(*parts)
+    points, distance, usable = nearest_points(*(np.concatenate(side) for side in sides))
     return points[usable & (distance <= threshold)]
 
 
-def meeting_of_all(cameras: Sequence[Camera], pixels: Sequence[Array]) -> Array:
+def triangulate(cameras: Sequence[Camera], pixels: Sequence[Array]) -> Array:
     """(3,) the point nearest to the rays of one pixel (2,) in each camera [m]; nan has no say."""
     A, b = np.zeros((3, 3)), np.zeros(3)
     for camera, uv in zip(cameras, pixels, strict=True):
@@ -105,3 +94,44 @@ def meeting_of_all(cameras: Sequence[Camera], pixels: Sequence[Array]) -> Array:
         A += across
         b += across @ origin[0]
     return np.asarray(np.linalg.lstsq(A, b, rcond=None)[0])
+
+
+def sum_at_points(
+    camera: Camera, picture: NDArray[np.int8], points: Array, weights: Array
+) -> tuple[Array, Array]:
+    """(n,) weighted sums of a picture (H, W) at n sets of m points, and of the weights in it.
+
+    Args:
+        camera: took the picture.
+        picture: (H, W).
+        points: (n, m, 3) in the world [m]; those out of the picture add nothing.
+        weights: (n, m).
+    """
+    X_CW = np.ascontiguousarray(camera.X_CW)
+    total: tuple[Array, Array] = _sum_at_points(
+        camera.kernel_parameters(), X_CW, picture, points, weights
+    )
+    return total
+
+
+@compiled
+def _sum_at_points(
+    camera: Array, X_CW: Array, picture: NDArray[np.int8], points: Array, weights: Array
+) -> tuple[Array, Array]:
+    height, width = picture.shape
+    sums, seen, p = np.zeros(points.shape[0]), np.zeros(points.shape[0]), np.empty(3)
+    for n in range(points.shape[0]):
+        for m in range(points.shape[1]):
+            for r in range(3):
+                p[r] = X_CW[r, 3]
+                for c in range(3):
+                    p[r] += X_CW[r, c] * points[n, m, c]
+            depth = p[2] if camera[0] == 0.0 else 1.0
+            if depth <= 0.0 or depth < camera[5]:
+                continue
+            column = int(np.floor(camera[1] * p[0] / depth + camera[3] + 0.5))
+            row = int(np.floor(camera[2] * p[1] / depth + camera[4] + 0.5))
+            if 0 <= row < height and 0 <= column < width:
+                sums[n] += weights[n, m] * picture[row, column]
+                seen[n] += weights[n, m]
+    return sums, seen

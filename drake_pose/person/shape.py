@@ -6,7 +6,7 @@ share them, each frame has its own pose.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,215 +14,76 @@ from numpy.typing import NDArray
 
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import Camera
-from drake_pose.errors import ModelError
+from drake_pose.errors import ModelError, UnknownNameError
 from drake_pose.fit.contour_fit import ContourFit, Noise
-from drake_pose.fit.evidence import NO_EDGE, EdgePoints, Evidence, pack_evidence
+from drake_pose.fit.evidence import NO_EDGE, EdgePoints, pack_evidence
 from drake_pose.fit.frames_fit import FramesFit
-from drake_pose.fit.levenberg_marquardt import AnnealingStage
+from drake_pose.fit.levenberg_marquardt import Round
 from drake_pose.fit.parameters import GIRTH_PREFIX, BodyParameters
 from drake_pose.fit.surfaces import with_girths
 from drake_pose.fit.unknowns import Unknowns, choose, join
+from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.pose_uncertainty import pose_uncertainty
+from drake_pose.person.search import LENIENT
 from drake_pose.silhouette.areas.outline import Outline
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Frames = Sequence[tuple[Sequence[Camera], Sequence[EdgePoints]]]
+"""The cameras of each frame and their regions' edges."""
 
-# The logarithm of a girth is no farther from the model's.
-_WIDEST = 0.5
+# How far off the model lengths are, left and right differ [m], girths' logarithms are, and angles
+# are off where they were [rad]; and the farthest that a girth's logarithm is off.
+_LENGTH, _SIDE, _GIRTH, _POSE, _WIDEST = 0.03, 0.005, 0.15, 0.5, 0.5
+_ROUNDS = tuple(Round(scale, 0.04) for scale in (0.10, 0.08, 0.06, 0.05, 0.04, 0.04, 0.03, 0.03))
+NOISE = Noise(deviation=0.02, correlation=0.15)
+"""What a point of contour is worth where the model is only like the person."""
 
 
-@dataclass(frozen=True)
-class ShapeSettings:
-    """How a person's shape is fitted.
+@dataclass(frozen=True, eq=False)
+class KnownShape:
+    """A person's lengths and girths.
 
     Args:
-        rounds: the steps.
-        length_deviation: how far lengths are off the model's [m].
-        side_deviation: how far left and right differ [m].
-        girth_deviation: how far girths are off the model's, as a share.
-        pose_deviation: how far a frame's angles are off where they were [rad].
+        lengths: by shape joint [m]; those that are missing are the model's.
+        girths: by part, sides alike: how wide, 1 as the model.
     """
 
-    rounds: tuple[AnnealingStage, ...] = (
-        AnnealingStage(0.10, 0.04),
-        AnnealingStage(0.08, 0.04),
-        AnnealingStage(0.06, 0.04),
-        AnnealingStage(0.05, 0.04),
-        AnnealingStage(0.04, 0.04),
-        AnnealingStage(0.04, 0.04),
-        AnnealingStage(0.03, 0.04),
-        AnnealingStage(0.03, 0.04),
-    )
-    length_deviation: float = 0.03
-    side_deviation: float = 0.005
-    girth_deviation: float = 0.15
-    pose_deviation: float = 0.5
+    lengths: Mapping[str, float]
+    girths: Mapping[str, float]
 
 
 @dataclass(frozen=True, eq=False)
 class PersonShape:
-    """A person's shape.
+    """A person's fitted shape.
 
     Args:
+        known: lengths and girths.
         values: (m,) of the pose tree; the shape joints' are the person's, others 0.
         covariance: (h, h) of the shape joints' [m].
-        is_shape: (m,) which values are shape joints.
-        girths: by part, sides alike: how wide, 1 as the model.
         poses: (frames, m) values in the frames that it was fitted to.
         outlines: the model's simplified surfaces with these girths.
     """
 
+    known: KnownShape
     values: Array
     covariance: Array
-    is_shape: Mask
-    girths: dict[str, float]
     poses: Array
     outlines: tuple[Outline, ...]
 
 
 def shape_values(tree: PoseTree) -> Mask:
     """(m,) which of a tree's values are shape joints: lengths that do not move the whole body."""
-    fit_names = [name for node in tree.nodes for name in node.value_names]
     root = set(tree.nodes[0].value_names)
     kinds = tree.model.position_kinds
     return np.array(
         [
             name not in root and kinds[tree.model.position_index(name)] == "length"
-            for name in fit_names
+            for node in tree.nodes
+            for name in node.value_names
         ],
         dtype=np.bool_,
     )
-
-
-def fit_shape(
-    fit: ContourFit,
-    frames: Sequence[tuple[Sequence[Camera], Sequence[EdgePoints]]],
-    poses: Array,
-    settings: ShapeSettings | None = None,
-) -> PersonShape:
-    """Fits lengths, girths and all frames' poses.
-
-    Args:
-        fit: made for a model with shape joints, such as urdf/person/person_shape.urdf.
-        frames: the cameras of each and their regions' edges.
-        poses: (frames, m) values to start from.
-        settings: how.
-
-    Raises:
-        ModelError: the model has no shape joints.
-    """
-    settings = settings or ShapeSettings()
-    is_shape = shape_values(fit.tree)
-    if not is_shape.any():
-        raise ModelError(f"{fit.tree.model.path}: a person's shape needs a model with shape joints")
-    parts, groups = shape_parts(fit.tree)
-    body = BodyParameters(fit.kinematics, fit.outlines, groups, parts)
-    poses = np.array(poses, dtype=np.float64)
-    own = poses[:, ~is_shape]
-    unknowns = _unknowns(fit, body, is_shape, settings)
-    shape_count = int(is_shape.sum())
-    names = [name for name, wanted in zip(body.names, is_shape, strict=False) if wanted]
-    cameras, evidence = _of_all_cameras(frames)
-    found = FramesFit(body, cameras, unknowns, noise=fit.noise).fit(
-        evidence,
-        np.zeros((len(frames), 0)),
-        own,
-        np.zeros(shape_count + len(parts)),
-        settings.rounds,
-        shared_information=_sides_information(names, len(parts), settings),
-    )
-    shape, girths = found.shared[:shape_count], found.shared[shape_count:]
-    worn = ContourFit(fit.tree, with_girths(fit.outlines, np.exp(girths)[groups]), fit.noise)
-    values = np.zeros(len(is_shape))
-    values[is_shape] = shape
-    poses[:, is_shape] = shape
-    poses[:, ~is_shape] = found.own
-    widths = {part: float(np.exp(girth)) for part, girth in zip(parts, girths, strict=True)}
-    prior = np.eye(shape_count) / settings.length_deviation**2
-    prior += _sides_information(names, 0, settings)
-    information = prior + _told(worn, frames, poses, is_shape, settings)
-    covariance = np.asarray(np.linalg.inv(information))
-    return PersonShape(values, covariance, is_shape, widths, poses, worn.outlines)
-
-
-def _unknowns(
-    fit: ContourFit, body: BodyParameters, is_shape: Mask, settings: ShapeSettings
-) -> Unknowns:
-    """Each frame's pose, and the lengths and girths of all frames."""
-    of_values = np.array(body.names[: len(is_shape)])
-    return join(
-        choose(
-            body.names,
-            of_values[~is_shape].tolist(),
-            lower=fit.lower[~is_shape],
-            upper=fit.upper[~is_shape],
-            deviation=settings.pose_deviation,
-        ),
-        choose(
-            body.names,
-            of_values[is_shape].tolist(),
-            shared=True,
-            lower=fit.lower[is_shape],
-            upper=fit.upper[is_shape],
-            deviation=settings.length_deviation,
-        ),
-        choose(
-            body.names,
-            [name for name in body.names if name.startswith(GIRTH_PREFIX)],
-            shared=True,
-            lower=-_WIDEST,
-            upper=_WIDEST,
-            deviation=settings.girth_deviation,
-        ),
-    )
-
-
-def _of_all_cameras(
-    frames: Sequence[tuple[Sequence[Camera], Sequence[EdgePoints]]],
-) -> tuple[list[Camera], list[Evidence]]:
-    """All cameras that have a picture in some frame, and what each frame's say."""
-    known = {camera.name: camera for cameras, _ in frames for camera in cameras}
-    evidence = []
-    for cameras, edges in frames:
-        seen = {camera.name: edge for camera, edge in zip(cameras, edges, strict=True)}
-        evidence.append(pack_evidence([seen.get(name, NO_EDGE) for name in known]))
-    return list(known.values()), evidence
-
-
-def _sides_information(names: Sequence[str], girths: int, settings: ShapeSettings) -> Array:
-    """The information about lengths, and after them girths: left and right are alike."""
-    information = np.zeros((len(names) + girths, len(names) + girths))
-    for k, name in enumerate(names):
-        other = name.replace("left_", "right_", 1)
-        if name.startswith("left_") and other in names:
-            row = np.zeros(len(information))
-            row[k], row[list(names).index(other)] = 1.0, -1.0
-            information += np.outer(row, row) / settings.side_deviation**2
-    return information
-
-
-def _told(
-    fit: ContourFit,
-    frames: Sequence[tuple[Sequence[Camera], Sequence[EdgePoints]]],
-    poses: Array,
-    is_shape: Mask,
-    settings: ShapeSettings,
-) -> Array:
-    """(h, h) information about the lengths, that of a frame, the mean.
-
-    Where a person's surface is not the model's it is so in all frames: more of them do not help.
-    """
-    own = np.flatnonzero(~is_shape)
-    apriori = np.eye(len(own)) / settings.pose_deviation**2
-    told = np.zeros((int(is_shape.sum()), int(is_shape.sum())))
-    for (cameras, edges), pose in zip(frames, poses, strict=True):
-        compared = fit.compare(cameras, edges, pose, settings.rounds[-1])
-        H = pose_uncertainty(fit, compared).information
-        cross = H[np.ix_(own, is_shape)]
-        follow = np.linalg.solve(H[np.ix_(own, own)] + apriori, cross)
-        told += (H[np.ix_(is_shape, is_shape)] - cross.T @ follow) / len(frames)
-    return told
 
 
 def shape_parts(tree: PoseTree) -> tuple[list[str], list[int]]:
@@ -235,6 +96,122 @@ def shape_parts(tree: PoseTree) -> tuple[list[str], list[int]]:
     return parts, [parts.index(name) for name in names]
 
 
-def shape_noise() -> Noise:
-    """What a point of contour is worth where the model is only like the person."""
-    return Noise(deviation=0.02, correlation=0.15)
+def tracker_of_person(tree: PoseTree, shape: KnownShape | None) -> PersonPoseTracker:
+    """What follows a person of a known shape, or of the model's own; lengths stay as they are.
+
+    Raises:
+        ModelError: the model has no landmarks of trunk, arms and legs.
+        UnknownNameError: the shape has a length or a part that the model has not.
+    """
+    shape = shape or KnownShape({}, {})
+    fit, held = ContourFit(tree, noise=NOISE), shape_values(tree)
+    rest = fit.kinematics.flatten(tree.default_values())
+    names = list(fit.kinematics.names)
+    lengths = [name for name, wanted in zip(names, held, strict=True) if wanted]
+    for name, length in shape.lengths.items():
+        if name not in lengths:
+            raise UnknownNameError("length", name, lengths, str(tree.model.path))
+        rest[names.index(name)] = length
+    parts, groups = shape_parts(tree)
+    for part in shape.girths:
+        if part not in parts:
+            raise UnknownNameError("part", part, parts, str(tree.model.path))
+    if shape.girths:
+        widths = np.array([shape.girths.get(part, 1.0) for part in parts])
+        fit = ContourFit(tree, with_girths(fit.outlines, widths[groups]), NOISE)
+    return PersonPoseTracker(fit, LENIENT, held, rest)
+
+
+def fit_shape(fit: ContourFit, frames: Frames, poses: Array) -> PersonShape:
+    """Fits lengths, girths and all frames' poses.
+
+    Args:
+        fit: made for a model with shape joints, such as urdf/person/person_shape.urdf.
+        frames: what is seen in each.
+        poses: (frames, m) values to start from.
+
+    Raises:
+        ModelError: the model has no shape joints.
+    """
+    is_shape = shape_values(fit.tree)
+    if not is_shape.any():
+        raise ModelError(f"{fit.tree.model.path}: a person's shape needs a model with shape joints")
+    parts, groups = shape_parts(fit.tree)
+    body = BodyParameters(fit.kinematics, fit.outlines, groups, parts)
+    count = int(is_shape.sum())
+    names = [name for name, wanted in zip(body.names, is_shape, strict=False) if wanted]
+    cameras = {camera.name: camera for seers, _ in frames for camera in seers}
+    evidence = []
+    for seers, edges in frames:
+        seen = {camera.name: edge for camera, edge in zip(seers, edges, strict=True)}
+        evidence.append(pack_evidence([seen.get(name, NO_EDGE) for name in cameras]))
+    poses = np.array(poses, dtype=np.float64)
+    unknowns = _unknowns(fit, body, is_shape)
+    found = FramesFit(body, list(cameras.values()), unknowns, noise=fit.noise).fit(
+        evidence,
+        np.zeros((len(frames), 0)),
+        poses[:, ~is_shape],
+        np.zeros(count + len(parts)),
+        _ROUNDS,
+        shared_information=_sides_information(names, len(parts)),
+    )
+    lengths, girths = found.shared[:count], np.exp(found.shared[count:])
+    worn = ContourFit(fit.tree, with_girths(fit.outlines, girths[groups]), fit.noise)
+    values = np.zeros(len(is_shape))
+    values[is_shape] = poses[:, is_shape] = lengths
+    poses[:, ~is_shape] = found.own
+    prior = np.eye(count) / _LENGTH**2 + _sides_information(names, 0)
+    covariance = np.linalg.inv(prior + _frame_information(worn, frames, poses, is_shape))
+    known = KnownShape(
+        dict(zip(names, lengths.tolist(), strict=True)),
+        dict(zip(parts, girths.tolist(), strict=True)),
+    )
+    return PersonShape(known, values, np.asarray(covariance), poses, worn.outlines)
+
+
+def _unknowns(fit: ContourFit, body: BodyParameters, is_shape: Mask) -> Unknowns:
+    """Each frame's pose, and the lengths and girths of all frames."""
+    names = np.array(body.names[: len(is_shape)])
+    girths = [name for name in body.names if name.startswith(GIRTH_PREFIX)]
+    pose, length = (
+        choose(
+            body.names,
+            names[chosen].tolist(),
+            shared=shared,
+            lower=fit.lower[chosen],
+            upper=fit.upper[chosen],
+            deviation=deviation,
+        )
+        for chosen, shared, deviation in ((~is_shape, False, _POSE), (is_shape, True, _LENGTH))
+    )
+    girth = choose(body.names, girths, shared=True, lower=-_WIDEST, upper=_WIDEST, deviation=_GIRTH)
+    return join(pose, length, girth)
+
+
+def _sides_information(names: Sequence[str], girths: int) -> Array:
+    """The information about lengths, and after them girths: left and right are alike."""
+    information = np.zeros((len(names) + girths, len(names) + girths))
+    for k, name in enumerate(names):
+        other = name.replace("left_", "right_", 1)
+        if name.startswith("left_") and other in names:
+            row = np.zeros(len(information))
+            row[k], row[list(names).index(other)] = 1.0, -1.0
+            information += np.outer(row, row) / _SIDE**2
+    return information
+
+
+def _frame_information(fit: ContourFit, frames: Frames, poses: Array, is_shape: Mask) -> Array:
+    """(h, h) information about the lengths, that of a frame, the mean.
+
+    Where a person's surface is not the model's it is so in all frames: more of them do not help.
+    """
+    own = np.flatnonzero(~is_shape)
+    prior = np.eye(len(own)) / _POSE**2
+    total = np.zeros((int(is_shape.sum()), int(is_shape.sum())))
+    for (cameras, edges), pose in zip(frames, poses, strict=True):
+        compared = fit.compare(cameras, edges, pose, _ROUNDS[-1])
+        H = pose_uncertainty(fit, compared).information
+        cross = H[np.ix_(own, is_shape)]
+        follow = np.linalg.solve(H[np.ix_(own, own)] + prior, cross)
+        total += (H[np.ix_(is_shape, is_shape)] - cross.T @ follow) / len(frames)
+    return total

@@ -34,15 +34,20 @@ from drake_pose.jobs.cluster.remote_keeper import RemoteKeeper
 from drake_pose.jobs.live.run import FrameWatch, LiveFrame
 from drake_pose.person.date.skeleton import load_skeleton
 from drake_pose.person.date.walking_motion import make_motion
-from drake_pose.person.recordings.known_shape import tracker_of_person
-from drake_pose.person.silhouette_tracker import SilhouetteTracker
-from drake_pose.person.silhouette_view import KeptEdge, see_silhouette
-from drake_pose.person.view_packing import pack_view, unpack_view
+from drake_pose.person.pose_tracker import PersonPoseTracker
+from drake_pose.person.shape import tracker_of_person
+from drake_pose.person.views import (
+    FrameViews,
+    KeptEdge,
+    edge_spacing,
+    pack_view,
+    see_silhouette,
+    unpack_view,
+)
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.scoring import draw_mask
-from drake_pose.systems.person.live_capture import SensorPorts, add_person_tracker
-from drake_pose.systems.person.remote_sensors import RemoteSensors
-from drake_pose.systems.person.silhouette_sensor import edge_spacing
+from drake_pose.systems.person.live_capture import add_person_tracker
+from drake_pose.systems.person.silhouette_sensor import RemoteSensors
 
 Array = NDArray[np.float64]
 
@@ -93,7 +98,7 @@ class SimulatedViews:
         model = load_model(bundled_model("person"), check=False)
         poses = make_motion(load_skeleton(model), _MOTION_FRAMES, 0).q[:frames]
         self.first = poses[0]
-        self.tracker: SilhouetteTracker = tracker_of_person(model.pose_tree(), None)
+        self.tracker: PersonPoseTracker = tracker_of_person(model.pose_tree(), None)
         self.cameras: dict[str, Camera] = dict(circle_of_cameras(count, face_camera=False))
         fit = self.tracker.fit
         outlines = few_triangles(TreeSurfaces(fit.tree), FEW)
@@ -209,8 +214,14 @@ def _follow(
     builder = DiagramBuilder()
     builder.AddNamedSystem("remote_sensors", sensors)
     silhouettes = {name: sensors.GetOutputPort(f"silhouette_{name}") for name in views.cameras}
-    ports = SensorPorts(silhouettes, sensors.GetOutputPort("time"))
-    system = add_person_tracker(builder, views.tracker, views.cameras, ports, sensors.period)
+    system = add_person_tracker(
+        builder,
+        views.tracker,
+        views.cameras,
+        silhouettes,
+        sensors.period,
+        sensors.GetOutputPort("time"),
+    )
     for name, port in silhouettes.items():
         builder.ExportOutput(port, f"silhouette_{name}")
     for index in range(system.num_output_ports()):
@@ -224,7 +235,7 @@ def _follow(
     frames: list[LiveFrame] = []
     simulator.set_monitor(FrameWatch(diagram, views.cameras, frames.append))
     seconds = []
-    rounds, count = len(tracker.settings.rounds), len(next(iter(views.packed.values())))
+    rounds, count = len(tracker.schedule.follow), len(next(iter(views.packed.values())))
     for k in range(count):
         answers = sum(keeper.answers for keeper in keepers)
         begin = time.process_time()
@@ -284,7 +295,7 @@ def _connect(views: SimulatedViews, keepers: Mapping[str, RemoteKeeper]) -> None
     while not all(keeper.answers for keeper in keepers.values()):
         if time.monotonic() > end:
             raise ClusterError("the simulated workers do not get ready")
-        tracker.follow(last, list(views.cameras.values()), seen)
+        tracker.follow(last, FrameViews(list(views.cameras.values()), seen))
 
 
 def _serve_sums(pipe: Connection, groups: Sequence[Mapping[str, Sequence[bytes]]]) -> None:

@@ -36,7 +36,7 @@ from drake_pose.jobs.live.scene import LiveScene, load_live_scene
 from drake_pose.papers.kameda.experiment import experiment_camera
 from drake_pose.person.date.skeleton import load_skeleton
 from drake_pose.person.date.walking_motion import make_motion
-from drake_pose.person.recordings.known_shape import tracker_of_person
+from drake_pose.person.shape import tracker_of_person
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask

@@ -26,9 +26,8 @@ from drake_pose.camera.models import Camera
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.colour_views import ColourViews, KnownColours
-from drake_pose.person.silhouette_tracker import SilhouetteTracker
-from drake_pose.person.silhouette_view import see_silhouette
-from drake_pose.systems.person.silhouette_sensor import edge_spacing
+from drake_pose.person.pose_tracker import PersonPoseTracker
+from drake_pose.person.views import FrameViews, edge_spacing, see_silhouette
 from tests.benchmarks.colour import ROOMS, ColourScene, Frame, Room
 
 Array = NDArray[np.float64]
@@ -100,7 +99,7 @@ def follow_person(
     The first frame's masks are given in both cases.
     """
     tracker, landmarks = (
-        SilhouetteTracker(ContourFit(model.pose_tree())),
+        PersonPoseTracker(ContourFit(model.pose_tree())),
         load_landmarks(model.path),
     )
     state = tracker.start(tracker.values(frames[0].q))
@@ -116,21 +115,21 @@ def follow_person(
             else:
                 pairs = zip(cameras, frame.masks, strict=True)
                 regions = {camera.name: mask for camera, mask in pairs}
-            if not tracker.is_lost(state):
+            if not state.is_lost:
                 known = views.learned(tracker.fit, state.values, regions)
         else:
             seen = [
                 see_silhouette(mask, edge_spacing(camera))
                 for camera, mask in zip(cameras, frame.masks, strict=True)
             ]
-            state = tracker.follow(state, cameras, seen) or state
+            state = tracker.follow(state, FrameViews(cameras, seen)) or state
         seconds.append(time.process_time() - start)
         places = [
             np.array(landmark_positions(model, landmarks, q))
             for q in (tracker.positions(state.values), frame.q)
         ]
         errors.append(1e3 * np.linalg.norm(places[0] - places[1], axis=1))
-        lost.append(tracker.is_lost(state))
+        lost.append(state.is_lost)
     milliseconds = 1e3 * float(np.median(seconds[1:]))
     return PersonOutcome(np.array(errors[1:]), np.array(lost[1:]), milliseconds)
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from drake_pose.jobs.estimate.scene_checks import SceneWarning, frame_ranges
 from drake_pose.person.recordings.checked_capture import CheckedCapture, MovedCamera
-from drake_pose.person.recordings.person_recording import ViewFaults
+from drake_pose.person.recordings.persons_in_view import ViewFaults
 from drake_pose.person.recordings.rig_faults import RigFault
 
 # Below this share of the contours the pose is hardly that of the person in the masks.

@@ -26,7 +26,7 @@ from drake_pose.jobs.estimate.scene_checks import (
     texts_of,
 )
 from drake_pose.person.recordings.checked_capture import capture_checked
-from drake_pose.person.recordings.person_capture import PersonCapture, PersonCaptureSettings
+from drake_pose.person.recordings.person_capture import PersonCapture
 from drake_pose.results.folder import PoseRow
 from drake_pose.results.joint_tables import record_deviations
 from drake_pose.results.summary import FrameRecord
@@ -74,7 +74,9 @@ def follow_person(
     reader.on_stage = None
     seconds = (time.perf_counter() - begin) / count
     result.begin_again(inputs)
-    result.more.update(_describe_shape(followed.captured))
+    shape = followed.captured.shape
+    if shape is not None:
+        result.more |= {"lengths_m": shape.known.lengths, "girths": shape.known.girths}
     if on_frame is not None:
         on_frame(0, count, "", None)
     for index, frame in enumerate(inputs.frames):
@@ -91,7 +93,7 @@ def _follow_masks(inputs: Inputs, reader: _Reader, track: bool) -> FollowedPerso
         reader.cameras,
         reader,
         len(inputs.frames),
-        PersonCaptureSettings(is_sequence=inputs.scene.sequence and track),
+        inputs.scene.sequence and track,
         reader.count_followed,
     )
     return FollowedPerson(checked.captured, checked.read, describe_faults(checked, inputs.frames))
@@ -203,17 +205,3 @@ def _draw_parts(
                 X_CN = camera.X_CW @ X_WN
                 segments[camera.name] = draw_labels(captured.outlines, labels, X_CN, camera)
     return segments
-
-
-def _describe_shape(captured: PersonCapture) -> dict[str, object]:
-    """What summary.json says of the person's shape: lengths [m] and girths, 1 as the model."""
-    shape = captured.shape
-    if shape is None:
-        return {}
-    names = [name for node in captured.tree.nodes for name in node.value_names]
-    lengths = {
-        name: float(value)
-        for name, value, wanted in zip(names, shape.values, shape.is_shape, strict=True)
-        if wanted
-    }
-    return {"lengths_m": lengths, "girths": dict(shape.girths)}

@@ -14,7 +14,8 @@ from drake_pose.jobs.estimate.capture_warnings import describe_faults
 from drake_pose.jobs.estimate.inputs import Inputs
 from drake_pose.jobs.estimate.scene_checks import SceneWarning, frame_ranges
 from drake_pose.person.recordings.colour_capture import ColourRecording, capture_by_colour
-from drake_pose.person.recordings.person_capture import PersonCapture, ReadFrame
+from drake_pose.person.recordings.person_capture import PersonCapture
+from drake_pose.person.recordings.persons_in_view import ReadFrame
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.mask_agreement import edge_area
 

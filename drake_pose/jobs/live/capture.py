@@ -15,7 +15,7 @@ from drake_pose.jobs.live.frame_results import LiveResult, LiveWriter
 from drake_pose.jobs.live.run import FrameWatch, run_live
 from drake_pose.jobs.live.scene import LiveScene
 from drake_pose.jobs.live.shape import fit_first_frames, shape_of_result
-from drake_pose.person.recordings.known_shape import KnownShape, tracker_of_person
+from drake_pose.person.shape import KnownShape, tracker_of_person
 from drake_pose.results.folder import require_empty
 from drake_pose.systems.person.live_capture import LiveSensors, build_live_capture
 

@@ -18,9 +18,9 @@ from drake_pose.jobs.estimate.person import FOLLOWED
 from drake_pose.jobs.estimate.result import ResultWriter, SceneEstimate
 from drake_pose.jobs.live.run import LiveFrame, Mask
 from drake_pose.jobs.live.scene import LiveScene
-from drake_pose.person.recordings.known_shape import KnownShape
-from drake_pose.person.recordings.other_persons import keep_person
-from drake_pose.person.silhouette_tracker import SilhouetteTracker
+from drake_pose.person.pose_tracker import PersonPoseTracker
+from drake_pose.person.recordings.persons_in_view import keep_person
+from drake_pose.person.shape import KnownShape
 from drake_pose.results.folder import PoseRow
 from drake_pose.results.joint_tables import record_deviations
 from drake_pose.results.settings import EstimateSettings
@@ -29,7 +29,6 @@ from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.mask_agreement import compare_masks
 from drake_pose.silhouette.pictures.scenes import Scene
 from drake_pose.systems.person.live_capture import LiveSensors
-from drake_pose.systems.person.person_tracker import place_of_person
 from drake_pose.systems.pictures.picture_capture import CameraCount
 
 
@@ -72,7 +71,7 @@ class LiveWriter:
         self,
         scene: LiveScene,
         model: ArticulatedModel,
-        tracker: SilhouetteTracker,
+        tracker: PersonPoseTracker,
         out: Path,
         period: float,
         packages: Mapping[str, Path],
@@ -162,7 +161,7 @@ class LiveWriter:
         X_WN = fit.kinematics.poses(values)
         masks: Mapping[str, Mask] = {name: view.region for name, view in frame.views.items()}
         if frame.has_others:
-            place = place_of_person(self._tracker, values)
+            place = self._tracker.place(values)
             masks = keep_person(self._scene.cameras, masks, place).masks
         bodies = {}
         for name in masks:

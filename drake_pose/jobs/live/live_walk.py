@@ -19,7 +19,7 @@ from drake_pose.jobs.live.scene import LiveScene
 from drake_pose.jobs.live.shape import shape_of_result
 from drake_pose.jobs.live.walk import CommandLog, stride_positions
 from drake_pose.person.date.walk_commands import WalkSettings
-from drake_pose.person.recordings.known_shape import tracker_of_person
+from drake_pose.person.shape import tracker_of_person
 from drake_pose.systems.person.live_capture import LiveSensors, add_person_tracker
 from drake_pose.systems.walk.walk import build_walk
 
@@ -75,7 +75,9 @@ def walk_live(
 
         def add(builder: DiagramBuilder) -> OutputPort:
             ports = opened.add(builder)
-            system = add_person_tracker(builder, tracker, scene.cameras, ports, opened.period)
+            system = add_person_tracker(
+                builder, tracker, scene.cameras, ports.silhouettes, opened.period, ports.time
+            )
             return system.GetOutputPort("estimated_positions")
 
         stride = stride_positions(model)

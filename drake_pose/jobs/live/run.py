@@ -13,7 +13,7 @@ from pydrake.systems.analysis import Simulator, SimulatorStatus
 from pydrake.systems.framework import Context, Diagram
 
 from drake_pose.person.date.capture import PersonView
-from drake_pose.person.silhouette_view import SilhouetteView
+from drake_pose.person.views import SilhouetteView
 from drake_pose.systems.person.live_capture import LiveSensors
 
 Array = NDArray[np.float64]

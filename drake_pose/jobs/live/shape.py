@@ -11,13 +11,12 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.errors import OutputError, SettingsError
 from drake_pose.jobs.live.run import Mask, run_live
 from drake_pose.jobs.live.scene import LiveScene
-from drake_pose.person.recordings.known_shape import KnownShape
 from drake_pose.person.recordings.person_capture import capture_person
-from drake_pose.person.recordings.person_recording import PersonRecording
-from drake_pose.person.shape import shape_values
+from drake_pose.person.recordings.persons_in_view import PersonRecording
+from drake_pose.person.shape import KnownShape, shape_values
+from drake_pose.person.views import shows_somebody
 from drake_pose.results.folder import read_summary
 from drake_pose.systems.person.live_capture import LiveSensors
-from drake_pose.systems.person.silhouette_sensor import shows_somebody
 
 _FRAMES = 40
 # How long it is waited for a person to come into view [s].
@@ -97,4 +96,4 @@ def fit_first_frames(
             "and compare the pictures with their backgrounds"
         )
     found = capture_person(tree, scene.cameras, lambda k: alone.read(seen[k]), len(seen))
-    return None if found.shape is None else KnownShape.of_fit(tree, found.shape)
+    return None if found.shape is None else found.shape.known

@@ -23,11 +23,11 @@ from drake_pose.person.date.capture import CaptureSetup, PersonView
 from drake_pose.person.date.faces import cut_face, face_direction
 from drake_pose.person.date.features import Features
 from drake_pose.person.date.skeleton import LIMBS
-from drake_pose.person.silhouette_tracker import SilhouetteTracker, TrackState
+from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
 from drake_pose.silhouette.segmentation.background import Background
 from drake_pose.systems.colour_images import colour_image_to_picture, picture_to_colour_image
 from drake_pose.systems.date.capture import PaperCapture, build_paper_capture
-from drake_pose.systems.person.silhouette_capture import SilhouetteCapture, build_silhouette_capture
+from drake_pose.systems.person.live_capture import SilhouetteCapture, build_silhouette_capture
 from drake_pose.systems.staged_diagram import StagedDiagram
 
 Array = NDArray[np.float64]
@@ -207,7 +207,7 @@ class SilhouetteTrack:
     def __init__(
         self,
         capture: SilhouetteCapture,
-        tracker: SilhouetteTracker,
+        tracker: PersonPoseTracker,
         shared: SilhouetteTrack | None = None,
     ) -> None:
         self.milliseconds: list[Mapping[str, float]] = []
@@ -221,7 +221,7 @@ class SilhouetteTrack:
         backgrounds: Mapping[str, Background],
     ) -> SilhouetteTrack:
         """A track that knows nothing yet."""
-        tracker = SilhouetteTracker(ContourFit(model.pose_tree()))
+        tracker = PersonPoseTracker(ContourFit(model.pose_tree()))
         capture = build_silhouette_capture(tracker, cameras, backgrounds, _PERIOD, _EDGE_POINTS)
         return SilhouetteTrack(capture, tracker)
 

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.camera.models import Camera
-from drake_pose.person.date.contours import DIRECTIONS, Contour, measure_contour, similarity
+from drake_pose.person.date.recognition import DIRECTIONS, Contour, measure_contour, similarity
 from drake_pose.person.date.skeleton import Skeleton
-from drake_pose.person.rays import meeting_of_all
+from drake_pose.person.rays import triangulate
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -82,7 +82,7 @@ def stand_registered(
     q = registered_positions(skeleton)
     head, _, _, left_foot, right_foot = skeleton.features(q)
     middle = 0.5 * head + 0.25 * (left_foot + right_foot)
-    q[skeleton.head_positions] += meeting_of_all(cameras, middles) - middle
+    q[skeleton.head_positions] += triangulate(cameras, middles) - middle
     return q
 
 
@@ -155,7 +155,7 @@ def recognise(
     q = np.array(registered.q)
     q[registered.heading_position] = _refined_heading(registered.headings, means, best)
     templates_middles = [registered.middles[camera.name][best] for camera in seers]
-    q[skeleton.head_positions] += meeting_of_all(seers, middles) - meeting_of_all(
+    q[skeleton.head_positions] += triangulate(seers, middles) - triangulate(
         seers, templates_middles
     )
     return Recognition(skeleton.clip(q), float(means[best]), len(seers))

@@ -17,7 +17,7 @@ from drake_pose.camera.models import Camera
 from drake_pose.fit.contour_fit import ContourFit, Prior
 from drake_pose.fit.evidence import EdgePoints, pack_evidence
 from drake_pose.fit.frames_fit import FramesFit
-from drake_pose.fit.levenberg_marquardt import AnnealingStage, StepSettings
+from drake_pose.fit.levenberg_marquardt import Round, StepSettings
 from drake_pose.fit.parameters import CAMERA_NAMES, CameraParameters
 from drake_pose.fit.unknowns import choose
 from drake_pose.person.rays import viewing_rays
@@ -28,14 +28,10 @@ Mask = NDArray[np.bool_]
 
 # A camera that was pushed has turned and shifted by about this much [rad, m].
 _TURN, _SHIFT = 0.15, 0.3
-_POSE_ROUNDS = tuple(
-    AnnealingStage(scale, 0.05) for scale in (0.15, 0.12, 0.10, 0.08, 0.06, 0.05, 0.04)
-)
-_CAMERA_ROUNDS = tuple(
-    AnnealingStage(scale, 0.05) for scale in (0.4, 0.3, 0.2, 0.15, 0.1, 0.07, 0.05, 0.05)
-)
+_POSE_ROUNDS = tuple(Round(scale, 0.05) for scale in (0.15, 0.12, 0.10, 0.08, 0.06, 0.05, 0.04))
+_CAMERA_ROUNDS = tuple(Round(scale, 0.05) for scale in (0.4, 0.3, 0.2, 0.15, 0.1, 0.07, 0.05, 0.05))
 _CAMERA_STEPS = StepSettings(longest=2.0, damping=1e-6, even_damping=1e-9)
-_TOLD_APART = AnnealingStage(0.05, 0.05)
+_JUDGED = Round(0.05, 0.05)
 _ANGLE_DEVIATION = 0.5
 # A camera is at fault where leaving it out lowers the others' misfit to so little of what it was,
 # and nobody else's leaving does as much.
@@ -49,12 +45,7 @@ _EXPLAINED = 0.9
 
 @dataclass(frozen=True, eq=False)
 class FrameView:
-    """A frame: the cameras that see the person, their regions' edges, and about the pose.
-
-    Args:
-        edges: by camera.
-        values: (m,) of the pose tree.
-    """
+    """A frame: edges of the regions by camera that sees the person, and about the pose (m,)."""
 
     edges: Mapping[str, EdgePoints]
     values: Array
@@ -83,6 +74,31 @@ class CameraMotion:
     share_after: float
 
 
+@dataclass(frozen=True, eq=False)
+class CameraFault:
+    """A camera that contradicts the others.
+
+    Args:
+        name: the camera.
+        motion: how it has moved; it may also have turned further than can be told.
+        is_explained: whether its having moved explains all: else its masks may be poor, mirrored,
+            or another camera's.
+        rivals: cameras that may be at fault in its stead: who it is, cannot be told.
+        others_share: of the other cameras' contours, what fits without it.
+    """
+
+    name: str
+    motion: CameraMotion
+    is_explained: bool
+    rivals: tuple[str, ...]
+    others_share: float
+
+    def with_motion(self, motion: CameraMotion) -> CameraFault:
+        """The fault with a motion that was measured anew."""
+        explained = motion.share_after > _EXPLAINED * self.others_share
+        return replace(self, motion=motion, is_explained=explained)
+
+
 def fit_without(
     fit: ContourFit,
     cameras: Mapping[str, Camera],
@@ -92,8 +108,7 @@ def fit_without(
 ) -> tuple[Array, float]:
     """A frame's pose (m,) by all cameras but one, and what share of their contours fits."""
     names = [name for name in frame.edges if name != left_out]
-    angle = fit.kinematics.is_angle
-    information = np.where(angle, 1.0, 4.0) / _ANGLE_DEVIATION**2
+    information = np.where(fit.kinematics.is_angle, 1.0, 4.0) / _ANGLE_DEVIATION**2
     found = fit.fit(
         [cameras[name] for name in names],
         [frame.edges[name] for name in names],
@@ -102,7 +117,7 @@ def fit_without(
         Prior(frame.values, information),
         held,
     )
-    return found.values, found.inlier_ratio
+    return found.values, found.share
 
 
 def camera_motion(
@@ -121,7 +136,7 @@ def camera_motion(
     found = []
     for start in (np.zeros(3), _way_to_regions(camera, edges, places)):
         moved = _moved_camera(fit, camera, pairs, places.reshape(-1, 3).mean(axis=0), start)
-        found.append(_describe(fit, camera, moved, pairs, places))
+        found.append(_describe(fit, camera, moved, pairs, places.reshape(-1, 3)))
         # What is far off may be drawn to the wrong side of the body; else one start is enough.
         if found[0].share_after > _EXPLAINED:
             break
@@ -132,12 +147,10 @@ def _way_to_regions(camera: Camera, edges: Sequence[EdgePoints], places: Array) 
     """The mean way (3,) from the bodies' middles to the rays of their regions' middles [m]."""
     ways = [np.zeros(3)]
     for edge, own in zip(edges, places, strict=True):
-        if not len(edge.uv):
-            continue
-        middle = own.mean(axis=0)
-        origin, direction = viewing_rays(camera, edge.middle[None])
-        across = origin[0] - middle
-        ways.append(across - (across @ direction[0]) * direction[0])
+        if len(edge.uv):
+            origin, direction = viewing_rays(camera, edge.middle[None])
+            across = origin[0] - own.mean(axis=0)
+            ways.append(across - (across @ direction[0]) * direction[0])
     return np.asarray(np.sum(ways, axis=0) / max(len(ways) - 1, 1))
 
 
@@ -174,7 +187,7 @@ def _moved_camera(
 
 def share_of(fit: ContourFit, camera: Camera, edge: EdgePoints, values: Array) -> float:
     """What share of the contours' lengths fits in one picture."""
-    return fit.compare([camera], [edge], values, _TOLD_APART).inlier_ratio
+    return fit.compare([camera], [edge], values, _JUDGED).share
 
 
 def _describe(
@@ -182,55 +195,24 @@ def _describe(
     camera: Camera,
     moved: Camera,
     pairs: Sequence[tuple[EdgePoints, Array]],
-    places: Array,
+    points: Array,
 ) -> CameraMotion:
-    """What a camera's motion does to its pictures."""
-    points = places.reshape(-1, 3)
+    """What a camera's motion does to its pictures, and to points (n, 3) in them [m]."""
     before, _ = camera.project(points)
     after, _ = moved.project(points)
-    off = after - before
-    shift = off.mean(axis=0)
-    pixels = float(np.sqrt((off**2).sum(axis=1).mean()))
-    middle = before.mean(axis=0)
-    arms, ends = before - middle, after - after.mean(axis=0)
-    turn = np.arctan2(
-        (arms[:, 0] * ends[:, 1] - arms[:, 1] * ends[:, 0]).sum(), (arms * ends).sum()
-    )
+    pixels = float(np.sqrt(((after - before) ** 2).sum(axis=1).mean()))
+    arms, ends = before - before.mean(axis=0), after - after.mean(axis=0)
+    sine = (arms[:, 0] * ends[:, 1] - arms[:, 1] * ends[:, 0]).sum()
     shares = [np.mean([share_of(fit, one, e, q) for e, q in pairs]) for one in (camera, moved)]
     return CameraMotion(
         moved.X_WC,
-        shift,
+        (after - before).mean(axis=0),
         pixels,
         pixels / pixels_per_metre(camera, points.mean(axis=0)),
-        float(turn),
+        float(np.arctan2(sine, (arms * ends).sum())),
         float(shares[0]),
         float(shares[1]),
     )
-
-
-@dataclass(frozen=True, eq=False)
-class CameraFault:
-    """A camera that contradicts the others.
-
-    Args:
-        name: the camera.
-        motion: how it has moved; it may also have turned further than can be told.
-        is_explained: whether its having moved explains all: else its masks may be poor, mirrored,
-            or another camera's.
-        rivals: cameras that may be at fault in its stead: who it is, cannot be told.
-        others_share: of the other cameras' contours, what fits without it.
-    """
-
-    name: str
-    motion: CameraMotion
-    is_explained: bool
-    rivals: tuple[str, ...]
-    others_share: float
-
-    def with_motion(self, motion: CameraMotion) -> CameraFault:
-        """The fault with a motion that was measured anew."""
-        explained = motion.share_after > _EXPLAINED * self.others_share
-        return replace(self, motion=motion, is_explained=explained)
 
 
 def find_fault(
@@ -255,12 +237,8 @@ def find_fault(
         own = [frame for frame in frames if name in frame.edges]
         together = np.mean([s for s, f in zip(with_all, frames, strict=True) if name in f.edges])
         without = [fit_without(fit, cameras, frame, name, held) for frame in own]
-        motion = camera_motion(
-            fit,
-            cameras[name],
-            [frame.edges[name] for frame in own],
-            [values for values, _ in without],
-        )
+        edges, poses = [frame.edges[name] for frame in own], [values for values, _ in without]
+        motion = camera_motion(fit, cameras[name], edges, poses)
         share = float(np.mean([others for _, others in without]))
         count = float(np.mean([len(frame.edges) for frame in own]))
         best = ((count - 1.0) * share + max(motion.share_after, motion.share_before)) / count

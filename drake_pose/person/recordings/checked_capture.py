@@ -18,6 +18,7 @@ from drake_pose.camera.models import Camera
 from drake_pose.errors import CameraError, MaskError, SettingsError
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.fit.evidence import EdgePoints, find_edge_points
+from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.recordings.camera_faults import (
     CameraFault,
     FrameView,
@@ -27,25 +28,17 @@ from drake_pose.person.recordings.camera_faults import (
     moved_since,
     share_of,
 )
-from drake_pose.person.recordings.person_capture import (
-    EDGE_POINTS,
-    PersonCapture,
-    PersonCaptureSettings,
-    ReadFrame,
-    capture_person,
-)
-from drake_pose.person.recordings.person_recording import PersonRecording, ViewFaults
+from drake_pose.person.recordings.person_capture import PersonCapture, capture_person
+from drake_pose.person.recordings.persons_in_view import PersonRecording, ReadFrame, ViewFaults
 from drake_pose.person.recordings.rig_faults import RigFault, find_rig_fault
-from drake_pose.person.shape import shape_noise, shape_values
-from drake_pose.person.silhouette_tracker import SilhouetteTracker
+from drake_pose.person.shape import NOISE, shape_values
+from drake_pose.person.views import edge_spacing
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# Cameras are compared in this many frames.
-_COMPARED = 10
-# And carved out of their silhouettes in this many.
-_CARVED = 3
+# Cameras are compared in this many frames, and carved out of their silhouettes in so many.
+_COMPARED, _CARVED = 10, 3
 # Pictures of which less fits than this share of the others' do not agree.
 _AGREES = 0.7
 # Nobody is seen as small or as tall [m], not even in part; else lengths are in another unit.
@@ -81,7 +74,7 @@ class CheckedCapture:
         cameras: those that contradict the others.
         rig: what the silhouettes say against the calibration as a whole, if no single camera
             explains it; undone where it can be.
-        read: gives the masks that were used, by camera.
+        read: gives the masks that were used.
     """
 
     captured: PersonCapture
@@ -96,7 +89,7 @@ def capture_checked(
     cameras: Mapping[str, Camera],
     read: ReadFrame,
     count: int,
-    settings: PersonCaptureSettings | None = None,
+    is_sequence: bool = True,
     on_frame: Callable[[int], None] | None = None,
 ) -> CheckedCapture:
     """Captures a recording like `capture_person`, whose arguments it has, and finds its faults.
@@ -107,18 +100,17 @@ def capture_checked(
         ModelError: the model has no landmarks of trunk, arms and legs.
         SettingsError: there is no frame in which two cameras see a person.
     """
-    settings = settings or PersonCaptureSettings()
-    recording = _record(cameras, read, count, settings.is_sequence)
-    rig = find_rig_fault(
-        cameras, [recording.read(k) for k in _spread_over(recording.seen, _CARVED)]
-    )
-    if rig is not None and (rig.mirrored or rig.exchanged):
+    recording = _record(cameras, read, count, is_sequence)
+    carved = [recording.read(k) for k in _spread_over(recording.seen, _CARVED)]
+    rig = find_rig_fault(cameras, carved)
+    if rig is not None and rig.is_undone:
         undo = rig.undo
-        recording = _record(cameras, lambda k: undo(read(k)), count, settings.is_sequence)
+        recording = _record(cameras, lambda k: undo(read(k)), count, is_sequence)
     found: list[MovedCamera] = []
     while True:
-        # All frames are finished once only, as those hear of it who count them.
-        captured = _capture_seen(tree, cameras, recording, settings, None if found else on_frame)
+        # All frames are finished once only, as those who count them are told of it.
+        tell = None if found else on_frame
+        captured = _capture_seen(tree, cameras, recording, is_sequence, tell)
         judge = _Judge(tree, cameras, recording, captured)
         found = [judge.dated(one) for one in found]
         fault, first = judge.find()
@@ -130,12 +122,10 @@ def capture_checked(
         if not is_left_out:
             break
         recording.leave_out(fault.name, first)
-    seen = recording.seen
-    if found and rig is not None and not (rig.mirrored or rig.exchanged):
+    if found and rig is not None and not rig.is_undone:
         rig = None
-    return CheckedCapture(
-        _spread(captured, seen, count), recording.faults(), tuple(found), rig, recording.read
-    )
+    whole = _spread(captured, recording.seen, count)
+    return CheckedCapture(whole, recording.faults(), tuple(found), rig, recording.read)
 
 
 def _record(
@@ -164,19 +154,14 @@ def _capture_seen(
     tree: PoseTree,
     cameras: Mapping[str, Camera],
     recording: PersonRecording,
-    settings: PersonCaptureSettings,
+    is_sequence: bool,
     on_frame: Callable[[int], None] | None,
 ) -> PersonCapture:
     """The capture of those frames alone in which two cameras see the person."""
     seen = recording.seen
+    pauses = [k for k in range(1, len(seen)) if seen[k] > seen[k - 1] + 1]
     return capture_person(
-        tree,
-        cameras,
-        lambda index: recording.read(seen[index]),
-        len(seen),
-        settings,
-        on_frame,
-        [k for k in range(1, len(seen)) if seen[k] > seen[k - 1] + 1],
+        tree, cameras, lambda k: recording.read(seen[k]), len(seen), is_sequence, on_frame, pauses
     )
 
 
@@ -198,23 +183,24 @@ class _Judge:
     ) -> None:
         self._cameras, self._recording = cameras, recording
         self._held = shape_values(tree)
-        noise = None if captured.shape is None else shape_noise()
-        self._fit = ContourFit(tree, captured.outlines, noise)
-        tracker = SilhouetteTracker(self._fit, held=self._held)
+        self._fit = ContourFit(tree, captured.outlines, None if captured.shape is None else NOISE)
+        tracker = PersonPoseTracker(self._fit, held=self._held)
         poses = zip(recording.seen, captured.q, strict=True)
         self._values = {k: tracker.values(q) for k, q in poses if np.isfinite(q).all()}
 
     def find(self) -> tuple[CameraFault | None, int]:
         """The camera that contradicts the others in all frames or in the last, and since when."""
         picked = _spread_over(list(self._values), _COMPARED)
-        views = [self._view(frame) for frame in picked]
+        views = []
+        for frame in picked:
+            masks = self._recording.read(frame)
+            edges = {name: self._edge(name, mask) for name, mask in masks.items()}
+            views.append(FrameView(edges, self._values[frame]))
         fault = find_fault(self._fit, self._cameras, views, self._held)
         if fault is None or not fault.is_explained:
             # A camera that moved in the middle is another one before and after that.
-            latest = find_fault(
-                self._fit, self._cameras, views[-(len(views) + 2) // 3 :], self._held
-            )
-            fault = latest or fault
+            late = views[-(len(views) + 2) // 3 :]
+            fault = find_fault(self._fit, self._cameras, late, self._held) or fault
         if fault is None:
             return None, 0
         own = [k for k, view in enumerate(views) if fault.name in view.edges]
@@ -253,21 +239,15 @@ class _Judge:
     ) -> int:
         """Since which of some pictures a camera is at fault."""
         camera = self._cameras[fault.name]
-        there = camera.with_pose(fault.motion.X_WC)
-        pairs = list(zip(edges, poses, strict=True))
-        before = [share_of(self._fit, camera, edge, values) for edge, values in pairs]
-        after = [share_of(self._fit, there, edge, values) for edge, values in pairs]
+        before, after = (
+            [share_of(self._fit, one, e, values) for e, values in zip(edges, poses, strict=True)]
+            for one in (camera, camera.with_pose(fault.motion.X_WC))
+        )
         least = _AGREES * fault.others_share
         return moved_since(before, [max(one, least) for one in after])
 
-    def _view(self, frame: int) -> FrameView:
-        masks = self._recording.read(frame)
-        edges = {name: self._edge(name, mask) for name, mask in masks.items()}
-        return FrameView(edges, self._values[frame])
-
     def _edge(self, name: str, mask: Mask) -> EdgePoints:
-        spacing = max(2.0, self._cameras[name].height / EDGE_POINTS)
-        return find_edge_points(mask, spacing)
+        return find_edge_points(mask, edge_spacing(self._cameras[name]))
 
 
 def _spread(captured: PersonCapture, seen: Sequence[int], count: int) -> PersonCapture:

@@ -17,17 +17,14 @@ from drake_pose.camera.models import Camera
 from drake_pose.fit.colours import Picture
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.colour_views import ColourViews, KnownColours
+from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
 from drake_pose.person.recordings.checked_capture import CheckedCapture, capture_checked
-from drake_pose.person.recordings.person_capture import (
-    PersonCapture,
-    PersonCaptureSettings,
-    ReadFrame,
-)
-from drake_pose.person.shape import PersonShape, shape_noise, shape_values
-from drake_pose.person.silhouette_tracker import SilhouetteTracker, TrackState
+from drake_pose.person.recordings.person_capture import PersonCapture
+from drake_pose.person.recordings.persons_in_view import ReadFrame
+from drake_pose.person.search import LENIENT
+from drake_pose.person.shape import NOISE, shape_values
 
 Array = NDArray[np.float64]
-ReadPictures = Callable[[int], Mapping[str, Picture]]
 
 # Silhouettes of fewer cameras do not tell where a person is.
 _FEWEST = 2
@@ -58,7 +55,7 @@ class ColourRecording:
     Args:
         cameras: by name.
         count: how many frames there are.
-        masks: gives the masks (H, W) of a frame, counted from 0, by camera; none in most.
+        masks: gives the masks of a frame; none in most.
         pictures: gives the pictures (H, W, 3) of a frame by camera.
         starts: the plant's positions (nq,) by frame, where they are about known.
     """
@@ -66,7 +63,7 @@ class ColourRecording:
     cameras: Mapping[str, Camera]
     count: int
     masks: ReadFrame
-    pictures: ReadPictures
+    pictures: Callable[[int], Mapping[str, Picture]]
     starts: Mapping[int, Array]
 
 
@@ -74,7 +71,6 @@ def capture_by_colour(
     tree: PoseTree,
     recording: ColourRecording,
     masked: tuple[int, ...],
-    settings: PersonCaptureSettings | None = None,
     on_frame: Callable[[int], None] | None = None,
 ) -> ColourCapture:
     """Captures a recording of few masks.
@@ -84,26 +80,24 @@ def capture_by_colour(
             with masks; without any they stay where the first start has them.
         recording: masks, pictures and starts.
         masked: the frames that have masks.
-        settings: how.
-        on_frame: called with each frame that is finished.
+        on_frame: called after each frame.
 
     Raises:
         ModelError: the model has no landmarks of trunk, arms and legs.
         SettingsError: in none of the frames with masks two cameras see a person.
     """
-    settings = settings or PersonCaptureSettings()
     masked = tuple(k for k in masked if len(recording.masks(k)) >= _FEWEST)
     checked = None
     if masked:
         checked = capture_checked(
-            tree, recording.cameras, lambda k: recording.masks(masked[k]), len(masked), settings
+            tree, recording.cameras, lambda k: recording.masks(masked[k]), len(masked)
         )
-    follower = _Follower(tree, recording, settings, checked, masked)
+    follower = _Follower(tree, recording, checked, masked)
     for frame in range(recording.count):
         follower.follow(frame)
         if on_frame is not None:
             on_frame(frame)
-    return ColourCapture(follower.captured(), checked, masked, follower.distances)
+    return ColourCapture(follower.captured, checked, masked, follower.distances)
 
 
 class _Follower:
@@ -113,77 +107,68 @@ class _Follower:
         self,
         tree: PoseTree,
         recording: ColourRecording,
-        settings: PersonCaptureSettings,
         checked: CheckedCapture | None,
         masked: tuple[int, ...],
     ) -> None:
-        self._tree, self._recording, self._checked = tree, recording, checked
+        self._recording, self._checked = recording, checked
         self._places = {frame: k for k, frame in enumerate(masked)}
         own = None if checked is None else checked.captured
-        self._shape: PersonShape | None = None if own is None else own.shape
-        fit = ContourFit(tree, None if own is None else own.outlines, shape_noise())
-        rest = None if self._shape is None else self._shape.values
-        self._tracker = SilhouetteTracker(fit, settings.tracker, shape_values(tree), rest)
+        shape = None if own is None else own.shape
+        fit = ContourFit(tree, None if own is None else own.outlines, NOISE)
+        rest = None if shape is None else shape.values
+        self._tracker = PersonPoseTracker(fit, LENIENT, shape_values(tree), rest)
         self._state: TrackState | None = None
         self._known: KnownColours = {}
         size = recording.count, len(tree.model.position_names)
-        self._q, self._deviations = np.full(size, np.nan), np.full(size, np.nan)
-        self._shares, self.distances = np.zeros(size[0]), np.full(size[0], np.nan)
+        unknown = np.full(size, np.nan)
+        self.captured = PersonCapture(
+            unknown, np.zeros(size[0]), shape, fit.outlines, tree, unknown.copy()
+        )
+        self.distances = np.full(size[0], np.nan)
 
     def follow(self, frame: int) -> None:
         """The next frame."""
-        recording = self._recording
+        recording, tracker = self._recording, self._tracker
         pictures = recording.pictures(frame)
         cameras = [recording.cameras[name] for name in pictures]
         views = ColourViews(cameras, list(pictures.values()), self._known)
         if self._follow_masks(frame, views):
             return
-        last = self._state
-        if last is not None:
-            self._state = self._tracker.follow_by_colour(last, views)
+        if self._state is not None:
+            self._state = tracker.follow_by_colour(self._state, views)
         start = recording.starts.get(frame)
-        if start is not None and (self._state is None or self._tracker.is_lost(self._state)):
-            began = self._tracker.start(self._tracker.values(start))
+        if start is not None and (self._state is None or self._state.is_lost):
+            began = tracker.start(tracker.values(start))
             if not self._known:
-                views = ColourViews(
-                    cameras, views.pictures, views.learned(self._tracker.fit, began.values)
-                )
-            self._state = self._tracker.follow_by_colour(began, views)
+                learned = views.learned(tracker.fit, began.values)
+                views = ColourViews(cameras, views.pictures, learned)
+            self._state = tracker.follow_by_colour(began, views)
         if self._state is None:
             return
-        self._shares[frame] = self._state.share
-        if self._tracker.is_lost(self._state):
-            self._state = replace(self._state, step=np.zeros(len(self._state.step)))
+        captured, values = self.captured, self._state.values
+        captured.shares[frame] = self._state.share
+        if self._state.is_lost:
+            self._state = replace(self._state, step=np.zeros(len(values)))
             return
-        values = self._state.values
-        self._known = views.learned(self._tracker.fit, values)
-        lengths = None if self._shape is None else self._shape.covariance
-        sure = self._tracker.uncertainty_by_colour(values, views, lengths)
-        self._q[frame] = self._tracker.positions(values)
-        self._deviations[frame] = self._tracker.deviations(sure.covariance)
-        self.distances[frame] = self._tracker.distance_by_colour(values, views)
+        self._known = views.learned(tracker.fit, values)
+        lengths = None if captured.shape is None else captured.shape.covariance
+        captured.q[frame] = tracker.positions(values)
+        captured.deviations[frame] = tracker.deviations(values, views, lengths)
+        self.distances[frame] = tracker.distance_by_colour(values, views)
 
     def _follow_masks(self, frame: int, views: ColourViews) -> bool:
         """Takes what masks said of a frame; False where they did not say where the person is."""
         place = self._places.get(frame)
         if self._checked is None or place is None:
             return False
-        own = self._checked.captured
+        own, captured = self._checked.captured, self.captured
         if not np.isfinite(own.q[place]).all():
             return False
         values, last = self._tracker.values(own.q[place]), self._state
-        state = self._tracker.start(values)
-        if last is not None and not self._tracker.is_lost(last):
-            state = replace(state, step=values - last.values)
-        self._state = state
-        self._q[frame], self._deviations[frame] = own.q[place], own.deviations[place]
-        self._shares[frame] = own.shares[place]
+        self._state = self._tracker.start(values)
+        if last is not None and not last.is_lost:
+            self._state = replace(self._state, step=values - last.values)
+        captured.q[frame], captured.shares[frame] = own.q[place], own.shares[place]
+        captured.deviations[frame] = own.deviations[place]
         self._known = views.learned(self._tracker.fit, values, self._checked.read(place))
         return True
-
-    def captured(self) -> PersonCapture:
-        """All frames."""
-        return PersonCapture(
-            self._q, self._shares, self._shape, self._tracker.fit.outlines, self._tree,
-            self._deviations,
-        )  # fmt: skip

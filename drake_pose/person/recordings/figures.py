@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import combinations
 from typing import NamedTuple
 
 import cv2
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.camera.models import Camera, ParallelCamera
-from drake_pose.person.rays import meeting_of_all, nearest_points, viewing_rays
+from drake_pose.person.rays import meeting_points, triangulate, viewing_rays
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -117,7 +116,7 @@ def find_persons(
         seers = [k for k, own in enumerate(figures) if own]
         if len(seers) < 2:
             return ()
-        place = meeting_of_all([cameras[k] for k in seers], [figures[k][0].middle for k in seers])
+        place = triangulate([cameras[k] for k in seers], [figures[k][0].middle for k in seers])
         offs = [metres_off(cameras[k], figures[k][0].middle, place[None])[0] for k in seers]
         if max(offs) < _WITHIN:
             return (_person(place, dict.fromkeys(seers, 0), figures),)
@@ -141,7 +140,11 @@ def _best_person(
     cameras: Sequence[Camera], figures: Sequence[Sequence[Figure]], free: Sequence[set[int]]
 ) -> Person | None:
     """The best supported place of which two cameras have a figure that is still free."""
-    places = _candidates(cameras, figures, free)
+    middles = [np.array([figure.middle for figure in own]).reshape(-1, 2) for own in figures]
+    is_free = [
+        np.isin(np.arange(len(own)), list(left)) for own, left in zip(figures, free, strict=True)
+    ]
+    places = meeting_points(cameras, middles, 2.0 * _WITHIN, is_free)
     if not len(places):
         return None
     scores, _ = _support(cameras, figures, free, places)
@@ -153,40 +156,13 @@ def _best_person(
             if len(taken) < 2:
                 break
             used = [figures[k][i].middle for k, i in taken.items()]
-            place = meeting_of_all([cameras[k] for k in taken], used)
+            place = triangulate([cameras[k] for k in taken], used)
         if len(taken) < 2:
             continue
         person = _person(place, taken, figures)
         if best is None or (float(score[0]), person.area) > best[:2]:
             best = float(score[0]), person.area, person
     return None if best is None else best[2]
-
-
-def _candidates(
-    cameras: Sequence[Camera], figures: Sequence[Sequence[Figure]], free: Sequence[set[int]]
-) -> Array:
-    """Where rays (n, 3) of the middles of two views' figures meet, of which one is free [m]."""
-    rays = [
-        viewing_rays(camera, np.array([figure.middle for figure in own]).reshape(-1, 2))
-        for camera, own in zip(cameras, figures, strict=True)
-    ]
-    sides: list[list[Array]] = [[], [], [], []]
-    for a, b in combinations(range(len(cameras)), 2):
-        pairs = [
-            (i, j)
-            for i in range(len(figures[a]))
-            for j in range(len(figures[b]))
-            if i in free[a] or j in free[b]
-        ]
-        if pairs:
-            i, j = np.array(pairs).T
-            ends = rays[a][0][i], rays[a][1][i], rays[b][0][j], rays[b][1][j]
-            for side, end in zip(sides, ends, strict=True):
-                side.append(end)
-    if not sides[0]:
-        return np.empty((0, 3))
-    points, distance, usable = nearest_points(*(np.concatenate(side) for side in sides))
-    return points[usable & (distance < 2.0 * _WITHIN)]
 
 
 def _support(

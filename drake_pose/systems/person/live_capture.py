@@ -1,30 +1,32 @@
-"""A person captured live: cameras' pictures in, poses out, the sensors here or elsewhere."""
+"""A person captured by all silhouettes at once as ready diagrams: pictures in, poses out."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
+from pydrake.trajectories import Trajectory
 
-from drake_pose.camera.models import Camera
-from drake_pose.person.recordings.person_capture import EDGE_POINTS
-from drake_pose.person.silhouette_tracker import SilhouetteTracker
+from drake_pose.body.model import ArticulatedModel
+from drake_pose.camera.models import Camera, PinholeCamera
+from drake_pose.errors import SettingsError
+from drake_pose.fit.contour_fit import ContourFit
+from drake_pose.person.pose_tracker import PersonPoseTracker
+from drake_pose.person.views import EDGE_POINTS
 from drake_pose.silhouette.segmentation.background import Background
 from drake_pose.systems.bodies.posed_geometry import add_avatar
 from drake_pose.systems.person.person_tracker import PersonTracker
 from drake_pose.systems.person.silhouette_sensor import SilhouetteSensor
+from drake_pose.systems.pictures.camera_rig import build_camera_rig
 from drake_pose.systems.pictures.picture_capture import CameraCount, PictureCapture
+from drake_pose.systems.staged_diagram import StagedDiagram
 
 
 class SensorPorts(NamedTuple):
-    """What the sensors of all cameras give, wherever they are.
-
-    Attributes:
-        silhouettes: by camera, the port of a SilhouetteView or None.
-        time: the port of the pictures' time stamp (1) [s].
-    """
+    """By camera the port of a SilhouetteView or None, and that of the pictures' time stamp [s]."""
 
     silhouettes: Mapping[str, OutputPort]
     time: OutputPort
@@ -65,7 +67,6 @@ class LocalSensors:
         capture: gives the pictures.
         cameras: the calibrated cameras.
         backgrounds: of the cameras whose sources do not deliver masks.
-        edge_points: a picture's height over the spacing of the edge points.
     """
 
     def __init__(
@@ -73,12 +74,12 @@ class LocalSensors:
         capture: PictureCapture,
         cameras: Mapping[str, Camera],
         backgrounds: Mapping[str, Background],
-        edge_points: float = EDGE_POINTS,
     ) -> None:
         self.capture = capture
         self.period, self.live = capture.period, capture.live
         self._cameras, self._backgrounds = cameras, backgrounds
-        self._edge_points = edge_points
+        self.take_reports, self.counts = capture.take_reports, capture.counts
+        self.close = capture.close
 
     @property
     def skipped(self) -> int:
@@ -88,35 +89,36 @@ class LocalSensors:
     def add(self, builder: DiagramBuilder) -> SensorPorts:
         """Adds the systems that see to a diagram under construction."""
         builder.AddNamedSystem("picture_capture", self.capture)
-        silhouettes = {}
-        for name, camera in self._cameras.items():
-            background = self._backgrounds.get(name)
-            sensor = SilhouetteSensor(camera, background, self._edge_points)
-            builder.AddNamedSystem(f"sensor_{name}", sensor)
-            port = f"{'label' if background is None else 'color'}_image_{name}"
-            builder.Connect(self.capture.GetOutputPort(port), sensor.get_input_port())
-            silhouettes[name] = sensor.GetOutputPort("silhouette")
+        sensors = _add_sensors(builder, self._cameras, self._backgrounds)
+        for name, sensor in sensors.items():
+            image = f"{sensor.get_input_port().get_name()}_{name}"
+            builder.Connect(self.capture.GetOutputPort(image), sensor.get_input_port())
+        silhouettes = {k: sensor.GetOutputPort("silhouette") for k, sensor in sensors.items()}
         return SensorPorts(silhouettes, self.capture.GetOutputPort("time"))
 
-    def take_reports(self) -> list[str]:
-        """What the user should know and was not told yet."""
-        return self.capture.take_reports()
 
-    def counts(self) -> dict[str, CameraCount]:
-        """How each camera did so far."""
-        return self.capture.counts()
-
-    def close(self) -> None:
-        """Lets go of files and cameras."""
-        self.capture.close()
+def _add_sensors(
+    builder: DiagramBuilder,
+    cameras: Mapping[str, Camera],
+    backgrounds: Mapping[str, Background],
+    edge_points: float = EDGE_POINTS,
+) -> dict[str, SilhouetteSensor]:
+    return {
+        name: builder.AddNamedSystem(
+            f"sensor_{name}", SilhouetteSensor(camera, backgrounds.get(name), edge_points)
+        )
+        for name, camera in cameras.items()
+    }
 
 
 def add_person_tracker(
     builder: DiagramBuilder,
-    tracker: SilhouetteTracker,
+    tracker: PersonPoseTracker,
     cameras: Mapping[str, Camera],
-    sensors: SensorPorts,
+    silhouettes: Mapping[str, OutputPort],
     period: float,
+    time: OutputPort | None = None,
+    meshcat: Meshcat | None = None,
     with_deviations: bool = False,
 ) -> PersonTracker:
     """Add what follows a person with sensors.
@@ -125,8 +127,10 @@ def add_person_tracker(
         builder: the diagram under construction.
         tracker: made for the person's pose tree.
         cameras: two calibrated cameras or more.
-        sensors: what LiveSensors.add gave.
+        silhouettes: by camera.
         period: time between two looks at the sensors [s].
+        time: the pictures' time stamp; None: every period brings new pictures.
+        meshcat: where the avatar is shown; None: nowhere.
         with_deviations: whether the positions' standard deviations are an output.
 
     Raises:
@@ -134,14 +138,24 @@ def add_person_tracker(
     """
     system = PersonTracker(tracker, list(cameras.values()), period, with_deviations)
     builder.AddNamedSystem("person_tracker", system)
-    for name, port in sensors.silhouettes.items():
+    for name, port in silhouettes.items():
         builder.Connect(port, system.GetInputPort(f"silhouette_{name}"))
-    builder.Connect(sensors.time, system.GetInputPort("time"))
+    if time is not None:
+        builder.Connect(time, system.GetInputPort("time"))
+    if meshcat is not None:
+        positions = system.GetOutputPort("last_positions")
+        add_avatar(builder, tracker.fit.tree.model, positions, meshcat, "avatar", period)
     return system
 
 
+def _export_outputs(builder: DiagramBuilder, system: PersonTracker) -> None:
+    for index in range(system.num_output_ports()):
+        port = system.get_output_port(index)
+        builder.ExportOutput(port, port.get_name())
+
+
 def build_live_capture(
-    tracker: SilhouetteTracker,
+    tracker: PersonPoseTracker,
     cameras: Mapping[str, Camera],
     sensors: LiveSensors,
     meshcat: Meshcat | None = None,
@@ -149,30 +163,112 @@ def build_live_capture(
 ) -> Diagram:
     """Cameras' pictures, or what workers elsewhere make of them, to a person's poses.
 
-    The diagram's outputs are those of PersonTracker: ``estimated_positions``, ``last_positions``,
-    ``share``, ``time``, ``seen``, ``others``, and where wanted ``deviations``; and
-    ``silhouette_<camera>``, its inputs.
+    The diagram's outputs are those of PersonTracker, and ``silhouette_<camera>``, its inputs.
 
     Args:
-        tracker: made for the person's pose tree.
-        cameras: two calibrated cameras or more.
+        tracker, cameras, meshcat, with_deviations: as of add_person_tracker.
         sensors: those of the cameras, here or elsewhere.
-        meshcat: where the avatar is shown; None: nowhere.
-        with_deviations: whether the positions' standard deviations are an output.
 
     Raises:
         SettingsError: fewer than two cameras, or a period that is not positive.
     """
     builder = DiagramBuilder()
     ports = sensors.add(builder)
-    system = add_person_tracker(builder, tracker, cameras, ports, sensors.period, with_deviations)
+    system = add_person_tracker(
+        builder,
+        tracker,
+        cameras,
+        ports.silhouettes,
+        sensors.period,
+        ports.time,
+        meshcat,
+        with_deviations,
+    )
     for name, port in ports.silhouettes.items():
         builder.ExportOutput(port, f"silhouette_{name}")
-    for index in range(system.num_output_ports()):
-        port = system.get_output_port(index)
-        builder.ExportOutput(port, port.get_name())
-    if meshcat is not None:
-        positions = system.GetOutputPort("last_positions")
-        model = tracker.fit.tree.model
-        add_avatar(builder, model, positions, meshcat, "avatar", sensors.period)
+    _export_outputs(builder, system)
+    return builder.Build()
+
+
+@dataclass(frozen=True, eq=False)
+class SilhouetteCapture(StagedDiagram):
+    """A diagram of the capture. person: keeps what one frame hands to the next."""
+
+    person: PersonTracker
+
+
+def build_silhouette_capture(
+    tracker: PersonPoseTracker,
+    cameras: Mapping[str, Camera],
+    backgrounds: Mapping[str, Background],
+    period: float = 1.0 / 30.0,
+    edge_points: float = EDGE_POINTS,
+) -> SilhouetteCapture:
+    """Wire the cameras' images to their sensors, and these to what follows the person.
+
+    The diagram's inputs are ``color_image_<camera>``, its outputs those of PersonTracker, and its
+    stages ``region`` and ``edge``.
+
+    Args:
+        tracker: made for the person's pose tree.
+        cameras: two calibrated cameras or more.
+        backgrounds: of all cameras.
+        period: time between two frames [s].
+        edge_points: a picture's height over the spacing of the edge points.
+
+    Raises:
+        SettingsError: fewer than two cameras, one without a background, or a period that is not
+            positive.
+    """
+    for name in cameras:
+        if name not in backgrounds:
+            raise SettingsError(
+                f"camera '{name}' has no background: give one for each of {', '.join(cameras)}"
+            )
+    builder = DiagramBuilder()
+    sensors = _add_sensors(builder, cameras, backgrounds, edge_points)
+    for name, sensor in sensors.items():
+        builder.ExportInput(sensor.get_input_port(), f"color_image_{name}")
+    edges = {name: sensor.GetOutputPort("silhouette") for name, sensor in sensors.items()}
+    person = add_person_tracker(builder, tracker, cameras, edges, period)
+    _export_outputs(builder, person)
+    regions = tuple(sensor.GetOutputPort("region") for sensor in sensors.values())
+    stages = {"region": regions, "edge": tuple(edges.values())}
+    return SilhouetteCapture(builder.Build(), stages, person)
+
+
+def build_person_capture(
+    model: ArticulatedModel,
+    cameras: Mapping[str, PinholeCamera],
+    true_positions: Trajectory,
+    period: float = 1.0 / 30.0,
+    meshcat: Meshcat | None = None,
+) -> Diagram:
+    """A simulated person, the cameras around it, what follows it, and the avatar in the browser.
+
+    The diagram's outputs are ``estimated_positions`` and ``share``.
+
+    Args:
+        model: the person, with landmarks.yaml beside its file.
+        cameras: two or more.
+        true_positions: the person's positions (nq,) over time.
+        period: time between two frames [s].
+        meshcat: where the avatar is shown; None: nowhere.
+
+    Raises:
+        SettingsError: fewer than two cameras, or a period that is not positive.
+        ModelError: the model has no landmarks of trunk, arms and legs.
+    """
+    builder = DiagramBuilder()
+    rig = builder.AddNamedSystem(
+        "camera_rig", build_camera_rig(model, cameras, true_positions).diagram
+    )
+    sensors = _add_sensors(builder, cameras, {})
+    for name, sensor in sensors.items():
+        builder.Connect(rig.GetOutputPort(f"label_image_{name}"), sensor.get_input_port())
+    edges = {name: sensor.GetOutputPort("silhouette") for name, sensor in sensors.items()}
+    tracker = PersonPoseTracker(ContourFit(model.pose_tree()))
+    system = add_person_tracker(builder, tracker, cameras, edges, period, meshcat=meshcat)
+    for name in ("estimated_positions", "share"):
+        builder.ExportOutput(system.GetOutputPort(name), name)
     return builder.Build()

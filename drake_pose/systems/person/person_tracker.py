@@ -1,20 +1,17 @@
-"""A person followed by all silhouettes at once, as a Drake system and in a ready diagram."""
+"""A person followed by all silhouettes at once, as a Drake system."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import (
     BasicVector,
     Context,
-    Diagram,
-    DiagramBuilder,
     DiscreteStateIndex,
     DiscreteValues,
     EventStatus,
@@ -22,25 +19,15 @@ from pydrake.systems.framework import (
     LeafSystem,
 )
 from pydrake.systems.sensors import ImageRgba8U
-from pydrake.trajectories import Trajectory
 
-from drake_pose.body.model import ArticulatedModel
-from drake_pose.camera.models import Camera, PinholeCamera
+from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.fit.colour_lines import COLOURS
-from drake_pose.fit.contour_fit import ContourFit, inlier_ratio_of
+from drake_pose.fit.contour_fit import fitting_share
 from drake_pose.person.colour_views import ColourViews
-from drake_pose.person.frame_views import FrameViews
-from drake_pose.person.recordings.other_persons import keep_views
-from drake_pose.person.silhouette_tracker import SilhouetteTracker, TrackState
-from drake_pose.person.silhouette_view import SilhouetteView
-from drake_pose.systems.bodies.posed_geometry import add_avatar
-from drake_pose.systems.person.silhouette_sensor import (
-    SilhouetteSensor,
-    edge_spacing,
-    shows_somebody,
-)
-from drake_pose.systems.pictures.camera_rig import build_camera_rig
+from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
+from drake_pose.person.recordings.persons_in_view import keep_views
+from drake_pose.person.views import FrameViews, SilhouetteView, shows_somebody
 
 # Before the values in the state: whether the person is known, the share that fits, the usual share,
 # troubled frames, whether lost, in how many more frames others are looked for, the frame's time
@@ -65,7 +52,7 @@ class PersonTracker(LeafSystem):
         name: PersonTracker
         input_ports:
         - silhouette_<camera>
-        - color_image_<camera> (where asked for)
+        - color_image_<camera> (of color_cameras)
         - time
         output_ports:
         - estimated_positions
@@ -77,30 +64,26 @@ class PersonTracker(LeafSystem):
         - others
         - deviations
 
-    ``silhouette_<camera>`` is a SilhouetteView, as SilhouetteSensor gives it, or None: then the
-    others go on without the camera, as they do where the port is not connected. ``time`` is the
-    pictures' time stamp [s]: while it stays the same, or is nan, there is nothing new; where it is
-    not connected, every period brings new pictures.
+    ``silhouette_<camera>`` is a SilhouetteView, as SilhouetteSensor gives it; where it is None or
+    not connected the others go on without the camera. ``time`` is the pictures' time stamp [s]:
+    while it stays the same, or is nan, there is nothing new; where it is not connected, every
+    period brings new pictures.
 
-    The estimated positions are nan until the person is found and while the person is lost or seen
-    by fewer than two cameras; the last ones known, at first the model's default, are another
-    output, which an avatar can always show. Further outputs: the share of the contours that fits,
-    0 where nobody was seen; the time stamp of the last pictures used; for each camera whether it
-    saw the person in them, 1 or 0; and ``others``, 1 where other persons were in them. Others are
-    looked for at the start, while too little of the contours fits, and for a while after they were
-    seen; they are cut out, and a camera in which the person and another are one figure is left out
-    where three others see the person alone, else not judged by.
+    ``estimated_positions`` are nan until the person is found, while lost, and while fewer than two
+    cameras see the person; ``last_positions`` are the last ones known, at first the model's
+    default, and ``body_poses`` those of all bodies there, in the plant's order. ``share`` is that
+    of the contours that fits, 0 where nobody was seen; ``time`` the stamp of the last pictures
+    used; ``seen`` for each camera whether it saw the person in them, 1 or 0; ``others`` 1 where
+    other persons were in them. Others are looked for at the start, while too little of the contours
+    fits, and for a while after they were seen; they are cut out, and a camera in which the person
+    and another are one figure is left out where three others see the person alone, else not judged
+    by. ``deviations``, where asked for, are the positions' standard deviations [rad or m] by the
+    pictures and the limits alone.
 
-    ``color_image_<camera>`` of each camera named in ``color_cameras`` is an ``ImageRgba8U``. Where
-    fewer than two cameras give a silhouette that shows somebody, a person who is known is followed
-    by colour; the colours are learned from frame to frame. So silhouettes of one moment will do, or
-    ``set_person``. A person who is lost by colour is searched in the next silhouettes.
-
-    ``body_poses`` are the poses of all bodies at the last positions, in the plant's order, as a
-    plant's output of that name gives them.
-
-    ``deviations`` is there where it is asked for: (nq,) the positions' standard deviations
-    [rad or m], by the pictures and the limits alone; nan where the positions are.
+    Where fewer than two cameras give a silhouette that shows somebody, a person who is known is
+    followed by colour in ``color_image_<camera>``, an ``ImageRgba8U``; the colours are learned from
+    frame to frame. So silhouettes of one moment will do, or ``set_person``. A person who is lost by
+    colour is searched in the next silhouettes.
 
     Args:
         tracker: made for the person's pose tree.
@@ -116,7 +99,7 @@ class PersonTracker(LeafSystem):
 
     def __init__(
         self,
-        tracker: SilhouetteTracker,
+        tracker: PersonPoseTracker,
         cameras: Sequence[Camera],
         period: float,
         with_deviations: bool = False,
@@ -183,22 +166,13 @@ class PersonTracker(LeafSystem):
         }
 
     def known_person(self, context: Context) -> TrackState | None:
-        """What is known of the person, lost or not; None: nobody was found yet.
-
-        Args:
-            context: this system's.
-        """
+        """What is known of the person, lost or not; None: nobody was found yet."""
         return _unpack(context.get_discrete_state(self._state).value(), 0.0)
 
     def set_person(self, context: Context, person: TrackState) -> None:
-        """Say what is known of the person; the next pictures follow within a period.
-
-        Args:
-            context: this system's.
-            person: as known_person or SilhouetteTracker.start gives it.
-        """
+        """Say what is known of the person; the next pictures follow within a period."""
         state = context.get_mutable_discrete_state(self._state)
-        state.SetFromVector(_pack(person, self._tracker.is_lost(person), 0.0, np.nan, 0.0))
+        state.SetFromVector(_pack(person, 0.0, np.nan, 0.0))
 
     def _follow(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         vector = context.get_discrete_state(self._state).value()
@@ -210,14 +184,14 @@ class PersonTracker(LeafSystem):
                 return EventStatus.Succeeded()
         elapsed = 0.0 if np.isnan(before) else time - before
         last = _unpack(vector, elapsed)
-        frame_views, colours = self._frame_views(context), self._colour_views(context)
-        is_blind = sum(shows_somebody(view) for view in frame_views.views) < _SEERS
+        moment, colours = self._moment(context), self._colour_views(context)
+        is_blind = sum(shows_somebody(view) for view in moment.seen.views) < _SEERS
         found: TrackState | None
         if is_blind and colours is not None and last is not None:
             found, colours = self._followed_by_colour(last, colours)
-            kept, by_colour = _FrameViews((), ()), colours
+            kept, by_colour = _Moment(FrameViews((), ())), colours
         else:
-            found, kept = self._followed(last, frame_views, vector[_OTHERS] > 0)
+            found, kept = self._followed(last, moment, vector[_OTHERS] > 0)
             by_colour = None
         self._set_seen(discrete_state, kept, by_colour)
         if self._deviations is not None:
@@ -228,10 +202,9 @@ class PersonTracker(LeafSystem):
             discrete_state.get_mutable_value(self._state)[_SCALARS - 2] = time
             return EventStatus.Succeeded()
         found = self._judged(found, kept)
-        lost = self._tracker.is_lost(found)
         watched = _REMEMBERED if kept.others else max(vector[_OTHERS] - 1.0, 0.0)
-        discrete_state.set_value(self._state, _pack(found, lost, watched, time, elapsed))
-        if not lost:
+        discrete_state.set_value(self._state, _pack(found, watched, time, elapsed))
+        if not found.is_lost:
             self._note(discrete_state, found.values, kept, colours, by_colour is not None)
         return EventStatus.Succeeded()
 
@@ -239,7 +212,7 @@ class PersonTracker(LeafSystem):
         self,
         discrete_state: DiscreteValues,
         values: np.ndarray,
-        kept: _FrameViews,
+        kept: _Moment,
         colours: ColourViews | None,
         by_colour: bool,
     ) -> None:
@@ -247,16 +220,12 @@ class PersonTracker(LeafSystem):
         tracker = self._tracker
         discrete_state.set_value(self._last, tracker.positions(values))
         if self._deviations is not None:
-            if by_colour and colours is not None:
-                sure = tracker.uncertainty_by_colour(values, colours)
-            else:
-                sure = tracker.uncertainty(values, kept.cameras, kept.views)
-            deviations = tracker.deviations(sure.covariance)
-            discrete_state.set_value(self._deviations, deviations)
+            seen = colours if by_colour and colours is not None else kept.seen
+            discrete_state.set_value(self._deviations, tracker.deviations(values, seen))
         if colours is not None:
             regions = {
                 camera.name: view.region
-                for camera, view in zip(kept.cameras, kept.views, strict=True)
+                for camera, view in kept.pairs
                 if camera.name not in kept.merged and shows_somebody(view)
             }
             known = colours.learned(tracker.fit, values, regions)
@@ -266,14 +235,11 @@ class PersonTracker(LeafSystem):
                     packed[k] = known[name]
 
     def _set_seen(
-        self, discrete_state: DiscreteValues, kept: _FrameViews, by_colour: ColourViews | None
+        self, discrete_state: DiscreteValues, kept: _Moment, by_colour: ColourViews | None
     ) -> None:
         """Notes which cameras saw the person, and whether others were there."""
-        seers = {*kept.merged} | {
-            camera.name
-            for camera, view in zip(kept.cameras, kept.views, strict=True)
-            if shows_somebody(view)
-        }
+        seers = {camera.name for camera, view in kept.pairs if shows_somebody(view)}
+        seers |= {*kept.merged}
         if by_colour is not None:
             seers = {camera.name for camera in by_colour.cameras}
         seen = [float(camera.name in seers) for camera in self._cameras]
@@ -304,66 +270,59 @@ class PersonTracker(LeafSystem):
         self, last: TrackState, colours: ColourViews
     ) -> tuple[TrackState, ColourViews]:
         """The next state by pictures, and the pictures with what is known of their colours."""
-        if not colours.known and not self._tracker.is_lost(last):
+        if not colours.known and not last.is_lost:
             # The person was set: these are the first pictures.
             known = colours.learned(self._tracker.fit, last.values)
             colours = ColourViews(colours.cameras, colours.pictures, known)
         return self._tracker.follow_by_colour(last, colours), colours
 
-    def _frame_views(self, context: Context) -> _FrameViews:
-        """What those cameras say that have a picture."""
-        cameras, views = [], []
-        for camera, port in zip(self._cameras, self._silhouettes, strict=True):
-            view = port.Eval(context) if port.HasValue(context) else None
-            if view is not None:
-                cameras.append(camera)
-                views.append(view)
-        return _FrameViews(cameras, views)
+    def _moment(self, context: Context) -> _Moment:
+        """What those cameras see that have a picture."""
+        pairs = [
+            (camera, view)
+            for camera, port in zip(self._cameras, self._silhouettes, strict=True)
+            if (view := port.Eval(context) if port.HasValue(context) else None) is not None
+        ]
+        return _Moment(FrameViews([camera for camera, _ in pairs], [view for _, view in pairs]))
 
     def _followed(
-        self, last: TrackState | None, frame_views: _FrameViews, is_watching: bool
-    ) -> tuple[TrackState | None, _FrameViews]:
-        """The next state, and what the cameras say of the person alone."""
+        self, last: TrackState | None, moment: _Moment, is_watching: bool
+    ) -> tuple[TrackState | None, _Moment]:
+        """The next state, and what the cameras see of the person alone."""
         is_sorted = last is None or last.troubled != 0 or is_watching
         if is_sorted:
-            frame_views = self._alone(frame_views, last)
-        found = self._follow_one(last, frame_views)
+            moment = self._alone(moment.seen, last)
+        found = self._follow_one(last, moment.seen)
         if not is_sorted and (found is None or found.troubled != 0):
-            alone = self._alone(frame_views, last)
+            alone = self._alone(moment.seen, last)
             if alone.others:
-                return self._follow_one(last, alone), alone
-        return found, frame_views
+                return self._follow_one(last, alone.seen), alone
+        return found, moment
 
-    def _follow_one(self, last: TrackState | None, frame_views: _FrameViews) -> TrackState | None:
+    def _follow_one(self, last: TrackState | None, seen: FrameViews) -> TrackState | None:
         """The next state; None where fewer than two cameras see anybody."""
-        if sum(shows_somebody(view) for view in frame_views.views) < _SEERS:
+        if sum(shows_somebody(view) for view in seen.views) < _SEERS:
             return None
-        return self._tracker.follow(last, frame_views.cameras, frame_views.views)
+        return self._tracker.follow(last, seen)
 
-    def _alone(self, frame_views: _FrameViews, last: TrackState | None) -> _FrameViews:
-        """What cameras say without other persons than the one who was seen last."""
-        place = None if last is None else place_of_person(self._tracker, last.values)
-        views, cut, merged = keep_views(frame_views.cameras, frame_views.views, edge_spacing, place)
-        seers = [
-            (camera, view)
-            for camera, view in zip(frame_views.cameras, views, strict=True)
-            if camera.name not in merged
-        ]
-        if merged and sum(shows_somebody(view) for _, view in seers) >= _ENOUGH:
-            cameras, views = [camera for camera, _ in seers], [view for _, view in seers]
-            return _FrameViews(cameras, views, True, merged)
-        return _FrameViews(frame_views.cameras, views, bool(cut or merged), merged)
+    def _alone(self, seen: FrameViews, last: TrackState | None) -> _Moment:
+        """What cameras see without other persons than the one who was seen last."""
+        place = None if last is None else self._tracker.place(last.values)
+        alone, kept = keep_views(seen, place)
+        clean = _without(alone, kept.merged)
+        if kept.merged and sum(shows_somebody(view) for view in clean.views) >= _ENOUGH:
+            return _Moment(clean, True, kept.merged)
+        return _Moment(alone, bool(kept.cut or kept.merged), kept.merged)
 
-    def _judged(self, found: TrackState, frame_views: _FrameViews) -> TrackState:
+    def _judged(self, found: TrackState, moment: _Moment) -> TrackState:
         """A state whose share is that of the cameras in which nobody else's contours are."""
-        pairs = list(zip(frame_views.cameras, frame_views.views, strict=True))
-        clean = [(camera, view) for camera, view in pairs if camera.name not in frame_views.merged]
-        if not 0 < len(clean) < len(pairs):
+        clean = _without(moment.seen, moment.merged)
+        if not 0 < len(clean.cameras) < len(moment.seen.cameras):
             return found
         fit = self._tracker.fit
-        add_up = FrameViews([c for c, _ in clean], [view for _, view in clean]).add_up(fit)
-        total = add_up(fit.body.place(found.values), self._tracker.settings.rounds[-1])
-        return replace(found, share=inlier_ratio_of(total.sums))
+        step = self._tracker.schedule.follow[-1]
+        total = clean.add_up(fit)(fit.body.place(found.values), step)
+        return replace(found, share=fitting_share(total.sums))
 
     def _calc_positions(self, context: Context, output: BasicVector) -> None:
         vector = context.get_discrete_state(self._state).value()
@@ -385,28 +344,33 @@ class PersonTracker(LeafSystem):
         output.SetFromVector(vector[_SCALARS - 2 : _SCALARS - 1])
 
 
-class _FrameViews(NamedTuple):
-    """What cameras say at a moment.
+def _without(seen: FrameViews, names: Collection[str]) -> FrameViews:
+    """What the cameras see that are not named."""
+    chosen = [k for k, camera in enumerate(seen.cameras) if camera.name not in names]
+    return FrameViews([seen.cameras[k] for k in chosen], [seen.views[k] for k in chosen])
+
+
+class _Moment(NamedTuple):
+    """What cameras see at a moment.
 
     Attributes:
-        cameras: those that have a picture.
-        views: what each of them says.
+        seen: by those that have a picture.
         others: whether other persons were cut out, or cameras left out because of them.
         merged: the names of the cameras in which the person and another are one figure.
     """
 
-    cameras: Sequence[Camera]
-    views: Sequence[SilhouetteView]
+    seen: FrameViews
     others: bool = False
     merged: tuple[str, ...] = ()
 
+    @property
+    def pairs(self) -> list[tuple[Camera, SilhouetteView]]:
+        """Cameras and their views."""
+        return list(zip(self.seen.cameras, self.seen.views, strict=True))
 
-def place_of_person(tracker: SilhouetteTracker, values: np.ndarray) -> np.ndarray:
-    """(3,) where a person is who has values (m,) of the tracker's pose tree: the trunk [m]."""
-    return tracker.plan.trunk_middle(tracker.fit.kinematics.poses(values))
 
-
-def _pack(state: TrackState, lost: bool, watched: float, time: float, elapsed: float) -> np.ndarray:
+def _pack(state: TrackState, watched: float, time: float, elapsed: float) -> np.ndarray:
+    lost = state.is_lost
     scalars = [1.0, state.share, state.usual, state.troubled, lost, watched, time, elapsed]
     return np.concatenate([scalars, state.values, state.step])
 
@@ -420,47 +384,3 @@ def _unpack(vector: np.ndarray, elapsed: float) -> TrackState | None:
     # Where frames were skipped, the motion has gone on for longer than from frame to frame.
     frames = min(elapsed / usually, _LONGEST_PAUSE) if usually > 0 and elapsed > 0 else 1.0
     return TrackState(values.copy(), frames * step, float(share), float(usual), int(troubled))
-
-
-def build_person_capture(
-    model: ArticulatedModel,
-    cameras: Mapping[str, PinholeCamera],
-    true_positions: Trajectory,
-    period: float = 1.0 / 30.0,
-    meshcat: Meshcat | None = None,
-) -> Diagram:
-    """A simulated person, the cameras around it, what follows it, and the avatar in the browser.
-
-    The diagram's outputs are ``estimated_positions`` and ``share``.
-
-    Args:
-        model: the person, with landmarks.yaml beside its file.
-        cameras: two or more.
-        true_positions: the person's positions (nq,) over time.
-        period: time between two frames [s].
-        meshcat: where the avatar is shown; None: nowhere.
-
-    Raises:
-        SettingsError: fewer than two cameras, or a period that is not positive.
-        ModelError: the model has no landmarks of trunk, arms and legs.
-    """
-    builder = DiagramBuilder()
-    tracker = SilhouetteTracker(ContourFit(model.pose_tree()))
-    system = builder.AddNamedSystem(
-        "person_tracker", PersonTracker(tracker, list(cameras.values()), period)
-    )
-    rig = builder.AddNamedSystem(
-        "camera_rig", build_camera_rig(model, cameras, true_positions).diagram
-    )
-    for name, camera in cameras.items():
-        sensor = builder.AddNamedSystem(f"sensor_{name}", SilhouetteSensor(camera))
-        builder.Connect(rig.GetOutputPort(f"label_image_{name}"), sensor.get_input_port())
-        builder.Connect(
-            sensor.GetOutputPort("silhouette"), system.GetInputPort(f"silhouette_{name}")
-        )
-    for name in ("estimated_positions", "share"):
-        builder.ExportOutput(system.GetOutputPort(name), name)
-    if meshcat is not None:
-        positions = system.GetOutputPort("last_positions")
-        add_avatar(builder, model, positions, meshcat, "avatar", period)
-    return builder.Build()

@@ -1,34 +1,29 @@
-"""One camera's share of following a person: the edge of the person's region."""
+"""One camera's share of following a person, here or on another machine, as Drake systems."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from typing import Any
+
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import Context, LeafSystem
+from pydrake.systems.framework import Context, DependencyTicket, LeafSystem
 from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 
 from drake_pose.camera.models import Camera
-from drake_pose.person.recordings.person_capture import EDGE_POINTS
-from drake_pose.person.silhouette_view import SilhouetteView, see_silhouette
+from drake_pose.camera.sources.frame_source import FrameSource
+from drake_pose.fit.camera_sums import EdgeKeeper
+from drake_pose.person.views import (
+    EDGE_POINTS,
+    KeptEdge,
+    edge_spacing,
+    see_silhouette,
+    unpack_view,
+)
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 from drake_pose.silhouette.segmentation.background import Background, person_region
 from drake_pose.systems.colour_images import colour_image_to_picture
-
-# The edge of a person's region is longer than this share of the picture's height.
-_LEAST_EDGE = 0.15
-
-
-def edge_spacing(camera: Camera, edge_points: float = EDGE_POINTS) -> float:
-    """From edge point to edge point in a camera's pictures [pixel]."""
-    return max(2.0, camera.height / edge_points)
-
-
-def shows_somebody(view: SilhouetteView | None) -> bool:
-    """Whether a view has more to show than a speck: to search a person in specks takes seconds."""
-    if view is None:
-        return False
-    return bool(view.edge_length >= _LEAST_EDGE * view.height)
+from drake_pose.systems.pictures.picture_capture import PictureCapture
 
 
 class SilhouetteSensor(LeafSystem):
@@ -67,29 +62,87 @@ class SilhouetteSensor(LeafSystem):
         else:
             name, image = "color_image", ImageRgba8U(camera.width, camera.height)
         self._image = self.DeclareAbstractInputPort(name, AbstractValue.Make(image))
+        tickets = {self._image.ticket()}
         self._region = self.DeclareAbstractOutputPort(
-            "region", _allocate, self._calc_region, {self._image.ticket()}
+            "region", _allocate, self._calc_region, tickets
         )
-        self.DeclareAbstractOutputPort(
-            "silhouette", _allocate, self._calc_silhouette, {self._image.ticket()}
-        )
+        self.DeclareAbstractOutputPort("silhouette", _allocate, self._calc_silhouette, tickets)
 
     def _calc_region(self, context: Context, output: AbstractValue) -> None:
-        output.set_value(self._person(context))
+        image = self._image.Eval(context) if self._image.HasValue(context) else None
+        if image is None or image.size() == 0:
+            output.set_value(None)
+        elif self._background is None:
+            output.set_value(label_image_to_mask(image))
+        else:
+            output.set_value(person_region(colour_image_to_picture(image), self._background))
 
     def _calc_silhouette(self, context: Context, output: AbstractValue) -> None:
         region = self._region.Eval(context)
         output.set_value(None if region is None else see_silhouette(region, self._spacing))
 
-    def _person(self, context: Context) -> NDArray[np.bool_] | None:
-        if not self._image.HasValue(context):
-            return None
-        image = self._image.Eval(context)
-        if image.size() == 0:
-            return None
-        if self._background is None:
-            return label_image_to_mask(image)
-        return person_region(colour_image_to_picture(image), self._background)
+
+class RemoteSensors(PictureCapture):
+    """Gives the synchronised views of cameras whose pictures stay on other machines.
+
+    .. pydrake_system::
+
+        name: RemoteSensors
+        output_ports:
+        - silhouette_<camera>
+        - time
+        - fresh
+
+    As PictureCapture, but its sources deliver packed views (bytes (n,) of pack_view) in place of
+    pictures, and its outputs are what SilhouetteSensor gives: a SilhouetteView, or None where the
+    camera gave no picture at that moment.
+
+    Args:
+        sources: where each camera's packed views come from, opened.
+        cameras: the calibrated cameras.
+        keepers: by camera, who has the edges of its pictures and compares contours with them; the
+            process itself does where nobody has.
+        others: the further arguments of PictureCapture.
+    """
+
+    def __init__(
+        self,
+        sources: Mapping[str, FrameSource],
+        cameras: Mapping[str, Camera],
+        *,
+        keepers: Mapping[str, EdgeKeeper] | None = None,
+        **others: Any,
+    ) -> None:
+        super().__init__(sources, cameras, **others)
+        self._keepers = dict(keepers or {})
+
+    def _declare_outputs(
+        self, cameras: Mapping[str, Camera], ticket: set[DependencyTicket]
+    ) -> None:
+        for name in self._sources:
+            self.DeclareAbstractOutputPort(
+                f"silhouette_{name}", _allocate, self._calc_silhouette(name), ticket
+            )
+
+    def overdue(self, camera: str) -> float:
+        """The time stamp up to which a camera's pictures come too late [s]."""
+        return -np.inf if self.moment is None else self._origins[camera] + self.moment.time
+
+    def _feed(self, name: str, source: FrameSource, now: float) -> None:
+        """Hands on the views of a camera that are due; one that is silent is waited for."""
+        self._feed_due(name, source, now)
+
+    def _calc_silhouette(self, name: str) -> Callable[[Context, AbstractValue], None]:
+        def calc(context: Context, output: AbstractValue) -> None:
+            one = None if self.moment is None else self.moment.items.get(name)
+            if one is None:
+                output.set_value(None)
+                return
+            keeper = self._keepers.get(name)
+            kept = None if keeper is None else KeptEdge(keeper, name, one.time)
+            output.set_value(unpack_view(one.picture.tobytes(), kept))
+
+        return calc
 
 
 def _allocate() -> AbstractValue:

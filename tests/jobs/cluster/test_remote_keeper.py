@@ -16,9 +16,9 @@ from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.jobs.cluster.camera_worker import EdgeServer
 from drake_pose.jobs.cluster.lines import Line, serve
 from drake_pose.jobs.cluster.remote_keeper import RemoteKeeper
-from drake_pose.person.silhouette_tracker import SilhouetteTracker
-from drake_pose.person.silhouette_view import KeptEdge, see_silhouette
-from drake_pose.person.view_packing import pack_view, unpack_view
+from drake_pose.person.pose_tracker import PersonPoseTracker
+from drake_pose.person.views import FrameViews, KeptEdge, see_silhouette
+from drake_pose.person.views import pack_view, unpack_view
 from drake_pose.silhouette.areas.scoring import draw_mask
 
 HOST = "127.0.0.1"
@@ -29,7 +29,7 @@ class World:
     """A person before four cameras, and the person a moment before."""
 
     def __init__(self):
-        self.tracker = SilhouetteTracker(
+        self.tracker = PersonPoseTracker(
             ContourFit(load_model(bundled_model("person"), check=False).pose_tree())
         )
         fit = self.tracker.fit
@@ -43,7 +43,7 @@ class World:
         self.here = self.follow(self.views)
 
     def follow(self, views):
-        return self.tracker.follow(self.tracker.start(self.before), self.cameras, views)
+        return self.tracker.follow(self.tracker.start(self.before), FrameViews(self.cameras, views))
 
     def kept(self, *keepers):
         """Packed views whose edges are kept: of the first two cameras, and of the others."""
@@ -99,7 +99,7 @@ def test_the_answer_is_that_of_one_process_which_unpacks_nothing(world, closed):
     views = world.kept(*keepers)
     world.same(world.follow(views))
     assert not any({"region", "edge"} & set(vars(view)) for view in views)
-    rounds = len(world.tracker.settings.rounds)
+    rounds = len(world.tracker.schedule.follow)
     assert [keeper.answers - n for keeper, n in zip(keepers, asked, strict=True)] == [rounds] * 2
     # One group's edges are in this process.
     world.same(world.follow(world.kept(keepers[0], None)))

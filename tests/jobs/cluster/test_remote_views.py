@@ -16,7 +16,7 @@ from drake_pose.jobs.cluster.remote_views import ClusterSensors
 from drake_pose.jobs.cluster.scheduler import open_cluster
 from drake_pose.jobs.live.run import FrameWatch, run_live
 from drake_pose.jobs.live.scene import load_live_scene
-from drake_pose.person.recordings.known_shape import tracker_of_person
+from drake_pose.person.shape import tracker_of_person
 from drake_pose.systems.person.live_capture import build_live_capture
 from tests.cli import CliRunner
 from tests.jobs.live_scenes import RATE_HZ, load_person, standing, write_studio

@@ -16,7 +16,7 @@ from drake_pose.jobs.estimate.capture import capture_scene
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.person.recordings.checked_capture import CheckedCapture
 from drake_pose.person.recordings.person_capture import PersonCapture
-from drake_pose.person.recordings.person_recording import ViewFaults
+from drake_pose.person.recordings.persons_in_view import ViewFaults
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.silhouette.pictures.masks import write_mask
 from tests.cli import CliRunner

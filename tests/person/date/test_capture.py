@@ -7,7 +7,7 @@ import pytest
 from drake_pose.camera.rigs import FACE_CAMERA
 from drake_pose.errors import SettingsError
 from drake_pose.person.date.capture import CaptureSetup, see_person
-from drake_pose.person.date.contours import measure_contour, similarity
+from drake_pose.person.date.recognition import measure_contour, similarity
 from drake_pose.person.date.faces import (
     cut_face,
     face_direction,

@@ -7,13 +7,12 @@ from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.landmarks import landmark_positions, load_landmarks
 from drake_pose.body.model import load_model
 from drake_pose.camera.rigs import circle_of_cameras
-from drake_pose.errors import SettingsError
 from drake_pose.fit.colour_lines import BESIDE, ON
 from drake_pose.fit.contour_fit import ContourFit
-from drake_pose.person.colour_views import ColourViews, PersonColourSettings
+from drake_pose.person.colour_views import ColourViews
+from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.recordings.colour_capture import ColourRecording, capture_by_colour
-from drake_pose.person.shape import shape_noise
-from drake_pose.person.silhouette_tracker import SilhouetteTracker
+from drake_pose.person.shape import NOISE
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.person.recordings.test_person_capture import stepping
 
@@ -127,8 +126,8 @@ class TestLearning:
     def test_masks_say_which_colours_are_the_persons(self, person, cameras, recording):
         """Of a model that is 4 cm off, colours are learned right where the masks are known."""
         pictures, masks, q = (one[0] for one in recording)
-        fit = ContourFit(person.pose_tree(), noise=shape_noise())
-        tracker = SilhouetteTracker(fit)
+        fit = ContourFit(person.pose_tree(), noise=NOISE)
+        tracker = PersonPoseTracker(fit)
         off = q.copy()
         off[person.position_index("position_y")] += 0.04
         views = ColourViews(list(cameras.values()), list(pictures.values()), {})
@@ -145,16 +144,10 @@ class TestLearning:
 
     def test_a_camera_that_is_not_known_says_nothing(self, person, cameras, recording):
         pictures, _, q = (one[0] for one in recording)
-        fit = ContourFit(person.pose_tree(), noise=shape_noise())
-        tracker = SilhouetteTracker(fit)
+        fit = ContourFit(person.pose_tree(), noise=NOISE)
+        tracker = PersonPoseTracker(fit)
         views = ColourViews(list(cameras.values()), list(pictures.values()), {})
         state = tracker.follow_by_colour(tracker.start(tracker.values(q)), views)
         assert state.share == 0.0
-        assert tracker.is_lost(state)
+        assert state.is_lost
         assert np.isnan(tracker.distance_by_colour(state.values, views))
-
-    def test_settings_are_checked(self):
-        with pytest.raises(SettingsError, match="rate"):
-            PersonColourSettings(rate=1.5)
-        with pytest.raises(SettingsError, match="inside"):
-            PersonColourSettings(inside=0.0)

@@ -13,6 +13,7 @@ from drake_pose.camera.models import Camera
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.fit.evidence import find_edge_points
+from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.recordings.camera_faults import (
     CameraFault,
     FrameView,
@@ -21,11 +22,9 @@ from drake_pose.person.recordings.camera_faults import (
     moved_since,
 )
 from drake_pose.person.recordings.figures import cut_figures, find_figures, find_persons
-from drake_pose.person.recordings.other_persons import keep_person, keep_views
-from drake_pose.person.recordings.person_recording import PersonRecording
+from drake_pose.person.recordings.persons_in_view import PersonRecording, keep_person, keep_views
 from drake_pose.person.recordings.rig_faults import find_rig_fault
-from drake_pose.person.silhouette_tracker import SilhouetteTracker
-from drake_pose.person.silhouette_view import see_silhouette
+from drake_pose.person.views import FrameViews, see_silhouette
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.person.persons_in_view import see, stepping
 
@@ -41,7 +40,7 @@ class Stage:
     masks: Masks
 
     def frames(self, masks: Masks) -> list[FrameView]:
-        tracker = SilhouetteTracker(self.fit)
+        tracker = PersonPoseTracker(self.fit)
         return [
             FrameView({n: find_edge_points(m, 2.0) for n, m in own.items()}, tracker.values(q))
             for own, q in zip(masks, self.poses, strict=True)
@@ -218,9 +217,9 @@ class TestOthers:
         cameras = list(nine.cameras.values())
         views = [see_silhouette(mask | other[name], 2.0) for name, mask in alone.items()]
         place = np.array([-0.2, 0.1, 0.9])
-        found = keep_views(cameras, views, lambda _: 2.0, place)
+        frame, found = keep_views(FrameViews(cameras, views), place)
         assert (found.cut, found.merged) == (kept.cut, kept.merged)
-        for name, view in zip(alone, found.views, strict=True):
+        for name, view in zip(alone, frame.views, strict=True):
             np.testing.assert_array_equal(view.region, kept.masks[name])
             if name in kept.cut:
                 np.testing.assert_array_equal(view.edge.uv, find_edge_points(alone[name], 2.0).uv)

@@ -11,8 +11,8 @@ from drake_pose.errors import ModelError, SettingsError
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.surfaces import with_girths
-from drake_pose.person.recordings.person_capture import PersonCaptureSettings, capture_person
-from drake_pose.person.shape import fit_shape, shape_noise, shape_values
+from drake_pose.person.recordings.person_capture import capture_person
+from drake_pose.person.shape import NOISE, fit_shape, shape_values
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import load_scene
@@ -62,7 +62,7 @@ def stepping(person, phase):
 
 class TestShape:
     def test_lengths_are_found(self, person, cameras):
-        fit = ContourFit(person.pose_tree(), noise=shape_noise())
+        fit = ContourFit(person.pose_tree(), noise=NOISE)
         order = [person.position_index(name) for name in fit.kinematics.names]
         renderers = [LabelRenderer(person, camera) for camera in cameras.values()]
         frames, starts = [], []
@@ -80,13 +80,12 @@ class TestShape:
             assert found[name] == pytest.approx(stretch, abs=0.02), name
         off = np.array([found[name] - stretch for name, stretch in LENGTHS.items()])
         assert np.abs(off).mean() < 0.5 * np.mean(np.abs(list(LENGTHS.values())))
-        assert all(0.93 < girth < 1.07 for girth in shape.girths.values())
-        names = [n for n, is_length in zip(found, shape.is_shape, strict=True) if is_length]
-        off = np.array([found[name] - LENGTHS.get(name, 0.0) for name in names])
+        assert all(0.93 < girth < 1.07 for girth in shape.known.girths.values())
+        off = np.array([x - LENGTHS.get(name, 0.0) for name, x in shape.known.lengths.items()])
         assert 0.05 < off @ np.linalg.solve(shape.covariance, off) / len(off) < 2.0
 
     def test_girths_are_found(self, person, cameras):
-        fit = ContourFit(person.pose_tree(), noise=shape_noise())
+        fit = ContourFit(person.pose_tree(), noise=NOISE)
         order = [person.position_index(name) for name in fit.kinematics.names]
         factors = {"trunk": 1.1, "thigh": 1.2, "shin": 0.9}
         girths = np.ones(len(fit.outlines))
@@ -104,7 +103,7 @@ class TestShape:
             frames.append((list(cameras.values()), [find_edge_points(m, 3.0) for m in masks]))
         shape = fit_shape(fit, frames, np.array(starts))
         for part, factor in factors.items():
-            assert shape.girths[part] == pytest.approx(factor, abs=0.05), part
+            assert shape.known.girths[part] == pytest.approx(factor, abs=0.05), part
 
     def test_model_of_fixed_lengths_is_refused(self):
         person = load_model(bundled_model("person"), check=False)
@@ -125,10 +124,6 @@ class TestCapture:
         with pytest.raises(SettingsError, match="two cameras"):
             capture_person(person.pose_tree(), cameras, read, 2)
 
-    def test_settings_are_checked(self):
-        with pytest.raises(SettingsError, match="shape_frames"):
-            PersonCaptureSettings(shape_frames=0)
-
     @pytest.mark.slow
     def test_real_person_of_unknown_proportions(self, person, shared_data):
         scene = load_scene(shared_data / "human_four_views")
@@ -137,8 +132,7 @@ class TestCapture:
         def read(k):
             return {name: scene.read(name, frames[k]) for name in scene.cameras}
 
-        settings = PersonCaptureSettings(starts=2)
-        captured = capture_person(person.pose_tree(), scene.cameras, read, len(frames), settings)
+        captured = capture_person(person.pose_tree(), scene.cameras, read, len(frames))
         landmarks = load_landmarks(person.path)
         truth = {}
         with (scene.path / "joint_centres.csv").open() as stream:

@@ -9,12 +9,12 @@ from drake_pose.body.model import load_model
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.fit.contour_fit import ContourFit
-from drake_pose.person.silhouette_tracker import SilhouetteTracker
-from drake_pose.person.silhouette_view import see_silhouette
+from drake_pose.person.pose_tracker import PersonPoseTracker
+from drake_pose.person.views import edge_spacing, see_silhouette
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.systems.colour_images import picture_to_colour_image
-from drake_pose.systems.person.person_tracker import PersonTracker, build_person_capture
-from drake_pose.systems.person.silhouette_sensor import edge_spacing
+from drake_pose.systems.person.live_capture import build_person_capture
+from drake_pose.systems.person.person_tracker import PersonTracker
 from tests.person.persons_in_view import see, stepping
 
 # Who is followed walks; in this frame another one comes into view, and stays.
@@ -56,7 +56,7 @@ def test_moving_person_is_followed_and_shown(person, cameras):
 
 
 def test_without_pictures_nobody_is_found(person, cameras):
-    tracker = SilhouetteTracker(ContourFit(person.pose_tree()))
+    tracker = PersonPoseTracker(ContourFit(person.pose_tree()))
     system = PersonTracker(tracker, list(cameras.values()), 0.1)
     simulator = Simulator(system)
     simulator.AdvanceTo(0.25)
@@ -70,7 +70,7 @@ def test_without_pictures_nobody_is_found(person, cameras):
 
 @pytest.mark.slow
 def test_person_is_lost_kept_in_mind_and_found_again(person, cameras):
-    tracker = SilhouetteTracker(ContourFit(person.pose_tree()))
+    tracker = PersonPoseTracker(ContourFit(person.pose_tree()))
     system = PersonTracker(tracker, list(cameras.values()), 0.1)
     simulator = Simulator(system)
     context = simulator.get_context()
@@ -138,7 +138,7 @@ def both(person, cameras, alone):
 @pytest.fixture(scope="module")
 def watch(person, cameras):
     """What comes out for masks (T,), by port: (T, n)."""
-    tracker = SilhouetteTracker(ContourFit(person.pose_tree()))
+    tracker = PersonPoseTracker(ContourFit(person.pose_tree()))
     names = ("estimated_positions", "others", "deviations", "seen")
 
     def watch(frames):
@@ -186,7 +186,7 @@ def test_deviations_tell_how_sure_each_position_is(watch, poses, alone):
 
 
 def test_arguments_are_checked(person, cameras):
-    tracker = SilhouetteTracker(ContourFit(person.pose_tree()))
+    tracker = PersonPoseTracker(ContourFit(person.pose_tree()))
     with pytest.raises(SettingsError, match="two or more"):
         PersonTracker(tracker, list(cameras.values())[:1], 0.1)
     with pytest.raises(SettingsError, match="period"):
@@ -194,7 +194,7 @@ def test_arguments_are_checked(person, cameras):
 
 
 def test_a_person_who_is_set_is_followed_by_colour_images(person, cameras):
-    tracker = SilhouetteTracker(ContourFit(person.pose_tree()))
+    tracker = PersonPoseTracker(ContourFit(person.pose_tree()))
     names = list(cameras)
     system = PersonTracker(
         tracker, list(cameras.values()), 0.1, with_deviations=True, color_cameras=names
@@ -245,6 +245,6 @@ def test_a_person_who_is_set_is_followed_by_colour_images(person, cameras):
 
 
 def test_a_colour_image_of_no_camera_is_refused(person, cameras):
-    tracker = SilhouetteTracker(ContourFit(person.pose_tree()))
+    tracker = PersonPoseTracker(ContourFit(person.pose_tree()))
     with pytest.raises(UnknownNameError, match="elsewhere"):
         PersonTracker(tracker, list(cameras.values()), 0.1, color_cameras=["elsewhere"])

@@ -7,12 +7,11 @@ from pydrake.systems.analysis import Simulator
 
 from drake_pose.errors import SettingsError
 from drake_pose.fit.contour_fit import ContourFit
-from drake_pose.person.silhouette_tracker import SilhouetteTracker
-from drake_pose.person.silhouette_view import see_silhouette
+from drake_pose.person.pose_tracker import PersonPoseTracker
+from drake_pose.person.views import FrameViews, edge_spacing, see_silhouette
 from drake_pose.silhouette.segmentation.background import person_region
 from drake_pose.systems.colour_images import picture_to_colour_image
-from drake_pose.systems.person.silhouette_capture import build_silhouette_capture
-from drake_pose.systems.person.silhouette_sensor import edge_spacing
+from drake_pose.systems.person.live_capture import build_silhouette_capture
 from tests.person.studio import Studio
 
 # A power of two, for times between frames that are all exactly the same.
@@ -36,7 +35,7 @@ def backgrounds(studio, cameras):
 
 @pytest.fixture(scope="module")
 def tracker(studio):
-    return SilhouetteTracker(ContourFit(studio.model.pose_tree()))
+    return PersonPoseTracker(ContourFit(studio.model.pose_tree()))
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +72,7 @@ def test_diagram_is_the_plain_functions_in_turn(
             see_silhouette(person_region(shot, backgrounds[name]), edge_spacing(cameras[name]))
             for name, shot in pictures.items()
         ]
-        state = tracker.follow(state, list(cameras.values()), views)
+        state = tracker.follow(state, FrameViews(list(cameras.values()), views))
         found = capture.diagram.GetOutputPort("estimated_positions").Eval(context)
         np.testing.assert_array_equal(found, tracker.positions(state.values))
         known = capture.person.known_person(own)

@@ -9,14 +9,10 @@ from drake_pose.body.model import load_model
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecification, TimedPicture
 from drake_pose.errors import SettingsError, UnknownNameError
-from drake_pose.person.silhouette_view import see_silhouette
+from drake_pose.person.views import edge_spacing, see_silhouette, shows_somebody
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask, mask_to_label_image
 from drake_pose.silhouette.segmentation.background import learn_background, person_region
-from drake_pose.systems.person.silhouette_sensor import (
-    SilhouetteSensor,
-    edge_spacing,
-    shows_somebody,
-)
+from drake_pose.systems.person.silhouette_sensor import SilhouetteSensor
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
 from drake_pose.systems.pictures.picture_capture import PictureCapture
 

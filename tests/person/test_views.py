@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from drake_pose.person.silhouette_view import see_silhouette
-from drake_pose.person.view_packing import pack_view, unpack_view
+from drake_pose.person.views import pack_view, see_silhouette, unpack_view
 
 
 def ellipse(rows: int, columns: int) -> np.ndarray:

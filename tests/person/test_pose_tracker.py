@@ -9,10 +9,9 @@ from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.errors import ModelError, SettingsError
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.body_plan import crowding
-from drake_pose.person.frame_views import FrameViews
-from drake_pose.person.search import SearchSettings
-from drake_pose.person.silhouette_tracker import SilhouetteTracker, TrackerSettings
-from drake_pose.person.silhouette_view import see_silhouette
+from drake_pose.person.pose_tracker import PersonPoseTracker
+from drake_pose.person.search import EXACT, headings_of
+from drake_pose.person.views import FrameViews, see_silhouette
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
 
@@ -22,7 +21,7 @@ class World:
         ring = circle_of_cameras(5, size=(320, 240), face_camera=False)
         self.cameras = list(ring.values())
         self.renderers = [LabelRenderer(self.person, camera) for camera in self.cameras]
-        self.tracker = SilhouetteTracker(ContourFit(self.person.pose_tree()))
+        self.tracker = PersonPoseTracker(ContourFit(self.person.pose_tree()))
 
     def pose(self, **degrees):
         q = np.zeros(len(self.person.position_names))
@@ -71,7 +70,9 @@ class TestTracker:
         np.testing.assert_allclose(world.tracker.positions(turned), q, atol=1e-12)
 
     def test_person_is_found_and_followed_even_without_a_camera(self, world):
-        state = world.tracker.follow(None, world.cameras, world.views(world.pose(**WALKING)))
+        state = world.tracker.follow(
+            None, FrameViews(world.cameras, world.views(world.pose(**WALKING)))
+        )
         assert world.off(state.values, world.pose(**WALKING)) < 40.0
         for k in range(1, 6):
             q = world.pose(**{name: (1 - 0.2 * k) * a for name, a in WALKING.items()}, head_y=5 * k)
@@ -79,7 +80,7 @@ class TestTracker:
             cameras = world.cameras
             if k >= 3:
                 cameras, views = cameras[1:], views[1:]
-            state = world.tracker.follow(state, cameras, views)
+            state = world.tracker.follow(state, FrameViews(cameras, views))
             assert world.off(state.values, q) < 30.0, k
 
     def test_destroyed_track_is_right_again_without_a_registered_pose(self, world):
@@ -95,7 +96,7 @@ class TestTracker:
         state = replace(state, values=wrong)
         errors = []
         for _ in range(15):
-            state = world.tracker.follow(state, world.cameras, views)
+            state = world.tracker.follow(state, FrameViews(world.cameras, views))
             errors.append(world.off(state.values, q))
         assert min(errors) < 25.0
         assert errors[-1] < 25.0
@@ -103,7 +104,7 @@ class TestTracker:
     def test_stretched_arms_are_not_bent_the_wrong_way(self, world):
         # Slightly bent backwards and twisted about itself, a stretched arm looks almost the same.
         q = world.pose(left_upper_arm_z=80.0, right_upper_arm_z=-80.0)
-        state = world.tracker.follow(None, world.cameras, world.views(q))
+        state = world.tracker.follow(None, FrameViews(world.cameras, world.views(q)))
         assert world.off(state.values, q) < 25.0
 
     def test_lost_arm_is_searched_again(self, world):
@@ -111,24 +112,23 @@ class TestTracker:
         lifted = world.pose(**{**WALKING, "left_upper_arm_z": 110.0, "left_forearm_x": -20.0})
         state = world.tracker.start(world.tracker.values(q))
         for _ in range(4):
-            state = world.tracker.follow(state, world.cameras, world.views(lifted))
+            state = world.tracker.follow(state, FrameViews(world.cameras, world.views(lifted)))
         assert world.off(state.values, lifted) < 25.0
 
     def test_nobody_in_view(self, world):
         empty = [see_silhouette(np.zeros((240, 320), dtype=bool), 4.0) for _ in world.cameras]
-        assert world.tracker.follow(None, world.cameras, empty) is None
+        assert world.tracker.follow(None, FrameViews(world.cameras, empty)) is None
         values = world.tracker.values(world.pose())
-        state = world.tracker.follow(world.tracker.start(values), world.cameras, empty)
+        state = world.tracker.follow(world.tracker.start(values), FrameViews(world.cameras, empty))
         assert state.share == 0.0
         np.testing.assert_allclose(state.values, values, atol=1e-6)
 
     def test_all_headings_are_tried_the_first_ones_all_around(self):
-        settings = SearchSettings(headings=12, headings_a_frame=3)
-        tried = [settings.turns(k) for k in range(4)]
+        tried = [headings_of(k) for k in range(4)]
         assert sorted(turn for turns in tried for turn in turns) == list(range(12))
         assert tried[0] == [0, 4, 8]
         assert tried[1] == [2, 6, 10]
-        assert settings.turns(4) == tried[0]
+        assert headings_of(4) == tried[0]
 
     def test_small_pictures_show_the_same_places(self, world):
         views = world.views(world.pose(**WALKING))
@@ -141,14 +141,9 @@ class TestTracker:
             np.testing.assert_allclose(small.project(points)[0], uv / stride, atol=1e-9)
 
     def test_settings_are_checked(self):
-        with pytest.raises(SettingsError, match="round"):
-            TrackerSettings(rounds=())
-        with pytest.raises(SettingsError, match="headings must be 1"):
-            SearchSettings(headings=0)
-        with pytest.raises(SettingsError, match="round"):
-            SearchSettings(rounds=())
-        with pytest.raises(SettingsError, match="share"):
-            SearchSettings(fitted=0.0)
+        for rounds in ({"follow": ()}, {"search": ()}):
+            with pytest.raises(SettingsError, match="round"):
+                replace(EXACT, **rounds)
 
 
 class TestPlan:
@@ -178,4 +173,4 @@ class TestPlan:
     def test_model_without_landmarks_is_refused(self):
         hand = load_model(bundled_model("two_finger_hand"), check=False)
         with pytest.raises(ModelError, match="landmarks"):
-            SilhouetteTracker(ContourFit(hand.pose_tree()))
+            PersonPoseTracker(ContourFit(hand.pose_tree()))

@@ -1,0 +1,269 @@
+"""What cameras see of a person at a moment, here or elsewhere, and as few bytes for the way."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.camera.models import Camera, ParallelCamera
+from drake_pose.fit.camera_sums import (
+    AddUp,
+    CameraSum,
+    EdgeKeeper,
+    SumRequest,
+    Views,
+    add_cameras,
+    add_sums,
+    compare_placed,
+)
+from drake_pose.fit.contour_fit import ContourFit, pack_cameras
+from drake_pose.fit.evidence import EdgePoints, find_edge_points, pack_evidence
+from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.parameters import Placement
+from drake_pose.person.rays import triangulate
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+EDGE_POINTS = 120.0
+"""A picture's height over the usual spacing of its region's edge points."""
+# The edge of a person's region is longer than this share of the picture's height.
+_LEAST_EDGE = 0.15
+
+# Guesses are judged by this many cameras, in pictures with about this many rows.
+_JUDGES = 5
+_ROWS = 120
+
+# Height and width of the picture; the region's box: top, left, height, width; edge points; bytes
+# of the region.
+_HEADER = struct.Struct("<8I")
+# The fastest of zlib's levels: a person's region is a few runs a row.
+_LEVEL = 1
+
+
+@dataclass(frozen=True, eq=False)
+class KeptEdge:
+    """Who keeps a view's edge elsewhere. camera: its name; time: the picture's stamp [s]."""
+
+    keeper: EdgeKeeper
+    camera: str
+    time: float
+
+
+@dataclass(frozen=True, eq=False)
+class SilhouetteView:
+    """What one camera sees of the person.
+
+    Args:
+        region: (H, W) the person.
+        edge: points of the region's edge.
+        kept: who else has the edge and can compare contours with it.
+    """
+
+    region: Mask
+    edge: EdgePoints
+    kept: KeptEdge | None = None
+
+    @property
+    def height(self) -> int:
+        """Of the picture [pixel]."""
+        return len(self.region)
+
+    @property
+    def edge_length(self) -> float:
+        """Of the region's edge [pixel]."""
+        return float(self.edge.lengths.sum())
+
+
+def see_silhouette(region: Mask, spacing: float) -> SilhouetteView:
+    """The view of a person's region (H, W), its edge points this many pixels apart."""
+    return SilhouetteView(region, find_edge_points(region, spacing))
+
+
+def edge_spacing(camera: Camera, edge_points: float = EDGE_POINTS) -> float:
+    """From edge point to edge point in a camera's pictures [pixel]."""
+    return max(2.0, camera.height / edge_points)
+
+
+def shows_somebody(view: SilhouetteView | None) -> bool:
+    """Whether a view shows more than a speck: to search a person in specks takes seconds."""
+    return view is not None and view.edge_length >= _LEAST_EDGE * view.height
+
+
+def pack_view(view: SilhouetteView) -> bytes:
+    """Packs a view without loss: the region's box as bits, and the edge points."""
+    region, edge = view.region, view.edge
+    left, top, width, height = cv2.boundingRect(np.ascontiguousarray(region).view(np.uint8))
+    box = region[top : top + height, left : left + width]
+    bits = zlib.compress(np.packbits(box).tobytes(), _LEVEL)
+    count = len(edge.uv)
+    header = _HEADER.pack(*region.shape, top, left, height, width, count, len(bits))
+    numbers = np.concatenate([edge.uv.ravel(), edge.normals.ravel(), edge.lengths, edge.middle])
+    return header + bits + numbers.astype("<f8").tobytes()
+
+
+def unpack_view(data: bytes, kept: KeptEdge | None = None) -> SilhouetteView:
+    """The view that was packed; region and edge are unpacked when they are looked at first."""
+    return _PackedView(data, kept)
+
+
+class _PackedView(SilhouetteView):
+    """A view that is unpacked no more than it must: who adds up sums needs no pictures."""
+
+    _data: bytes
+
+    def __init__(self, data: bytes, kept: KeptEdge | None) -> None:
+        object.__setattr__(self, "_data", data)
+        object.__setattr__(self, "kept", kept)
+
+    @property
+    def height(self) -> int:
+        return int(_HEADER.unpack_from(self._data)[0])
+
+    @cached_property
+    def edge_length(self) -> float:
+        *_, count, size = _HEADER.unpack_from(self._data)
+        begin = _HEADER.size + size + 8 * 4 * count
+        return float(np.frombuffer(self._data, "<f8", count, begin).sum())
+
+    @cached_property
+    def region(self) -> Mask:
+        data = self._data
+        rows, columns, top, left, height, width, _, size = _HEADER.unpack_from(data)
+        packed = np.frombuffer(zlib.decompress(data[_HEADER.size : _HEADER.size + size]), np.uint8)
+        bits = np.unpackbits(packed, count=height * width).view(np.bool_)
+        region = np.zeros((rows, columns), dtype=np.bool_)
+        region[top : top + height, left : left + width] = bits.reshape(height, width)
+        return region
+
+    @cached_property
+    def edge(self) -> EdgePoints:
+        *_, count, size = _HEADER.unpack_from(self._data)
+        numbers = np.frombuffer(self._data, "<f8", offset=_HEADER.size + size).astype(np.float64)
+        uv, normals, lengths, middle = np.split(numbers, np.cumsum([2 * count, 2 * count, count]))
+        return EdgePoints(uv.reshape(-1, 2), normals.reshape(-1, 2), lengths, middle)
+
+
+@dataclass(frozen=True, eq=False)
+class FrameViews:
+    """The cameras that have a picture in a frame, and what each of them sees."""
+
+    cameras: Sequence[Camera]
+    views: Sequence[SilhouetteView]
+    _packed: dict[tuple[int, ...], Views] = field(default_factory=dict, init=False, repr=False)
+
+    def add_up(self, fit: ContourFit) -> AddUp:
+        """What compares a body's contours with all cameras, weighed as `fit` does, and adds up.
+
+        Edges that are kept elsewhere are compared there; what does not come from there is compared
+        here: the answer is the same, but for the order of the sum.
+        """
+        here = tuple(k for k, view in enumerate(self.views) if view.kept is None)
+
+        def total(placement: Placement, step: Round) -> CameraSum:
+            weights = fit.weights(self._arrays, placement, step)
+            asked = [
+                (keeper, index, keeper.ask(self._request(index, placement, weights)))
+                for keeper, index in self._kept
+            ]
+            parts = [self._compared(here, placement, weights)] if here or not asked else []
+            for keeper, index, is_asked in asked:
+                answer = keeper.answer() if is_asked else None
+                parts.append(answer or self._compared(index, placement, weights))
+            return parts[0] if len(parts) == 1 else add_sums(parts, len(placement.X_WN))
+
+        return total
+
+    @cached_property
+    def _arrays(self) -> tuple[Array, Array]:
+        return pack_cameras(self.cameras)
+
+    @cached_property
+    def _kept(self) -> list[tuple[EdgeKeeper, tuple[int, ...]]]:
+        """Who keeps edges elsewhere, and of which cameras."""
+        found: dict[int, tuple[EdgeKeeper, list[int]]] = {}
+        for k, view in enumerate(self.views):
+            if view.kept is not None:
+                keeper = view.kept.keeper
+                found.setdefault(id(keeper), (keeper, []))[1].append(k)
+        return [(keeper, tuple(index)) for keeper, index in found.values()]
+
+    def _request(self, index: tuple[int, ...], placement: Placement, weights: Array) -> SumRequest:
+        kept = [one for k in index if (one := self.views[k].kept) is not None]
+        chosen = list(index)
+        return SumRequest(
+            [one.camera for one in kept],
+            np.array([one.time for one in kept]),
+            (self._arrays[0][chosen], self._arrays[1][chosen]),
+            weights[chosen],
+            placement.packed,
+            placement.X_WN,
+        )
+
+    def _compared(self, index: tuple[int, ...], placement: Placement, weights: Array) -> CameraSum:
+        """Some cameras compared in this process, and added up."""
+        chosen = list(index)
+        if index not in self._packed:
+            cameras = self._arrays[0][chosen], self._arrays[1][chosen]
+            self._packed[index] = Views(cameras, pack_evidence([self.views[k].edge for k in index]))
+        packed, X_WN = placement.packed, placement.X_WN
+        return add_cameras(*compare_placed(packed, X_WN, self._packed[index], weights[chosen]))
+
+    @cached_property
+    def seers(self) -> list[int]:
+        """Which cameras see somebody."""
+        return [k for k, view in enumerate(self.views) if len(view.edge.uv)]
+
+    @cached_property
+    def judges(self) -> list[int]:
+        """Which of them judge guesses; a few, as far as possible all around."""
+        count = min(_JUDGES, len(self.seers))
+        chosen = np.linspace(0, len(self.seers), count, endpoint=False).astype(int)
+        return [self.seers[k] for k in chosen]
+
+    @cached_property
+    def small(self) -> tuple[list[Camera], list[Mask]]:
+        """The judges' cameras and regions with fewer pixels."""
+        strides = {k: max(1, self.views[k].height // _ROWS) for k in self.judges}
+        return (
+            [_coarser(self.cameras[k], n) for k, n in strides.items()],
+            [self.views[k].region[::n, ::n] for k, n in strides.items()],
+        )
+
+    @cached_property
+    def coarse(self) -> tuple[list[Camera], list[EdgePoints]]:
+        """The judges' cameras and every other point of their edges."""
+        edges = [self.views[k].edge for k in self.judges]
+        return [self.cameras[k] for k in self.judges], [
+            EdgePoints(edge.uv[::2], edge.normals[::2], 2.0 * edge.lengths[::2], edge.middle)
+            for edge in edges
+        ]
+
+    def middle(self) -> Array | None:
+        """(3,) where somebody is [m]; None where fewer than two cameras see one."""
+        if len(self.seers) < 2:
+            return None
+        return triangulate(
+            [self.cameras[k] for k in self.seers], [self.views[k].edge.middle for k in self.seers]
+        )
+
+
+def _coarser(camera: Camera, stride: int) -> Camera:
+    """The camera of every stride-th pixel of every stride-th row."""
+    smaller = replace(
+        camera,
+        width=-(-camera.width // stride),
+        height=-(-camera.height // stride),
+        center_x=camera.center_x / stride,
+        center_y=camera.center_y / stride,
+    )
+    if isinstance(smaller, ParallelCamera):
+        return replace(smaller, pixels_per_metre=smaller.pixels_per_metre / stride)
+    return replace(smaller, focal_x=smaller.focal_x / stride, focal_y=smaller.focal_y / stride)

@@ -71,16 +71,12 @@ class PaperPose:
         q: (nq,) positions inside their limits: the model's trunk points from the neck's base to the
             waist, its limbs go from there to the middle joints and ends below.
         limbs: by name, (3, 3) shoulder, elbow and hand, or hip, knee and foot, as found [m].
-        neck: (3,) the neck's base [m].
         waist: (3,) half-way between the hips, by the waist formula [m].
-        scores: by limb: the correlation C of its middle joint; nan without a search.
     """
 
     q: Array
     limbs: Mapping[str, Array]
-    neck: Array
     waist: Array
-    scores: Mapping[str, float]
 
 
 def estimate_pose(
@@ -119,7 +115,7 @@ def estimate_pose(
     # positions the waist counts; so the neck's base cannot wander off from frame to frame either.
     aimed = aim_trunk(skeleton, q, place)
     R_aimed, _ = skeleton.trunk_pose(aimed)
-    limbs, scores = {}, {}
+    limbs = {}
     for k, name in enumerate(LIMBS):
         limb, end = skeleton.limbs[name], features[1 + k]
         if name.endswith("arm"):
@@ -130,10 +126,9 @@ def estimate_pose(
             root = place + outward
             angles = move_limb(limb, R_aimed, root, q[limb.positions], end)
             found = np.array([root, _middle(limb, R_aimed, root, angles), end])
-        scores[name] = float("nan")
         if search != "none":
             last_angles = q[limb.positions]
-            found[1], end, scores[name] = search_limb(
+            found[1], end = search_limb(
                 limb, R, root, end, outward, found[1], last_angles, cameras, regions, search
             )
             found[2] = end
@@ -142,7 +137,7 @@ def estimate_pose(
         # Where limits forbid that, the hand or foot counts more than the elbow or knee.
         aimed[limb.positions] = move_limb(limb, R_aimed, own_root, angles, end)
         limbs[name] = found
-    return PaperPose(skeleton.clip(aimed), limbs, neck, place, scores)
+    return PaperPose(skeleton.clip(aimed), limbs, place)
 
 
 def _lowered(skeleton: Skeleton, R_WT: Array, place: Array, feet: Array) -> Array:

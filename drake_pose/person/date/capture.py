@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.person.date.body_pose import Waist
-from drake_pose.person.date.recognition import Contour, measure_contour
 from drake_pose.person.date.faces import FaceTemplates
 from drake_pose.person.date.features import FeatureSettings
 from drake_pose.person.date.limb_search import Search
-from drake_pose.person.date.recognition import RegisteredPose
+from drake_pose.person.date.recognition import Contour, RegisteredPose, measure_contour
 from drake_pose.person.date.skeleton import Skeleton
 from drake_pose.person.date.skin_blobs import Blobs, SkinColour, skin_blobs
 from drake_pose.silhouette.segmentation.background import Background

@@ -164,8 +164,8 @@ def reach(
 ) -> tuple[Array, float]:
     """Moves a chain's angles in small steps until its end is at the target.
 
-    A step is Levenberg and Marquardt's, damped so that all joints take part, none by more than two
-    degrees; then limits hold.
+    A step is Levenberg and Marquardt's, J (J^T J + damping)^-1 gap, damped so that all joints take
+    part, none by more than two degrees; then limits hold.
 
     Args:
         R_start, p_start: (3, 3) and (3,) frame on which the chain hangs, in the world.
@@ -182,27 +182,43 @@ def reach(
         (n,) angles, and the distance that is left [m].
     """
     n = len(axes)
-    angles = angles.copy()
-    turning, places, J = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
-    tip, gap, pull = np.empty(3), np.empty(3), np.empty(3)
-    R = np.empty((3, 3))
-    distance = np.inf
+    angles, distance = angles.copy(), np.inf
+    turning, places, J = np.empty((n, 3)), np.empty((n, 3)), np.zeros((n, 3))
     for step in range(steps + 1):
-        _walk_chain(R_start, p_start, axes, offsets, end, angles, R, turning, places, tip)
-        distance = 0.0
+        R, tip = R_start.copy(), p_start.copy()
+        for k in range(n):
+            i, j = (axes[k] + 1) % 3, (axes[k] + 2) % 3
+            cosine, sine = math.cos(angles[k]), math.sin(angles[k])
+            for r in range(3):
+                for c in range(3):
+                    tip[r] += R[r, c] * offsets[k, c]
+                places[k, r], turning[k, r] = tip[r], R[r, axes[k]]
+                old_i, old_j = R[r, i], R[r, j]
+                R[r, i] = cosine * old_i + sine * old_j
+                R[r, j] = cosine * old_j - sine * old_i
+        gap = target - tip
         for r in range(3):
-            gap[r] = target[r] - tip[r]
-            distance += gap[r] ** 2
-        distance = math.sqrt(distance)
+            for c in range(3):
+                gap[r] -= R[r, c] * end[c]
+        tip = target - gap
+        distance = math.sqrt(gap[0] ** 2 + gap[1] ** 2 + gap[2] ** 2)
         if distance < _CLOSE_ENOUGH or step == steps:
             break
-        _fill_jacobian(turning, places, tip, free, J)
-        _solve_damped(J, gap, pull)
-        largest = 0.0
+        A = _DAMPING * np.eye(3)
+        for k in range(n):
+            if free[k]:
+                for r in range(3):
+                    u, v = (r + 1) % 3, (r + 2) % 3
+                    arm_u, arm_v = tip[u] - places[k, u], tip[v] - places[k, v]
+                    J[k, r] = turning[k, u] * arm_v - turning[k, v] * arm_u
+                for r in range(3):
+                    for c in range(3):
+                        A[r, c] += J[k, r] * J[k, c]
+        pull = np.linalg.solve(A, gap)
+        largest = 1e-12
         for k in range(n):
             largest = max(largest, abs(J[k, 0] * pull[0] + J[k, 1] * pull[1] + J[k, 2] * pull[2]))
-        share = min(1.0, _LARGEST_STEP / max(largest, 1e-12))
-        moved = 0.0
+        share, moved = min(1.0, _LARGEST_STEP / largest), 0.0
         for k in range(n):
             change = J[k, 0] * pull[0] + J[k, 1] * pull[1] + J[k, 2] * pull[2]
             new = min(max(angles[k] + share * change, lower[k]), upper[k])
@@ -211,68 +227,3 @@ def reach(
         if moved < _STALLED:
             break
     return angles, distance
-
-
-@compiled(error_model="python")
-def _walk_chain(
-    R_start: Array,
-    p_start: Array,
-    axes: NDArray[np.int64],
-    offsets: Array,
-    end: Array,
-    angles: Array,
-    R: Array,
-    turning: Array,
-    places: Array,
-    tip: Array,
-) -> None:
-    """Fills in the joints' axes (n, 3) and places (n, 3) in the world, and the end's place (3,)."""
-    for r in range(3):
-        tip[r] = p_start[r]
-        for c in range(3):
-            R[r, c] = R_start[r, c]
-    for k in range(len(axes)):
-        i, j = (axes[k] + 1) % 3, (axes[k] + 2) % 3
-        cosine, sine = math.cos(angles[k]), math.sin(angles[k])
-        for r in range(3):
-            tip[r] += R[r, 0] * offsets[k, 0] + R[r, 1] * offsets[k, 1] + R[r, 2] * offsets[k, 2]
-            places[k, r] = tip[r]
-            turning[k, r] = R[r, axes[k]]
-            old_i, old_j = R[r, i], R[r, j]
-            R[r, i] = cosine * old_i + sine * old_j
-            R[r, j] = cosine * old_j - sine * old_i
-    for r in range(3):
-        tip[r] += R[r, 0] * end[0] + R[r, 1] * end[1] + R[r, 2] * end[2]
-
-
-@compiled(error_model="python")
-def _fill_jacobian(
-    turning: Array, places: Array, tip: Array, free: NDArray[np.bool_], J: Array
-) -> None:
-    """Fills in J (n, 3): how the end (3,) moves with each free joint; 0 for the others."""
-    for k in range(len(turning)):
-        for r in range(3):
-            u, v = (r + 1) % 3, (r + 2) % 3
-            arm_u, arm_v = tip[u] - places[k, u], tip[v] - places[k, v]
-            J[k, r] = turning[k, u] * arm_v - turning[k, v] * arm_u if free[k] else 0.0
-
-
-@compiled(error_model="python")
-def _solve_damped(J: Array, gap: Array, pull: Array) -> None:
-    """Fills in pull (3,) = (J^T J + damping)^-1 gap, J (n, 3), by Cramer's rule."""
-    A = np.zeros((3, 3))
-    for r in range(3):
-        A[r, r] = _DAMPING
-        for c in range(3):
-            for k in range(J.shape[0]):
-                A[r, c] += J[k, r] * J[k, c]
-    determinant = 0.0
-    for c in range(3):
-        u, v = (c + 1) % 3, (c + 2) % 3
-        determinant += A[0, c] * (A[1, u] * A[2, v] - A[1, v] * A[2, u])
-    for r in range(3):
-        pull[r] = 0.0
-        for c in range(3):
-            # The adjugate of a symmetric matrix, by cyclic minors.
-            r1, r2, c1, c2 = (r + 1) % 3, (r + 2) % 3, (c + 1) % 3, (c + 2) % 3
-            pull[r] += (A[r1, c1] * A[r2, c2] - A[r1, c2] * A[r2, c1]) * gap[c] / determinant

@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from drake_pose.camera.models import Camera
-from drake_pose.compiled import compiled
 from drake_pose.person.date.skeleton import Limb, rotation
+from drake_pose.person.rays import sum_at_points
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -97,19 +97,6 @@ def joint_circle(limb: Limb, root: Array, end: Array, outward: Array) -> Circle:
     return Circle(center, radius, i, -j if limb.name.endswith("leg") else j)
 
 
-class FoundLimb(NamedTuple):
-    """A limb whose elbow or knee was searched.
-
-    Attributes:
-        middle, end: (3,) elbow and hand, or knee and foot [m].
-        score: the correlation C there.
-    """
-
-    middle: Array
-    end: Array
-    score: float
-
-
 def search_limb(
     limb: Limb,
     R_WT: Array,
@@ -121,7 +108,7 @@ def search_limb(
     cameras: Sequence[Camera],
     regions: Sequence[Mask],
     search: Search = "surfaces",
-) -> FoundLimb:
+) -> tuple[Array, Array]:
     """The place of an elbow or knee at which the limb agrees best with the silhouettes.
 
     Args:
@@ -146,9 +133,7 @@ def search_limb(
     best = np.flatnonzero(scores >= scores.max() - 1e-9)
     chosen = best[np.argmin(np.linalg.norm(middles[best] - near, axis=1))]
     counts = [len(places) for places, _ in found]
-    return FoundLimb(
-        middles[chosen], np.repeat(ends, counts, axis=0)[chosen], float(scores[chosen])
-    )
+    return middles[chosen], np.repeat(ends, counts, axis=0)[chosen]
 
 
 def _possible_ends(limb: Limb, root: Array, end: Array) -> list[Array]:
@@ -234,41 +219,13 @@ def correlation(samples: Array, cameras: Sequence[Camera], regions: Sequence[Mas
     Returns:
         (n,) mean share of the points, as far as they are in the picture, inside the silhouette.
     """
-    total, seers = np.zeros(len(samples)), 0
+    total, seers, weights = np.zeros(len(samples)), 0, np.ones(samples.shape[:2])
     for camera, region in zip(cameras, regions, strict=True):
-        if not region.any():
-            continue
-        total += _inside_share(
-            samples, camera.kernel_parameters(), np.ascontiguousarray(camera.X_CW), region
-        )
-        seers += 1
+        if region.any():
+            inside, seen = sum_at_points(camera, region.view(np.int8), samples, weights)
+            total += inside / np.maximum(seen, 1.0)
+            seers += 1
     return total / max(1, seers)
-
-
-@compiled(error_model="python")
-def _inside_share(samples: Array, camera: Array, X_CW: Array, region: Mask) -> Array:
-    """(n,) share of points (n, m, 3) in the picture that lie inside the region (H, W)."""
-    shares = np.zeros(samples.shape[0])
-    height, width = region.shape
-    for n in range(samples.shape[0]):
-        seen, inside = 0, 0
-        for m in range(samples.shape[1]):
-            x, y, z = samples[n, m]
-            x_C = X_CW[0, 0] * x + X_CW[0, 1] * y + X_CW[0, 2] * z + X_CW[0, 3]
-            y_C = X_CW[1, 0] * x + X_CW[1, 1] * y + X_CW[1, 2] * z + X_CW[1, 3]
-            z_C = X_CW[2, 0] * x + X_CW[2, 1] * y + X_CW[2, 2] * z + X_CW[2, 3]
-            if camera[0] == 0.0:
-                if z_C <= camera[5]:
-                    continue
-                x_C, y_C = x_C / z_C, y_C / z_C
-            column = math.floor(camera[1] * x_C + camera[3] + 0.5)
-            row = math.floor(camera[2] * y_C + camera[4] + 0.5)
-            if 0 <= column < width and 0 <= row < height:
-                seen += 1
-                inside += region[row, column]
-        if seen > 0:
-            shares[n] = inside / seen
-    return shares
 
 
 def limb_angles(

@@ -7,7 +7,6 @@ import pytest
 from drake_pose.camera.rigs import FACE_CAMERA
 from drake_pose.errors import SettingsError
 from drake_pose.person.date.capture import CaptureSetup, see_person
-from drake_pose.person.date.recognition import measure_contour, similarity
 from drake_pose.person.date.faces import (
     cut_face,
     face_direction,
@@ -16,7 +15,7 @@ from drake_pose.person.date.faces import (
     learn_faces,
 )
 from drake_pose.person.date.features import find_features
-from drake_pose.person.date.recognition import recognise
+from drake_pose.person.date.recognition import measure_contour, recognise, similarity
 from drake_pose.person.date.skeleton import FEATURES, rotation
 from drake_pose.person.date.skin_blobs import SkinColour, skin_blobs
 from drake_pose.silhouette.segmentation.background import learn_background, person_region

@@ -10,13 +10,13 @@ import pytest
 from drake_pose.camera.rigs import FACE_CAMERA
 from drake_pose.errors import OutputError, SceneError
 from drake_pose.person.date.faces import find_face
-from drake_pose.person.date.faces import (
+from drake_pose.person.date.learned_files import (
+    learn_recorded_faces,
     load_background,
     load_faces,
     save_background,
     save_faces,
 )
-from drake_pose.person.date.faces import learn_recorded_faces
 from drake_pose.silhouette.segmentation.background import learn_background
 from tests.person.studio import shared_studio
 

@@ -41,7 +41,7 @@ class Waist:
         """The waist (3,): at the head's place, at a height between head and feet (z upwards).
 
         Args:
-            features: (5, 3) head, hands and feet in the order of FEATURES [m].
+            features: (5, 3) in the order of FEATURES [m].
             heading: where the head looks, from the world's x axis [rad].
         """
         head, _, _, left_foot, right_foot = features
@@ -103,7 +103,7 @@ def estimate_pose(
         search: how elbows and knees are searched: "surfaces" by points of the limbs' surfaces, on
             the circles of all ends within what hands and feet are measured off; "rectangles" as in
             the paper, on one circle; "none": they stay where inverse kinematics puts them.
-        waist: the constants of the waist formula; the paper's where not given.
+        waist: the constants of the waist formula.
     """
     q = _head_and_arms(skeleton, last, features, head_angles)
     R_WT, neck = skeleton.trunk_pose(q)

@@ -1,8 +1,4 @@
-"""What the paper's capture must know beforehand, and one camera's share of it (Date, figure 1).
-
-`see_person` is one camera's share: a function of its picture alone, so it can run elsewhere. The
-stages are wired in `systems/date/capture.py`.
-"""
+"""What the paper's capture must know beforehand, and one camera's share of it (Date, figure 1)."""
 
 from __future__ import annotations
 
@@ -50,13 +46,7 @@ class CaptureSettings:
 
 @dataclass(frozen=True, eq=False)
 class PersonView:
-    """What one camera's picture says (the paper's horizontal image processing module).
-
-    Args:
-        region: (H, W) the person.
-        blobs: the skin in it.
-        contour: None where the person is not seen whole.
-    """
+    """What one camera sees: region (H, W), skin in it, and the contour of a person seen whole."""
 
     region: Mask
     blobs: Blobs
@@ -69,8 +59,8 @@ class CaptureSetup:
 
     Args:
         skeleton: the person.
-        cameras: the cameras on the circle, by name.
-        face_camera: the face camera, where there is one.
+        cameras: on the circle, by name.
+        face_camera: where there is one.
         faces: the templates of the face's direction, where there are some.
         registered: the registered pose, where it is to be recognised.
         backgrounds: by camera, the face camera's among them; a camera without one needs masks.
@@ -99,12 +89,7 @@ class CaptureSetup:
 
 
 def see_person(picture: Picture, region: Mask, skin: SkinColour) -> PersonView:
-    """One camera's share: the skin in the person's region, and the region's contour.
-
-    Args:
-        picture: (H, W, 3) red, green, blue.
-        region: (H, W) the person, a given mask or from person_region.
-        skin: which colours are skin.
+    """One camera's share: skin in the person's region (H, W) of a picture (H, W, 3), and contour.
 
     Raises:
         SettingsError: a region of another size than the picture's.

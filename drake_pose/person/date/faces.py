@@ -34,7 +34,7 @@ class FaceTemplates:
 
     Args:
         mean: (d,) the mean face, d = 80 x 130 x 3.
-        basis: (k, d) float32, the leading eigenvectors, orthonormal.
+        basis: (k, d) the leading eigenvectors, orthonormal.
         coordinates: (n, k) the templates in the eigenspace.
         directions: (n, 2) turn to the person's left and nod downwards, away from facing the camera
             [rad].
@@ -51,8 +51,7 @@ class FaceDirection:
     """The direction of a face.
 
     Args:
-        direction: (2,) turn to the person's left and nod downwards, away from facing the camera
-            [rad].
+        direction: (2,) as of FaceTemplates [rad].
         template: which template is nearest.
         distance: in the eigenspace, over the square root of the pixels' number [grey levels].
         outside: how far the picture is from the eigenspace [grey levels]; large: it is no face.
@@ -65,14 +64,9 @@ class FaceDirection:
 
 
 def cut_face(picture: Picture, blobs: Blobs) -> Picture | None:
-    """The largest skin-coloured blob of a picture, scaled to 80 x 130.
+    """The largest skin-coloured blob of a picture (H, W, 3), scaled to (130, 80, 3).
 
-    Args:
-        picture: (H, W, 3).
-        blobs: its skin.
-
-    Returns:
-        (130, 80, 3); None where there is no skin, or it touches the picture's edge.
+    None where there is no skin, or it touches the picture's edge.
     """
     if not len(blobs.areas):
         return None
@@ -91,12 +85,7 @@ def cut_face(picture: Picture, blobs: Blobs) -> Picture | None:
 def learn_faces(
     faces: Sequence[Picture], directions: Array, dimensions: int = DIMENSIONS
 ) -> FaceTemplates:
-    """The eigenspace of faces of known directions.
-
-    Args:
-        faces: (130, 80, 3) each, from cut_face.
-        directions: (n, 2) their directions, see FaceTemplates [rad].
-        dimensions: how many eigenvectors are kept; fewer where there are fewer faces.
+    """The eigenspace of faces (130, 80, 3) of known directions (n, 2) [rad], see FaceTemplates.
 
     Raises:
         SettingsError: fewer than three faces, or not one direction for each.
@@ -121,13 +110,12 @@ def learn_faces(
 def head_angles(direction: Array, head: Array, camera: Camera) -> Array:
     """The head's turn and nod in the world (2,) [rad] of a face seen by a camera.
 
+    Turn about the vertical is 0 where the face looks along the world's x; nod is downwards.
+
     Args:
         direction: (2,) turn and nod away from facing the camera, from face_direction [rad].
         head: (3,) where the head is [m].
         camera: the face camera.
-
-    Returns:
-        Turn about the vertical, 0 where the face looks along the world's x, and nod downwards.
     """
     towards = camera.X_WC[:3, 3] - head
     level = math.hypot(towards[0], towards[1])
@@ -159,10 +147,10 @@ def face_direction(face: Picture, templates: FaceTemplates) -> FaceDirection:
 
 
 def find_face(picture: Picture, blobs: Blobs, templates: FaceTemplates, farthest: float) -> Array:
-    """The direction (2,) of the face in a picture [rad]; nan where no face is seen.
+    """The direction (2,) of the face in a picture (H, W, 3) [rad]; nan where no face is seen.
 
     Args:
-        picture: (H, W, 3) red, green, blue.
+        picture: red, green, blue.
         blobs: its skin.
         templates: what faces look like.
         farthest: how far from the eigenspace a face may be [grey levels].

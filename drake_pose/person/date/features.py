@@ -56,15 +56,9 @@ class Features:
 def inside_silhouettes(
     points: Array, cameras: Sequence[Camera], regions: Sequence[Mask], margin: int = 0
 ) -> Mask:
-    """Which points (m, 3) every camera sees inside its silhouette.
+    """Which points (m, 3) [m] every camera sees in its silhouette, or so many pixels beside it.
 
     A camera has no say about points outside its picture, nor where it sees nobody at all.
-
-    Args:
-        points: in the world [m].
-        cameras: the cameras.
-        regions: (H, W) the person in each camera's picture.
-        margin: how far outside its silhouette a point may be seen [pixel].
     """
     kept = np.ones(len(points), dtype=bool)
     for camera, region in zip(cameras, regions, strict=True):
@@ -103,10 +97,8 @@ def expect_features(
     taken for each other.
 
     Args:
-        places: (5, 3) the features in this frame [m].
-        support: (5,) how many 3-D points each was taken from.
-        last: (5, 3) the same in the frame before.
-        last_support: (5,) likewise.
+        places, last: (5, 3) the features in this frame and in the one before [m].
+        support, last_support: (5,) how many 3-D points each was taken from.
     """
     measured = (np.asarray(support) > 0) & (np.asarray(last_support) > 0)
     step = np.where(measured[:, None], places - last, 0.0)
@@ -154,9 +146,9 @@ def find_features(
         centroids: (n_k, 2) the skin blobs' centroids in each camera [pixel].
         regions: (H, W) the person in each camera's picture.
         last: (k, 3) the last frame's features [m].
-        settings: how; the defaults where not given.
-        expected: (k, 3) where they are expected in this frame [m]; the last frame's places where
-            not given, as in the paper.
+        settings: how.
+        expected: (k, 3) where they are expected in this frame [m]; None: as in the paper, the last
+            frame's places.
     """
     settings = settings or FeatureSettings()
     points = meeting_points(cameras, centroids, settings.threshold)

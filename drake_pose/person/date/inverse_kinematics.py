@@ -75,15 +75,7 @@ def upper_body(skeleton: Skeleton, q: Array, features: Array, *, face_known: boo
 
 
 def move_limb(limb: Limb, R_WT: Array, root: Array, angles: Array, target: Array) -> Array:
-    """Moves a limb's angles (4,) until its end is at a target (3,), its root (3,) held.
-
-    Args:
-        limb: the limb.
-        R_WT: (3, 3) the trunk's axes in the world.
-        root: where shoulder or hip is [m].
-        angles: (4,) the last frame's [rad].
-        target: where hand or foot is [m].
-    """
+    """Moves a limb's angles (4,) until its end is at a target (3,), its root (3,) held [m, rad]."""
     offsets = np.zeros((4, 3))
     offsets[3] = limb.middle_U
     moved: Array
@@ -104,16 +96,7 @@ def move_limb(limb: Limb, R_WT: Array, root: Array, angles: Array, target: Array
 
 
 def aim_trunk(skeleton: Skeleton, q: Array, waist: Array) -> Array:
-    """Turns the neck base so that the trunk points from there to the waist.
-
-    Args:
-        skeleton: the person.
-        q: (nq,) positions, the head's place and angles set.
-        waist: (3,) [m].
-
-    Returns:
-        (nq,) positions; only the neck base's angles differ.
-    """
+    """Turns the neck base of q (nq,) so that the trunk points from there to the waist (3,) [m]."""
     index = skeleton.neck_angles
     _, neck = skeleton.trunk_pose(q)
     across = waist - neck

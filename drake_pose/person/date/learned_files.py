@@ -155,10 +155,6 @@ def learn_recorded_faces(folder: Path, skin: SkinColour | None = None) -> FaceTe
     takes them, from any distance. Of each the largest skin-coloured patch is the face. A
     folder `empty` of pictures without the person is needed where other things have skin's colour.
 
-    Args:
-        folder: the folder; the paper's has 300 pictures.
-        skin: which colours are skin.
-
     Raises:
         SceneError: names the file, line or picture at fault.
         SettingsError: fewer than three pictures.

@@ -51,10 +51,8 @@ _STRETCHED = 1e-3
 class Circle:
     """Where a middle joint can be: center + radius (sin(theta) i + cos(theta) j).
 
-    Args:
-        center: (3,) [m].
-        radius: [m]; 0 where the limb is stretched out.
-        i, j: (3,) orthogonal directions of length 1: outwards; and behind (arm) or in front (leg).
+    i and j are orthogonal, of length 1: outwards; and behind (arm) or in front (leg). The radius is
+    0 where the limb is stretched out [m].
     """
 
     center: Array
@@ -79,8 +77,7 @@ def joint_circle(limb: Limb, root: Array, end: Array, outward: Array) -> Circle:
 
     Args:
         limb: the limb.
-        root: (3,) shoulder or hip [m].
-        end: (3,) hand or foot [m].
+        root, end: (3,) shoulder and hand, or hip and foot [m].
         outward: (3,) from the neck's base to the shoulder, or from the waist to the hip.
     """
     a, b = limb.lengths
@@ -109,7 +106,7 @@ def search_limb(
     regions: Sequence[Mask],
     search: Search = "surfaces",
 ) -> tuple[Array, Array]:
-    """The place of an elbow or knee at which the limb agrees best with the silhouettes.
+    """The places (3,) of an elbow or knee, and of the end, that agree best with the silhouettes.
 
     Args:
         limb: the limb.
@@ -180,7 +177,7 @@ def _points_of_segments(
 
 
 def rectangles(root: Array, middles: Array, end: Array, half_widths: Array) -> Array:
-    """Points all over the two rectangles of a limb, for several places of its middle joint.
+    """Points (n, m, 3) all over the two rectangles of a limb, for n places of its middle joint [m].
 
     They lie in the plane of root, middle joint and end, one from the root to the middle joint, one
     from there to the end.
@@ -189,9 +186,6 @@ def rectangles(root: Array, middles: Array, end: Array, half_widths: Array) -> A
         root, end: (3,) [m].
         middles: (n, 3) [m].
         half_widths: (2,) of the rectangles [m].
-
-    Returns:
-        (n, m, 3) points.
     """
     normal = np.cross(middles - root, end - root)
     along = ((np.arange(_SAMPLES_ALONG) + 0.5) / _SAMPLES_ALONG)[:, None, None]
@@ -209,15 +203,9 @@ def rectangles(root: Array, middles: Array, end: Array, half_widths: Array) -> A
 
 
 def correlation(samples: Array, cameras: Sequence[Camera], regions: Sequence[Mask]) -> Array:
-    """C: how well rectangles agree with the silhouettes, mean over the cameras.
+    """C (n,): the share of samples (n, m, 3) in the picture that lie inside the silhouette (H, W).
 
-    Args:
-        samples: (n, m, 3) points all over each candidate's rectangles [m].
-        cameras: the cameras; those that see nobody have no say.
-        regions: (H, W) the person in each camera's picture.
-
-    Returns:
-        (n,) mean share of the points, as far as they are in the picture, inside the silhouette.
+    The mean over those cameras that see somebody.
     """
     total, seers, weights = np.zeros(len(samples)), 0, np.ones(samples.shape[:2])
     for camera, region in zip(cameras, regions, strict=True):
@@ -231,15 +219,9 @@ def correlation(samples: Array, cameras: Sequence[Camera], regions: Sequence[Mas
 def limb_angles(
     limb: Limb, R_WT: Array, root: Array, middle: Array, end: Array, last: Array
 ) -> Array:
-    """The joint angles (4,) that put a limb's joints where they were found, inside its limits.
+    """The angles (4,) that put a limb's joints (3,) [m] where they were found, inside its limits.
 
     Where the limits do not allow it, what is clipped goes at the end's expense.
-
-    Args:
-        limb: the limb.
-        R_WT: (3, 3) the trunk's axes in the world.
-        root, middle, end: (3,) [m].
-        last: (4,) angles to stay near where several sets do the same [rad].
     """
     angles, _ = place_limb(limb, R_WT, root, middle[None], end, last)
     return np.clip(angles[0], limb.lower, limb.upper)
@@ -297,10 +279,7 @@ def _shortest_turn(old: Array, new: Array) -> Array:
 
 
 def _middle_angles(limb: Limb, distance: float) -> list[float]:
-    """The middle joint's angles at which root and end are a distance apart [rad].
-
-    One or two inside its limits; where there is none, the limit that is nearest.
-    """
+    """The middle joint's angles [rad] for a distance of root and end: one or two inside limits."""
     base, swing, start = _bending(limb)
     turn = math.acos(min(1.0, max(-1.0, (distance**2 - base) / swing)))
     options = [math.remainder(start + sign * turn, 2.0 * math.pi) for sign in (-1.0, 1.0)]
@@ -321,11 +300,7 @@ def _reach(limb: Limb) -> tuple[float, float]:
 
 
 def _bending(limb: Limb) -> tuple[float, float, float]:
-    """How far apart root and end are: their squared distance is base + swing cos(bend - start).
-
-    Returns:
-        base and swing [m^2], and start [rad].
-    """
+    """Base, swing [m^2], start [rad]: the squared distance is base + swing cos(bend - start)."""
     axis = np.zeros(3)
     axis[limb.axes[3]] = 1.0
     along = (limb.middle_U @ axis) * (limb.end_L @ axis)
@@ -337,10 +312,7 @@ def _bending(limb: Limb) -> tuple[float, float, float]:
 
 
 def _root_angles(limb: Limb, R_TU: Array, last: Array) -> tuple[Array, Array]:
-    """Angles (n, 3) about the limb's axes of rotations (n, 3, 3), inside the limits if possible.
-
-    Second: (n,) by how much the worst of each three lies beyond its limits [rad].
-    """
+    """Angles (n, 3) of rotations (n, 3, 3), and how far (n,) the worst is off limits [rad]."""
     i, j, k = (int(axis) for axis in limb.axes[:3])
     sign = 1.0 if (j - i) % 3 == 1 else -1.0
     second = np.arcsin(np.clip(sign * R_TU[:, i, k], -1.0, 1.0))

@@ -41,15 +41,7 @@ class Contour:
 
 
 def measure_contour(region: Mask) -> Contour | None:
-    """Measures the contour of a region.
-
-    Args:
-        region: (H, W) the person.
-
-    Returns:
-        The contour. None where nobody is seen, or the region touches the picture's edge and so a
-        part of the contour is not the person's.
-    """
+    """The contour of a region (H, W); None where nobody is seen, or it touches the edge."""
     if not region.any() or _touches_edge(region):
         return None
     rows, columns = np.flatnonzero(region.any(axis=1)), np.flatnonzero(region.any(axis=0))
@@ -105,13 +97,7 @@ class RegisteredPose:
 
 @dataclass(frozen=True, eq=False)
 class Recognition:
-    """The registered pose, recognised.
-
-    Args:
-        q: (nq,) the person's positions.
-        similarity: mean over the cameras, 0 to 1.
-        cameras: how many had a say.
-    """
+    """The registered pose, recognised: positions (nq,), mean similarity (0 to 1) of cameras."""
 
     q: Array
     similarity: float
@@ -119,12 +105,7 @@ class Recognition:
 
 
 def registered_positions(skeleton: Skeleton, spread_deg: float = 80.0) -> Array:
-    """Positions (nq,) of the paper's registered pose: upright, both arms spread.
-
-    Args:
-        skeleton: the person.
-        spread_deg: how far the arms are raised sideways from hanging [deg].
-    """
+    """Positions (nq,) of the paper's registered pose: upright, both arms spread by degrees."""
     q = np.zeros(len(skeleton.lower))
     for name, sign in (("left_arm", 1.0), ("right_arm", -1.0)):
         q[skeleton.limbs[name].positions[1]] = sign * math.radians(spread_deg)
@@ -134,11 +115,11 @@ def registered_positions(skeleton: Skeleton, spread_deg: float = 80.0) -> Array:
 def stand_registered(
     skeleton: Skeleton, cameras: Sequence[Camera], middles: Sequence[Array]
 ) -> Array:
-    """Positions (nq,) of the registered pose, about where the cameras see somebody.
+    """Positions (nq,) of the registered pose, about where two cameras or more see somebody.
 
     Args:
         skeleton: the person.
-        cameras: two or more.
+        cameras: the cameras.
         middles: (2,) middle of the person's bounding box in each camera's picture [pixel].
     """
     q = registered_positions(skeleton)
@@ -198,8 +179,7 @@ def recognise(
         threshold: mean similarity that is needed.
 
     Returns:
-        The positions; None where the contours differ too much or fewer than two cameras see the
-        person whole.
+        None where the contours differ too much or fewer than two cameras see the person whole.
     """
     scores, seers, middles = [], [], []
     for camera, contour in zip(cameras, contours, strict=True):

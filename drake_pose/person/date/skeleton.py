@@ -47,8 +47,7 @@ class Limb:
         lower, upper: (4,) their limits [rad].
         half_widths: (2,) mean distance of the upper and the lower segment's surface from the line
             through its joints [m].
-        surfaces: (m, 3) points all over the upper and the lower segment's surface, each in the
-            segment's frame [m].
+        surfaces: (m, 3) points all over either segment's surface, in its frame [m].
     """
 
     name: str
@@ -133,14 +132,10 @@ class Skeleton:
         return 0.5 * (self.limbs["left_leg"].root_T + self.limbs["right_leg"].root_T)
 
     def with_features(self, q: Array, places: Array) -> Skeleton:
-        """The same person whose features are where they were measured in a known pose.
+        """The same person whose features are at places (5, 3) measured in a known pose q (nq,) [m].
 
-        What is seen of the skin has another middle than the whole hand or head.
-
-        Args:
-            q: (nq,) the known pose.
-            places: (5, 3) the features as measured in it [m]; nan where not measured. Each is moved
-                by five centimetres at most.
+        What is seen of the skin has another middle than the whole hand or head. nan: not measured;
+        each is moved by five centimetres at most.
         """
         off = np.nan_to_num(np.asarray(places) - self.features(q))
         length = np.linalg.norm(off, axis=1, keepdims=True)

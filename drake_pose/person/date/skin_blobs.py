@@ -33,11 +33,7 @@ class SkinColour:
 
 
 def learn_skin_colour(colours: NDArray[np.uint8], share: float = 0.99) -> SkinColour:
-    """The box that holds a share of sampled skin colours, with a margin of its own size's tenth.
-
-    Args:
-        colours: (n, 3) red, green, blue of skin.
-        share: of the samples in each chroma.
+    """The box that holds a share of skin colours (n, 3) in each chroma, a tenth of its size larger.
 
     Raises:
         SettingsError: fewer than ten samples.
@@ -83,11 +79,11 @@ def skin_mask(picture: Picture, region: Mask, colour: SkinColour) -> Mask:
 def skin_blobs(
     picture: Picture, region: Mask, colour: SkinColour, smallest: int = 12, most: int = 12
 ) -> Blobs:
-    """The skin-coloured blobs of a picture.
+    """The skin-coloured blobs of a picture (H, W, 3) in the person's region (H, W).
 
     Args:
-        picture: (H, W, 3) red, green, blue.
-        region: (H, W) the person; skin is looked for there only.
+        picture: red, green, blue.
+        region: skin is looked for there only.
         colour: which colours are skin.
         smallest: area of the smallest blob [pixel].
         most: how many are kept.

@@ -65,29 +65,25 @@ class WalkSettings:
 
 
 def stance_of(left_W: Array, head_W: Array, feet_W: Array) -> Array:
-    """How a person stands in the room.
+    """How a person stands: (5,) the face's heading [rad], head's and feet's x and y [m].
+
+    The heading is about the upward z axis, 0 along x; of the feet it is midway between them.
 
     Args:
         left_W: (3,) the direction to the left of the face. The face's own direction would be
             undefined where the person looks at the floor; this one stays level.
         head_W: (3,) where the head is [m].
         feet_W: (2, 3) where the feet are [m].
-
-    Returns:
-        (5,) the face's heading [rad] about the upward z axis, 0 along x; the head's x and y and the
-        x and y midway between the feet [m].
     """
     heading = math.atan2(-left_W[0], left_W[1])
     return np.array([heading, *head_W[:2], *np.asarray(feet_W)[:, :2].mean(axis=0)])
 
 
 def offsets_from_rest(stance: Array, rest: Array) -> tuple[float, float]:
-    """How far a stance is from the one at rest.
+    """How far a stance (5,) is from the one at rest: turned to the left [rad], and ahead [m].
 
-    Returns:
-        How far the face is turned to the left [rad], and how far ahead, in the rest's direction,
-        the person stands [m]: the lesser of the head's and the feet's way, 0 where they go
-        different ways. Leaning and reaching a foot out are thus no steps.
+    Ahead, in the rest's direction, is the lesser of the head's and the feet's way, 0 where they go
+    different ways. Leaning and reaching a foot out are thus no steps.
     """
     turned = stance[0] - rest[0]
     turned = math.atan2(math.sin(turned), math.cos(turned))
@@ -100,11 +96,10 @@ def offsets_from_rest(stance: Array, rest: Array) -> tuple[float, float]:
 def recognise_command(
     stance: Array, rest: Array, last: tuple[int, int], settings: WalkSettings
 ) -> tuple[int, int]:
-    """Table 1: the command that a stance gives.
+    """Table 1: the command that a stance gives; whoever is lost from sight stops.
 
     Args:
-        stance, rest: (5,) from stance_of. A stance that is not finite, because the person was not
-            found, is no command: whoever is lost from sight stops.
+        stance, rest: (5,) from stance_of.
         last: the command before; see WalkSettings.
         settings: the thresholds.
 
@@ -124,7 +119,7 @@ NO_STEPS = (0.0, 0.0, 0.0)
 
 
 def follow_steps(lift: float, steps: Array, seconds: float, settings: WalkSettings) -> Array:
-    """Counts the steps of somebody who may be walking on the spot.
+    """Counts the steps of somebody who may be walking on the spot; one foot held up is one step.
 
     Args:
         lift: how much higher the left foot is than the right one [m]; nan: not seen.
@@ -132,9 +127,6 @@ def follow_steps(lift: float, steps: Array, seconds: float, settings: WalkSettin
             many steps, each with the other foot, were taken without a pause.
         seconds: since the last frame.
         settings: what is a step.
-
-    Returns:
-        (3,) the same after this frame. One foot held up is one step.
     """
     foot, since, count = steps[0], steps[1] + seconds, steps[2]
     if since > settings.pause:
@@ -157,7 +149,7 @@ def follow_command(
     half_size: float = math.inf,
     obstacles: Array | None = None,
 ) -> Array:
-    """The walker's pose in the place after a command was followed for a while.
+    """The walker's pose (3,), its heading in -pi..pi, after a command was followed for a while.
 
     Turning and walking at once is an exact arc of a circle. At a wall or an obstacle the walker
     slides along.
@@ -169,9 +161,6 @@ def follow_command(
         settings: how fast.
         half_size: the place is a square about the origin; half its side [m].
         obstacles: (n, 3) x, y and radius of round obstacles [m].
-
-    Returns:
-        (3,) the new pose, its heading in -pi..pi.
     """
     turn = command[0] * settings.turn_rate * seconds
     middle = pose[2] + 0.5 * turn

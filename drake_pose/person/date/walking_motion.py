@@ -90,12 +90,7 @@ _KEY_POSES: Mapping[str, tuple[KeyPose, ...]] = {
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Known positions in every frame.
-
-    Args:
-        q: (n, nq) positions [rad or m].
-        names: (n,) which motion each frame belongs to: one of MOTIONS, or REGISTERED.
-    """
+    """Positions q (n, nq) [rad or m], and each frame's motion: of MOTIONS, or REGISTERED."""
 
     q: Array
     names: tuple[str, ...]
@@ -104,15 +99,9 @@ class Motion:
 def make_motion(skeleton: Skeleton, frames: int, seed: int) -> Motion:
     """A person who shows the registered pose, goes through all motions, and shows it again.
 
-    All of it takes 120 frames or more; of fewer the first ones are given.
-
-    The lower foot always stands on the floor. Every run draws how far each motion goes (85 to 115
-    per cent) and where on the floor the person stands.
-
-    Args:
-        skeleton: the person.
-        frames: how many in all.
-        seed: another one draws other motions.
+    All of it takes 120 frames or more; of fewer the first ones are given. The lower foot always
+    stands on the floor. Every run draws how far each motion goes (85 to 115 per cent) and where on
+    the floor the person stands; another seed draws others.
 
     Raises:
         SettingsError: fewer than FEWEST_FRAMES frames.

@@ -34,13 +34,7 @@ _LOOKED_AT = 8
 
 
 class Figure(NamedTuple):
-    """A connected part of a mask.
-
-    Attributes:
-        middle: (2,) [pixel].
-        area: [pixel^2].
-        box: (4,) left, top, right, bottom [pixel].
-    """
+    """A connected part of a mask: middle (2,) [pixel], area, box (4,) left, top, right, bottom."""
 
     middle: Array
     area: float
@@ -106,12 +100,7 @@ def cut_figures(mask: Mask, unwanted: Sequence[Figure]) -> Mask:
 def find_persons(
     cameras: Sequence[Camera], figures: Sequence[Sequence[Figure]]
 ) -> tuple[Person, ...]:
-    """The persons whom two cameras or more see, the best supported first.
-
-    Args:
-        cameras: the cameras.
-        figures: of each camera's mask.
-    """
+    """The persons whom two cameras or more see by masks' figures, the best supported first."""
     if all(len(own) <= 1 for own in figures):
         seers = [k for k, own in enumerate(figures) if own]
         if len(seers) < 2:

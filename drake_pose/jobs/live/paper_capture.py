@@ -22,7 +22,7 @@ from drake_pose.jobs.live.registered_pose import RegisteredPoseSearch
 from drake_pose.jobs.live.run import FrameWatch, LiveFrame, run_live
 from drake_pose.jobs.live.scene import LiveScene
 from drake_pose.person.date.capture import CaptureSetup
-from drake_pose.person.date.learned_files import learn_recorded_faces
+from drake_pose.person.date.faces import learn_recorded_faces
 from drake_pose.person.date.skeleton import FEATURES
 from drake_pose.person.shape import tracker_of_person
 from drake_pose.results.folder import require_empty

@@ -6,17 +6,27 @@ known directions; the nearest template's direction is the answer.
 
 from __future__ import annotations
 
+import csv
+import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.camera.models import Camera
-from drake_pose.errors import SettingsError
-from drake_pose.person.date.skin_blobs import Blobs
+from drake_pose.camera.picture_files import SUFFIXES, read_picture
+from drake_pose.errors import SceneError, SettingsError
+from drake_pose.person.date.skin_blobs import Blobs, SkinColour, skin_blobs
+from drake_pose.regular_files import read_regular
+from drake_pose.silhouette.segmentation.background import (
+    Background,
+    learn_background,
+    person_region,
+)
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -26,6 +36,10 @@ FACE_WIDTH, FACE_HEIGHT = 80, 130
 
 DIMENSIONS = 60
 """How many eigenvectors span the space of faces."""
+
+DIRECTIONS = "directions.csv"
+"""The file of a folder of recorded faces that says where each picture's face looks."""
+_COLUMNS, _EMPTY = ["picture", "turn", "nod"], "empty"
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,3 +175,89 @@ def find_face(picture: Picture, blobs: Blobs, templates: FaceTemplates, farthest
         if found.outside <= farthest:
             return found.direction
     return np.full(2, np.nan)
+
+
+def learn_recorded_faces(folder: Path, skin: SkinColour | None = None) -> FaceTemplates:
+    """The eigenspace of faces that a camera recorded.
+
+    The folder holds `directions.csv`, whose first line is `picture,turn,nod`: a picture's file
+    beside it (.png or .jpg), and where the face looks in it, away from facing the camera [deg]:
+    the turn to the person's left and the nod downwards. Pictures are whole ones as the face camera
+    takes them, from any distance. Of each the largest skin-coloured patch is the face. A
+    folder `empty` of pictures without the person is needed where other things have skin's colour.
+
+    Raises:
+        SceneError: names the file, line or picture at fault.
+        SettingsError: fewer than three pictures.
+    """
+    table = _read_directions(folder / DIRECTIONS)
+    background = _read_background(folder / _EMPTY)
+    faces = [_read_face(folder / name, background, skin or SkinColour()) for name, _, _ in table]
+    directions = np.radians([[turn, nod] for _, turn, nod in table]).reshape(-1, 2)
+    return learn_faces(faces, directions)
+
+
+def _read_directions(path: Path) -> list[tuple[str, float, float]]:
+    """Picture, turn and nod [deg] of each line."""
+    try:
+        text = read_regular(path).decode("utf-8-sig")
+        rows = list(csv.reader(io.StringIO(text, newline="")))
+    except OSError as error:
+        raise SceneError(f"{path}: cannot read the directions: {error.strerror}") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise SceneError(f"{path}: is no table of comma-separated values: {error}") from error
+    if not rows or [cell.strip() for cell in rows[0]] != _COLUMNS:
+        raise SceneError(f"{path}: the first line must be {','.join(_COLUMNS)}")
+    table: dict[str, tuple[str, float, float]] = {}
+    for number, row in enumerate(rows[1:], 2):
+        if not row:
+            continue
+        line = _read_line(row, f"{path}, line {number}")
+        if line[0] in table:
+            raise SceneError(f"{path}, line {number}: '{line[0]}' has a line already")
+        table[line[0]] = line
+    return list(table.values())
+
+
+def _read_line(row: list[str], where: str) -> tuple[str, float, float]:
+    cells = [cell.strip() for cell in row]
+    try:
+        name, turn, nod = cells[0], *(float(cell) for cell in cells[1:])
+    except ValueError as error:
+        raise SceneError(f"{where}: expected a picture and two angles [deg]: {error}") from error
+    if Path(name).name != name or Path(name).suffix.lower() not in SUFFIXES:
+        raise SceneError(f"{where}: '{name}' is no picture {' or '.join(SUFFIXES)} in the folder")
+    if not (math.isfinite(turn) and math.isfinite(nod) and max(abs(turn), abs(nod)) <= 180.0):
+        raise SceneError(f"{where}: turn and nod must be -180 to 180 degrees, not {turn} and {nod}")
+    return name, turn, nod
+
+
+def _read_background(folder: Path) -> Background | None:
+    """What is behind the face; None: nothing that matters."""
+    if not folder.is_dir():
+        return None
+    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+    if not files:
+        raise SceneError(f"{folder}: holds no picture; remove the folder, or fill it")
+    pictures = [read_picture(file, SceneError) for file in files]
+    for file, picture in zip(files, pictures, strict=True):
+        if picture.shape != pictures[0].shape:
+            raise SceneError(f"{file}: is not as large as {files[0].name}")
+    return learn_background(pictures)
+
+
+def _read_face(path: Path, background: Background | None, skin: SkinColour) -> Picture:
+    """The face (130, 80, 3) in a picture."""
+    picture = read_picture(path, SceneError)
+    region = np.ones(picture.shape[:2], dtype=np.bool_)
+    if background is not None:
+        if background.mean.shape != picture.shape:
+            raise SceneError(f"{path}: is not as large as the pictures in '{_EMPTY}'")
+        region = person_region(picture, background)
+    face = cut_face(picture, skin_blobs(picture, region, skin))
+    if face is None:
+        raise SceneError(
+            f"{path}: no face: nothing in it has the colour of skin, or the largest patch touches "
+            f"the picture's edge; take the picture out of {DIRECTIONS}, or name another skin colour"
+        )
+    return face

@@ -8,8 +8,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.errors import SettingsError
-
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
@@ -30,25 +28,6 @@ class SkinColour:
     red: tuple[float, float] = (133.0, 173.0)
     blue: tuple[float, float] = (77.0, 127.0)
     darkest: float = 30.0
-
-
-def learn_skin_colour(colours: NDArray[np.uint8], share: float = 0.99) -> SkinColour:
-    """The box that holds a share of skin colours (n, 3) in each chroma, a tenth of its size larger.
-
-    Raises:
-        SettingsError: fewer than ten samples.
-    """
-    if len(colours) < 10:
-        raise SettingsError(f"skin colour needs ten samples or more, not {len(colours)}")
-    chroma = _chroma(colours.reshape(1, -1, 3))[0].astype(np.float64)
-    low, high = np.quantile(chroma, [0.5 * (1.0 - share), 0.5 * (1.0 + share)], axis=0)
-    margin = np.maximum(2.0, 0.1 * (high - low))
-    low, high = low - margin, high + margin
-    return SkinColour(
-        red=(float(low[1]), float(high[1])),
-        blue=(float(low[2]), float(high[2])),
-        darkest=float(max(0.0, 0.5 * chroma[:, 0].min())),
-    )
 
 
 @dataclass(frozen=True, eq=False)

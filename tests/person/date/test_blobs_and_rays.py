@@ -15,7 +15,7 @@ from drake_pose.person.date.features import (
     find_features,
     inside_silhouettes,
 )
-from drake_pose.person.date.skin_blobs import SkinColour, learn_skin_colour, skin_blobs
+from drake_pose.person.date.skin_blobs import SkinColour, skin_blobs
 from drake_pose.person.rays import meeting_points, nearest_points, viewing_rays
 from drake_pose.silhouette.segmentation.background import (
     Background,
@@ -119,19 +119,6 @@ class TestSkin:
         region[:, :60] = False
         assert not len(skin_blobs(picture, region, SkinColour()).areas)
         assert not len(skin_blobs(picture, np.zeros_like(region), SkinColour()).areas)
-
-    def test_colour_is_learned_from_samples(self):
-        generator = np.random.default_rng(0)
-        samples = (np.array([120, 200, 90]) * generator.uniform(0.6, 1.0, (200, 1))).astype(
-            np.uint8
-        )
-        colour = learn_skin_colour(samples)  # A Martian.
-        picture = np.full((50, 50, 3), SKIN, np.uint8)
-        picture[10:20, 10:20] = (96, 160, 72)
-        blobs = skin_blobs(picture, np.ones((50, 50), bool), colour)
-        assert blobs.areas.tolist() == [100]
-        with pytest.raises(SettingsError):
-            learn_skin_colour(samples[:5])
 
 
 class TestRays:

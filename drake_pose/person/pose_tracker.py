@@ -167,11 +167,15 @@ class PersonPoseTracker:
         if last is None:
             found = self._search.found(frame, range(HEADINGS))
             still = np.zeros(len(self._held))
-            return None if found is None else TrackState(found.values, still, found.share, _USUAL)
+            return (
+                None
+                if found is None
+                else TrackState(found.values, still, found.inlier_ratio, _USUAL)
+            )
         fitted = self._fitted(last, frame.add_up(self.fit))
         enough = last.usual - _RETRY_BELOW
-        lost = fitted.share < _LOST_BELOW * last.usual
-        due = fitted.share < enough and _is_due(last.troubled)
+        lost = fitted.inlier_ratio < _LOST_BELOW * last.usual
+        due = fitted.inlier_ratio < enough and _is_due(last.troubled)
         if due and not lost:
             first = last.troubled * LIMBS_A_FRAME
             fitted = self._search.mended(fitted, frame, enough, first, LIMBS_A_FRAME)
@@ -179,11 +183,11 @@ class PersonPoseTracker:
         state = TrackState(
             fitted.values,
             fitted.values - last.values if last.troubled == 0 else np.zeros(len(last.values)),
-            fitted.share,
-            max(fitted.share, last.usual + (fitted.share - last.usual) / _MEMORY),
-            last.troubled + 1 if doubted or fitted.share < enough else 0,
+            fitted.inlier_ratio,
+            max(fitted.inlier_ratio, last.usual + (fitted.inlier_ratio - last.usual) / _MEMORY),
+            last.troubled + 1 if doubted or fitted.inlier_ratio < enough else 0,
         )
-        hopeless = due and fitted.share < enough and last.troubled > 0
+        hopeless = due and fitted.inlier_ratio < enough and last.troubled > 0
         return self._restarted(state, last, frame) if lost or doubted or hopeless else state
 
     def follow_by_colour(self, last: TrackState, colours: ColourViews) -> TrackState:
@@ -192,7 +196,7 @@ class PersonPoseTracker:
         step = fitted.values - last.values
         lengths, fitting = fitted.sums[:-1, [COMPARED, FITTING]].T
         worst = np.min(fitting / np.maximum(lengths, 1e-9), where=lengths >= _TELLING, initial=1.0)
-        return TrackState(fitted.values, step, fitted.share, last.usual, worst=float(worst))
+        return TrackState(fitted.values, step, fitted.inlier_ratio, last.usual, worst=float(worst))
 
     def distance_by_colour(self, values: Array, colours: ColourViews) -> float:
         """Root mean square distance of the contour at values (m,) to that of the colours [pixel].
@@ -212,11 +216,13 @@ class PersonPoseTracker:
         """
         headings = headings_of(last.troubled)
         found = self._search.found(frame, headings, last.values, last.usual)
-        if found is None or found.share <= state.share:
+        if found is None or found.inlier_ratio <= state.share:
             return state
         left = last.troubled + 1 if last.troubled < 0 else 1 - CYCLE
         still = np.zeros(len(found.values))
-        return replace(state, values=found.values, step=still, share=found.share, troubled=left)
+        return replace(
+            state, values=found.values, step=still, share=found.inlier_ratio, troubled=left
+        )
 
     def _fitted(self, last: TrackState, add_up: AddUp) -> PoseFit:
         """The frame fitted from where the last ones point to."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from drake_pose.errors import SettingsError
 from drake_pose.fit.contour_fit import ContourFit, PoseFit, Prior
 from drake_pose.fit.kernel import COMPARED, FITTING
-from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.person.body_plan import BodyPlan, PlannedLimb, crowding
 from drake_pose.person.rays import sum_at_points
 from drake_pose.person.views import FrameViews
@@ -50,27 +50,27 @@ _JUDGED, _ROUGHER = 3, 1.5
 class AnnealingSchedule:
     """The steps of a frame's fit from where the last ones point to, and from a coarse guess."""
 
-    follow: tuple[Round, ...]
-    search: tuple[Round, ...]
+    follow: tuple[AnnealingStage, ...]
+    search: tuple[AnnealingStage, ...]
 
     def __post_init__(self) -> None:
         if not self.follow or not self.search:
             raise SettingsError("a tracker and its search need one round or more")
 
 
-_ENDS = (Round(0.07, 0.05), Round(0.05, 0.05), Round(0.04, 0.04))
+_ENDS = (AnnealingStage(0.07, 0.05), AnnealingStage(0.05, 0.05), AnnealingStage(0.04, 0.04))
 EXACT = AnnealingSchedule(
-    (Round(0.08, 0.06), Round(0.04, 0.06), Round(0.02, 0.05)),
+    (AnnealingStage(0.08, 0.06), AnnealingStage(0.04, 0.06), AnnealingStage(0.02, 0.05)),
     (
-        *(Round(scale, 0.06) for scale in (0.15, 0.10, 0.07, 0.05)),
-        Round(0.03, 0.05),
-        Round(0.02, 0.05),
+        *(AnnealingStage(scale, 0.06) for scale in (0.15, 0.10, 0.07, 0.05)),
+        AnnealingStage(0.03, 0.05),
+        AnnealingStage(0.02, 0.05),
     ),
 )
 """For a model that is the person."""
 LENIENT = AnnealingSchedule(
-    (Round(0.10, 0.06), *_ENDS),
-    (*(Round(scale, 0.06) for scale in (0.20, 0.15, 0.10)), *_ENDS),
+    (AnnealingStage(0.10, 0.06), *_ENDS),
+    (*(AnnealingStage(scale, 0.06) for scale in (0.20, 0.15, 0.10)), *_ENDS),
 )
 """For a model that is only like the person: it fits to within centimetres."""
 
@@ -101,7 +101,7 @@ class PersonSearch:
         self,
         fit: ContourFit,
         plan: BodyPlan,
-        rounds: Sequence[Round],
+        rounds: Sequence[AnnealingStage],
         information: Array,
         held: Mask,
         rest: Array,
@@ -128,7 +128,7 @@ class PersonSearch:
             limbs: how many limbs are searched; None: all that are doubtful.
         """
         best = _better(fitted, self._refine(fitted.values, frame))
-        if best.share >= enough:
+        if best.inlier_ratio >= enough:
             return best
         doubtful = self._doubtful(best, frame)
         begin = first % len(doubtful)
@@ -146,7 +146,7 @@ class PersonSearch:
                 guesses[-1][limb.values] = pose
             for values in guesses:
                 best = _better(best, self._refine(values, frame))
-            if best.share >= enough:
+            if best.inlier_ratio >= enough:
                 break
         return best
 

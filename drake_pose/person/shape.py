@@ -18,7 +18,7 @@ from drake_pose.errors import ModelError, UnknownNameError
 from drake_pose.fit.contour_fit import ContourFit, Noise
 from drake_pose.fit.evidence import NO_EDGE, EdgePoints, pack_evidence
 from drake_pose.fit.frames_fit import FramesFit
-from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import GIRTH_PREFIX, BodyParameters
 from drake_pose.fit.surfaces import with_girths
 from drake_pose.fit.unknowns import Unknowns, choose, join
@@ -35,7 +35,9 @@ Frames = Sequence[tuple[Sequence[Camera], Sequence[EdgePoints]]]
 # How far off the model lengths are, left and right differ [m], girths' logarithms are, and angles
 # are off where they were [rad]; and the farthest that a girth's logarithm is off.
 _LENGTH, _SIDE, _GIRTH, _POSE, _WIDEST = 0.03, 0.005, 0.15, 0.5, 0.5
-_ROUNDS = tuple(Round(scale, 0.04) for scale in (0.10, 0.08, 0.06, 0.05, 0.04, 0.04, 0.03, 0.03))
+_ROUNDS = tuple(
+    AnnealingStage(scale, 0.04) for scale in (0.10, 0.08, 0.06, 0.05, 0.04, 0.04, 0.03, 0.03)
+)
 NOISE = Noise(deviation=0.02, correlation=0.15)
 """What a point of contour is worth where the model is only like the person."""
 

@@ -25,7 +25,7 @@ from drake_pose.fit.camera_sums import (
 )
 from drake_pose.fit.contour_fit import ContourFit, pack_cameras
 from drake_pose.fit.evidence import EdgePoints, find_edge_points, pack_evidence
-from drake_pose.fit.levenberg_marquardt import Round
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import Placement
 from drake_pose.person.rays import triangulate
 
@@ -167,7 +167,7 @@ class FrameViews:
         """
         here = tuple(k for k, view in enumerate(self.views) if view.kept is None)
 
-        def total(placement: Placement, step: Round) -> CameraSum:
+        def total(placement: Placement, step: AnnealingStage) -> CameraSum:
             weights = fit.weights(self._arrays, placement, step)
             asked = [
                 (keeper, index, keeper.ask(self._request(index, placement, weights)))

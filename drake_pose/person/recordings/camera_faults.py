@@ -17,7 +17,7 @@ from drake_pose.camera.models import Camera
 from drake_pose.fit.contour_fit import ContourFit, Prior
 from drake_pose.fit.evidence import EdgePoints, pack_evidence
 from drake_pose.fit.frames_fit import FramesFit
-from drake_pose.fit.levenberg_marquardt import Round, StepSettings
+from drake_pose.fit.levenberg_marquardt import AnnealingStage, StepSettings
 from drake_pose.fit.parameters import CAMERA_NAMES, CameraParameters
 from drake_pose.fit.unknowns import choose
 from drake_pose.person.rays import viewing_rays
@@ -28,10 +28,14 @@ Mask = NDArray[np.bool_]
 
 # A camera that was pushed has turned and shifted by about this much [rad, m].
 _TURN, _SHIFT = 0.15, 0.3
-_POSE_ROUNDS = tuple(Round(scale, 0.05) for scale in (0.15, 0.12, 0.10, 0.08, 0.06, 0.05, 0.04))
-_CAMERA_ROUNDS = tuple(Round(scale, 0.05) for scale in (0.4, 0.3, 0.2, 0.15, 0.1, 0.07, 0.05, 0.05))
+_POSE_ROUNDS = tuple(
+    AnnealingStage(scale, 0.05) for scale in (0.15, 0.12, 0.10, 0.08, 0.06, 0.05, 0.04)
+)
+_CAMERA_ROUNDS = tuple(
+    AnnealingStage(scale, 0.05) for scale in (0.4, 0.3, 0.2, 0.15, 0.1, 0.07, 0.05, 0.05)
+)
 _CAMERA_STEPS = StepSettings(longest=2.0, damping=1e-6, even_damping=1e-9)
-_JUDGED = Round(0.05, 0.05)
+_JUDGED = AnnealingStage(0.05, 0.05)
 _ANGLE_DEVIATION = 0.5
 # A camera is at fault where leaving it out lowers the others' misfit to so little of what it was,
 # and nobody else's leaving does as much.
@@ -117,7 +121,7 @@ def fit_without(
         Prior(frame.values, information),
         held,
     )
-    return found.values, found.share
+    return found.values, found.inlier_ratio
 
 
 def camera_motion(
@@ -187,7 +191,7 @@ def _moved_camera(
 
 def share_of(fit: ContourFit, camera: Camera, edge: EdgePoints, values: Array) -> float:
     """What share of the contours' lengths fits in one picture."""
-    return fit.compare([camera], [edge], values, _JUDGED).share
+    return fit.compare([camera], [edge], values, _JUDGED).inlier_ratio
 
 
 def _describe(

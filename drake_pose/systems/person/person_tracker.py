@@ -23,7 +23,7 @@ from pydrake.systems.sensors import ImageRgba8U
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.fit.colour_lines import COLOURS
-from drake_pose.fit.contour_fit import fitting_share
+from drake_pose.fit.contour_fit import inlier_ratio_of
 from drake_pose.person.colour_views import ColourViews
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
 from drake_pose.person.recordings.persons_in_view import keep_views
@@ -322,7 +322,7 @@ class PersonTracker(LeafSystem):
         fit = self._tracker.fit
         step = self._tracker.schedule.follow[-1]
         total = clean.add_up(fit)(fit.body.place(found.values), step)
-        return replace(found, share=fitting_share(total.sums))
+        return replace(found, share=inlier_ratio_of(total.sums))
 
     def _calc_positions(self, context: Context, output: BasicVector) -> None:
         vector = context.get_discrete_state(self._state).value()

@@ -11,9 +11,9 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_pose.camera.sources.frame_source import Clock
 from drake_pose.jobs.cluster.camera_groups import WatchedSource, Watchers
 from drake_pose.jobs.live.scene import LiveScene
+from drake_pose.person.views import edge_spacing
 from drake_pose.systems.person.live_capture import LocalSensors, SensorPorts
 from drake_pose.systems.person.silhouette_sensor import RemoteSensors
-from drake_pose.person.views import edge_spacing
 
 if TYPE_CHECKING:
     from distributed import Client

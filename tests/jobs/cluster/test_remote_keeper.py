@@ -17,8 +17,7 @@ from drake_pose.jobs.cluster.camera_worker import EdgeServer
 from drake_pose.jobs.cluster.lines import Line, serve
 from drake_pose.jobs.cluster.remote_keeper import RemoteKeeper
 from drake_pose.person.pose_tracker import PersonPoseTracker
-from drake_pose.person.views import FrameViews, KeptEdge, see_silhouette
-from drake_pose.person.views import pack_view, unpack_view
+from drake_pose.person.views import FrameViews, KeptEdge, pack_view, see_silhouette, unpack_view
 from drake_pose.silhouette.areas.scoring import draw_mask
 
 HOST = "127.0.0.1"

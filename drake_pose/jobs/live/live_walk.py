@@ -52,8 +52,7 @@ def walk_live(
         seconds: how long; without end, or until the recordings end, where not given.
         open_sensors: opens the sensors; those of the scene in this process where not given.
         on_command: called when the command changes, with its words, "" for none.
-        on_report: hears at once of cameras that stop and return, of bad pictures, and of a person
-            who is found or lost.
+        on_report: told of cameras that stop and return, bad pictures, a person found or lost.
         packages: folders of packages that the model's ``package://`` names mean, by name.
         settings: what is a command.
 
@@ -74,10 +73,8 @@ def walk_live(
     try:
 
         def add(builder: DiagramBuilder) -> OutputPort:
-            ports = opened.add(builder)
-            system = add_person_tracker(
-                builder, tracker, scene.cameras, ports.silhouettes, opened.period, ports.time
-            )
+            seen, time = opened.add(builder)
+            system = add_person_tracker(builder, tracker, scene.cameras, seen, opened.period, time)
             return system.GetOutputPort("estimated_positions")
 
         stride = stride_positions(model)

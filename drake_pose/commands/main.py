@@ -17,10 +17,7 @@ from drake_pose.commands.batch import batch
 from drake_pose.commands.capture import capture, empty_room
 from drake_pose.commands.estimate import demo, estimate
 from drake_pose.commands.masks import masks
-from drake_pose.commands.papers.date import date
-from drake_pose.commands.papers.kameda import kameda
-from drake_pose.commands.papers.reproduce_all import reproduce_all
-from drake_pose.commands.papers.shimada import shimada
+from drake_pose.commands.papers import date, kameda, reproduce_all, shimada
 from drake_pose.commands.prepare import calibrate, check, undistort
 from drake_pose.commands.register import audit, register
 from drake_pose.commands.terminal import UsageError, say

@@ -3,51 +3,45 @@
 from __future__ import annotations
 
 import base64
-import html
 import io
 import json
 import os
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rich.console import Console, RenderableType
-from rich.text import Text
 
 from drake_pose.errors import OutputError
 from drake_pose.filtering.kalman.truncated_filter import FilterSettings
-from drake_pose.papers import paper_figures
-from drake_pose.papers.date.experiment import run_experiment as run_date
-from drake_pose.papers.date.pictures import save_pictures as save_date
-from drake_pose.papers.kameda.continuous import (
-    continuous_search,
-    continuous_table,
-    run_continuous_experiment,
-)
-from drake_pose.papers.kameda.experiment import (
+from drake_pose.papers.date import run_experiment as run_date
+from drake_pose.papers.date_pictures import save_pictures as save_date
+from drake_pose.papers.kameda import (
     beam_experiment_search,
+    continuous_search,
     experiment_search,
 )
-from drake_pose.papers.kameda.experiment import run_experiment as run_kameda
-from drake_pose.papers.kameda.pictures import save_pictures as save_kameda
-from drake_pose.papers.kameda.real_pictures import (
-    METHODS,
-    picture_names,
-    real_table,
-    run_real_experiment,
+from drake_pose.papers.kameda import run_experiment as run_kameda
+from drake_pose.papers.kameda_figures import (
+    PAPER,
+    continuous_figures,
+    continuous_table,
+    grid_figures,
+    grid_table,
 )
-from drake_pose.papers.kameda.table import experiment_table
-from drake_pose.papers.paper_figures import Beside
-from drake_pose.papers.shimada.experiment import run_experiment as run_shimada
-from drake_pose.papers.shimada.hypotheses import run_hypotheses_experiment
-from drake_pose.papers.shimada.pictures import save_hypotheses
-from drake_pose.papers.shimada.pictures import save_pictures as save_shimada
-from drake_pose.papers.shimada.static_view import run_static_experiment
+from drake_pose.papers.kameda_pictures import save_pictures as save_kameda
+from drake_pose.papers.kameda_real_pictures import real_table, run_real_experiment
+from drake_pose.papers.shimada import result_table
+from drake_pose.papers.shimada import run_experiment as run_shimada
+from drake_pose.papers.shimada_hypotheses import run_hypotheses_experiment
+from drake_pose.papers.shimada_pictures import save_hypotheses
+from drake_pose.papers.shimada_pictures import save_pictures as save_shimada
+from drake_pose.papers.tables import Count, Figures
 from drake_pose.results.folder import without_nan
+from drake_pose.results.report_page import page_template
 from drake_pose.search.scoring import PoseSearch
 from drake_pose.version import VERSION
 
@@ -57,35 +51,30 @@ _OUTSIDE_WEIGHT = 10.0
 _COLUMNS = 110
 # The paper's filter and ours, by the names of their figures.
 _FILTERS = (("paper", "sequential", 1), ("ours", "joint", FilterSettings().iterations))
-
-Advance = Callable[[int], None]
-Count = Callable[[str, int], "Advance"]
+_NONE = "-"
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What an experiment came to.
+class Beside(NamedTuple):
+    """One figure of a paper, in words where it shows a picture, and what comes out here."""
 
-    Args:
-        figures: as its command prints them with --json.
-        shown: its tables.
-        beside: the paper's figures beside ours; empty where the paper has no such experiment.
-    """
+    what: str
+    paper: str
+    its_method: str
+    ours: str
 
-    figures: Mapping[str, Any]
+
+class Outcome(NamedTuple):
+    """What an experiment came to: figures by method, its tables, and the paper's beside ours."""
+
+    figures: Figures
     shown: Sequence[RenderableType]
     beside: Sequence[Beside] = ()
 
 
-@dataclass(frozen=True)
-class Experiment:
-    """One of all.
+class Experiment(NamedTuple):
+    """One of all: its folder, its title on the page, what runs it alone, and what makes it.
 
-    Args:
-        name: of its folder.
-        title: what the page calls it.
-        command: what runs it alone.
-        run: makes it, given whether it is short, its folder for pictures, and what counts.
+    The last is given whether it is short, its folder for pictures, and what counts.
     """
 
     name: str
@@ -94,101 +83,118 @@ class Experiment:
     run: Callable[[bool, Path, Count], Outcome]
 
 
+def _beside(what: str, form: str, *columns: str | Figures) -> Beside:
+    """A row of the paper, its method and ours: words, or figures that are put into a form."""
+    return Beside(what, *(one if isinstance(one, str) else form.format(**one) for one in columns))
+
+
 def _kameda(short: bool, folder: Path, count: Count) -> Outcome:
-    images = 3 if short else 219
     searches: dict[str, PoseSearch] = {
         "paper": experiment_search(),
         "outside_weight": experiment_search(outside_weight=_OUTSIDE_WEIGHT),
         "beam": beam_experiment_search(),
     }
     results = {
-        name: run_kameda(search, images, 0, count(f"Kameda A, {name}", images))
-        for name, search in searches.items()
+        name: run_kameda(search, 3 if short else 219, 0, count) for name, search in searches.items()
     }
     for name, result in results.items():
         save_kameda(result, folder / name)
-    figures = {name: result.as_json() for name, result in results.items()}
-    shown: list[RenderableType] = [experiment_table([[result] for result in results.values()])]
-    return Outcome(figures, shown, paper_figures.kameda_a(figures))
-
-
-def _kameda_continuous(short: bool, folder: Path, count: Count) -> Outcome:
-    images = 1 if short else 30
-    result = run_continuous_experiment(
-        continuous_search(), images, 77, progress=count("Kameda A, continuous", images)
+    figures = {name: grid_figures(result) for name, result in results.items()}
+    paper, beam = figures["paper"], figures["beam"]
+    rows = (
+        _beside("mean E_total of poses found", "{mean_e_total:.2%}", PAPER, paper, beam),
+        _beside("silhouettes matched exactly", "{exact} of {images}", PAPER, paper, beam),
+        _beside("every joint angle right", "{pose_equal} of {images}", PAPER, paper, beam),
+        _beside("improved by re-estimation", "{improved} of {images}", PAPER, paper, _NONE),
+        _beside("runs of step 3, mean", "{mean_runs:.1f}", PAPER, paper, _NONE),
+        _beside("processor seconds an image, median", "{median_seconds:.2f}", _NONE, paper, beam),
     )
-    return Outcome(result.as_json(), [continuous_table({"one view": result})])
+    return Outcome(figures, [grid_table([[one] for one in results.values()])], rows)
+
+
+def _kameda_continuous(short: bool, _folder: Path, count: Count) -> Outcome:
+    result = run_kameda(continuous_search(), 1 if short else 30, 77, count)
+    return Outcome(continuous_figures(result), [continuous_table({"one view": result})])
 
 
 def _kameda_pictures(experiment: str, short: bool, folder: Path, count: Count) -> Outcome:
-    frames = picture_names(experiment)[: 1 if short else None]
-    results = [
-        run_real_experiment(
-            experiment,
-            method,
-            frames,
-            folder / method,
-            count(f"Kameda {experiment}, {name}", len(frames)),
-        )
-        for method, name in METHODS.items()
-    ]
-    figures: dict[str, Any] = {result.method: result.as_json() for result in results}
-    warnings = [
-        Text(f"Warning: {METHODS[result.method]}: {text}")
-        for result in results
-        for text in result.warnings
-    ]
-    shown: list[RenderableType] = [real_table(results), *warnings]
-    return Outcome(figures, shown, paper_figures.kameda_pictures(figures))
+    figures = run_real_experiment(experiment, 1 if short else None, folder, count)
+    paper, beam = figures["paper"], figures["beam"]
+    said = "{paper_mean_e_total:.1%} ({paper_images} pictures)".format(**paper)
+    rows = (
+        _beside("mean E_total", "{mean_e_total:.1%} ({images})", said, paper, beam),
+        _beside("processor seconds an image", "{seconds_an_image:.1f}", _NONE, paper, beam),
+    )
+    warnings = [f"Warning: {text}" for one in figures.values() for text in one["warnings"]]
+    return Outcome(figures, [real_table(figures), *warnings], rows)
 
 
 def _shimada(short: bool, folder: Path, count: Count) -> Outcome:
-    runs = 1 if short else 50
-    figures, shown = {}, []
+    figures: dict[str, dict[str, Any]] = {}
+    shown = []
     for name, truncation, iterations in _FILTERS:
-        advance = count(f"Shimada, {name}", 2 * runs)
-        result = run_shimada(runs, 0, truncation, "lines", advance, iterations)
+        result = run_shimada(1 if short else 50, 0, truncation, "lines", count, iterations)
         save_shimada(result, folder / name)
         figures[name] = result.as_json()
-        shown.append(result.table())
-    return Outcome(figures, shown, paper_figures.shimada(figures))
+        shown.append(result_table(result))
+    both = (figures["paper"], figures["ours"])
+    first, second = ([one[case] for one in both] for case in ("r13_35", "r13_40"))
+    r_13, form = "r_13 after 55 frames where it is", "{r_13_mean:.1f} (RMS error {r_13_rmse:.1f})"
+    angles = "joint angles at the end, RMS error [deg]"
+    lost = [
+        f"{one['lost'] + other['lost']} of {2 * both[0]['runs']}"
+        for one, other in zip(first, second, strict=True)
+    ]
+    inside = ("{inside_2sigma:.0%}", "in its figures 12 to 16")
+    rows = (
+        _beside(f"{r_13} 35 [pixel]", form, "right (figure 15)", *first),
+        _beside(f"{r_13} 40 [pixel]", form, "right (figure 16)", *second),
+        _beside("truths within two deviations", *inside, *first),
+        _beside(angles, "{angle_rmse_at_end:.1f}", "right (figure 14)", *first),
+        Beside("sequences lost", "none of two", *lost),
+    )
+    return Outcome(figures, shown, rows)
 
 
 def _shimada_hypotheses(short: bool, folder: Path, count: Count) -> Outcome:
-    runs = 2 if short else 50
     figures, shown = {}, []
     for name, truncation, iterations in _FILTERS:
-        advance = count(f"Shimada's figure 9, {name}", runs)
-        result = run_hypotheses_experiment(runs, 0, truncation, "lines", advance, iterations)
+        runs = 2 if short else 50
+        result = run_hypotheses_experiment(runs, 0, truncation, "lines", count, iterations)
         save_hypotheses(result, folder / name)
         figures[name] = result.as_json()
         shown.append(result.table())
-    return Outcome(figures, shown, paper_figures.shimada_hypotheses(figures))
-
-
-def _shimada_static(short: bool, folder: Path, count: Count) -> Outcome:
-    runs, frames = (1, 20) if short else (4, 1000)
-    figures: dict[str, Any] = {}
-    shown: list[RenderableType] = []
-    for name, truncation, iterations in _FILTERS:
-        result = run_static_experiment(
-            runs,
-            truncation=truncation,
-            marks=(frames // 2, frames),
-            progress=count(f"Shimada, one view, {name}", runs),
-            iterations=iterations,
-        )
-        figures[name] = result.as_json()
-        shown += [Text(f"{name}:"), result.table()]
-    return Outcome(figures, shown, paper_figures.shimada_static(figures))
+    paper, ours = figures["paper"], figures["ours"]
+    later, lived = "{rejected_later_than_made}", f"{paper['frames_lived_median'] or 0:g} (median)"
+    coupled = "{of_these_by_coupled_joints}"
+    rows = (
+        _beside("hypotheses rejected later than made", later, "one is shown", paper, ours),
+        _beside("of these wrong", "{of_these_wrong}", "that one", paper, _NONE),
+        Beside("frames from its birth to its end", "2 (18 to 20)", lived, _NONE),
+        _beside("as two joints do not bend alike", coupled, "that one", paper, _NONE),
+    )
+    return Outcome(figures, shown, rows)
 
 
 def _date(short: bool, folder: Path, count: Count) -> Outcome:
     cameras, frames, size = (4, 40, (320, 240)) if short else (9, 240, (640, 480))
-    result = run_date(cameras, frames, 0, "silhouette", count("Date", frames), size)
+    result = run_date(cameras, frames, 0, "silhouette", count, size)
     save_date(result, folder)
-    shown: list[RenderableType] = [result.table(), result.found_table(), result.costs()]
-    return Outcome(result.as_json(), shown, paper_figures.date(result.as_json()))
+    figures: dict[str, Any] = result.as_json()
+    rows = []
+    for joint in ("elbow", "knee"):
+        what = f"{joint}s, upright: by inverse kinematics alone, then with the search [mm]"
+        found = f"{figures[f'{joint}_ik_mm']:.0f} to {figures[f'{joint}_mm']:.0f}"
+        all_at_once = f"{figures[f'{joint}s']['silhouette_mm']:.1f} (all motions)"
+        rows.append(Beside(what, "wrong, then right (figure 7)", found, all_at_once))
+    whole = f"{figures['ms_per_frame']['all']:.0f} ms, one core"
+    back = figures["frames_to_recover_registered"]
+    shown = "not" if back is None else str(back)
+    rows += [
+        Beside("a frame", "real time, a cluster (15 ms for the face)", _NONE, whole),
+        Beside("frames until right when the registered pose is shown", "that frame", _NONE, shown),
+    ]
+    return Outcome(figures, [*result.tables(), result.costs()], rows)
 
 
 EXPERIMENTS = (
@@ -229,12 +235,6 @@ EXPERIMENTS = (
         _shimada_hypotheses,
     ),
     Experiment(
-        "shimada_static",
-        "One unchanging view, the limitation that its authors state",
-        "drake-pose reproduce shimada --runs 4 --static 1000",
-        _shimada_static,
-    ),
-    Experiment(
         "date",
         "Date, Yoshimatsu, Arita, Taniguchi: a person before many cameras",
         "drake-pose reproduce date",
@@ -251,7 +251,7 @@ def reproduce_all(out: Path, short: bool, count: Count, say: Callable[[str], Non
     Args:
         out: the folder.
         short: a few images, runs and frames of each, to see that all of it works.
-        count: called with what is counted and up to where; its value with how many are done.
+        count: counts images, sequences and frames.
         say: called with what happens.
 
     Returns:
@@ -262,108 +262,66 @@ def reproduce_all(out: Path, short: bool, count: Count, say: Callable[[str], Non
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
-        _check_settings(out / _SETTINGS, {"short": short, "version": VERSION})
+        settings, made = out / _SETTINGS, json.dumps({"short": short, "version": VERSION}, indent=2)
+        if settings.is_file() and settings.read_text() != made:
+            raise OutputError(
+                f"{out}: holds experiments made with other settings ({_SETTINGS}); name another "
+                "folder with --out"
+            )
+        _write(settings, made)
         for number, experiment in enumerate(EXPERIMENTS, start=1):
-            folder = out / experiment.name
-            if folder.is_dir():
-                say(f"{number} of {len(EXPERIMENTS)}, {experiment.name}: is there")
-                continue
-            say(f"{number} of {len(EXPERIMENTS)}, {experiment.name}")
-            part = out / f"{experiment.name}.part"
-            shutil.rmtree(part, ignore_errors=True)
-            part.mkdir()
-            begin = time.process_time()
-            outcome = experiment.run(short, part, count)
-            _write_outcome(part, outcome, time.process_time() - begin)
-            os.replace(part, folder)
+            folder, part = out / experiment.name, out / f"{experiment.name}.part"
+            which = f"{number} of {len(EXPERIMENTS)}, {experiment.name}"
+            say(f"{which}: is there" if folder.is_dir() else which)
+            if not folder.is_dir():
+                shutil.rmtree(part, ignore_errors=True)
+                part.mkdir()
+                begin = time.process_time()
+                outcome = experiment.run(short, part, count)
+                _write_outcome(part, outcome, time.process_time() - begin)
+                os.replace(part, folder)
             _write(out / REPORT, _page(out, short))
-        return _write(out / REPORT, _page(out, short))
     except OSError as error:
         raise OutputError(f"{out}: cannot write the experiments: {error.strerror}") from error
-
-
-def _check_settings(path: Path, settings: Mapping[str, Any]) -> None:
-    """Refuses to go on with experiments that were made otherwise."""
-    text = json.dumps(settings, indent=2)
-    if path.is_file() and path.read_text() != text:
-        raise OutputError(
-            f"{path.parent}: holds experiments made with other settings ({path.name}); name "
-            "another folder with --out"
-        )
-    _write(path, text)
+    return out / REPORT
 
 
 def _write_outcome(folder: Path, outcome: Outcome, cpu_seconds: float) -> None:
-    beside = {
-        "figures": [one._asdict() for one in outcome.beside],
-        "cpu_seconds": round(cpu_seconds, 1),
-    }
-    (folder / BESIDE).write_text(json.dumps(beside, indent=2))
-    (folder / FIGURES).write_text(
-        json.dumps(without_nan(outcome.figures), indent=2, allow_nan=False)
-    )
+    beside = [one._asdict() for one in outcome.beside]
+    for name, content in (
+        (BESIDE, {"figures": beside, "cpu_seconds": round(cpu_seconds, 1)}),
+        (FIGURES, without_nan(outcome.figures)),
+    ):
+        (folder / name).write_text(json.dumps(content, indent=2, allow_nan=False))
     console = Console(file=io.StringIO(), record=True, width=_COLUMNS)
     for one in outcome.shown:
-        console.print(one)
+        console.print(one, markup=False)
     (folder / TABLES).write_text(console.export_text())
 
 
-def _write(path: Path, text: str) -> Path:
+def _write(path: Path, text: str) -> None:
     """Writes a file beside its place and moves it there."""
     beside = path.with_name(f"{path.name}.part")
     beside.write_text(text)
     os.replace(beside, path)
-    return path
 
 
 def _page(out: Path, short: bool) -> str:
-    """The page about the experiments that are finished."""
-    finished = [one for one in EXPERIMENTS if (out / one.name).is_dir()]
-    left = [one.name for one in EXPERIMENTS if one not in finished]
-    notes = ""
-    if short:
-        notes += "<p><strong>Short: too few images and runs for any conclusion.</strong></p>"
-    if left:
-        notes += f"<p><strong>Not finished: {html.escape(', '.join(left))}.</strong></p>"
-    notes += _overview(out, finished)
-    sections = "".join(_section(out / one.name, one) for one in finished)
-    return (
-        "<!DOCTYPE html><html lang='en'><head><meta charset='utf-8'>"
-        "<title>The papers' experiments</title><style>body{font-family:sans-serif;margin:2em}"
-        "pre{line-height:1.15}td,th{padding:.1em .8em;text-align:left}"
-        "img{max-width:48em;margin:.5em;vertical-align:top}</style></head>"
-        f"<body><h1>The papers' experiments</h1>{notes}{sections}</body></html>\n"
-    )
-
-
-def _overview(out: Path, finished: Sequence[Experiment]) -> str:
-    """The papers' figures beside ours, of all experiments, and what they cost."""
-    rows, seconds = "", 0.0
-    for one in finished:
-        beside = json.loads((out / one.name / BESIDE).read_text())
-        seconds += beside["cpu_seconds"]
-        if beside["figures"]:
-            rows += f"<tr><th colspan='4'>{html.escape(one.title)}</th></tr>"
-        for row in beside["figures"]:
-            rows += (
-                "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row.values()) + "</tr>"
-            )
-    return (
-        f"<p>Processor time: {seconds / 60:.1f} minutes.</p><table><tr><th>figure</th>"
-        "<th>the paper</th><th>its method here</th><th>ours</th></tr>"
-        f"{rows}</table>"
-    )
-
-
-def _section(folder: Path, experiment: Experiment) -> str:
-    pictures = "".join(
-        f"<figure><img alt='{html.escape(path.stem)}' src='data:image/png;base64,"
-        f"{base64.b64encode(path.read_bytes()).decode()}'>"
-        f"<figcaption>{html.escape(str(path.relative_to(folder)))}</figcaption></figure>"
-        for path in sorted(folder.rglob("*.png"))
-    )
-    tables = html.escape((folder / TABLES).read_text())
-    return (
-        f"<h2>{html.escape(experiment.title)}</h2><p><code>{html.escape(experiment.command)}"
-        f"</code></p><pre>{tables}</pre>{pictures}"
+    """The page about the experiments that are finished: the papers' figures beside ours first."""
+    finished = []
+    for one in EXPERIMENTS:
+        folder = out / one.name
+        if folder.is_dir():
+            pictures = {
+                str(path.relative_to(folder)): base64.b64encode(path.read_bytes()).decode()
+                for path in sorted(folder.rglob("*.png"))
+            }
+            beside = json.loads((folder / BESIDE).read_text())
+            tables = (folder / TABLES).read_text()
+            finished.append({**one._asdict(), **beside, "tables": tables, "pictures": pictures})
+    return page_template("drake_pose.papers", "report_template.html.j2").render(
+        short=short,
+        missing=[one.name for one in EXPERIMENTS if not (out / one.name).is_dir()],
+        minutes=sum(one["cpu_seconds"] for one in finished) / 60,
+        finished=finished,
     )

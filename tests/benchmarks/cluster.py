@@ -2,8 +2,7 @@
 
 Run as ``python -m tests.benchmarks.cluster``. A batch of stills and a live capture of a
 simulated person are done by this process, one worker and two; bytes are counted, milliseconds are
-the processor's own, so that a busy machine changes little but the frames a second. What a hundred
-cameras cost the process in the middle is measured with simulated views.
+the processor's own, so that a busy machine changes little but the frames a second.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from drake_pose.jobs.cluster.remote_views import ClusterSensors
 from drake_pose.jobs.cluster.scheduler import open_cluster
 from drake_pose.jobs.live.run import FrameWatch, LiveFrame, run_live
 from drake_pose.jobs.live.scene import LiveScene, load_live_scene
-from drake_pose.papers.kameda.experiment import experiment_camera
+from drake_pose.papers.kameda import experiment_camera
 from drake_pose.person.date.skeleton import load_skeleton
 from drake_pose.person.date.walking_motion import make_motion
 from drake_pose.person.shape import tracker_of_person
@@ -42,12 +41,6 @@ from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.systems.person.live_capture import LiveSensors, build_live_capture
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
-from tests.benchmarks.centre import (
-    CentreFigures,
-    SimulatedViews,
-    measure_centre,
-    measure_polls,
-)
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -57,8 +50,6 @@ _CAMERAS, _SIZE, _RATE_HZ = 8, (640, 480), 30.0
 # How many frames of Date's motions, which take twelve seconds in all.
 _FRAMES, _MOTION_FRAMES = 60, 360
 _FAR_AWAY = -9.0
-# The centre is measured with so many cameras, ten a worker; and with fewer, four a worker.
-_CENTRE, _GROUPS, _FEW, _LEAST_GROUP = 100, 10, 40, 4
 _GIGA = 1e9
 
 
@@ -244,46 +235,14 @@ def live_table(found: list[LiveFigures]) -> Table:
     return table
 
 
-def measure_centres(views: SimulatedViews) -> list[CentreFigures]:
-    """What following a person by simulated views costs the centre: alone, then with groups."""
-    few = views.fewer(_FEW)
-    return [
-        *(measure_centre(few, groups) for groups in (0, _FEW // _LEAST_GROUP)),
-        *(measure_centre(views, groups) for groups in (0, _CENTRE // _LEAST_GROUP, _GROUPS)),
-    ]
-
-
-def centre_table(found: list[CentreFigures]) -> Table:
-    """What following costs the centre, and how far its answer is from that of one process."""
-    table = Table(title="The process in the middle, which follows by workers' sums")
-    for heading in ("cameras", "a worker", "centre, a frame", "off one process"):
-        table.add_column(heading, justify="right")
-    for one in found:
-        alone = next(own for own in found if own.cameras == one.cameras and not own.groups)
-        table.add_row(
-            str(one.cameras),
-            f"{one.cameras // one.groups}" if one.groups else "none",
-            f"{1e3 * one.seconds:.1f} ms",
-            f"{np.abs(one.q - alone.q).max():.0e}" if one.groups else "",
-        )
-    return table
-
-
-def needs_table(
-    batch: BatchFigures, live: LiveFigures, centre: CentreFigures, polls: float
-) -> Table:
+def needs_table(batch: BatchFigures, live: LiveFigures) -> Table:
     """What 100 cameras at 30 Hz and ten million frames would need.
 
     Args:
         batch: this process's.
         live: a capture by two workers.
-        centre: following by 100 cameras in groups.
-        polls: what asking all workers once for their views costs the centre [s].
     """
-    hundred = centre.seconds + polls
-    per_second = centre.cameras * _RATE_HZ
-    # A sum goes and comes once for each worker and round.
-    sums = centre.groups * _RATE_HZ * centre.sum_bytes
+    per_second = 100 * _RATE_HZ
     table = Table(title="What more would need")
     table.add_column("for")
     table.add_column("needs")
@@ -293,12 +252,8 @@ def needs_table(
                      f"(its picture: {picture})"),
         ("100 cameras at 30 Hz: workers", f"{per_second * live.view_seconds:.1f} cores"),
         ("100 cameras at 30 Hz: network",
-         f"{8e-6 * per_second * live.view_bytes:.0f} Mbit/s of views, {8e-6 * sums:.0f} of sums "
+         f"{8e-6 * per_second * live.view_bytes:.0f} Mbit/s of views "
          f"(pictures: {8e-6 * per_second * picture:.0f})"),
-        ("100 cameras at 30 Hz: centre",
-         f"{1e3 * hundred:.1f} ms a frame = {_RATE_HZ * hundred:.2f} cores, of which it can use 1: "
-         f"{1e3 * centre.seconds:.1f} to follow, {1e3 * polls:.1f} for the views of "
-         f"{centre.groups} workers"),
         ("ten million stills", f"{1e7 * batch.processor_seconds / batch.frames / 3600:.0f} core "
                                f"hours, {1e7 * batch.bytes_a_frame / _GIGA:.0f} GB"),
     )  # fmt: skip
@@ -335,10 +290,7 @@ def main() -> None:
         console.print(batch_table(batch))
         live = [measure_live(scene, workers, client) for workers, client in clients.items()]
         console.print(live_table(live))
-    centres = measure_centres(SimulatedViews(_CENTRE))
-    console.print(centre_table(centres))
-    polls = measure_polls(_GROUPS, _CENTRE, live[2].view_bytes)
-    console.print(needs_table(batch[0], live[2], centres[-1], polls))
+    console.print(needs_table(batch[0], live[2]))
 
 
 if __name__ == "__main__":

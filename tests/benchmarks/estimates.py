@@ -23,10 +23,8 @@ from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.jobs.demo import demo_scene, demo_settings
 from drake_pose.jobs.estimate.scene import estimate_scene
-from drake_pose.papers.kameda.continuous import (
-    continuous_search,
-    run_continuous_experiment,
-)
+from drake_pose.papers.kameda import continuous_search, run_experiment
+from drake_pose.papers.kameda_figures import continuous_figures
 from drake_pose.results.folder import PoseRow
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
@@ -176,7 +174,7 @@ def estimates_table(data: Path | None, folder: Path, label_image: float) -> Tabl
         table.add_row(
             work.name, f"{seconds:.3f} s", f"{seconds / label_image:.0f}", f"{E_total:.2%}", error
         )
-    plain = run_continuous_experiment(continuous_search(), _IMAGES, seed=1).as_json()
+    plain = continuous_figures(run_experiment(continuous_search(), _IMAGES, seed=1))
     seconds = float(plain["median_seconds"] or 0.0) + float(plain["mean_interval_seconds"] or 0.0)
     table.add_row(
         "continuous angles, one view, exact masks",

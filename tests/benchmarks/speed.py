@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import resource
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from pydrake.common import MemoryFile
 from pydrake.geometry import (
@@ -31,15 +32,17 @@ from drake_pose.body.model import load_model
 from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.camera.drake import camera_to_drake
 from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
-from drake_pose.papers.date.cost import cost_table
-from drake_pose.papers.kameda.experiment import (
+from drake_pose.papers.date_capture import SilhouetteTrack, Studio
+from drake_pose.papers.kameda import (
     experiment_camera,
     experiment_search,
     run_experiment,
 )
-from drake_pose.papers.kameda.table import experiment_table
+from drake_pose.papers.kameda_figures import grid_table
+from drake_pose.person.date.walking_motion import FEWEST_FRAMES, MOTIONS, make_motion
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import prefix_sums, score_bodies
+from drake_pose.systems.colour_images import picture_to_colour_image
 from tests.silhouette.agreement import measure_agreement
 
 _RENDERER = "benchmark"
@@ -169,6 +172,50 @@ def _fastest(function: Callable[[], object], repeats: int) -> float:
     return min(times)
 
 
+CAMERAS = (4, 8, 16)
+_FRAMES = 12
+
+
+def measure_cost(cameras: int, size: tuple[int, int] = (640, 480), seed: int = 0) -> np.ndarray:
+    """Processor time of region and edge, and of the pose (2,), a frame [ms], the medians.
+
+    The person walks, and is known where the measurement begins.
+
+    Args:
+        cameras: how many, the face camera included.
+        size: width and height of the pictures [pixel].
+        seed: of noise and motion.
+    """
+    studio = Studio.build(cameras, size, np.random.default_rng([seed, 1]))
+    motion = make_motion(studio.skeleton, 4 * FEWEST_FRAMES, seed)
+    begin = motion.names.index(MOTIONS[0])
+    track = SilhouetteTrack.build(studio.model, studio.cameras, studio.backgrounds)
+    track.place(motion.q[begin])
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        for q in motion.q[begin : begin + _FRAMES]:
+            shots = studio.pictures(q)
+            track.step({name: picture_to_colour_image(one) for name, one in shots.items()})
+    finally:
+        cv2.setNumThreads(threads)
+    laps = [(lap["region"] + lap["edge"], lap["pose"]) for lap in track.milliseconds]
+    return np.asarray(np.median(laps, axis=0))
+
+
+def cost_table(counts: Sequence[int] = CAMERAS) -> Table:
+    """The cost for each number of cameras, and for each camera."""
+    table = Table(title="Date, all silhouettes, 640 x 480, one core: milliseconds a frame")
+    for heading in ("cameras", "region and edge", "pose", "all", "a camera"):
+        table.add_column(heading, justify="right")
+    for cameras in counts:
+        seen, pose = measure_cost(cameras)
+        whole = seen + pose
+        each = whole / cameras
+        table.add_row(str(cameras), *(f"{cost:.1f}" for cost in (seen, pose, whole, each)))
+    return table
+
+
 def main() -> None:
     """Print what kernel, agreement with Drake, Date's capture and experiment A come to here."""
     console = Console()
@@ -189,7 +236,7 @@ def main() -> None:
     start = time.process_time()
     result = run_experiment(experiment_search())
     seconds = time.process_time() - start
-    console.print(experiment_table([[result]]))
+    console.print(grid_table([[result]]))
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     console.print(f"experiment A: {seconds:.1f} s CPU on one core; peak memory {memory:.0f} MiB")
 

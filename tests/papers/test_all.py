@@ -11,11 +11,11 @@ from drake_pose.papers.all_experiments import (
     EXPERIMENTS,
     FIGURES,
     REPORT,
+    Beside,
     Experiment,
     Outcome,
     reproduce_all,
 )
-from drake_pose.papers.paper_figures import Beside
 from tests.cli import CliRunner
 
 

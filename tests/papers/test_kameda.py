@@ -1,26 +1,49 @@
-import math
+"""Experiment A on the grid: what is drawn, counted and shown."""
 
+import math
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import pytest
 
 from drake_pose.errors import SettingsError
-from drake_pose.papers.kameda.experiment import (
-    PAPER,
+from drake_pose.papers.kameda import (
     beam_experiment_search,
+    causes_of_wrong_angles,
     draw_values,
     experiment_camera,
     experiment_search,
     run_experiment,
-    side_camera,
 )
-from drake_pose.papers.kameda.pictures import save_pictures
-from drake_pose.papers.kameda.table import experiment_table, spread_over_seeds
+from drake_pose.papers.kameda_edges import edge_lines, noisy_edges, settle_by_edges
+from drake_pose.papers.kameda_figures import PAPER, grid_figures, grid_table
+from drake_pose.papers.kameda_pictures import (
+    chest_ranks,
+    ratio_within,
+    save_families,
+    save_pictures,
+)
+from drake_pose.search.grid.families.inner_edges import edges_of_labels
+from drake_pose.search.grid.families.search import find_families, samples_at
+from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from tests.search.grid_problems import show_pose
 
 
 @pytest.fixture(scope="module")
-def result():
-    return run_experiment(experiment_search(), images=8, seed=5)
+def search():
+    return experiment_search()
+
+
+@pytest.fixture(scope="module")
+def result(search):
+    return run_experiment(search, images=8, seed=5)
+
+
+@pytest.fixture(scope="module")
+def beam_result():
+    return run_experiment(beam_experiment_search(), images=12, seed=5)
 
 
 def test_the_camera_is_the_papers():
@@ -28,149 +51,225 @@ def test_the_camera_is_the_papers():
     assert (camera.width, camera.height, camera.pixels_per_metre) == (700, 700, 226.0)
     # The world's y is the picture's right, z its up, x comes towards the camera.
     pixels, _ = camera.project(np.array([[0.0, 0, 0], [0, 1, 0], [0, 0, 1]]))
-    np.testing.assert_allclose(pixels[1] - pixels[0], [226, 0], atol=1e-9)
-    np.testing.assert_allclose(pixels[2] - pixels[0], [0, -226], atol=1e-9)
+    np.testing.assert_allclose(pixels[1:] - pixels[0], [[226, 0], [0, -226]], atol=1e-9)
 
 
 def test_the_side_camera_sees_depth():
     """It stands along the world's y and looks back: what comes towards the front goes left."""
-    camera = side_camera()
+    camera = experiment_camera(0.5 * np.pi)
     np.testing.assert_allclose(camera.X_WC[:3, 3], [0.0, 5.0, 0.0], atol=1e-12)
     pixels, depths = camera.project(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]))
-    np.testing.assert_allclose(pixels[1] - pixels[0], [-226, 0], atol=1e-9)
-    np.testing.assert_allclose(pixels[2] - pixels[0], [0, 0], atol=1e-9)
-    np.testing.assert_allclose(pixels[3] - pixels[0], [0, -226], atol=1e-9)
+    expected = [[-226, 0], [0, 0], [0, -226]]
+    np.testing.assert_allclose(pixels[1:] - pixels[0], expected, atol=1e-9)
     assert depths[2] < depths[0]
 
 
-def test_lattice_angles_are_multiples_of_20_degrees_inside_table_2():
-    search = experiment_search()
-    values = draw_values(search, "grid", np.random.default_rng(1))
-    for node, node_values in zip(search.tree.nodes, values, strict=True):
-        model = search.tree.model
-        for index, value in zip(node.positions, node_values, strict=True):
+def test_drawn_angles_are_multiples_of_20_degrees_inside_table_2_or_between(search):
+    model = search.tree.model
+    on_grid, between = (
+        draw_values(search, angles, np.random.default_rng(1)) for angles in ("grid", "continuous")
+    )
+    for node, values in zip(search.tree.nodes, on_grid, strict=True):
+        for index, value in zip(node.positions, values, strict=True):
             assert model.lower[index] - 1e-9 <= value <= model.upper[index] + 1e-9
             if model.position_kinds[index] == "angle":
                 assert math.degrees(value) / 20 == pytest.approx(round(math.degrees(value) / 20))
-
-
-def test_continuous_angles_are_not_on_the_lattice_and_the_root_stays():
-    search = experiment_search()
-    values = draw_values(search, "continuous", np.random.default_rng(1))
-    np.testing.assert_array_equal(values[0][:3], 0.0)
-    off = [abs(math.degrees(v) / 20 - round(math.degrees(v) / 20)) for v in values[0][3:]]
+    # The root's place is known.
+    np.testing.assert_array_equal(between[0][:3], 0.0)
+    off = [abs(math.degrees(v) / 20 - round(math.degrees(v) / 20)) for v in between[0][3:]]
     assert max(off) > 0.01
 
 
 def test_the_figures_are_what_drake_draws(result):
     """E_total, recomputed from Drake's own label images of the true and the found pose."""
-    renderer = LabelRenderer(result.search.tree.model, result.camera)
+    renderer = LabelRenderer(result.search.tree.model, result.cameras[0])
     for trial in result.trials:
         if trial.result.found:
             q_true, _ = result.search.tree.positions_from(trial.true_values)
             true, found = renderer.mask(q_true), renderer.mask(trial.result.q)
             # The two renderers differ by at most 0.2 % of a mask each.
             expected = (true ^ found).sum() / true.sum()
-            assert trial.E_total == pytest.approx(expected, abs=0.004)
+            assert trial.result.E_total == pytest.approx(expected, abs=0.004)
 
 
-def test_json_has_the_keys_of_the_paper(result):
-    figures = result.as_json()
+def test_json_has_the_keys_of_the_paper_and_the_same_seed_the_same_figures(search, result):
+    figures = grid_figures(result)
     assert set(PAPER) | {"median_seconds"} <= set(figures)
     assert figures["images"] == 8
-    assert figures["mean_e_total"] == pytest.approx(np.mean([t.E_total for t in result.trials]))
-    assert figures["min_runs"] <= figures["mean_runs"]
-    assert experiment_table([[result]]).row_count >= len(PAPER)
-
-
-def test_the_same_seed_gives_the_same_figures(result):
-    again = run_experiment(experiment_search(), images=8, seed=5).as_json()
-    for key in ("mean_e_total", "exact", "pose_equal", "improved", "mean_runs"):
-        assert again[key] == result.as_json()[key]
+    E_total = [trial.result.E_total for trial in result.trials]
+    assert figures["mean_e_total"] == pytest.approx(np.mean(E_total))
+    assert figures["min_runs"] == min(trial.result.runs for trial in result.trials)
+    again = run_experiment(search, images=2, seed=5)
+    for one, other in zip(result.trials, again.trials, strict=False):
+        np.testing.assert_array_equal(one.result.q, other.result.q)
 
 
 def test_poses_not_found_are_counted_apart():
     """With one candidate for each segment there is no way back: it often ends without a pose."""
-    search = experiment_search(candidate_limit=1)
-    partly = run_experiment(search, images=8, seed=5)
-    figures = partly.as_json()
+    partly = run_experiment(experiment_search(candidate_limit=1), images=8, seed=5)
     found = [trial.result.E_total for trial in partly.trials if trial.result.found]
     assert 0 < len(found) < 8
-    assert figures["not_found"] == 8 - len(found)
-    assert figures["mean_e_total"] == pytest.approx(np.mean(found))
+    assert grid_figures(partly)["not_found"] == 8 - len(found)
+    assert grid_figures(partly)["mean_e_total"] == pytest.approx(np.mean(found))
 
 
 def test_a_cost_for_what_lies_outside_finds_more_exactly(result):
-    weighted = run_experiment(experiment_search(outside_weight=10.0), images=8, seed=5)
-    assert weighted.as_json()["outside_weight"] == 10.0
-    assert result.as_json()["outside_weight"] == 0.0
-    assert weighted.as_json()["exact"] >= 4 > result.as_json()["exact"]
-
-
-def test_the_spread_over_seeds_is_that_of_its_runs(result):
-    other = run_experiment(experiment_search(), images=8, seed=6)
-    spread = spread_over_seeds([result, other])
-    both = [one.as_json()["mean_e_total"] for one in (result, other)]
-    assert spread["mean_e_total"]["min"] == min(both)
-    assert spread["mean_e_total"]["max"] == max(both)
-    assert spread["mean_e_total"]["mean"] == pytest.approx(np.mean(both))
-    assert "seed" not in spread
-    assert " to " in str(list(experiment_table([[result, other]]).columns[2].cells))
+    weighted = grid_figures(
+        run_experiment(experiment_search(outside_weight=10.0), images=8, seed=5)
+    )
+    assert (weighted["outside_weight"], grid_figures(result)["outside_weight"]) == (10.0, 0.0)
+    assert weighted["exact"] >= 4 > grid_figures(result)["exact"]
 
 
 def test_nothing_outside_allowed_is_exact_far_more_often():
     """The paper's own expectation in section 6.1 for r = 0."""
-    strict = run_experiment(experiment_search(outside_limit=0.0), images=12, seed=5)
-    assert strict.as_json()["exact"] >= 7
-    for trial in strict.trials:
-        if trial.pose_equal:
-            assert trial.exact
+    strict = run_experiment(experiment_search(outside_limit=0.0), images=8, seed=5)
+    assert grid_figures(strict)["exact"] >= 4
+    assert all(trial.exact for trial in strict.trials if trial.pose_equal)
 
 
-@pytest.fixture(scope="module")
-def wide_result():
-    return run_experiment(beam_experiment_search(), images=12, seed=5)
-
-
-def test_the_wide_search_matches_every_silhouette_exactly(wide_result):
+def test_the_beam_search_matches_every_silhouette_exactly_and_names_the_truth(beam_result):
     """Without being told r, in one run over poses that the paper's search mostly misses."""
-    figures = wide_result.as_json()
+    figures = grid_figures(beam_result)
     assert figures["exact"] == figures["proved"] == figures["truth_in_set"] == 12
     assert figures["method"] == "beam"
-
-
-def test_the_truth_is_in_the_set(wide_result):
-    for trial in wide_result.trials:
-        answer = trial.result.pose_set
+    for trial in beam_result.trials:
         values = np.concatenate(trial.true_values)
-        for joint, value in zip(answer.joints, values, strict=True):
-            assert joint.holds(value)
+        joints = trial.result.pose_set.joints
+        assert all(joint.holds(value) for joint, value in zip(joints, values, strict=True))
 
 
-def test_three_columns_stand_side_by_side(result, wide_result):
-    table = experiment_table([[result], [wide_result]])
-    assert [column.header for column in table.columns] == [
-        "figure",
-        "paper",
-        "the paper's method",
-        "beam search",
-    ]
-    assert table.row_count > experiment_table([[result]]).row_count
-
-
-def test_the_wide_search_has_its_own_pictures(wide_result, tmp_path):
-    names = {file.name for file in save_pictures(wide_result, tmp_path / "pictures")}
-    assert "figure_11_milliseconds.png" in names
-    ambiguous = any(one.result.pose_set.family_count > 1 for one in wide_result.trials)
-    assert ("families_1.png" in names) == ambiguous
+def test_columns_stand_side_by_side(result, beam_result):
+    table = grid_table([[result], [beam_result]])
+    headings = ["figure", "paper", "the paper's method", "beam search"]
+    assert [column.header for column in table.columns] == headings
+    assert table.row_count > grid_table([[result]]).row_count >= len(PAPER)
 
 
 def test_pictures_are_written(result, tmp_path):
-    files = save_pictures(result, tmp_path / "pictures")
-    assert any("figure_11" in file.name for file in files)
+    few = replace(result, trials=result.trials[:2])
+    files = save_pictures(few, tmp_path)
     assert all(file.stat().st_size > 5000 for file in files)
+    names = {file.name for file in files}
+    assert {"figure_11_runs_of_step_3.png", "figure_12_chest_candidates.png"} < names
+    assert ("figure_12_not_matched.png" in names) == any(not one.exact for one in few.trials)
 
 
-def test_no_images_are_refused():
+def test_the_beam_search_has_its_own_pictures(beam_result, tmp_path):
+    several = [one for one in beam_result.trials if one.result.pose_set.family_count > 1][:1]
+    few = (*beam_result.trials[:1], *several)
+    names = {file.name for file in save_pictures(replace(beam_result, trials=few), tmp_path)}
+    assert "figure_11_milliseconds.png" in names
+    assert ("families_1.png" in names) == bool(several)
+
+
+def test_no_images_are_refused(search):
     with pytest.raises(SettingsError, match="images"):
-        run_experiment(experiment_search(), images=0)
+        run_experiment(search, images=0)
+
+
+def at(search, **degrees):
+    """The nodes' values where all angles are 0 but those given."""
+    model = search.tree.model
+    q = np.zeros(len(model.position_names))
+    for name, value in degrees.items():
+        q[model.position_index(name)] = np.radians(value)
+    return search.tree.values_from_positions(q)
+
+
+def test_a_hand_before_the_belly_is_hidden_from_behind(search):
+    camera = experiment_camera()
+    behind = replace(camera, X_WC=np.diag([-1.0, -1.0, 1.0, 1.0]) @ camera.X_WC)
+    arm = {"right_upper_arm_x": -15, "right_upper_arm_y": 60, "right_forearm_x": -60}
+    true, found = at(search, **arm), at(search, **arm, right_hand_x=20)
+    before = causes_of_wrong_angles(search.sampled, camera, true, found)
+    assert (before.hidden, before.inner_edges) == (False, True)
+    after = causes_of_wrong_angles(search.sampled, behind, true, found)
+    assert (after.hidden, after.inner_edges) == (True, False)
+    assert causes_of_wrong_angles(search.sampled, camera, true, true) == (False, False)
+
+
+def test_the_chests_rank_is_that_of_areas_counted_in_masks(search, result):
+    ranks, lengths = chest_ranks(replace(result, trials=result.trials[:1]))
+    trial, nodes = result.trials[0], [node.name for node in search.tree.nodes]
+    head, chest = nodes.index("head"), nodes.index("chest")
+
+    def masks(values):
+        X_CN = result.cameras[0].X_CW @ search.tree.node_poses(values)
+        outlines = search.sampled.surfaces.at(values)
+        return [draw_mask([outlines[i]], X_CN[[i]], result.cameras[0]) for i in (head, chest)], (
+            draw_mask(outlines, X_CN, result.cameras[0])
+        )
+
+    (true_head, true_chest), silhouette = masks(trial.true_values)
+    covered = []
+    for values in search.sampled.values[chest]:
+        posed = list(trial.true_values)
+        posed[chest] = values
+        (_, mask), _ = masks(posed)
+        if (mask & ~silhouette).sum() <= search.settings.outside_limit:
+            covered.append(int((mask & silhouette & ~true_head).sum()))
+    own = int((true_chest & silhouette & ~true_head).sum())
+    assert lengths[0] == pytest.approx(len(covered), abs=1)
+    better = sum(one > own + 3 for one in covered)
+    worse = sum(one < own - 3 for one in covered)
+    assert 1 + better <= ranks[0] <= len(covered) - worse
+    assert (ratio_within(ranks, ranks[0] - 1), ratio_within(ranks, ranks[0])) == (0.0, 1.0)
+
+
+@pytest.mark.slow
+def test_edges_settle_what_the_silhouette_leaves_open():
+    result = run_experiment(beam_experiment_search(), images=20, seed=2026)
+    # Few poses, so that all are judged, and one silhouette that leaves nothing open.
+    few = [one for one in result.trials if 1 < one.result.pose_set.size < 100]
+    alone = [one for one in result.trials if one.result.pose_set.size == 1]
+    counts = settle_by_edges(replace(result, trials=(*few, *alone[:1])))
+    assert counts["ambiguous"] == len(few) > 1
+    assert 0 < counts["edges_narrow"] <= counts["ambiguous"]
+    assert counts["edges_settle"] <= counts["edges_narrow"]
+    assert counts["edges_settle_rightly"] == counts["edges_settle"]
+    assert counts["edges_keep_truth"] == counts["ambiguous"]
+    # With edges to the pixel nothing that can be settled is left open.
+    assert counts["edges_settle"] + counts["edges_undecidable"] == counts["ambiguous"]
+    assert str(counts["edges_keep_truth"]) in edge_lines(counts)
+    noisy = settle_by_edges(replace(result, trials=tuple(few)), noise=0.2)
+    assert noisy["edges_keep_truth"] == noisy["ambiguous"] == len(few)
+    assert 0 < noisy["edges_settle"] <= counts["edges_settle"]
+    assert noisy["edges_settle_rightly"] == noisy["edges_settle"]
+    assert noisy["edges_undecidable"] == counts["edges_undecidable"]
+
+
+def test_noise_loses_moves_and_adds_edges():
+    segments = np.zeros((80, 80), dtype=np.int64)
+    segments[:, 40:] = 1
+    edges = edges_of_labels(segments, np.ones((80, 80), dtype=np.bool_))
+    noisy = noisy_edges(edges, 0.3, np.random.default_rng(0))
+    near = np.abs(np.nonzero(noisy.edges)[1] - 39) <= 1
+    assert 0.4 < near.sum() / 80 < 0.9
+    assert (~near).any()
+    assert (noisy.errors.missing, noisy.errors.wrong) == (0.3, 0.075)
+    assert noisy_edges(edges, 0.9, np.random.default_rng(0)).edges[:, 38:41].sum() < near.sum()
+
+
+@pytest.mark.slow
+def test_a_column_for_each_family(tmp_path):
+    search, camera = beam_experiment_search(), experiment_camera()
+    generator = np.random.default_rng(77)
+    for _ in range(20):
+        values = draw_values(search, "grid", generator)
+        view = show_pose(search.sampled, values, camera)
+        samples = samples_at(search.sampled, values)
+        answer = find_families(search.body, [view], samples, 0.0)
+        if answer.family_count == 2:
+            break
+    assert answer.family_count == 2
+    model = search.tree.model
+    both = cv2.imread(str(save_families(tmp_path / "out" / "both.png", model, answer, [view])))
+    one = cv2.imread(str(save_families(tmp_path / "one.png", model, answer, [view], most=1)))
+    assert both.shape[0] == one.shape[0]
+    assert both.shape[1] > 1.8 * one.shape[1]
+    # Both columns hold colours: the segments.
+    colourful = np.ptp(both.astype(int), axis=2) > 60
+    half = both.shape[1] // 2
+    assert colourful[:, :half].mean() > 0.02
+    assert colourful[:, half:].mean() > 0.02

@@ -17,7 +17,7 @@ from drake_pose.filtering.hand.observation import (
 from drake_pose.filtering.kalman.truncated_filter import FilterSettings, TruncatedFilter
 from drake_pose.filtering.state import Belief
 from drake_pose.filtering.truncation.couplings import model_inequalities
-from drake_pose.papers.shimada.motion import ACCELERATIONS
+from drake_pose.papers.shimada_motion import ACCELERATIONS
 
 TIP = HAND_STATE.index("flexion_13")
 

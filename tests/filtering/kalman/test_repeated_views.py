@@ -13,8 +13,8 @@ from drake_pose.filtering.kalman.repeated_views import (
 from drake_pose.filtering.kalman.truncated_filter import FilterSettings
 from drake_pose.filtering.kalman.update import update
 from drake_pose.filtering.state import Belief
-from drake_pose.papers.shimada.experiment import experiment_filter
-from drake_pose.papers.shimada.motion import make_sequence
+from drake_pose.papers.shimada import experiment_filter
+from drake_pose.papers.shimada_motion import make_sequence
 
 CHANCE = 1e-9
 

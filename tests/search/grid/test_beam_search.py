@@ -11,7 +11,7 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import SettingsError
-from drake_pose.papers.kameda.experiment import (
+from drake_pose.papers.kameda import (
     draw_values,
     experiment_camera,
     experiment_search,

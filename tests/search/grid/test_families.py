@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from drake_pose.errors import SettingsError
-from drake_pose.papers.kameda.experiment import (
+from drake_pose.papers.kameda import (
     beam_experiment_search,
     draw_values,
     experiment_camera,

@@ -7,8 +7,8 @@ from pydrake.systems.primitives import VectorLogSink
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.hand.observation import HAND_STATE
 from drake_pose.filtering.state import Belief
-from drake_pose.papers.shimada.experiment import experiment_filter
-from drake_pose.papers.shimada.motion import make_sequence
+from drake_pose.papers.shimada import experiment_filter
+from drake_pose.papers.shimada_motion import make_sequence
 from drake_pose.systems.estimators.truncated_ekf import STATISTICS, TruncatedEkf
 
 PERIOD = 1 / 30

@@ -4,15 +4,14 @@ The paper names the edges as its future work. Here they are those of Drake's lab
 segment lies before another.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
 import numpy as np
 
-from drake_pose.papers.kameda.experiment import ExperimentResult, Trial
+from drake_pose.papers.kameda import ExperimentResult, Trial
+from drake_pose.papers.tables import Count, uncounted
 from drake_pose.search.grid.families.inner_edges import (
-    EdgeChoice,
     EdgeErrors,
     InnerEdges,
     choose_by_edges,
@@ -22,7 +21,7 @@ from drake_pose.search.grid.families.inner_edges import (
 from drake_pose.search.grid.families.search import GridPoseSet, samples_at
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
-COUNTS = (
+_COUNTS = (
     "ambiguous",
     "edges_narrow",
     "edges_settle",
@@ -30,7 +29,6 @@ COUNTS = (
     "edges_keep_truth",
     "edges_undecidable",
 )
-
 # Edges are lost in squares of so many pixels, as they are where colours are alike, not singly.
 _SQUARE = 5
 # So long are the wrong ones of what is lost.
@@ -38,15 +36,13 @@ _WRONG = 0.25
 
 
 def settle_by_edges(
-    result: ExperimentResult,
-    progress: Callable[[int], None] | None = None,
-    noise: float = 0.0,
+    result: ExperimentResult, count: Count = uncounted, noise: float = 0.0
 ) -> dict[str, int]:
     """Choose among the poses that look the same by their inner edges.
 
     Args:
         result: an experiment whose answers are sets.
-        progress: called with the number of images done after each.
+        count: counts the images.
         noise: see noisy_edges; 0: the edges of the label image as they are.
 
     Returns:
@@ -56,16 +52,17 @@ def settle_by_edges(
         (``edges_keep_truth``), and in how many another pose has the true one's edges to the pixel
         (``edges_undecidable``): these cannot be settled.
     """
-    renderer = LabelRenderer(result.search.tree.model, result.camera)
-    counts = dict.fromkeys(COUNTS, 0)
+    renderer = LabelRenderer(result.search.tree.model, result.cameras[0])
+    counts = dict.fromkeys(_COUNTS, 0)
     generator = np.random.default_rng([result.seed, 1])
+    advance = count("silhouettes, edges", len(result.trials))
     for done, trial in enumerate(result.trials, start=1):
         answer = trial.result.pose_set
         if isinstance(answer, GridPoseSet) and answer.size > 1.0:
-            for name, holds in _judge(trial, answer, renderer, noise, generator).items():
+            judged = _judge(trial, answer, renderer, noise, generator)
+            for name, holds in zip(_COUNTS, judged, strict=True):
                 counts[name] += holds
-        if progress is not None:
-            progress(done)
+        advance(done)
     return counts
 
 
@@ -74,11 +71,6 @@ def noisy_edges(edges: InnerEdges, share: float, generator: np.random.Generator)
 
     Wrong ones are short strokes anywhere inside the silhouette, a quarter as long as what is lost.
     The edges that are returned are judged by the rates of these errors.
-
-    Args:
-        edges: the true ones.
-        share: 0 to 1.
-        generator: the source of chance.
     """
     shape = edges.edges.shape
     squares = tuple(-(-side // _SQUARE) for side in shape)
@@ -104,8 +96,8 @@ def _judge(
     renderer: LabelRenderer,
     noise: float,
     generator: np.random.Generator,
-) -> dict[str, bool]:
-    """What the edges of one silhouette's true pose settle."""
+) -> tuple[bool, ...]:
+    """What the edges of one silhouette's true pose settle, in the order of _COUNTS."""
     q_true, X_WB_true = answer.sampled.tree.positions_from(trial.true_values)
     seen = renderer.segments(q_true, X_WB_true)
     exact = edges_of_labels(seen, seen >= 0)
@@ -123,19 +115,9 @@ def _judge(
     choice = choose_by_edges(answer, [edges], [render])
     true = samples_at(answer.sampled, trial.true_values)
     assert true is not None, "drawn from the grid"
-    return {
-        "ambiguous": True,
-        "edges_narrow": choice.left < len(choice.samples),
-        "edges_settle": choice.settled,
-        "edges_settle_rightly": choice.settled and _is_only(choice, true),
-        "edges_keep_truth": not choice.rules_out(true),
-        "edges_undecidable": alike > 0,
-    }
-
-
-def _is_only(choice: EdgeChoice, samples: np.ndarray) -> bool:
-    """Whether the one pose left is this one (nodes,)."""
-    return bool((choice.samples[0] == samples).all())
+    rightly = choice.settled and bool((choice.samples[0] == true).all())
+    narrow = choice.left < len(choice.samples)
+    return True, narrow, choice.settled, rightly, not choice.rules_out(true), alike > 0
 
 
 def edge_lines(counts: dict[str, int]) -> str:

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.errors import SettingsError
 from drake_pose.filtering.hand.observation import (
     FLEXIONS,
     HAND_STATE,
@@ -36,16 +35,6 @@ ACCELERATIONS = {
 """Standard deviations of the accelerations per frame^2: [pixel], -, [rad]."""
 
 
-def require_observed(observed: str) -> None:
-    """Refuses what is none of OBSERVED.
-
-    Raises:
-        SettingsError: it is none.
-    """
-    if observed not in OBSERVED:
-        raise SettingsError(f"observed must be one of {', '.join(OBSERVED)}, not '{observed}'")
-
-
 @dataclass(frozen=True, eq=False)
 class SyntheticSequence:
     """One synthetic sequence.
@@ -61,17 +50,12 @@ class SyntheticSequence:
     guess: Belief
 
 
-def true_lengths(r_13: float) -> Array:
-    """(6,) the true lengths [m]: table 1 holds for r_13 = 35 and 40 [mm]."""
-    return np.array([62.0, 41.0, r_13, 60.0, 40.0, 38.0]) / 1000.0
-
-
 def true_states(r_13: float, phase: Array, yaw_middle: float = 0.0) -> Array:
     """(55, n) a hand that moves, turns, flexes and comes closer and goes away.
 
     Args:
         r_13: the length of finger 1's last segment [mm].
-        phase: (6,) shifts of the swings [rad], to make another sequence of the same kind.
+        phase: (6,) shifts of the swings [rad].
         yaw_middle: about what the fingers swing away from the camera [rad]; negative: towards it.
     """
     frames = np.arange(FRAMES)
@@ -98,8 +82,9 @@ def true_states(r_13: float, phase: Array, yaw_middle: float = 0.0) -> Array:
         put(f"flexion_{i}1", np.radians(40 + 28 * np.sin(turn + phase[4] + shift)))
         put(f"flexion_{i}2", np.radians(38 + 28 * wave))
         put(f"flexion_{i}3", np.radians(36 + 25 * np.sin(1.2 * turn + phase[5] + shift - 0.1)))
-    for name, length in zip(LENGTHS, true_lengths(r_13), strict=True):
-        put(name, length)
+    # Table 1 holds for r_13 = 35 and 40.
+    for name, length in zip(LENGTHS, (62.0, 41.0, r_13, 60.0, 40.0, 38.0), strict=True):
+        put(name, length / 1000.0)
     for name, size in zip(PALM, (0.070, 0.080, 0.022), strict=True):
         put(name, size)
     moving = len(HAND_STATE.moving)
@@ -117,11 +102,10 @@ def make_sequence(
     """Draw a sequence: its motion's phases, its noise, and table 2's first guess.
 
     Args:
-        r_13: [mm].
+        r_13, yaw_middle: as for ``true_states``.
         observed: "full", or "lines": the knuckles are hidden.
         observation: gives h and the noise.
-        generator: the source of chance.
-        yaw_middle: as for ``true_states`` [rad].
+        generator: draws.
     """
     states = true_states(r_13, generator.uniform(-0.6, 0.6, 6), yaw_middle)
     deviations = np.sqrt(observation.variances)

@@ -1,0 +1,378 @@
+"""Date's experiment: a simulated person with known motion, captured by many cameras."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple, cast
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from rich.table import Table
+
+from drake_pose.body.landmarks import landmarks_of_nodes, load_landmarks
+from drake_pose.body.model import ArticulatedModel
+from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.errors import SettingsError
+from drake_pose.papers.date_capture import PaperTrack, Seen, SilhouetteTrack, Studio, Track
+from drake_pose.papers.tables import Count, figure_table, require_choice, uncounted
+from drake_pose.person.date.body_pose import Waist
+from drake_pose.person.date.limb_search import Search
+from drake_pose.person.date.skeleton import LIMBS
+from drake_pose.person.date.walking_motion import REGISTERED, UPRIGHT, Motion, make_motion
+from drake_pose.systems.colour_images import picture_to_colour_image
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+
+METHODS = ("silhouette", "paper")
+WAISTS = ("reach", "person", "paper")
+SEARCHES: tuple[Search, ...] = ("surfaces", "rectangles")
+FEWEST_CAMERAS = 3
+SHOWN_CAMERA = "camera_0"
+TITLES = {
+    "ik_only": "inverse kinematics alone",
+    "paper": "with the search",
+    "silhouette": "all silhouettes",
+}
+"""What the ways of capturing are called."""
+
+# A track is right again within twice its usual error, or within this [mm].
+_RIGHT_AGAIN, _RIGHT_MM = 2.0, 25.0
+# How long a destroyed track is watched [frames].
+_WATCHED, _FEWEST_WATCHED = 30, 10
+
+
+class Moment(NamedTuple):
+    """The middle frame of a motion, for pictures.
+
+    Attributes:
+        compared: (H, n W, 3) the input and all estimates, side by side.
+        picture: (H, W, 3) of SHOWN_CAMERA.
+        seen: what the paper's stages saw.
+        faces: (130, 80, 3) the face, the nearest template, and the model's head as estimated; none
+            where no face was seen.
+    """
+
+    compared: Picture
+    picture: Picture
+    seen: Seen
+    faces: tuple[Picture, ...]
+
+
+class DestroyedTrack(NamedTuple):
+    """A track that lost the person during a motion. errors: mean of each frame since [mm]."""
+
+    motion: str
+    track: Track
+    errors: list[float]
+
+
+class DateResult:
+    """What the experiment measures, frame by frame; see run_experiment.
+
+    Attributes:
+        names: (n,) motion of each frame.
+        errors: by way of capturing, of the joint centres in each frame (k,) [mm].
+        found_errors: of "paper" and "ik_only", elbows and knees as found, before the model with its
+            stiff trunk is laid through them, in each frame (4,) in the order of LIMBS [mm]; nan
+            where the registered pose was recognised instead.
+        face_errors: angle between true and estimated direction of the head in each frame [deg].
+        destroyed: tracks on their way back, by the motion during which they were destroyed;
+            REGISTERED: the registered pose was shown.
+        moments: by motion, what pictures show.
+    """
+
+    def __init__(
+        self, studio: Studio, motion: Motion, method: str, waist: str, search: str, seed: int
+    ) -> None:
+        self.studio, self.names = studio, motion.names
+        self._motion, self._method = motion, method
+        self._settings = {"seed": seed, "method": method, "waist": waist, "search": search}
+        self._tracks = _tracks(studio, motion.q[0], method, waist, search)
+        self._generator = np.random.default_rng([seed, 2])
+        self._destroyed_at = frames_of_destruction(motion)
+        self._joints = _JointCentres(studio.model)
+        self.errors: dict[str, list[Array]] = {way: [] for way in self._tracks}
+        self.found_errors: dict[str, list[Array]] = {"paper": [], "ik_only": []}
+        self.face_errors: list[float] = []
+        self.destroyed: list[DestroyedTrack] = []
+        self.moments: dict[str, Moment] = {}
+
+    def step(self, k: int) -> None:
+        """One more frame."""
+        studio, q = self.studio, self._motion.q[k]
+        shots = studio.pictures(q)
+        images = {name: picture_to_colour_image(shot) for name, shot in shots.items()}
+        if k in self._destroyed_at:
+            lost = self._tracks[self._method].destroyed(self._motion.q[k - 1], self._generator)
+            self.destroyed.append(DestroyedTrack(self._destroyed_at[k], lost, []))
+        estimates = {}
+        for way, track in self._tracks.items():
+            estimates[way] = track.step(images)
+            self.errors[way].append(self._joints.errors(estimates[way], q))
+            if isinstance(track, PaperTrack):
+                true = [studio.skeleton.limb_points(q, name)[1] for name in LIMBS]
+                off = 1e3 * np.linalg.norm(track.middle_joints() - true, axis=1)
+                self.found_errors[way].append(off)
+        heads = [studio.skeleton.head_rotation(one)[:, 2] for one in (estimates[self._method], q)]
+        cosine = float(np.clip(heads[0] @ heads[1], -1.0, 1.0))
+        self.face_errors.append(math.degrees(math.acos(cosine)))
+        for one in self.destroyed:
+            if len(one.errors) < _WATCHED:
+                one.errors.append(_mean(self._joints.errors(one.track.step(images), q)))
+        if _is_middle(self._motion, k):
+            paper = self._tracks["paper"]
+            assert isinstance(paper, PaperTrack)
+            seen = paper.seen()
+            compared = studio.side_by_side([q, *estimates.values()], SHOWN_CAMERA)
+            head = studio.face_at(estimates["paper"]) if seen.faces else None
+            faces = () if head is None else (*seen.faces, head)
+            self.moments[self.names[k]] = Moment(compared, shots[SHOWN_CAMERA], seen, faces)
+
+    @property
+    def motions(self) -> tuple[str, ...]:
+        """Those that were shown."""
+        return tuple(name for name in dict.fromkeys(self.names) if name != REGISTERED)
+
+    @property
+    def recoveries(self) -> dict[str, int | None]:
+        """Frames until a destroyed track was right again, by motion; None: not within _WATCHED."""
+        right = max(_RIGHT_MM, _RIGHT_AGAIN * _mean(self.errors[self._method]))
+        return {
+            one.motion: next((k for k, off in enumerate(one.errors, 1) if off <= right), None)
+            for one in self.destroyed
+        }
+
+    @property
+    def slowest_recovery(self) -> float:
+        """The longest that a frame's pose took on the way back [ms]."""
+        laps = [lap["pose"] for one in self.destroyed for lap in one.track.milliseconds]
+        return max(laps, default=0.0)
+
+    @property
+    def milliseconds(self) -> dict[str, float]:
+        """Processor time by stage, a frame, all cameras together; "all": of all stages."""
+        laps = self._tracks[self._method].milliseconds
+        names = dict.fromkeys(name for lap in laps for name in lap)
+        stages = {name: float(np.median([lap.get(name, 0.0) for lap in laps])) for name in names}
+        return {**stages, "all": sum(stages.values())}
+
+    def as_json(self) -> dict[str, object]:
+        """The figures; the registered pose's frames do not count."""
+        own = np.array(self.errors[self._method])[np.isin(self.names, self.motions)]
+        all_motions = self._of_motions(self.motions)
+        recoveries, spent, cameras = self.recoveries, self.milliseconds, len(self.studio.cameras)
+        anywhere = [n for motion, n in recoveries.items() if motion != REGISTERED]
+        return {
+            "joint_error_mm": _mean(own),
+            "joint_error_p95_mm": float(np.percentile(own, 95)),
+            "ik_only_mm": all_motions["ik_only_mm"],
+            "paper_mm": all_motions["paper_mm"],
+            "elbows_and_knees": self._of_joints(("elbow", "knee")),
+            "elbows": self._of_joints(("elbow",)),
+            "knees": self._of_joints(("knee",)),
+            **self._as_found(UPRIGHT),
+            "as_found": {motion: self._as_found((motion,)) for motion in self.motions},
+            "face_error_deg": all_motions["face_error_deg"],
+            "frames_to_recover": _slowest(anywhere or list(recoveries.values())),
+            "frames_to_recover_registered": recoveries.get(REGISTERED),
+            "ms_of_slowest_recovering_frame": self.slowest_recovery,
+            "ms_per_frame": spent,
+            "fps": 1e3 / spent["all"],
+            "camera_frames_per_second": 1e3 * cameras / spent["all"],
+            "motions": {motion: self._of_motions((motion,)) for motion in self.motions},
+            "frames": len(self.names),
+            "cameras": cameras,
+            **self._settings,
+        }
+
+    def _as_found(self, motions: Sequence[str]) -> dict[str, float]:
+        """Mean errors of elbows and knees as found, with the search and without [mm]."""
+        chosen = np.isin(self.names, motions)
+        figures = {}
+        for way, ending in (("paper", "mm"), ("ik_only", "ik_mm")):
+            errors = np.array(self.found_errors[way])[chosen]
+            errors = errors[np.isfinite(errors).all(axis=1)]
+            for joint, limbs in (("elbow", errors[:, :2]), ("knee", errors[:, 2:])):
+                figures[f"{joint}_{ending}"] = _mean(limbs) if len(limbs) else math.nan
+        return figures
+
+    def _of_motions(self, motions: Sequence[str]) -> dict[str, float]:
+        """Mean errors in the frames of some motions."""
+        chosen = np.isin(self.names, motions)
+        errors = {f"{way}_mm": _mean(np.array(one)[chosen]) for way, one in self.errors.items()}
+        return {**errors, "face_error_deg": _mean(np.array(self.face_errors)[chosen])}
+
+    def _of_joints(self, ends: tuple[str, ...]) -> dict[str, float]:
+        """Mean errors in all motions of the joints whose names end so, by way of capturing."""
+        moving = np.isin(self.names, self.motions)
+        chosen = [i for i, name in enumerate(self._joints.names) if name.endswith(ends)]
+        return {
+            f"{way}_mm": _mean(np.array(one)[moving][:, chosen]) for way, one in self.errors.items()
+        }
+
+    def tables(self) -> tuple[Table, Table]:
+        """The errors in each motion; and elbows and knees as found, with the search and without."""
+        rows = {motion: self._of_motions((motion,)) for motion in self.motions}
+        found = {motion: self._as_found((motion,)) for motion in self.motions}
+        headings = {f"{way}_mm": f"{TITLES[way]} [mm]" for way in self.errors}
+        found_headings = {
+            "elbow_mm": "elbows [mm]",
+            "elbow_ik_mm": "elbows by IK alone",
+            "knee_mm": "knees [mm]",
+            "knee_ik_mm": "knees by IK alone",
+        }
+        one = self._settings
+        return (
+            _table_of_motions(
+                f"Date: {len(self.studio.cameras)} cameras, {len(self.names)} frames",
+                {**rows, "all": self._of_motions(self.motions)},
+                {**headings, "face_error_deg": "face [deg]"},
+                "{:.1f}",
+            ),
+            _table_of_motions(
+                f"Elbows and knees as found, --waist {one['waist']} --search {one['search']}",
+                {**found, "upright": self._as_found(UPRIGHT)},
+                found_headings,
+                "{:.0f}",
+            ),
+        )
+
+    def costs(self) -> str:
+        """What a frame costs, and how soon a destroyed track is right again."""
+        *stages, (_, whole) = self.milliseconds.items()
+        parts = ", ".join(f"{name} {spent:.1f}" for name, spent in stages)
+        soon = ", ".join(
+            f"{motion} {'not' if n is None else n}" for motion, n in self.recoveries.items()
+        )
+        return (
+            f"One core, {TITLES[self._method]}: {whole:.1f} ms a frame ({parts}), "
+            f"{1e3 / whole:.0f} frames a second.\n"
+            f"Frames until a destroyed track was right again: {soon}; "
+            f"the slowest of them took {self.slowest_recovery:.0f} ms."
+        )
+
+
+def run_experiment(
+    cameras: int = 9,
+    frames: int = 240,
+    seed: int = 0,
+    method: str = "silhouette",
+    count: Count = uncounted,
+    size: tuple[int, int] = (640, 480),
+    waist: str = "reach",
+    search: str = "surfaces",
+) -> DateResult:
+    """Captures a simulated person, by one core.
+
+    Args:
+        cameras: how many, the face camera included.
+        frames: how many.
+        seed: another one draws other motions.
+        method: "silhouette" for all silhouettes at once, "paper" for the paper's way alone; its
+            figures lead.
+        count: counts the frames.
+        size: width and height of the pictures [pixel].
+        waist: of the paper's formula: "person" with this person's constants, "paper" with 0.55,
+            0.225, 0.225; "reach" as "person", then lowered until both feet are in reach.
+        search: of elbows and knees: "rectangles" as in the paper, or "surfaces".
+
+    Raises:
+        SettingsError: an argument is out of its range.
+    """
+    require_choice("method", method, METHODS)
+    require_choice("waist", waist, WAISTS)
+    require_choice("search", search, SEARCHES)
+    if cameras < FEWEST_CAMERAS:
+        raise SettingsError(f"cameras must be {FEWEST_CAMERAS} or more, not {cameras}")
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        studio = Studio.build(cameras, size, np.random.default_rng([seed, 1]))
+        motion = make_motion(studio.skeleton, frames, seed)
+        result = DateResult(studio, motion, method, waist, search, seed)
+        advance = count("frames", frames)
+        for k in range(len(motion.q)):
+            result.step(k)
+            advance(k + 1)
+    finally:
+        cv2.setNumThreads(threads)
+    return result
+
+
+def _tracks(studio: Studio, q: Array, method: str, waist: str, search: str) -> dict[str, Track]:
+    """The ways of capturing that are compared; q (nq,) is the registered pose."""
+    setup = studio.prepare(q)
+    settings = replace(setup.settings, search=cast(Search, search))
+    if waist != "reach":
+        own = replace(settings.waist, in_reach=False)
+        settings = replace(settings, waist=Waist() if waist == "paper" else own)
+    tracks: dict[str, Track] = {
+        "ik_only": PaperTrack.build(replace(setup, settings=replace(settings, search="none"))),
+        "paper": PaperTrack.build(replace(setup, settings=settings)),
+    }
+    if method == "silhouette":
+        tracks[method] = SilhouetteTrack.build(studio.model, studio.cameras, studio.backgrounds)
+    return tracks
+
+
+class _JointCentres:
+    """The joint centres that are compared."""
+
+    def __init__(self, model: ArticulatedModel) -> None:
+        landmarks = load_landmarks(model.path)
+        del landmarks["head_top"]
+        tree = model.pose_tree()
+        self._kinematics = TreeKinematics(tree)
+        self._landmarks = landmarks_of_nodes(tree, landmarks)
+        self._order = np.array([model.position_index(name) for name in self._kinematics.names])
+        self.names = self._landmarks.names
+
+    def errors(self, found: Array, q: Array) -> Array:
+        """(k,) how far those at found positions (nq,) are off those at q (nq,) [mm]."""
+        places = [
+            self._landmarks.positions(self._kinematics.poses(one[self._order]))
+            for one in (found, q)
+        ]
+        return np.asarray(1e3 * np.linalg.norm(places[0] - places[1], axis=1))
+
+
+def _table_of_motions(
+    title: str, rows: Mapping[str, Mapping[str, float]], headings: Mapping[str, str], form: str
+) -> Table:
+    """A row a motion, a column a figure."""
+    columns = {
+        heading: {motion: figures[key] for motion, figures in rows.items()}
+        for key, heading in headings.items()
+    }
+    return figure_table(title, {motion: (motion, form) for motion in rows}, columns, "motion")
+
+
+def frames_of_destruction(motion: Motion) -> dict[int, str]:
+    """Where tracks are destroyed: amid each motion, and when the registered pose is shown again.
+
+    Not in the last frames of a motion cut short, where recovery could not be seen.
+    """
+    count = len(motion.names)
+    found = {k: motion.names[k] for k in range(count - _FEWEST_WATCHED) if _is_middle(motion, k)}
+    again = 1 + max(k for k, name in enumerate(motion.names) if name != REGISTERED)
+    return found if again == count else {**found, again: REGISTERED}
+
+
+def _is_middle(motion: Motion, k: int) -> bool:
+    """Whether frame k is the middle one of its motion."""
+    same = [i for i, name in enumerate(motion.names) if name == motion.names[k]]
+    return motion.names[k] != REGISTERED and k == same[len(same) // 2]
+
+
+def _slowest(frames: Sequence[int | None]) -> int | None:
+    """The largest; None where one is."""
+    known = [n for n in frames if n is not None]
+    return max(known) if known and len(known) == len(frames) else None
+
+
+def _mean(values: Array | Sequence[Array]) -> float:
+    return float(np.mean(values))

@@ -1,1 +1,0 @@
-"""Date's experiment: a simulated person before many cameras."""

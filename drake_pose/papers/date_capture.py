@@ -1,0 +1,341 @@
+"""Date's simulated studio, and the ways of capturing that are compared in it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import AbstractValue
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context
+from pydrake.systems.sensors import ImageRgba8U
+
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.camera.models import Camera, PinholeCamera
+from drake_pose.camera.rigs import FACE_CAMERA, circle_of_cameras
+from drake_pose.errors import SettingsError
+from drake_pose.fit.contour_fit import ContourFit
+from drake_pose.person.date.capture import CaptureSetup, PersonView, see_person
+from drake_pose.person.date.faces import FACE_HEIGHT, FACE_WIDTH, cut_face, face_direction
+from drake_pose.person.date.features import Features
+from drake_pose.person.date.skeleton import LIMBS, Skeleton, load_skeleton
+from drake_pose.person.date.skin_blobs import SkinColour
+from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
+from drake_pose.silhouette.segmentation.background import Background, learn_background
+from drake_pose.systems.colour_images import colour_image_to_picture
+from drake_pose.systems.date.capture import PaperCapture, build_paper_capture
+from drake_pose.systems.date.preparation import prepare_paper_capture
+from drake_pose.systems.person.live_capture import SilhouetteCapture, build_silhouette_capture
+from drake_pose.systems.pictures.camera_rig import CameraRig, build_camera_rig
+from drake_pose.systems.staged_diagram import StagedDiagram
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+Images = Mapping[str, ImageRgba8U]
+
+# Of every pixel [grey levels].
+_NOISE = 3.0
+_EMPTY_PICTURES = 5
+_FAR_AWAY = -9.0
+# An edge point every 8 pixels of 640 x 480 pictures.
+_EDGE_POINTS = 60.0
+# A power of two: the time from frame to frame is exactly the same, and so is the motion expected.
+_PERIOD = 1.0 / 32.0
+
+
+@dataclass(frozen=True, eq=False)
+class Studio:
+    """The simulated person, cameras (the face camera among them), empty room and noise."""
+
+    model: ArticulatedModel
+    skeleton: Skeleton
+    cameras: Mapping[str, PinholeCamera]
+    rig: CameraRig
+    context: Context
+    backgrounds: Mapping[str, Background]
+    generator: np.random.Generator
+
+    @staticmethod
+    def build(cameras: int, size: tuple[int, int], generator: np.random.Generator) -> Studio:
+        """A studio of this many cameras, face camera included, pictures of one size [pixel]."""
+        model = load_model(bundled_model("person"), check=False)
+        placed = circle_of_cameras(cameras - 1, size=size)
+        rig = build_camera_rig(model, placed)
+        context = rig.diagram.CreateDefaultContext()
+        away = np.array(model.default_positions)
+        away[model.position_index("position_z")] = _FAR_AWAY
+        rig.set_positions(context, away)
+        backgrounds = {}
+        for name in placed:
+            empty = rig.picture(context, name)
+            shots = [noisy(empty, generator) for _ in range(_EMPTY_PICTURES)]
+            backgrounds[name] = learn_background(shots)
+        skeleton = load_skeleton(model)
+        return Studio(model, skeleton, placed, rig, context, backgrounds, generator)
+
+    def pictures(self, q: Array) -> dict[str, Picture]:
+        """What all cameras see of a person at q (nq,), noise included."""
+        self.rig.set_positions(self.context, q)
+        return {
+            name: noisy(self.rig.picture(self.context, name), self.generator)
+            for name in self.cameras
+        }
+
+    def prepare(self, q: Array) -> CaptureSetup:
+        """What must be known before: faces, skin, and q (nq,), the registered pose, shown once."""
+        return prepare_paper_capture(
+            self.model, self.cameras, FACE_CAMERA, q, self.pictures(q), self.backgrounds
+        )
+
+    def side_by_side(self, poses: Sequence[Array], name: str) -> Picture:
+        """The person in poses (nq,) as a camera sees it, side by side (H, n W, 3)."""
+        shown = []
+        for q in poses:
+            self.rig.set_positions(self.context, q)
+            shown.append(self.rig.picture(self.context, name))
+        return np.hstack(shown)
+
+    def face_at(self, q: Array) -> Picture | None:
+        """The face (130, 80, 3) of a person at q as the face camera sees it; None: no skin."""
+        self.rig.set_positions(self.context, q)
+        picture = self.rig.picture(self.context, FACE_CAMERA)
+        mask = self.rig.mask(self.context, FACE_CAMERA)
+        return cut_face(picture, see_person(picture, mask, SkinColour()).blobs)
+
+
+def noisy(picture: Picture, generator: np.random.Generator) -> Picture:
+    """A picture with a camera's noise."""
+    # One byte a channel is enough for noise, and four times as fast as a double.
+    noise = np.empty(picture.shape, dtype=np.int16)
+    cv2.setRNGSeed(int(generator.integers(1 << 31)))
+    cv2.randn(noise, np.zeros(3), np.full(3, _NOISE))
+    return np.clip(picture + noise, 0, 255).astype(np.uint8)
+
+
+class Seen(NamedTuple):
+    """What the paper's stages saw in a frame.
+
+    Attributes:
+        views: the person by camera on the circle.
+        found: 3-D points of skin, and the features made of them.
+        faces: (130, 80, 3) the face as cut from the face camera's picture, and the nearest template
+            as far as the eigenspace holds it; none where the face camera saw no face.
+    """
+
+    views: Mapping[str, PersonView]
+    found: Features
+    faces: tuple[Picture, ...]
+
+
+class Track:
+    """A ready diagram that is run frame by frame, each stage by the clock.
+
+    Attributes:
+        milliseconds: processor time of each frame's stages.
+    """
+
+    def __init__(self, staged: StagedDiagram) -> None:
+        self.milliseconds: list[Mapping[str, float]] = []
+        self._staged = staged
+        self._simulator = Simulator(staged.diagram)
+        self._frames = 0
+
+    @property
+    def context(self) -> Context:
+        """The diagram's."""
+        return self._simulator.get_mutable_context()
+
+    def step(self, images: Images) -> Array:
+        """The positions (nq,) of one more frame."""
+        raise NotImplementedError
+
+    def destroyed(self, q: Array, generator: np.random.Generator) -> Track:
+        """A track that has lost the person, who was at q (nq,)."""
+        raise NotImplementedError
+
+    def _begin_frame(self) -> None:
+        """Goes to just before the next frame's update, which so sees the images that follow."""
+        if self._frames:
+            self._simulator.AdvanceTo(_PERIOD * self._frames)
+        self._frames += 1
+
+    def _fix(self, images: Images) -> None:
+        for name, image in images.items():
+            port = self._staged.diagram.GetInputPort(f"color_image_{name}")
+            port.FixValue(self.context, AbstractValue.Make(image))
+
+    def _finish_frame(self, stages: Iterable[str]) -> None:
+        """Evaluates stages and the pose, and notes their processor time."""
+        laps, last = {}, time.process_time()
+        for stage in (*stages, "pose"):
+            if stage == "pose":
+                self._simulator.AdvancePendingEvents()
+            else:
+                self._staged.evaluate(self.context, stage)
+            now = time.process_time()
+            laps[stage], last = 1e3 * (now - last), now
+        self.milliseconds.append(laps)
+
+
+class PaperTrack(Track):
+    """The paper's way, with its search for elbows and knees or without.
+
+    A frame whose pose was recognised adds no milliseconds.
+    """
+
+    def __init__(self, capture: PaperCapture) -> None:
+        super().__init__(capture)
+        self._capture = capture
+
+    @staticmethod
+    def build(setup: CaptureSetup) -> PaperTrack:
+        """A track that knows nothing yet."""
+        return PaperTrack(build_paper_capture(setup, period=_PERIOD))
+
+    def step(self, images: Images) -> Array:
+        """The positions (nq,) of one more frame.
+
+        Raises:
+            SettingsError: the registered pose was not recognised in the first frame.
+        """
+        self._begin_frame()
+        self._fix(images)
+        self._finish_frame(self._capture.stages)
+        diagram = self._capture.diagram
+        q = np.array(diagram.GetOutputPort("estimated_positions").Eval(self.context))
+        if not np.isfinite(q).all():
+            raise SettingsError(
+                "the registered pose was not recognised in the first frame: take more cameras, or "
+                "larger pictures"
+            )
+        if diagram.GetOutputPort("similarity").Eval(self.context)[0]:
+            self.milliseconds.pop()
+        return q
+
+    def middle_joints(self) -> Array:
+        """(4, 3) elbows and knees of the last frame as found, in the order of LIMBS [m].
+
+        nan in a frame whose pose was recognised instead.
+        """
+        port = self._capture.diagram.GetOutputPort("limb_points")
+        return np.array(port.Eval(self.context)).reshape(len(LIMBS), 3, 3)[:, 1]
+
+    def seen(self) -> Seen:
+        """What was seen in the last frame; none of it changes what was estimated."""
+        setup, diagram, context = self._capture.estimator.setup, self._capture.diagram, self.context
+        views = {
+            name: diagram.GetOutputPort(f"person_view_{name}").Eval(context)
+            for name in setup.cameras
+        }
+        finder = diagram.GetSubsystemByName("features")
+        found = finder.GetOutputPort("found").Eval(finder.GetMyContextFromRoot(context))
+        if setup.face_camera is None or setup.faces is None:
+            return Seen(views, found, ())
+        name, templates = setup.face_camera.name, setup.faces
+        picture = colour_image_to_picture(diagram.GetInputPort(f"color_image_{name}").Eval(context))
+        blobs = diagram.GetOutputPort(f"person_view_{name}").Eval(context).blobs
+        face = cut_face(picture, blobs)
+        nearest = None if face is None else face_direction(face, templates)
+        if face is None or nearest is None or nearest.outside > setup.settings.farthest_face:
+            return Seen(views, found, ())
+        flat = templates.mean + templates.coordinates[nearest.template] @ templates.basis
+        template = np.clip(flat, 0, 255).astype(np.uint8).reshape(FACE_HEIGHT, FACE_WIDTH, 3)
+        return Seen(views, found, (face, template))
+
+    def destroyed(self, q: Array, generator: np.random.Generator) -> PaperTrack:
+        """A track that is turned around, its left and right exchanged; q (nq,) is where it was."""
+        estimator = self._capture.estimator
+        skeleton = estimator.setup.skeleton
+        wrong = np.array(q)
+        wrong[skeleton.head_angles[0]] += np.pi
+        wrong = skeleton.clip(wrong)
+        track = PaperTrack(self._capture)
+        context = estimator.GetMyMutableContextFromRoot(track.context)
+        estimator.set_person(context, wrong, skeleton.features(wrong)[[3, 4, 0, 2, 1]])
+        return track
+
+
+class SilhouetteTrack(Track):
+    """All silhouettes at once.
+
+    Args:
+        capture: the diagram.
+        tracker: what it follows with.
+        shared: another track of the same diagram, whose silhouettes of each frame are used, too, as
+            it stepped before; None: the images are looked at.
+    """
+
+    def __init__(
+        self,
+        capture: SilhouetteCapture,
+        tracker: PersonPoseTracker,
+        shared: SilhouetteTrack | None = None,
+    ) -> None:
+        super().__init__(capture)
+        self._capture, self._tracker, self._shared = capture, tracker, shared
+
+    @staticmethod
+    def build(
+        model: ArticulatedModel,
+        cameras: Mapping[str, Camera],
+        backgrounds: Mapping[str, Background],
+    ) -> SilhouetteTrack:
+        """A track that knows nothing yet."""
+        tracker = PersonPoseTracker(ContourFit(model.pose_tree()))
+        capture = build_silhouette_capture(tracker, cameras, backgrounds, _PERIOD, _EDGE_POINTS)
+        return SilhouetteTrack(capture, tracker)
+
+    def place(self, q: Array) -> None:
+        """Has the person be known to be at q (nq,)."""
+        self._set_state(self._tracker.start(self._tracker.values(q)))
+
+    def step(self, images: Images) -> Array:
+        """The positions (nq,) of one more frame, even where the person is lost.
+
+        Raises:
+            SettingsError: nobody was seen in the first frame.
+        """
+        self._begin_frame()
+        if self._shared is None:
+            self._fix(images)
+            self._finish_frame(self._capture.stages)
+        else:
+            # What a fixed input is given comes before what the diagram connects it to.
+            person = self._capture.person
+            own = person.GetMyMutableContextFromRoot(self.context)
+            other = person.GetMyContextFromRoot(self._shared.context)
+            for name in images:
+                port = person.GetInputPort(f"silhouette_{name}")
+                port.FixValue(own, AbstractValue.Make(port.Eval(other)))
+            self._finish_frame(())
+        return self._tracker.positions(self._state().values)
+
+    def destroyed(self, q: Array, generator: np.random.Generator) -> SilhouetteTrack:
+        """A track in a random pose half a metre away, turned anyhow."""
+        fit, state = self._tracker.fit, self._state()
+        values, angles = state.values.copy(), fit.kinematics.is_angle
+        lower = np.where(np.isinf(fit.lower), -np.pi, fit.lower)
+        upper = np.where(np.isinf(fit.upper), np.pi, fit.upper)
+        values[angles] = generator.uniform(lower, upper)[angles]
+        direction = generator.uniform(0.0, 2.0 * np.pi)
+        values[:2] += 0.5 * np.array([np.cos(direction), np.sin(direction)])
+        track = SilhouetteTrack(self._capture, self._tracker, self)
+        track._set_state(replace(state, values=values, step=np.zeros(len(values))))
+        return track
+
+    def _state(self) -> TrackState:
+        person = self._capture.person
+        state = person.known_person(person.GetMyContextFromRoot(self.context))
+        if state is None:
+            raise SettingsError("fewer than two cameras saw a person in the first frame")
+        return state
+
+    def _set_state(self, state: TrackState) -> None:
+        person = self._capture.person
+        person.set_person(person.GetMyMutableContextFromRoot(self.context), state)

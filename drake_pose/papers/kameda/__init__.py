@@ -1,1 +1,0 @@
-"""Kameda's experiment A."""

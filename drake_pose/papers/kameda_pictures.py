@@ -1,0 +1,268 @@
+"""Pictures of experiment A in the manner of the paper's figures 7 to 12, and of pose families."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
+from numpy.typing import NDArray
+
+from drake_pose.body.parsed_model import ParsedModel
+from drake_pose.papers.kameda import ExperimentResult, Trial, experiment_camera
+from drake_pose.papers.tables import save_figure
+from drake_pose.results.overlay import paint_agreement
+from drake_pose.search.estimates import PoseFamily, PoseSet, View
+from drake_pose.search.grid.families.search import samples_at
+from drake_pose.search.kameda.search import PaperSearch
+from drake_pose.search.scoring import Scoring
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+
+_EXAMPLES, _SETS, _MOST_NAMES = 4, 3, 5
+_MARGIN = 20
+_BACKGROUND = (1.0, 1.0, 1.0)
+_PANELS = (
+    "true pose", "estimate", "silhouettes", "true pose from the side", "estimate from the side",
+)  # fmt: skip
+_COLOURS = "grey: agreement, blue: missing, orange: excess"
+_KINDS: dict[str, tuple[str, Callable[[Trial], bool]]] = {
+    "figure_07_exact_and_pose_right": (
+        "silhouette matched exactly, every angle right (figure 7)",
+        lambda trial: trial.pose_equal,
+    ),
+    "figure_08_09_exact_but_another_pose": (
+        "silhouette matched exactly by another pose (figures 8 and 9)",
+        lambda trial: trial.exact and not trial.pose_equal,
+    ),
+    "figure_10_improved_by_re_estimation": (
+        "improved by re-estimation (figure 10)",
+        lambda trial: trial.improved,
+    ),
+    "figure_12_not_matched": (
+        "not matched exactly (figure 12)",
+        lambda trial: trial.result.found and not trial.exact,
+    ),
+}
+
+
+def save_pictures(result: ExperimentResult, folder: Path) -> list[Path]:
+    """Draw examples of each kind of outcome, a histogram of the effort, and poses as good.
+
+    Args:
+        result: the experiment.
+        folder: where the PNG files go; made if it is not there.
+
+    Returns:
+        The files written.
+    """
+    figures = {}
+    for name, (title, belongs) in _KINDS.items():
+        trials = [trial for trial in result.trials if belongs(trial)][:_EXAMPLES]
+        if trials:
+            figures[name] = _draw_examples(title, trials, result)
+    if isinstance(result.search, PaperSearch):
+        runs = np.array([trial.result.statistics.runs for trial in result.trials])
+        figures["figure_11_runs_of_step_3"] = _draw_histogram(runs, 100, "runs of step 3")
+        K = result.search.settings.candidate_limit
+        figures["figure_12_chest_candidates"] = _draw_chest_ranks(result, K)
+    else:
+        times = np.array([1e3 * trial.seconds for trial in result.trials])
+        label = "processor time of the search [ms]"
+        figures["figure_11_milliseconds"] = _draw_histogram(times, 200, label)
+    files = [save_figure(figure, folder / f"{name}.png") for name, figure in figures.items()]
+    several = [
+        (trial, answer)
+        for trial in result.trials
+        if (answer := trial.result.pose_set) is not None and answer.family_count > 1
+    ]
+    for k, (trial, answer) in enumerate(several[:_SETS], start=1):
+        path, model = folder / f"families_{k}.png", result.search.tree.model
+        files.append(save_families(path, model, answer, [result.view(trial)]))
+    return files
+
+
+def _draw_examples(title: str, trials: list[Trial], result: ExperimentResult) -> Figure:
+    """True poses and estimates as the camera sees them, their silhouettes, and the side."""
+    tree = result.search.tree
+    renderers = [
+        LabelRenderer(tree.model, camera)
+        for camera in (result.cameras[0], experiment_camera(0.5 * np.pi))
+    ]
+    names = [node.name for node in tree.nodes]
+    # Links without a surface would use up colours.
+    order = [names.index(name) if name in names else 0 for name in renderers[0].link_names.values()]
+    colours = matplotlib.colormaps["tab20"](np.array(order) % 20)[:, :3]
+    figure = Figure(figsize=(3 * len(trials), 15))
+    axes = figure.subplots(5, len(trials), squeeze=False)
+    for column, trial in zip(axes.T, trials, strict=True):
+        q_true, _ = tree.positions_from(trial.true_values)
+        pictures, side = (
+            _crop([renderer.segments(q) for q in (q_true, trial.result.q)])
+            for renderer in renderers
+        )
+        for axis, segments in zip(column[[0, 1, 3, 4]], [*pictures, *side], strict=True):
+            axis.imshow(np.where(segments[..., None] >= 0, colours[segments], _BACKGROUND))
+        column[2].imshow(paint_agreement(pictures[0] >= 0, pictures[1] >= 0))
+        title_of_one = f"E_total {trial.result.E_total:.2%}, {trial.result.statistics.runs} runs"
+        column[0].set_title(title_of_one, fontsize=9)
+    for axis, label in zip(axes[:, 0], _PANELS, strict=True):
+        axis.set_ylabel(label)
+    for axis in axes.ravel():
+        axis.set(xticks=[], yticks=[])
+    figure.suptitle(f"{title}\n{_COLOURS}", fontsize=10)
+    return figure
+
+
+def _crop(pictures: list[np.ndarray]) -> list[np.ndarray]:
+    """Cut pictures of segments (H, W) to the square about what any of them shows."""
+    rows, columns = np.nonzero(np.logical_or.reduce([picture >= 0 for picture in pictures]))
+    side = _MARGIN + max(np.ptp(rows), np.ptp(columns))
+    square = []
+    for picture in pictures:
+        framed = np.pad(picture, side, constant_values=-1)
+        top = (rows.min() + rows.max() - side) // 2 + side
+        left = (columns.min() + columns.max() - side) // 2 + side
+        square.append(framed[top : top + side, left : left + side])
+    return square
+
+
+def _draw_histogram(values: np.ndarray, end: int, label: str) -> Figure:
+    """How often values (n,) occur; what is beyond the end is counted there."""
+    figure = Figure(figsize=(6, 4))
+    axis = figure.subplots()
+    axis.hist(np.minimum(values, end), bins=np.linspace(0, end, 21).tolist(), color="0.4")
+    axis.set(xlabel=f"{label} ({end}: {end} or more)", ylabel="images")
+    axis.set_title(f"{len(values)} images, mean {values.mean():.1f}, minimum {values.min():.0f}")
+    return figure
+
+
+def _draw_chest_ranks(result: ExperimentResult, limit: int) -> Figure:
+    """In how many images the true chest is among the first K of its list, against K."""
+    ranks, lengths = chest_ranks(result)
+    Ks = range(1, max(2, int(lengths.max())) + 1)
+    figure = Figure(figsize=(6, 4))
+    axis = figure.subplots()
+    axis.semilogx(Ks, [ratio_within(ranks, K) for K in Ks], color="0.2")
+    axis.axvline(limit, color="0.6", linestyle="--", label=f"K = {limit}")
+    axis.set(xlabel="K, candidates of the chest that are kept", ylim=(0.0, 1.03))
+    axis.set_ylabel("images with the true chest among them")
+    axis.xaxis.set_major_formatter("{x:g}")
+    axis.yaxis.set_major_formatter(PercentFormatter(1.0))
+    axis.legend(loc="lower right")
+    axis.set_title(
+        f"{len(ranks)} images, {np.median(lengths):.0f} candidates (median); "
+        f"among the first {limit}: {ratio_within(ranks, limit):.0%}",
+        fontsize=10,
+    )
+    return figure
+
+
+def chest_ranks(result: ExperimentResult) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Where the true chest stands in its list of candidates, the head where it truly is.
+
+    The paper says that what the list's length K cuts off is why silhouettes are not matched (6.1,
+    figure 12).
+
+    Args:
+        result: of the paper's search; its r and its order, but no K.
+
+    Returns:
+        By image the true chest's rank, from 1; 0: it is not in the list, as it leaves the
+        silhouette by more than r. And the lists' lengths.
+    """
+    search = result.search
+    assert isinstance(search, PaperSearch)
+    chest = [node.name for node in search.tree.nodes].index("chest")
+    ranks, lengths = [], []
+    for trial in result.trials:
+        true = samples_at(search.sampled, trial.true_values)
+        assert true is not None, "drawn from the grid"
+        order = _chest_list(search, result.view(trial), trial, true, chest)
+        place = np.flatnonzero(order == true[chest])
+        ranks.append(int(place[0]) + 1 if len(place) else 0)
+        lengths.append(len(order))
+    return np.array(ranks), np.array(lengths)
+
+
+def ratio_within(ranks: NDArray[np.int64], limit: int) -> float:
+    """The ratio of images whose true chest is among the first of its list, up to a limit."""
+    return float(((ranks > 0) & (ranks <= limit)).mean())
+
+
+def _chest_list(
+    search: PaperSearch, view: View, trial: Trial, true: NDArray[np.int64], chest: int
+) -> NDArray[np.int64]:
+    """Steps 3 to 5 for the chest with all ancestors where they truly are: samples, best first."""
+    settings = search.settings
+    X_WN = search.tree.node_poses(trial.true_values)
+    scoring = Scoring(search.sampled, [view])
+    done: list[int] = []
+    parent = search.tree.nodes[chest].parent
+    while parent >= 0:
+        done.insert(0, parent)
+        parent = search.tree.nodes[parent].parent
+    uncovered = scoring.uncovered(done, true, X_WN)
+    poses = scoring.candidate_poses(chest, X_WN[done[-1]])
+    outside, covered = scoring.candidate_areas(chest, np.arange(len(poses)), poses, uncovered)
+    inside = np.flatnonzero((outside <= (settings.outside_limit or 0.0)).all(axis=0))
+    worth = covered[inside] - settings.outside_weight * outside[:, inside].sum(axis=0)
+    return inside[np.argsort(-worth, kind="stable")]
+
+
+def save_families(
+    path: Path, model: ParsedModel, answer: PoseSet, views: Sequence[View], most: int = 6
+) -> Path:
+    """Draw the families side by side, a column each: what the silhouettes leave open.
+
+    For every camera the first row shows the segments of the family's representative in colours,
+    the second where its body and the silhouette agree. Below stand the joints that are free in
+    the family.
+
+    Args:
+        path: the PNG file.
+        model: the model.
+        answer: the families.
+        views: the silhouettes.
+        most: how many families are drawn, the best first.
+
+    Returns:
+        The file written.
+    """
+    families = answer.families[:most]
+    renderers = [LabelRenderer(model, view.camera) for view in views]
+    figure = Figure(figsize=(3.2 * len(families), 3.2 * 2 * len(views) + 1.4))
+    axes = figure.subplots(2 * len(views), len(families), squeeze=False)
+    for column, family in zip(axes.T, families, strict=True):
+        for i, (view, renderer) in enumerate(zip(views, renderers, strict=True)):
+            segments = renderer.segments(family.q, family.X_WB)
+            rows, columns = np.nonzero(view.mask | (segments >= 0))
+            window = tuple(
+                slice(max(0, one.min() - _MARGIN), one.max() + 1 + _MARGIN)
+                for one in (rows, columns)
+            )
+            mask, segments = view.mask[window], segments[window]
+            colours = matplotlib.colormaps["tab20"](np.arange(segments.max() + 2) % 20)[:, :3]
+            coloured = np.where(segments[..., None] >= 0, colours[segments], _BACKGROUND)
+            column[2 * i].imshow(coloured)
+            column[2 * i + 1].imshow(paint_agreement(mask, segments >= 0, segments))
+        poses = "1 pose" if family.size == 1 else f"{family.size:,.0f} poses"
+        column[0].set_title(f"J = {family.J:.0f} pixels, {poses}", fontsize=9)
+        column[-1].set_xlabel(_free_names(family), fontsize=8)
+    for axis in axes.ravel():
+        axis.set(xticks=[], yticks=[])
+    found = "all found" if answer.complete else "the search left some out"
+    figure.suptitle(
+        f"{len(families)} of {answer.family_count} families within {answer.tolerance:.0f} pixels "
+        f"of the best ({found})\n{_COLOURS}",
+        fontsize=10,
+    )
+    return save_figure(figure, path)
+
+
+def _free_names(family: PoseFamily) -> str:
+    names = [joint.name for joint in family.joints if not joint.determined]
+    if not names:
+        return "every joint determined"
+    more = len(names) - _MOST_NAMES
+    return "\n".join(["free:", *names[:_MOST_NAMES], *([f"and {more} more"] if more > 0 else [])])

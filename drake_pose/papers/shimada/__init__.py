@@ -1,1 +1,0 @@
-"""Shimada's synthetic experiment with the two-finger hand."""

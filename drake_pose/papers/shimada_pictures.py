@@ -1,0 +1,181 @@
+"""Pictures of Shimada's synthetic experiment in the manner of the paper's figures 9 to 16."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from drake_pose.filtering.hand.observation import (
+    FLEXIONS,
+    HAND_STATE,
+    LENGTHS,
+    PALM,
+    QUATERNION,
+    SPREADS,
+    HandObservation,
+)
+from drake_pose.papers.shimada import CASES, PIXELS_PER_METRE, ExperimentResult, Trial
+from drake_pose.papers.shimada_hypotheses import HypothesesResult
+from drake_pose.papers.shimada_motion import FRAMES
+from drake_pose.papers.tables import save_figure
+
+Array = NDArray[np.float64]
+
+_SHOWN_FRAMES = (1, 8, 16, 32, 40, 55)
+_TRUE, _ESTIMATE, _REJECTED = "0.35", "#0072b2", "#d55e00"
+# So many frames are drawn after a hypothesis is rejected.
+_AFTERWARDS = 6
+_DEGREES = 180 / np.pi
+
+
+def save_pictures(result: ExperimentResult, folder: Path) -> list[Path]:
+    """Draw the first run of each case; returns the PNG files written."""
+    first = {key: trials[0] for key, trials in result.trials.items()}
+    trial = first["r13_35"]
+    curves = (
+        ("figure_13_palm_rotation", QUATERNION[1], trial, 1.0, "q_1"),
+        ("figure_14_joint_angle", "flexion_13", trial, _DEGREES, "theta_13 [deg]"),
+        ("figure_15_length_r13_35", "length_13", first["r13_35"], PIXELS_PER_METRE, "r_13 [pixel]"),
+        ("figure_16_length_r13_40", "length_13", first["r13_40"], PIXELS_PER_METRE, "r_13 [pixel]"),
+    )
+    figures = {
+        "figure_10_sequence": _draw_sequence(trial),
+        "figure_11_shapes": _draw_shapes(first),
+        "figure_12_scale": _draw_scale(trial),
+    }
+    for name, element, shown, factor, label in curves:
+        index = HAND_STATE.index(element)
+        values = shown.sequence.states, shown.means, shown.deviations
+        figures[name] = _draw_curve(label, *(factor * one[:, index] for one in values))
+    return [save_figure(figure, folder / f"{name}.png") for name, figure in figures.items()]
+
+
+def save_hypotheses(result: HypothesesResult, folder: Path) -> list[Path]:
+    """Draw the hypothesis that an inequality rejected, and the one that it left, if there are any.
+
+    Above both and the truth: when both are there, before the end, and in the end. Below the
+    joint in which they differ most, what the inequality is about, and their weights.
+    """
+    shown = result.shown()
+    if shown is None:
+        return []
+    dead, survivor = shown
+    truths, begin, end = (
+        result.sequences[dead.run].states,
+        int(dead.frames[0]),
+        int(dead.frames[-1]),
+    )
+    figure = Figure(figsize=(13, 7.5))
+    figure.suptitle(
+        f"sequence {dead.run}: made in frame {begin}, rejected in frame {end} by {dead.row} "
+        f"(c = {dead.c:.1f})\ngrey: true, blue: kept, orange: rejected",
+        fontsize=10,
+    )
+    grid = figure.subplots(2, 3)
+    both = max(begin, int(survivor.frames[0]))
+    for axes, frame in zip(grid[0], (both, end - 1, end), strict=True):
+        _draw_hand(axes, truths[frame - 1], _TRUE)
+        _draw_hand(axes, survivor.at(frame), _ESTIMATE)
+        _draw_hand(axes, dead.at(frame), _REJECTED)
+        axes.invert_yaxis()
+        axes.set_title(f"t = {frame}" + (" (rejected)" if frame == end else ""), fontsize=9)
+    k = result.inequalities.rows.index(dead.row)
+    phi, b = result.inequalities.phi[k], float(result.inequalities.b[k])
+    apart = np.where(phi != 0, np.abs(dead.at(both) - survivor.at(both)), -1.0)
+    widest = int(np.argmax(apart))
+    name = HAND_STATE.names[widest]
+    factor, unit = (
+        (_DEGREES, "deg") if name in (*SPREADS, *FLEXIONS) else (PIXELS_PER_METRE, "pixel")
+    )
+    side, sign = (">=", -1.0) if ">=" in dead.row else ("<=", 1.0)
+    row = f"{dead.row.split(side)[0]}{side} {sign * factor * b:.0f} {unit}"
+    curves = ((np.eye(len(HAND_STATE))[widest], f"{name} [{unit}]"), (sign * phi, row))
+    frames = np.arange(begin, min(FRAMES, end + _AFTERWARDS) + 1)
+    for axes, (direction, label) in zip(grid[1], curves, strict=False):
+        axes.plot(frames, factor * truths[frames - 1] @ direction, color=_TRUE)
+        for one, colour in ((dead, _REJECTED), (survivor, _ESTIMATE)):
+            path = factor * one.means @ direction
+            axes.plot(one.frames, path, "-o", color=colour, mfc="white", ms=4)
+        axes.plot(end, factor * dead.means[-1] @ direction, "x", color=_REJECTED, ms=12)
+        axes.set_ylabel(label)
+    grid[1, 1].axhline(sign * factor * b, color="black", linestyle="--")
+    for one, colour in ((survivor, _ESTIMATE), (dead, _REJECTED)):
+        grid[1, 2].semilogy(one.frames, one.weights, "-o", color=colour, ms=4)
+    grid[1, 2].set_ylabel("weight (rejects nothing here)")
+    for axes in grid[1]:
+        axes.set(xlabel="t", xlim=(frames[0] - 0.5, frames[-1] + 0.5))
+    return [save_figure(figure, folder / "figure_9_hypotheses.png")]
+
+
+def _draw_hand(axes: Axes, state: Array, colour: str) -> None:
+    points = HandObservation(pixels_per_metre=PIXELS_PER_METRE).drawing(state)
+    for finger in (points[:4], points[4:8]):
+        axes.plot(finger[:, 0], finger[:, 1], "-o", color=colour, markersize=3, linewidth=2)
+    for edge in (points[8:10], points[10:12], points[12:14]):
+        axes.plot(edge[:, 0], edge[:, 1], color=colour, linewidth=1)
+    axes.set_aspect("equal")
+
+
+def _draw_sequence(trial: Trial) -> Figure:
+    figure = Figure(figsize=(15, 5.2))
+    grid = figure.subplots(2, len(_SHOWN_FRAMES), sharex=True, sharey=True)
+    rows = (("true", trial.sequence.states, _TRUE), ("estimate", trial.means, _ESTIMATE))
+    for line, (label, states, colour) in zip(grid, rows, strict=True):
+        for axes, frame in zip(line, _SHOWN_FRAMES, strict=True):
+            _draw_hand(axes, states[frame - 1], colour)
+            axes.set_title(f"{label}, t = {frame}", fontsize=9)
+    # Pixels count downwards.
+    grid[0, 0].invert_yaxis()
+    return figure
+
+
+def _draw_shapes(first: dict[str, Trial]) -> Figure:
+    """The hand laid flat: the first guess, the estimates and the truths."""
+    figure = Figure(figsize=(12, 4))
+    grid = figure.subplots(1, 3, sharex=True, sharey=True)
+    sequence = first["r13_35"].sequence
+    panels = [("(a) first guess", sequence.states[0], sequence.guess.mean)]
+    for label, (key, shown) in zip("bc", first.items(), strict=True):
+        title = f"({label}) at t = {FRAMES}, r_13 = {CASES[key]:.0f}"
+        panels.append((title, shown.sequence.states[-1], shown.means[-1]))
+    for axes, (title, true, estimate) in zip(grid, panels, strict=True):
+        _draw_hand(axes, _flat(true), _TRUE)
+        _draw_hand(axes, _flat(estimate), _ESTIMATE)
+        axes.set_title(title, fontsize=9)
+    figure.suptitle("grey: true, blue: estimate", fontsize=9)
+    return figure
+
+
+def _flat(state: Array) -> Array:
+    flat = np.zeros_like(state)
+    shape = HAND_STATE.indices((*LENGTHS, *PALM))
+    flat[shape] = state[shape]
+    # A quarter turn about the fingers' axis: the palm faces the camera.
+    flat[HAND_STATE.indices(QUATERNION)] = np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0
+    return flat
+
+
+def _draw_scale(trial: Trial) -> Figure:
+    """The scale is the quaternion's squared norm; its deviation by linear propagation."""
+    indices = HAND_STATE.indices(QUATERNION)
+    true, estimate = (
+        np.sum(one[:, indices] ** 2, axis=1) for one in (trial.sequence.states, trial.means)
+    )
+    # Elements taken as independent: an upper bound where errors of rotation dominate.
+    slopes = 2 * trial.means[:, indices] * trial.deviations[:, indices]
+    return _draw_curve("scale", true, estimate, np.linalg.norm(slopes, axis=1))
+
+
+def _draw_curve(label: str, true: Array, estimate: Array, deviation: Array) -> Figure:
+    figure = Figure(figsize=(6, 4))
+    axes = figure.subplots()
+    frames = np.arange(1, len(true) + 1)
+    axes.errorbar(frames, estimate, 2 * deviation, fmt="o", color=_ESTIMATE, mfc="white", ms=4)
+    axes.plot(frames, true, color=_TRUE)
+    # Early bars may reach far beyond all that comes later.
+    middle, reach = true.mean(), max(np.ptp(true), np.percentile(2 * deviation, 90), 1e-3)
+    axes.set(xlabel="t", ylabel=label, ylim=(middle - 1.6 * reach, middle + 1.6 * reach))
+    axes.set_title("line: true; circles: estimate; bars: 2 standard deviations", fontsize=9)
+    return figure

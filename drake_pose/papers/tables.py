@@ -1,0 +1,127 @@
+"""How all experiments count, compare and show: spread over seeds, one table, one picture."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from rich.markup import escape
+from rich.table import Table
+
+from drake_pose.errors import SettingsError
+
+Figures = Mapping[str, Any]
+Advance = Callable[[int], None]
+"""Called with how many are done."""
+
+Count = Callable[[str, int], Advance]
+"""Begins to count: called with what is counted and up to where."""
+
+_NONE = "-"
+_DPI = 90
+
+
+def uncounted(_what: str, _total: int) -> Advance:
+    """Counts nothing: the ``Count`` of who wants to see none."""
+    return lambda _done: None
+
+
+def require_counts(**counts: int) -> None:
+    """Refuses counts below 1.
+
+    Raises:
+        SettingsError: names the first.
+    """
+    for name, count in counts.items():
+        if count < 1:
+            raise SettingsError(f"{name} must be 1 or more, not {count}")
+
+
+def require_choice(name: str, value: str, choices: Sequence[str]) -> None:
+    """Refuses a value that is none of the choices.
+
+    Raises:
+        SettingsError: names them.
+    """
+    if value not in choices:
+        raise SettingsError(f"{name} must be one of {', '.join(choices)}, not '{value}'")
+
+
+def spread_over_seeds(
+    runs: Sequence[Figures], without: Sequence[str] = ()
+) -> dict[str, dict[str, float]]:
+    """Mean, smallest and largest of every number over runs that differ in the seed alone.
+
+    Args:
+        runs: the figures of each.
+        without: keys that are no outcome.
+    """
+    spread = {}
+    for key, first in runs[0].items():
+        if key not in without and isinstance(first, int | float):
+            values = np.array([float(run[key]) for run in runs])
+            spread[key] = {
+                "mean": float(values.mean()),
+                "min": float(values.min()),
+                "max": float(values.max()),
+            }
+    return spread
+
+
+def figure_table(
+    title: str,
+    rows: Mapping[str, tuple[str, str]],
+    columns: Mapping[str, Figures | Sequence[Figures]],
+    heading: str = "figure",
+) -> Table:
+    """Figures side by side: a row each, as far as a column has it.
+
+    Args:
+        title: of the table.
+        rows: by key, what the row is called and the format of its figures.
+        columns: by heading, the figures; or those of several seeds, of which the mean is shown, and
+            the smallest and largest.
+        heading: of the rows.
+    """
+    table = Table(title=title)
+    table.add_column(heading)
+    for name in columns:
+        table.add_column(escape(name), justify="right")
+    runs = [[one] if isinstance(one, Mapping) else one for one in columns.values()]
+    for key, (label, form) in rows.items():
+        if any(key in one[0] for one in runs):
+            table.add_row(
+                escape(label), *(_cell([run.get(key) for run in one], form) for one in runs)
+            )
+    return table
+
+
+def _cell(values: Sequence[Any], form: str) -> str:
+    """A figure of one run, or the mean of several with the smallest and largest."""
+    if any(value is None or (isinstance(value, float) and math.isnan(value)) for value in values):
+        return _NONE
+    if len(set(values)) == 1:
+        return form.format(values[0])
+    mean = (form if "." in form else "{:.1f}").format(float(np.mean(values)))
+    return f"{mean} ({form.format(min(values))} to {form.format(max(values))})"
+
+
+def save_figure(figure: Figure, path: Path) -> Path:
+    """Writes a drawing as a PNG file, in a folder that is made if it is not there."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.set_layout_engine("tight")
+    figure.savefig(path, dpi=_DPI)
+    return path
+
+
+def save_picture(picture: NDArray[np.uint8], path: Path) -> Path:
+    """Writes a picture (H, W, 3) as a PNG file, in a folder that is made if it is not there."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), np.ascontiguousarray(picture[:, :, ::-1]))
+    return path

@@ -158,8 +158,7 @@ def empty_room(folder: Path, /, *, pictures: Annotated[int, within(1)] = 30) -> 
         folder: Folder with cameras.yaml and sources.yaml.
         pictures: Number of pictures of each camera.
     """
-    from drake_pose.jobs.live.empty_room import take_empty_room
-    from drake_pose.jobs.live.scene import hush_opencv
+    from drake_pose.jobs.live.scene import hush_opencv, take_empty_room
 
     hush_opencv()
     for camera, place in take_empty_room(folder, pictures).items():

@@ -114,7 +114,7 @@ def walk(
         player = walking.simulated_player() if options.simulate else walking.key_player()
     waits = player.q is not None and (options.browser if options.wait is None else options.wait)
     page = _open_page(options, waits)
-    again = _asker(page) if waits and options.seconds is None else None
+    again = _asker(page) if waits and options.seconds is None else lambda: False
     walked = walking.walk(
         player, page, options.seconds, options.speed, _say_command, again, settings
     )
@@ -123,8 +123,8 @@ def walk(
 
 def _walk_live(folder: Path, options: WalkOptions, settings: WalkSettings) -> dict[str, Any]:
     """Walks with the cameras of a folder; what it is to walk with is read before the page opens."""
-    from drake_pose.jobs.live.live_walk import walk_live
     from drake_pose.jobs.live.scene import hush_opencv, load_live_scene
+    from drake_pose.jobs.live.walk import walk_live
 
     hush_opencv()
     with workers_of(options.workers, options.scheduler) as client:

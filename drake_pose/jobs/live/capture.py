@@ -7,19 +7,24 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
-from drake_pose.body.model import ArticulatedModel, load_model
-from drake_pose.errors import SettingsError
+from drake_pose.body.model import load_model
+from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.errors import OutputError, SettingsError
 from drake_pose.jobs.estimate.capture import bundled_person
 from drake_pose.jobs.live.frame_results import LiveResult, LiveWriter
-from drake_pose.jobs.live.run import FrameWatch, run_live
+from drake_pose.jobs.live.run import FrameWatch, Mask, run_live
 from drake_pose.jobs.live.scene import LiveScene
-from drake_pose.jobs.live.shape import fit_first_frames, shape_of_result
-from drake_pose.person.shape import KnownShape, tracker_of_person
-from drake_pose.results.folder import require_empty
+from drake_pose.person.recordings.person_capture import capture_person
+from drake_pose.person.recordings.persons_in_view import PersonRecording
+from drake_pose.person.shape import KnownShape, shape_values, tracker_of_person
+from drake_pose.person.views import shows_somebody
+from drake_pose.results.folder import read_summary, require_empty
 from drake_pose.systems.person.live_capture import LiveSensors, build_live_capture
 
-OpenSensors = Callable[[], LiveSensors]
+# How many frames give a person's shape, and how long it is waited for the person [s].
+_FRAMES, _PATIENCE = 40, 60.0
 
 
 @dataclass(frozen=True)
@@ -53,7 +58,7 @@ def capture_live(
     out: Path,
     model_path: Path | None = None,
     settings: LiveSettings | None = None,
-    open_sensors: OpenSensors | None = None,
+    open_sensors: Callable[[], LiveSensors] | None = None,
     on_report: Callable[[str], None] = lambda _: None,
     on_frame: Callable[[int, bool], None] = lambda _, __: None,
 ) -> LiveResult:
@@ -69,8 +74,8 @@ def capture_live(
         settings: how.
         open_sensors: opens the sensors; where not given the scene's, in this process. Called once
             more for the frames that give the person's shape.
-        on_report: hears at once of cameras that stop and return, and of bad pictures.
-        on_frame: hears of each frame: how many there are, and whether a person was found.
+        on_report: called at once when cameras stop and return, and with bad pictures.
+        on_frame: called with each frame: how many there are, and whether a person was found.
 
     Raises:
         SceneError, ModelError, SettingsError: what was given cannot be captured.
@@ -80,41 +85,118 @@ def capture_live(
     model = load_model(model_path or bundled_person(), package_paths=settings.packages)
     # A folder that cannot be written is refused before a camera is opened.
     require_empty(out)
-    shape = _shape(scene, model, settings, opener, on_report)
+    shape = None
+    if settings.shape is not None:
+        shape = shape_of_result(settings.shape)
+    elif settings.fit_shape:
+        shape = _fit_first_frames(scene, opener(), model.pose_tree(), on_report)
     tracker = tracker_of_person(model.pose_tree(), shape)
     sensors = opener()
     try:
+        writer = LiveWriter(
+            scene, tracker, out, sensors.period, settings.packages, on_report, on_frame
+        )
+        if shape is not None:
+            writer.writer.more |= {"lengths_m": shape.lengths, "girths": shape.girths}
         diagram = build_live_capture(tracker, scene.cameras, sensors, with_deviations=True)
-        period, packages = sensors.period, settings.packages
-        result = LiveWriter(scene, model, tracker, out, period, packages, on_report, on_frame)
-        result.open("person", shape)
-        try:
-            watch = FrameWatch(diagram, scene.cameras, result.add)
-            interrupted = run_live(diagram, sensors, settings.seconds, result.tell, monitor=watch)
-            result.finish(sensors, settings.replay)
-        finally:
-            result.writer.close()
+        watch = FrameWatch(diagram, scene.cameras, writer.add)
+        return record_frames("person", diagram, sensors, watch, writer, settings)
     finally:
         sensors.close()
+
+
+def record_frames(
+    method: str,
+    diagram: Diagram,
+    sensors: LiveSensors,
+    watch: FrameWatch,
+    result: LiveWriter,
+    settings: LiveSettings,
+) -> LiveResult:
+    """Runs the diagram of a capture, and writes what comes out.
+
+    Args:
+        method: what summary.json calls it.
+        diagram: of the capture, with the sensors.
+        sensors: its sensors.
+        watch: hands frames to ``result``.
+        result: under way.
+        settings: how long, and whether with a replay.
+    """
+    result.writer.more["method"] = method
+    result.writer.open()
+    try:
+        interrupted = run_live(diagram, sensors, settings.seconds, result.tell, monitor=watch)
+        result.writer.warn(watch.doubts())
+        result.finish(sensors, settings.replay)
+    finally:
+        result.writer.close()
     return result.result(interrupted)
 
 
-def _shape(
+def shape_of_result(result: Path) -> KnownShape:
+    """The lengths and girths that an earlier capture found.
+
+    Raises:
+        OutputError: there is no such result, or it has none.
+    """
+    summary = read_summary(result)
+    found = []
+    for name in ("lengths_m", "girths"):
+        numbers = summary.get(name)
+        if not isinstance(numbers, dict) or not all(
+            isinstance(number, int | float) for number in numbers.values()
+        ):
+            raise OutputError(f"{result}: its summary has no {name}; name a result of capture")
+        found.append(numbers)
+    return KnownShape(*found)
+
+
+def _fit_first_frames(
     scene: LiveScene,
-    model: ArticulatedModel,
-    settings: LiveSettings,
-    open_sensors: OpenSensors,
+    sensors: LiveSensors,
+    tree: PoseTree,
     on_report: Callable[[str], None],
 ) -> KnownShape | None:
-    """The person's lengths and girths; None: the model's."""
-    if settings.shape is not None:
-        return shape_of_result(settings.shape)
-    if not settings.fit_shape:
-        return None
-    sensors = open_sensors()
+    """A person's lengths and girths by the first frames in which two cameras see the person.
+
+    The sensors are used up. None: the model has no shape joints.
+    """
+    frames: list[dict[str, Mask]] = []
+    builder = DiagramBuilder()
+    ports = sensors.add(builder)
+    for name, port in ports.silhouettes.items():
+        builder.ExportOutput(port, name)
+    builder.ExportOutput(ports.time, "time")
+    diagram = builder.Build()
+    last = np.nan
+
+    def look(context: Context) -> None:
+        nonlocal last
+        before, last = last, float(diagram.GetOutputPort("time").Eval(context)[0])
+        if last != before and not np.isnan(last):
+            views = {name: diagram.GetOutputPort(name).Eval(context) for name in ports.silhouettes}
+            seen = {name: view.region for name, view in views.items() if shows_somebody(view)}
+            if len(seen) >= 2:
+                frames.append(seen)
+
     try:
+        if not shape_values(tree).any():
+            return None
         # What is wrong with recorded pictures is said when they are captured.
         report = on_report if sensors.live else lambda _: None
-        return fit_first_frames(scene, sensors, model.pose_tree(), report)
+        waited = _PATIENCE if sensors.live else None
+        if run_live(diagram, sensors, waited, report, lambda: len(frames) >= _FRAMES, look):
+            raise KeyboardInterrupt
     finally:
         sensors.close()
+    # Whoever else is in view is cut out.
+    alone = PersonRecording(scene.cameras, lambda k: frames[k], len(frames), True)
+    seen = alone.seen
+    if not seen:
+        raise SettingsError(
+            f"{scene.path}: two cameras never saw a person at the same time: stand before them, "
+            "and compare the pictures with their backgrounds"
+        )
+    found = capture_person(tree, scene.cameras, lambda k: alone.read(seen[k]), len(seen))
+    return None if found.shape is None else found.shape.known

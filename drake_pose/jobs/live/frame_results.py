@@ -5,13 +5,11 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from drake_pose.body.model import ArticulatedModel
 from drake_pose.camera.sources.recorded import TIME_STAMPS
 from drake_pose.jobs.estimate.inputs import Inputs
 from drake_pose.jobs.estimate.person import FOLLOWED
@@ -20,7 +18,6 @@ from drake_pose.jobs.live.run import LiveFrame, Mask
 from drake_pose.jobs.live.scene import LiveScene
 from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.recordings.persons_in_view import keep_person
-from drake_pose.person.shape import KnownShape
 from drake_pose.results.folder import PoseRow
 from drake_pose.results.joint_tables import record_deviations
 from drake_pose.results.settings import EstimateSettings
@@ -55,13 +52,12 @@ class LiveWriter:
 
     Args:
         scene: the cameras and where their pictures come from.
-        model: the person.
         tracker: made for the person's pose tree; gives its surfaces.
         out: the result's folder, empty or not there.
         period: time between two frames [s].
         packages: folders of packages that the model's ``package://`` names mean, by name.
-        on_report: hears what the user is told.
-        on_frame: hears of each frame: how many there are, and whether a person was found.
+        on_report: called with what the user is told.
+        on_frame: called with each frame: how many there are, and whether a person was found.
 
     Raises:
         OutputError: the folder is not empty, or cannot be written.
@@ -70,7 +66,6 @@ class LiveWriter:
     def __init__(
         self,
         scene: LiveScene,
-        model: ArticulatedModel,
         tracker: PersonPoseTracker,
         out: Path,
         period: float,
@@ -78,8 +73,8 @@ class LiveWriter:
         on_report: Callable[[str], None],
         on_frame: Callable[[int, bool], None],
     ) -> None:
-        self._scene, self._model, self._tracker = scene, model, tracker
-        self._period = period
+        self._scene, self._tracker, self._period = scene, tracker, period
+        self._model = model = tracker.fit.tree.model
         self._on_report, self._on_frame = on_report, on_frame
         self._times: dict[str, float] = {}
         self._seen: dict[tuple[str, str], Path] = {}
@@ -90,11 +85,6 @@ class LiveWriter:
         settings = EstimateSettings(method="person", packages=packages)
         job = describe_job(scene.path, model.path, settings)
         self.writer = ResultWriter(inputs, job, out, None, with_base=False)
-
-    @property
-    def count(self) -> int:
-        """How many frames there are."""
-        return len(self._times)
 
     def tell(self, text: str) -> None:
         """Tells the user while the capture runs, and notes it."""
@@ -128,14 +118,7 @@ class LiveWriter:
             share=frame.share if np.isfinite(frame.share) else None,
         )
         self.writer.finish_frame(row, record)
-        self._on_frame(self.count, row.found)
-
-    def open(self, method: str, shape: KnownShape | None = None) -> None:
-        """Opens the files; shape: the person's lengths and girths, None: the model's."""
-        self.writer.more["method"] = method
-        if shape is not None:
-            self.writer.more |= {"lengths_m": shape.lengths, "girths": shape.girths}
-        self.writer.open()
+        self._on_frame(len(self._times), row.found)
 
     def finish(self, sensors: LiveSensors, replay: bool) -> None:
         """Writes what is made of all frames."""
@@ -144,29 +127,37 @@ class LiveWriter:
         frames = tuple(f"{k:06d}" for k in range(self._last + 1))
         scene = replace(writer.inputs.scene, frames=frames, masks=self._seen)
         writer.inputs = replace(writer.inputs, scene=scene, frames=tuple(self._times))
-        counts = sensors.counts()
-        writer.more["sources"] = {
-            name: _describe_camera(self._scene, name, count) for name, count in counts.items()
-        }
-        writer.more["skipped_moments"] = sensors.skipped
+        counts, sources = sensors.counts(), {}
+        for name, count in counts.items():
+            given = self._scene.specifications[name]
+            changes = [
+                {"time": one.time, "what": "stopped" if one.stopped else "returned"}
+                for one in count.changes
+            ]
+            sources[name] = {"kind": given.kind, "location": given.location, **asdict(count)}
+            sources[name]["changes"] = changes
+        writer.more |= {"sources": sources, "skipped_moments": sensors.skipped}
         writer.warn(camera_troubles(counts, sensors.skipped))
         if writer.rows:
             writer.finish(replay)
-            _write_times(writer, self._times)
+            text = io.StringIO()
+            table = csv.writer(text, lineterminator="\n")
+            table.writerow(["frame", "time"])
+            table.writerows([frame, f"{time:.6f}"] for frame, time in self._times.items())
+            writer.write(TIME_STAMPS, text.getvalue().encode())
 
     def _agreement(self, frame: LiveFrame) -> tuple[float, Mapping[str, float]]:
-        """E_total, and by camera the intersection over union of region and body."""
-        fit = self._tracker.fit
+        """E_total over all views, and each one's IoU."""
+        fit, cameras = self._tracker.fit, self._scene.cameras
         values = self._tracker.values(frame.q)
         X_WN = fit.kinematics.poses(values)
         masks: Mapping[str, Mask] = {name: view.region for name, view in frame.views.items()}
         if frame.has_others:
-            place = self._tracker.place(values)
-            masks = keep_person(self._scene.cameras, masks, place).masks
-        bodies = {}
-        for name in masks:
-            camera = self._scene.cameras[name]
-            bodies[name] = draw_mask(fit.outlines, camera.X_CW @ X_WN, camera)
+            masks = keep_person(cameras, masks, self._tracker.place(values)).masks
+        bodies = {
+            name: draw_mask(fit.outlines, cameras[name].X_CW @ X_WN, cameras[name])
+            for name in masks
+        }
         agreement = compare_masks(masks, bodies)
         return agreement.E_total, agreement.ious
 
@@ -175,46 +166,14 @@ def camera_troubles(counts: Mapping[str, CameraCount], skipped: int) -> list[str
     """What the user should know at the end of a capture: pictures lost, by camera."""
     troubles = []
     for name, count in counts.items():
-        lost = [
-            f"{number} {what}"
-            for number, what in (
-                (count.dropped, "could not be used"),
-                (count.late, "came after their moment"),
-            )
-            if number
-        ]
+        numbers = {"could not be used": count.dropped, "came after their moment": count.late}
+        lost = [f"{number} {what}" for what, number in numbers.items() if number]
         if lost:
             troubles.append(f"camera '{name}': of its pictures {' and '.join(lost)}")
-        stops = sum(change.stopped for change in count.changes)
-        if stops and count.changes[-1].stopped:
+        if count.changes and count.changes[-1].stopped:
             troubles.append(f"camera '{name}' had stopped by the end")
     if skipped:
         troubles.append(
             f"{skipped} moments were skipped: this computer could not follow the cameras"
         )
     return troubles
-
-
-def _describe_camera(scene: LiveScene, name: str, count: CameraCount) -> dict[str, Any]:
-    """What summary.json says of a camera's source."""
-    given = scene.specifications[name]
-    return {
-        "kind": given.kind,
-        "location": given.location,
-        "used": count.used,
-        "dropped": count.dropped,
-        "late": count.late,
-        "changes": [
-            {"time": change.time, "what": "stopped" if change.stopped else "returned"}
-            for change in count.changes
-        ],
-    }
-
-
-def _write_times(writer: ResultWriter, times: Mapping[str, float]) -> None:
-    """Writes timestamps.csv: frame, time [s]."""
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(["frame", "time"])
-    table.writerows([frame, f"{time:.6f}"] for frame, time in times.items())
-    writer.write(TIME_STAMPS, text.getvalue().encode())

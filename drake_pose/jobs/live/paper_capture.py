@@ -5,7 +5,7 @@ The registered pose, upright with both arms spread, begins it and sets it right.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,17 +16,15 @@ from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.errors import SettingsError
 from drake_pose.jobs.estimate.scene_checks import frame_ranges
-from drake_pose.jobs.live.capture import LiveSettings
+from drake_pose.jobs.live.capture import LiveSettings, record_frames
 from drake_pose.jobs.live.frame_results import LiveResult, LiveWriter
 from drake_pose.jobs.live.registered_pose import RegisteredPoseSearch
-from drake_pose.jobs.live.run import FrameWatch, LiveFrame, run_live
+from drake_pose.jobs.live.run import FrameWatch, LiveFrame
 from drake_pose.jobs.live.scene import LiveScene
-from drake_pose.person.date.capture import CaptureSetup
 from drake_pose.person.date.faces import learn_recorded_faces
 from drake_pose.person.date.skeleton import FEATURES
 from drake_pose.person.shape import tracker_of_person
 from drake_pose.results.folder import require_empty
-from drake_pose.results.summary import FrameRecord
 from drake_pose.systems.date.capture import build_paper_capture
 from drake_pose.systems.person.live_capture import LocalSensors
 
@@ -39,12 +37,7 @@ _LEAST_IOU = 0.6
 
 @dataclass(frozen=True)
 class FaceFolder:
-    """What the face's direction is found with.
-
-    Args:
-        camera: the camera before the face.
-        templates: a folder as of learn_recorded_faces.
-    """
+    """The camera before the face, and a folder of templates as of learn_recorded_faces."""
 
     camera: str
     templates: Path
@@ -73,8 +66,8 @@ def capture_paper(
         settings: how; no shape can be given or fitted.
         face: how the face's direction is found; None: by inverse kinematics alone.
         open_sensors: opens the sensors; where not given the scene's. Called twice.
-        on_report: hears at once of cameras that stop and return, and of bad pictures.
-        on_frame: hears of each frame: how many there are, and whether a person was found.
+        on_report: called at once when cameras stop and return, and with bad pictures.
+        on_frame: called with each frame: how many there are, and whether a person was found.
 
     Raises:
         SceneError, CameraError, ModelError, SettingsError, UnknownNameError: what was given cannot
@@ -88,99 +81,63 @@ def capture_paper(
     require_empty(out)
     templates = None if face is None else learn_recorded_faces(face.templates)
     search = RegisteredPoseSearch(scene, model, None if face is None else face.camera, templates)
-    sensors = opener()
-    try:
-        setup = search.run(sensors, on_report)
-    finally:
-        sensors.close()
+    setup = search.run(opener(), on_report)
     sensors = opener()
     try:
         tracker = tracker_of_person(model.pose_tree(), None)
-        period, packages = sensors.period, settings.packages
-        result = LiveWriter(scene, model, tracker, out, period, packages, on_report, on_frame)
-        result.open(METHOD)
-        try:
-            interrupted = _follow(setup, sensors, result, settings.seconds)
-            result.finish(sensors, settings.replay)
-        finally:
-            result.writer.close()
+        writer = LiveWriter(
+            scene, tracker, out, sensors.period, settings.packages, on_report, on_frame
+        )
+        diagram = build_paper_capture(setup, sensors.capture, sensors.period).diagram
+        watch = _PaperWatch(diagram, setup.cameras, writer)
+        return record_frames(METHOD, diagram, sensors, watch, writer, settings)
     finally:
         sensors.close()
-    return result.result(interrupted)
 
 
-def _follow(
-    setup: CaptureSetup,
-    sensors: LocalSensors,
-    result: LiveWriter,
-    seconds: float | None,
-) -> bool:
-    """Follows the person and writes all frames; whether Ctrl-C ended it."""
-    diagram = build_paper_capture(setup, sensors.capture, sensors.period).diagram
-    doubts = _Doubts(diagram)
+class _PaperWatch(FrameWatch):
+    """Also notes frames whose pose the paper's method gives, but that one should not trust."""
 
-    def note(frame: LiveFrame) -> None:
-        result.add(frame)
-        doubts.add(*next(reversed(result.writer.records.items())))
-
-    frames = FrameWatch(diagram, setup.cameras, note, "person_view")
-
-    def watch(context: Context) -> None:
-        doubts.look(context)
-        frames(context)
-
-    interrupted = run_live(diagram, sensors, seconds, result.tell, monitor=watch)
-    result.writer.warn(doubts.texts())
-    return interrupted
-
-
-class _Doubts:
-    """Frames whose pose the paper's method gives, but that one should not trust."""
-
-    def __init__(self, diagram: Diagram) -> None:
-        self._support, self._limbs = (
-            diagram.GetOutputPort(name) for name in ("last_support", "limb_points")
-        )
+    def __init__(self, diagram: Diagram, cameras: Iterable[str], result: LiveWriter) -> None:
+        super().__init__(diagram, cameras, self._note, "person_view")
+        self._result = result
         self._unmeasured: Sequence[str] = ()
-        self._frames: list[str] = []
         self._nobody: list[str] = []
         self._differs: list[str] = []
         self._held: dict[str, list[str]] = {name: [] for name in FEATURES}
 
-    def look(self, context: Context) -> None:
+    def __call__(self, context: Context) -> None:
         """Notes which features were not measured; where a pose was recognised none need be."""
-        support = self._support.Eval(context)
-        is_followed = np.isfinite(self._limbs.Eval(context)).all()
+        support = self._value(context, "last_support")
+        is_followed = np.isfinite(self._value(context, "limb_points")).all()
         pairs = zip(FEATURES, support, strict=True)
         self._unmeasured = [name for name, count in pairs if is_followed and not count]
+        super().__call__(context)
 
-    def add(self, frame: str, record: FrameRecord) -> None:
-        """Takes the frame that was looked at."""
-        self._frames.append(frame)
+    def _note(self, frame: LiveFrame) -> None:
+        self._result.add(frame)
+        name, record = next(reversed(self._result.writer.records.items()))
         if not record.found:
-            self._nobody.append(frame)
+            self._nobody.append(name)
             return
-        for name in self._unmeasured:
-            self._held[name].append(frame)
+        for feature in self._unmeasured:
+            self._held[feature].append(name)
         if np.mean(list(record.ious.values()) or [0.0]) < _LEAST_IOU:
-            self._differs.append(frame)
+            self._differs.append(name)
 
-    def texts(self) -> list[str]:
+    def doubts(self) -> list[str]:
         """What the user should know."""
-        texts = []
-        if self._nobody:
-            texts.append(f"{self._listed(self._nobody)}: before the registered pose; no pose")
+        said = {"before the registered pose; no pose": self._nobody}
         for name, frames in self._held.items():
-            if frames:
-                what = name.replace("_", " ")
-                texts.append(f"{self._listed(frames)}: {what} not seen; held where it was last")
-        if self._differs:
-            texts.append(
-                f"{self._listed(self._differs)}: the body and the silhouettes hardly agree (mean "
-                f"IoU below {_LEAST_IOU}); the paper's method does not notice when it has lost the "
-                "person, until the registered pose is shown again"
-            )
-        return texts
-
-    def _listed(self, frames: list[str]) -> str:
-        return f"frame {frame_ranges(frames, self._frames)}"
+            said[f"{name.replace('_', ' ')} not seen; held where it was last"] = frames
+        said[
+            f"the body and the silhouettes hardly agree (mean IoU below {_LEAST_IOU}); the paper's "
+            "method does not notice when it has lost the person, until the registered pose is "
+            "shown again"
+        ] = self._differs
+        known = list(self._result.writer.records)
+        return [
+            f"frame {frame_ranges(frames, known)}: {text}"
+            for text, frames in said.items()
+            if frames
+        ]

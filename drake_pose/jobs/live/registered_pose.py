@@ -42,9 +42,6 @@ _MORE_MOMENTS = 10
 class RegisteredPoseSearch:
     """Looks for the registered pose in a scene's pictures: upright, both arms spread.
 
-    Attributes:
-        setup: what is known without the person: skeleton and cameras.
-
     Args:
         scene: the cameras and where their pictures come from.
         model: the person.
@@ -75,7 +72,7 @@ class RegisteredPoseSearch:
         self._face_camera, self._faces = face_camera, faces
         ring = {name: one for name, one in self._cameras.items() if name != face_camera}
         self._settings = CaptureSettings()
-        self.setup = CaptureSetup(load_skeleton(model), ring, settings=self._settings)
+        self._setup = CaptureSetup(load_skeleton(model), ring, settings=self._settings)
         self._rig = build_camera_rig(model, ring)
         self._context = self._rig.diagram.CreateDefaultContext()
         self._registered: RegisteredPose | None = None
@@ -88,7 +85,7 @@ class RegisteredPoseSearch:
 
         Args:
             sensors: are used up.
-            on_report: hears of cameras that stop, and of bad pictures.
+            on_report: called when cameras stop, and with bad pictures.
 
         Raises:
             SettingsError: nobody showed the registered pose.
@@ -96,58 +93,61 @@ class RegisteredPoseSearch:
         """
         builder = DiagramBuilder()
         capture = builder.AddNamedSystem("picture_capture", sensors.capture)
-        ports = {}
-        for name, camera in self.setup.cameras.items():
+        for name, camera in self._setup.cameras.items():
             image = HorizontalImage(camera, self._scene.backgrounds[name], self._settings.skin)
             builder.AddNamedSystem(f"horizontal_image_{name}", image)
             port = capture.GetOutputPort(f"color_image_{name}")
             builder.Connect(port, image.GetInputPort("color_image"))
             builder.ExportOutput(port, f"color_image_{name}")
-            ports[name] = image.GetOutputPort("person_view")
-            builder.ExportOutput(ports[name], f"person_view_{name}")
+            builder.ExportOutput(image.GetOutputPort("person_view"), f"person_view_{name}")
         builder.ExportOutput(capture.GetOutputPort("fresh"), "fresh")
         diagram = builder.Build()
 
         def look(context: Context) -> None:
             if diagram.GetOutputPort("fresh").Eval(context)[0]:
-                views = {n: diagram.GetOutputPort(f"person_view_{n}").Eval(context) for n in ports}
-                if self._look({n: view for n, view in views.items() if view is not None}):
-                    images = {n: diagram.GetOutputPort(f"color_image_{n}") for n in views}
+                views = {
+                    name: diagram.GetOutputPort(f"person_view_{name}").Eval(context)
+                    for name in self._setup.cameras
+                }
+                seen = {name: view for name, view in views.items() if view is not None}
+                if self._is_best(seen):
+                    images = {n: diagram.GetOutputPort(f"color_image_{n}") for n in seen}
                     self._shown = {
-                        n: colour_image_to_picture(images[n].Eval(context)).copy()
-                        for n, view in views.items()
-                        if view is not None
+                        name: colour_image_to_picture(port.Eval(context)).copy()
+                        for name, port in images.items()
                     }
+
+        def is_done() -> bool:
+            return self._similarity >= self._settings.recognition and self._since >= _MORE_MOMENTS
 
         # What is wrong with recorded pictures is said when they are captured.
         report = on_report if sensors.live else lambda _: None
         waited = PATIENCE if sensors.live else None
-        if run_live(diagram, sensors, waited, report, self._is_done, look):
-            raise KeyboardInterrupt
+        try:
+            if run_live(diagram, sensors, waited, report, is_done, look):
+                raise KeyboardInterrupt
+        finally:
+            sensors.close()
         return self._prepared(on_report)
 
-    def _is_done(self) -> bool:
-        return self._is_recognised() and self._since >= _MORE_MOMENTS
+    @property
+    def _similarity(self) -> float:
+        return -1.0 if self._best is None else self._best.similarity
 
-    def _is_recognised(self) -> bool:
-        best = self._best
-        return best is not None and best.similarity >= self._settings.recognition
-
-    def _look(self, views: Mapping[str, PersonView]) -> bool:
+    def _is_best(self, views: Mapping[str, PersonView]) -> bool:
         """Whether a moment's views are the most like the registered pose."""
-        whole = {name: view for name, view in views.items() if view.contour is not None}
-        cameras = [self.setup.cameras[name] for name in whole]
+        contours = {name: view.contour for name, view in views.items() if view.contour is not None}
+        skeleton, cameras = self._setup.skeleton, [self._setup.cameras[name] for name in contours]
         self._since += 1
-        if len(whole) < 2:
+        if len(contours) < 2:
             return False
-        contours = [view.contour for view in whole.values()]
         if self._registered is None:
-            middles = [one.middle for one in contours if one is not None]
-            q = stand_registered(self.setup.skeleton, cameras, middles)
-            ring = list(self.setup.cameras.values())
-            self._registered = register_pose(self.setup.skeleton, q, ring, self._draw)
-        found = recognise(self.setup.skeleton, self._registered, cameras, contours, threshold=0.0)
-        if found is None or (self._best and found.similarity <= self._best.similarity):
+            q = stand_registered(skeleton, cameras, [one.middle for one in contours.values()])
+            ring = list(self._setup.cameras.values())
+            self._registered = register_pose(skeleton, q, ring, self._draw)
+        seen = list(contours.values())
+        found = recognise(skeleton, self._registered, cameras, seen, threshold=0.0)
+        if found is None or found.similarity <= self._similarity:
             return False
         self._best, self._since = found, 0
         return True
@@ -163,28 +163,26 @@ class RegisteredPoseSearch:
                 f"{path}: two cameras never saw a person whole at the same time: compare the "
                 "pictures with those of the empty room"
             )
-        if not self._is_recognised():
+        if self._similarity < needed:
             raise SettingsError(
                 f"{path}: nobody showed the registered pose, upright with both arms spread: the "
-                f"likest silhouettes agree with it by {self._best.similarity:.2f}, "
+                f"likest silhouettes agree with it by {self._similarity:.2f}, "
                 f"{needed:.2f} are needed; show it once, give a model of the person's measures "
                 "(urdf/person/make_person.py makes one), or capture by all silhouettes "
                 "(--method person)"
             )
-        known = [self._face_camera, *self._shown]
+        known = {
+            name: one
+            for name, one in self._cameras.items()
+            if name == self._face_camera or name in self._shown
+        }
         for name in self._cameras:
             if name not in known:
                 on_report(f"camera '{name}' gave no picture of the registered pose: left out")
         return prepare_paper_capture(
-            self._model,
-            {name: one for name, one in self._cameras.items() if name in known},
-            self._face_camera,
-            self._best.q,
-            self._shown,
-            self._scene.backgrounds,
-            self._settings,
-            self._faces,
-        )
+            self._model, known, self._face_camera, self._best.q, self._shown,
+            self._scene.backgrounds, self._settings, self._faces,
+        )  # fmt: skip
 
 
 def require_colour(scene: LiveScene) -> dict[str, PinholeCamera]:

@@ -1,4 +1,4 @@
-"""Runs the diagram of a live capture, period by period, and notes what comes out."""
+"""The one loop of what happens live: a diagram's periods, what came out of them, and their end."""
 
 from __future__ import annotations
 
@@ -19,8 +19,62 @@ from drake_pose.systems.person.live_capture import LiveSensors
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+# Between two looks whether a walk without cameras has ended [s].
+_LOOK = 0.5
 # A simulation that lags behind the clock by more [s] does not try to make up for it.
 _LARGEST_LAG = 0.2
+
+
+def run_live(
+    diagram: Diagram,
+    sensors: LiveSensors | None,
+    seconds: float | None,
+    on_report: Callable[[str], None] = lambda _: None,
+    until: Callable[[], bool] = lambda: False,
+    monitor: Callable[[Context], None] | None = None,
+    speed: float = 0.0,
+) -> bool:
+    """Runs a diagram until its recordings end, its time is up, or Ctrl-C.
+
+    Args:
+        diagram: with the sensors in it.
+        sensors: its sensors; None: it has none.
+        seconds: how long; None: without end.
+        on_report: called with what the user should know of cameras and pictures.
+        until: asked after every period whether it is enough.
+        monitor: called with the diagram's context after every step.
+        speed: simulated seconds a second where no camera is live; 0: as fast as it can.
+
+    Returns:
+        Whether it was ended by Ctrl-C.
+    """
+    simulator = Simulator(diagram)
+    if monitor is not None:
+        simulator.set_monitor(monitor)
+    is_live = sensors is not None and sensors.live
+    speed = 1.0 if is_live else speed
+    simulator.set_target_realtime_rate(speed)
+    context = simulator.get_context()
+    period = _LOOK if sensors is None else sensors.period
+    end = math.inf if seconds is None else seconds
+    try:
+        simulator.Initialize()
+        begin = start = time.monotonic()
+        while (time.monotonic() - start if is_live else context.get_time()) < end and not until():
+            goal = context.get_time() + period
+            status = simulator.AdvanceTo(goal if is_live else min(goal, end))
+            for report in [] if sensors is None else sensors.take_reports():
+                on_report(report)
+            if status.reason() == SimulatorStatus.ReturnReason.kReachedTerminationCondition:
+                break
+            lag = time.monotonic() - begin - context.get_time() / speed if speed else 0.0
+            if lag > _LARGEST_LAG:
+                # What was missed is gone: nobody wants to see it in fast motion.
+                simulator.ResetStatistics()
+                begin += lag
+    except KeyboardInterrupt:
+        return True
+    return False
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,69 +101,13 @@ class LiveFrame:
     seconds: float
 
 
-def run_live(
-    diagram: Diagram,
-    sensors: LiveSensors,
-    seconds: float | None,
-    on_report: Callable[[str], None],
-    until: Callable[[], bool] = lambda: False,
-    monitor: Callable[[Context], None] | None = None,
-    is_shown: bool = False,
-) -> bool:
-    """Runs a diagram until its recordings end, its time is up, or Ctrl-C.
-
-    Args:
-        diagram: with the sensors in it.
-        sensors: the sensors.
-        seconds: how long; None: without end.
-        on_report: hears what the user should know of cameras and pictures.
-        until: asked after every period whether it is enough.
-        monitor: called with the diagram's context after every period.
-        is_shown: whether somebody watches: then recordings, too, run no faster than the clock.
-
-    Returns:
-        Whether it was ended by Ctrl-C.
-    """
-    simulator = Simulator(diagram)
-    if monitor is not None:
-        simulator.set_monitor(monitor)
-    is_paced = sensors.live or is_shown
-    if is_paced:
-        simulator.set_target_realtime_rate(1.0)
-    context = simulator.get_context()
-    begin = start = time.monotonic()
-
-    def elapsed() -> float:
-        return time.monotonic() - start if sensors.live else context.get_time()
-
-    end = math.inf if seconds is None else seconds
-    reached = SimulatorStatus.ReturnReason.kReachedTerminationCondition
-    try:
-        simulator.Initialize()
-        begin = start = time.monotonic()
-        while elapsed() < end and not until():
-            status = simulator.AdvanceTo(context.get_time() + sensors.period)
-            for report in sensors.take_reports():
-                on_report(report)
-            if status.reason() == reached:
-                break
-            lag = time.monotonic() - begin - context.get_time()
-            if is_paced and lag > _LARGEST_LAG:
-                # What was missed is gone: nobody wants to see it in fast motion.
-                simulator.ResetStatistics()
-                begin += lag
-    except KeyboardInterrupt:
-        return True
-    return False
-
-
 class FrameWatch:
-    """Notes each new moment of a diagram from build_live_capture or build_paper_capture.
+    """A monitor that notes each new moment of a diagram of build_live_capture or the paper's.
 
     Args:
         diagram: the diagram.
         cameras: the names of its cameras.
-        on_frame: hears of each frame.
+        on_frame: called with each frame.
         view: before a camera's name, the output with what the camera's picture says.
     """
 
@@ -120,31 +118,33 @@ class FrameWatch:
         on_frame: Callable[[LiveFrame], None],
         view: str = "silhouette",
     ) -> None:
-        self._time = diagram.GetOutputPort("time")
-        self._positions = diagram.GetOutputPort("estimated_positions")
-        self._share, self._others, self._deviations = (
-            diagram.GetOutputPort(name) if diagram.HasOutputPort(name) else None
-            for name in ("share", "others", "deviations")
-        )
+        self._diagram, self._on_frame = diagram, on_frame
         self._views = {name: diagram.GetOutputPort(f"{view}_{name}") for name in cameras}
-        self._on_frame = on_frame
         self._last = math.nan
         self._begin = time.perf_counter()
 
     def __call__(self, context: Context) -> None:
         """Looks whether there is a new moment."""
-        moment = float(self._time.Eval(context)[0])
+        moment = float(self._value(context, "time")[0])
         if math.isnan(moment) or moment == self._last:
             return
         self._last = moment
         views = {name: port.Eval(context) for name, port in self._views.items()}
         seen = {name: view for name, view in views.items() if view is not None}
-        q = np.array(self._positions.Eval(context))
-        share = math.nan if self._share is None else float(self._share.Eval(context)[0])
-        has_others = self._others is not None and bool(self._others.Eval(context)[0])
-        deviations = np.full(len(q), np.nan)
-        if self._deviations is not None:
-            deviations = np.array(self._deviations.Eval(context))
-        now = time.perf_counter()
-        self._on_frame(LiveFrame(moment, q, share, seen, has_others, deviations, now - self._begin))
+        q = self._value(context, "estimated_positions")
+        share = float(self._value(context, "share")[0])
+        has_others = bool(self._value(context, "others")[0] > 0.0)
+        deviations = self._value(context, "deviations", len(q))
+        seconds = time.perf_counter() - self._begin
+        self._on_frame(LiveFrame(moment, q, share, seen, has_others, deviations, seconds))
         self._begin = time.perf_counter()
+
+    def doubts(self) -> list[str]:
+        """What the user should know of the frames at the end."""
+        return []
+
+    def _value(self, context: Context, name: str, size: int = 1) -> Array:
+        """An output's value; nan where the diagram has no such output."""
+        if not self._diagram.HasOutputPort(name):
+            return np.full(size, np.nan)
+        return np.array(self._diagram.GetOutputPort(name).Eval(context))

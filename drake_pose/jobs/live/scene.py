@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Mapping
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,22 +20,23 @@ from drake_pose.camera.sources.files import (
     load_sources,
     open_source,
 )
-from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecification
-from drake_pose.errors import DrakePoseError, SceneError
+from drake_pose.camera.sources.frame_source import FrameSource, Picture, SourceSpecification
+from drake_pose.errors import OutputError, SceneError
 from drake_pose.silhouette.segmentation.background import Background, learn_background
 from drake_pose.systems.person.live_capture import LocalSensors
 from drake_pose.systems.pictures.picture_capture import PictureCapture
 
+# How long it is waited for a camera that is to show the empty room [s].
+_PATIENCE = 30.0
+# Between two looks at live cameras [s].
+_PAUSE = 0.005
+
 
 @dataclass(frozen=True, eq=False)
 class LiveScene:
-    """Calibrated cameras and where their pictures come from.
+    """Calibrated cameras, where their pictures come from, and how the empty room looks.
 
-    Args:
-        path: the folder.
-        cameras: by name.
-        specifications: of their sources.
-        backgrounds: of the cameras whose sources do not deliver masks.
+    A camera whose source delivers masks has no background.
     """
 
     path: Path
@@ -54,16 +57,20 @@ class LiveScene:
             SceneError: a source cannot be opened; what was opened is closed.
             SettingsError: the tolerance cannot be.
         """
-        opened: dict[str, FrameSource] = {}
-        try:
-            for name, one in self.specifications.items():
-                opened[name] = open_source(one)
-            capture = PictureCapture(opened, self.cameras, live=live, tolerance=tolerance)
-        except DrakePoseError:
-            for source in opened.values():
-                source.close()
-            raise
+        with ExitStack() as opened:
+            sources = _open(self.specifications, opened)
+            capture = PictureCapture(sources, self.cameras, live=live, tolerance=tolerance)
+            opened.pop_all()
         return LocalSensors(capture, self.cameras, self.backgrounds)
+
+
+def _open(
+    specifications: Mapping[str, SourceSpecification], opened: ExitStack
+) -> dict[str, FrameSource]:
+    return {
+        name: opened.enter_context(closing(open_source(one)))
+        for name, one in specifications.items()
+    }
 
 
 def hush_opencv() -> None:
@@ -98,3 +105,62 @@ def load_live_scene(path: Path) -> LiveScene:
         if not one.gives_masks
     }
     return LiveScene(path, cameras, specifications, backgrounds)
+
+
+def take_empty_room(folder: Path, count: int, patience: float = _PATIENCE) -> dict[str, Path]:
+    """Writes the first pictures of every camera that has a background folder into that folder.
+
+    Args:
+        folder: has cameras.yaml and sources.yaml.
+        count: how many pictures of each camera.
+        patience: how long it is waited for pictures [s].
+
+    Returns:
+        By camera, where they are.
+
+    Raises:
+        SceneError: a camera gives too few pictures, or none needs a background.
+        OutputError: a background folder holds something already, or cannot be written.
+    """
+    specifications = {
+        name: one for name, one in load_sources(folder).items() if one.background is not None
+    }
+    if not specifications:
+        raise SceneError(f"{folder}: all sources deliver masks, so none needs a background")
+    places = {name: Path(str(one.background)) for name, one in specifications.items()}
+    for name, place in places.items():
+        if place.exists() and (not place.is_dir() or any(place.iterdir())):
+            raise OutputError(
+                f"{place}: the background of camera '{name}' exists already; move it away first"
+            )
+    with ExitStack() as opened:
+        pictures = _take(_open(specifications, opened), count, patience)
+    for name, place in places.items():
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+            for k, picture in enumerate(pictures[name]):
+                _, data = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+                (place / f"{k:03d}.png").write_bytes(data.tobytes())
+        except OSError as error:
+            raise OutputError(f"{place}: cannot be written: {error.strerror}") from error
+    return places
+
+
+def _take(
+    sources: Mapping[str, FrameSource], count: int, patience: float
+) -> dict[str, list[Picture]]:
+    """This many pictures of each camera."""
+    pictures: dict[str, list[Picture]] = {name: [] for name in sources}
+    end = time.monotonic() + patience
+    while slow := [name for name, some in pictures.items() if len(some) < count]:
+        for name in slow:
+            if (taken := sources[name].read()) is not None:
+                pictures[name].append(taken.picture.astype("uint8"))
+            elif sources[name].ended or time.monotonic() > end:
+                reasons = "; ".join(sources[name].problems)
+                raise SceneError(
+                    f"camera '{name}' gave {len(pictures[name])} of {count} pictures"
+                    f"{': ' if reasons else ''}{reasons}"
+                )
+        time.sleep(_PAUSE)
+    return pictures

@@ -1,4 +1,4 @@
-"""A walk through a garden in the browser: what moves the avatar, the page, and the run."""
+"""A walk through a garden in the browser: what moves the avatar, and the run."""
 
 from __future__ import annotations
 
@@ -14,17 +14,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import Meshcat
-from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Diagram
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.errors import OutputError, SettingsError
+from drake_pose.jobs.estimate.capture import bundled_person
+from drake_pose.jobs.live.capture import shape_of_result
+from drake_pose.jobs.live.frame_results import camera_troubles
+from drake_pose.jobs.live.run import run_live
+from drake_pose.jobs.live.scene import LiveScene
 from drake_pose.person.date.skeleton import load_skeleton
 from drake_pose.person.date.walk_commands import WalkSettings
 from drake_pose.person.date.walking_motion import make_motion
+from drake_pose.person.shape import tracker_of_person
 from drake_pose.results.folder import POSES, read_summary
+from drake_pose.systems.person.live_capture import LiveSensors, add_person_tracker
 from drake_pose.systems.walk.walk import KEYS, build_walk
 
 Array = NDArray[np.float64]
@@ -37,9 +43,10 @@ REPLAY, _REPLAY_KEY = "play again", "Space"
 
 COMMANDS = ("turn left", "turn right", "walk ahead", "walk behind")
 
+SETTLE = 1.0
+"""Whoever comes before the cameras commands after standing still for this long [s]."""
+
 _SIMULATED_FRAMES = 1200
-# How often it is looked whether the walk has ended [s].
-_LOOK = 0.5
 # Between two looks at browser and button [s].
 _POLL_PAUSE = 0.05
 
@@ -137,8 +144,8 @@ def walk(
     meshcat: Meshcat,
     seconds: float | None = None,
     speed: float = 1.0,
-    on_command: Callable[[str], None] | None = None,
-    again: Callable[[], bool] | None = None,
+    on_command: Callable[[str], None] = lambda _: None,
+    again: Callable[[], bool] = lambda: False,
     settings: WalkSettings | None = None,
 ) -> dict[str, Any]:
     """Lets the avatar walk until its recording, the given time, or the user (Ctrl-C) ends it.
@@ -149,8 +156,7 @@ def walk(
         seconds: how long; the recording's length where not given, without end for keys alone.
         speed: seconds walked a second; 0: as fast as the machine can.
         on_command: called when the command changes, with its words, "" for none.
-        again: asked at the end whether to walk once more from the start; not at all where not
-            given.
+        again: asked at the end whether to walk once more from the start.
         settings: what is a command.
 
     Returns:
@@ -160,8 +166,7 @@ def walk(
     Raises:
         SettingsError: a time or a speed that cannot be.
     """
-    if seconds is not None and not (math.isfinite(seconds) and seconds > 0):
-        raise SettingsError(f"the walk's length must be a positive number, not {seconds} s")
+    _require_length(seconds)
     if not (math.isfinite(speed) and speed >= 0):
         raise SettingsError(f"the speed must be 0 or a positive number, not {speed}")
     period = 1.0 / player.rate_hz
@@ -174,49 +179,124 @@ def walk(
         seconds = min(seconds or times[-1], times[-1])
     stride = stride_positions(player.model)
     diagram = build_walk(player.model, meshcat, positions, stride, period, settings)
-    end = math.inf if seconds is None else seconds
     while True:
-        walked, reached = _walk_once(diagram, end, speed, CommandLog(on_command))
-        if not reached or again is None or not again():
-            return walked
+        log = _WalkLog(diagram, on_command)
+        interrupted = run_live(diagram, None, seconds, monitor=log.watch, speed=speed)
+        if interrupted or not again():
+            return log.as_json()
         # What was pressed before does not move the next walker.
         for name, key in KEYS.items():
             meshcat.AddButton(name, key)
 
 
-def _walk_once(
-    diagram: Diagram, end: float, speed: float, log: CommandLog
-) -> tuple[dict[str, Any], bool]:
-    """Walks up to a time [s] or Ctrl-C; what ``walk`` returns, and whether it came to the time."""
-    simulator = Simulator(diagram)
-    simulator.set_target_realtime_rate(speed)
-    command, pose = (diagram.GetOutputPort(name) for name in ("command", "walker_pose"))
-    simulator.set_monitor(lambda context: log.add(context.get_time(), command.Eval(context)))
-    context = simulator.get_context()
-    reached = True
+def walk_live(
+    scene: LiveScene,
+    meshcat: Meshcat,
+    model_path: Path | None = None,
+    shape: Path | None = None,
+    seconds: float | None = None,
+    open_sensors: Callable[[], LiveSensors] | None = None,
+    on_command: Callable[[str], None] = lambda _: None,
+    on_report: Callable[[str], None] = lambda _: None,
+    packages: Mapping[str, Path] | None = None,
+    settings: WalkSettings | None = None,
+) -> dict[str, Any]:
+    """Lets the avatar walk as the person before the cameras commands, until Ctrl-C.
+
+    Recorded sources are played as if they were live.
+
+    Args:
+        scene: the cameras and where their pictures come from.
+        meshcat: the page.
+        model_path: a person with landmarks.yaml beside it; the bundled one where not given.
+        shape: a result of capture with the same person, whose lengths and girths are taken; the
+            model's where not given.
+        seconds: how long; without end, or until the recordings end, where not given.
+        open_sensors: opens the sensors; those of the scene in this process where not given.
+        on_command: called when the command changes, with its words, "" for none.
+        on_report: called at once when cameras stop and return, with bad pictures, and when the
+            person is found or lost.
+        packages: folders of packages that the model's ``package://`` names mean, by name.
+        settings: what is a command.
+
+    Returns:
+        As walk; found_share of the periods in which the person was known; and warnings.
+
+    Raises:
+        SceneError, ModelError, SettingsError: what was given cannot be walked with.
+        OutputError: the shape's result is none.
+    """
+    _require_length(seconds)
+    model = load_model(model_path or bundled_person(), package_paths=packages)
+    known = None if shape is None else shape_of_result(shape)
+    tracker = tracker_of_person(model.pose_tree(), known)
+    opened: LiveSensors = scene.open_sensors(live=True) if open_sensors is None else open_sensors()
+    count = found = 0
+
+    def add(builder: DiagramBuilder) -> OutputPort:
+        seen, time = opened.add(builder)
+        system = add_person_tracker(builder, tracker, scene.cameras, seen, opened.period, time)
+        return system.GetOutputPort("estimated_positions")
+
     try:
-        simulator.Initialize()
-        while context.get_time() < end:
-            simulator.AdvanceTo(min(context.get_time() + _LOOK, end))
-    except KeyboardInterrupt:
-        reached = False
-    x, y, heading = pose.Eval(context)
-    walked = {
-        "seconds": context.get_time(),
-        "x": float(x),
-        "y": float(y),
-        "heading_deg": math.degrees(heading),
-        "commands": log.seconds,
-    }
-    return walked, reached
+        stride = stride_positions(model)
+        diagram = build_walk(model, meshcat, add, stride, opened.period, settings, SETTLE)
+        person, log = diagram.GetSubsystemByName("person_tracker"), _WalkLog(diagram, on_command)
+        positions, was_known = person.GetOutputPort("estimated_positions"), False
+
+        def watch(context: Context) -> None:
+            nonlocal count, found, was_known
+            log.watch(context)
+            is_known = math.isfinite(positions.Eval(person.GetMyContextFromRoot(context))[0])
+            if is_known != was_known:
+                on_report("the person is found" if is_known else "the person is lost")
+            count, found, was_known = count + 1, found + is_known, is_known
+
+        run_live(diagram, opened, seconds, on_report, monitor=watch, speed=1.0)
+        warnings = camera_troubles(opened.counts(), 0)
+    finally:
+        opened.close()
+    return {**log.as_json(), "found_share": found / max(count, 1), "warnings": warnings}
+
+
+def _require_length(seconds: float | None) -> None:
+    if seconds is not None and not 0.0 < seconds < math.inf:
+        raise SettingsError(f"the walk's length must be a positive number, not {seconds} s")
+
+
+class _WalkLog:
+    """Which commands of a diagram of build_walk were followed for how long, and where to."""
+
+    def __init__(self, diagram: Diagram, on_command: Callable[[str], None]) -> None:
+        self._command, self._pose = (
+            diagram.GetOutputPort(name) for name in ("command", "walker_pose")
+        )
+        self._seconds = dict.fromkeys(COMMANDS, 0.0)
+        self._on_command = on_command
+        self._words: tuple[str, ...] = ()
+        self._time, self._last = 0.0, self._pose.Eval(diagram.CreateDefaultContext())
+
+    def watch(self, context: Context) -> None:
+        """Notes the command that holds from a time on."""
+        elapsed, self._time = context.get_time() - self._time, context.get_time()
+        for word in self._words:
+            self._seconds[word] += elapsed
+        turn, ahead = self._command.Eval(context)
+        holds = (turn > 0, turn < 0, ahead > 0, ahead < 0)
+        words = tuple(word for word, now in zip(COMMANDS, holds, strict=True) if now)
+        if words != self._words:
+            self._on_command(" and ".join(words))
+        self._words, self._last = words, self._pose.Eval(context)
+
+    def as_json(self) -> dict[str, Any]:
+        """How long the walk was, where it ended, and what was commanded."""
+        x, y, heading = (float(value) for value in self._last)
+        place = {"x": x, "y": y, "heading_deg": math.degrees(heading)}
+        return {"seconds": self._time, **place, "commands": self._seconds}
 
 
 def show(page: Meshcat, patience: float = 10.0) -> bool:
-    """Opens a page in the user's browser, where there is one, and waits until it is there.
-
-    Args:
-        page: to be opened.
-        patience: how long it is waited for [s].
+    """Opens a page in the user's browser, and waits until it is there, for this long at most [s].
 
     Returns:
         Whether a browser shows it.
@@ -244,30 +324,6 @@ def wait_for_replay(page: Meshcat) -> bool:
     finally:
         page.DeleteButton(REPLAY)
     return True
-
-
-class CommandLog:
-    """Which commands were followed for how long."""
-
-    def __init__(self, on_command: Callable[[str], None] | None) -> None:
-        self.seconds: dict[str, float] = dict.fromkeys(COMMANDS, 0.0)
-        self._on_command = on_command
-        self._time = 0.0
-        self._words: tuple[str, ...] = ()
-
-    def add(self, time: float, command: Array) -> None:
-        """Takes the command (2,) that holds from a time on."""
-        for word in self._words:
-            self.seconds[word] += time - self._time
-        turn, walk = (int(value) for value in command)
-        words = []
-        if turn:
-            words.append(COMMANDS[0 if turn > 0 else 1])
-        if walk:
-            words.append(COMMANDS[2 if walk > 0 else 3])
-        if tuple(words) != self._words and self._on_command is not None:
-            self._on_command(" and ".join(words))
-        self._time, self._words = time, tuple(words)
 
 
 def summary_line(walked: Mapping[str, Any]) -> str:

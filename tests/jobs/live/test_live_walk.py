@@ -6,10 +6,10 @@ import pytest
 
 from drake_pose.commands.main import app
 from drake_pose.errors import SettingsError
-from drake_pose.jobs.live.live_walk import SETTLE, walk_live
 from drake_pose.jobs.live.local_proxy import open_page
 from drake_pose.jobs.live.run import run_live
 from drake_pose.jobs.live.scene import load_live_scene
+from drake_pose.jobs.live.walk import SETTLE, walk_live
 from drake_pose.person.date.walk_commands import WalkSettings
 from drake_pose.systems.walk.garden import START
 from tests.cli import CliRunner

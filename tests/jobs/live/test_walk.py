@@ -16,10 +16,10 @@ from drake_pose.body.model import load_model
 from drake_pose.commands.main import app
 from drake_pose.errors import OutputError, SettingsError
 from drake_pose.jobs.live.local_proxy import open_page
+from drake_pose.jobs.live.run import run_live
 from drake_pose.jobs.live.walk import (
     REPLAY,
     Player,
-    _walk_once,
     key_player,
     recorded_player,
     show,
@@ -177,14 +177,14 @@ def test_recording_waits_for_a_browser_and_is_played_again(tmp_path, monkeypatch
         presses.append(page)
         return len(presses) == 1
 
-    def walk_once(*arguments):
+    def run(*arguments, **others):
         begun.append(pages[0].GetNumActiveConnections())
-        return _walk_once(*arguments)
+        return run_live(*arguments, **others)
 
     opening = threading.Thread(target=open_later)
     monkeypatch.setattr("webbrowser.open", lambda url: urls.append(url) or opening.start())
     monkeypatch.setattr("drake_pose.jobs.live.walk.wait_for_replay", press)
-    monkeypatch.setattr("drake_pose.jobs.live.walk._walk_once", walk_once)
+    monkeypatch.setattr("drake_pose.jobs.live.walk.run_live", run)
     with browsers:
         done = CliRunner().invoke(app, ["walk", str(tmp_path), "--speed", "0", "--json"])
         opening.join()

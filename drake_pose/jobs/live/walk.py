@@ -231,7 +231,6 @@ def walk_live(
     known = None if shape is None else shape_of_result(shape)
     tracker = tracker_of_person(model.pose_tree(), known)
     opened: LiveSensors = scene.open_sensors(live=True) if open_sensors is None else open_sensors()
-    count = found = 0
 
     def add(builder: DiagramBuilder) -> OutputPort:
         seen, time = opened.add(builder)
@@ -241,22 +240,12 @@ def walk_live(
     try:
         stride = stride_positions(model)
         diagram = build_walk(model, meshcat, add, stride, opened.period, settings, SETTLE)
-        person, log = diagram.GetSubsystemByName("person_tracker"), _WalkLog(diagram, on_command)
-        positions, was_known = person.GetOutputPort("estimated_positions"), False
-
-        def watch(context: Context) -> None:
-            nonlocal count, found, was_known
-            log.watch(context)
-            is_known = math.isfinite(positions.Eval(person.GetMyContextFromRoot(context))[0])
-            if is_known != was_known:
-                on_report("the person is found" if is_known else "the person is lost")
-            count, found, was_known = count + 1, found + is_known, is_known
-
-        run_live(diagram, opened, seconds, on_report, monitor=watch, speed=1.0)
+        log = _PersonLog(diagram, on_command, on_report)
+        run_live(diagram, opened, seconds, on_report, monitor=log.watch, speed=1.0)
         warnings = camera_troubles(opened.counts(), 0)
     finally:
         opened.close()
-    return {**log.as_json(), "found_share": found / max(count, 1), "warnings": warnings}
+    return {**log.as_json(), "warnings": warnings}
 
 
 def _require_length(seconds: float | None) -> None:
@@ -293,6 +282,34 @@ class _WalkLog:
         x, y, heading = (float(value) for value in self._last)
         place = {"x": x, "y": y, "heading_deg": math.degrees(heading)}
         return {"seconds": self._time, **place, "commands": self._seconds}
+
+
+class _PersonLog(_WalkLog):
+    """Also notes whether the person before the cameras is known."""
+
+    def __init__(
+        self,
+        diagram: Diagram,
+        on_command: Callable[[str], None],
+        on_report: Callable[[str], None],
+    ) -> None:
+        super().__init__(diagram, on_command)
+        self._person = diagram.GetSubsystemByName("person_tracker")
+        self._on_report = on_report
+        self._count, self._found, self._is_known = 0, 0, False
+
+    def watch(self, context: Context) -> None:
+        """Notes a period."""
+        super().watch(context)
+        positions = self._person.GetOutputPort("estimated_positions")
+        is_known = math.isfinite(positions.Eval(self._person.GetMyContextFromRoot(context))[0])
+        if is_known != self._is_known:
+            self._on_report("the person is found" if is_known else "the person is lost")
+        self._count, self._found, self._is_known = self._count + 1, self._found + is_known, is_known
+
+    def as_json(self) -> dict[str, Any]:
+        """Also the share of the periods in which the person was known."""
+        return {**super().as_json(), "found_share": self._found / max(self._count, 1)}
 
 
 def show(page: Meshcat, patience: float = 10.0) -> bool:

@@ -94,7 +94,7 @@ def capture_live(
     sensors = opener()
     try:
         writer = LiveWriter(
-            scene, tracker, out, sensors.period, settings.packages, on_report, on_frame
+            scene, model, tracker, out, sensors.period, settings.packages, on_report, on_frame
         )
         if shape is not None:
             writer.writer.more |= {"lengths_m": shape.lengths, "girths": shape.girths}

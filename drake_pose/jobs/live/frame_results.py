@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from drake_pose.body.model import ArticulatedModel
 from drake_pose.camera.sources.recorded import TIME_STAMPS
 from drake_pose.jobs.estimate.inputs import Inputs
 from drake_pose.jobs.estimate.person import FOLLOWED
@@ -52,6 +53,7 @@ class LiveWriter:
 
     Args:
         scene: the cameras and where their pictures come from.
+        model: the person.
         tracker: made for the person's pose tree; gives its surfaces.
         out: the result's folder, empty or not there.
         period: time between two frames [s].
@@ -66,6 +68,7 @@ class LiveWriter:
     def __init__(
         self,
         scene: LiveScene,
+        model: ArticulatedModel,
         tracker: PersonPoseTracker,
         out: Path,
         period: float,
@@ -74,7 +77,7 @@ class LiveWriter:
         on_frame: Callable[[int, bool], None],
     ) -> None:
         self._scene, self._tracker, self._period = scene, tracker, period
-        self._model = model = tracker.fit.tree.model
+        self._model = model
         self._on_report, self._on_frame = on_report, on_frame
         self._times: dict[str, float] = {}
         self._seen: dict[tuple[str, str], Path] = {}

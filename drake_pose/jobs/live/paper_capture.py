@@ -86,7 +86,7 @@ def capture_paper(
     try:
         tracker = tracker_of_person(model.pose_tree(), None)
         writer = LiveWriter(
-            scene, tracker, out, sensors.period, settings.packages, on_report, on_frame
+            scene, model, tracker, out, sensors.period, settings.packages, on_report, on_frame
         )
         diagram = build_paper_capture(setup, sensors.capture, sensors.period).diagram
         watch = _PaperWatch(diagram, setup.cameras, writer)

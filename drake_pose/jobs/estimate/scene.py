@@ -164,7 +164,7 @@ class _Matching:
             # The frame is matched at index periods; half a period later the answer surely stands.
             simulator.AdvanceTo((index + 0.5) * period)
             if frame not in self._result.records:
-                self._finish_frame(frame, matching.matcher.last_result)
+                self._finish_frame(frame, matching.estimate(simulator.get_context()))
                 finished += 1
                 if on_frame is not None:
                     on_frame(finished, total, frame, self._result.records[frame])

@@ -20,7 +20,7 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
-from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, OutputPort
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, LeafSystem, OutputPort
 from pydrake.systems.primitives import LogVectorOutput, TrajectorySource, VectorLogSink
 from pydrake.systems.sensors import RgbdSensor
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
@@ -30,13 +30,16 @@ from drake_pose.body.tree.tree_builder import build_pose_tree
 from drake_pose.camera.drake import camera_to_drake
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.filtering.tracking.contour_tracker import TrackingSettings
+from drake_pose.registration.online_registration import OnlineRegistration
+from drake_pose.search.estimates import PoseEstimate
 from drake_pose.search.scoring import PoseSearch
 from drake_pose.silhouette.pictures.scenes import Scene
 from drake_pose.systems.bodies.posed_geometry import pose_plant
 from drake_pose.systems.bodies.skin import add_meshcat_skin, add_skin
+from drake_pose.systems.estimators.camera_registration import CameraRegistration
 from drake_pose.systems.estimators.mask_player import MaskPlayer
-from drake_pose.systems.estimators.silhouette_matcher import SilhouetteMatcher, label_image_port
-from drake_pose.systems.estimators.silhouette_tracker import SilhouetteTracker, color_image_port
+from drake_pose.systems.estimators.silhouette_matcher import SilhouetteMatcher, camera_port
+from drake_pose.systems.estimators.silhouette_tracker import SilhouetteTracker
 
 ESTIMATE_COLOUR = Rgba(0.0, 0.45, 0.70, 0.6)
 _RENDERER = "label_renderer"
@@ -59,6 +62,12 @@ class MatchingDiagram:
     positions_log: VectorLogSink
     error_log: VectorLogSink
     player: MaskPlayer | None = None
+
+    def estimate(self, context: Context) -> PoseEstimate | None:
+        """The last update's estimate; None: nothing was seen. context: the diagram's."""
+        own = self.matcher.GetMyContextFromRoot(context)
+        estimate: PoseEstimate | None = self.matcher.GetOutputPort("pose_estimate").Eval(own)
+        return estimate
 
 
 def build_recorded_matching(
@@ -96,10 +105,10 @@ def build_recorded_matching(
         "silhouette_matcher",
         _make_matcher(search, cameras, player.period, tracking, player.color_cameras),
     )
-    ports = [label_image_port(camera, cameras) for camera in cameras]
+    ports = [camera_port("label_image", camera, cameras) for camera in cameras]
     if tracking is not None:
         seen = [camera for camera in cameras if camera.name in player.color_cameras]
-        ports += [color_image_port(camera, cameras) for camera in seen]
+        ports += [camera_port("color_image", camera, cameras) for camera in seen]
         ports += ["measured_positions"] if starts else []
     for port in ports:
         builder.Connect(player.GetOutputPort(port), matcher.GetInputPort(port))
@@ -154,7 +163,7 @@ def build_simulated_matching(
     )
     truth, images = add_simulated_cameras(builder, scene_graph, model, cameras, true_positions)
     for camera, image in zip(cameras, images, strict=True):
-        builder.Connect(image, matcher.GetInputPort(label_image_port(camera, cameras)))
+        builder.Connect(image, matcher.GetInputPort(camera_port("label_image", camera, cameras)))
     if meshcat is not None:
         add_posed_body(builder, scene_graph, model, matcher, "estimated", ESTIMATE_COLOUR)
         MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
@@ -295,3 +304,55 @@ def _finish(
     )
     error_log = LogVectorOutput(matcher.GetOutputPort("error"), builder, publish_period=period)
     return MatchingDiagram(builder.Build(), matcher, positions_log, error_log, player)
+
+
+@dataclass(frozen=True)
+class RegistrationDiagram:
+    """A diagram that registers a simulated camera, and the parts of it that one asks afterwards.
+
+    Args:
+        diagram: the whole diagram.
+        registration: the system in it that finds the camera.
+        sensor: the simulated camera; ``sensor.SetX_PB(context, X_WC)`` moves it.
+        status_log: logs ``status`` once a period.
+    """
+
+    diagram: Diagram
+    registration: CameraRegistration
+    sensor: RgbdSensor
+    status_log: VectorLogSink
+
+
+def build_simulated_registration(
+    registration: OnlineRegistration,
+    camera: PinholeCamera,
+    true_positions: Trajectory | np.ndarray,
+    period: float,
+    meshcat: Meshcat | None = None,
+) -> RegistrationDiagram:
+    """Wire a simulated body and camera to the registration, which is not told the camera's pose.
+
+    Args:
+        registration: the body, the camera's intrinsics, and settings.
+        camera: where the sensor is.
+        true_positions: the body's positions (nq,), constant or over time; they are measured without
+            an error.
+        period: time between two images, and two updates [s].
+        meshcat: where to show the body; nowhere where not given.
+
+    Returns:
+        The diagram.
+    """
+    builder = DiagramBuilder()
+    scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
+    system = builder.AddNamedSystem("camera_registration", CameraRegistration(registration, period))
+    model = registration.body.tree.model
+    truth, images = add_simulated_cameras(builder, scene_graph, model, [camera], true_positions)
+    builder.Connect(images[0], system.GetInputPort("label_image"))
+    builder.Connect(truth, system.GetInputPort("measured_positions"))
+    if meshcat is not None:
+        MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
+    status_log = LogVectorOutput(system.GetOutputPort("status"), builder, publish_period=period)
+    diagram = builder.Build()
+    sensor = diagram.GetSubsystemByName(f"camera_{camera.name}")
+    return RegistrationDiagram(diagram, system, sensor, status_log)

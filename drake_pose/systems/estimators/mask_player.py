@@ -12,8 +12,7 @@ from drake_pose.camera.models import Camera
 from drake_pose.silhouette.pictures.label_images import mask_to_label_image
 from drake_pose.silhouette.pictures.scenes import Scene
 from drake_pose.systems.colour_images import picture_to_colour_image
-from drake_pose.systems.estimators.silhouette_matcher import label_image_port
-from drake_pose.systems.estimators.silhouette_tracker import color_image_port
+from drake_pose.systems.estimators.silhouette_matcher import camera_port
 
 DEFAULT_FRAME_RATE_HZ = 1.0
 """Where a scene says nothing, as stills do."""
@@ -64,7 +63,7 @@ class MaskPlayer(LeafSystem):
         for camera in cameras:
             image = ImageLabel16I(camera.width, camera.height)
             self.DeclareAbstractOutputPort(
-                label_image_port(camera, cameras),
+                camera_port("label_image", camera, cameras),
                 lambda image=image: AbstractValue.Make(image),
                 self._calc_label_image(camera),
                 {self.time_ticket()},
@@ -77,7 +76,7 @@ class MaskPlayer(LeafSystem):
         for camera in cameras:
             if camera.name in self.color_cameras:
                 self.DeclareAbstractOutputPort(
-                    color_image_port(camera, cameras),
+                    camera_port("color_image", camera, cameras),
                     lambda: AbstractValue.Make(ImageRgba8U()),
                     self._calc_color_image(camera),
                     {self.time_ticket()},

@@ -1,18 +1,16 @@
 """The matcher as a Drake system: label images in, estimated positions out."""
 
+from __future__ import annotations
+
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DiscreteStateIndex,
-    DiscreteValues,
-    EventStatus,
-    LeafSystem,
-)
+from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
 from pydrake.systems.sensors import ImageLabel16I
 
 from drake_pose.camera.models import Camera
@@ -20,14 +18,34 @@ from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import PoseEstimate, View
 from drake_pose.search.scoring import PoseSearch
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
+from drake_pose.systems.shared_value import SharedValue
+
+Array = NDArray[np.float64]
 
 STATISTICS = ("found", "J", "E_total", "first_E_total", "runs", "outside_limit", "seconds")
 """What the elements of the output ``statistics`` are."""
 
 
-def label_image_port(camera: Camera, cameras: Sequence[Camera]) -> str:
-    """Name of the port that carries a camera's label image, where there are ``cameras``."""
-    return "label_image" if len(cameras) == 1 else f"label_image_{camera.name}"
+def camera_port(kind: str, camera: Camera, cameras: Sequence[Camera]) -> str:
+    """Name of the port that carries a camera's image of a kind, where there are ``cameras``."""
+    return kind if len(cameras) == 1 else f"{kind}_{camera.name}"
+
+
+@dataclass(frozen=True, eq=False)
+class Matched(SharedValue):
+    """What is known after an update.
+
+    Args:
+        q: (nq,) the last pose that was found.
+        X_WB: (4, 4) its base.
+        estimate: this update's; None: there was nothing to see.
+        memory: what a tracker hands to its next update.
+    """
+
+    q: Array
+    X_WB: Array
+    estimate: PoseEstimate | None
+    memory: Any
 
 
 class SilhouetteMatcher(LeafSystem):
@@ -50,6 +68,7 @@ class SilhouetteMatcher(LeafSystem):
         - lower
         - upper
         - family_positions
+        - pose_estimate
 
     With several cameras the input ports are ``label_image_<camera>``; an unconnected one, or an
     image without any pixel of the body, is left out of the match. All pixels with a label other
@@ -58,7 +77,8 @@ class SilhouetteMatcher(LeafSystem):
     The match is made in a periodic update. Until the first one, and where no pose is found, the
     estimated positions are the last ones (at first the model's default), and the error is infinite.
     ``body_poses`` are the poses of all bodies in the scene's world, in the plant's order, as a
-    plant's output of that name gives them: a SilhouetteCamera draws what is estimated.
+    plant's output of that name gives them. ``pose_estimate`` is the whole ``PoseEstimate`` of the
+    last update, None where no camera saw the body.
 
     What the answer is worth: ``proved_optimal`` is 1 where it is proved that no pose of the grid
     that was searched fits better. ``determined`` is 1 for each position that the silhouettes
@@ -96,156 +116,134 @@ class SilhouetteMatcher(LeafSystem):
             raise SettingsError(f"the matcher's period must be positive, not {period}")
         if family_limit < 1:
             raise SettingsError(f"the family limit must be 1 or more, not {family_limit}")
-        self._search = search
-        self._cameras = tuple(cameras)
+        self._search, self._cameras, self._family_limit = search, tuple(cameras), family_limit
         self._labels = None if labels is None else frozenset(labels)
-        model = search.tree.model
-        position_count = model.plant.num_positions()
         for camera in cameras:
-            image = ImageLabel16I(camera.width, camera.height)
-            self.DeclareAbstractInputPort(
-                label_image_port(camera, cameras), AbstractValue.Make(image)
-            )
+            image = AbstractValue.Make(ImageLabel16I(camera.width, camera.height))
+            self.DeclareAbstractInputPort(camera_port("label_image", camera, cameras), image)
         self._root_position = self.DeclareVectorInputPort("root_position", 3)
-        no_match = np.zeros(len(STATISTICS))
-        no_match[[1, 2, 3]] = np.inf
-        self._positions = self.DeclareDiscreteState(model.default_positions)
-        self._base_pose = self.DeclareDiscreteState(np.eye(4)[:3].ravel())
-        self._statistics = self.DeclareDiscreteState(no_match)
-        self._declare_estimates(position_count)
-        self._worth = [
-            self._declare_nan_output(name, size)
-            for name, size in (
+        first = Matched(search.tree.model.default_positions, np.eye(4), None, self._first_memory())
+        self._state = self.DeclareAbstractState(AbstractValue.Make(first))
+        self._declare_outputs(search.tree.model.plant.num_positions())
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period, offset, self._match)
+        self.DeclareForcedUnrestrictedUpdateEvent(self._match)
+
+    def _declare_outputs(self, position_count: int) -> None:
+        ticket = self._ticket = {self.abstract_state_ticket(self._state)}
+        for name, size, calc in (
+            ("estimated_positions", position_count, self._calc_positions),
+            ("error", 1, self._calc_error),
+            ("statistics", len(STATISTICS), self._calc_statistics),
+        ):
+            self.DeclareVectorOutputPort(name, size, calc, ticket)
+        for name, initial, calc_value in (
+            ("base_pose", RigidTransform(), self._calc_base_pose),
+            ("body_poses", [RigidTransform()], self._calc_body_poses),
+            ("pose_estimate", None, self._calc_estimate),
+        ):
+            value = AbstractValue.Make(initial)
+            self.DeclareAbstractOutputPort(name, value.Clone, calc_value, ticket)
+        for row, (name, count) in enumerate(
+            (
                 ("proved_optimal", 1),
                 ("determined", position_count),
                 ("lower", position_count),
                 ("upper", position_count),
-                ("family_positions", family_limit * position_count),
+                ("family_positions", self._family_limit * position_count),
             )
-        ]
-        self.DeclarePeriodicDiscreteUpdateEvent(period, offset, self._match)
-        self.last_result: PoseEstimate | None = None
+        ):
 
-    def _declare_estimates(self, position_count: int) -> None:
-        """The outputs of what is estimated, which only read the state."""
-        states = {self.discrete_state_ticket(self._positions)}
-        self.DeclareVectorOutputPort(
-            "estimated_positions", position_count, self._calc_positions, states
-        )
-        statistics_ticket = {self.discrete_state_ticket(self._statistics)}
-        self.DeclareVectorOutputPort("error", 1, self._calc_error, statistics_ticket)
-        self.DeclareAbstractOutputPort(
-            "base_pose",
-            lambda: AbstractValue.Make(RigidTransform()),
-            self._calc_base_pose,
-            {self.discrete_state_ticket(self._base_pose)},
-        )
-        self.DeclareAbstractOutputPort(
-            "body_poses",
-            lambda: AbstractValue.Make([RigidTransform()]),
-            self._calc_body_poses,
-            {*states, self.discrete_state_ticket(self._base_pose)},
-        )
-        self.DeclareVectorOutputPort(
-            "statistics", len(STATISTICS), self._calc_statistics, statistics_ticket
-        )
+            def calc_worth(context: Context, output: BasicVector, row: int = row) -> None:
+                worth = self._worth(self._matched(context).estimate)
+                output.SetFromVector(
+                    np.full(output.size(), np.nan) if worth is None else worth[row]
+                )
 
-    def _declare_nan_output(self, name: str, size: int) -> DiscreteStateIndex:
-        """A state, NaN at first, and the output that gives it out."""
-        state = self.DeclareDiscreteState(np.full(size, np.nan))
+            self.DeclareVectorOutputPort(name, count, calc_worth, ticket)
 
-        def calculate(context: Context, output: BasicVector) -> None:
-            output.SetFromVector(context.get_discrete_state(state).value())
-
-        self.DeclareVectorOutputPort(name, size, calculate, {self.discrete_state_ticket(state)})
-        return state
+    def _matched(self, context: Context) -> Matched:
+        matched: Matched = context.get_abstract_state(int(self._state)).get_value()
+        return matched
 
     def _views(self, context: Context) -> list[View]:
         views = []
         for index, camera in enumerate(self._cameras):
             port = self.get_input_port(index)
-            if not port.HasValue(context):
-                continue
-            mask = label_image_to_mask(port.Eval(context), self._labels)
-            if mask.any():
-                views.append(View(camera, mask))
+            if port.HasValue(context):
+                mask = label_image_to_mask(port.Eval(context), self._labels)
+                if mask.any():
+                    views.append(View(camera, mask))
         return views
 
-    def _match(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        views = self._views(context)
-        statistics = np.zeros(len(STATISTICS))
-        statistics[[1, 2, 3]] = np.inf
-        self.last_result = None
-        for state in self._worth:
-            discrete_state.set_value(state, np.full(discrete_state.value(state).size, np.nan))
+    def _match(self, context: Context, state: State) -> EventStatus:
+        last, views = self._matched(context), self._views(context)
+        q, X_WB, estimate, memory = last.q, last.X_WB, None, last.memory
         if self._is_seen(context, views):
             root_position = None
             if self._root_position.HasValue(context):
                 root_position = self._root_position.Eval(context)
-            result = self._find(context, discrete_state, views, root_position)
-            self.last_result = result
-            search = result.statistics
-            statistics[4:] = search.runs, max(search.outside_limit, default=0.0), result.seconds
-            if result.found:
-                statistics[:4] = 1.0, result.J, result.E_total, result.first_E_total
-                discrete_state.set_value(self._positions, result.q)
-                discrete_state.set_value(self._base_pose, result.X_WB[:3].ravel())
-                self._set_worth(result, discrete_state)
-        discrete_state.set_value(self._statistics, statistics)
+            estimate, memory = self._find(context, memory, views, root_position)
+            if estimate.found:
+                q, X_WB = estimate.q, estimate.X_WB
+        known = Matched(q, X_WB, estimate, memory)
+        state.get_mutable_abstract_state(int(self._state)).set_value(known)
         return EventStatus.Succeeded()
+
+    def _first_memory(self) -> Any:
+        """What the first update gets as its memory."""
+        return None
 
     def _is_seen(self, context: Context, views: Sequence[View]) -> bool:
         """Whether there is anything to find a pose in."""
         return bool(views)
 
     def _find(
-        self,
-        context: Context,
-        discrete_state: DiscreteValues,
-        views: Sequence[View],
-        root_position: np.ndarray | None,
-    ) -> PoseEstimate:
-        """The pose that the views show."""
-        return self._search.match(views, root_position)
+        self, context: Context, memory: Any, views: Sequence[View], root_position: Array | None
+    ) -> tuple[PoseEstimate, Any]:
+        """The pose that the views show, and what the next update gets as its memory."""
+        return self._search.match(views, root_position), None
 
-    def _set_worth(self, result: PoseEstimate, discrete_state: DiscreteValues) -> None:
-        """Put what the answer is worth into the state."""
-        proved, determined, lower, upper, families = self._worth
-        answer = result.pose_set
-        if answer is None:
-            return
+    def _worth(self, estimate: PoseEstimate | None) -> Sequence[Array] | None:
+        """What an answer is worth, in the order of the ports; None: it is not said."""
+        if estimate is None or not estimate.found or estimate.pose_set is None:
+            return None
         names = self._search.tree.model.position_names
-        positions = np.full((discrete_state.value(families).size // len(names), len(names)), np.nan)
-        found = [family.q for family in answer.families[: len(positions)]]
-        positions[: len(found)] = found
-        discrete_state.set_value(proved, np.array([float(result.proved_optimal)]))
-        intervals = answer.position_intervals(names)
-        for state, values in zip((determined, lower, upper), intervals, strict=True):
-            discrete_state.set_value(state, values)
-        discrete_state.set_value(families, positions.ravel())
+        families = np.full((self._family_limit, len(names)), np.nan)
+        found = [family.q for family in estimate.pose_set.families[: self._family_limit]]
+        families[: len(found)] = found
+        proved = np.array([float(estimate.proved_optimal)])
+        return proved, *estimate.pose_set.position_intervals(names), families.ravel()
 
     def _calc_positions(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state(self._positions).value())
+        output.SetFromVector(self._matched(context).q)
+
+    def _statistics(self, context: Context) -> Array:
+        values, estimate = np.zeros(len(STATISTICS)), self._matched(context).estimate
+        values[1:4] = np.inf
+        if estimate is not None:
+            search = estimate.statistics
+            values[4:] = search.runs, max(search.outside_limit, default=0.0), estimate.seconds
+            if estimate.found:
+                values[:4] = 1.0, estimate.J, estimate.E_total, estimate.first_E_total
+        return values
 
     def _calc_error(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state(self._statistics).value()[2:3])
+        output.SetFromVector(self._statistics(context)[2:3])
 
     def _calc_statistics(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state(self._statistics).value())
-
-    def _X_WB(self, context: Context) -> RigidTransform:
-        """The pose in the scene's world of the frame that the plant takes for its world."""
-        X_WB = np.eye(4)
-        X_WB[:3] = context.get_discrete_state(self._base_pose).value().reshape(3, 4)
-        return RigidTransform(X_WB)
+        output.SetFromVector(self._statistics(context))
 
     def _calc_base_pose(self, context: Context, output: AbstractValue) -> None:
-        output.set_value(self._X_WB(context))
+        output.set_value(RigidTransform(self._matched(context).X_WB))
 
     def _calc_body_poses(self, context: Context, output: AbstractValue) -> None:
-        plant = self._search.tree.model.plant
+        plant, matched = self._search.tree.model.plant, self._matched(context)
         plant_context = plant.CreateDefaultContext()
-        plant.SetPositions(plant_context, context.get_discrete_state(self._positions).value())
-        X_WB = self._X_WB(context)
+        plant.SetPositions(plant_context, matched.q)
+        # The pose in the scene's world of the frame that the plant takes for its world.
+        X_WB = RigidTransform(matched.X_WB)
         poses = plant.get_body_poses_output_port().Eval(plant_context)
         output.set_value([X_WB @ pose for pose in poses])
+
+    def _calc_estimate(self, context: Context, output: AbstractValue) -> None:
+        output.set_value(self._matched(context).estimate)

@@ -1,22 +1,23 @@
 """A body that moves, from silhouettes: the matcher and the truncated filter as one Drake system."""
 
 from collections.abc import Collection, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, InputPort
+from pydrake.systems.framework import BasicVector, Context
 from pydrake.systems.sensors import ImageRgba8U
 
 from drake_pose.camera.models import Camera
 from drake_pose.errors import UnknownNameError
-from drake_pose.filtering.tracking.contour_tracker import Track, TrackingSettings
+from drake_pose.filtering.tracking.contour_tracker import TrackingSettings
 from drake_pose.filtering.tracking.match_and_track import Followed, MatchAndTrack
 from drake_pose.fit.colours import Picture
 from drake_pose.search.estimates import TRACKED, PoseEstimate, View
 from drake_pose.search.scoring import PoseSearch
-from drake_pose.systems.estimators.filter_packing import FilterPacking, require_time_forward
-from drake_pose.systems.estimators.silhouette_matcher import SilhouetteMatcher
+from drake_pose.systems.estimators.silhouette_matcher import SilhouetteMatcher, camera_port
+from drake_pose.systems.shared_value import require_time_forward
 
 Array = NDArray[np.float64]
 
@@ -24,9 +25,12 @@ TRACK = ("tracked", "matches", "distance")
 """What the elements of the output ``track`` are."""
 
 
-def color_image_port(camera: Camera, cameras: Sequence[Camera]) -> str:
-    """Name of the port that carries a camera's colour image, where there are ``cameras``."""
-    return "color_image" if len(cameras) == 1 else f"color_image_{camera.name}"
+class _Memory(NamedTuple):
+    """What the next update begins with: what is followed, TRACK, and the last update's time [s]."""
+
+    followed: Followed
+    track: tuple[float, float, float]
+    time: float
 
 
 class SilhouetteTracker(SilhouetteMatcher):
@@ -51,6 +55,7 @@ class SilhouetteTracker(SilhouetteMatcher):
         - lower
         - upper
         - family_positions
+        - pose_estimate
         - position_deviations
         - estimated_state
         - track
@@ -73,7 +78,8 @@ class SilhouetteTracker(SilhouetteMatcher):
       search found it; ``matches`` counts how often the search was asked; ``distance`` is between
       the body's contour and the masks' edge (root mean square, robust) [pixel].
 
-    The belief is state of the context, so that a simulation can be reset, copied and replayed.
+    All that is known is state of the context, so that a simulation can be reset, copied and
+    replayed.
 
     Args:
         search: asked in the first frame and when the track is lost.
@@ -101,81 +107,37 @@ class SilhouetteTracker(SilhouetteMatcher):
     ) -> None:
         super().__init__(search, cameras, period, offset, labels)
         self._follower = MatchAndTrack(search, cameras, period, tracking)
-        belief_filter = self._follower.tracker.filter
-        self._packing = FilterPacking(belief_filter, 0)
-        names = search.tree.model.position_names
-        layout = belief_filter.layout
-        # Which position each element of the state that is one stands for.
-        seen = [name for name in (*layout.moving, *layout.constant) if name in names]
-        self._elements = layout.indices(seen)
-        self._rates = layout.indices([f"rate_{name}" for name in layout.moving if name in names])
-        self._moving = np.array(
-            [names.index(name) for name in layout.moving if name in names], dtype=np.intp
-        )
-        self._still = np.array(
-            [names.index(name) for name in layout.constant if name in names], dtype=np.intp
-        )
-        self._period = period
-        self._tracked_positions = np.array([names.index(name) for name in seen], dtype=np.intp)
-        width = self._packing.cap * self._packing.belief_width
-        self._belief = self.DeclareDiscreteState(np.zeros(width))
-        self._measured = self.DeclareVectorInputPort("measured_positions", len(names))
-        self._color_ports = self._declare_color_ports(cameras, color_cameras)
-        # What is known of the body's colours: state, so that a simulation can be replayed.
-        known = self._follower.tracker.observation.no_colours() if color_cameras else np.zeros(0)
-        self._colours_shape = known.shape
-        self._colours = self.DeclareDiscreteState(known.ravel().astype(np.float64))
-        # Whether there is a track; the reference; TRACK; the last time.
-        self._record = self.DeclareDiscreteState(np.r_[np.zeros(2 + len(TRACK)), -np.inf])
-        self.DeclareVectorOutputPort(
-            "position_deviations",
-            len(names),
-            self._calc_deviations,
-            {self.discrete_state_ticket(self._belief), self.discrete_state_ticket(self._record)},
-        )
-        self.DeclareVectorOutputPort(
-            "estimated_state",
-            search.tree.model.plant.num_multibody_states(),
-            self._calc_state,
-            {
-                self.discrete_state_ticket(index)
-                for index in (self._positions, self._belief, self._record)
-            },
-        )
-        self.DeclareVectorOutputPort(
-            "track", len(TRACK), self._calc_track, {self.discrete_state_ticket(self._record)}
-        )
+        model, layout = search.tree.model, self._follower.tracker.filter.layout
+        names = model.position_names
 
-    def _declare_color_ports(
-        self, cameras: Sequence[Camera], wanted: Collection[str]
-    ) -> dict[str, InputPort]:
-        """The ports of colour images by camera."""
+        def own(some: Sequence[str]) -> list[str]:
+            return [name for name in some if name in names]
+
+        # Which position each element of the state that is one stands for.
+        self._layout, self._period = layout, period
+        self._moving, self._still = own(layout.moving), own(layout.constant)
+        self._measured = self.DeclareVectorInputPort("measured_positions", len(names))
         known = {camera.name: camera for camera in cameras}
-        for name in wanted:
+        for name in color_cameras:
             if name not in known:
                 raise UnknownNameError("camera", name, known, "color_cameras")
-        return {
+        self._color_ports = {
             camera.name: self.DeclareAbstractInputPort(
-                color_image_port(camera, cameras),
+                camera_port("color_image", camera, cameras),
                 AbstractValue.Make(ImageRgba8U(camera.width, camera.height)),
             )
             for camera in cameras
-            if camera.name in wanted
+            if camera.name in color_cameras
         }
+        for port, size, calc in (
+            ("position_deviations", len(names), self._calc_deviations),
+            ("estimated_state", model.plant.num_multibody_states(), self._calc_state),
+            ("track", len(TRACK), self._calc_track),
+        ):
+            self.DeclareVectorOutputPort(port, size, calc, self._ticket)
 
-    def followed(self, context: Context) -> Followed:
-        """What is known in a context."""
-        has_track, reference, _, matches = context.get_discrete_state(self._record).value()[:4]
-        if not has_track:
-            return Followed(None, float(reference), int(matches))
-        belief = np.array(context.get_discrete_state(self._belief).value())
-        state = self._packing.unpack(belief, np.zeros(0), np.zeros(1), 0, 0.0, 0)
-        colours = None
-        if self._color_ports:
-            values = context.get_discrete_state(self._colours).value()
-            if np.any(values):
-                colours = values.astype(np.float32).reshape(self._colours_shape)
-        return Followed(Track(state, None, False, colours), float(reference), int(matches))
+    def _first_memory(self) -> _Memory:
+        return _Memory(Followed(), (0.0, 0.0, 0.0), -np.inf)
 
     def _pictures(self, context: Context) -> dict[str, Picture]:
         """The colour images that are there, by camera."""
@@ -187,66 +149,50 @@ class SilhouetteTracker(SilhouetteMatcher):
         # A camera that has nothing to show gives an image of no pixels.
         return {name: np.array(image.data) for name, image in images.items() if image.size()}
 
-    def _start(self, context: Context) -> Array | None:
-        """Where the body is measured to be; None where it is not."""
-        if not self._measured.HasValue(context):
-            return None
-        q = np.array(self._measured.Eval(context))
-        return q if np.all(np.isfinite(q)) else None
-
     def _is_seen(self, context: Context, views: Sequence[View]) -> bool:
         return bool(views) or bool(self._pictures(context))
 
     def _find(
-        self,
-        context: Context,
-        discrete_state: DiscreteValues,
-        views: Sequence[View],
-        root_position: Array | None,
-    ) -> PoseEstimate:
-        last_time = context.get_discrete_state(self._record).value()[-1]
-        require_time_forward(self, context, last_time)
+        self, context: Context, memory: _Memory, views: Sequence[View], root_position: Array | None
+    ) -> tuple[PoseEstimate, _Memory]:
+        require_time_forward(self, context, memory.time)
+        start = None
+        if self._measured.HasValue(context):
+            q = np.array(self._measured.Eval(context))
+            start = q if np.all(np.isfinite(q)) else None
+        last = memory.followed
         now, result = self._follower.next(
-            self.followed(context), views, root_position, self._pictures(context),
-            self._start(context),
-        )  # fmt: skip
-        distance = np.nan
-        if now.track is not None:
-            discrete_state.set_value(self._belief, self._packing.pack(now.track.state)[0])
-            if now.track.colours is not None:
-                discrete_state.set_value(self._colours, now.track.colours.ravel())
-            if now.track.measurement is not None:
-                distance = now.track.measurement.distance
-        tracked = float(
-            result.found and result.stopped_by == TRACKED and now.matches == self._matches(context)
+            last, views, root_position, self._pictures(context), start
         )
-        record = [float(now.track is not None), now.reference, tracked, now.matches, distance]
-        record.append(context.get_time())
-        discrete_state.set_value(self._record, np.array(record))
-        return result
-
-    def _matches(self, context: Context) -> int:
-        return int(context.get_discrete_state(self._record).value()[3])
+        is_tracked = result.stopped_by == TRACKED and now.matches == last.matches
+        measurement = None if now.track is None else now.track.measurement
+        distance = np.nan if measurement is None else measurement.distance
+        track = float(result.found and is_tracked), float(now.matches), distance
+        return result, _Memory(now, track, context.get_time())
 
     def _calc_deviations(self, context: Context, output: BasicVector) -> None:
         deviations = np.full(output.size(), np.nan)
-        track = self.followed(context).track
+        track = self._matched(context).memory.followed.track
         if track is not None:
-            deviations[self._tracked_positions] = track.state.best.deviations()[self._elements]
+            seen = [*self._moving, *self._still]
+            found = track.state.best.deviations()[self._layout.indices(seen)]
+            deviations[self._indices(seen)] = found
         output.SetFromVector(deviations)
 
     def _calc_state(self, context: Context, output: BasicVector) -> None:
-        q = context.get_discrete_state(self._positions).value()
-        qdot = np.full(len(q), np.nan)
-        track = self.followed(context).track
+        matched, plant = self._matched(context), self._search.tree.model.plant
+        qdot, track = np.full(len(matched.q), np.nan), matched.memory.followed.track
         if track is not None:
-            qdot[self._still] = 0.0
-            qdot[self._moving] = track.state.best.mean[self._rates] / self._period
-        plant = self._search.tree.model.plant
+            rates = self._layout.indices([f"rate_{name}" for name in self._moving])
+            qdot[self._indices(self._still)] = 0.0
+            qdot[self._indices(self._moving)] = track.state.best.mean[rates] / self._period
         plant_context = plant.CreateDefaultContext()
-        plant.SetPositions(plant_context, q)
+        plant.SetPositions(plant_context, matched.q)
         v = plant.MapQDotToVelocity(plant_context, qdot)
-        output.SetFromVector(np.concatenate([q, v]))
+        output.SetFromVector(np.concatenate([matched.q, v]))
+
+    def _indices(self, names: Sequence[str]) -> list[int]:
+        return [self._search.tree.model.position_index(name) for name in names]
 
     def _calc_track(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state(self._record).value()[2:-1])
+        output.SetFromVector(self._matched(context).memory.track)

@@ -1,21 +1,19 @@
 """The truncated filter as a Drake system: measurements in, a belief within limits out."""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, EventStatus, LeafSystem
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
 from scipy.special import chdtri
 
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.kalman.truncated_filter import FilterState, TruncatedFilter
-from drake_pose.filtering.kalman.update import ObservationModel, with_variances
+from drake_pose.filtering.kalman.update import with_variances
 from drake_pose.filtering.state import Belief, make_belief
-from drake_pose.systems.estimators.filter_packing import (
-    HEAD,
-    FilterPacking,
-    require_time_forward,
-)
+from drake_pose.systems.shared_value import SharedValue, require_time_forward
 
 Array = NDArray[np.float64]
 
@@ -23,6 +21,25 @@ STATISTICS = ("step", "hypotheses", "distance", "count", "lost")
 """What the elements of the output ``statistics`` are."""
 
 _LOSS_PROBABILITY = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class _Known(SharedValue):
+    """What is known after an update.
+
+    Args:
+        state: the filter's.
+        step: how many updates there were.
+        unlikely: how many unlikely measurements there were in a row.
+        lost: whether they are too many.
+        time: of the last update [s].
+    """
+
+    state: FilterState
+    step: int = 0
+    unlikely: int = 0
+    lost: bool = False
+    time: float = -math.inf
 
 
 class TruncatedEkf(LeafSystem):
@@ -85,137 +102,99 @@ class TruncatedEkf(LeafSystem):
             raise SettingsError(f"the filter's period must be positive, not {period}")
         if patience < 1:
             raise SettingsError(f"patience must be 1 or more, not {patience}")
-        self.filter = belief_filter
+        self.filter, self._patience = belief_filter, patience
         self._start = make_belief(start.mean, start.covariance)
-        self._patience = patience
-        self._packing = FilterPacking(belief_filter, len(belief_filter.observation.names))
-        self._n, self._cap = self._packing.n, self._packing.cap
-        packed = self._packing.pack(belief_filter.start(self._start))
-        self._declare_measurement()
-        self._reset = self.DeclareVectorInputPort("reset_state", self._n)
-        self._restart = self.DeclareVectorInputPort("restart", 1)
-        self._belief, self._stare, self._view = (self.DeclareDiscreteState(p) for p in packed)
-        # The statistics, how many unlikely measurements there were in a row, the last time.
-        self._record = self.DeclareDiscreteState(np.r_[0.0, 1.0, 0.0, 0.0, 0.0, 0.0, -math.inf])
-        self._active = self.DeclareDiscreteState(np.zeros(max(len(belief_filter.inequalities), 1)))
-        self._declare_outputs()
-        self.DeclarePeriodicDiscreteUpdateEvent(period, offset, self._update)
-
-    def _declare_measurement(self) -> None:
-        size = len(self.filter.observation.names)
-        self._measurement = self.DeclareVectorInputPort("measurement", size)
-        self._variances = self.DeclareVectorInputPort("measurement_variances", size)
-
-    def _measure(self, context: Context) -> tuple[Array, ObservationModel | None]:
-        """What is measured now, and with what model if not the filter's own."""
-        if not self._measurement.HasValue(context):
-            return np.full(len(self.filter.observation.names), np.nan), None
-        y = np.array(self._measurement.Eval(context))
-        if not self._variances.HasValue(context):
-            return y, None
-        variances = np.array(self._variances.Eval(context))
-        return y, with_variances(self.filter.observation, y, variances)
-
-    def _declare_outputs(self) -> None:
-        n = self._n
-        belief = {self.discrete_state_ticket(self._belief)}
+        n, cap = len(belief_filter.layout), belief_filter.settings.hypothesis_cap
+        measured = len(belief_filter.observation.names)
+        self._measurement, self._variances, self._reset, self._restart = (
+            self.DeclareVectorInputPort(name, size)
+            for name, size in (
+                ("measurement", measured),
+                ("measurement_variances", measured),
+                ("reset_state", n),
+                ("restart", 1),
+            )
+        )
+        first = _Known(belief_filter.start(self._start))
+        self._state = self.DeclareAbstractState(AbstractValue.Make(first))
+        ticket = {self.abstract_state_ticket(self._state)}
         for name, size, calculate in (
             ("estimated_state", n, self._calc_state),
             ("covariance", n * n, self._calc_covariance),
-            ("hypothesis_weights", self._cap, self._calc_weights),
-            ("hypothesis_states", self._cap * n, self._calc_states),
+            ("hypothesis_weights", cap, self._calc_weights),
+            ("hypothesis_states", cap * n, self._calc_states),
+            ("active_limits", max(len(belief_filter.inequalities), 1), self._calc_active),
+            ("statistics", len(STATISTICS), self._calc_statistics),
         ):
-            self.DeclareVectorOutputPort(name, size, calculate, belief)
-        self.DeclareVectorOutputPort(
-            "active_limits",
-            max(len(self.filter.inequalities), 1),
-            self._calc_active,
-            {self.discrete_state_ticket(self._active)},
-        )
-        self.DeclareVectorOutputPort(
-            "statistics",
-            len(STATISTICS),
-            self._calc_statistics,
-            {self.discrete_state_ticket(self._record)},
-        )
+            self.DeclareVectorOutputPort(name, size, calculate, ticket)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period, offset, self._update)
+        self.DeclareForcedUnrestrictedUpdateEvent(self._update)
 
     def filter_state(self, context: Context) -> FilterState:
-        """The filter's state in a context, without its rejections."""
-        step, _, distance, count = context.get_discrete_state(self._record).value()[:4]
-        beliefs, repeated_views, view = (
-            np.array(context.get_discrete_state(index).value())
-            for index in (self._belief, self._stare, self._view)
-        )
-        return self._packing.unpack(
-            beliefs, repeated_views, view, int(step), float(distance), int(count)
-        )
+        """The filter's state in a context."""
+        return self._known(context).state
 
-    def _rows(self, context: Context) -> Array:
-        return np.array(context.get_discrete_state(self._belief).value()).reshape(self._cap, -1)
+    def _known(self, context: Context) -> _Known:
+        known: _Known = context.get_abstract_state(int(self._state)).get_value()
+        return known
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        state = self.filter_state(context)
-        record = context.get_discrete_state(self._record).value()
-        require_time_forward(self, context, record[6])
-        first, lost, unlikely = record[0] == 0, record[4] > 0, int(record[5])
-        fresh = first
-        wanted = first or lost
+    def _update(self, context: Context, state: State) -> EventStatus:
+        known = self._known(context)
+        require_time_forward(self, context, known.time)
+        now, unlikely, is_fresh = known.state, known.unlikely, known.step == 0
+        is_wanted = is_fresh or known.lost
         if self._restart.HasValue(context):
-            wanted = wanted or self._restart.Eval(context)[0] != 0
-        if wanted and self._reset.HasValue(context):
+            is_wanted = is_wanted or self._restart.Eval(context)[0] != 0
+        if is_wanted and self._reset.HasValue(context):
             mean = np.array(self._reset.Eval(context))
             if np.isfinite(mean).all():
-                state = self.filter.start(Belief(mean, self._start.covariance))
-                fresh, unlikely = True, 0
-        if not fresh:
-            state = self.filter.predict(state)
-        y, model = self._measure(context)
-        state = self.filter.update(state, y, model)
-        if state.count:
-            limit = chdtri(state.count, _LOSS_PROBABILITY)
-            unlikely = unlikely + 1 if state.distance > limit else 0
-        packed = self._packing.pack(state)
-        for index, vector in zip((self._belief, self._stare, self._view), packed, strict=True):
-            discrete_state.set_value(index, vector)
-        discrete_state.set_value(
-            self._record,
-            np.array(
-                [
-                    record[0] + 1,
-                    len(state.hypotheses),
-                    state.distance,
-                    state.count,
-                    float(unlikely >= self._patience),
-                    unlikely,
-                    context.get_time(),
-                ]
-            ),
-        )
-        names = self.filter.inequalities.rows
-        active = np.isin(names, state.hypotheses[0].active) if names else np.zeros(1)
-        discrete_state.set_value(self._active, active.astype(np.float64))
+                now = self.filter.start(Belief(mean, self._start.covariance))
+                is_fresh, unlikely = True, 0
+        if not is_fresh:
+            now = self.filter.predict(now)
+        y, model = np.full(self._measurement.size(), np.nan), None
+        if self._measurement.HasValue(context):
+            y = np.array(self._measurement.Eval(context))
+            if self._variances.HasValue(context):
+                variances = np.array(self._variances.Eval(context))
+                model = with_variances(self.filter.observation, y, variances)
+        now = self.filter.update(now, y, model)
+        if now.count:
+            is_unlikely = now.distance > chdtri(now.count, _LOSS_PROBABILITY)
+            unlikely = unlikely + 1 if is_unlikely else 0
+        lost = unlikely >= self._patience
+        updated = _Known(now, known.step + 1, unlikely, lost, context.get_time())
+        state.get_mutable_abstract_state(int(self._state)).set_value(updated)
         return EventStatus.Succeeded()
 
     def _calc_state(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._rows(context)[0, HEAD : HEAD + self._n])
+        output.SetFromVector(self.filter_state(context).best.mean)
 
     def _calc_covariance(self, context: Context, output: BasicVector) -> None:
-        start = HEAD + self._n
-        output.SetFromVector(self._rows(context)[0, start : start + self._n**2])
+        output.SetFromVector(self.filter_state(context).best.covariance.ravel())
 
     def _calc_weights(self, context: Context, output: BasicVector) -> None:
-        rows = self._rows(context)
-        output.SetFromVector(np.where(rows[:, 0] > 0, np.exp(rows[:, 1]), 0.0))
+        weights = np.zeros(output.size())
+        hypotheses = self.filter_state(context).hypotheses
+        weights[: len(hypotheses)] = [one.weight for one in hypotheses]
+        output.SetFromVector(weights)
 
     def _calc_states(self, context: Context, output: BasicVector) -> None:
-        rows = self._rows(context)
-        states = rows[:, HEAD : HEAD + self._n]
-        states[rows[:, 0] == 0] = np.nan
+        states = np.full((self.filter.settings.hypothesis_cap, len(self.filter.layout)), np.nan)
+        hypotheses = self.filter_state(context).hypotheses
+        states[: len(hypotheses)] = [one.belief.mean for one in hypotheses]
         output.SetFromVector(states.ravel())
 
     def _calc_active(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state(self._active).value())
+        names = self.filter.inequalities.rows
+        known = self._known(context)
+        active = np.zeros(output.size())
+        if known.step and names:
+            active[:] = np.isin(names, known.state.hypotheses[0].active)
+        output.SetFromVector(active)
 
     def _calc_statistics(self, context: Context, output: BasicVector) -> None:
-        record = context.get_discrete_state(self._record).value()
-        output.SetFromVector(record[: len(STATISTICS)])
+        known = self._known(context)
+        state = known.state
+        values = known.step, len(state.hypotheses), state.distance, state.count, known.lost
+        output.SetFromVector(np.array(values, dtype=float))

@@ -15,7 +15,7 @@ from drake_pose.registration.online_registration import OnlineRegistration, pose
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.silhouette.pictures.label_images import mask_to_label_image
 from drake_pose.systems.estimators.camera_registration import REGISTRATION, CameraRegistration
-from drake_pose.systems.estimators.registration_diagram import build_simulated_registration
+from drake_pose.systems.estimators.diagrams import build_simulated_registration
 from tests.registration.test_register import looking_at
 from tests.search.arms import arm_urdf
 

@@ -24,8 +24,12 @@ from drake_pose.search.grid.beam.search import BeamSearch
 from drake_pose.search.grid.settings import BeamSearchSettings
 from drake_pose.silhouette.pictures.label_images import EMPTY
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from drake_pose.systems.estimators.axis_sensor import AxisSensor, StateMatcher
-from drake_pose.systems.estimators.hand_tracking import add_hand_tracking, build_hand_tracking
+from drake_pose.systems.estimators.hand_tracking import (
+    AxisSensor,
+    StateMatcher,
+    add_hand_tracking,
+    build_hand_tracking,
+)
 from drake_pose.systems.estimators.truncated_ekf import STATISTICS
 
 PERIOD = 1 / 30

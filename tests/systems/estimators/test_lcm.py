@@ -75,5 +75,5 @@ def test_label_images_and_estimates_travel_by_lcm(tmp_path: Path) -> None:
     assert heard.message.joint_name == list(body.position_names)
     assert heard.message.utime == round(1e6 * 7 * PERIOD)
     np.testing.assert_allclose(heard.message.joint_position, q, atol=math.radians(4.0))
-    assert tracker.last_result is not None
-    assert tracker.last_result.found
+    context = tracker.GetMyContextFromRoot(simulator.get_context())
+    assert tracker.GetOutputPort("pose_estimate").Eval(context).found

@@ -94,8 +94,7 @@ def test_velocities_and_body_poses_are_those_of_the_plant(body, search):
     for k in range(12):
         q = np.array([-0.1, 0.5, -0.3]) + speed * PERIOD * k
         tracker.GetInputPort("label_image").FixValue(context, mask_to_label_image(renderer.mask(q)))
-        updates = tracker.EvalUniquePeriodicDiscreteUpdate(context)
-        context.get_mutable_discrete_state().SetFrom(updates)
+        tracker.ExecuteForcedEvents(context)
     estimate = state.Eval(context)
     found = tracker.GetOutputPort("estimated_positions").Eval(context)
     np.testing.assert_array_equal(estimate[:3], found)
@@ -123,8 +122,7 @@ def test_a_copied_context_goes_on_as_the_first_did(body, search):
     def step(context, q):
         image = mask_to_label_image(renderer.mask(q))
         tracker.GetInputPort("label_image").FixValue(context, image)
-        updates = tracker.EvalUniquePeriodicDiscreteUpdate(context)
-        context.get_mutable_discrete_state().SetFrom(updates)
+        tracker.ExecuteForcedEvents(context)
 
     for q in truth[:3]:
         step(context, q)
@@ -198,9 +196,8 @@ def test_a_covered_lens_loses_the_track_and_a_measured_position_brings_it_back(b
     for image, measured in ((lit, truth), (dark, truth * np.nan), (lit, truth)):
         tracker.GetInputPort("color_image").FixValue(context, AbstractValue.Make(image))
         tracker.GetInputPort("measured_positions").FixValue(context, measured)
-        updates = tracker.EvalUniquePeriodicDiscreteUpdate(context)
-        context.get_mutable_discrete_state().SetFrom(updates)
-        found.append(tracker.last_result.found)
+        tracker.ExecuteForcedEvents(context)
+        found.append(tracker.GetOutputPort("pose_estimate").Eval(context).found)
     assert found == [True, False, True]
     # Nobody asked the search, for which there was no mask.
     assert tracker.GetOutputPort("track").Eval(context)[TRACK.index("matches")] == 0
@@ -214,10 +211,9 @@ def test_a_color_camera_that_is_none_is_named(search):
 def test_without_pictures_nothing_is_estimated(body, search):
     tracker = SilhouetteTracker(search, [front_camera(200)], PERIOD)
     context = tracker.CreateDefaultContext()
-    updates = tracker.EvalUniquePeriodicDiscreteUpdate(context)
-    context.get_mutable_discrete_state().SetFrom(updates)
+    tracker.ExecuteForcedEvents(context)
     np.testing.assert_array_equal(tracker.GetOutputPort("track").Eval(context), 0.0)
-    assert tracker.last_result is None
+    assert tracker.GetOutputPort("pose_estimate").Eval(context) is None
 
 
 def test_it_is_a_matcher_and_checks_what_a_matcher_checks(search):

@@ -147,7 +147,7 @@ def test_restart_starts_again_although_nothing_is_lost(sequence):
         context.SetTime(t)
         ekf.GetInputPort("restart").FixValue(context, [restart])
         ekf.GetInputPort("reset_state").FixValue(context, moved)
-        context.get_mutable_discrete_state().SetFrom(ekf.EvalUniquePeriodicDiscreteUpdate(context))
+        ekf.ExecuteForcedEvents(context)
         return ekf.GetOutputPort("estimated_state").Eval(context)[0]
 
     assert step(0.0, 0.0) == pytest.approx(wanted)
@@ -168,7 +168,7 @@ def test_a_frame_can_bring_its_own_noise(sequence):
         if factor is not None:
             port = ekf.GetInputPort("measurement_variances")
             port.FixValue(context, factor * observation.variances)
-        context.get_mutable_discrete_state().SetFrom(ekf.EvalUniquePeriodicDiscreteUpdate(context))
+        ekf.ExecuteForcedEvents(context)
         covariance = ekf.GetOutputPort("covariance").Eval(context).reshape(len(HAND_STATE), -1)
         deviations.append(np.sqrt(np.diag(covariance)))
     np.testing.assert_array_equal(deviations[0], deviations[1])
@@ -191,9 +191,9 @@ def test_time_that_runs_backwards_is_refused(sequence):
     context = ekf.CreateDefaultContext()
     for t in (0.0, 1.0):
         context.SetTime(t)
-        context.get_mutable_discrete_state().SetFrom(ekf.EvalUniquePeriodicDiscreteUpdate(context))
+        ekf.ExecuteForcedEvents(context)
     context.SetTime(0.5)
     with pytest.raises(SettingsError, match=r"backwards, from 1 s to 0\.5 s"):
-        ekf.EvalUniquePeriodicDiscreteUpdate(context)
+        ekf.ExecuteForcedEvents(context)
     ekf.SetDefaultContext(context)
-    ekf.EvalUniquePeriodicDiscreteUpdate(context)
+    ekf.ExecuteForcedEvents(context)

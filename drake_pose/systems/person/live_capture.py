@@ -78,8 +78,6 @@ class LocalSensors:
         self.capture = capture
         self.period, self.live = capture.period, capture.live
         self._cameras, self._backgrounds = cameras, backgrounds
-        self.take_reports, self.counts = capture.take_reports, capture.counts
-        self.close = capture.close
 
     @property
     def skipped(self) -> int:
@@ -95,6 +93,18 @@ class LocalSensors:
             builder.Connect(self.capture.GetOutputPort(image), sensor.get_input_port())
         silhouettes = {k: sensor.GetOutputPort("silhouette") for k, sensor in sensors.items()}
         return SensorPorts(silhouettes, self.capture.GetOutputPort("time"))
+
+    def take_reports(self) -> list[str]:
+        """What the user should know and was not told yet."""
+        return self.capture.take_reports()
+
+    def counts(self) -> dict[str, CameraCount]:
+        """How each camera did so far."""
+        return self.capture.counts()
+
+    def close(self) -> None:
+        """Lets go of files and cameras."""
+        self.capture.close()
 
 
 def _add_sensors(

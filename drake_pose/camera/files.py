@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from drake_pose.camera.checks import check_number, check_pose, check_side
+from drake_pose.camera.checks import check_number, check_pose
 from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
 from drake_pose.errors import CameraError
 from drake_pose.yaml_files import read_yaml
@@ -104,12 +104,8 @@ def load_camera_file(path: str | Path) -> CameraFile:
             raise CameraError(f"{path}: camera '{name}' is given twice")
         cameras[name] = _read_camera(name, entry, path)
     links = {str(key): entry["link"] for key, entry in content.items() if "link" in entry}
-    unplaced = [
-        name
-        for name, entry in zip(cameras, content.values(), strict=True)
-        if "X_WC" not in entry and name not in links
-    ]
-    return CameraFile(cameras, tuple(unplaced), links)
+    placed = {str(key) for key, entry in content.items() if "X_WC" in entry}
+    return CameraFile(cameras, tuple(n for n in cameras if n not in {*placed, *links}), links)
 
 
 def save_cameras(path: str | Path, cameras: Mapping[str, Camera] | Iterable[Camera]) -> None:
@@ -118,9 +114,9 @@ def save_cameras(path: str | Path, cameras: Mapping[str, Camera] | Iterable[Came
     Raises:
         CameraError: when the file cannot be written.
     """
-    path = Path(path)
+    text = dump_cameras(cameras)
     try:
-        path.write_text(dump_cameras(cameras), encoding="utf-8")
+        Path(path).write_text(text, encoding="utf-8")
     except OSError as error:
         raise CameraError(f"{path}: cannot write the cameras: {error.strerror}") from error
 
@@ -128,12 +124,7 @@ def save_cameras(path: str | Path, cameras: Mapping[str, Camera] | Iterable[Came
 def dump_cameras(
     cameras: Mapping[str, Camera] | Iterable[Camera], links: Mapping[str, str] | None = None
 ) -> str:
-    """The text of a camera file.
-
-    Args:
-        cameras: the cameras.
-        links: as of CameraFile.
-    """
+    """The text of a camera file; links are those of CameraFile."""
     listed = cameras.values() if isinstance(cameras, Mapping) else cameras
     content = {camera.name: _write_camera(camera) for camera in listed}
     for name, link in (links or {}).items():
@@ -214,33 +205,24 @@ def _read_camera(name: str, entry: Any, path: Path) -> Camera:
                 "there (X_LC), and no X_WC"
             )
         pose = "X_LC"
-    common: dict[str, Any] = {
-        "name": name,
-        "width": check_side(entry["width"], "width", where),
-        "height": check_side(entry["height"], "height", where),
-        "center_x": check_number(entry["center_x"], "center_x", where),
-        "center_y": check_number(entry["center_y"], "center_y", where),
-        "X_WC": check_pose(entry.get(pose, np.eye(4)), pose, where),
-    }
-
-    def positive(field: str) -> float:
-        return check_number(entry[field], field, where, positive=True)
-
-    if projection == "parallel":
-        return ParallelCamera(pixels_per_metre=positive("pixels_per_metre"), **common)
+    values: dict[str, Any] = {"name": name, "X_WC": entry.get(pose, np.eye(4))}
+    values |= {field: entry[field] for field in required}
+    check_pose(values["X_WC"], pose, where)
     if "clipping_near" in entry:
-        common["near"] = positive("clipping_near")
-    return PinholeCamera(focal_x=positive("focal_x"), focal_y=positive("focal_y"), **common)
+        values["near"] = check_number(entry["clipping_near"], "clipping_near", where, positive=True)
+    try:
+        return ParallelCamera(**values) if projection == "parallel" else PinholeCamera(**values)
+    except CameraError as error:
+        raise CameraError(f"{path}: {error}") from error
 
 
 def _write_camera(camera: Camera) -> dict[str, Any]:
     """Returns the entry of a camera in a file."""
-    entry: dict[str, Any] = {"width": camera.width, "height": camera.height}
-    if isinstance(camera, ParallelCamera):
-        entry = {"projection": "parallel", **entry, "pixels_per_metre": camera.pixels_per_metre}
-    else:
-        entry |= {"focal_x": camera.focal_x, "focal_y": camera.focal_y}
-    entry |= {"center_x": camera.center_x, "center_y": camera.center_y}
+    is_parallel = isinstance(camera, ParallelCamera)
+    focal = ("pixels_per_metre",) if is_parallel else ("focal_x", "focal_y")
+    fields = ("width", "height", *focal, "center_x", "center_y")
+    entry: dict[str, Any] = {"projection": "parallel"} if is_parallel else {}
+    entry |= {field: getattr(camera, field) for field in fields}
     if isinstance(camera, PinholeCamera):
         entry["clipping_near"] = camera.near
     return entry | {"X_WC": camera.X_WC.tolist()}

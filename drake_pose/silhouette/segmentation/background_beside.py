@@ -1,7 +1,6 @@
 """What one camera's pictures say of the background beside a body that is about known.
 
-Where the body is about known in each picture, the other pictures show what is behind it. From them
-each pixel's likelihood ratio is told: the background's colour, or any other.
+Where the body is about known in each picture, the other pictures show what is behind it.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ def tell_from_background(
         The logarithm of the ratio of likelihoods (H, W), of each picture; 0 where no other pictures
         show the background.
     """
-    even = _evened(pictures, probabilities)
+    even = _match_exposure(pictures, probabilities)
     step = -(-len(even) // _MOST)
     stack = np.stack(even[::step])
     hidden = np.stack(probabilities[::step]) >= _BESIDE
@@ -60,7 +59,7 @@ def tell_from_background(
     return found
 
 
-def _evened(pictures: Sequence[Picture], probabilities: Sequence[Array]) -> list[Array]:
+def _match_exposure(pictures: Sequence[Picture], probabilities: Sequence[Array]) -> list[Array]:
     """Pictures of one exposure: each channel is scaled by what surely is background in all."""
     sure = np.max(probabilities, axis=0) < 0.5 * _BESIDE
     if not sure.any():
@@ -77,14 +76,10 @@ def _evened(pictures: Sequence[Picture], probabilities: Sequence[Array]) -> list
 def _masked_median(stack: Array, hidden: NDArray[np.bool_], count: NDArray[np.intp]) -> Array:
     """The median (H, W, 3) of a stack (n, H, W, 3) without what is hidden (n, H, W)."""
     result = np.zeros(stack.shape[1:], dtype=np.float32)
+    last = np.maximum(count - 1, 0)
     for row in range(stack.shape[1]):
-        values = stack[:, row].copy()
-        values[hidden[:, row]] = np.inf
-        values.sort(axis=0)
-        last = np.maximum(count[row] - 1, 0)
-        lower, upper = (
-            np.take_along_axis(values, np.broadcast_to(k[None, :, None], (1, *values.shape[1:])), 0)
-            for k in (last // 2, (last + 1) // 2)
-        )
-        result[row] = np.where(count[row][:, None] > 0, 0.5 * (lower + upper)[0], 0.0)
+        values = np.sort(np.where(hidden[:, row, :, None], np.inf, stack[:, row]), axis=0)
+        across = np.arange(values.shape[1])
+        middle = values[last[row] // 2, across] + values[(last[row] + 1) // 2, across]
+        result[row] = np.where(count[row][:, None] > 0, 0.5 * middle, 0.0)
     return result

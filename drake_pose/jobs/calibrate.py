@@ -21,20 +21,14 @@ from drake_pose.camera.calibration.board import (
     read_board_picture,
 )
 from drake_pose.camera.calibration.calibrate import Calibration, CalibrationSettings, calibrate
-from drake_pose.camera.calibration.lens import COEFFICIENTS, Lens, save_lenses
+from drake_pose.camera.calibration.lens import Lens, save_lenses
 from drake_pose.camera.files import save_cameras
 from drake_pose.errors import CameraError, OutputError
 
 
 @dataclass(frozen=True, eq=False)
 class CalibrationReport:
-    """A calibration, and what became of every picture.
-
-    Args:
-        calibration: the result.
-        seen: in which pictures the board was found.
-        files: what was written.
-    """
+    """A calibration, in which pictures the board was found, and the files that were written."""
 
     calibration: Calibration
     seen: BoardDetections
@@ -43,15 +37,20 @@ class CalibrationReport:
     @property
     def warnings(self) -> list[str]:
         """What the user should look at, a line each."""
-        unreadable = self.seen.unreadable
-        lines = [reason for reason in unreadable.values()]
+        lines = list(self.seen.unreadable.values())
         for camera in self.seen.detections:
-            blank = [frame for name, frame in self.seen.not_found if name == camera]
+            blank = [f"'{frame}'" for name, frame in self.seen.not_found if name == camera]
             if blank:
-                lines.append(f"camera '{camera}': no board found in {_listed(blank)}")
+                more = f" and {len(blank) - 5} more" if len(blank) > 5 else ""
+                lines.append(f"camera '{camera}': no board found in {', '.join(blank[:5])}{more}")
         for (camera, frame), reason in self.calibration.left_out.items():
             lines.append(f"camera '{camera}', picture '{frame}' left out: {reason}")
         return lines
+
+    def errors(self, camera: str) -> dict[str, float]:
+        """The errors of a camera's pictures by frame [pixel]."""
+        errors = self.calibration.errors
+        return {frame: error for (name, frame), error in errors.items() if name == camera}
 
     def as_json(self) -> dict[str, Any]:
         """Everything as plain values: errors in pixels, lengths in metres."""
@@ -59,25 +58,15 @@ class CalibrationReport:
         cameras = {
             name: {
                 "error_pixels": found.camera_errors[name],
-                "pictures": {
-                    frame: error
-                    for (camera, frame), error in found.errors.items()
-                    if camera == name
-                },
-                "as_taken": {
-                    "focal_x": lens.focal_x,
-                    "focal_y": lens.focal_y,
-                    "center_x": lens.center_x,
-                    "center_y": lens.center_y,
-                    **dict(zip(COEFFICIENTS, map(float, lens.distortion), strict=True)),
-                },
+                "pictures": self.errors(name),
+                "as_taken": lens.numbers(),
                 "X_WC": found.cameras[name].X_WC.tolist(),
             }
             for name, lens in found.lenses.items()
         }
         return {
             "world": found.world,
-            "error_pixels": overall_error(found),
+            "error_pixels": float(np.sqrt(np.mean(np.square(list(found.errors.values()))))),
             "cameras": cameras,
             "not_found": [list(picture) for picture in self.seen.not_found],
             "unreadable": [list(picture) for picture in self.seen.unreadable],
@@ -102,7 +91,7 @@ class CalibrationReport:
             title=escape(f"{len(found.cameras)} cameras, world = {found.world}"),
         )
         for name, lens in found.lenses.items():
-            errors = {frame: e for (camera, frame), e in found.errors.items() if camera == name}
+            errors = self.errors(name)
             worst = max(errors, key=lambda frame: errors[frame])
             table.add_row(
                 escape(name),
@@ -114,11 +103,6 @@ class CalibrationReport:
                 ", ".join(f"{p:.3f}" for p in found.cameras[name].X_WC[:3, 3]),
             )
         return table
-
-
-def overall_error(found: Calibration) -> float:
-    """Root mean square of the pictures' errors [pixel]."""
-    return float(np.sqrt(np.mean(np.square(list(found.errors.values())))))
 
 
 def calibrate_folder(
@@ -144,15 +128,14 @@ def calibrate_folder(
     """
     seen = find_boards(find_pictures(folder), load_board(board), on_picture)
     calibration = calibrate(seen, settings)
-    files: tuple[Path, ...] = ()
-    if out is not None:
-        cameras = Path(out)
-        lenses = cameras.with_name(f"{cameras.stem}_lenses.yaml")
-        cameras.parent.mkdir(parents=True, exist_ok=True)
-        save_cameras(cameras, calibration.cameras)
-        save_lenses(lenses, calibration.lenses)
-        files = (cameras, lenses)
-    return CalibrationReport(calibration, seen, files)
+    if out is None:
+        return CalibrationReport(calibration, seen)
+    cameras = Path(out)
+    lenses = cameras.with_name(f"{cameras.stem}_lenses.yaml")
+    cameras.parent.mkdir(parents=True, exist_ok=True)
+    save_cameras(cameras, calibration.cameras)
+    save_lenses(lenses, calibration.lenses)
+    return CalibrationReport(calibration, seen, (cameras, lenses))
 
 
 def undistort_pictures(
@@ -189,9 +172,3 @@ def undistort_pictures(
                 raise OutputError(f"{target}: cannot write it: {error.strerror}") from error
             written[name, frame] = target
     return written
-
-
-def _listed(frames: list[str]) -> str:
-    """Some frames' names, and how many more there are."""
-    shown = ", ".join(f"'{frame}'" for frame in frames[:5])
-    return shown if len(frames) <= 5 else f"{shown} and {len(frames) - 5} more"

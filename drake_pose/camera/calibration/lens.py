@@ -7,7 +7,7 @@ black rim that would pass for background.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -24,11 +24,8 @@ from drake_pose.yaml_files import read_yaml
 
 Array = NDArray[np.float64]
 
-COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
-"""The distortion coefficients of a Lens, in OpenCV's order."""
-
-_SIDES = ("width", "height")
-_NUMBERS = ("focal_x", "focal_y", "center_x", "center_y")
+NUMBERS = ("focal_x", "focal_y", "center_x", "center_y", "k1", "k2", "p1", "p2", "k3")
+"""Focal lengths, principal point and distortion coefficients of a Lens, in OpenCV's order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,11 +47,23 @@ class Lens:
     center_y: float
     distortion: Array
 
+    @classmethod
+    def from_numbers(cls, size: tuple[int, int], numbers: Sequence[float] | Array) -> Lens:
+        """The lens of pictures of a width and height, with the values of NUMBERS in their order."""
+        fx, fy, cx, cy, *distortion = np.asarray(numbers, dtype=np.float64).tolist()
+        return cls(*size, fx, fy, cx, cy, np.array(distortion))
+
+    def numbers(self) -> dict[str, float]:
+        """The values of NUMBERS."""
+        own = [self.focal_x, self.focal_y, self.center_x, self.center_y, *self.distortion.tolist()]
+        return dict(zip(NUMBERS, map(float, own), strict=True))
+
     @property
     def matrix(self) -> Array:
         """(3, 3) the camera matrix of the pictures as taken."""
-        fx, fy, cx, cy = (getattr(self, name) for name in _NUMBERS)
-        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        return np.array(
+            [[self.focal_x, 0.0, self.center_x], [0.0, self.focal_y, self.center_y], [0, 0, 1]]
+        )
 
     @cached_property
     def straight_matrix(self) -> Array:
@@ -106,9 +115,7 @@ def save_lenses(path: str | Path, lenses: Mapping[str, Lens]) -> None:
         CameraError: when the file cannot be written.
     """
     content = {
-        name: {side: getattr(lens, side) for side in _SIDES}
-        | {field: float(getattr(lens, field)) for field in _NUMBERS}
-        | dict(zip(COEFFICIENTS, lens.distortion.tolist(), strict=True))
+        name: {"width": lens.width, "height": lens.height, **lens.numbers()}
         for name, lens in lenses.items()
     }
     try:
@@ -127,13 +134,12 @@ def load_lenses(path: str | Path) -> dict[str, Lens]:
     if not isinstance(content, dict) or not content:
         raise CameraError(f"{path}: expected a mapping from camera names to their lenses")
     lenses = {}
-    needed = {*_SIDES, *_NUMBERS, *COEFFICIENTS}
+    needed = {"width", "height", *NUMBERS}
     for name, entry in content.items():
         where = f"{path}: camera '{name}'"
         if not isinstance(entry, dict) or set(entry) != needed:
             raise CameraError(f"{where}: a lens has exactly {', '.join(sorted(needed))}")
-        width, height = (check_side(entry[side], side, where) for side in _SIDES)
-        numbers = {field: check_number(entry[field], field, where) for field in _NUMBERS}
-        distortion = np.array([check_number(entry[k], k, where) for k in COEFFICIENTS])
-        lenses[str(name)] = Lens(width, height, distortion=distortion, **numbers)
+        size = tuple(check_side(entry[side], side, where) for side in ("width", "height"))
+        numbers = [check_number(entry[field], field, where) for field in NUMBERS]
+        lenses[str(name)] = Lens.from_numbers((size[0], size[1]), numbers)
     return lenses

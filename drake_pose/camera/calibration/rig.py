@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 from scipy.sparse.linalg import LinearOperator, aslinearoperator
 
 from drake_pose.camera.calibration.board import Detection
-from drake_pose.camera.calibration.lens import COEFFICIENTS, Lens
+from drake_pose.camera.calibration.lens import NUMBERS, Lens
 from drake_pose.camera.models import inverse_pose
 from drake_pose.errors import CameraError
 
@@ -32,9 +32,10 @@ FREE_COEFFICIENTS = {"none": 0, "standard": 4, "full": 5}
 """How many of a lens's distortion coefficients are free, by the lens model's name."""
 
 _FEWEST_PICTURES = 3
-_LENS, _POSE = 4 + len(COEFFICIENTS), 6
+_LENS, _POSE = len(NUMBERS), 6
 # Cauchy's loss counts squares up to a scale: this many pixels, or medians of the start's errors.
 _ROBUST_PIXELS, _ROBUST_MEDIANS = 1.0, 3.0
+_MOST_STEPS = 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,10 +118,10 @@ def estimate_lens(
     if not (np.isfinite(matrix).all() and np.isfinite(distortion).all()):
         raise CameraError(f"camera '{name}': its pictures give no lens; tilt the board more")
     numbers = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]
-    row = np.array([*numbers, *np.ravel(distortion)[: len(COEFFICIENTS)]], dtype=np.float64)
+    row = np.array([*numbers, *np.ravel(distortion)[: _LENS - 4]])
     vectors = np.hstack([np.reshape(turns, (-1, 3)), np.reshape(shifts, (-1, 3))])
     return LensEstimate(
-        _lens(size, row),
+        Lens.from_numbers(size, row),
         {frame: _pose(vector) for frame, vector in zip(detections, vectors, strict=True)},
         dict(zip(detections, np.ravel(errors).tolist(), strict=True)),
         float(np.ravel(deviations)[0] / row[0]),
@@ -233,7 +234,9 @@ def adjust_rig(
     """
     # In a row: each camera's lens, then each camera's pose X_CR, then each board's pose X_RB.
     poses = [inverse_pose(X) for X in start.X_RC.values()] + list(start.X_RB.values())
-    rows = [_lens_vector(lens) for lens in start.lenses.values()] + [_vector(X) for X in poses]
+    rows = [np.array([*lens.numbers().values()]) for lens in start.lenses.values()] + [
+        _vector(X) for X in poses
+    ]
     x0, count = np.concatenate(rows), len(start.lenses)
     is_free = np.ones(len(x0), dtype=bool)
     is_free[: _LENS * count].reshape(count, -1)[:, 4 + FREE_COEFFICIENTS[model] :] = False
@@ -260,6 +263,7 @@ def adjust_rig(
         tr_solver="lsmr",
         tr_options={"atol": 1e-8, "btol": 1e-8},
         ftol=1e-6 if robust else 1e-10,
+        max_nfev=_MOST_STEPS,
         xtol=1e-12,
         gtol=1e-12,
     )
@@ -267,7 +271,7 @@ def adjust_rig(
     sizes = [(lens.width, lens.height) for lens in start.lenses.values()]
     return Rig(
         {
-            name: _lens(size, row)
+            name: Lens.from_numbers(size, row)
             for name, size, row in zip(start.lenses, sizes, lenses, strict=True)
         },
         {name: inverse_pose(_pose(row)) for name, row in zip(start.X_RC, X_CR, strict=True)},
@@ -336,15 +340,6 @@ def _split(x: Array, count: int) -> tuple[Array, Array, Array]:
     """Lenses, poses X_CR and poses X_RB of a row of unknowns."""
     lenses, X_CR, X_RB = np.split(x, [_LENS * count, (_LENS + _POSE) * count])
     return lenses.reshape(-1, _LENS), X_CR.reshape(-1, _POSE), X_RB.reshape(-1, _POSE)
-
-
-def _lens(size: tuple[int, int], row: Array) -> Lens:
-    focal_x, focal_y, center_x, center_y = row[:4].tolist()
-    return Lens(*size, focal_x, focal_y, center_x, center_y, row[4:])
-
-
-def _lens_vector(lens: Lens) -> Array:
-    return np.array([lens.focal_x, lens.focal_y, lens.center_x, lens.center_y, *lens.distortion])
 
 
 def _vector(X: Array) -> Array:

@@ -226,6 +226,9 @@ class TestDevice:
         source.close()
 
 
+VIDEO = {"kind": "video", "location": "a"}
+
+
 class TestSourcesFile:
     @pytest.fixture
     def studio(self, tmp_path):
@@ -238,13 +241,9 @@ class TestSourcesFile:
 
     @staticmethod
     def entries():
+        common = {"kind": "folder", "rate_hz": 10}
         return {
-            name: {
-                "kind": "folder",
-                "location": f"images/{name}",
-                "rate_hz": 10,
-                "background": f"empty/{name}",
-            }
+            name: common | {"location": f"images/{name}", "background": f"empty/{name}"}
             for name in ("camera_1", "camera_0")
         }
 
@@ -264,12 +263,10 @@ class TestSourcesFile:
         assert empty.shape == (HEIGHT, WIDTH, 3)
 
     def test_device_may_have_a_number_or_an_address(self, studio):
-        entries = self.entries()
-        entries["camera_0"] = {"kind": "device", "location": 0, "masks": True}
-        entries["camera_1"] = {"kind": "device", "location": "rtsp://x/y", "masks": True}
-        self.save(studio, entries)
+        devices = [{"kind": "device", "location": place, "masks": True} for place in (0, "rtsp://")]
+        self.save(studio, dict(zip(("camera_0", "camera_1"), devices, strict=True)))
         found = load_sources(studio / "sources.yaml")
-        assert [one.location for one in found.values()] == ["0", "rtsp://x/y"]
+        assert [one.location for one in found.values()] == ["0", "rtsp://"]
         assert all(one.live and one.gives_masks for one in found.values())
 
     @pytest.mark.parametrize(
@@ -279,16 +276,10 @@ class TestSourcesFile:
             ({"camera_1": None}, "camera_1.*mapping"),
             ({"camera_1": {"kind": "film"}}, "kind must be"),
             ({"camera_1": {"kind": "video"}}, "location"),
-            ({"camera_1": {"kind": "video", "location": "a", "colour": 1}}, "unknown field colour"),
-            ({"camera_1": {"kind": "video", "location": "a"}}, "masks: true"),
-            (
-                {"camera_1": {"kind": "video", "location": "a", "masks": True, "background": "b"}},
-                "either",
-            ),
-            (
-                {"camera_1": {"kind": "video", "location": "a", "masks": True, "rate_hz": -1}},
-                "rate_hz",
-            ),
+            ({"camera_1": VIDEO | {"colour": 1}}, "unknown field colour"),
+            ({"camera_1": VIDEO}, "masks: true"),
+            ({"camera_1": VIDEO | {"masks": True, "background": "b"}}, "either"),
+            ({"camera_1": VIDEO | {"masks": True, "rate_hz": -1}}, "rate_hz"),
         ],
     )
     def test_wrong_entries_are_named(self, studio, change, why):
@@ -298,9 +289,7 @@ class TestSourcesFile:
         assert "sources.yaml" in str(error.value)
 
     def test_calibrated_camera_without_source_is_named(self, studio):
-        entries = self.entries()
-        del entries["camera_1"]
-        self.save(studio, entries)
+        self.save(studio, {"camera_0": self.entries()["camera_0"]})
         with pytest.raises(SceneError, match=r"'camera_1' of .* has no source"):
             load_sources(studio)
 
@@ -315,10 +304,10 @@ class TestSourcesFile:
             load_background_pictures(load_sources(studio)["camera_1"])
 
 
-def test_specification_checks_itself():
-    with pytest.raises(SettingsError, match="kind"):
-        SourceSpecification("a", "film", "x", 1, 1)
-    with pytest.raises(SettingsError, match="rate_hz"):
-        SourceSpecification("a", "video", "x", 1, 1, rate_hz=0.0)
-    with pytest.raises(SettingsError, match="cannot be"):
-        SourceSpecification("a", "video", "x", 0, 1)
+@pytest.mark.parametrize(
+    ("kind", "width", "rate_hz", "why"),
+    [("film", 1, 1.0, "kind"), ("video", 1, 0.0, "rate_hz"), ("video", 0, 1.0, "cannot be")],
+)
+def test_specification_checks_itself(kind, width, rate_hz, why):
+    with pytest.raises(SettingsError, match=why):
+        SourceSpecification("a", kind, "x", width, 1, rate_hz)

@@ -37,7 +37,7 @@ def play(synchroniser, recorded, delays, now=None):
     return found
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_jittered_streams_with_drops_are_grouped_by_their_true_moments(seed):
     generator = np.random.default_rng(seed)
     cameras = [f"c{k}" for k in range(generator.integers(2, 6))]
@@ -77,7 +77,7 @@ def brute_force(recorded, tolerance):
     return found
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_streams_of_any_rate_are_grouped_as_brute_force_groups_them(seed):
     generator = np.random.default_rng(100 + seed)
     recorded = {

@@ -10,7 +10,7 @@ import numpy as np
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import Camera
 from drake_pose.search.estimates import PoseEstimate, View
-from drake_pose.search.settings import PaperSearchSettings
+from drake_pose.search.settings import GridSettings
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import Outline
 from drake_pose.silhouette.areas.scoring import draw_mask, prefix_sums, score_bodies, subtract_body
@@ -35,7 +35,7 @@ class SampledTree:
         settings: gives the sampling intervals.
     """
 
-    def __init__(self, tree: PoseTree, settings: PaperSearchSettings) -> None:
+    def __init__(self, tree: PoseTree, settings: GridSettings) -> None:
         self.tree = tree
         self._settings = settings
         samples = [self._sample(i) for i in range(len(tree.nodes))]
@@ -121,6 +121,18 @@ class SampledTree:
             if node.parent < 0:
                 moved.values[i], moved.X_PN[i] = moved._sample(i)
         return moved
+
+    def poses(self, samples: np.ndarray) -> np.ndarray:
+        """X_WN (n, nodes, 4, 4) at samples (n, nodes)."""
+        X_WN = np.empty((*samples.shape, 4, 4))
+        for i, node in enumerate(self.tree.nodes):
+            X_PN = self.X_PN[i][samples[:, i]]
+            X_WN[:, i] = X_PN if node.parent < 0 else X_WN[:, node.parent] @ X_PN
+        return X_WN
+
+    def values_at(self, samples: np.ndarray) -> list[np.ndarray]:
+        """The values of each node at samples (nodes,)."""
+        return [grid[t] for grid, t in zip(self.values, samples, strict=True)]
 
     def _sample(self, node: int) -> tuple[np.ndarray, np.ndarray]:
         settings = self._settings

@@ -11,8 +11,8 @@ from drake_pose.camera.models import ParallelCamera
 from drake_pose.search.estimates import View
 from drake_pose.search.grid.families.search import samples_at
 from drake_pose.search.grid.sampled_body import SampledBody
-from drake_pose.search.grid.settings import BeamSearchSettings
 from drake_pose.search.scoring import SampledTree, Scoring
+from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask
 

@@ -17,14 +17,19 @@ from drake_pose.filtering.kalman.hypotheses import (
     normalise,
     prune,
 )
-from drake_pose.filtering.kalman.limited_update import LimitedUpdate, limited_update
 from drake_pose.filtering.kalman.repeated_views import (
     AnchoredObservation,
     View,
     begin_repeated_view,
     next_view,
 )
-from drake_pose.filtering.kalman.update import ObservationModel, check_measurement, update
+from drake_pose.filtering.kalman.update import (
+    LimitedUpdate,
+    ObservationModel,
+    check_measurement,
+    limited_update,
+    update,
+)
 from drake_pose.filtering.state import Belief, StateLayout, make_belief, name_flaws
 from drake_pose.filtering.truncation.inequalities import Inequalities, inner_point
 from drake_pose.filtering.truncation.truncated_normal import (

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from drake_pose.compiled import compiled, copy_into
 from drake_pose.filtering.factors import apply_site
-from drake_pose.filtering.truncation.normal_moments import FAR, interval_moments
+from drake_pose.filtering.truncation.kernels import FAR, interval_moments
 
 Array = NDArray[np.float64]
 

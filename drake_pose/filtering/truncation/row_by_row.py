@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.compiled import compiled
-from drake_pose.filtering.truncation.normal_moments import interval_moments
+from drake_pose.filtering.truncation.kernels import interval_moments
 
 Array = NDArray[np.float64]
 

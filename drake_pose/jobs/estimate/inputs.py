@@ -34,10 +34,9 @@ from drake_pose.search.continuous.multi_start import MultiStartSearch
 from drake_pose.search.continuous.multi_start_settings import MultiStartSettings
 from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
 from drake_pose.search.estimates import PoseEstimate
-from drake_pose.search.grid.settings import BeamSearchSettings
 from drake_pose.search.kameda.search import PaperSearch
 from drake_pose.search.scoring import PoseSearch
-from drake_pose.search.settings import PaperSearchSettings
+from drake_pose.search.settings import BeamSearchSettings, PaperSearchSettings
 from drake_pose.search.starts.root_placement import PlacementSettings, hub, turns_freely
 from drake_pose.silhouette.areas.visibility import require_visible
 from drake_pose.silhouette.pictures.scenes import Scene, load_scene

@@ -7,7 +7,7 @@ from drake_pose.errors import SettingsError
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.search.continuous.equivalent_poses import RobustFamilySettings
 from drake_pose.search.grid.families.examination import ExaminationSettings
-from drake_pose.search.grid.settings import BeamSearchSettings
+from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.search.starts.coarse_search import CoarseSettings
 
 COARSE = (AnnealingStage(0.1, 0.04, 3), AnnealingStage(0.05, 0.04, 3))

@@ -24,10 +24,10 @@ from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
 from drake_pose.search.grid.beam.hypotheses import Beam, Hypotheses
 from drake_pose.search.grid.beam.search import BeamSearch
 from drake_pose.search.grid.node_poses import Pictures, PoseStore, coarsen
-from drake_pose.search.grid.settings import BeamSearchSettings, Stage
 from drake_pose.search.raster_fit.body import RefinementBody
 from drake_pose.search.raster_fit.passes import COARSE_PASSES, FINE_PASSES, Pass, descend
 from drake_pose.search.raster_fit.problem import RefinementProblem
+from drake_pose.search.settings import BeamSearchSettings, Stage
 from drake_pose.search.starts.neighbourhood import NeighbourhoodSearch
 from drake_pose.search.starts.part_placement import PartSearch
 from drake_pose.search.starts.root_placement import (

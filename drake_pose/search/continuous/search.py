@@ -20,7 +20,6 @@ from drake_pose.search.continuous.intervals import (
 )
 from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
 from drake_pose.search.grid.beam.search import BeamSearch
-from drake_pose.search.grid.settings import BeamSearchSettings, Stage
 from drake_pose.search.raster_fit.body import RefinementBody
 from drake_pose.search.raster_fit.passes import (
     COARSE_PASSES,
@@ -30,6 +29,7 @@ from drake_pose.search.raster_fit.passes import (
     descend,
 )
 from drake_pose.search.raster_fit.problem import RefinementProblem
+from drake_pose.search.settings import BeamSearchSettings, Stage
 from drake_pose.search.starts.neighbourhood import NeighbourhoodSearch, NeighbourhoodSettings
 from drake_pose.search.starts.part_placement import PartSearch
 

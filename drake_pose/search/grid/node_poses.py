@@ -7,6 +7,7 @@ import numpy as np
 
 from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
 from drake_pose.search.estimates import View
+from drake_pose.search.grid.pair_kernel import Reaches, unite_masks
 from drake_pose.search.grid.sampled_body import SampledBody
 from drake_pose.silhouette.bits.bit_kernel import draw_bits
 from drake_pose.silhouette.bits.bit_view import WORD, BitView, make_bit_view
@@ -58,6 +59,7 @@ class Pictures:
         body, views: what it was made of.
         bit_views: one for each view.
         has_bands: whether pixels outside the silhouettes have bits, too.
+        coarse: whether surfaces of many triangles may be simplified.
         part_starts: (parts + 1,) where each part begins, and the mask's length [word].
         area: the silhouettes' area [pixel].
         everything: (w,) uint64 all pixels of the silhouettes.
@@ -66,12 +68,16 @@ class Pictures:
         body: the body.
         views: the silhouettes.
         band: the width of the band [pixel]; 0: none.
+        in_full: never simplify a surface, so that areas are those of the definition.
     """
 
-    def __init__(self, body: SampledBody, views: Sequence[View], band: int) -> None:
+    def __init__(
+        self, body: SampledBody, views: Sequence[View], band: int, in_full: bool = False
+    ) -> None:
         self.body = body
         self.views = tuple(views)
         self.has_bands = band > 0
+        self.coarse = self.has_bands and not in_full
         self.bit_views: list[BitView] = [
             make_bit_view(view.mask, view.camera.kernel_parameters(), view.camera.X_CW, band)
             for view in views
@@ -84,6 +90,35 @@ class Pictures:
         self.everything = np.concatenate([_ones(count) for count in counts])
         self.part_starts = np.concatenate([[0], np.cumsum([n // WORD + 1 for n in pixels])])
 
+    def draw_node(
+        self, node: int, samples: np.ndarray, X_WN: np.ndarray, masks: np.ndarray
+    ) -> np.ndarray:
+        """Add a node's pictures to masks; there must be bands.
+
+        Args:
+            node: the node.
+            samples: (n,) the samples it takes.
+            X_WN: (n, 4, 4) its poses there.
+            masks: (n, W) uint64, changed in place.
+
+        Returns:
+            (n, 3) int64 the areas in the silhouettes, in the bands and beyond, summed over the
+            views.
+        """
+        starts, views = self.part_starts, len(self.views)
+        total = np.zeros((len(X_WN), 3), dtype=np.int64)
+        pairs = np.column_stack([np.arange(len(X_WN)), samples]).astype(np.int32)
+        in_place = np.tile(np.eye(4), (len(self.body.sampled.values[node]), 1, 1))
+        all_of_them = np.zeros(len(X_WN), dtype=np.bool_)
+        for index, view in enumerate(self.bit_views):
+            celled = self.body.celled_outline(node, self.views[index].camera, self.coarse)
+            drawn = draw_bits(celled, view, X_WN, in_place, pairs, np.inf, all_of_them)
+            _, areas, runs, words = drawn
+            runs[:, :, 0] += np.array([starts[index], starts[views + index]])
+            unite_masks(masks, runs, words)
+            total += areas
+        return total
+
 
 def _ones(count: int) -> np.ndarray:
     """The first ``count`` bits set, in as many words as a part of that many pixels has."""
@@ -92,12 +127,16 @@ def _ones(count: int) -> np.ndarray:
     return np.packbits(bits, bitorder="little").view(np.uint64)
 
 
+def _placed(poses: np.ndarray, node: int) -> set[int]:
+    """The nodes that poses (B, nodes) have placed, and one more."""
+    return {int(i) for i in np.flatnonzero(poses[:1].max(axis=0, initial=-1) >= 0)} | {node}
+
+
 @dataclass
 class _Poses:
     """Poses of one node: arrays that grow by whole groups."""
 
     samples: np.ndarray
-    parents: np.ndarray
     X_WN: np.ndarray
     areas: np.ndarray
     runs: np.ndarray
@@ -106,8 +145,7 @@ class _Poses:
     @property
     def nbytes(self) -> int:
         """The memory that they take [byte]."""
-        arrays = (self.samples, self.parents, self.X_WN, self.areas, self.runs, self.words)
-        return sum(array.nbytes for array in arrays)
+        return sum(array.nbytes for array in vars(self).values())
 
 
 class PoseStore:
@@ -123,17 +161,17 @@ class PoseStore:
         self.body = body
         self.pictures = pictures
         self._outside_share = outside_share
+        self.tree_nodes = body.sampled.tree.nodes
         parts = len(pictures.part_starts) - 1
         self.nodes = [
             _Poses(
-                np.empty(0, dtype=np.int32),
                 np.empty(0, dtype=np.int32),
                 np.empty((0, 4, 4)),
                 np.empty((0, 3), dtype=np.int32),
                 np.empty((0, parts, 3), dtype=np.int64),
                 np.empty(0, dtype=np.uint64),
             )
-            for _ in body.sampled.tree.nodes
+            for _ in self.tree_nodes
         ]
         # For each node and pose of its parent: where its poses begin and end, and how many of
         # them are drawn: none, one that is enough, or all.
@@ -208,9 +246,46 @@ class PoseStore:
             self.reach_words = np.concatenate(pieces)
         return rows
 
+    def parents(self, poses: np.ndarray, node: int) -> np.ndarray:
+        """The poses (B,) of a node's parent among poses (B, nodes); 0 for a root."""
+        parent = self.tree_nodes[node].parent
+        if parent < 0:
+            return np.zeros(len(poses), dtype=np.int32)
+        return np.asarray(poses[:, parent])
+
+    def reaches(self, poses: np.ndarray, node: int, taken: np.ndarray) -> Reaches:
+        """What can be reached by the nodes that come after ``node``, which takes poses (p,).
+
+        Args:
+            poses: (B, nodes) of the nodes placed before; -1: not placed.
+            node: the node.
+            taken: (p,).
+        """
+        placed = _placed(poses, node)
+        waiting = [
+            i
+            for i, other in enumerate(self.tree_nodes)
+            if i not in placed and (other.parent < 0 or other.parent in placed)
+        ]
+        rows = []
+        for i in waiting if len(taken) else ():
+            own = self.tree_nodes[i].parent == node
+            rows.append(self.reach_rows(i, taken if own else self.parents(poses, i)))
+        table = np.zeros((len(rows), max((len(row) for row in rows), default=0)), dtype=np.int64)
+        for i, row in enumerate(rows):
+            table[i, : len(row)] = row
+        parents = np.array([self.tree_nodes[i].parent for i in waiting], dtype=np.int64)
+        return Reaches(self.reach_runs, self.reach_words, parents, table)
+
+    def open_nodes(self, poses: np.ndarray, node: int) -> np.ndarray:
+        """Nodes that have children to come, once ``node`` is placed beside poses (B, nodes)."""
+        placed = _placed(poses, node)
+        is_open = [i for i in sorted(placed) if not placed.issuperset(self.tree_nodes[i].children)]
+        return np.array(is_open, dtype=np.int64)
+
     def _parent_poses(self, node: int, parents: np.ndarray) -> np.ndarray:
         """X_WP (n, 4, 4) of poses (n,) of the node's parent."""
-        parent = self.body.sampled.tree.nodes[node].parent
+        parent = self.tree_nodes[node].parent
         return np.eye(4)[None] if parent < 0 else self.nodes[parent].X_WN[parents]
 
     def _draw(self, node: int, parents: np.ndarray, one_enough: np.ndarray) -> np.ndarray:
@@ -233,7 +308,7 @@ class PoseStore:
         drawn: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         for index, view in enumerate(self.pictures.bit_views):
             celled = self.body.celled_outline(
-                node, self.pictures.views[index].camera, coarse=self.pictures.has_bands
+                node, self.pictures.views[index].camera, self.pictures.coarse
             )
             kept, areas, runs, words = draw_bits(celled, view, X_WP, X_PN, pairs, limit, one_enough)
             pairs = pairs[kept]
@@ -242,7 +317,7 @@ class PoseStore:
             kept = sum(areas[:, 1:].sum(axis=1) for areas, _, _ in drawn) <= limit
             pairs = pairs[kept]
             drawn = [(a[kept], r[kept], w) for a, r, w in drawn]
-        self._append(node, parents, X_WP, pairs, drawn)
+        self._append(node, X_WP, pairs, drawn)
         return np.bincount(pairs[:, 0], minlength=len(X_WP))
 
     def _limit(self, node: int) -> float:
@@ -255,7 +330,6 @@ class PoseStore:
     def _append(
         self,
         node: int,
-        parents: np.ndarray,
         X_WP: np.ndarray,
         pairs: np.ndarray,
         drawn: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
@@ -274,7 +348,6 @@ class PoseStore:
             used += len(words)
         X_WN = X_WP[pairs[:, 0]] @ self.body.sampled.X_PN[node][pairs[:, 1]]
         poses.samples = np.concatenate([poses.samples, pairs[:, 1]])
-        poses.parents = np.concatenate([poses.parents, parents[pairs[:, 0]].astype(np.int32)])
         poses.X_WN = np.concatenate([poses.X_WN, X_WN])
         poses.areas = np.concatenate([poses.areas, areas])
         poses.runs = np.concatenate([poses.runs, runs])

@@ -1,6 +1,6 @@
-"""The inner loops of the beam search: pairs of a hypothesis and a pose of its next node.
+"""Kernels of the searches on the grid: pairs of a partial pose and a pose of the next node.
 
-A hypothesis is a row of words, the pixels that its nodes cover. Its hash is the sum of half-word
+A partial pose is a row of words, the pixels that its nodes cover. Its hash is the sum of half-word
 values times random numbers, modulo 2^64: because new pixels only add to it, the hash of a pair
 costs a look at the new pixels alone, and equal masks have equal hashes however they came about.
 """
@@ -29,6 +29,20 @@ def _count_bits(typing_context: Any, word: types.Type) -> Any:
 
 
 count_bits: Any = intrinsic(_count_bits)
+
+
+class Reaches(NamedTuple):
+    """What the nodes that are still to come can cover at most.
+
+    runs: (r, V, 3) int64 and words: (n,) uint64 pixels of the silhouettes in their reach;
+    parents: (m,) int64 the parents of the nodes to come whose parent is placed; rows:
+    (m, poses) int64 the row of runs for each pose of the parent.
+    """
+
+    runs: np.ndarray
+    words: np.ndarray
+    parents: np.ndarray
+    rows: np.ndarray
 
 
 @compiled
@@ -86,105 +100,65 @@ def score_pairs(
 
 
 def order_best(costs: np.ndarray, count: int) -> np.ndarray:
-    """The indices of the smallest costs (n,) int64, smallest first, equals in their order.
-
-    All of them if there are ``count`` or fewer, else the best ``count``.
-    """
-    lowest, highest = int(costs.min()), int(costs.max())
-    if costs.shape[0] > count and highest - lowest < 1 << 22:
-        return _order_by_counting(costs, lowest, highest, count)
-    return np.argsort(costs, kind="stable")[:count]
+    """The indices of the ``count`` smallest costs (n,), smallest first, equals in their order."""
+    if len(costs) <= count:
+        return np.argsort(costs, kind="stable")
+    near = np.flatnonzero(costs <= np.partition(costs, count - 1)[count - 1])
+    return np.asarray(near[np.argsort(costs[near], kind="stable")[:count]])
 
 
-@compiled
-def _order_by_counting(costs: np.ndarray, lowest: int, highest: int, count: int) -> np.ndarray:
-    """As order_best, where the costs lie so close that each may have a counter."""
-    numbers = np.zeros(highest - lowest + 2, dtype=np.int64)
-    for cost in costs:
-        numbers[cost - lowest + 1] += 1
-    total, limit = 0, highest
-    for step in range(1, numbers.shape[0]):
-        total += numbers[step]
-        numbers[step] += numbers[step - 1]
-        if total >= count:
-            limit = lowest + step - 1
-            break
-    chosen = np.empty(total, dtype=np.int64)
-    for i in range(costs.shape[0]):
-        if costs[i] <= limit:
-            step = costs[i] - lowest
-            chosen[numbers[step]] = i
-            numbers[step] += 1
-    return chosen[:count]
+def random_keys(words: int) -> np.ndarray:
+    """(2 words,) uint64 odd numbers for hashes; always the same, so that answers are."""
+    generator = np.random.default_rng(2718)
+    return generator.integers(0, 2**64, 2 * words, dtype=np.uint64) | np.uint64(1)
+
+
+def hash_mask(mask: np.ndarray, keys: np.ndarray) -> np.uint64:
+    """The hash of a mask (W,)."""
+    halves = np.column_stack([mask & _LOW_HALF, mask >> _HALF]).ravel()
+    return np.uint64((halves * keys).sum(dtype=np.uint64))
 
 
 @compiled
-def mix_bits(number: np.uint64) -> np.uint64:
-    """A number scattered over all 64 bits (splitmix64)."""
-    number = number + np.uint64(0x9E3779B97F4A7C15)
-    number = (number ^ (number >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    number = (number ^ (number >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return number ^ (number >> np.uint64(31))
-
-
-@compiled
-def _find_likeness(
-    poses: np.ndarray, code: np.uint64, node: int, pose: int, open_nodes: np.ndarray
-) -> np.uint64:
-    """A number that tells by a code and by the poses of the nodes that have children to come."""
-    for i in open_nodes:
-        p = pose if i == node else poses[i]
-        code = mix_bits(code ^ np.uint64(p * poses.shape[0] + i))
-    return code | np.uint64(1)
-
-
-@compiled
-def _is_new(table: np.ndarray, likeness: np.uint64) -> bool:
-    """Whether a number is not in a hash table yet (0: an empty slot); it is then."""
-    last = table.shape[0] - 1
-    slot = np.int64(mix_bits(likeness) & np.uint64(last))
-    while table[slot] != np.uint64(0):
-        if table[slot] == likeness:
-            return False
-        slot = (slot + 1) & last
-    table[slot] = likeness
-    return True
-
-
-@compiled
-def _add_hash(mask: np.ndarray, runs: np.ndarray, words: np.ndarray, keys: np.ndarray) -> np.uint64:
+def add_hash(mask: np.ndarray, runs: np.ndarray, words: np.ndarray, keys: np.ndarray) -> np.uint64:
     """What the pixels of a pose (runs (K, 3)) that are not in a mask (W,) add to its hash."""
     code = np.uint64(0)
     for part in range(runs.shape[0]):
         begin, place = runs[part, 0], runs[part, 2]
         for k in range(runs[part, 1]):
             added = words[place + k] & ~mask[begin + k]
-            code += (added & _LOW_HALF) * keys[2 * (begin + k)]
-            code += (added >> _HALF) * keys[2 * (begin + k) + 1]
+            if added != np.uint64(0):
+                code += (added & _LOW_HALF) * keys[2 * (begin + k)]
+                code += (added >> _HALF) * keys[2 * (begin + k) + 1]
     return code
 
 
 @compiled
-def _is_part(mask: np.ndarray, other: np.ndarray) -> bool:
-    """Whether one mask (W,) is a part of another."""
-    k = 0
-    while k < mask.shape[0] and mask[k] & ~other[k] == np.uint64(0):
-        k += 1
-    return k == mask.shape[0]
+def hash_state(
+    poses: np.ndarray, code: np.uint64, node: int, pose: int, open_nodes: np.ndarray
+) -> np.uint64:
+    """An odd number that tells by a code and by the poses of the nodes with children to come."""
+    for j in range(-1, open_nodes.shape[0]):
+        if j >= 0:
+            i = open_nodes[j]
+            p = pose if i == node else poses[i]
+            code ^= np.uint64(p * poses.shape[0] + i)
+        # splitmix64
+        code += np.uint64(0x9E3779B97F4A7C15)
+        code = (code ^ (code >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        code = (code ^ (code >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        code ^= code >> np.uint64(31)
+    return code | np.uint64(1)
 
 
-class Reaches(NamedTuple):
-    """What the nodes that are still to come can cover at most.
-
-    runs: (r, V, 3) int64 and words: (n,) uint64 pixels of the silhouettes in their reach;
-    parents: (m,) int64 the parents of the nodes to come whose parent is placed; rows:
-    (m, poses) int64 the row of runs for each pose of the parent.
-    """
-
-    runs: np.ndarray
-    words: np.ndarray
-    parents: np.ndarray
-    rows: np.ndarray
+@compiled
+def find_slot(table: np.ndarray, number: np.uint64) -> np.int64:
+    """Where an odd number is, or belongs, in a hash table of 2^k slots (0: an empty one)."""
+    last = table.shape[0] - 1
+    slot = np.int64((number >> np.uint64(1)) & np.uint64(last))
+    while table[slot] != np.uint64(0) and table[slot] != number:
+        slot = (slot + 1) & last
+    return slot
 
 
 @compiled
@@ -243,7 +217,7 @@ def grow_hypotheses(
         pairs, runs, words: as in score_pairs.
         node: the node that the poses are of.
         open_nodes: nodes that have children to come, this one perhaps among them.
-        keys: (2 W,) uint64 random odd numbers.
+        keys: of random_keys.
         width: at most this many are made.
         everything, reaches: as in count_unreachable.
         exact: nothing may lie outside, and nothing be left that is out of reach.
@@ -268,24 +242,31 @@ def grow_hypotheses(
         index = ordered[seen]
         seen += 1
         h, c = pairs[index, 0], pairs[index, 1]
-        code = hashes[h] + _add_hash(masks[h], runs[c], words, keys)
-        if not _is_new(table, _find_likeness(poses[h], code, node, c, open_nodes)):
+        code = hashes[h] + add_hash(masks[h], runs[c], words, keys)
+        state = hash_state(poses[h], code, node, c, open_nodes)
+        slot = find_slot(table, state)
+        if table[slot] == state:
             continue
+        table[slot] = state
         copy_into(new_masks[count], masks[h])
-        unite_masks(new_masks[count], runs[c : c + 1], words)
+        unite_masks(new_masks[count : count + 1], runs[c : c + 1], words)
         copy_into(new_poses[count], poses[h])
         new_poses[count, node] = c
         lost = count_unreachable(new_masks[count], new_poses[count], everything, reaches, rest)
         if exact:
-            opening = _find_likeness(poses[h], np.uint64(0), node, c, open_nodes)
+            opening = hash_state(poses[h], np.uint64(0), node, c, open_nodes)
             openings[count] = opening
             useless = bool(lost > 0)
             for other in range(count):
                 if useless:
                     break
-                useless = openings[other] == opening and _is_part(
-                    new_masks[count], new_masks[other]
-                )
+                if openings[other] == opening:
+                    k = 0
+                    while k < masks.shape[1] and new_masks[count, k] & ~new_masks[
+                        other, k
+                    ] == np.uint64(0):
+                        k += 1
+                    useless = k == masks.shape[1]
             if useless:
                 continue
         new_hashes[count], chosen[count], left[count] = code, index, lost
@@ -301,38 +282,10 @@ def grow_hypotheses(
 
 
 @compiled
-def find_hidden(
-    masks: np.ndarray, rows: np.ndarray, runs: np.ndarray, words: np.ndarray
-) -> np.ndarray:
-    """Which hypotheses (B,) bool have covered all that a node can reach, row (B,) of the runs."""
-    hidden = np.ones(masks.shape[0], dtype=np.bool_)
-    for h in range(masks.shape[0]):
+def unite_masks(masks: np.ndarray, runs: np.ndarray, words: np.ndarray) -> None:
+    """Add the pixels of poses, given by their runs (n, K, 3), to masks (n, W), in place."""
+    for c in range(runs.shape[0]):
         for part in range(runs.shape[1]):
-            begin, place = runs[rows[h], part, 0], runs[rows[h], part, 2]
-            for k in range(runs[rows[h], part, 1]):
-                if words[place + k] & ~masks[h, begin + k] != np.uint64(0):
-                    hidden[h] = False
-                    break
-            if not hidden[h]:
-                break
-    return hidden
-
-
-@compiled
-def unite_masks(base: np.ndarray, pose_runs: np.ndarray, words: np.ndarray) -> None:
-    """Add the pixels of poses, given by their runs (n, K, 3), to a mask (W,), in place."""
-    for c in range(pose_runs.shape[0]):
-        for part in range(pose_runs.shape[1]):
-            begin, length, place = pose_runs[c, part]
+            begin, length, place = runs[c, part]
             for k in range(length):
-                base[begin + k] |= words[place + k]
-
-
-@compiled
-def hash_mask(mask: np.ndarray, keys: np.ndarray) -> np.uint64:
-    """The hash of a mask (W,)."""
-    code = np.uint64(0)
-    for k in range(mask.shape[0]):
-        code += (mask[k] & _LOW_HALF) * keys[2 * k]
-        code += (mask[k] >> _HALF) * keys[2 * k + 1]
-    return code
+                masks[c, begin + k] |= words[place + k]

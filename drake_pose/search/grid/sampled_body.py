@@ -9,9 +9,8 @@ from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.errors import SettingsError
-from drake_pose.search.grid.settings import BeamSearchSettings
 from drake_pose.search.scoring import SampledTree
-from drake_pose.search.settings import PaperSearchSettings
+from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.silhouette.areas.inscribed_balls import VisualHull
 from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
 from drake_pose.silhouette.contours.direction_cells import CelledOutline, divide_outline
@@ -50,14 +49,7 @@ class SampledBody:
     """
 
     def __init__(self, tree: PoseTree, settings: BeamSearchSettings) -> None:
-        self.sampled = SampledTree(
-            tree,
-            PaperSearchSettings(
-                interval=settings.interval,
-                length_interval=settings.length_interval,
-                intervals=settings.intervals,
-            ),
-        )
+        self.sampled = SampledTree(tree, settings)
         # The mean projected area of a convex surface is a quarter of its area (Cauchy); a plane's
         # normal is twice its triangle's area long.
         self.surface_areas = [

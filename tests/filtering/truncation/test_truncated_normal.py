@@ -2,6 +2,7 @@ import math
 
 import numpy as np
 import pytest
+from drake_pose.filtering.truncation.kernels import interval_moments
 from scipy.integrate import quad
 from scipy.stats import multivariate_normal, truncnorm
 
@@ -15,7 +16,6 @@ from drake_pose.filtering.truncation.inequalities import (
     stack,
     two_sided,
 )
-from drake_pose.filtering.truncation.normal_moments import interval_moments
 from drake_pose.filtering.truncation.truncated_normal import (
     clip,
     join_rows,

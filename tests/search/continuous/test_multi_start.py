@@ -9,7 +9,7 @@ from drake_pose.errors import SettingsError
 from drake_pose.search.continuous.multi_start import MultiStartSearch
 from drake_pose.search.continuous.multi_start_settings import MultiStartSettings
 from drake_pose.search.estimates import PoseEstimate, View
-from drake_pose.search.grid.settings import BeamSearchSettings
+from drake_pose.search.settings import BeamSearchSettings
 from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_pose, draw_view, split
 
 GRID = np.radians(20.0)

@@ -18,9 +18,8 @@ from drake_pose.papers.kameda import (
 )
 from drake_pose.search.estimates import View
 from drake_pose.search.grid.beam.search import BeamSearch
-from drake_pose.search.grid.settings import BeamSearchSettings, Stage
 from drake_pose.search.scoring import SampledTree, Scoring
-from drake_pose.search.settings import PaperSearchSettings
+from drake_pose.search.settings import BeamSearchSettings, PaperSearchSettings, Stage
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.scoring import draw_mask
 from tests.search.bodies import (

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drake_pose.search.grid.branch_and_bound.full_detail import BoundLimits
+from drake_pose.search.grid.branch_and_bound.bounded_poses import BoundLimits
 from drake_pose.search.grid.branch_and_bound.partial_pose_graph import PartialPoseGraph
 from drake_pose.search.grid.branch_and_bound.search import branch_and_bound
 from tests.search.bodies import box_link, forked_body, joint, load_body, swinging_chain
@@ -56,7 +56,7 @@ def test_a_limit_that_no_pose_reaches_leaves_nothing(maker: ProblemMaker) -> Non
 
 def test_what_was_left_out_is_no_better_than_the_bound(maker: ProblemMaker) -> None:
     generator = np.random.default_rng(3)
-    for limits in (BoundLimits(states=3), BoundLimits(pairs=5), BoundLimits(deadline=0.0)):
+    for limits in (BoundLimits(states=3), BoundLimits(pairs=5), BoundLimits(time_limit=0.0)):
         problem = maker.make(generator, views=1, noise=0.02, on_grid=False)
         samples, J = problem.best
         found = branch_and_bound(maker.body, problem.views, J + 60.0, limits, samples)
@@ -74,7 +74,7 @@ def test_time_is_kept(maker: ProblemMaker) -> None:
     problem = maker.make(np.random.default_rng(4), views=1, noise=0.0, on_grid=False)
     branch_and_bound(maker.body, problem.views, 1.0)
     start = time.perf_counter()
-    found = branch_and_bound(maker.body, problem.views, 500.0, BoundLimits(deadline=start))
+    found = branch_and_bound(maker.body, problem.views, 500.0, BoundLimits(time_limit=0.0))
     assert time.perf_counter() - start < 1.0
     assert not found.complete
 

@@ -12,9 +12,8 @@ from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import View
 from drake_pose.search.grid.beam.distinct_poses import GridPoses
 from drake_pose.search.grid.beam.search import BeamSearch
-from drake_pose.search.grid.settings import BeamSearchSettings
 from drake_pose.search.scoring import SampledTree, Scoring
-from drake_pose.search.settings import PaperSearchSettings
+from drake_pose.search.settings import BeamSearchSettings, PaperSearchSettings
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask
 from tests.search.bodies import forked_body, front_camera

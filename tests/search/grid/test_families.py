@@ -13,10 +13,10 @@ from drake_pose.papers.kameda import (
     experiment_camera,
 )
 from drake_pose.search.estimates import JointEstimate, View
-from drake_pose.search.grid.beam.limb_search import poses_at
+from drake_pose.search.grid.branch_and_bound.bounded_poses import BoundLimits
+from drake_pose.search.grid.families.examination import ExaminationSettings
 from drake_pose.search.grid.families.joint_estimates import estimate_joints, grid_steps
 from drake_pose.search.grid.families.search import (
-    FamilySettings,
     GridPoseSet,
     contour_length,
     find_families,
@@ -45,8 +45,7 @@ def flipping_body(tmp_path_factory: pytest.TempPathFactory) -> ProblemMaker:
 
 def found_families(problem: GridProblem, tolerance: float | None = None) -> GridPoseSet:
     samples, J = problem.best
-    settings = FamilySettings(tolerance=tolerance)
-    return find_families(problem.body, problem.views, samples, J, settings)
+    return find_families(problem.body, problem.views, samples, J, tolerance)
 
 
 def seen_values(problem: GridProblem, J: float, node: int) -> np.ndarray:
@@ -122,9 +121,7 @@ def test_a_better_pose_that_turns_up_takes_the_place_of_the_known_one(
     worse = int(np.argsort(problem.Js)[40])
     J = float(problem.Js[worse])
     assert J > 0.0
-    answer = find_families(
-        problem.body, problem.views, problem.choices[worse], J, FamilySettings(tolerance=0.0)
-    )
+    answer = find_families(problem.body, problem.views, problem.choices[worse], J, tolerance=0.0)
     assert answer.families[0].J == problem.best[1]
     assert answer.size == len(problem.within(problem.best[1]))
 
@@ -135,8 +132,9 @@ def test_a_limit_still_leaves_the_best_pose_and_is_reported(
 ) -> None:
     problem = flipping_body.make(np.random.default_rng(24), views=1, noise=0.0, on_grid=False)
     samples, J = problem.best
-    settings = FamilySettings(tolerance=60.0, **limits)
-    answer = find_families(problem.body, problem.views, samples, J, settings)
+    answer = find_families(
+        problem.body, problem.views, samples, J, 60.0, limits=BoundLimits(**limits)
+    )
     assert not answer.complete
     assert answer.graph.contains(samples)
     assert answer.families[0].J == J
@@ -188,16 +186,14 @@ def test_two_neighbouring_values_are_still_determined(tmp_path: Path) -> None:
     "settings",
     [
         {"tolerance": -1.0},
-        {"contour_share": 1.5},
         {"families": 0},
-        {"states": 0},
-        {"pairs": 0},
-        {"time_limit": -1.0},
+        {"proof_poses": 0},
+        {"memory": 0},
     ],
 )
 def test_settings_out_of_range_are_refused(settings: dict[str, float]) -> None:
     with pytest.raises(SettingsError):
-        FamilySettings(**settings)
+        ExaminationSettings(**settings)
 
 
 def test_a_pose_off_the_grid_has_no_samples(tmp_path: Path) -> None:
@@ -223,7 +219,7 @@ def test_experiment_a_the_truth_is_in_the_set_and_all_members_look_alike() -> No
         assert answer.contains(values)
         members = answer.graph.draw(10, generator)
         scoring = Scoring(search.sampled, [view])
-        assert scoring.J(poses_at(scoring, members), members).max() == 0.0
+        assert scoring.J(scoring.sampled.poses(members), members).max() == 0.0
         flat = np.concatenate(values)
         assert all(report.holds(v) for report, v in zip(answer.joints, flat, strict=True))
         sizes.append(answer.size)

@@ -22,7 +22,7 @@ from drake_pose.search.grid.families.inner_edges import (
 )
 from drake_pose.search.grid.families.search import GridPoseSet, find_families, samples_at
 from drake_pose.search.grid.sampled_body import SampledBody
-from drake_pose.search.grid.settings import BeamSearchSettings
+from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.search.bodies import box_link, front_camera, joint, load_body
 from tests.search.grid_problems import show_pose

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from drake_pose.search.grid.branch_and_bound.proof import prove_optimal
+from drake_pose.search.grid.branch_and_bound.bounded_poses import BoundLimits
+from drake_pose.search.grid.families.examination import prove_optimal
 from tests.search.bodies import forked_body, swinging_chain
 from tests.search.grid_problems import ProblemMaker
 
@@ -48,7 +49,11 @@ def test_a_limit_leaves_a_true_bound_and_no_false_proof(
         problem = makers[number % 2].make(generator, views=1, noise=0.01, on_grid=False)
         start = int(np.argsort(problem.Js)[number])
         proof = prove_optimal(
-            problem.body, problem.views, problem.choices[start], float(problem.Js[start]), **limit
+            problem.body,
+            problem.views,
+            problem.choices[start],
+            float(problem.Js[start]),
+            BoundLimits(**limit),
         )
         best = float(problem.Js.min())
         assert proof.lower_bound <= best <= proof.J <= problem.Js[start]
@@ -64,7 +69,7 @@ def test_an_exact_pose_needs_no_search(makers: list[ProblemMaker]) -> None:
     problem = makers[0].make(np.random.default_rng(13), views=1, noise=0.0, on_grid=True)
     samples, J = problem.best
     assert J == 0.0
-    proof = prove_optimal(problem.body, problem.views, samples, J, time_limit=0.0)
+    proof = prove_optimal(problem.body, problem.views, samples, J, BoundLimits(time_limit=0.0))
     assert proof.proved
     assert proof.states == 0
 

@@ -9,12 +9,10 @@ from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.search.estimates import View
-from drake_pose.search.grid.beam.limb_search import poses_at
 from drake_pose.search.grid.beam.search import BeamSearch
-from drake_pose.search.grid.settings import BeamSearchSettings
 from drake_pose.search.kameda.search import PaperSearch
 from drake_pose.search.scoring import SampledTree, Scoring
-from drake_pose.search.settings import PaperSearchSettings
+from drake_pose.search.settings import BeamSearchSettings, PaperSearchSettings
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.scoring import draw_mask
 from tests.body.skins import load_limb
@@ -54,13 +52,13 @@ def test_the_objective_counts_the_skin(limb: ArticulatedModel) -> None:
     view = view_of(tree, [v[t] for v, t in zip(sampled.values, target, strict=True)])
     scoring = Scoring(sampled, [view])
     samples = np.array([target, *(random_samples(sampled, rng) for _ in range(20))])
-    Js = scoring.J(poses_at(scoring, samples), samples)
+    Js = scoring.J(scoring.sampled.poses(samples), samples)
     assert Js[0] == 0
     for J, taken in zip(Js, samples, strict=True):
         mask = view_of(tree, [v[t] for v, t in zip(sampled.values, taken, strict=True)]).mask
         assert np.count_nonzero(mask ^ view.mask) == J
     with pytest.raises(ValueError, match="samples of lower, hand are needed"):
-        scoring.J(poses_at(scoring, samples))
+        scoring.J(scoring.sampled.poses(samples))
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -93,7 +91,7 @@ def test_the_wide_search_finds_the_minimum(limb: ArticulatedModel, seed: int) ->
     scoring = Scoring(sampled, [view])
     everything = itertools.product(*(range(len(v)) for v in sampled.values))
     samples = np.array(list(everything))
-    assert search.match([view]).J == scoring.J(poses_at(scoring, samples), samples).min()
+    assert search.match([view]).J == scoring.J(scoring.sampled.poses(samples), samples).min()
 
 
 @pytest.mark.parametrize("root", ["lower", "hand"])

@@ -10,7 +10,7 @@ from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import View
 from drake_pose.search.grid.sampled_body import SampledBody
-from drake_pose.search.grid.settings import BeamSearchSettings
+from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.search.starts.coarse_kernel import fill_cover, score_samples, unite_pairs
 from drake_pose.search.starts.coarse_search import (
     CoarseSearch,

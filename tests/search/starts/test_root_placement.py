@@ -11,7 +11,7 @@ from drake_pose.errors import SettingsError
 from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
 from drake_pose.search.estimates import View
 from drake_pose.search.grid.sampled_body import SampledBody
-from drake_pose.search.grid.settings import BeamSearchSettings
+from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.search.starts.root_placement import (
     PlacementSettings,
     choose_root_samples,

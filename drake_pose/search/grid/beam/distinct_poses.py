@@ -4,12 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drake_pose.compiled import compiled
 from drake_pose.errors import SettingsError
-from drake_pose.search.grid.beam.drawing import draw_node
-from drake_pose.search.grid.beam.limb_search import poses_at
 from drake_pose.search.grid.node_poses import Pictures
-from drake_pose.search.grid.pair_kernel import count_bits
 from drake_pose.search.scoring import Scoring
 
 # How many times the poses asked for are looked at in one go, and scored in full.
@@ -76,28 +72,22 @@ class Gathering:
         nodes = len(scoring.sampled.values)
         samples = self._different_samples(nodes)
         chosen = np.empty((0, nodes), dtype=samples.dtype)
-        looks = _Looks.of(pictures, chosen, poses_at(scoring, chosen))
+        looks = _Looks.of(pictures, chosen, scoring.sampled.poses(chosen))
         chunk = _LOOKED_AT * count
         for begin in range(0, len(samples), chunk):
             more = samples[begin : begin + chunk]
-            looks = looks.joined(_Looks.of(pictures, more, poses_at(scoring, more)))
-            kept = _find_different(
-                looks.masks, looks.areas, looks.hidden, len(chosen), _SCORED * count, alike
-            )
+            looks = looks.joined(_Looks.of(pictures, more, scoring.sampled.poses(more)))
+            kept = _find_different(looks, len(chosen), _SCORED * count, alike)
             chosen = np.concatenate([chosen, more])[kept]
             looks = looks.only(kept)
             if len(chosen) >= _SCORED * count:
                 break
-        X_WN = poses_at(scoring, chosen)
+        X_WN = scoring.sampled.poses(chosen)
         J = scoring.J(X_WN, chosen)
         best = np.argsort(J, kind="stable")[:count]
-        values = scoring.sampled.values
         return GridPoses(
             samples=chosen[best],
-            node_values=tuple(
-                tuple(grid[t] for grid, t in zip(values, pose, strict=True))
-                for pose in chosen[best]
-            ),
+            node_values=tuple(tuple(scoring.sampled.values_at(pose)) for pose in chosen[best]),
             X_WN=X_WN[best],
             J=J[best],
             area=scoring.silhouette_area,
@@ -129,7 +119,7 @@ class _Looks:
         areas = np.zeros(shape, dtype=np.int64)
         far = np.zeros(shape, dtype=np.int64)
         for node in range(shape[1]):
-            drawn = draw_node(pictures, node, samples[:, node], X_WN[:, node], masks[:, node])
+            drawn = pictures.draw_node(node, samples[:, node], X_WN[:, node], masks[:, node])
             areas[:, node], far[:, node] = drawn.sum(axis=1), drawn[:, 2]
         return _Looks(masks, areas, _find_hidden(masks, far))
 
@@ -146,60 +136,30 @@ class _Looks:
         return _Looks(self.masks[kept], self.areas[kept], self.hidden[kept])
 
 
-@compiled
 def _find_hidden(masks: np.ndarray, far: np.ndarray) -> np.ndarray:
     """Which nodes (n, nodes) bool add nothing to what the others of their pose cover.
 
     masks: (n, nodes, W) uint64; far: (n, nodes) the areas that have no bits.
     """
-    hidden = far == 0
-    for i in range(masks.shape[0]):
-        once, twice = np.zeros_like(masks[i, 0]), np.zeros_like(masks[i, 0])
-        for node in range(masks.shape[1]):
-            for k in range(masks.shape[2]):
-                twice[k] |= once[k] & masks[i, node, k]
-                once[k] |= masks[i, node, k]
-        for node in range(masks.shape[1]):
-            for k in range(masks.shape[2]):
-                if masks[i, node, k] & ~twice[k] != np.uint64(0):
-                    hidden[i, node] = False
-                    break
-    return hidden
+    once, twice = np.zeros_like(masks[:, 0]), np.zeros_like(masks[:, 0])
+    for node in range(masks.shape[1]):
+        twice |= once & masks[:, node]
+        once |= masks[:, node]
+    return (far == 0) & ~np.any(masks & ~twice[:, None], axis=2)
 
 
-@compiled
-def _find_different(
-    masks: np.ndarray, areas: np.ndarray, hidden: np.ndarray, known: int, count: int, alike: float
-) -> np.ndarray:
+def _find_different(looks: _Looks, known: int, count: int, alike: float) -> np.ndarray:
     """The first poses that do not look like one before, (m,) int64, at most ``count``.
 
     The first ``known`` are known to be different.
     """
-    chosen = np.empty(count, dtype=np.int64)
-    for i in range(known):
-        chosen[i] = i
-    found = known
-    for i in range(known, masks.shape[0]):
-        if found == count:
+    chosen = list(range(known))
+    for i in range(known, len(looks.masks)):
+        if len(chosen) == count:
             break
-        new = True
-        for other in range(found):
-            j = chosen[other]
-            different = False
-            for node in range(masks.shape[1]):
-                if hidden[i, node] and hidden[j, node]:
-                    continue
-                common = np.uint64(0)
-                for k in range(masks.shape[2]):
-                    common += count_bits(masks[i, node, k] & masks[j, node, k])
-                union = areas[i, node] + areas[j, node] - np.int64(common)
-                if common < alike * union:
-                    different = True
-                    break
-            if not different:
-                new = False
-                break
-        if new:
-            chosen[found] = i
-            found += 1
-    return chosen[:found]
+        common = np.bitwise_count(looks.masks[i] & looks.masks[chosen]).sum(axis=2, dtype=np.int64)
+        union = looks.areas[i] + looks.areas[chosen] - common
+        same = (common >= alike * union) | (looks.hidden[i] & looks.hidden[chosen])
+        if not same.all(axis=1).any():
+            chosen.append(i)
+    return np.array(chosen, dtype=np.int64)

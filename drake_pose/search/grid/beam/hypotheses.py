@@ -7,11 +7,10 @@ import numpy as np
 
 from drake_pose.search.grid.node_poses import PoseStore
 from drake_pose.search.grid.pair_kernel import (
-    Reaches,
-    find_hidden,
     grow_hypotheses,
     hash_mask,
     order_best,
+    random_keys,
     score_pairs,
     unite_masks,
 )
@@ -62,10 +61,7 @@ class Beam:
     def __init__(self, store: PoseStore) -> None:
         self.store = store
         self.nodes = store.body.sampled.tree.nodes
-        size = 2 * int(store.pictures.part_starts[-1])
-        # Any odd numbers will do; always the same, so that answers are.
-        generator = np.random.default_rng(2718)
-        self._keys = generator.integers(0, 2**64, size, dtype=np.uint64) | np.uint64(1)
+        self._keys = random_keys(int(store.pictures.part_starts[-1]))
 
     def start(self) -> Hypotheses:
         """The one hypothesis that has placed nothing."""
@@ -91,7 +87,7 @@ class Beam:
         start.poses[0, list(nodes)] = -1
         for node in np.flatnonzero(start.poses[0] >= 0):
             stored, pose = self.store.nodes[node], int(start.poses[0, node])
-            unite_masks(start.masks[0], stored.runs[pose : pose + 1], stored.words)
+            unite_masks(start.masks, stored.runs[pose : pose + 1], stored.words)
             far += int(stored.areas[pose, 2])
         silhouettes = int(self.store.pictures.part_starts[len(self.store.pictures.views)])
         ones = np.bitwise_count(start.masks[0])
@@ -144,11 +140,11 @@ class Beam:
             stored.runs,
             stored.words,
             node,
-            self._open_nodes(hypotheses.poses[0], node),
+            store.open_nodes(hypotheses.poses, node),
             self._keys,
             grown,
             pictures.everything,
-            self._reaches(hypotheses, node, pairs[ordered, 1]),
+            store.reaches(hypotheses.poses, node, pairs[ordered, 1]),
             exact,
         )
         lost = seen < len(pairs)
@@ -164,45 +160,15 @@ class Beam:
     def _groups(self, hypotheses: Hypotheses, node: int) -> np.ndarray:
         """Where the poses of a node begin and end (B, 2) that each hypothesis may take."""
         store = self.store
-        parents = self._parents(hypotheses, node)
+        parents = store.parents(hypotheses.poses, node)
         hidden = np.zeros(len(hypotheses), dtype=np.bool_)
         if not self.nodes[node].children and not store.pictures.has_bands:
             rows = store.reach_rows(node, parents)[parents]
-            hidden = find_hidden(hypotheses.masks, rows, store.reach_runs, store.reach_words)
+            runs, words = store.reach_runs, store.reach_words
+            hidden = score_pairs(
+                hypotheses.masks, rows, rows + 1, runs, words, runs.shape[1], False
+            )[1] == 0  # fmt: skip
         return store.groups(node, parents, hidden)
-
-    def _parents(self, hypotheses: Hypotheses, node: int) -> np.ndarray:
-        """The poses (B,) of a node's parent; 0 for a root."""
-        parent = self.nodes[node].parent
-        if parent < 0:
-            return np.zeros(len(hypotheses), dtype=np.int32)
-        return np.asarray(hypotheses.poses[:, parent])
-
-    def _reaches(self, hypotheses: Hypotheses, node: int, poses: np.ndarray) -> Reaches:
-        """What can be reached by the nodes that come after ``node``, which takes these poses."""
-        placed = {int(i) for i in np.flatnonzero(hypotheses.poses[0] >= 0)} | {node}
-        waiting = [
-            i
-            for i, other in enumerate(self.nodes)
-            if i not in placed and (other.parent < 0 or other.parent in placed)
-        ]
-        rows = [
-            self.store.reach_rows(
-                i, poses if self.nodes[i].parent == node else self._parents(hypotheses, i)
-            )
-            for i in waiting
-        ]
-        table = np.zeros((len(rows), max((len(row) for row in rows), default=0)), dtype=np.int64)
-        for i, row in enumerate(rows):
-            table[i, : len(row)] = row
-        parents = np.array([self.nodes[i].parent for i in waiting], dtype=np.int64)
-        return Reaches(self.store.reach_runs, self.store.reach_words, parents, table)
-
-    def _open_nodes(self, poses: np.ndarray, node: int) -> np.ndarray:
-        """The nodes placed, ``node`` included, that have children to come."""
-        placed = {int(i) for i in np.flatnonzero(poses >= 0)} | {node}
-        is_open = [i for i in sorted(placed) if not placed.issuperset(self.nodes[i].children)]
-        return np.array(is_open, dtype=np.int64)
 
     def run(
         self,

@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from drake_pose.search.grid.beam.drawing import draw_node
 from drake_pose.search.grid.beam.hypotheses import Beam, Hypotheses
 from drake_pose.search.grid.node_poses import Pictures
 from drake_pose.search.scoring import Scoring
@@ -96,7 +95,7 @@ def turn_single_nodes(
         pictures show it, or as far as it got.
     """
     current = samples.copy()
-    J = float(scoring.J(poses_at(scoring, current[None]), current[None])[0])
+    J = float(scoring.J(scoring.sampled.poses(current[None]), current[None])[0])
     unchanged = 0
     for node in itertools.cycle(range(len(current))):
         if not proceed():
@@ -105,7 +104,7 @@ def turn_single_nodes(
         tried[:, node] = np.arange(len(tried))
         approximate = _J_by_bits(scoring, pictures, tried, node)
         tried = tried[np.argsort(approximate, kind="stable")[:_JUDGED]]
-        Js = scoring.J(poses_at(scoring, tried), tried)
+        Js = scoring.J(scoring.sampled.poses(tried), tried)
         best = int(np.argmin(Js))
         unchanged += 1
         if Js[best] < J:
@@ -120,7 +119,7 @@ def _J_by_bits(scoring: Scoring, pictures: Pictures, samples: np.ndarray, node: 
 
     Beyond the bands areas are added up, not united.
     """
-    X_WN = poses_at(scoring, samples)
+    X_WN = scoring.sampled.poses(samples)
     silhouettes = int(pictures.part_starts[len(pictures.views)])
     moving = {node}
     still = np.zeros((1, int(pictures.part_starts[-1])), dtype=np.uint64)
@@ -129,19 +128,10 @@ def _J_by_bits(scoring: Scoring, pictures: Pictures, samples: np.ndarray, node: 
         if i in moving or other.parent in moving:
             moving.add(i)
         else:
-            far += draw_node(pictures, i, samples[:1, i], X_WN[:1, i], still)[0, 2]
+            far += pictures.draw_node(i, samples[:1, i], X_WN[:1, i], still)[0, 2]
     masks = np.repeat(still, len(samples), axis=0)
     for i in sorted(moving):
-        far += draw_node(pictures, i, samples[:, i], X_WN[:, i], masks)[:, 2]
+        far += pictures.draw_node(i, samples[:, i], X_WN[:, i], masks)[:, 2]
     covered = np.bitwise_count(masks[:, :silhouettes]).sum(axis=1, dtype=np.int64)
     outside = np.bitwise_count(masks[:, silhouettes:]).sum(axis=1, dtype=np.int64)
     return np.asarray(pictures.area - covered + outside + far)
-
-
-def poses_at(scoring: Scoring, samples: np.ndarray) -> np.ndarray:
-    """X_WN (n, nodes, 4, 4) at samples (n, nodes)."""
-    X_WN = np.empty((*samples.shape, 4, 4))
-    for i, node in enumerate(scoring.sampled.tree.nodes):
-        X_PN = scoring.sampled.X_PN[i][samples[:, i]]
-        X_WN[:, i] = X_PN if node.parent < 0 else X_WN[:, node.parent] @ X_PN
-    return X_WN

@@ -20,15 +20,14 @@ from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
 from drake_pose.search.grid.beam.distinct_poses import Gathering, GridPoses, check_choice
 from drake_pose.search.grid.beam.hypotheses import Beam, Hypotheses
 from drake_pose.search.grid.beam.limb_search import (
-    poses_at,
     search_limbs_again,
     turn_single_nodes,
 )
 from drake_pose.search.grid.families.examination import ExaminationSettings, examine
 from drake_pose.search.grid.node_poses import Pictures, PoseStore, coarsen
 from drake_pose.search.grid.sampled_body import SampledBody
-from drake_pose.search.grid.settings import BeamSearchSettings, Stage
 from drake_pose.search.scoring import Scoring
+from drake_pose.search.settings import BeamSearchSettings, Stage
 
 # A body that is the object itself needs far less.
 _MOST_BYTES = 1_000_000_000
@@ -288,7 +287,7 @@ class _Run:
 
     def _keep_if_better(self, samples: np.ndarray) -> None:
         """Keep samples (nodes,) if their J is the smallest so far."""
-        X_WN = poses_at(self.scoring, samples[None])
+        X_WN = self.scoring.sampled.poses(samples[None])
         J = float(self.scoring.J(X_WN, samples[None])[0])
         if self.samples is None:
             self.first_J = J
@@ -299,7 +298,7 @@ class _Run:
 
     def result(self, seconds: float) -> PoseEstimate:
         """What the search found."""
-        tree, grids = self.body.sampled.tree, self.body.sampled.values
+        tree = self.body.sampled.tree
         told: dict[str, Any] = {
             "stopped_by": self.stopped_by,
             "seconds": seconds,
@@ -307,5 +306,5 @@ class _Run:
         }
         if self.samples is None:
             return PoseEstimate.nothing(tree, **told)
-        values = [grid[t] for grid, t in zip(grids, self.samples, strict=True)]
+        values = self.body.sampled.values_at(self.samples)
         return PoseEstimate.of_values(tree, values, self.J, self.scoring.silhouette_area, **told)

@@ -12,27 +12,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drake_pose.search.estimates import View
-from drake_pose.search.grid.branch_and_bound.full_detail import (
+from drake_pose.search.grid.branch_and_bound.bounded_poses import (
     BoundedPoses,
     BoundLimits,
-    DetailedBody,
     LimitReached,
+    SubtreeReaches,
     make_pictures,
 )
 from drake_pose.search.grid.branch_and_bound.kernel import (
     bound_pairs,
-    find_rests,
-    sift_pairs,
-    tell_apart,
-    unite_pairs,
+    deduplicate,
+    prune_pairs,
 )
 from drake_pose.search.grid.branch_and_bound.partial_pose_graph import (
     Layer,
     PartialPoseGraph,
     make_layer,
 )
-from drake_pose.search.grid.branch_and_bound.reachable_area import SubtreeReaches
-from drake_pose.search.grid.pair_kernel import Reaches
+from drake_pose.search.grid.pair_kernel import random_keys, unite_masks
 from drake_pose.search.grid.sampled_body import SampledBody
 
 # What lies outside counts so much where partial poses must be ranked: it stays outside, while what
@@ -96,6 +93,7 @@ def branch_and_bound(
     J_limit: float,
     limits: BoundLimits | None = None,
     kept_samples: np.ndarray | None = None,
+    deadline: float | None = None,
 ) -> PosesWithin:
     """Find all poses of the grid whose objective is no greater than a limit.
 
@@ -105,12 +103,17 @@ def branch_and_bound(
         J_limit: the limit, 0 or more [pixel].
         limits: how much it may look at.
         kept_samples: (nodes,) samples of a pose that is never dropped for want of room.
+        deadline: the value of time.perf_counter() at which it stops, where several searches share
+            a time limit [s].
 
     Returns:
         The poses; not all if a limit was reached, or if an area beyond the bands around the
         silhouettes is counted twice.
     """
-    return _BranchAndBound(body, views, J_limit, limits or BoundLimits(), kept_samples).run()
+    search = _BranchAndBound(body, views, J_limit, limits or BoundLimits(), kept_samples)
+    if deadline is not None:
+        search.store.deadline = deadline
+    return search.run()
 
 
 class _BranchAndBound:
@@ -130,13 +133,10 @@ class _BranchAndBound:
         self.limits = limits
         self.kept_samples = kept_samples
         self.pictures = make_pictures(body, views, J_limit)
-        self.store = BoundedPoses(DetailedBody(body), self.pictures, J_limit, limits)
+        self.store = BoundedPoses(body, self.pictures, J_limit, limits)
         self.quick = SubtreeReaches(self.store, _QUICK_TRIES)
         self.close = SubtreeReaches(self.store, _CLOSE_TRIES)
-        words = int(self.pictures.part_starts[-1])
-        # Any odd numbers will do; always the same, so that answers are.
-        generator = np.random.default_rng(2718)
-        self._keys = generator.integers(0, 2**64, 2 * words, dtype=np.uint64) | np.uint64(1)
+        self._keys = random_keys(int(self.pictures.part_starts[-1]))
         self._layers: list[Layer] = []
         self._complete = True
         self._limited = False
@@ -210,20 +210,20 @@ class _BranchAndBound:
         states = self._fit_pairs(states, node)
         if min(totals) <= _FEW_PAIRS:
             return states, node, self._pairs(states, node)
-        best = self._sift(states, waiting, self.quick)
+        best = self._prune(states, waiting, self.quick)
         if best is not None and len(best[1]) > _MANY_PAIRS:
-            best = self._sift(states, waiting, self.close)
+            best = self._prune(states, waiting, self.close)
         if best is None:
             return states, node, self._pairs(states, node)
         return states, *best
 
-    def _sift(
+    def _prune(
         self, states: _States, waiting: Sequence[int], reaches: SubtreeReaches
     ) -> tuple[int, np.ndarray] | None:
         """The waiting node that leaves the fewest pairs, and these; None: all have too many."""
         best: tuple[int, np.ndarray] | None = None
         for node in waiting:
-            pairs = self._sifted_pairs(states, node, waiting, reaches)
+            pairs = self._pruned_pairs(states, node, waiting, reaches)
             if pairs is not None and (best is None or len(pairs) < len(best[1])):
                 best = node, pairs
         return best
@@ -238,7 +238,7 @@ class _BranchAndBound:
         pairs[:, 1] = np.arange(len(pairs)) + offsets
         return pairs
 
-    def _sifted_pairs(
+    def _pruned_pairs(
         self, states: _States, node: int, waiting: Sequence[int], reaches: SubtreeReaches
     ) -> np.ndarray | None:
         """Those pairs that leave no more than what the waiting nodes can really cover.
@@ -253,14 +253,16 @@ class _BranchAndBound:
         others = [i for i in waiting if i != node]
         rows = np.zeros((len(others), len(states)), dtype=np.int64)
         for k, other in enumerate(others):
-            parents = self._parents(states, other)
+            parents = self.store.parents(states.poses, other)
             rows[k] = reaches.rows(other, parents)[parents]
         everything = self.pictures.everything
-        rests = find_rests(states.masks, everything, rows, reaches.table)
+        uncovered = everything & ~states.masks[:, : len(everything)]
+        for other_rows in rows:
+            uncovered &= ~reaches.table[other_rows]
         room = np.floor(self.J_limit - states.outside).astype(np.int64)
         stored = self.store.nodes[node]
-        good = sift_pairs(
-            rests, room, pairs, stored.runs, stored.words, len(self.pictures.views), below,
+        good = prune_pairs(
+            uncovered, room, pairs, stored.runs, stored.words, len(self.pictures.views), below,
             reaches.table,
         )  # fmt: skip
         return pairs[good]
@@ -270,26 +272,20 @@ class _BranchAndBound:
         children = self.nodes[node].children
         return len(children) > 1 or any(self._is_forked(child) for child in children)
 
-    def _parents(self, states: _States, node: int) -> np.ndarray:
-        """The poses (B,) of a node's parent; 0 for a root."""
-        parent = self.nodes[node].parent
-        if parent < 0:
-            return np.zeros(len(states), dtype=np.int32)
-        return np.asarray(states.poses[:, parent])
-
     def _groups(self, states: _States, node: int) -> np.ndarray:
         """Where the node's poses begin and end (B, 2) for each state."""
         if len(states) == 0:
             return np.zeros((0, 2), dtype=np.int64)
         nothing_hidden = np.zeros(len(states), dtype=np.bool_)
-        return self.store.groups(node, self._parents(states, node), nothing_hidden)
+        return self.store.groups(node, self.store.parents(states.poses, node), nothing_hidden)
 
     def _place(self, states: _States, node: int, pairs: np.ndarray) -> _States:
         """Place a node as pairs (p, 2) of a state and a pose say, and note the edges."""
         stored = self.store.nodes[node]
-        numbers, firsts, hashes = tell_apart(
+        numbers, firsts, hashes = deduplicate(
             states.masks, states.poses, states.hashes, states.far, pairs, stored.runs,
-            stored.words, stored.areas[:, 2], node, self._open_nodes(node), self._keys,
+            stored.words, stored.areas[:, 2], node,
+            self.store.open_nodes(states.poses, node), self._keys,
         )  # fmt: skip
         made = self._make(states, node, pairs[firsts], hashes)
         alive = made.lows <= self.J_limit
@@ -304,7 +300,9 @@ class _BranchAndBound:
         if self._kept_state >= 0:
             self._kept_state = int(places[self._kept_state]) if kept[self._kept_state] else -1
         made = made.chosen(kept)
-        masks = unite_pairs(states.masks, pairs[firsts[kept]], stored.runs, stored.words)
+        pairs = pairs[firsts[kept]]
+        masks = states.masks[pairs[:, 0]]
+        unite_masks(masks, stored.runs[pairs[:, 1]], stored.words)
         return replace(made, masks=masks)
 
     def _make(self, states: _States, node: int, pairs: np.ndarray, hashes: np.ndarray) -> _States:
@@ -316,7 +314,7 @@ class _BranchAndBound:
         far[:, 1] = states.far[pairs[:, 0], 1] + beyond
         areas = bound_pairs(
             states.masks, states.poses, pairs, stored.runs, stored.words, node,
-            self.pictures.everything, self._reaches(states, node, pairs),
+            self.pictures.everything, self.store.reaches(states.poses, node, pairs[:, 1]),
         )  # fmt: skip
         lost = areas[:, 1] + areas[:, 2]
         poses = states.poses[pairs[:, 0]]
@@ -330,32 +328,6 @@ class _BranchAndBound:
             lows=lost + far[:, 0],
             costs=_OUTSIDE_WEIGHT * (lost + far[:, 1]) - areas[:, 0],
         )
-
-    def _reaches(self, states: _States, node: int, pairs: np.ndarray) -> Reaches:
-        """What can be reached by the nodes that come after one that takes the poses of pairs."""
-        placed = {layer.node for layer in self._layers} | {node}
-        waiting = [
-            i
-            for i, other in enumerate(self.nodes)
-            if i not in placed and (other.parent < 0 or other.parent in placed)
-        ]
-        rows = []
-        if len(pairs):
-            for i in waiting:
-                own = self.nodes[i].parent == node
-                poses = pairs[:, 1] if own else self._parents(states, i)
-                rows.append(self.store.reach_rows(i, poses))
-        table = np.zeros((len(rows), max((len(row) for row in rows), default=0)), dtype=np.int64)
-        for i, row in enumerate(rows):
-            table[i, : len(row)] = row
-        parents = np.array([self.nodes[i].parent for i in waiting], dtype=np.int64)
-        return Reaches(self.store.reach_runs, self.store.reach_words, parents, table)
-
-    def _open_nodes(self, node: int) -> np.ndarray:
-        """The nodes placed, ``node`` included, that have children to come."""
-        placed = {layer.node for layer in self._layers} | {node}
-        is_open = [i for i in sorted(placed) if not placed.issuperset(self.nodes[i].children)]
-        return np.array(is_open, dtype=np.int64)
 
     def _fit_pairs(self, states: _States, node: int) -> _States:
         """Keep as many of the best states as make no more pairs than allowed."""

@@ -1,11 +1,11 @@
 """What an answer on a grid is worth: whether it is proved best, and what else looks the same.
 
-The search is quick because it drops poses by guess. What it finds is examined afterwards: bounds
-over the whole grid prove it best or find a better one (``proof``), and all poses as good as it are
-gathered (``family_search``), each within its own time.
+A search is quick because it drops poses by guess. Branch and bound drops a partial pose only if no
+completion can be within a limit: a complete search without a find proves that the objective is
+greater than the limit everywhere. The limit is raised step by step from 0 to just below the best
+objective known, so that a bound is proved even where time does not suffice for the whole.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -13,10 +13,12 @@ import numpy as np
 
 from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import PoseEstimate, View
-from drake_pose.search.grid.branch_and_bound.full_detail import BoundLimits
-from drake_pose.search.grid.branch_and_bound.proof import prove_optimal
-from drake_pose.search.grid.families.search import FamilySettings, find_families, samples_at
+from drake_pose.search.grid.branch_and_bound.bounded_poses import BoundLimits
+from drake_pose.search.grid.branch_and_bound.search import branch_and_bound
+from drake_pose.search.grid.families.search import find_families, samples_at
 from drake_pose.search.grid.sampled_body import SampledBody
+
+_FIRST_LIMIT = 8.0
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,7 @@ class ExaminationSettings:
         family_poses: the same of the search for all poses as good: about two seconds.
         memory: of each of the two, for what it keeps; it ends as if its time were over [byte].
         families: how many families are described at most.
-        tolerance: as in ``FamilySettings``.
+        tolerance: as in ``find_families`` [pixel].
 
     Raises:
         SettingsError: if a value is out of its range.
@@ -49,22 +51,22 @@ class ExaminationSettings:
     tolerance: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("proof_time_limit", "family_time_limit"):
-            limit = getattr(self, name)
-            if limit is not None and not (math.isfinite(limit) and limit >= 0.0):
-                raise SettingsError(f"{name} must be 0 s or more, not {limit}")
-        if self.proof_poses < 1:
-            raise SettingsError(f"proof_poses must be 1 or more, not {self.proof_poses}")
-        self.family_settings()
+        if self.tolerance is not None and not self.tolerance >= 0.0:
+            raise SettingsError(f"tolerance must be 0 pixels or more, not {self.tolerance}")
+        if self.families < 1:
+            raise SettingsError(f"families must be 1 or more, not {self.families}")
+        self.family_limits(), self.proof_limits()
 
-    def family_settings(self) -> FamilySettings:
-        """Those of the search for families."""
-        return FamilySettings(
-            tolerance=self.tolerance,
-            families=self.families,
-            poses=self.family_poses,
-            time_limit=self.family_time_limit,
-            memory=self.memory,
+    def family_limits(self) -> BoundLimits:
+        """Those of the search for all poses as good."""
+        return BoundLimits(
+            poses=self.family_poses, memory=self.memory, time_limit=self.family_time_limit
+        )
+
+    def proof_limits(self) -> BoundLimits:
+        """Those of the proof."""
+        return BoundLimits(
+            poses=self.proof_poses, memory=self.memory, time_limit=self.proof_time_limit
         )
 
 
@@ -100,18 +102,12 @@ def examine(
         raise SettingsError("the pose to be examined is not on the body's sampling grid")
     J, lower_bound, spent = result.J, 0.0, result.J > 0.0
     if J > 0.0 and settings.proof_time_limit != 0.0:
-        proof = prove_optimal(
-            body,
-            views,
-            samples,
-            J,
-            settings.proof_time_limit,
-            poses=settings.proof_poses,
-            memory=settings.memory,
-        )
+        proof = prove_optimal(body, views, samples, J, settings.proof_limits())
         samples, J, lower_bound = proof.samples, proof.J, proof.lower_bound
         spent = proof.budget_spent
-    answer = find_families(body, views, samples, J, settings.family_settings())
+    answer = find_families(
+        body, views, samples, J, settings.tolerance, settings.families, settings.family_limits()
+    )
     best = answer.families[0]
     J = min(J, best.J)
     if J < result.J:
@@ -125,3 +121,50 @@ def examine(
         budget_spent=answer.budget_spent or (spent and lower_bound < J),
         pose_set=answer,
     )
+
+
+@dataclass(frozen=True)
+class Proof:
+    """What is proved of an objective.
+
+    Attributes:
+        proved: whether no pose of the grid has a smaller objective than J.
+        budget_spent: whether a limit on time or room ended the proof before that was settled.
+        J: the smallest objective known [pixel].
+        samples: (nodes,) the samples of a pose that has it.
+        lower_bound: no pose of the grid has a smaller objective than this [pixel].
+        states: how many partial poses were looked at.
+    """
+
+    proved: bool
+    budget_spent: bool
+    J: float
+    samples: np.ndarray
+    lower_bound: float
+    states: int
+
+
+def prove_optimal(
+    body: SampledBody,
+    views: Sequence[View],
+    samples: np.ndarray,
+    J: float,
+    limits: BoundLimits | None = None,
+) -> Proof:
+    """Prove a pose, samples (nodes,) with objective J [pixel], the best of the grid; or find it."""
+    limits = limits or BoundLimits()
+    deadline = limits.deadline
+    best, bound, visited, J_limit, spent = samples, 0.0, 0, 0.0, False
+    while bound < J:
+        J_limit = min(J_limit, J - 1.0)
+        found = branch_and_bound(body, views, J_limit, limits, deadline=deadline)
+        visited += found.states
+        if found.graph.best_J < J:
+            J, best = found.graph.best_J, found.graph.central()
+        bound = max(bound, min(J, found.lower_bound))
+        if not found.complete:
+            spent = found.limited
+            break
+        J_limit = max(_FIRST_LIMIT, 2.0 * J_limit)
+    proved = bound >= J
+    return Proof(proved, spent and not proved, J, best, bound, visited)

@@ -264,8 +264,7 @@ def choose_by_edges(
     def judge(samples: np.ndarray) -> float:
         key = tuple(samples.tolist())
         if key not in known:
-            values = [grid[t] for grid, t in zip(answer.sampled.values, samples, strict=True)]
-            q, X_WB = tree.positions_from(values)
+            q, X_WB = tree.positions_from(answer.sampled.values_at(samples))
             known[key] = sum(
                 edge.log_likelihood(render(q, X_WB))
                 for edge, render in zip(edges, renders, strict=True)
@@ -286,7 +285,7 @@ def choose_by_edges(
     allowed = np.log(risk) - len(edges) * np.log(2.0) - np.log(answer.size)
     left = max(1, int((log_probabilities >= allowed).sum()))
     seen = [np.unique(column) for column in samples[:left].T]
-    best = [grid[t] for grid, t in zip(answer.sampled.values, samples[0], strict=True)]
+    best = answer.sampled.values_at(samples[0])
     complete = answer.complete and exhaustive
     joints = estimate_joints(answer.sampled, seen, best, complete=complete)
     return EdgeChoice(samples, np.exp(log_probabilities), left, joints, exhaustive)

@@ -1,14 +1,12 @@
 """All poses of the grid as good as the best within the noise, in families."""
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import PoseFamily, PoseSet, View
-from drake_pose.search.grid.branch_and_bound.full_detail import BoundLimits
+from drake_pose.search.grid.branch_and_bound.bounded_poses import BoundLimits
 from drake_pose.search.grid.branch_and_bound.partial_pose_graph import (
     PartialPoseGraph,
     single_pose,
@@ -23,46 +21,8 @@ from drake_pose.search.grid.families.split import (
 from drake_pose.search.grid.sampled_body import SampledBody
 from drake_pose.search.scoring import SampledTree
 
-
-@dataclass(frozen=True)
-class FamilySettings:
-    """Parameters of the search for families.
-
-    Args:
-        tolerance: a pose counts as good as the best if its objective is greater by no more than
-            this [pixel]; None: not at all where the best is exact, else ``contour_share`` of the
-            length of the silhouettes' contours.
-        contour_share: the share of the contours' pixels that noise may turn.
-        families: how many are described at most.
-        states: how many partial poses are kept after each node.
-        pairs: how many pairs of a partial pose and a pose of the next node are looked at.
-        poses: after this many poses of nodes are drawn it returns what it has.
-        time_limit: it returns what it has after this time [s]; None: no limit.
-        memory: as in BoundLimits [byte].
-
-    Raises:
-        SettingsError: if a value is out of its range.
-    """
-
-    tolerance: float | None = None
-    contour_share: float = 0.05
-    families: int = 32
-    states: int = 20_000
-    pairs: int = 1_000_000
-    poses: int = 100_000
-    time_limit: float | None = None
-    memory: int = BoundLimits.memory
-
-    def __post_init__(self) -> None:
-        if self.tolerance is not None and not self.tolerance >= 0.0:
-            raise SettingsError(f"tolerance must be 0 pixels or more, not {self.tolerance}")
-        if not 0.0 <= self.contour_share <= 1.0:
-            raise SettingsError(f"contour_share must be from 0 to 1, not {self.contour_share}")
-        if self.time_limit is not None and not self.time_limit >= 0.0:
-            raise SettingsError(f"time_limit must be 0 s or more, not {self.time_limit}")
-        for name in ("families", "states", "pairs", "poses", "memory"):
-            if getattr(self, name) < 1:
-                raise SettingsError(f"{name} must be 1 or more, not {getattr(self, name)}")
+# The share of the contours' pixels that noise may turn.
+_CONTOUR_SHARE = 0.05
 
 
 @dataclass(frozen=True)
@@ -92,7 +52,7 @@ class GridPoseSet(PoseSet):
     def draw(self, count: int, generator: np.random.Generator) -> list[list[np.ndarray]]:
         """Draw members at random, each as likely as any other: for each the nodes' values."""
         drawn = self.graph.draw(count, generator)
-        return [_values_at(self.sampled, samples) for samples in drawn]
+        return [self.sampled.values_at(samples) for samples in drawn]
 
 
 def find_families(
@@ -100,7 +60,9 @@ def find_families(
     views: Sequence[View],
     samples: np.ndarray,
     J: float,
-    settings: FamilySettings | None = None,
+    tolerance: float | None = None,
+    most: int = 32,
+    limits: BoundLimits | None = None,
 ) -> GridPoseSet:
     """Find all poses of the grid as good as the best.
 
@@ -109,20 +71,18 @@ def find_families(
         views: the silhouettes.
         samples: (nodes,) the samples of the best pose known.
         J: its objective [pixel].
-        settings: the parameters.
+        tolerance: a pose counts as good as the best if its objective is greater by no more than
+            this [pixel]; None: not at all where the best is exact, else 5 % of the length of the
+            silhouettes' contours.
+        most: how many families are described at most.
+        limits: how much may be looked at; a limit leaves those found.
 
     Returns:
         The set. It holds the best pose known, and if a better one turns up, that one and those
         within the tolerance of it.
     """
-    settings = settings or FamilySettings()
-    tolerance = settings.tolerance
     if tolerance is None:
-        tolerance = 0.0 if J == 0.0 else settings.contour_share * contour_length(views)
-    deadline = np.inf
-    if settings.time_limit is not None:
-        deadline = time.perf_counter() + settings.time_limit
-    limits = BoundLimits(settings.states, settings.pairs, settings.poses, settings.memory, deadline)
+        tolerance = 0.0 if J == 0.0 else _CONTOUR_SHARE * contour_length(views)
     found = branch_and_bound(body, views, J + tolerance, limits, samples)
     graph = found.graph
     if graph.best_J < J:
@@ -130,7 +90,7 @@ def find_families(
     complete = found.complete
     if graph.size == 0.0:
         graph, complete = single_pose(samples, J), False
-    described = _describe(body.sampled, graph, samples, tolerance, complete, settings.families)
+    described = _describe(body.sampled, graph, samples, tolerance, complete, most)
     return replace(described, budget_spent=found.limited)
 
 
@@ -198,7 +158,7 @@ def _describe_family(
     complete: bool,
 ) -> PoseFamily:
     central = samples if graph.objective(samples) == family.J else graph.central()
-    values = _values_at(sampled, central)
+    values = sampled.values_at(central)
     q, X_WB = sampled.tree.positions_from(values)
     return PoseFamily(
         q=q,
@@ -208,7 +168,3 @@ def _describe_family(
         joints=estimate_joints(sampled, graph.samples_seen(), values, complete=complete),
         size=family.size,
     )
-
-
-def _values_at(sampled: SampledTree, samples: np.ndarray) -> list[np.ndarray]:
-    return [grid[t] for grid, t in zip(sampled.values, samples, strict=True)]

@@ -119,6 +119,11 @@ class Belief:
     mean: Array
     covariance: Array
 
+    @cached_property
+    def root(self) -> Array:
+        """(n, n) L with L L^T = covariance."""
+        return factor_of(self.covariance)
+
     def deviations(self) -> Array:
         """(n,) standard deviations."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))

@@ -30,7 +30,6 @@ class View:
     """What one calibrated camera sees of the body.
 
     Args:
-        camera: the camera.
         mask: the silhouette S, (height, width) bool.
 
     Raises:
@@ -211,7 +210,6 @@ class PoseEstimate:
         lower_bound: no pose of the search's grid has a smaller J than this [pixel].
         budget_spent: whether a limit on poses, time or memory ended the proof, or the search for
             poses as good, before all was settled.
-        statistics: how the search went.
     """
 
     found: bool

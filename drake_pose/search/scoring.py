@@ -22,17 +22,11 @@ class SampledTree:
     """A pose tree with every node's sampling grid, made once and matched to many pictures.
 
     Attributes:
-        tree: the pose tree.
         values: for each node (n, k) its values at its samples [rad or m].
         X_PN: for each node (n, 4, 4) its poses in its parent at its samples.
-        surfaces: the nodes' surfaces.
         outlines: the rigid part of each node's surface: all of it where the model has no skin.
         bands: for each node (n, v, 3) the vertices of its band of skin at its samples, in the
             node's frame [m]; None for a node without one.
-
-    Args:
-        tree: the pose tree.
-        settings: gives the sampling intervals.
     """
 
     def __init__(self, tree: PoseTree, settings: GridSettings) -> None:
@@ -54,7 +48,6 @@ class SampledTree:
         """The whole surfaces of nodes at their samples, each in its node's frame.
 
         Args:
-            nodes: the nodes.
             samples: (len(nodes),) indices into their samples; may be None where no node bends.
 
         Raises:
@@ -92,10 +85,8 @@ class SampledTree:
         """Areas of the union of nodes at many poses.
 
         Args:
-            nodes: the nodes.
             samples: (n, len(nodes)) the samples they take; may be None where no node bends.
             X_CN: (n, len(nodes), 4, 4) their poses there, in the camera.
-            camera: the camera.
             prefixes: (k, H, W + 1) int32 prefix sums of sets.
 
         Returns:
@@ -146,7 +137,6 @@ class Scoring:
     """Scores poses of a sampled tree against the silhouettes of one instant.
 
     Args:
-        sampled: the sampled tree.
         views: the silhouettes, at least one.
     """
 
@@ -167,10 +157,8 @@ class Scoring:
         """Areas of a node outside the silhouette and in a region of it.
 
         Args:
-            node: the node.
             samples: (n,) the samples it takes.
             X_WN: (n, 4, 4) its poses there.
-            regions: the region.
 
         Returns:
             area(P_i minus S) in each view, (views, n) (4), and area(region and P_i) summed over
@@ -188,7 +176,6 @@ class Scoring:
         """S minus the projections of some nodes (3), (6).
 
         Args:
-            nodes: the nodes.
             samples: (all nodes,) the samples the nodes take.
             X_WN: (all nodes, 4, 4) their poses there.
         """
@@ -219,7 +206,6 @@ class Scoring:
         """The union of some nodes' projections in one view, bool.
 
         Args:
-            nodes: the nodes.
             samples: (len(nodes),) the samples they take.
             X_WN: (len(nodes), 4, 4) their poses there.
             view: index of the view.
@@ -255,9 +241,6 @@ class Regions:
     Attributes:
         masks: for each view (H, W) uint8, the region.
         prefixes: for each view (2, H, W + 1), prefix sums of the silhouette and of the region.
-
-    Args:
-        scoring: the silhouettes.
     """
 
     def __init__(self, scoring: Scoring) -> None:
@@ -269,7 +252,6 @@ class Regions:
         """Take the projections of nodes out of the region.
 
         Args:
-            nodes: the nodes.
             samples: (len(nodes),) the samples they take.
             X_WN: (len(nodes), 4, 4) their poses there.
         """

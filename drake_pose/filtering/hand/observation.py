@@ -115,9 +115,6 @@ class HandObservation:
         A segment that points a little towards the camera looks like one that points as much away
         from it. Only the angle at its root is changed.
 
-        Args:
-            belief: the prediction.
-
         Returns:
             States (n,), one for each joint where the mirrored angle is another one, and not
             excluded by the prediction.
@@ -142,7 +139,6 @@ def plant_positions(x: Array, names: tuple[str, ...], pixels_per_metre: float) -
 
     Args:
         x: (n,) a state as in ``HAND_STATE``.
-        names: the model's position names.
         pixels_per_metre: of the image, for scale 1.
     """
     value = dict(zip(HAND_STATE.names, x, strict=True))

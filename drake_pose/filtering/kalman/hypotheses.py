@@ -83,7 +83,6 @@ def merge_twins(
     """Keep the heavier of any two that say the same, with the weight of both.
 
     Args:
-        hypotheses: the heaviest first.
         distance: means closer than this in every element are the same [standard deviations].
         step: for the record.
     """

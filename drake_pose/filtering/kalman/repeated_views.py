@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from drake_pose.filtering.factors import lower_or_root
+from drake_pose.filtering.factors import factor_of
 from drake_pose.filtering.kalman.update import ObservationModel, difference
 from drake_pose.filtering.state import Belief
 
@@ -47,17 +47,15 @@ class View:
     count: int
 
 
-def next_view(view: View | None, y: Array, model: ObservationModel, chance: float) -> View:
+def next_view(view: View | None, y: Array, model: ObservationModel, significance: float) -> View:
     """The view a measurement belongs to: the one so far, or one that begins with it.
 
     Args:
-        view: the one so far.
         y: (m,) measured, NaN where occluded.
-        model: gives the noise.
-        chance: a view is new when noise alone would make it differ so much from the reference
+        significance: a view is new when noise alone would make it differ so much from the reference
             with no more than this probability; 0: every one is new.
     """
-    if view is None or chance == 0 or len(view.reference) != len(y):
+    if view is None or significance == 0 or len(view.reference) != len(y):
         return View(y, 1)
     change = difference(y, view.reference, model.wraps)
     both = np.isfinite(change)
@@ -65,13 +63,13 @@ def next_view(view: View | None, y: Array, model: ObservationModel, chance: floa
     if new_rows.any() or not both.any():
         return View(y, 1)
     size = float(np.sum(change[both] ** 2 / (2.0 * model.variances[both])))
-    is_new = size > _largest_change(chance, int(np.count_nonzero(both)))
+    is_new = size > _largest_change(significance, int(np.count_nonzero(both)))
     return View(y, 1) if is_new else View(view.reference, view.count + 1)
 
 
 @lru_cache(maxsize=1024)
-def _largest_change(chance: float, count: int) -> float:
-    return float(chdtri(count, chance))
+def _largest_change(significance: float, count: int) -> float:
+    return float(chdtri(count, significance))
 
 
 def measure_curvature(model: ObservationModel, belief: Belief) -> Array:
@@ -81,7 +79,7 @@ def measure_curvature(model: ObservationModel, belief: Belief) -> Array:
     """
     h, H = model.predict(belief.mean)
     used = np.flatnonzero(np.abs(H).sum(axis=0) > 0)
-    root = lower_or_root(belief.covariance[np.ix_(used, used)])
+    root = factor_of(belief.covariance[np.ix_(used, used)])
     total = np.zeros(len(h))
     for column in root.T:
         step = np.zeros_like(belief.mean)
@@ -126,7 +124,6 @@ def begin_repeated_view(
     """A view's second frame: nothing is known yet of the offsets but how large they may be.
 
     Args:
-        model: what is observed.
         free: the prediction of the second frame, without its limits.
         seen: how far the state may be from the tangent, where the curvature is measured.
         tangent: (n,) where the first frame was linearised.
@@ -143,7 +140,6 @@ class AnchoredObservation:
     """An observation model held at the tangent of one state, with offsets: linear in both.
 
     Args:
-        model: what is observed.
         tangent: (n,) where the model is made linear.
     """
 

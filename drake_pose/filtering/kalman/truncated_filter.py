@@ -60,7 +60,6 @@ class FilterSettings:
         reject_below: a hypothesis beyond a row by more is given up: c_k (24) below this.
         smallest_weight: lighter hypotheses are given up.
         twin_distance: hypotheses closer than this in every element are one [deviations].
-        tolerance: of the joint truncation.
         novelty: a measurement shows nothing new if noise alone would make it differ as much
             from the one that began the view with more than this probability, see ``views``. 0:
             every frame is new, as in the paper; so it is always with "sequential" and "clip".
@@ -130,11 +129,8 @@ class TruncatedFilter:
     become ever surer, though the limits say the same each time.
 
     Args:
-        layout: what the state means.
-        observation: what is measured.
         inequalities: the rows, over any elements of the state.
         process_noise: (n, n) U of (6).
-        settings: how to work.
         transition: (n, n) A of (6); constant velocity (8) if not given.
 
     Attributes:
@@ -194,7 +190,6 @@ class TruncatedFilter:
         """Use a measurement of the predicted moment: section 5, steps 2 to 6.
 
         Args:
-            state: the prediction.
             y: (m,) NaN where occluded.
             observation: what is measured this time, if not what the filter was made with.
 
@@ -242,7 +237,7 @@ class TruncatedFilter:
             return found
         for start in model.mirrors(hypothesis.belief):
             other = replace(hypothesis, born=step, place=next(places))
-            found.append((other, self._update(other, y, model, start, heated=False)))
+            found.append((other, self._update(other, y, model, start, tempered=False)))
         return found
 
     def _update(
@@ -251,14 +246,14 @@ class TruncatedFilter:
         y: Array,
         model: ObservationModel,
         start: Array,
-        heated: bool = True,
+        tempered: bool = True,
     ) -> LimitedUpdate:
         iterations = self.settings.iterations
         if self.settings.truncation == "none" or not self.inequalities:
-            updated = update(hypothesis.free, y, model, iterations, start, heated)
+            updated = update(hypothesis.free, y, model, iterations, start, tempered)
             return LimitedUpdate(updated, unlimited(updated.belief))
         return limited_update(
-            hypothesis.free, y, model, self._truncate, iterations, start, hypothesis.sites, heated
+            hypothesis.free, y, model, self._truncate, iterations, start, hypothesis.sites, tempered
         )
 
     def _repeat(self, hypothesis: Hypothesis, y: Array, model: ObservationModel) -> Branch:

@@ -25,14 +25,12 @@ class AxisObservation:
 
     Args:
         body: turns a state into a pose; its tree's root stays where the tree holds it.
-        camera: the camera.
         axes: start and end of each segment's axis (3,), (3,) in its link's frame, by name [m].
         origin: (2,) where the image's origin is for rho [pixel]; the nearer to the segments, the
             more rho tells.
         settings: how axes are measured, and how well.
 
     Attributes:
-        body: as given.
         observer: measures the axes in a label image.
         names: (m) ``alpha_<link>`` and ``rho_<link>`` of each segment.
         variances: (m,) of the noise, where a frame does not say its own.
@@ -127,10 +125,6 @@ class AxisObservation:
 
 
 def _independent(axis: Axis) -> Array:
-    """(2,) variances whose diagonal matrix is no smaller than the axis' covariance.
-
-    rho errs sideways by itself, and with alpha by the reach r: [[a, ra], [ra, r^2 a + b]] is no
-    larger than diag(2 a, 2 r^2 a + b).
-    """
+    """(2,) variances whose diagonal matrix is no smaller than the axis' covariance."""
     a, c, d = axis.covariance[0, 0], axis.covariance[0, 1], axis.covariance[1, 1]
     return np.array([2 * a, d + c**2 / a])

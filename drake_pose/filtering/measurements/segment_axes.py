@@ -1,4 +1,4 @@
-"""The axes of segments from label images or bare masks: (11) and (12) of Shimada et al."""
+"""The axes of segments from label images: (11) and (12) of Shimada et al."""
 
 import math
 from collections.abc import Mapping
@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.camera.models import Camera
@@ -29,10 +28,6 @@ class AxisSettings:
         correlation: how much of an edge [pixel] errs together.
         smallest_share: a segment of whose area less than this is seen, in the picture or at the
             rough pose, is occluded: it is left out.
-        reach: pixels of a bare mask further than this from all segments of the rough pose belong
-            to none [pixel].
-        mask_growth: deviations are larger by this in bare masks, which do not show the borders
-            between segments.
 
     Raises:
         SettingsError: a number that is not positive.
@@ -41,8 +36,6 @@ class AxisSettings:
     edge_deviation: float = 0.7
     correlation: float = 3.0
     smallest_share: float = 0.7
-    reach: float = 12.0
-    mask_growth: float = 3.0
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -75,12 +68,9 @@ class AxisObserver:
     from the drawing corrects the axis of the rough pose.
 
     Args:
-        model: the body.
-        camera: the camera.
         axes: start and end of each segment's axis (3,), (3,) in the frame of its link, by the
             link's name [m].
         origin: (2,) where the image's origin is for rho [pixel].
-        settings: how to measure.
 
     Raises:
         UnknownNameError: there is no link of such a name.
@@ -115,21 +105,6 @@ class AxisObserver:
         self._check_size(labels)
         return self._measure(labels, self._renderer.segments(q), q)
 
-    def measure_mask(self, mask: NDArray[np.bool_], q: Array) -> dict[str, Axis]:
-        """Axes in a bare mask (H, W): its pixels belong to the nearest segment of the rough pose.
-
-        What separates two segments that touch in the mask is known from the rough pose alone.
-
-        Raises:
-            MaskError: a mask that is not of the camera's size.
-        """
-        self._check_size(mask)
-        rough = self._renderer.segments(q)
-        distance, nearest = distance_transform_edt(rough < 0, return_indices=True)
-        labels = rough[tuple(nearest)]
-        labels[~mask | (distance > self._settings.reach)] = -1
-        return self._measure(labels, rough, q, self._settings.mask_growth)
-
     def _check_size(self, image: NDArray[np.generic]) -> None:
         expected = (self._camera.height, self._camera.width)
         if image.shape != expected:
@@ -138,9 +113,7 @@ class AxisObserver:
                 f"{expected[::-1]} expected"
             )
 
-    def _measure(
-        self, labels: Labels, rough: Labels, q: Array, growth: float = 1.0
-    ) -> dict[str, Axis]:
+    def _measure(self, labels: Labels, rough: Labels, q: Array) -> dict[str, Axis]:
         poses = self._renderer.link_poses(q)
         found = {}
         for name, link in self._links.items():
@@ -155,7 +128,7 @@ class AxisObserver:
             # A segment that another covers at the rough pose is much shorter than its axis.
             if drawn.length < self._settings.smallest_share * float(np.linalg.norm(uv[1] - uv[0])):
                 continue
-            found[name] = _correct(uv, seen, drawn, growth)
+            found[name] = _correct(uv, seen, drawn)
         return found
 
     def _fit(self, pixels: NDArray[np.bool_]) -> "_Fit | None":
@@ -187,7 +160,7 @@ class _Fit:
     count: int
 
 
-def _correct(uv: Array, seen: _Fit, drawn: _Fit, growth: float) -> Axis:
+def _correct(uv: Array, seen: _Fit, drawn: _Fit) -> Axis:
     """The axis of the rough pose, from uv[0] to uv[1], moved as the region moved."""
     along = uv[1] - uv[0]
     alpha = math.atan2(along[1], along[0])
@@ -207,4 +180,4 @@ def _correct(uv: Array, seen: _Fit, drawn: _Fit, growth: float) -> Axis:
     reach = -(c * foot[0] + s * foot[1])
     a, b = seen.angle_variance, seen.sideways_variance
     covariance = np.array([[a, reach * a], [reach * a, b + reach**2 * a]])
-    return Axis(alpha, float(rho), growth**2 * covariance, seen.count / drawn.count)
+    return Axis(alpha, float(rho), covariance, seen.count / drawn.count)

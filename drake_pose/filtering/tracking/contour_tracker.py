@@ -8,18 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.errors import SettingsError
+from drake_pose.filtering.body_state import GROWTH, Mask
 from drake_pose.filtering.kalman.truncated_filter import (
     FilterSettings,
     FilterState,
     TruncatedFilter,
 )
-from drake_pose.filtering.measurements.contour import (
-    GROWTH,
-    ContourMeasurement,
-    ContourObservation,
-    Mask,
-    Seen,
-)
+from drake_pose.filtering.measurements.contour import ContourMeasurement, ContourObservation, Seen
 from drake_pose.filtering.state import Belief
 from drake_pose.fit.colours import Histograms, Picture
 
@@ -91,7 +86,6 @@ class Track:
     """Where a tracker is after a frame.
 
     Attributes:
-        state: the filter's.
         measurement: of the contour at the end; None where no mask was given.
         lost: whether the contour is far from the masks' edge, or a part's from that which colours
             show.
@@ -110,7 +104,6 @@ class ContourTracker:
     Args:
         observation: the body and its cameras.
         period: time between two frames [s].
-        settings: how it may move.
 
     Attributes:
         filter: the filter; its layout is the observation's.
@@ -186,7 +179,6 @@ class ContourTracker:
         """The next frame.
 
         Args:
-            track: the last one.
             masks: (H, W) of each camera; None where there is none.
             first: the frame that the start was made for: nothing has moved since.
             root_position: (3,) where the root is known to be now, if not where the tree holds it
@@ -257,11 +249,7 @@ class ContourTracker:
         measurement: ContourMeasurement,
         astray: Mask,
     ) -> FilterState:
-        """Where all lines lead to, as unsure as if those of parts that are astray were not seen.
-
-        They may be those of something else, all of them together: by how much they have moved the
-        state is not known of it either.
-        """
+        """Where all lines lead to, as unsure as if those of parts that are astray were not seen."""
         found, rest = state.best.mean, None
         if not astray.all():
             rounds = self.settings.rounds

@@ -43,8 +43,6 @@ def make_tracker(
     """The tracker of a pose tree's contour.
 
     Args:
-        tree: the body's pose tree.
-        cameras: the cameras.
         period: time between two frames [s].
         settings: how the body may move, and what is unknown.
 
@@ -73,7 +71,6 @@ class MatchAndTrack:
 
     Args:
         search: asked in the first frame, and when the track is lost.
-        cameras: the calibrated cameras.
         period: time between two frames [s].
         settings: how the body may move, and when its track is lost.
 
@@ -204,11 +201,7 @@ class MatchAndTrack:
         return track.lost or (has_masks and result.E_total > min(limit, UNEXPLAINED))
 
     def _difference(self, track: Track, frame: _Frame) -> tuple[float, float]:
-        """How large the area is where the body differs from what is seen, and the body's [pixel].
-
-        Where there are no masks it is that between the body's contour and the one that colours
-        show: its length times their distance.
-        """
+        """The area where the body differs from what is seen, and the body's [pixel]."""
         observation, x = self._observation(frame.root_position), track.state.best.mean
         if frame.views:
             return observation.difference(x, [(view.camera, view.mask) for view in frame.views])

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.filtering.measurements.contour import Mask
+from drake_pose.filtering.body_state import Mask
 from drake_pose.filtering.tracking.contour_tracker import ContourTracker
 from drake_pose.fit.contour_fit import Noise
 from drake_pose.fit.evidence import find_edge_points
@@ -70,7 +70,6 @@ class FittedSequence:
     """One explanation of a sequence.
 
     Args:
-        body: what was fitted.
         fitted: its proportions, and its pose in every frame.
     """
 
@@ -108,7 +107,6 @@ def fit_sequence(
         masks: of the frames, three or more.
         starts: for each start the states (n,) in all frames.
         period: time between two frames [s].
-        settings: how.
     """
     settings = settings or SequenceFitSettings()
     observation = tracker.observation
@@ -158,7 +156,6 @@ def pose_set(
     Args:
         explanations: best first.
         poses: q (nq,), X_WB (4, 4) and the objective (1) J [pixel] of each in the frame.
-        frame: the frame's number.
     """
     families = []
     for one, (q, X_WB, J) in zip(explanations, poses, strict=True):

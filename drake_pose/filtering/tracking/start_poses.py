@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from drake_pose.filtering.measurements.contour import ContourObservation, Mask
+from drake_pose.filtering.body_state import Mask
+from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.tracking.contour_tracker import ContourTracker, Track
 
 Array = NDArray[np.float64]
@@ -50,13 +51,13 @@ class FollowedStart:
         states: (n,) the state in each frame.
         track: in the last frame followed.
         errors: E_total of each frame.
-        strains: for each frame how far from the middle of their limits joints are [deviations^2].
+        prior_distances: of each frame, see ``ContourObservation.prior_distance``.
     """
 
     states: tuple[Array, ...]
     track: Track
     errors: tuple[float, ...]
-    strains: tuple[float, ...]
+    prior_distances: tuple[float, ...]
 
     @property
     def x(self) -> Array:
@@ -66,11 +67,11 @@ class FollowedStart:
     @property
     def cost(self) -> float:
         """What tells the better of two."""
-        return float(np.mean(self.errors)) + _STRAIN * float(np.mean(self.strains))
+        return float(np.mean(self.errors)) + _PRIOR_WEIGHT * float(np.mean(self.prior_distances))
 
 
 # A joint at its limits (three deviations squared) counts as so much E_total.
-_STRAIN = 0.0003
+_PRIOR_WEIGHT = 0.0003
 
 
 def tilted(observation: ContourObservation, x: Array, tilt: Sequence[float]) -> Array:
@@ -96,7 +97,6 @@ def find_start(
         tracker: follows.
         x: (n,) a state that explains the first frame.
         masks: of the first frames, of all cameras.
-        settings: how.
     """
     settings = settings or StartSettings()
     observation = tracker.observation
@@ -120,18 +120,6 @@ def find_start(
     return sorted(kept, key=lambda one: one.cost)
 
 
-def follow_start(
-    tracker: ContourTracker, x: Array, masks: Sequence[Sequence[Mask | None]]
-) -> FollowedStart:
-    """A state (n,) of the first frame followed through frames."""
-    observation = tracker.observation
-    followed = _judged(observation, tracker.follow(tracker.start(x), masks[0], True), masks[0])
-    for frame in masks[1:]:
-        track = tracker.follow(followed.track, frame)
-        followed = _judged(observation, track, frame, followed)
-    return followed
-
-
 def _judged(
     observation: ContourObservation,
     track: Track,
@@ -143,9 +131,9 @@ def _judged(
     pairs = zip(observation.cameras, masks, strict=True)
     seen = [(camera, mask) for camera, mask in pairs if mask is not None]
     wrong, area = observation.difference(x, seen)
-    error, strain = wrong / max(area, 1), observation.strain(x)
+    error, prior = wrong / max(area, 1), observation.prior_distance(x)
     if before is None:
-        return FollowedStart((x,), track, (error,), (strain,))
+        return FollowedStart((x,), track, (error,), (prior,))
     return FollowedStart(
-        (*before.states, x), track, (*before.errors, error), (*before.strains, strain)
+        (*before.states, x), track, (*before.errors, error), (*before.prior_distances, prior)
     )

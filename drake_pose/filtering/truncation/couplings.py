@@ -34,7 +34,6 @@ class Difference:
     """lower <= first - second <= upper, or |first - second| <= within.
 
     Attributes:
-        first, second: the joints' names.
         within, lower, upper: bounds in ``unit``; what is not given does not bound.
         unit: "deg", "mm", "rad", "m", or nothing (the model's own, rad or m).
     """
@@ -119,7 +118,6 @@ def load_couplings(path: Path | str, columns: Sequence[str]) -> Inequalities:
           - {name: curl, terms: {flexion_11: 1, flexion_12: 1}, upper: 150, unit: deg}
 
     Args:
-        path: the file.
         columns: (n) the names of the elements of the state.
 
     Raises:
@@ -156,7 +154,6 @@ def load_usual_pose(path: Path | str, columns: Sequence[str]) -> UsualPose:
           - {name: knuckle, terms: {flexion_11: 1}, mean: 30, deviation: 25, unit: deg}
 
     Args:
-        path: the file.
         columns: (n) the names of the elements of the state. Rows about others are left out.
 
     Raises:

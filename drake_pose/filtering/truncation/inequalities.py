@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.solvers import Binding, MathematicalProgram
 from scipy.optimize import linprog
 
 from drake_pose.body.parsed_model import ParsedModel
@@ -110,7 +108,6 @@ def two_sided(
 
     Args:
         columns: (n) the names of the elements of x.
-        name: what is bounded.
         phi: (n,) its factors.
         lower, upper: the bounds; -inf and inf mean none.
 
@@ -196,59 +193,6 @@ def say_if_unlimited(inequalities: Inequalities, where: str) -> Inequalities:
             f"{where}: no joint has a limit; nothing will be truncated", UserWarning, stacklevel=3
         )
     return inequalities
-
-
-def from_plant(plant: MultibodyPlant) -> Inequalities:
-    """Every finite position limit of a finalized plant, under the plant's own position names."""
-    names = plant.GetPositionNames(add_model_instance_prefix=False, always_add_suffix=False)
-    if len(set(names)) < len(names):
-        names = plant.GetPositionNames(add_model_instance_prefix=True, always_add_suffix=False)
-    return from_bounds(names, plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits())
-
-
-def from_program(
-    program: MathematicalProgram, columns: Sequence[str] | None = None
-) -> Inequalities:
-    """The linear and bounding-box constraints of a MathematicalProgram.
-
-    Args:
-        program: its decision variables are the elements of x.
-        columns: names for them in the program's order; the variables' own if not given.
-
-    Raises:
-        SettingsError: it has linear equalities (they leave no room to truncate), or there are
-            more or fewer names than variables.
-    """
-    variables = program.decision_variables()
-    names = [v.get_name() for v in variables] if columns is None else list(columns)
-    if len(names) != len(variables):
-        raise SettingsError(
-            f"the program has {len(variables)} decision variables, but {len(names)} names are given"
-        )
-    if program.linear_equality_constraints():
-        raise SettingsError(
-            "the program has linear equality constraints, which leave no room for a covariance; "
-            "eliminate a variable for each"
-        )
-    bindings: list[tuple[str, Binding]] = [
-        *(("linear", binding) for binding in program.linear_constraints()),
-        *(("bounds", binding) for binding in program.bounding_box_constraints()),
-    ]
-    parts = []
-    for number, (kind, binding) in enumerate(bindings):
-        evaluator = binding.evaluator()
-        indices = program.FindDecisionVariableIndices(binding.variables())
-        dense = evaluator.GetDenseA()
-        phi = np.zeros((len(dense), len(names)))
-        for column, index in enumerate(indices):
-            # A variable may occur twice in a binding.
-            phi[:, index] += dense[:, column]
-        label = evaluator.get_description() or f"{kind} {number}"
-        for i, row in enumerate(phi):
-            name = label if len(phi) == 1 else f"{label}[{i}]"
-            lower, upper = evaluator.lower_bound()[i], evaluator.upper_bound()[i]
-            parts.append(two_sided(names, name, row, lower, upper))
-    return stack(parts, names)
 
 
 def row_from_terms(columns: Sequence[str], terms: Mapping[str, float], where: str) -> NDArray:

@@ -10,15 +10,11 @@ from drake_pose.filtering.factors import (
     check_moments,
     covariance_from,
     factor_and_kind,
-    is_inside,
-    lower_or_root,
-    margins_in_deviations,
-    outer_product,
+    factor_of,
 )
 from drake_pose.filtering.state import Belief
-from drake_pose.filtering.truncation.expectation_propagation import apply_sites, propagate
 from drake_pose.filtering.truncation.inequalities import Inequalities
-from drake_pose.filtering.truncation.row_by_row import cut_one_by_one
+from drake_pose.filtering.truncation.kernels import apply_sites, cut_one_by_one, propagate
 
 Array = NDArray[np.float64]
 
@@ -60,7 +56,6 @@ class JointRows:
     given twice counts once.
 
     Attributes:
-        inequalities: as given.
         used: (m,) the elements of the state that occur in a row.
         directions: (S, m) unit vectors over the used elements.
         lower, upper: (S,) bounds along them, infinite for none.
@@ -119,11 +114,19 @@ def normalised_margins(mean: Array, covariance: Array, inequalities: Inequalitie
     Raises:
         SettingsError: a row without variance is not satisfied; it is named.
     """
-    c, beyond = margins_in_deviations(mean, covariance, inequalities.phi, inequalities.b)
-    if beyond >= 0:
-        excess = -inequalities.margins(mean)[beyond]
+    phi, margins = np.abs(inequalities.phi), inequalities.margins(mean)
+    variance = np.einsum("ki,ki->k", inequalities.phi @ covariance, inequalities.phi)
+    size = phi @ np.sqrt(np.abs(np.diag(covariance)))
+    # What rounding makes of a variance of zero.
+    solid = variance > 1e-30 + 1e-23 * size**2
+    c = np.full(len(margins), np.inf)
+    c[solid] = margins[solid] / np.sqrt(variance[solid])
+    reach = np.abs(inequalities.b) + phi @ np.abs(mean)
+    beyond = np.flatnonzero(~solid & (margins < -1e-9 * reach))
+    if len(beyond):
+        row, excess = inequalities.rows[beyond[0]], -margins[beyond[0]]
         raise SettingsError(
-            f"inequality '{inequalities.rows[beyond]}' is not satisfied by {excess:.3g}, and the "
+            f"inequality '{row}' is not satisfied by {excess:.3g}, and the "
             "belief has no variance along it; start from a belief that allows it"
         )
     return c
@@ -157,7 +160,6 @@ def truncate_sequential(
     factor, definite = factor_and_kind(Q)
     normalised_margins(q, Q, inequalities)
     c = np.empty(len(inequalities))
-    factor = np.ascontiguousarray(factor)
     total = cut_one_by_one(q, factor, inequalities.phi, inequalities.b, skip_above, c)
     return Truncated(q, covariance_from(factor, definite), c, c <= skip_above, total)
 
@@ -166,7 +168,6 @@ def truncate_joint(
     mean: ArrayLike,
     covariance: ArrayLike,
     rows: JointRows | Inequalities,
-    contained: ArrayLike | None = None,
     tolerance: float = 1e-9,
     sweep_limit: int = 400,
     start: Array | None = None,
@@ -182,10 +183,7 @@ def truncate_joint(
         mean: (n,).
         covariance: (n, n).
         rows: the inequalities, prepared by ``join_rows`` or not.
-        contained: (S, 2) sites of an earlier result that the given belief still contains: what is
-            known about elements that never change is then not counted twice.
         tolerance: of the marginals' change from sweep to sweep.
-        sweep_limit: of expectation propagation.
         start: (S, 2) sites of a similar problem to begin with, which saves sweeps.
 
     Raises:
@@ -195,12 +193,8 @@ def truncate_joint(
     q, Q = _check(mean, covariance, joint.inequalities)
     c = normalised_margins(q, Q, joint.inequalities)
     factor, definite = factor_and_kind(Q)
-    factor = np.ascontiguousarray(factor)
     sites = np.zeros((len(joint.directions), 2))
-    if contained is not None:
-        sites[:] = np.asarray(contained, dtype=np.float64)
-        apply_sites(q, factor, joint.whole, sites, -1, -1.0)
-    elif start is not None:
+    if start is not None:
         sites[:] = start
     q, factor, log_probability = _settle(q, factor, joint, sites, tolerance, sweep_limit)
     active = (c <= SKIP_ABOVE) & (sites[joint.group, 0] > 0)
@@ -212,7 +206,7 @@ def _settle(
     q: Array, factor: Array, joint: JointRows, sites: Array, tolerance: float, sweep_limit: int
 ) -> tuple[Array, Array, float]:
     """Expectation propagation from sites (S, 2), which are moved: mean, factor, log probability."""
-    base = lower_or_root(outer_product(factor[joint.used]))
+    base = factor_of(covariance_from(factor[joint.used], False))
     free = q, factor
     for limit in (sweep_limit, _PATIENCE * sweep_limit):
         log_probability, sweeps = propagate(
@@ -228,9 +222,15 @@ def _settle(
         q, factor = free[0].copy(), free[1].copy()
         apply_sites(q, factor, joint.whole, sites, -1, 1.0)
         # Rows thousands of deviations away, almost parallel, settle slowly.
-        if sweeps < limit or is_inside(q, joint.inequalities.phi, joint.inequalities.b):
+        if sweeps < limit or _is_inside(q, joint.inequalities):
             break
     return q, factor, log_probability
+
+
+def _is_inside(q: Array, inequalities: Inequalities) -> bool:
+    """Whether a point (n,) is inside all rows, but for rounding."""
+    reach = np.abs(inequalities.b) + np.abs(inequalities.phi) @ np.abs(q)
+    return bool(np.all(inequalities.margins(q) >= -1e-10 * reach))
 
 
 def clip(mean: ArrayLike, covariance: ArrayLike, inequalities: Inequalities) -> Truncated:

@@ -65,8 +65,6 @@ class Pictures:
         everything: (w,) uint64 all pixels of the silhouettes.
 
     Args:
-        body: the body.
-        views: the silhouettes.
         band: the width of the band [pixel]; 0: none.
         in_full: never simplify a surface, so that areas are those of the definition.
     """
@@ -96,7 +94,6 @@ class Pictures:
         """Add a node's pictures to masks; there must be bands.
 
         Args:
-            node: the node.
             samples: (n,) the samples it takes.
             X_WN: (n, 4, 4) its poses there.
             masks: (n, W) uint64, changed in place.
@@ -152,8 +149,6 @@ class PoseStore:
     """All poses of all nodes that stay inside a limit, by the pose of their parent.
 
     Args:
-        body: the body.
-        pictures: the silhouettes.
         outside_share: the share of a node's mean projected area that may lie outside.
     """
 
@@ -258,7 +253,6 @@ class PoseStore:
 
         Args:
             poses: (B, nodes) of the nodes placed before; -1: not placed.
-            node: the node.
             taken: (p,).
         """
         placed = _placed(poses, node)

@@ -217,7 +217,6 @@ def grow_hypotheses(
         pairs, runs, words: as in score_pairs.
         node: the node that the poses are of.
         open_nodes: nodes that have children to come, this one perhaps among them.
-        keys: of random_keys.
         width: at most this many are made.
         everything, reaches: as in count_unreachable.
         exact: nothing may lie outside, and nothing be left that is out of reach.

@@ -30,7 +30,6 @@ class SampledBody:
     """A sampled tree with what makes its nodes quick to draw and to reject; made once.
 
     Attributes:
-        sampled: the sampled tree.
         surface_areas: the mean area of each node's parallel projection from all sides [m^2].
         order: the nodes in the order in which they are placed: the ends of limbs last.
         limb_order: the same, but one limb after another.
@@ -41,7 +40,6 @@ class SampledBody:
             node and its descendants at all samples.
 
     Args:
-        tree: the pose tree.
         settings: intervals and order.
 
     Raises:
@@ -158,14 +156,7 @@ class SampledBody:
         return np.append(ball[:3], max(ball[3], farthest))
 
     def _find_order(self, limb_by_limb: bool) -> tuple[int, ...]:
-        """Trunk first, then limb after limb, the larger before the smaller.
-
-        The trunk is what a fork lies beyond. The nodes at the ends of the limbs come last: they
-        are small and have many poses, most of which hang on what is not placed yet.
-
-        Args:
-            limb_by_limb: a limb's end comes with the limb.
-        """
+        """Trunk first, then limb after limb, the larger before the smaller."""
         nodes = self.sampled.tree.nodes
         forks = [len(node.children) > 1 for node in nodes]
         sizes = [round(area, 6) for area in self.surface_areas]
@@ -211,10 +202,7 @@ def named_order(tree: PoseTree, names: tuple[str, ...]) -> tuple[int, ...]:
 
 
 def _fixed_points(X_PN: np.ndarray, ball: np.ndarray) -> np.ndarray:
-    """Points (n, 3) of frame N that the samples X_PN leave where they are; none: (0, 3).
-
-    Where that is an axis, the points of it that lie in a ball (4,), centre and radius [m].
-    """
+    """Points (n, 3) of frame N that the samples X_PN leave where they are; none: (0, 3)."""
     A = (X_PN[:, :3, :3] - X_PN[0, :3, :3]).reshape(-1, 3)
     b = (X_PN[0, :3, 3] - X_PN[:, :3, 3]).reshape(-1)
     _, sizes, Vt = np.linalg.svd(A, full_matrices=False)

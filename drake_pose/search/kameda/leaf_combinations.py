@@ -30,10 +30,8 @@ def best_leaf_combination(
     a combination costs one look at the few patterns, not at the picture.
 
     Args:
-        scoring: the silhouettes.
         inner: the nodes that are not leaves.
         inner_poses: their samples (len(inner),) and poses (len(inner), 4, 4).
-        leaves: the leaf nodes.
         candidates: for each leaf the samples (n,) and poses (n, 4, 4) of its candidates.
         adopted: for each leaf the candidate in use.
         limit: up to this many combinations are all tried; beyond, one leaf after another.

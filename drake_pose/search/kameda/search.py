@@ -56,7 +56,6 @@ class PaperSearch:
     The sampling grids are made once; :meth:`match` may then be called for any number of pictures.
 
     Args:
-        tree: the pose tree.
         settings: the parameters; the paper's where not given.
     """
 

@@ -5,8 +5,8 @@ from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import SettingsError, UnknownNameError
+from drake_pose.filtering.body_state import ROOT_SHIFT
 from drake_pose.filtering.measurements.contour import (
-    ROOT_SHIFT,
     ContourObservation,
     ContourSettings,
 )

@@ -95,18 +95,6 @@ def test_axes_from_a_rendered_label_image(hand, camera, observer):
     assert all(0.7 < axis.share < 1.4 for axis in axes.values())
 
 
-def test_axes_from_a_bare_mask(hand, camera, observer):
-    x, rough = state(TRUE), state([32, 18, 17, 53, 12, 6])
-    q, q_rough = (plant_positions(s, hand.position_names, 1000.0) for s in (x, rough))
-    mask = LabelRenderer(hand, camera).mask(q)
-    axes = observer.measure_mask(mask, q_rough)
-    assert len(axes) >= 4
-    errors, distances = compare(axes, x)
-    assert errors.max() < 3.0
-    assert np.median(errors) < 1.5
-    assert distances.mean() < 3.0
-
-
 def test_what_is_occluded_is_left_out(hand, camera, observer):
     x = state(TRUE)
     q = plant_positions(x, hand.position_names, 1000.0)
@@ -134,8 +122,8 @@ def test_at_the_rough_pose_the_axis_is_that_of_the_model(hand, camera, observer)
 def test_bad_arguments_are_named(hand, camera, observer):
     q = hand.default_positions
     with pytest.raises(MaskError, match="'top'"):
-        observer.measure_mask(np.zeros((3, 3), dtype=bool), q)
-    with pytest.raises(SettingsError, match="reach"):
-        AxisSettings(reach=0.0)
+        observer.measure_labels(np.zeros((3, 3), dtype=np.int16), q)
+    with pytest.raises(SettingsError, match="correlation"):
+        AxisSettings(correlation=0.0)
     with pytest.raises(UnknownNameError, match="thumb"):
         AxisObserver(hand, camera, {"thumb": SEGMENTS["segment_11"]})

@@ -109,7 +109,7 @@ def test_joints_that_are_not_seen_come_to_rest_in_the_middle_of_their_limits(tre
         track = tracker.start(x)
         for _ in range(10):
             track = tracker.follow(track, [empty])
-        moved[rest] = observation.strain(track.state.best.mean)
+        moved[rest] = observation.prior_distance(track.state.best.mean)
     assert moved[0.3] < moved[0.0]
 
 

@@ -3,9 +3,6 @@ import sys
 
 import numpy as np
 import pytest
-from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.solvers import MathematicalProgram
 
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import load_model
@@ -19,8 +16,6 @@ from drake_pose.filtering.truncation.couplings import (
 from drake_pose.filtering.truncation.inequalities import (
     from_bounds,
     from_model,
-    from_plant,
-    from_program,
     inner_point,
     make_inequalities,
     stack,
@@ -96,14 +91,6 @@ def test_table_1(hand):
             assert not satisfied({first: base + bound + outward * 1e-6, second: base})
 
 
-def test_model_and_plant_give_the_same_rows(hand):
-    plant = MultibodyPlant(0.0)
-    Parser(plant).AddModels(str(HAND))
-    plant.Finalize()
-    ours, theirs = from_model(hand), from_plant(plant)
-    assert set(ours.rows) == set(theirs.rows)
-
-
 def test_a_joint_that_turns_freely_has_no_row(tmp_path):
     file = tmp_path / "r.urdf"
     file.write_text(FREE_AND_LIMITED)
@@ -118,27 +105,6 @@ def test_a_model_without_limits_is_allowed_and_it_is_said(tmp_path):
     with pytest.warns(UserWarning, match="no joint has a limit"):
         rows = model_inequalities(load_model(file))
     assert len(rows) == 0
-
-
-def test_a_program_gives_its_linear_and_bounding_box_rows():
-    program = MathematicalProgram()
-    x = program.NewContinuousVariables(3, "x")
-    program.AddBoundingBoxConstraint([-1, -np.inf], [2, 3], x[[2, 0]])
-    program.AddLinearConstraint(np.array([[1.0, -2.0]]), [-np.inf], [0.5], x[[1, 2]])
-    program.AddLinearConstraint(x[0] + x[1] <= 4)
-    rows = from_program(program)
-    generator = np.random.default_rng(0)
-    for point in generator.uniform(-4, 5, size=(500, 3)):
-        expected = program.CheckSatisfied(program.GetAllConstraints(), point)
-        assert (rows.margins(point) >= 0).all() == expected
-
-
-def test_a_program_with_equalities_is_refused():
-    program = MathematicalProgram()
-    x = program.NewContinuousVariables(2, "x")
-    program.AddLinearEqualityConstraint(x[0] + x[1], 1)
-    with pytest.raises(SettingsError, match="equality"):
-        from_program(program)
 
 
 def test_the_rows_that_clash_are_named_and_no_others():

@@ -2,7 +2,6 @@ import math
 
 import numpy as np
 import pytest
-from drake_pose.filtering.truncation.kernels import interval_moments
 from scipy.integrate import quad
 from scipy.stats import multivariate_normal, truncnorm
 
@@ -16,6 +15,7 @@ from drake_pose.filtering.truncation.inequalities import (
     stack,
     two_sided,
 )
+from drake_pose.filtering.truncation.kernels import interval_moments
 from drake_pose.filtering.truncation.truncated_normal import (
     clip,
     join_rows,
@@ -247,16 +247,6 @@ def test_joint_counts_a_row_once_however_often_it_is_given():
     one, other = truncate_joint(mean, covariance, rows), truncate_joint(mean, covariance, doubled)
     np.testing.assert_array_equal(one.mean, other.mean)
     np.testing.assert_array_equal(one.covariance, other.covariance)
-
-
-def test_joint_truncates_once_what_it_has_truncated_before():
-    for seed in range(10):
-        mean, covariance, rows = random_problem(seed, n=5, rows=8)
-        prepared = join_rows(rows)
-        once = truncate_joint(mean, covariance, prepared)
-        twice = truncate_joint(once.mean, once.covariance, prepared, contained=once.sites)
-        np.testing.assert_allclose(twice.mean, once.mean, atol=1e-7)
-        np.testing.assert_allclose(twice.covariance, once.covariance, atol=1e-7)
 
 
 @pytest.mark.parametrize("method", METHODS)

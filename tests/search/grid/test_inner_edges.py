@@ -16,7 +16,6 @@ from drake_pose.papers.kameda import (
 from drake_pose.search.grid.families.inner_edges import (
     EdgeErrors,
     choose_by_edges,
-    edges_of_colours,
     edges_of_labels,
     find_borders,
 )
@@ -76,23 +75,12 @@ def test_errors_out_of_range_are_refused(values: dict[str, float], message: str)
         EdgeErrors(**values)
 
 
-def test_colours_show_the_same_edges_and_their_noise_is_borne() -> None:
-    generator = np.random.default_rng(1)
-    segments = two_halves(30)
-    colours = np.array([[200, 60, 60], [60, 60, 200], [0, 0, 0]])[segments]
-    noise = generator.integers(-8, 9, (*segments.shape, 3))
-    picture = np.clip(colours + noise, 0, 255).astype(np.uint8)
-    edges = edges_of_colours(picture, segments >= 0)
-    true, other = (edges.log_likelihood(two_halves(column)) for column in (30, 20))
-    assert true > other + 5.0
-
-
 def test_pictures_that_do_not_fit_are_refused() -> None:
     segments = two_halves(30)
     with pytest.raises(SettingsError, match="same camera"):
         edges_of_labels(segments, np.ones((30, 60), dtype=np.bool_))
     with pytest.raises(SettingsError, match="empty"):
-        edges_of_colours(np.zeros((40, 60, 3), dtype=np.uint8), np.zeros((40, 60), dtype=np.bool_))
+        edges_of_labels(np.zeros((40, 60), dtype=int), np.zeros((40, 60), dtype=np.bool_))
 
 
 @pytest.fixture

@@ -64,7 +64,6 @@ class Gathering:
         """The best poses that do not look alike.
 
         Args:
-            scoring: gives J.
             pictures: with bands; in them poses are compared.
             count: at most this many.
             alike: as in BeamSearch.best_poses.
@@ -137,10 +136,7 @@ class _Looks:
 
 
 def _find_hidden(masks: np.ndarray, far: np.ndarray) -> np.ndarray:
-    """Which nodes (n, nodes) bool add nothing to what the others of their pose cover.
-
-    masks: (n, nodes, W) uint64; far: (n, nodes) the areas that have no bits.
-    """
+    """Which nodes (n, nodes) bool add nothing to what the others of their pose cover."""
     once, twice = np.zeros_like(masks[:, 0]), np.zeros_like(masks[:, 0])
     for node in range(masks.shape[1]):
         twice |= once & masks[:, node]
@@ -149,10 +145,7 @@ def _find_hidden(masks: np.ndarray, far: np.ndarray) -> np.ndarray:
 
 
 def _find_different(looks: _Looks, known: int, count: int, alike: float) -> np.ndarray:
-    """The first poses that do not look like one before, (m,) int64, at most ``count``.
-
-    The first ``known`` are known to be different.
-    """
+    """The first poses that do not look like one before, (m,) int64, at most ``count``."""
     chosen = list(range(known))
     for i in range(known, len(looks.masks)):
         if len(chosen) == count:

@@ -52,11 +52,7 @@ class Hypotheses:
 
 
 class Beam:
-    """Grows hypotheses node by node.
-
-    Args:
-        store: the poses.
-    """
+    """Grows hypotheses node by node."""
 
     def __init__(self, store: PoseStore) -> None:
         self.store = store
@@ -103,8 +99,6 @@ class Beam:
 
         Args:
             hypotheses: they have placed the node's parent.
-            node: the node.
-            width: how many are kept.
             outside_weight: what a pixel outside counts; one newly covered counts one.
             exact: drop what cannot cover the whole silhouettes any more.
 
@@ -183,7 +177,6 @@ class Beam:
 
         Args:
             start: the hypotheses to begin with.
-            order: the nodes to place.
             width: how many are kept after each.
             outside_weight, exact: as in grow.
             proceed: asked after each node, with the number of hypotheses made, whether to go on.

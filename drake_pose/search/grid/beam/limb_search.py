@@ -27,7 +27,6 @@ def search_limbs_again(
     """Search limbs again, one or two at a time, until that improves nothing any more.
 
     Args:
-        beam: grows the hypotheses.
         order: the nodes in the order in which they are placed.
         poses: (nodes,) the pose of each node in the PoseStore.
         J: its objective as the beam counts it [pixel].
@@ -85,7 +84,6 @@ def turn_single_nodes(
     """Try all samples of one node after another, all that hangs on it moving along.
 
     Args:
-        scoring: gives J.
         pictures: with bands; in them the samples are compared.
         samples: (nodes,) the sample of each node.
         proceed: asked before each node whether to go on.
@@ -115,10 +113,7 @@ def turn_single_nodes(
 
 
 def _J_by_bits(scoring: Scoring, pictures: Pictures, samples: np.ndarray, node: int) -> np.ndarray:
-    """J (n,) as the pictures show it of samples (n, nodes) that differ in one node's alone.
-
-    Beyond the bands areas are added up, not united.
-    """
+    """J (n,) as the pictures show it of samples (n, nodes) that differ in one node's alone."""
     X_WN = scoring.sampled.poses(samples)
     silhouettes = int(pictures.part_starts[len(pictures.views)])
     moving = {node}

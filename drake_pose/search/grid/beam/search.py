@@ -39,8 +39,6 @@ class BeamSearch:
     Grids and tables are made once; :meth:`match` may then be called for any number of pictures.
 
     Args:
-        tree: the pose tree.
-        settings: the parameters.
         examination: how every answer is examined: whether it is proved best, and which other poses
             look the same; None: it is not.
     """

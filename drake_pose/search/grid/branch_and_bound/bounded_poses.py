@@ -137,7 +137,6 @@ class SubtreeReaches:
         """For all poses of the node's parent the row of ``table``; -1 where not asked for yet.
 
         Args:
-            node: the node.
             parents: (n,) the poses asked for; 0 for a root.
         """
         size = int(parents.max(initial=0)) + 1

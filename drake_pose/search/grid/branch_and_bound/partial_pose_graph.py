@@ -17,7 +17,6 @@ class Layer:
     """The edges that place one node, ordered by origin and sample.
 
     Attributes:
-        node: the node.
         origins: (m,) int64 the states they start from.
         samples: (m,) int64 the node's samples.
         ends: (m,) int64 the states of the next layer that they lead to.

@@ -98,8 +98,6 @@ def branch_and_bound(
     """Find all poses of the grid whose objective is no greater than a limit.
 
     Args:
-        body: the body.
-        views: the silhouettes.
         J_limit: the limit, 0 or more [pixel].
         limits: how much it may look at.
         kept_samples: (nodes,) samples of a pose that is never dropped for want of room.
@@ -175,10 +173,7 @@ class _BranchAndBound:
         return PosesWithin(PartialPoseGraph(layers, np.zeros(0)), False, True, bound, self._visited)
 
     def _finish(self, states: _States) -> PosesWithin:
-        """The answer when all nodes are placed: lows are then the objectives.
-
-        What lies beyond the bands twice makes them uncertain.
-        """
+        """The answer when all nodes are placed: lows are then the objectives."""
         highs = states.lows + states.far[:, 1] - states.far[:, 0]
         graph = PartialPoseGraph(self._layers, highs).up_to(self.J_limit)
         sure = bool(np.all(highs <= self.J_limit))
@@ -193,10 +188,7 @@ class _BranchAndBound:
         self._lower_bound = min(self._lower_bound, float(lows.min()))
 
     def _choose(self, states: _States) -> tuple[_States, int, np.ndarray]:
-        """The node to place next, and the pairs (p, 2) int32 of a state and a pose to look at.
-
-        Nodes with a fork below them come first, then that with the fewest pairs.
-        """
+        """The node to place next, and the pairs (p, 2) int32 of a state and a pose to look at."""
         placed = {layer.node for layer in self._layers}
         order = [node for node in self.body.limb_order if node not in placed]
         waiting = [i for i in order if self.nodes[i].parent in (-1, *placed)]
@@ -241,10 +233,7 @@ class _BranchAndBound:
     def _pruned_pairs(
         self, states: _States, node: int, waiting: Sequence[int], reaches: SubtreeReaches
     ) -> np.ndarray | None:
-        """Those pairs that leave no more than what the waiting nodes can really cover.
-
-        None if there are too many pairs to look at.
-        """
+        """Those pairs that leave no more than what the waiting nodes can really cover."""
         groups = self._groups(states, node)
         if np.diff(groups).sum() > self.limits.pairs:
             return None

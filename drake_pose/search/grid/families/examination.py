@@ -81,9 +81,7 @@ def examine(
 
     Args:
         body: the body whose grid was searched.
-        views: the silhouettes.
         result: what was found in them.
-        settings: the parameters.
         root_position: (3,) as the search was given it [m].
 
     Returns:

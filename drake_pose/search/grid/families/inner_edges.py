@@ -1,6 +1,6 @@
 """Edges inside the silhouette choose among poses that the silhouette cannot tell apart.
 
-Where one limb passes in front of another, a label or colour image shows an edge that the silhouette
+Where one limb passes in front of another, a label image shows an edge that the silhouette
 does not (Kameda, Minoh, Ikeda, section 7, name this as future work). How likely the edges are if a
 pose is the true one follows from how often edges are missed, displaced or wrong; poses under which
 they are far too unlikely are ruled out, so that the true one seldom is (``choose_by_edges``).
@@ -25,9 +25,6 @@ RenderSegments = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Draws a pose, q (nq,) and X_WB (4, 4): (H, W) int the segment seen at each pixel, -1 for none.
 ``LabelRenderer.segments`` is one."""
 
-_CANNY = (50, 150)
-# Colours change at the silhouette's edge, too: so near to it no edge counts.
-_RIM = 3
 # Where no wrong edge passes, so few pixels are wrong nevertheless.
 _WRONG_PIXEL = 1e-3
 # Errors reach beyond a patch into its neighbours, but seldom farther. In each of four classes of
@@ -99,21 +96,19 @@ class InnerEdges:
         window: first row, row after the last, first column and column after the last of the
             silhouette's surroundings.
         mask: (H, W) bool, the silhouette.
-        rim: so near to the silhouette's edge no edge counts [pixel].
         errors: how they may be wrong.
     """
 
     edges: np.ndarray
     window: tuple[int, int, int, int]
     mask: np.ndarray
-    rim: int
     errors: EdgeErrors = EdgeErrors()
 
     @cached_property
     def _inside(self) -> np.ndarray:
         """The pixels of the window at which edges count."""
         top, bottom, left, right = self.window
-        return _interior(self.mask[top:bottom, left:right], self.rim)
+        return self.mask[top:bottom, left:right]
 
     @cached_property
     def _seen(self) -> np.ndarray:
@@ -167,25 +162,7 @@ def edges_of_labels(labels: np.ndarray, mask: np.ndarray) -> InnerEdges:
     """
     window = _window(labels.shape[:2], mask)
     edges = find_borders(np.where(mask, labels, -1))
-    return InnerEdges(edges, window, mask, 0)
-
-
-def edges_of_colours(
-    picture: np.ndarray, mask: np.ndarray, thresholds: tuple[int, int] = _CANNY
-) -> InnerEdges:
-    """Canny's edges inside a silhouette, a little away from its own edge.
-
-    Args:
-        picture: (H, W, 3) or (H, W) uint8.
-        mask: (H, W) bool, the silhouette.
-        thresholds: Canny's lower and upper one.
-
-    Raises:
-        SettingsError: if the shapes differ or the silhouette is empty.
-    """
-    window = _window(picture.shape[:2], mask)
-    edges = cv2.Canny(np.ascontiguousarray(picture), *thresholds) > 0
-    return InnerEdges(edges & _interior(mask, _RIM), window, mask, _RIM)
+    return InnerEdges(edges, window, mask)
 
 
 def find_borders(segments: np.ndarray) -> np.ndarray:
@@ -246,8 +223,6 @@ def choose_by_edges(
     look like, as long as the edges are no worse than their ``errors`` say.
 
     Args:
-        answer: the set.
-        edges: of each camera.
         renders: one for each camera.
         most: a set of more poses is judged by this many random ones; from the best of them, one
             node and all that hangs on it is then turned in a tenth as many ways while that helps.
@@ -298,10 +273,7 @@ def _turn_subtrees(
     most: int,
     random: np.random.Generator,
 ) -> None:
-    """Judge what can be reached from a pose by turning one node and all that hangs on it.
-
-    The best found is followed until nothing is better; the smallest subtrees come first.
-    """
+    """Judge what can be reached from a pose by turning one node and all that hangs on it."""
     nodes = answer.sampled.tree.nodes
     subtrees = [{i} for i in range(len(nodes))]
     for i in reversed(range(len(nodes))):
@@ -342,12 +314,3 @@ def _window(shape: tuple[int, ...], mask: np.ndarray) -> tuple[int, int, int, in
     if len(rows) == 0:
         raise SettingsError("the silhouette is empty: it has no inner edges")
     return int(rows.min()), int(rows.max()) + 1, int(columns.min()), int(columns.max()) + 1
-
-
-def _interior(mask: np.ndarray, rim: int) -> np.ndarray:
-    """Pixels of a mask (H, W) bool that are farther than this many pixels from its edge."""
-    if rim == 0:
-        return mask
-    padded = np.pad(mask.astype(np.uint8), 1)
-    distances = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return np.asarray(distances[1:-1, 1:-1] > rim)

@@ -36,7 +36,6 @@ def estimate_joints(
     added on both sides, because the truth may lie between the grid's values.
 
     Args:
-        sampled: the sampled tree.
         samples: for each node (n,) those of its samples that occur.
         about: for each node the values (k,) of the answer; angles that turn around are given in
             the turn nearest to them.
@@ -65,13 +64,7 @@ def estimate_joints(
 
 
 def _joined(values: np.ndarray, about: float, step: float) -> np.ndarray:
-    """Angles of one turn, rising from the widest gap between them.
-
-    Args:
-        values: (n,) rising.
-        about: they are given in the turn nearest to it.
-        step: of the grid; where no gap is wider the angles stay as they are.
-    """
+    """Angles of one turn, rising from the widest gap between them."""
     full = 2.0 * np.pi
     gaps = np.diff(values, append=values[0] + full)
     widest = int(np.argmax(gaps))

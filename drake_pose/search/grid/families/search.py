@@ -30,8 +30,6 @@ class GridPoseSet(PoseSet):
     """A set of poses of the grid that tells of any pose whether it is in it.
 
     Args:
-        graph: the poses.
-        sampled: the sampled tree.
         budget_spent: whether a limit on time or room left poses out.
     """
 
@@ -67,8 +65,6 @@ def find_families(
     """Find all poses of the grid as good as the best.
 
     Args:
-        body: the body.
-        views: the silhouettes.
         samples: (nodes,) the samples of the best pose known.
         J: its objective [pixel].
         tolerance: a pose counts as good as the best if its objective is greater by no more than

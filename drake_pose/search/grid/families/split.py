@@ -67,7 +67,6 @@ def split_into_families(graph: PartialPoseGraph, labels: list[np.ndarray]) -> li
     """The families of a graph, best first, of equals the larger first.
 
     Args:
-        graph: the poses.
         labels: for each node the clusters of its samples, as of cluster_samples.
     """
     states, families = np.zeros(1, dtype=np.int64), np.zeros(1, dtype=np.int64)

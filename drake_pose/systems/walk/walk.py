@@ -109,7 +109,7 @@ class Walker(LeafSystem):
         for part in _PARTS:
             if part not in model.link_names:
                 raise UnknownNameError("link", part, model.link_names, str(model.path))
-        self._plant, self._period = model.plant, period
+        self._plant, self._period, self._settle = model.plant, period, settle
         self._plant_context = model.plant.CreateDefaultContext()
         self._settings = settings or WalkSettings()
         self._obstacles = garden_obstacles()
@@ -120,87 +120,69 @@ class Walker(LeafSystem):
             "command": np.zeros(2),
             "rest": np.full(5, np.nan),
             "avatar_positions": standing,
+            # The stance that the person may be settling in, and since when [s].
+            "settling": np.append(np.full(5, np.nan), 0.0),
+            "heading": np.full(1, np.nan),
+            "steps": np.array(NO_STEPS),
         }
-        self._settle = settle
-        # The stance that the person may be settling in, and since when [s].
-        self._settling = self.DeclareDiscreteState(np.append(np.full(5, np.nan), 0.0))
-        self._heading = self.DeclareDiscreteState(np.full(1, np.nan))
-        self._steps = self.DeclareDiscreteState(np.array(NO_STEPS))
         self._states = {name: self.DeclareDiscreteState(start) for name, start in starts.items()}
-        for name, state in self._states.items():
-            self.DeclareStateOutputPort(name, state)
+        for name in ("walker_pose", "command", "rest", "avatar_positions"):
+            self.DeclareStateOutputPort(name, self._states[name])
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._walk)
 
     def _walk(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        states = {
-            name: context.get_discrete_state(index).value() for name, index in self._states.items()
+        known = {
+            name: np.array(context.get_discrete_state(index).value())
+            for name, index in self._states.items()
         }
-        turn, walk = NO_COMMAND
         q = self._positions.Eval(context)
-        heading = np.nan
-        if not np.isfinite(q).all():
-            discrete_state.set_value(self._steps, np.array(NO_STEPS))
+        turn, walk = NO_COMMAND
+        if np.isfinite(q).all():
+            turn, walk = self._recognise(q, known, context.get_time())
         else:
-            discrete_state.set_value(self._states["avatar_positions"], q)
-            (stance, lift), rest = self._stance(q), states["rest"]
-            heading = stance[0]
-            turned = math.remainder(
-                heading - context.get_discrete_state(self._heading).value()[0], 2.0 * math.pi
-            )
-            if abs(turned) > _AROUND:
-                rest = rest + np.array([turned, 0.0, 0.0, 0.0, 0.0])
-                discrete_state.set_value(self._states["rest"], rest)
-            if not np.isfinite(rest).all() and self._is_settled(stance, context, discrete_state):
-                rest = stance
-                discrete_state.set_value(self._states["rest"], rest)
-            if np.isfinite(rest).all():
-                last = states["command"].astype(int)
-                turn, walk = recognise_command(stance, rest, (last[0], last[1]), self._settings)
-                if not self._walks_on_spot(lift, context, discrete_state):
-                    walk = 0
-        discrete_state.set_value(self._heading, np.array([heading]))
+            known["heading"], known["steps"] = np.full(1, np.nan), np.array(NO_STEPS)
         if self._keys.HasValue(context):
             pressed = self._keys.Eval(context).astype(int)
             turn, walk = int(pressed[0]) or turn, int(pressed[1]) or walk
-        pose = follow_command(
-            states["walker_pose"],
-            (turn, walk),
-            self._period,
-            self._settings,
-            HALF_SIZE,
+        known["command"] = np.array([turn, walk], dtype=float)
+        known["walker_pose"] = follow_command(
+            known["walker_pose"], (turn, walk), self._period, self._settings, HALF_SIZE,
             self._obstacles,
-        )
-        discrete_state.set_value(self._states["command"], np.array([turn, walk], dtype=float))
-        discrete_state.set_value(self._states["walker_pose"], pose)
+        )  # fmt: skip
+        for name, index in self._states.items():
+            discrete_state.set_value(index, known[name])
         return EventStatus.Succeeded()
 
-    def _is_settled(self, stance: Array, context: Context, discrete_state: DiscreteValues) -> bool:
-        """Whether the person has stood still for long enough."""
-        settling = context.get_discrete_state(self._settling).value()
-        moved = np.abs(stance - settling[:5])
-        still = bool((moved[1:] <= _STILL).all() and moved[0] <= _FACING)
-        if not still:
-            settling = np.append(stance, context.get_time())
-            discrete_state.set_value(self._settling, settling)
-        return bool(context.get_time() - settling[5] >= self._settle)
-
-    def _walks_on_spot(self, lift: float, context: Context, discrete_state: DiscreteValues) -> bool:
-        """Whether the person does, or need not."""
-        steps = context.get_discrete_state(self._steps).value()
-        steps = follow_steps(lift, steps, self._period, self._settings)
-        discrete_state.set_value(self._steps, steps)
-        return walks_on_spot(steps) or not self._settings.on_spot
+    def _recognise(self, q: Array, known: dict[str, Array], time: float) -> tuple[int, int]:
+        """The command of a person who is seen; what is known by state's name is brought up."""
+        known["avatar_positions"] = q
+        stance, lift = self._stance(q)
+        turned = math.remainder(stance[0] - known["heading"][0], 2.0 * math.pi)
+        known["heading"] = stance[:1]
+        if abs(turned) > _AROUND:
+            known["rest"][0] += turned
+        if not np.isfinite(known["rest"]).all():
+            moved = np.abs(stance - known["settling"][:5])
+            if not (moved[0] <= _FACING and (moved[1:] <= _STILL).all()):
+                known["settling"] = np.append(stance, time)
+            if time - known["settling"][5] < self._settle:
+                return NO_COMMAND
+            known["rest"] = stance
+        last = known["command"].astype(int)
+        turn, walk = recognise_command(stance, known["rest"], (last[0], last[1]), self._settings)
+        known["steps"] = follow_steps(lift, known["steps"], self._period, self._settings)
+        is_walking = walks_on_spot(known["steps"]) or not self._settings.on_spot
+        return turn, walk if is_walking else 0
 
     def _stance(self, q: Array) -> tuple[Array, float]:
         """The stance (5,), and how much higher the left foot is than the right one [m]."""
         self._plant.SetPositions(self._plant_context, q)
-        X_WL = [
+        X_WH, *X_WF = [
             self._plant.GetBodyByName(part).EvalPoseInWorld(self._plant_context) for part in _PARTS
         ]
-        left_W = X_WL[0].rotation().col(0)
-        feet = np.array([X.translation() for X in X_WL[1:]])
+        feet = np.array([X.translation() for X in X_WF])
         lift = float(feet[0, 2] - feet[1, 2])
-        return stance_of(left_W, X_WL[0].translation(), feet), lift
+        return stance_of(X_WH.rotation().col(0), X_WH.translation(), feet), lift
 
 
 class WalkKeys(LeafSystem):

@@ -27,7 +27,7 @@ from drake_pose.jobs.batch.tasks import (
     remove_parts,
     work_folder,
 )
-from drake_pose.jobs.batch.workers import OwnProcess, WorkerPool
+from drake_pose.jobs.batch.workers import WorkerPool
 from drake_pose.results.folder import require_empty
 
 # A scene of which this many chunks have failed is given up.
@@ -70,7 +70,7 @@ def run_batch(
     try:
         batch.write()
         batch.plan()
-        batch.run(OwnProcess() if pool is None else pool)
+        batch.run(pool or WorkerPool())
     finally:
         batch.write()
     return batch.result()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pickle
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from drake_pose.errors import ClusterError
 from drake_pose.jobs.batch.tasks import Outcome, Task, describe_failure, perform
@@ -16,39 +16,28 @@ if TYPE_CHECKING:
     from distributed import Client
 
 
-class WorkerPool(Protocol):
-    """Who does the tasks."""
+class WorkerPool:
+    """A pool of one worker: this process, which does a task when it is waited for."""
+
+    def __init__(self) -> None:
+        self._waiting: deque[Task] = deque()
 
     @property
     def size(self) -> int:
         """How many tasks can be under way at once."""
+        return 1
 
     def start(self, task: Task) -> None:
         """Begins a task."""
+        self._waiting.append(task)
 
     def next(self) -> tuple[Task, Outcome]:
         """Waits for a task that was begun; ClusterError: the workers are gone."""
-
-
-class OwnProcess:
-    """A pool of one worker: this process, which does a task when it is waited for."""
-
-    size = 1
-
-    def __init__(self) -> None:
-        self._tasks: deque[Task] = deque()
-
-    def start(self, task: Task) -> None:
-        """Begins a task."""
-        self._tasks.append(task)
-
-    def next(self) -> tuple[Task, Outcome]:
-        """Does the task that was begun first."""
-        task = self._tasks.popleft()
+        task = self._waiting.popleft()
         return task, perform(task)
 
 
-class ClusterPool:
+class ClusterPool(WorkerPool):
     """The workers of a cluster.
 
     At most one task a thread is under way, so that none waits at a worker that may die.
@@ -79,7 +68,7 @@ class ClusterPool:
         self._completed.add(future)
 
     def next(self) -> tuple[Task, Outcome]:
-        """Waits for a task; ClusterError: the scheduler has gone."""
+        """Waits for a task that was begun; ClusterError: the scheduler has gone."""
         from distributed import KilledWorker
 
         future = next(self._completed)

@@ -10,8 +10,6 @@ import yaml
 
 from drake_pose.camera.files import save_cameras
 from drake_pose.commands.main import app
-from drake_pose.errors import SettingsError
-from drake_pose.jobs.batch.job import read_job
 from tests.cli import CliRunner, Result
 from tests.jobs.registration.arm_scenes import ArmScene, write_arm_scene
 
@@ -92,20 +90,3 @@ def test_it_is_resumed(jobs: Path, audited: Result, runner: CliRunner) -> None:
     (masks / "0000.png").write_bytes(first)
     assert result.exit_code == 1
     assert "masks of frame 0000 were replaced" in " ".join(result.stderr.split())
-
-
-@pytest.mark.parametrize(
-    ("entry", "said"),
-    [
-        ({"audit": "joints.csv", "interval": 5}, "an audit has no setting interval"),
-        ({"audit": "joints.csv", "truth": "joints.csv"}, "an audit has no setting truth"),
-        ({"camera_file": "cameras.yaml"}, "camera_file is a setting of audits"),
-    ],
-)
-def test_settings_of_the_other_kind_are_refused(
-    entry: dict[str, object], said: str, tmp_path: Path
-) -> None:
-    path = tmp_path / "jobs.yaml"
-    path.write_text(yaml.safe_dump({"scenes": {"one": {"scene": "one", **entry}}}))
-    with pytest.raises(SettingsError, match=said):
-        read_job(path)

@@ -351,6 +351,9 @@ def test_job_file_gives_the_settings(tmp_path):
         ("scenes: {a: {scene: a}}\nchunk: 0", "chunk: must be a whole number"),
         ("scenes: {a: {scene: a}}\ndefaults: {model: 3}", "model: must be a text"),
         ("scene: {a: {scene: a}}", "no setting scene"),
+        ("scenes: {a: {scene: a, audit: j.csv, interval: 5}}", "an audit has no setting interval"),
+        ("scenes: {a: {scene: a, audit: j.csv, truth: j.csv}}", "an audit has no setting truth"),
+        ("scenes: {a: {scene: a, camera_file: c.yaml}}", "camera_file is a setting of audits"),
         ("scenes: {a: {scene: a}, a: {scene: b}}", "given twice"),
     ],
 )

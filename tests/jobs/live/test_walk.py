@@ -1,13 +1,10 @@
 import contextlib
 import json
 import math
-import shutil
 import socket
-import subprocess
 import threading
 import time
 
-import cv2
 import numpy as np
 import pytest
 
@@ -32,22 +29,6 @@ from drake_pose.person.date.walk_commands import WalkSettings
 from drake_pose.results.folder import PoseRow, ResultFolder
 from drake_pose.systems.walk.garden import START
 from tests.cli import CliRunner
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-WIDTH, HEIGHT, VIEW_DEGREES = 640, 480, 75.0
-FLAGS = [
-    "--headless",
-    "--no-sandbox",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--virtual-time-budget=10000",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
 
 
 def record(folder, ahead, lost=()):
@@ -233,92 +214,3 @@ def test_keys_alone_leave_the_walker_where_he_is():
     found = walk(key_player(), open_page(), seconds=1.0, speed=0.0)
     assert (found["x"], found["y"], found["heading_deg"]) == START
     assert not any(found["commands"].values())
-
-
-def screenshot(page, folder):
-    """What a real browser shows, (H, W, 3) red, green, blue."""
-    file = folder / "page.png"
-    subprocess.run(
-        [
-            CHROMIUM,
-            *FLAGS,
-            f"--user-data-dir={folder / 'profile'}",
-            f"--window-size={WIDTH},{HEIGHT}",
-            f"--screenshot={file}",
-            page.web_url(),
-        ],
-        check=True,
-        capture_output=True,
-        timeout=120,
-    )
-    return cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2RGB).astype(int)
-
-
-def pixel_of(point, pose):
-    """Where a point of the place is seen over the shoulder of the walker."""
-    forward = np.array([math.cos(pose[2]), math.sin(pose[2]), 0.0])
-    ground = np.array([pose[0], pose[1], 0.0])
-    eye = ground - 3.2 * forward + (0.0, 0.0, 2.1)
-    ahead = ground + 1.5 * forward + (0.0, 0.0, 1.1) - eye
-    ahead /= np.linalg.norm(ahead)
-    right = np.cross(ahead, (0.0, 0.0, 1.0))
-    right /= np.linalg.norm(right)
-    away = np.asarray(point) - eye
-    focal = 0.5 * HEIGHT / math.tan(math.radians(VIEW_DEGREES / 2))
-    depth = away @ ahead
-    column = WIDTH / 2 + focal * (away @ right) / depth
-    return round(column), round(HEIGHT / 2 - focal * (away @ np.cross(right, ahead)) / depth)
-
-
-def avatar_at(picture, point, pose):
-    """Whether a pixel shows the avatar's blue-green shirt."""
-    column, row = pixel_of(point, pose)
-    red, green, blue = picture[row, column]
-    return min(green, blue) > 1.5 * red
-
-
-def screenshot_of_avatar(page, folder, point, pose):
-    """A browser on a busy computer may take its picture before the avatar has come."""
-    for _ in range(3):
-        seen = screenshot(page, folder)
-        if avatar_at(seen, point, pose):
-            break
-    return seen
-
-
-def red_at(picture, point, pose):
-    column, row = pixel_of(point, pose)
-    red, green, blue = picture[row, column]
-    return red > 1.6 * max(green, blue, 40)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")
-def test_real_browser_shows_the_avatar_in_the_place(tmp_path):
-    player = key_player()
-    q = stride_positions(player.model)[-1]
-    ahead, turned = q.copy(), q.copy()
-    ahead[player.model.position_index("position_x")] = 0.4
-    turned[player.model.position_index("head_y")] = math.radians(-45.0)
-    page = open_page()
-    gates = [(-4.0, 1.3, 1.0), (-4.0, -1.3, 1.0), (-4.0, 0.0, 2.9)]
-
-    walked = walk(Player(player.model, np.array([q] + 30 * [ahead])), page, speed=0.0)
-    pose = (walked["x"], walked["y"], math.radians(walked["heading_deg"]))
-    assert pose[0] > START[0] + 0.7
-    # The avatar, 40 cm ahead of where it rests.
-    trunk = (pose[0] + 0.4, pose[1], 1.2)
-    seen = screenshot_of_avatar(page, tmp_path, trunk, pose)
-    assert avatar_at(seen, trunk, pose)
-    assert all(red_at(seen, gate, pose) for gate in gates)
-    top, bottom = seen[5, 200], seen[-30, 20]
-    assert top[2] > top[1] > top[0], "sky above"
-    assert bottom[1] > 1.2 * max(bottom[0], bottom[2]), "lawn below"
-
-    walked = walk(Player(player.model, np.array([q] + 60 * [turned])), page, speed=0.0)
-    pose = (walked["x"], walked["y"], math.radians(walked["heading_deg"]))
-    assert walked["heading_deg"] < -60.0
-    trunk = (pose[0], pose[1], 1.2)
-    seen = screenshot_of_avatar(page, tmp_path, trunk, pose)
-    assert avatar_at(seen, trunk, pose)
-    assert not any(red_at(seen, (-4.0, 1.3, z), (*START[:2], 0.0)) for z in (0.8, 1.0, 1.2))

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pydrake.geometry import Meshcat, MeshcatParams, Rgba
-from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
@@ -13,7 +12,6 @@ from pydrake.systems.primitives import ConstantVectorSource
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.tree.node_skin import ModelSkin
 from drake_pose.camera.models import ParallelCamera
-from drake_pose.results.replay import make_replay
 from drake_pose.search.kameda.search import PaperSearch
 from drake_pose.search.settings import PaperSearchSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
@@ -104,10 +102,3 @@ def test_models_without_skin_get_no_system(tmp_path: Path) -> None:
     source = builder.AddSystem(ConstantVectorSource(np.zeros(5)))
     add_meshcat_skin(builder, _Recorder(), plain, source.get_output_port(), "plain")
     assert len(builder.GetSystems()) == 1
-
-
-def test_a_replay_holds_each_shape(limb: ArticulatedModel) -> None:
-    positions = np.array([np.zeros(5), [0.1, 1.0, 0.2, 0.3, 0.4], [0.1, 1.5, 0.2, 0.3, 0.4]])
-    page = make_replay(limb, positions, [RigidTransform()] * 3, [camera()], 0.1)
-    assert page.count("body_skin") >= 0
-    assert len(page) > 10_000

@@ -178,24 +178,6 @@ def test_a_moving_hand_is_matched_once_and_tracked(hand, camera, search):
     assert np.isnan(deviations[:, held]).all()
 
 
-@pytest.mark.slow
-def test_after_blank_images_it_finds_the_hand_again(hand, camera, renderer, search):
-    """Nothing is seen for ten frames; then the hand is bent otherwise."""
-    truth = positions(search, np.vstack([true_angles(12), true_angles(28, phase=2.2)]))
-    images = [renderer.label_image(q) for q in truth]
-    for k in range(12, 22):
-        images[k] = np.full_like(images[k], EMPTY)
-    estimated, deviations, statistics, restart = play(images, search, camera)
-    np.testing.assert_array_equal(statistics[12:22, STATISTICS.index("count")], 0)
-    index = [hand.position_index(name) for name in ANGLES]
-    assert (deviations[21, index] > 2 * deviations[11, index]).all()
-    errors, inside = compare(hand, estimated, deviations, truth)
-    assert np.median(errors[26:]) < 1.0
-    assert inside[24:].mean() > 0.9
-    # So unsure, the filter finds the way itself, or asks the matcher.
-    assert restart[22:].sum() <= 1
-
-
 def bent(generator):
     """(8,) a hand within Table 1, some degrees from its bounds [rad]."""
     angles, flexion = [], generator.uniform(15, 70)
@@ -235,6 +217,7 @@ def test_a_loss_is_said_and_the_matcher_asked(hand, camera, renderer, search):
         assert inside[frames].mean() > 0.85
 
 
+@pytest.mark.slow
 def test_what_is_hidden_is_left_out(hand, camera, renderer, search):
     """A finger's tip behind something: the other segments are measured, and it grows unsure."""
     truth = positions(search, true_angles(12))

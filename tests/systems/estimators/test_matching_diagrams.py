@@ -2,7 +2,6 @@ import math
 
 import numpy as np
 import pytest
-from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
@@ -79,21 +78,6 @@ def test_two_cameras_and_a_missing_one(chain):
     Simulator(alone, context).AdvanceTo(0.01)
     found = alone.GetOutputPort("estimated_positions").Eval(context)
     np.testing.assert_allclose(found, truth, atol=1e-9)
-
-
-def test_output_goes_straight_into_drakes_geometry_pose(chain):
-    """The estimated body is shown in Meshcat beside the true one, and no sensor sees it."""
-    meshcat = Meshcat(MeshcatParams(host="localhost"))
-    truth = np.radians([30.0, -60.0, 0.0])
-    camera = pinhole()
-    built = build_simulated_matching(search_for(chain), [camera], truth, PERIOD, meshcat)
-    simulator = Simulator(built.diagram)
-    simulator.AdvanceTo(0.25)
-    assert meshcat.HasPath("/drake/visualizer/true/body")
-    assert meshcat.HasPath("/drake/visualizer/estimated/body")
-    errors = built.error_log.FindLog(simulator.get_context()).data()[0]
-    # Were the estimate seen by the sensor, the default pose of the first image would be too.
-    assert (errors[1:] < 0.02).all()
 
 
 def test_no_pose_keeps_the_last_estimate_and_says_so(chain):

@@ -101,14 +101,6 @@ def test_a_view_that_lasts_is_kept_in_the_context(sequence):
     )
 
 
-def test_without_measurements_it_predicts_and_grows_unsure(sequence):
-    f, _ = experiment_filter()
-    ekf = TruncatedEkf(f, sequence.guess, PERIOD)
-    _, context = simulate(ekf, None)
-    assert ekf.GetOutputPort("statistics").Eval(context)[3] == 0
-    assert np.isfinite(ekf.GetOutputPort("estimated_state").Eval(context)).all()
-
-
 def test_a_late_camera_is_bridged(sequence):
     f, _ = experiment_filter()
     gap = sequence.measurements.copy()

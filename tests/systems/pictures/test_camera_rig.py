@@ -67,19 +67,6 @@ def test_masks_are_those_of_the_label_renderer(person, standing, tmp_path):
         assert np.ptp(picture[~near], axis=0).max() <= 1  # The background has one colour.
 
 
-def test_pictures_follow_the_positions(person, standing):
-    rig = build_camera_rig(person, circle_of_cameras(1, size=SIZE, face_camera=False))
-    context = rig.diagram.CreateDefaultContext()
-    rig.set_positions(context, standing)
-    before = rig.mask(context, "camera_0")
-    moved = standing.copy()
-    moved[person.position_index("position_y")] += 0.5
-    rig.set_positions(context, moved)
-    assert not np.array_equal(before, rig.mask(context, "camera_0"))
-    rig.set_positions(context, standing)
-    assert np.array_equal(before, rig.mask(context, "camera_0"))
-
-
 def test_trajectory_moves_the_body(person, standing):
     moved = standing.copy()
     moved[person.position_index("position_y")] += 0.5

@@ -1,4 +1,3 @@
-import cv2
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator, SimulatorStatus
@@ -247,18 +246,3 @@ class TestEye:
         assert not shows_somebody(see_silhouette(empty, 2.0)), "a speck is nobody"
         empty[20:100, 60:80] = True
         assert shows_somebody(see_silhouette(empty, 2.0))
-
-
-def test_rgba_alpha_is_ignored():
-    camera = CAMERAS["camera_0"]
-    picture = np.full((*SIZE[::-1], 3), 90, np.uint8)
-    sensor = SilhouetteSensor(camera, learn_background([picture]))
-    image = ImageRgba8U(*SIZE)
-    cv2.cvtColor(picture, cv2.COLOR_RGB2RGBA, dst=image.mutable_data)
-    image.mutable_data[10:20, 10:20, :3] = 250
-    image.mutable_data[:, :, 3] = 7
-    context = sensor.CreateDefaultContext()
-    sensor.get_input_port().FixValue(context, image)
-    region = sensor.GetOutputPort("silhouette").Eval(context).region
-    assert region[12:18, 12:18].all()
-    assert not region[:8].any()

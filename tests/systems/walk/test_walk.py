@@ -1,4 +1,5 @@
 import math
+import struct
 
 import numpy as np
 import pytest
@@ -78,6 +79,12 @@ def test_the_paper_asks_for_steps_on_the_spot(person):
     assert found[-1] == 0
 
 
+def drawn_pose(page, path):
+    """The transform (4, 4) that the browser was sent: MessagePack that ends in sixteen numbers."""
+    packed = page._GetPackedTransform(path)[-16 * 9 :]
+    return np.array([one[0] for one in struct.iter_unpack(">xd", packed)]).reshape(4, 4).T
+
+
 def test_gestures_walk_and_turn(person, page):
     lost = np.full(len(person.position_names), np.nan)
     stances = [
@@ -98,6 +105,10 @@ def test_gestures_walk_and_turn(person, page):
     np.testing.assert_allclose(ways[3], back, atol=0.06)
     assert page.HasPath("/drake/walker/avatar")
     assert page.HasPath("/drake/place/lawn")
+    # Who rests at x = 0.1 m stands where the walker is.
+    X_PR, (x, y, heading) = drawn_pose(page, "/drake/walker"), found[-1][0]
+    np.testing.assert_allclose(X_PR @ [0.1, 0.0, 0.0, 1.0], [x, y, 0.0, 1.0], atol=0.06)
+    np.testing.assert_allclose(X_PR[:2, 0], [math.cos(heading), math.sin(heading)], atol=0.06)
 
 
 def test_who_was_taken_for_facing_the_wrong_way_turns_the_rest_around(person, page):

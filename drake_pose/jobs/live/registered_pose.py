@@ -24,8 +24,8 @@ from drake_pose.person.date.recognition import (
 )
 from drake_pose.person.date.skeleton import load_skeleton
 from drake_pose.systems.colour_images import colour_image_to_picture
-from drake_pose.systems.date.horizontal_image import HorizontalImage
 from drake_pose.systems.date.preparation import prepare_paper_capture
+from drake_pose.systems.date.stages import HorizontalImage
 from drake_pose.systems.person.live_capture import LocalSensors
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
 

@@ -17,11 +17,13 @@ from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.person.date.capture import CaptureSetup
 from drake_pose.systems.bodies.posed_geometry import add_avatar
-from drake_pose.systems.date.face_direction_finder import FaceDirectionFinder
-from drake_pose.systems.date.feature_finder import FeatureFinder
-from drake_pose.systems.date.horizontal_image import HorizontalImage
 from drake_pose.systems.date.pose_estimator import PaperPoseEstimator
-from drake_pose.systems.date.pose_recogniser import PoseRecogniser
+from drake_pose.systems.date.stages import (
+    FaceDirectionFinder,
+    FeatureFinder,
+    HorizontalImage,
+    PoseRecogniser,
+)
 from drake_pose.systems.staged_diagram import StagedDiagram
 
 
@@ -66,11 +68,24 @@ def build_paper_capture(
     estimator = wiring.add("pose", PaperPoseEstimator(setup, period))
     wiring.add_images()
     wiring.watch(estimator)
-    wiring.add_recognition(estimator)
-    wiring.add_features(estimator)
-    wiring.add_face(estimator)
+    cameras, settings = list(setup.cameras.values()), setup.settings
+    if setup.registered is not None:
+        recogniser = PoseRecogniser(setup.skeleton, setup.registered, cameras, settings.recognition)
+        wiring.watch(wiring.add("recognition", recogniser))
+        wiring.finish("recognition", recogniser, "recognised_positions", estimator)
+        wiring.export(recogniser.GetOutputPort("similarity"))
+    features = FeatureFinder(cameras, settings.features)
+    wiring.watch(wiring.add("features", features))
+    for name in ("last_features", "expected_features"):
+        wiring.connect(estimator, features, name)
+    wiring.finish("features", features, "features", estimator, exported=False)
+    wiring.connect(features, estimator, "support")
+    if setup.face_camera is not None and setup.faces is not None:
+        face = FaceDirectionFinder(setup.face_camera, setup.faces, settings.farthest_face)
+        wiring.add_face(face, setup.face_camera.name)
+        wiring.finish("face", face, "face_direction", estimator)
     if source is not None and source.HasOutputPort("fresh"):
-        wiring.builder.Connect(source.GetOutputPort("fresh"), estimator.GetInputPort("fresh"))
+        wiring.connect(source, estimator, "fresh")
     if source is not None and source.HasOutputPort("time"):
         wiring.export(source.GetOutputPort("time"))
     for port in range(estimator.num_output_ports()):
@@ -149,49 +164,22 @@ class _Wiring:
             view = self._images[name].GetOutputPort("person_view")
             self.builder.Connect(view, system.GetInputPort(f"person_view_{name}"))
 
-    def add_recognition(self, estimator: PaperPoseEstimator) -> None:
-        """The registered pose, where there is one."""
-        setup = self.setup
-        if setup.registered is None:
-            return
-        cameras = list(setup.cameras.values())
-        recogniser = PoseRecogniser(
-            setup.skeleton, setup.registered, cameras, setup.settings.recognition
-        )
-        self.add("recognition", recogniser)
-        self.watch(recogniser)
-        self._finish("recognition", recogniser, "recognised_positions", estimator)
-        self.export(recogniser.GetOutputPort("recognised_positions"))
-        self.export(recogniser.GetOutputPort("similarity"))
-
-    def add_features(self, estimator: PaperPoseEstimator) -> None:
-        """Head, hands and feet."""
-        cameras = list(self.setup.cameras.values())
-        finder = FeatureFinder(cameras, self.setup.settings.features)
-        self.add("features", finder)
-        self.watch(finder)
-        for name in ("last_features", "expected_features"):
-            self.builder.Connect(estimator.GetOutputPort(name), finder.GetInputPort(name))
-        self._finish("features", finder, "features", estimator)
-        self.builder.Connect(finder.GetOutputPort("support"), estimator.GetInputPort("support"))
-
-    def add_face(self, estimator: PaperPoseEstimator) -> None:
-        """The face's direction, where there is a face camera and it knows faces."""
-        camera, faces = self.setup.face_camera, self.setup.faces
-        if camera is None or faces is None:
-            return
-        finder = FaceDirectionFinder(camera, faces, self.setup.settings.farthest_face)
+    def add_face(self, finder: FaceDirectionFinder, camera: str) -> None:
+        """What the face camera sees, to what finds the face's direction."""
         self.add("face", finder)
-        self._connect_image("color_image", camera.name, finder)
-        view = self._images[camera.name].GetOutputPort("person_view")
+        self._connect_image("color_image", camera, finder)
+        view = self._images[camera].GetOutputPort("person_view")
         self.builder.Connect(view, finder.GetInputPort("person_view"))
-        self._finish("face", finder, "face_direction", estimator)
-        self.export(finder.GetOutputPort("face_direction"))
 
-    def _finish(
-        self, stage: str, system: LeafSystem, name: str, estimator: PaperPoseEstimator
+    def connect(self, giver: System, taker: System, name: str) -> None:
+        """Connects ports of one name."""
+        self.builder.Connect(giver.GetOutputPort(name), taker.GetInputPort(name))
+
+    def finish(
+        self, stage: str, system: System, name: str, estimator: System, exported: bool = True
     ) -> None:
         """A stage ends in an output that the estimator needs."""
-        port = system.GetOutputPort(name)
-        self.stages[stage] = (port,)
-        self.builder.Connect(port, estimator.GetInputPort(name))
+        self.stages[stage] = (system.GetOutputPort(name),)
+        self.connect(system, estimator, name)
+        if exported:
+            self.export(system.GetOutputPort(name))

@@ -17,7 +17,7 @@ from drake_pose.person.date.capture import CaptureSetup
 from drake_pose.person.date.faces import head_angles
 from drake_pose.person.date.features import expect_features
 from drake_pose.person.date.skeleton import FEATURES, LIMBS
-from drake_pose.systems.date.view_ports import ViewPorts
+from drake_pose.systems.date.stages import ViewPorts
 
 Array = NDArray[np.float64]
 

@@ -14,11 +14,13 @@ from drake_pose.systems.colour_images import (
     colour_image_to_picture,
     picture_to_colour_image,
 )
-from drake_pose.systems.date.face_direction_finder import FaceDirectionFinder
-from drake_pose.systems.date.feature_finder import FeatureFinder
-from drake_pose.systems.date.horizontal_image import HorizontalImage
-from drake_pose.systems.date.pose_recogniser import PoseRecogniser
 from drake_pose.systems.date.preparation import prepare_paper_capture
+from drake_pose.systems.date.stages import (
+    FaceDirectionFinder,
+    FeatureFinder,
+    HorizontalImage,
+    PoseRecogniser,
+)
 from tests.person.studio import shared_studio
 
 

@@ -24,8 +24,8 @@ from drake_pose.filtering.tracking.match_and_track import make_tracker
 from drake_pose.filtering.tracking.sequence_fit import FittedSequence, fit_sequence, pose_set
 from drake_pose.filtering.tracking.start_poses import FollowedStart, StartSettings, find_start
 from drake_pose.jobs.estimate.inputs import Inputs, leave_out_links, make_placement_search
+from drake_pose.jobs.estimate.matching import sequence_tracking
 from drake_pose.jobs.estimate.result import OnStage
-from drake_pose.jobs.estimate.sequence import sequence_tracking
 from drake_pose.results.overlay import draw_shapes
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.search.continuous.root_placement_search import RootPlacementSearch

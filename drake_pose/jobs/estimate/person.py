@@ -1,37 +1,36 @@
-"""One person before several cameras: followed by all silhouettes at once, then compared."""
+"""One person before several cameras: followed by silhouettes or colours, then compared."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.camera.models import Camera
-from drake_pose.errors import MaskError
+from drake_pose.errors import MaskError, SceneError
 from drake_pose.jobs.estimate.capture_warnings import describe_faults
 from drake_pose.jobs.estimate.inputs import Inputs
-from drake_pose.jobs.estimate.person_by_colour import (
-    FollowedPerson,
-    follow_by_colour,
-    read_pictures,
-)
-from drake_pose.jobs.estimate.result import OnFrame, OnStage, ResultWriter
+from drake_pose.jobs.estimate.result import Drawn, FinishedFrame, OnStage, ResultWriter
 from drake_pose.jobs.estimate.scene_checks import (
     SceneWarning,
     describe_unreadable,
+    frame_ranges,
     require_readable,
     texts_of,
 )
 from drake_pose.person.recordings.checked_capture import capture_checked
+from drake_pose.person.recordings.colour_capture import ColourRecording, capture_by_colour
 from drake_pose.person.recordings.person_capture import PersonCapture
+from drake_pose.person.recordings.persons_in_view import ReadFrame
 from drake_pose.results.folder import PoseRow
 from drake_pose.results.joint_tables import record_deviations
 from drake_pose.results.summary import FrameRecord
 from drake_pose.silhouette.areas.scoring import draw_labels
-from drake_pose.silhouette.pictures.mask_agreement import compare_masks
+from drake_pose.silhouette.pictures.mask_agreement import compare_masks, edge_area
 
 Mask = NDArray[np.bool_]
 
@@ -39,14 +38,27 @@ FOLLOWED = "followed"
 """FrameRecord.stopped_by of a frame in which a person was followed."""
 
 
+@dataclass(frozen=True, eq=False)
+class _Followed:
+    """A person who was followed through all frames.
+
+    Args:
+        captured: poses and shape.
+        read: gives the masks that were used.
+        faults: what the user should know.
+        distances: (frames,) as of `ColourCapture`; None: there are masks of all frames.
+    """
+
+    captured: PersonCapture
+    read: ReadFrame
+    faults: tuple[SceneWarning, ...]
+    distances: NDArray[np.float64] | None = None
+
+
 def follow_person(
-    result: ResultWriter,
-    track: bool,
-    overlay: bool,
-    on_frame: OnFrame | None,
-    on_stage: OnStage | None,
-) -> None:
-    """Follows the person through all frames, and writes them.
+    result: ResultWriter, track: bool, overlay: bool, on_stage: OnStage | None
+) -> Iterator[FinishedFrame]:
+    """Follows the person through all frames; then gives them, compared with their masks and drawn.
 
     A recording is followed as a whole: when it is resumed, frames that were finished before are
     followed once more with those that are missing.
@@ -55,8 +67,7 @@ def follow_person(
         result: what is estimated, and where the frames go to.
         track: whether the frames of a sequence follow each other.
         overlay: whether overlays are written.
-        on_frame: hears of every frame that is compared and written.
-        on_stage: hears of what is done before that.
+        on_stage: called with what is done before the first frame is finished.
 
     Raises:
         ModelError: the model has no landmarks of a person.
@@ -65,29 +76,25 @@ def follow_person(
     """
     inputs = result.inputs_of_all()
     reader = _Reader(inputs, on_stage)
-    count = len(inputs.frames)
     begin = time.perf_counter()
-    if inputs.scene.images:
-        followed = follow_by_colour(inputs, reader, reader.count_followed)
-    else:
-        followed = _follow_masks(inputs, reader, track)
+    follow = _follow_colours if inputs.scene.images else _follow_masks
+    followed = follow(inputs, reader, track)
     reader.on_stage = None
-    seconds = (time.perf_counter() - begin) / count
+    seconds = (time.perf_counter() - begin) / len(inputs.frames)
     result.begin_again(inputs)
     shape = followed.captured.shape
     if shape is not None:
         result.more |= {"lengths_m": shape.known.lengths, "girths": shape.known.girths}
-    if on_frame is not None:
-        on_frame(0, count, "", None)
-    for index, frame in enumerate(inputs.frames):
-        _finish_frame(inputs, result, followed, reader, index, seconds, overlay)
-        if on_frame is not None:
-            on_frame(index + 1, count, frame, result.records[frame])
-    result.warn(texts_of(*reader.warnings(), *followed.faults))
+
+    def finished() -> Iterator[FinishedFrame]:
+        for index in range(len(inputs.frames)):
+            yield _finished_frame(inputs, result, followed, reader, index, seconds, overlay)
+        result.warn(texts_of(*reader.warnings(), *followed.faults))
+
+    return finished()
 
 
-def _follow_masks(inputs: Inputs, reader: _Reader, track: bool) -> FollowedPerson:
-    """The person in frames of masks."""
+def _follow_masks(inputs: Inputs, reader: _Reader, track: bool) -> _Followed:
     checked = capture_checked(
         inputs.model.pose_tree(),
         reader.cameras,
@@ -96,7 +103,47 @@ def _follow_masks(inputs: Inputs, reader: _Reader, track: bool) -> FollowedPerso
         inputs.scene.sequence and track,
         reader.count_followed,
     )
-    return FollowedPerson(checked.captured, checked.read, describe_faults(checked, inputs.frames))
+    return _Followed(checked.captured, checked.read, describe_faults(checked, inputs.frames))
+
+
+def _follow_colours(inputs: Inputs, reader: _Reader, _track: bool) -> _Followed:
+    """A sequence of pictures of which few have masks."""
+    scene, frames = inputs.scene, inputs.frames
+    masked = tuple(k for k, frame in enumerate(frames) if len(scene.cameras_of(frame)) > 1)
+    if frames[0] not in inputs.starts and 0 not in masked:
+        raise SceneError(
+            f"{scene.path}: a person is found by the masks of two cameras or more, but the first "
+            f"frame, '{frames[0]}', has fewer: add them (drake-pose masks), or --start FILE.csv"
+        )
+    order = {frame: k for k, frame in enumerate(frames)}
+    recording = ColourRecording(
+        reader.cameras,
+        len(frames),
+        reader,
+        lambda index: _read_pictures(inputs, frames[index]),
+        {order[frame]: q for frame, q in inputs.starts.items()},
+    )
+    tree = inputs.model.pose_tree()
+    found = capture_by_colour(tree, recording, masked, on_frame=reader.count_followed)
+    faults: tuple[SceneWarning, ...] = ()
+    if found.checked is not None:
+        faults = describe_faults(found.checked, [frames[k] for k in found.masked])
+    lost = [frame for frame, q in zip(frames, found.captured.q, strict=True) if np.isnan(q).any()]
+    if lost:
+        text = (
+            f"frame {frame_ranges(lost, frames)}: the person is lost, too little of the contour "
+            "fits the colours; masks of two cameras in such a frame, or its row in --start "
+            "FILE.csv, say where the person is"
+        )
+        faults += (SceneWarning("lost", text, (), tuple(lost)),)
+    return _Followed(found.captured, reader, faults, found.distances)
+
+
+def _read_pictures(inputs: Inputs, frame: str) -> dict[str, NDArray[np.uint8]]:
+    """The pictures (H, W, 3) of a frame by camera."""
+    names = [camera.name for camera in inputs.cameras]
+    images = inputs.scene.images
+    return {k: inputs.scene.read_image(k, frame) for k in names if (k, frame) in images}
 
 
 class _Reader:
@@ -123,10 +170,10 @@ class _Reader:
                 self._refused[camera, frame] = str(error)
         require_readable(self._refused, scene)
         self._read_count += 1
-        self._tell_stage()
+        self._report_stage()
         return masks
 
-    def _tell_stage(self) -> None:
+    def _report_stage(self) -> None:
         """Says what a mask is read for: all are read once before anything else is done."""
         count = len(self._inputs.frames)
         if self.on_stage is None:
@@ -139,7 +186,7 @@ class _Reader:
             self.on_stage("comparing the cameras", self._read_count - count, None)
 
     def count_followed(self, _: int) -> None:
-        """Hears of every frame in which the person was followed."""
+        """Called after each frame in which the person was followed."""
         self._followed += 1
         if self.on_stage is not None:
             self.on_stage("following", self._followed, len(self._inputs.frames))
@@ -149,16 +196,16 @@ class _Reader:
         return describe_unreadable(self._refused, self._inputs.scene)
 
 
-def _finish_frame(
+def _finished_frame(
     inputs: Inputs,
     result: ResultWriter,
-    followed: FollowedPerson,
-    reader: _Reader,
+    followed: _Followed,
+    reader: Callable[[int], Mapping[str, Mask]],
     index: int,
     seconds: float,
     overlay: bool,
-) -> None:
-    """Compares a frame's masks with the captured person, of the girth that was found."""
+) -> FinishedFrame:
+    """A frame's masks compared with the captured person, of the girth that was found."""
     frame, captured = inputs.frames[index], followed.captured
     masks, q = followed.read(index), captured.q[index]
     shown: Mapping[str, NDArray[Any]] = masks
@@ -166,13 +213,20 @@ def _finish_frame(
     if len(masks) < len(inputs.scene.cameras_of(frame)):
         shown = {**reader(index), **shown}
     if overlay and inputs.scene.images:
-        shown = {**read_pictures(inputs, frame), **shown}
+        shown = {**_read_pictures(inputs, frame), **shown}
     found = bool(np.isfinite(q).all())
-    segments = _draw_parts(inputs, captured, q if found else None, shown)
+    by_colour = found and not masks and followed.distances is not None
+    wanted = [camera for camera in inputs.cameras if by_colour or camera.name in shown]
+    segments = _draw_parts(captured, q if found else None, wanted)
     bodies = {name: one > 0 for name, one in segments.items()}
     agreement = compare_masks(masks, bodies)
-    error = agreement.E_total if masks else followed.error_by_colour(index, inputs.cameras)
-    row = PoseRow(frame, q, None, error if found else float("nan"), seconds)
+    error = agreement.E_total if masks and found else float("nan")
+    if by_colour and followed.distances is not None:
+        # Without masks, E_total is the strip between both contours over the body's area.
+        area = sum(int(np.count_nonzero(body)) for body in bodies.values())
+        edge = sum(edge_area(body) for body in bodies.values())
+        error = float(edge * followed.distances[index] / max(area, 1))
+    row = PoseRow(frame, q, None, error, seconds)
     record = FrameRecord(
         found=row.found,
         E_total=row.error if row.found else None,
@@ -183,25 +237,16 @@ def _finish_frame(
         ious=agreement.ious if row.found else {},
         share=float(captured.shares[index]),
     )
-    if overlay:
-        for name, picture in shown.items():
-            result.write_overlay(name, row, picture, bodies[name], segments[name])
-    result.finish_frame(row, record)
+    drawn = {name: Drawn(seen, bodies[name], segments[name]) for name, seen in shown.items()}
+    return FinishedFrame(row, record, drawn if overlay else {})
 
 
 def _draw_parts(
-    inputs: Inputs, captured: PersonCapture, q: NDArray[np.float64] | None, wanted: Iterable[str]
+    captured: PersonCapture, q: NDArray[np.float64] | None, cameras: Sequence[Camera]
 ) -> dict[str, NDArray[np.int16]]:
-    """Which part of the person each pixel of the wanted cameras shows, from 1 on; 0: none."""
-    X_WN = None
-    if q is not None:
-        X_WN = captured.tree.node_poses(captured.tree.values_from_positions(q))
+    """Which part of the person each pixel of the cameras shows, from 1 on; 0: none."""
+    if q is None:
+        return {c.name: np.zeros((c.height, c.width), dtype=np.int16) for c in cameras}
+    X_WN = captured.tree.node_poses(captured.tree.values_from_positions(q))
     labels = range(1, 1 + len(captured.outlines))
-    segments: dict[str, NDArray[np.int16]] = {}
-    for camera in inputs.cameras:
-        if camera.name in wanted:
-            segments[camera.name] = np.zeros((camera.height, camera.width), dtype=np.int16)
-            if X_WN is not None:
-                X_CN = camera.X_CW @ X_WN
-                segments[camera.name] = draw_labels(captured.outlines, labels, X_CN, camera)
-    return segments
+    return {c.name: draw_labels(captured.outlines, labels, c.X_CW @ X_WN, c) for c in cameras}

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydrake.math import RigidTransform
@@ -51,6 +51,22 @@ record; once with "" and None before the first frame."""
 
 OnStage = Callable[[str, int, int | None], None]
 """Called with what is done, and how much of how much (None: nobody knows) is done of it."""
+
+
+class Drawn(NamedTuple):
+    """A camera's frame: a mask (H, W) or picture (H, W, 3), where the body is, and its segments."""
+
+    seen: np.ndarray
+    body: np.ndarray
+    segments: np.ndarray | None
+
+
+class FinishedFrame(NamedTuple):
+    """A frame as it is written; drawn: by camera, what an overlay is made of."""
+
+    row: PoseRow
+    record: FrameRecord
+    drawn: Mapping[str, Drawn]
 
 
 @dataclass(frozen=True)
@@ -189,6 +205,19 @@ class ResultWriter:
             self._folder.open()
         self.write_summary()
 
+    def add_all(self, frames: Iterable[FinishedFrame], on_frame: OnFrame | None) -> None:
+        """Write frames as they come, each at once."""
+        total = len(self.inputs.frames)
+        finished = total - len(self.missing)
+        if on_frame is not None:
+            on_frame(finished, total, "", None)
+        for count, (row, record, drawn) in enumerate(frames, finished + 1):
+            for camera, one in drawn.items():
+                self._write_overlay(camera, row, one)
+            self.finish_frame(row, record)
+            if on_frame is not None:
+                on_frame(count, total, row.frame, self.records[row.frame])
+
     def finish_frame(self, row: PoseRow, record: FrameRecord) -> None:
         """Write a frame. Finished is what has its row in poses.csv; all else comes before."""
         if self._folder is not None:
@@ -198,20 +227,12 @@ class ResultWriter:
         if time.monotonic() > self._next_summary:
             self.write_summary()
 
-    def write_overlay(
-        self,
-        camera: str,
-        row: PoseRow,
-        seen: np.ndarray,
-        body: np.ndarray,
-        segments: np.ndarray | None,
-    ) -> None:
-        """Write the overlay of a camera's frame: over its mask (H, W), or its picture (H, W, 3)."""
+    def _write_overlay(self, camera: str, row: PoseRow, drawn: Drawn) -> None:
         if self._folder is None:
             return
         error = f"E_total {100.0 * row.error:.1f} %" if row.found else "no pose found"
-        draw = draw_overlay if seen.ndim == 2 else draw_over_picture
-        picture = draw(seen, body, segments, [f"{camera}  frame {row.frame}  {error}"])
+        draw = draw_overlay if drawn.seen.ndim == 2 else draw_over_picture
+        picture = draw(*drawn, [f"{camera}  frame {row.frame}  {error}"])
         self._folder.write(f"{OVERLAY}/{camera}/{row.frame}.png", encode_png(picture))
 
     def write(self, name: str, data: bytes) -> None:

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from drake_pose.commands.main import app
+from drake_pose.jobs.estimate.matching import sequence_tracking
 from drake_pose.jobs.estimate.scene import estimate_scene
-from drake_pose.jobs.estimate.sequence import sequence_tracking
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
 from drake_pose.search.estimates import TRACKED

@@ -64,15 +64,7 @@ class FittedBody(NamedTuple):
 
 
 class _Fitted(NamedTuple):
-    """A sequence fitted as a whole.
-
-    Attributes:
-        search: for the fitted body.
-        known: the answer for each frame, by its number.
-        model: the fitted body.
-        observation: of it.
-        x: (n,) its state in the first frame.
-    """
+    """A sequence fitted as a whole: answers by frame number, the body, and its first state."""
 
     search: RootPlacementSearch
     known: dict[int, PoseEstimate]
@@ -82,27 +74,18 @@ class _Fitted(NamedTuple):
 
 
 class _StartedSearch(RootPlacementSearch):
-    """A search whose answer for one silhouette is known."""
+    """A search whose first answer is known: that of the frame in which the track goes on."""
 
-    def start_with(self, mask: np.ndarray, answer: PoseEstimate) -> None:
-        """Remember an answer."""
-        self._known = mask, answer
+    first: PoseEstimate | None = None
 
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
         """As RootPlacementSearch."""
-        mask, answer = self._known
-        if len(views) == 1 and np.array_equal(views[0].mask, mask):
-            return answer
-        return super().match(views, root_position)
+        known, self.first = self.first, None
+        return super().match(views, root_position) if known is None else known
 
 
 def fit_body(inputs: Inputs, settings: EstimateSettings, on_stage: OnStage | None) -> FittedBody:
-    """Find out about the body, where it is followed through a sequence of an unknown camera.
-
-    Args:
-        inputs: what is estimated.
-        settings: the estimate's.
-        on_stage: hears that it is done.
+    """Find out about the body, where it is followed through a sequence of an uncalibrated camera.
 
     Raises:
         DrakePoseError: as for an estimate.
@@ -160,8 +143,7 @@ class _BodyFit:
         self._more["body_fit_seconds"] = round(seconds, 3)
         known = {k: replace(one, seconds=seconds / len(known)) for k, one in known.items()}
         started = _StartedSearch(search.tree, search.settings, search.placement)
-        last = max(known)
-        started.start_with(self._masks[last], known[last])
+        started.first = known[max(known)]
         by_frame = {self._inputs.frames[k]: one for k, one in known.items()}
         inputs = replace(self._inputs, search=started, known=by_frame)
         return FittedBody(inputs, self._more, shapes)

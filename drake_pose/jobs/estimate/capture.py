@@ -27,22 +27,18 @@ def capture_scene(
     overlay: bool = True,
     packages: Mapping[str, Path] | None = None,
 ) -> SceneEstimate:
-    """Captures the person in a scene with two calibrated cameras or more.
+    """Captures the person in a scene with two calibrated cameras or more; see `estimate_scene`.
 
     Args:
         scene: the scene's folder.
         out: the result's folder, empty or not there; None writes nothing.
-        model: a person with landmarks.yaml beside it; the bundled one with shape joints where
-            not given.
+        model: a person with landmarks.yaml beside it; None: the bundled one with shape joints.
         replay: whether replay.html is written.
         overlay: whether overlays are written.
         packages: folders of packages that the model's ``package://`` names mean, by name.
 
-    Returns:
-        The estimate, as `estimate_scene` gives it.
-
     Raises:
-        SceneError: fewer than two cameras, or cameras nobody knows.
+        SceneError: fewer than two cameras, or uncalibrated ones.
         ModelError: the model is no person with landmarks.
         OutputError: the result cannot be written.
     """

@@ -16,12 +16,7 @@ _FITS_BADLY = 0.6
 
 
 def describe_faults(checked: CheckedCapture, frames: Sequence[str]) -> tuple[SceneWarning, ...]:
-    """All that was wrong with a recording.
-
-    Args:
-        checked: the capture; its frames are counted from 0.
-        frames: the names of all frames.
-    """
+    """All that was wrong with a recording whose frames have these names."""
     return (
         *describe_views(checked.views, frames),
         *describe_fit(checked.captured.shares.tolist(), frames),
@@ -31,12 +26,7 @@ def describe_faults(checked: CheckedCapture, frames: Sequence[str]) -> tuple[Sce
 
 
 def describe_views(views: ViewFaults, frames: Sequence[str]) -> tuple[SceneWarning, ...]:
-    """Warnings of who was in view or was not.
-
-    Args:
-        views: what was in view; frames are counted from 0.
-        frames: the names of all frames.
-    """
+    """Warnings of who was in view or was not."""
     found = []
     if views.nobody:
         names = [frames[k] for k in views.nobody]
@@ -73,12 +63,7 @@ def _describe_others(views: ViewFaults, frames: Sequence[str]) -> list[SceneWarn
 
 
 def describe_fit(shares: Sequence[float], frames: Sequence[str]) -> tuple[SceneWarning, ...]:
-    """A warning of a person who fits nowhere.
-
-    Args:
-        shares: of the contours, what fits in each frame; 0 where there is no pose.
-        frames: the names of all frames.
-    """
+    """A warning of a person of whose contours too little fits in the frames with a pose."""
     known = [share for share in shares if share > 0.0]
     usual = float(np.median(known)) if known else 1.0
     if usual > _FITS_BADLY:

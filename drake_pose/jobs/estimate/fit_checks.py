@@ -1,8 +1,4 @@
-"""Whether the poses that were found explain the pictures, and what to look at where they do not.
-
-A search answers with the best pose there is, even if cameras are exchanged, or the model is another
-robot's. What then remains is more than a sound model and calibration ever leave.
-"""
+"""Whether the poses that were found explain the pictures, and what to look at where they do not."""
 
 from __future__ import annotations
 
@@ -46,9 +42,7 @@ class Contradiction:
     Args:
         cameras: those at fault; all that are compared, where nobody can tell.
         exchanged: whether it is explained once their pictures are exchanged.
-        together: E_total by all cameras.
-        alone: by each camera alone; empty where cameras are exchanged.
-        after: with the pictures exchanged; NaN where they are not.
+        together, alone, after: E_total by all cameras, by each alone, and with pictures exchanged.
     """
 
     cameras: tuple[str, ...]

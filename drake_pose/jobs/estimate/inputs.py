@@ -7,6 +7,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydrake.multibody.tree import BodyIndex
@@ -18,7 +19,12 @@ from drake_pose.body.tree.root import RootRotation
 from drake_pose.camera.files import load_camera_file
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SceneError, SettingsError, UnknownNameError
-from drake_pose.jobs.estimate.measurements import TrueAngles, read_joint_centres, read_true_angles
+from drake_pose.jobs.estimate.measurements import (
+    TrueAngles,
+    read_joint_centres,
+    read_starts,
+    read_true_angles,
+)
 from drake_pose.jobs.estimate.person_choice import follows_person
 from drake_pose.jobs.estimate.scene_checks import (
     CheckedScene,
@@ -27,7 +33,6 @@ from drake_pose.jobs.estimate.scene_checks import (
     leave_out_unreadable,
     texts_of,
 )
-from drake_pose.jobs.estimate.starts import read_starts
 from drake_pose.results.options import select_frames
 from drake_pose.results.settings import EstimateSettings, RootTurns
 from drake_pose.search.continuous.multi_start import MultiStartSearch
@@ -55,8 +60,7 @@ class Inputs:
         model: the body.
         cameras: the cameras that are matched together.
         frames: the frames' names.
-        search: the search, made for the body's pose tree; None where a person is followed by all
-            silhouettes at once.
+        search: made for the body's pose tree; None where a person is followed by all silhouettes.
         root_positions: the root's position (3,) by frame [m], where it differs.
         truth: measured joint positions, where there are some.
         warnings: what the user should know of the input.
@@ -85,8 +89,7 @@ def read_inputs(
         scene_path: the scene's folder.
         model_path: the model file.
         settings: the settings.
-        truth_path: measured joint positions; the scene's own joint_angles.csv, if there is one,
-            where None.
+        truth_path: measured joint positions; None: the scene's own joint_angles.csv, if any.
 
     Raises:
         DrakePoseError: names the file, camera, frame, link or joint at fault.
@@ -105,20 +108,16 @@ def read_inputs(
     if (scene.images or not starts) and follows_person(scene, cameras, model, settings):
         texts = (*texts_of(*checked.warnings, *check_upright(cameras)), *model.warnings)
         return Inputs(scene, model, cameras, frames, None, None, truth, texts, starts)
-    root_positions = None
+    root_positions: Mapping[str, np.ndarray] | None = None
     position: np.ndarray | None = None
-    anywhere = settings.root_position == "unknown" or (
-        scene.scale_unknown and settings.root_position is None
-    )
-    if settings.root_position is None or settings.root_position == "unknown":
-        pass
-    elif len(settings.root_position) == 2:
-        root_positions = read_joint_centres(*settings.root_position, frames)
+    root = settings.root_position
+    if isinstance(root, tuple) and len(root) == 2:
+        root_positions = read_joint_centres(*root, frames)
         position = root_positions[frames[0]]
-    else:
-        position = np.array(settings.root_position)
+    elif isinstance(root, tuple):
+        position = np.array(root)
     search: PoseSearch
-    if anywhere or scene.scale_unknown:
+    if root == "unknown" or scene.scale_unknown:
         search = make_placement_search(model, settings, position, scene.scale_unknown)
     else:
         search = _make_search(make_tree(model, settings, position), settings, model)
@@ -129,10 +128,7 @@ def read_inputs(
 
 
 def _named_cameras(scene_path: Path, wanted: Sequence[str]) -> Mapping[str, Camera] | None:
-    """The scene's cameras where all that are named stand somewhere, though others may not.
-
-    None: the scene is read as ever, and says what is wrong.
-    """
+    """The scene's cameras where all that are named are placed, though others are not; else None."""
     path = scene_path / CAMERA_FILE
     if not wanted or not os.path.lexists(path):
         return None
@@ -265,22 +261,22 @@ def _in_plant_units(model: ArticulatedModel, values: Mapping[str, float]) -> dic
     }
 
 
+def _sampling(model: ArticulatedModel, settings: EstimateSettings) -> dict[str, Any]:
+    """The sampling intervals that all searches take."""
+    return {
+        "interval": math.radians(settings.interval),
+        "length_interval": settings.length_interval,
+        "intervals": _in_plant_units(model, settings.joint_intervals),
+    }
+
+
 def _make_search(tree: PoseTree, settings: EstimateSettings, model: ArticulatedModel) -> PoseSearch:
-    interval = math.radians(settings.interval)
-    intervals = _in_plant_units(model, settings.joint_intervals)
     if settings.method != "paper":
-        beam = BeamSearchSettings(
-            interval=interval,
-            length_interval=settings.length_interval,
-            intervals=intervals,
-            time_limit=settings.time_limit,
-        )
         continuous = settings.angles == "continuous"
+        beam = BeamSearchSettings(**_sampling(model, settings), time_limit=settings.time_limit)
         return MultiStartSearch(tree, MultiStartSettings(beam, continuous))
     paper = PaperSearchSettings(
-        interval=interval,
-        length_interval=settings.length_interval,
-        intervals=intervals,
+        **_sampling(model, settings),
         outside_limit=settings.outside_limit,
         candidate_limit=settings.candidates,
         run_limit=settings.run_limit,
@@ -318,22 +314,14 @@ def make_placement_search(
         held = _in_plant_units(model, settings.hold)
         rotation = RootRotation.free(interval_deg=_FREE_ROOT_INTERVAL)
         tree = model.pose_tree(hub(tree), root_position=first, root_rotation=rotation, held=held)
-    beam = BeamSearchSettings(
-        interval=math.radians(settings.interval),
-        length_interval=settings.length_interval,
-        intervals=_in_plant_units(model, settings.joint_intervals),
-        time_limit=settings.time_limit,
-    )
+    beam = BeamSearchSettings(**_sampling(model, settings), time_limit=settings.time_limit)
     return RootPlacementSearch(tree, beam, PlacementSettings(scale_unknown=scale_unknown))
 
 
 def _check_pictures(
     scene: Scene, cameras: Sequence[Camera], frames: Sequence[str], search: PoseSearch
 ) -> CheckedScene:
-    """Reads every mask once, and looks whether every camera can see the body in a first pose.
-
-    A bad mask is better met now than after an hour of searching; another camera makes up for it.
-    """
+    """Reads every mask once, and looks whether every camera can see the body in a first pose."""
     readable = leave_out_unreadable(scene, [camera.name for camera in cameras], frames)
     if isinstance(search, RootPlacementSearch):
         return readable

@@ -1,4 +1,4 @@
-"""Files of measured values: joint centres by frame, and joint angles to compare with."""
+"""Files of measured values: joint centres, angles to compare with or to start from, by frame."""
 
 from __future__ import annotations
 
@@ -11,10 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_pose.errors import SceneError, UnknownNameError
+from drake_pose.body.model import ArticulatedModel
+from drake_pose.camera.models import Camera
+from drake_pose.errors import SceneError, SettingsError, UnknownNameError
 from drake_pose.regular_files import read_regular
 from drake_pose.results.folder import BASE_COLUMNS, FIT_COLUMNS
 from drake_pose.results.options import frame_number
+from drake_pose.results.settings import EstimateSettings
+from drake_pose.silhouette.pictures.scenes import Scene
 
 _CENTRE_COLUMNS = ("frame", "joint", "x", "y", "z")
 
@@ -44,17 +48,9 @@ class TrueAngles:
 
 
 def read_joint_centres(path: Path, joint: str, frames: Sequence[str]) -> dict[str, np.ndarray]:
-    """Reads where a joint is in each frame from a file of `frame,joint,x,y,z` rows.
+    """Where a joint is in each frame (3,) [m], from a file of `frame,joint,x,y,z` rows.
 
     Frames are compared as numbers: the row of frame 3 is that of ``0003.png``.
-
-    Args:
-        path: the file.
-        joint: the joint.
-        frames: the frames that are needed.
-
-    Returns:
-        (3,) position in the world by frame [m].
 
     Raises:
         SceneError: if the file cannot be read, or a frame has no row.
@@ -84,15 +80,11 @@ def read_joint_centres(path: Path, joint: str, frames: Sequence[str]) -> dict[st
 
 
 def read_true_angles(path: Path, position_names: Sequence[str]) -> TrueAngles:
-    """Reads measured joint positions from a file with the columns `frame` and positions' names.
+    """Measured joint positions [rad or m] of a file with columns `frame` and positions' names.
 
     Frames are compared as numbers where they are numbers: the row of frame 3 is that of
     ``0003.png``. The file may be the poses.csv of an estimate, of which rows without a pose are
     left out.
-
-    Args:
-        path: the file, values in rad or m.
-        position_names: the model's positions.
 
     Raises:
         SceneError: if the file cannot be read, or gives a column or a frame twice.
@@ -165,3 +157,71 @@ def _numbers(cells: Sequence[str], path: Path, line: int) -> np.ndarray:
     if not np.isfinite(numbers).all():
         raise SceneError(f"{path}: line {line} holds a number that is not finite")
     return numbers
+
+
+def read_starts(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    frames: Sequence[str],
+    model: ArticulatedModel,
+    settings: EstimateSettings,
+) -> dict[str, np.ndarray]:
+    """The plant's positions (nq,) by frame, of ``settings.start``.
+
+    Every picture is read once: a bad one is better met now than in the middle.
+
+    Raises:
+        SceneError: nothing says where the body is in the first frame, or a picture cannot be read.
+        SettingsError: a start is given, or pictures without masks, where nothing is tracked.
+    """
+    starts = _read_start_rows(frames, model, settings)
+    if starts and not (scene.sequence and settings.track):
+        raise SettingsError(
+            f"{scene.path}: --start is where a track begins, but the frames are not tracked: "
+            "scene.yaml needs sequence: true"
+        )
+    names = [camera.name for camera in cameras]
+    bare = [
+        frame
+        for frame in frames
+        if scene.images and not any((name, frame) in scene.masks for name in names)
+    ]
+    if not bare:
+        return starts
+    if not settings.track:
+        raise SettingsError(
+            f"{scene.path}: frame '{bare[0]}' has pictures but no mask, which can only be tracked "
+            "by colour: leave --no-track out, or make masks (drake-pose masks)"
+        )
+    first = frames[0]
+    if first in bare and first not in starts:
+        where = f"masks/{names[0]}/{first}.png"
+        raise SceneError(
+            f"{scene.path}: nothing says where the body is in the first frame, '{first}': add its "
+            f"mask {where} (drake-pose masks makes one), or its joint positions (--start FILE.csv)"
+        )
+    for name, frame in scene.images:
+        if name in names and frame in frames:
+            scene.read_image(name, frame)
+    return starts
+
+
+def _read_start_rows(
+    frames: Sequence[str], model: ArticulatedModel, settings: EstimateSettings
+) -> dict[str, np.ndarray]:
+    if settings.start is None:
+        return {}
+    known = read_true_angles(settings.start, model.position_names)
+    places = [model.position_index(name) for name in known.names]
+    starts = {}
+    for frame in frames:
+        values = known.of(frame)
+        if values is not None:
+            starts[frame] = model.default_positions.copy()
+            starts[frame][places] = values
+    if frames[0] not in starts:
+        raise SceneError(
+            f"{settings.start}: has no row of the first frame, '{frames[0]}', in which the track "
+            "is to begin"
+        )
+    return starts

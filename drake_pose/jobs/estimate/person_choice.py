@@ -21,12 +21,6 @@ def follows_person(
 ) -> bool:
     """Whether the method is ``person``, by name or because ``auto`` chooses it.
 
-    Args:
-        scene: the scene.
-        cameras: those of its cameras that are used.
-        model: the body.
-        settings: what the user asks for.
-
     Raises:
         SceneError, ModelError: the method is asked for, but scene or model does not allow it.
     """

@@ -45,8 +45,7 @@ def estimate_scene(
         truth: measured joint positions to compare with; the scene's own joint_angles.csv, if it
             has one, where None.
         resume: go on with an interrupted result in ``out``.
-        replay: whether replay.html is made.
-        overlay: whether overlays are written.
+        replay, overlay: whether replay.html is made, and overlays are written.
         on_frame: called after each frame.
         on_stage: called with what is done before the first frame is finished.
 
@@ -68,7 +67,7 @@ def estimate_scene(
     with_base = search is not None and _base_moves(search)
     result = ResultWriter(inputs, job, folder_path, recorded, with_base)
     by_search = "paper" if settings.method == "paper" else "beam"
-    result.more |= {"method": "person" if search is None else by_search} | of_body
+    result.more |= {"method": by_search if search is not None else "person"} | of_body
     result.open()
     try:
         if shapes is not None:

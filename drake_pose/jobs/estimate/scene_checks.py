@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import filecmp
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -116,11 +116,7 @@ def leave_out_unreadable(
 
 
 def require_readable(refused: Mapping[tuple[str, str], str], scene: Scene) -> None:
-    """Refuses a scene none of whose masks can be read.
-
-    Raises:
-        SceneError: says what is wrong with the first.
-    """
+    """Refuses a scene none of whose masks can be read: SceneError says why of the first."""
     if refused and len(refused) == len(scene.masks):
         first = next(iter(refused.values()))
         raise SceneError(f"{scene.path}: none of {len(refused)} masks can be used: {first}")
@@ -129,12 +125,7 @@ def require_readable(refused: Mapping[tuple[str, str], str], scene: Scene) -> No
 def describe_unreadable(
     refused: Mapping[tuple[str, str], str], scene: Scene
 ) -> tuple[SceneWarning, ...]:
-    """One warning a camera.
-
-    Args:
-        refused: what is wrong with the mask of (camera, frame).
-        scene: the scene.
-    """
+    """One warning a camera of what is wrong with the masks of (camera, frame)."""
     found = []
     for camera in dict.fromkeys(name for name, _ in refused):
         frames = [frame for name, frame in refused if name == camera]
@@ -160,44 +151,23 @@ def frame_ranges(frames: Iterable[str], known: Sequence[str]) -> str:
     return ", ".join(texts) + (f" and {rest} more" if rest else "")
 
 
-class _MaskFile:
-    """A mask's file, read when it must be; nothing is said of one that cannot be."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        with suppress(OSError):
-            self._size: int | None = require_regular(path)
-            return
-        self._size = None
-
-    @cached_property
-    def _content(self) -> bytes | None:
-        with suppress(OSError), self._path.open("rb", buffering=0) as file:
-            return file.read(self._size or 0)
-        return None
-
-    def is_like(self, other: _MaskFile) -> bool:
-        """Whether the two are alike byte for byte; what cannot be read is not."""
-        if self._size is None or self._size != other._size:
-            return False
-        return self._content is not None and self._content == other._content
-
-
 def find_repeats(scene: Scene) -> set[tuple[str, str]]:
     """The masks, (camera, frame), whose file is that of the frame before again, byte for byte.
 
     A recording has a hundred thousand of them: each is looked at once, and read only where it is as
-    large as a neighbour.
+    large as a neighbour; what cannot be read is like none.
     """
     found = set()
     for name in scene.cameras:
-        last = None
+        last: tuple[Path, int] | None = None
         for frame in scene.frames:
-            path = scene.masks.get((name, frame))
-            file = None if path is None else _MaskFile(path)
-            if file is not None and last is not None and file.is_like(last):
-                found.add((name, frame))
-            last = file
+            path, size = scene.masks.get((name, frame)), None
+            if path is not None:
+                with suppress(OSError):
+                    size = require_regular(path)
+                    if last and last[1] == size and filecmp.cmp(last[0], path, shallow=False):
+                        found.add((name, frame))
+            last = None if path is None or size is None else (path, size)
     return found
 
 

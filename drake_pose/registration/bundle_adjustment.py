@@ -34,7 +34,7 @@ from drake_pose.fit.parameters import (
 )
 from drake_pose.fit.unknowns import Unknowns, choose, join
 from drake_pose.registration.camera_fit import POSE_NAMES
-from drake_pose.registration.freed_frames import SeenFrame, common_size
+from drake_pose.registration.per_frame_fit import SeenFrame, common_size
 from drake_pose.registration.uncertainty import pose_covariance
 from drake_pose.silhouette.areas.outline import Outline
 

@@ -1,10 +1,9 @@
 """Which frames, cameras or joints contradict the rest, where all of them are given.
 
-Masks, cameras and encoders are given. Each frame is fitted by itself, all that is given free to
-move (``freed_frames``), and so tells by how much what is given is off; its covariance counts what
-errs together in contours (``fit.covariance``). What all frames are off alike is estimated
-from those that agree. It is no frame's fault but that of a joint's zero, a camera or the base,
-where it is significant and shows. A frame is at fault that is significantly off from the others.
+Each frame, fitted by itself (``per_frame_fit``), tells N x = h of by how much x what is given is
+off, with h's covariance Q by ``fit.covariance``. What all frames that agree are off alike is the
+fault of a joint's zero, a camera or the base; a frame is at fault that is significantly off from
+the others: r^T Q^-1 r, r = h - N x_common, follows Fisher's distribution where nothing is wrong.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import f as fisher
 
-from drake_pose.errors import SettingsError
 from drake_pose.fit.covariance import (
     Distances,
     ErrorSizes,
@@ -28,7 +26,7 @@ from drake_pose.fit.covariance import (
     widening,
 )
 from drake_pose.registration.camera_fit import POSE_NAMES
-from drake_pose.registration.freed_frames import FrameFreer, FreedFrame
+from drake_pose.registration.per_frame_fit import FrameFit, PerFrameFit
 from drake_pose.registration.uncertainty import KNOWN_BEFOREHAND
 
 Array = NDArray[np.float64]
@@ -56,39 +54,17 @@ _UNKNOWN_SIZES = ErrorSizes(1.0, 0.0, 1.0, 1.0, 1.0)
 _WIDTH = 2.0
 
 
-@dataclass(frozen=True)
-class AuditSettings:
-    """When something contradicts the rest.
-
-    Args:
-        chance: a frame that is right is named by chance this often.
-        pixels: what moves the outline by less, root mean square, is not named.
-        angle: joints may be off by so much in each frame by itself, standard deviation [rad].
-        shift: the same of sliding joints and of the base [m].
-
-    Raises:
-        SettingsError: a number that is not positive.
-    """
-
-    chance: float = 1e-4
-    pixels: float = 1.0
-    angle: float = np.radians(0.1)
-    shift: float = 0.001
-
-    def __post_init__(self) -> None:
-        for name in ("chance", "pixels", "angle", "shift"):
-            if not getattr(self, name) > 0.0:
-                raise SettingsError(f"{name} must be positive, not {getattr(self, name)}")
+# What is right is named by chance this often, and not where it moves outlines by less [pixel].
+_SIGNIFICANCE, _LEAST_PIXELS = 1e-4, 1.0
+# Joints, or sliding ones and the base, may be off by so much in each frame by itself [rad; m].
+_ANGLE_SD, _SHIFT_SD = np.radians(0.1), 0.001
 
 
 class Cause(NamedTuple):
-    """What may be off.
+    """What may be off: a "joint", a "camera" or the "base", and its name.
 
-    Attributes:
-        kind: "joint", "camera" or "base".
-        name: of the joint or the camera; "base".
-        moves: (p, d) how what was freed follows it: a joint's position [rad or m], or a rotation
-            vector [rad] and a shift [m] of a camera along its axes, or of the base in the world.
+    moves: (p, d) how what was free to move follows it: a joint's position [rad or m], or a rotation
+    vector [rad] and a shift [m] of a camera along its axes, or of the base in the world.
     """
 
     kind: str
@@ -103,14 +79,12 @@ class Finding:
     Args:
         kind: "joint", "camera", "base", "joints" where several are off, or "unexplained" where
             nothing within reach explains a frame.
-        name: of the joint or the camera; "" for joints and unexplained.
-        angle: [rad], of a camera or the base how far it is turned; the largest of joints; 0 of
-            sliding ones.
-        shift: [m].
+        name: of the joint or the camera; else "".
+        angle, shift: [rad, m]; of joints the largest.
         angle_sd, shift_sd: their standard deviations.
         pixels: how far it moves the outlines of the parts that it moves, root mean square.
-        chance: how often nothing would seem so much off by chance.
-        rivals: names of what explains it as well: which of them it is, cannot be told.
+        p_value: how often nothing would seem so much off by chance.
+        rivals: names of what explains it as well.
         joints: by how much joints are off where several are [rad or m].
     """
 
@@ -121,7 +95,7 @@ class Finding:
     angle_sd: float
     shift_sd: float
     pixels: float
-    chance: float
+    p_value: float
     rivals: tuple[str, ...] = ()
     joints: Mapping[str, float] = field(default_factory=dict)
 
@@ -131,29 +105,21 @@ class FrameAudit:
     """What was found of one frame.
 
     Args:
-        frame: its name.
-        shares: by camera, of both contours' lengths, what fits where everything is as given.
-        explained: by camera, what fits once all that is given may move.
+        given, fitted: by camera, the inlier ratio with everything as given, and once fitted.
         pixels: how far the outlines are off from what all frames have in common.
         finding: what contradicts the other frames; None: it agrees.
     """
 
     frame: str
-    shares: Mapping[str, float]
-    explained: Mapping[str, float]
+    given: Mapping[str, float]
+    fitted: Mapping[str, float]
     pixels: float
     finding: Finding | None
 
 
 @dataclass(frozen=True)
 class Audit:
-    """What contradicts the rest.
-
-    Args:
-        frames: what was found of each.
-        common: what is off in all frames that agree.
-        sizes: how large errors of contours are [pixel].
-    """
+    """What contradicts the rest: of each frame; in all that agree; sizes of errors [pixel]."""
 
     frames: tuple[FrameAudit, ...]
     common: tuple[Finding, ...]
@@ -165,8 +131,8 @@ class Audit:
         return tuple(one.frame for one in self.frames if one.finding is not None)
 
 
-class _Told(NamedTuple):
-    """What a frame tells of what was freed, in units of its reach: x^T N x - 2 h^T x.
+class FrameInformation(NamedTuple):
+    """What a frame tells of what was free, in units of its deviations: x^T N x - 2 h^T x.
 
     N: (p, p); h: (p,); of_surface: (p, 12 nodes) how h follows the surfaces, which are the same in
     all frames; outlines: (nodes, p, p) squares of how far x moves each part's outline, summed along
@@ -192,26 +158,26 @@ class _Sum(NamedTuple):
     of_surface: Array
 
     @classmethod
-    def of_none(cls, told: _Told) -> _Sum:
+    def of_none(cls, told: FrameInformation) -> _Sum:
         """What no frames tell, of as many numbers as one."""
         return cls(0, *(np.zeros_like(one) for one in (told.N, told.h, told.of_surface)))
 
-    def with_frame(self, told: _Told, sign: float) -> _Sum:
+    def with_frame(self, told: FrameInformation, sign: float) -> _Sum:
         """With another frame, or without one of them: sign -1."""
-        share = sign / told.scale
+        weight = sign / told.scale
         return _Sum(
             self.frames + int(sign),
-            self.N + share * told.N,
-            self.h + share * told.h,
-            self.of_surface + share * told.of_surface,
+            self.N + weight * told.N,
+            self.h + weight * told.h,
+            self.of_surface + weight * told.of_surface,
         )
 
 
-class _Off(NamedTuple):
-    """By how much a frame is off from the others, in units of the reach.
+class FrameDeviation(NamedTuple):
+    """By how much a frame is off from the others, in units of the deviations.
 
     r: (p,) its h without what is common, and Q: (p, p) the covariance of that; x: (p,) by how much
-    what was freed is off, as far as that is told, and covariance: (p, p).
+    what was free is off, as far as that is told, and covariance: (p, p).
     """
 
     r: Array
@@ -230,42 +196,32 @@ class _Common(NamedTuple):
     Q: Array
 
 
-def audit_frames(
-    freer: FrameFreer, freed: Sequence[FreedFrame], settings: AuditSettings | None = None
-) -> Audit:
-    """Finds what contradicts the rest, in time linear in the frames.
-
-    Args:
-        freer: what freed them.
-        freed: the frames.
-        settings: when something contradicts the rest.
-    """
-    return _Auditor(freer, freed, settings or AuditSettings()).audit()
+def audit_frames(fit: PerFrameFit, frames: Sequence[FrameFit]) -> Audit:
+    """Finds what contradicts the rest in frames that were fitted, in time linear in them."""
+    return _Auditor(fit, frames).audit()
 
 
 class _Auditor:
     """An audit under way."""
 
-    def __init__(
-        self, freer: FrameFreer, freed: Sequence[FreedFrame], settings: AuditSettings
-    ) -> None:
-        self._freer, self._freed, self._settings = freer, freed, settings
-        self._joints = len(freer.joints)
-        self._is_angle = freer.is_angle
-        tolerance = np.where(self._is_angle, settings.angle, settings.shift)
-        self._tolerance = np.diag((tolerance / freer.deviations) ** 2)
-        self._explained = _explained(freed)
+    def __init__(self, fit: PerFrameFit, frames: Sequence[FrameFit]) -> None:
+        self._fit, self._frames = fit, frames
+        self._joints = len(fit.joints)
+        self._is_angle = fit.is_angle
+        tolerance = np.where(self._is_angle, _ANGLE_SD, _SHIFT_SD)
+        self._tolerance = np.diag((tolerance / fit.deviations) ** 2)
+        self._explained = _explained(frames)
 
     def audit(self) -> Audit:
         """Does it."""
         # As long as nobody knows which frames agree, each one by itself tells how large errors are.
         sizes = self._pooled_sizes(np.flatnonzero(self._explained), 1)
-        self._told = [self._tell(one, sizes) for one in self._freed]
+        self._told = [self._tell(one, sizes) for one in self._frames]
         self._surface = sizes.surface
         agreeing = self._agreeing()
         # Contradicting frames no longer make errors seem large.
         sizes = self._pooled_sizes(np.flatnonzero(agreeing), _IN_GROUP)
-        self._told = [self._tell(one, sizes) for one in self._freed]
+        self._told = [self._tell(one, sizes) for one in self._frames]
         self._surface = sizes.surface
         agreeing = self._agreeing()
         total = self._sum(agreeing)
@@ -285,15 +241,15 @@ class _Auditor:
         spread = which[np.linspace(0, len(which) - 1, count).round().astype(int)]
         sizes = []
         for k in range(groups):
-            pictures = [one for i in spread[k::groups] for one in self._freed[i].pictures]
+            pictures = [one for i in spread[k::groups] for one in self._frames[i].pictures]
             seen = self._distances(pictures)
             is_angle = np.append(self._is_angle, np.zeros(len(pictures), bool))
             sizes.append(estimate_sizes(seen, is_angle, least_camera=0.0))
         return ErrorSizes(*np.median(np.array(sizes), axis=0).tolist())
 
     def _distances(self, pictures: Sequence[Picture]) -> Distances:
-        """The distances in pictures; their values are what was freed, then each picture's width."""
-        outlines, wide = self._freer.contours.outlines, []
+        """The distances in pictures; their values are what was free, then each picture's width."""
+        outlines, wide = self._fit.contours.outlines, []
         for c, one in enumerate(pictures):
             more = np.zeros((len(outlines), len(pictures), 12))
             for n, (outline, X_WN) in enumerate(zip(outlines, one.X_WN, strict=True)):
@@ -301,10 +257,10 @@ class _Auditor:
             wide.append(one._replace(moves=np.concatenate([one.moves, more], axis=1)))
         return distances_in_pictures(outlines, wide)
 
-    def _tell(self, freed: FreedFrame, sizes: ErrorSizes) -> _Told:
-        seen = self._distances(freed.pictures)
-        own, widths = np.split(seen.X, [len(self._freer.names)], axis=1)
-        X = own * self._freer.deviations
+    def _tell(self, fitted: FrameFit, sizes: ErrorSizes) -> FrameInformation:
+        seen = self._distances(fitted.pictures)
+        own, widths = np.split(seen.X, [len(self._fit.names)], axis=1)
+        X = own * self._fit.deviations
         V = distances_covariance(seen, sizes) + _WIDTH**2 * widths @ widths.T
         PX, Py = np.split(np.linalg.solve(V, np.column_stack([X, seen.y])), [-1], axis=1)
         N, h = X.T @ PX, PX.T @ seen.y
@@ -312,12 +268,12 @@ class _Auditor:
         left = max(float(seen.y @ Py[:, 0]) - T, 0.0)
         freedom = KNOWN_BEFOREHAND + len(seen.y) - rank
         scale = (KNOWN_BEFOREHAND + left) / freedom
-        moves = [one.moves * self._freer.deviations[:, None] for one in freed.pictures]
+        moves = [one.moves * self._fit.deviations[:, None] for one in fitted.pictures]
         outlines = sum(
-            m @ one.A @ np.swapaxes(m, 1, 2) for m, one in zip(moves, freed.pictures, strict=True)
+            m @ one.A @ np.swapaxes(m, 1, 2) for m, one in zip(moves, fitted.pictures, strict=True)
         )
-        return _Told(
-            N, h, PX.T @ seen.bends, np.asarray(outlines), freed.weights, max(scale, 1.0),
+        return FrameInformation(
+            N, h, PX.T @ seen.bends, np.asarray(outlines), fitted.weights, max(scale, 1.0),
             float(freedom),
         )  # fmt: skip
 
@@ -332,7 +288,7 @@ class _Auditor:
             for _ in range(_ROUNDS):
                 common = self._common(self._sum(kept))
                 now = self._explained & [
-                    self._chance_of_all(told, common) > self._settings.chance for told in self._told
+                    self._p_value_of(told, common) > _SIGNIFICANCE for told in self._told
                 ]
                 if (now == kept).all():
                     break
@@ -360,84 +316,75 @@ class _Auditor:
         covariance = inverse @ (Q + prior) @ inverse
         return _Common(inverse @ total.h, covariance, total.N, total.h, Q)
 
-    def _left(self, told: _Told, common: _Common) -> tuple[Array, Array]:
+    def _left(self, told: FrameInformation, common: _Common) -> tuple[Array, Array]:
         """A frame's h without what is common, and its covariance."""
         Q = told.scale * told.N + told.N @ (common.covariance + self._tolerance) @ told.N
         return told.h - told.N @ common.x, Q
 
-    def _chance_of_all(self, told: _Told, common: _Common) -> float:
-        return _chance(*_statistic(*self._left(told, common), told.N), told.freedom)
+    def _p_value_of(self, told: FrameInformation, common: _Common) -> float:
+        return _p_value(*_statistic(*self._left(told, common), told.N), told.freedom)
 
     def _audit_frame(self, k: int, others: _Sum) -> FrameAudit:
-        told, freed = self._told[k], self._freed[k]
+        told, fitted = self._told[k], self._frames[k]
         r, Q = self._left(told, self._common(others))
         spread = told.scale * np.linalg.inv(told.N + np.eye(len(r)))
-        off = _Off(r, Q, np.asarray(spread @ r / told.scale), np.asarray(spread))
-        finding = self._frame_finding(told, off, self._causes(freed), bool(self._explained[k]))
-        return FrameAudit(
-            freed.name, freed.shares[0], freed.shares[1], _pixels([told], off.x), finding
-        )
+        off = FrameDeviation(r, Q, np.asarray(spread @ r / told.scale), np.asarray(spread))
+        finding = self._frame_finding(told, off, self._causes(fitted), bool(self._explained[k]))
+        return FrameAudit(fitted.name, *fitted.inlier_ratios, _pixels([told], off.x), finding)
 
     def _frame_finding(
-        self, told: _Told, off: _Off, causes: Sequence[Cause], explained: bool
+        self, told: FrameInformation, off: FrameDeviation, causes: Sequence[Cause], explained: bool
     ) -> Finding | None:
         """What contradicts the other frames in one of them."""
-        settings = self._settings
         T, rank = _statistic(off.r, off.Q, told.N)
-        chance = _chance(T, rank, told.freedom)
+        p_value = _p_value(T, rank, told.freedom)
         pixels = _pixels([told], off.x)
         if not explained:
-            return self._joints_finding("unexplained", off, chance, pixels)
+            return self._joints_finding("unexplained", off, p_value, pixels)
         tests = [_Test.of(cause, off.r, told.N, off.Q, told.freedom) for cause in causes]
         # Each of the tests may find something by chance.
-        least = min(chance, *(one.chance for one in tests)) * (1 + len(tests))
-        if least > settings.chance or pixels < settings.pixels:
+        least = min(p_value, *(one.p_value for one in tests)) * (1 + len(tests))
+        if least > _SIGNIFICANCE or pixels < _LEAST_PIXELS:
             return None
         sufficing = self._sufficing(tests, [told], off.r, told.N)
         if not sufficing:
-            return self._joints_finding("joints", off, chance, pixels)
+            return self._joints_finding("joints", off, p_value, pixels)
         best, *rivals = sufficing
         return self._finding(best, rivals, _pixels([told], best.x))
 
     def _sufficing(
-        self, tests: Sequence[_Test], told: Sequence[_Told], r: Array, N: Array
+        self, tests: Sequence[_Test], told: Sequence[FrameInformation], r: Array, N: Array
     ) -> list[_Test]:
-        """Causes that leave little of what is off, those of fewer numbers first.
-
-        Args:
-            tests: of all causes.
-            told: by the frames.
-            r, N: what is off, and what is told of it.
-        """
+        """Causes that leave little of what is off, r, those of fewer numbers first."""
         solve = np.linalg.inv(N + np.eye(len(r)))
-        most = max(self._settings.pixels, _EXPLAINED * _pixels(told, solve @ r))
+        most = max(_LEAST_PIXELS, _EXPLAINED * _pixels(told, solve @ r))
         left = [one for one in tests if _pixels(told, solve @ (r - N @ one.x)) < most]
-        return sorted(left, key=lambda one: (one.cause.moves.shape[1], -one.merit))
+        return sorted(left, key=lambda one: (one.cause.moves.shape[1], -one.aic_gain))
 
-    def _causes(self, freed: FreedFrame | None) -> list[Cause]:
+    def _causes(self, fitted: FrameFit | None) -> list[Cause]:
         """All that may be off by itself; of the cameras those that see a frame."""
-        eye = np.eye(len(self._freer.names))
-        causes = [Cause("joint", name, eye[:, [k]]) for k, name in enumerate(self._freer.joints)]
-        names = self._freer.camera_names
+        eye = np.eye(len(self._fit.names))
+        causes = [Cause("joint", name, eye[:, [k]]) for k, name in enumerate(self._fit.joints)]
+        names = self._fit.camera_names
         for c, name in enumerate(names):
-            if freed is None or name in freed.cameras:
+            if fitted is None or name in fitted.cameras:
                 first = self._joints + c * len(POSE_NAMES)
                 causes.append(Cause("camera", name, eye[:, first : first + len(POSE_NAMES)]))
         if len(names) > 1:
-            causes.append(Cause(BASE, BASE, self._freer.base_moves()))
+            causes.append(Cause(BASE, BASE, self._fit.base_moves()))
         return causes
 
     def _finding(self, best: _Test, others: Sequence[_Test], pixels: float) -> Finding:
         rivals = [one.cause.name for one in others]
         if (
             any(one.cause.kind == "camera" for one in (best, *others))
-            and len(self._freer.camera_names) == 1
+            and len(self._fit.camera_names) == 1
         ):
             rivals.append(BASE)
-        x = best.amount * best.units(self._freer.deviations)
-        sd = np.sqrt(np.diag(best.covariance)) * best.units(self._freer.deviations)
+        x = best.amount * best.units(self._fit.deviations)
+        sd = np.sqrt(np.diag(best.covariance)) * best.units(self._fit.deviations)
         if best.cause.kind == "joint":
-            turns = bool(self._is_angle[self._freer.joints.index(best.cause.name)])
+            turns = bool(self._is_angle[self._fit.joints.index(best.cause.name)])
             off = (float(x[0]), 0.0, float(sd[0]), 0.0)
             if not turns:
                 off = (0.0, off[0], 0.0, off[2])
@@ -446,21 +393,23 @@ class _Auditor:
                 float(np.linalg.norm(x[:3])), float(np.linalg.norm(x[3:])),
                 float(np.linalg.norm(sd[:3])), float(np.linalg.norm(sd[3:])),
             )  # fmt: skip
-        return Finding(best.cause.kind, best.cause.name, *off, pixels, best.chance, tuple(rivals))
+        return Finding(best.cause.kind, best.cause.name, *off, pixels, best.p_value, tuple(rivals))
 
-    def _joints_finding(self, kind: str, off: _Off, chance: float, pixels: float) -> Finding:
+    def _joints_finding(
+        self, kind: str, off: FrameDeviation, p_value: float, pixels: float
+    ) -> Finding:
         """What is off in a frame where no cause by itself explains it."""
-        joints = (off.x * self._freer.deviations)[: self._joints]
+        joints = (off.x * self._fit.deviations)[: self._joints]
         turns = self._is_angle[: self._joints]
         angle = float(np.abs(joints[turns]).max(initial=0.0))
         shift = float(np.abs(joints[~turns]).max(initial=0.0))
         sure = np.abs(off.x) > _SURE * np.sqrt(np.diag(off.covariance))
         named = {
             name: float(one)
-            for name, one, is_sure in zip(self._freer.joints, joints, sure, strict=False)
+            for name, one, is_sure in zip(self._fit.joints, joints, sure, strict=False)
             if is_sure
         }
-        return Finding(kind, "", angle, shift, 0.0, 0.0, pixels, chance, (), named)
+        return Finding(kind, "", angle, shift, 0.0, 0.0, pixels, p_value, (), named)
 
     def _common_findings(self, kept: Mask) -> tuple[Finding, ...]:
         """What is off in all frames that agree."""
@@ -475,9 +424,9 @@ class _Auditor:
         while causes:
             tests = [_Test.of(cause, r, N, Q, freedom) for cause in causes]
             sufficing = self._sufficing(tests, told, r, N)
-            best, *rivals = sufficing or [max(tests, key=lambda one: one.merit)]
+            best, *rivals = sufficing or [max(tests, key=lambda one: one.aic_gain)]
             pixels = _pixels(told, best.x)
-            if best.chance * len(tests) > self._settings.chance or pixels < self._settings.pixels:
+            if best.p_value * len(tests) > _SIGNIFICANCE or pixels < _LEAST_PIXELS:
                 break
             findings.append(self._finding(best, rivals, pixels))
             # What is left once that was put right.
@@ -494,7 +443,7 @@ class _Test(NamedTuple):
     cause: Cause
     T: float
     rank: int
-    chance: float
+    p_value: float
     amount: Array
     covariance: Array
 
@@ -505,17 +454,17 @@ class _Test(NamedTuple):
         inverse = np.linalg.inv(M.T @ N @ M + 1e-3 * np.eye(M.shape[1]))
         amount = inverse @ M.T @ r
         return cls(
-            cause, T, rank, _chance(T, rank, freedom), amount, inverse @ M.T @ Q @ M @ inverse
+            cause, T, rank, _p_value(T, rank, freedom), amount, inverse @ M.T @ Q @ M @ inverse
         )
 
     @property
-    def merit(self) -> float:
+    def aic_gain(self) -> float:
         """How well the cause explains what is off; more numbers explain more by chance."""
         return self.T - 2.0 * self.rank
 
     @property
     def x(self) -> Array:
-        """(p,) what was freed, off by this cause."""
+        """(p,) what was free, off by this cause."""
         return np.asarray(self.cause.moves @ self.amount)
 
     def units(self, deviations: Array) -> Array:
@@ -535,12 +484,12 @@ def _statistic(r: Array, Q: Array, N: Array | None = None) -> tuple[float, int]:
     return float(along @ np.linalg.solve(turn.T @ Q @ turn, along)), turn.shape[1]
 
 
-def _chance(T: float, rank: int, freedom: float) -> float:
+def _p_value(T: float, rank: int, freedom: float) -> float:
     """How often a statistic is as large by chance."""
     return float(fisher.sf(T / rank, rank, freedom)) if rank else 1.0
 
 
-def _pixels(told: Sequence[_Told], x: Array) -> float:
+def _pixels(told: Sequence[FrameInformation], x: Array) -> float:
     """How far x moves the outlines of the parts that it moves, root mean square [pixel]."""
     squares = np.sum([np.einsum("p,npq,q->n", x, one.outlines, x) for one in told], axis=0)
     lengths = np.sum([one.lengths for one in told], axis=0)
@@ -548,18 +497,13 @@ def _pixels(told: Sequence[_Told], x: Array) -> float:
     return float(np.sqrt(squares[moved].sum() / max(lengths[moved].sum(), 1e-9)))
 
 
-def _explained(freed: Sequence[FreedFrame]) -> Mask:
+def _explained(frames: Sequence[FrameFit]) -> Mask:
     """(frames,) whether something within reach explains all its pictures."""
-    best: dict[str, float] = {}
-    for name in {name for one in freed for name in one.shares[1]}:
-        shares = sorted(one.shares[1][name] for one in freed if name in one.shares[1])
-        best[name] = float(np.mean(shares[-max(2, len(shares) // 4) :]))
+    best = {}
+    for name in {name for one in frames for name in one.inlier_ratios[1]}:
+        ratios = [one.inlier_ratios[1][name] for one in frames if name in one.inlier_ratios[1]]
+        best[name] = float(np.mean(sorted(ratios)[-max(2, len(ratios) // 4) :]))
+    least = {name: max(_FITS * ratio, _FITS_AT_ALL) for name, ratio in best.items()}
     return np.array(
-        [
-            all(
-                share >= max(_FITS * best[name], _FITS_AT_ALL)
-                for name, share in one.shares[1].items()
-            )
-            for one in freed
-        ]
+        [all(ratio >= least[n] for n, ratio in one.inlier_ratios[1].items()) for one in frames]
     )

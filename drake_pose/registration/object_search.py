@@ -38,8 +38,8 @@ from drake_pose.registration.register import (
     CameraSearch,
     ObjectPose,
     RegisteredCamera,
-    RegistrationSettings,
     describe_fitted,
+    spread,
     with_widths,
 )
 from drake_pose.registration.standing_object import StandingObject, require_turns
@@ -59,30 +59,24 @@ _WORSE_BY, _WORSE_TIMES = 0.02, 2.0
 
 
 class ObjectSearch:
-    """Finds where a camera is on a link, and where the object stands that it sees.
+    """Finds where a camera is on a link of the robot, and where the object stands that it sees.
 
-    Args:
-        standing: the object, and the robot before which it stands.
-        settings: of the search for the object in each picture.
+    standing: the object, and the robot before which it stands; alone: finds it in one picture.
     """
 
-    def __init__(
-        self, standing: StandingObject, settings: RegistrationSettings | None = None
-    ) -> None:
-        self._standing = standing
-        self._settings = settings or RegistrationSettings()
-        self._alone = CameraSearch(standing.alone, self._settings)
+    def __init__(self, standing: StandingObject, alone: CameraSearch | None = None) -> None:
+        self._standing, self._alone = standing, alone or CameraSearch(standing.alone)
 
-    def with_settings(self, settings: RegistrationSettings) -> ObjectSearch:
-        """The same with other settings."""
-        return ObjectSearch(self._standing, settings)
+    def rough(self) -> ObjectSearch:
+        """A search that is faster, and less sure."""
+        return ObjectSearch(self._standing, self._alone.rough())
 
     def register(self, camera: PinholeCamera, frames: Sequence[PosedFrame]) -> RegisteredCamera:
         """Finds the camera's pose in the link's frame, and the object's in the world.
 
         Args:
-            camera: its intrinsics; the pose that it has is not used.
-            frames: what it sees, at values of the object's tree.
+            camera: its pose is not used.
+            frames: at values of the object's tree.
 
         Raises:
             MaskError: a mask of another size than the camera's picture, or an empty one.
@@ -119,8 +113,7 @@ class ObjectSearch:
 
     def _search(self, camera: PinholeCamera, frames: Sequence[PosedFrame]) -> list[Look]:
         """Where the best one may be near, best first."""
-        count = min(len(frames), self._settings.searched_frames)
-        some = [frames[k] for k in np.linspace(0, len(frames) - 1, count).round().astype(int)]
+        some = spread(frames)
         alone = [PosedFrame(one.name, np.zeros(0), one.mask) for one in some]
         X_CT = [
             np.array(self._apart(self._alone.search(camera, [one], _OF_A_PICTURE), alike=True))

@@ -188,7 +188,7 @@ class OnlineRegistration:
         keyframes = (*kept, frame)[-self.settings.most_frames :]
         found = self._search.refine(registered.camera, keyframes)
         newest = found.frames[-1]
-        if newest.agrees and newest.share >= _CONTRADICTS * _usual_share(registered):
+        if newest.agrees and newest.inlier_ratio >= _CONTRADICTS * _usual_inlier_ratio(registered):
             return self._settle(_registered(state, found, keyframes), found)
         return self._contradict(state, registered, frame)
 
@@ -240,7 +240,7 @@ class OnlineRegistration:
         self, registered: RegisteredCamera, frames: Sequence[PosedFrame]
     ) -> RegisteredCamera | None:
         """Where frames that contradict the pose agree with one another; None: nowhere."""
-        least = _CONTRADICTS * _usual_share(registered)
+        least = _CONTRADICTS * _usual_inlier_ratio(registered)
         found = self._search.refine(registered.camera, frames)
         if self._is_bump(registered.camera, found.camera, frames[-1]) and self._is_found(
             found, self.settings.newest, least
@@ -271,7 +271,7 @@ class OnlineRegistration:
         return (
             len(agreeing) >= max(count, len(found.frames) // 2 + 1)
             and float(np.mean([frame.iou for frame in agreeing])) >= self.settings.lowest_iou
-            and float(np.median([frame.share for frame in agreeing])) >= least
+            and float(np.median([frame.inlier_ratio for frame in agreeing])) >= least
         )
 
     def _misfit(self, camera: PinholeCamera, frame: PosedFrame) -> float:
@@ -327,6 +327,6 @@ def _distance(found: RegisteredCamera, registered: RegisteredCamera) -> float:
     return float(off @ np.linalg.solve(found.covariance, off))
 
 
-def _usual_share(registered: RegisteredCamera) -> float:
+def _usual_inlier_ratio(registered: RegisteredCamera) -> float:
     """Of both contours' lengths, what fits in the median frame."""
-    return float(np.median([frame.share for frame in registered.frames]))
+    return float(np.median([frame.inlier_ratio for frame in registered.frames]))

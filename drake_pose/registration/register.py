@@ -20,7 +20,7 @@ from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera
-from drake_pose.errors import RegistrationError, SettingsError
+from drake_pose.errors import RegistrationError
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.significance import excess
 from drake_pose.fit.surfaces import FEW, VERY_FEW, few_triangles, with_girths
@@ -58,6 +58,8 @@ FINE = (
 LAST = (AnnealingStage(0.02, 0.01), AnnealingStage(0.01, 0.005), AnnealingStage(0.005, 0.005, 6))
 # Spacing of silhouettes' edge points in each of these [root of the silhouettes' area].
 COARSE_SPACING, FINE_SPACING, LAST_SPACING = 1.0 / 40.0, 1.0 / 80.0, 1.0 / 300.0
+# Rotations tried and fitted in a search that is rough.
+_ROUGH = (2000, 15)
 # Sides of silhouettes in the pictures in which poses are compared [pixel].
 FIRST_SIDE, SECOND_SIDE = 40.0, 100.0
 # Poses that show the bodies nearer to each other than this are one [root of the area].
@@ -72,35 +74,10 @@ _PIECE = 0.2
 _SIGNIFICANCE = 1.96
 
 
-@dataclass(frozen=True)
-class RegistrationSettings:
-    """Parameters of the search for a camera's pose.
-
-    Args:
-        rotations: so many are tried.
-        fitted: so many of them are fitted.
-        searched_frames: at most so many frames are searched in; all are fitted.
-
-    Raises:
-        SettingsError: a number below 1.
-    """
-
-    rotations: int = 3000
-    fitted: int = 30
-    searched_frames: int = 8
-
-    def __post_init__(self) -> None:
-        for name in ("rotations", "fitted", "searched_frames"):
-            if getattr(self, name) < 1:
-                raise SettingsError(f"{name} must be 1 or more, not {getattr(self, name)}")
-
-
 class RegistrationBody:
     """A body's surfaces, as fine as searching and fitting a camera need them.
 
     Attributes:
-        tree: the pose tree.
-        kinematics: its kinematics.
         very_few, few, all: a surface for each node.
 
     Args:
@@ -143,38 +120,29 @@ class RegistrationBody:
 
 @dataclass(frozen=True, eq=False)
 class FrameMisfit:
-    """How well one frame fits a camera's pose.
-
-    Args:
-        frame: its name.
-        E_total: the area in which body and silhouette differ, over the silhouette's.
-        iou: intersection over union of both.
-        share: of both contours' lengths, what fits.
-        agrees: whether the frame agrees with the others; else it contradicts them, and did not
-            count.
-    """
+    """How well one frame fits a camera's pose; one that does not agree did not count."""
 
     frame: str
     E_total: float
     iou: float
-    share: float
+    inlier_ratio: float
     agrees: bool
 
 
 class _UncertainPose:
-    """How sure a pose is whose errors' covariance is known."""
+    """A pose whose errors' covariance is known: deviations are root mean squares over the axes."""
 
     covariance: Array
 
     @property
     def rotation_sd(self) -> float:
-        """Standard deviation of the rotation, root mean square over the axes [rad]."""
-        return _root_mean_square(self.covariance[:3, :3])
+        """Standard deviation of the rotation [rad]."""
+        return float(np.sqrt(np.trace(self.covariance[:3, :3]) / 3.0))
 
     @property
     def translation_sd(self) -> float:
-        """Standard deviation of the place, root mean square over the axes [m]."""
-        return _root_mean_square(self.covariance[3:, 3:])
+        """Standard deviation of the place [m]."""
+        return float(np.sqrt(np.trace(self.covariance[3:, 3:]) / 3.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,31 +189,19 @@ class RegisteredCamera(_UncertainPose):
         return tuple(frame.frame for frame in self.frames if not frame.agrees)
 
 
-def _root_mean_square(covariance: Array) -> float:
-    """Of the standard deviations along three axes."""
-    return float(np.sqrt(np.trace(covariance) / 3.0))
-
-
 class CameraSearch:
-    """Finds where a camera stands.
+    """Finds where a camera stands: so many rotations are tried, so many of them fitted."""
 
-    Args:
-        body: the body.
-        settings: of the search.
-    """
+    def __init__(self, body: RegistrationBody, rotations: int = 3000, fitted: int = 30) -> None:
+        self._body, self._fitted_count = body, fitted
+        self._R_CW = spread_rotations(rotations)
 
-    def __init__(
-        self, body: RegistrationBody, settings: RegistrationSettings | None = None
-    ) -> None:
-        self._body, self._settings = body, settings or RegistrationSettings()
-        self._R_CW = spread_rotations(self._settings.rotations)
+    def rough(self) -> CameraSearch:
+        """A search that is faster, and less sure."""
+        return CameraSearch(self._body, *_ROUGH)
 
     def register(self, camera: PinholeCamera, frames: Sequence[PosedFrame]) -> RegisteredCamera:
         """Finds the camera's pose; that which it has is not used.
-
-        Args:
-            camera: its intrinsics.
-            frames: what it sees.
 
         Raises:
             MaskError: a mask of another size than the camera's picture, or an empty one.
@@ -259,11 +215,7 @@ class CameraSearch:
         return self._fitted(camera, frames, self.search(camera, frames))
 
     def refine(self, camera: PinholeCamera, frames: Sequence[PosedFrame]) -> RegisteredCamera:
-        """Finds the camera's pose near that which it has; alternatives are not looked for.
-
-        Args:
-            camera: with a pose within some pixels of the right one.
-            frames: what it sees, one or more.
+        """Finds the camera's pose within some pixels of that which it has, without alternatives.
 
         Raises:
             MaskError: a mask of another size than the camera's picture, or an empty one.
@@ -285,23 +237,18 @@ class CameraSearch:
     ) -> PosedFrames:
         return PosedFrames(self._body.kinematics, outlines, camera, frames)
 
-    def with_settings(self, settings: RegistrationSettings) -> CameraSearch:
-        """The same with other settings."""
-        return CameraSearch(self._body, settings)
-
     def search(
         self, camera: PinholeCamera, frames: Sequence[PosedFrame], kept: int = _KEPT
     ) -> list[Array]:
         """Poses X_CW (4, 4) near which the best one may be, best first, so many at most."""
-        count = min(len(frames), self._settings.searched_frames)
-        some = [frames[k] for k in np.linspace(0, len(frames) - 1, count).round().astype(int)]
+        some = spread(frames)
         posed = self._posed(self._body.very_few, camera, some)
         starts = np.tile(np.eye(4), (len(self._R_CW), 1, 1))
         starts[:, :3, :3] = self._R_CW
         starts[:, :3, 3] = place_by_bounds(posed, self._R_CW)
         order = np.argsort(mean_misfit(posed, starts, FIRST_SIDE), kind="stable")
         fit = CameraFit(posed, COARSE_SPACING)
-        found = [fit.fit(starts[k], COARSE) for k in order[: self._settings.fitted]]
+        found = [fit.fit(starts[k], COARSE) for k in order[: self._fitted_count]]
         off = mean_misfit(posed, np.array(found), SECOND_SIDE)
         return distinct(posed, [found[k] for k in np.argsort(off, kind="stable")])[:kept]
 
@@ -309,29 +256,23 @@ class CameraSearch:
 def describe_fitted(
     fitted: Sequence[tuple[CameraFit, Calibration]], constants: Sequence[int] = ()
 ) -> tuple[RegisteredCamera, Array, list[int]]:
-    """The best of some poses of a camera, and those that fit no worse.
+    """The best of some fitted poses of a camera; its covariance; which fit no worse, best first.
 
-    Args:
-        fitted: each with its fit, which sees the same frames.
-        constants: what was fitted beside the camera, the same parameters of the body in all.
-
-    Returns:
-        the camera; the covariance of its pose and the constants, as they were fitted; and which are
-        as good, the best first.
+    constants: the body's parameters that were fitted beside the camera in all.
     """
     side = max(1.0, _PIECE * fitted[0][0].frames.size)
     pieces = [fit.piece_costs(one.X_CW[0], one.widths[0], TOLD_APART, side) for fit, one in fitted]
     order = np.argsort([one.sum() for one in pieces], kind="stable")
     fit, best = fitted[order[0]]
     X_CW = best.X_CW[0]
-    shares = inlier_ratios(CalibrationFit([fit], [], constants), best)
-    agree = agreeing(shares)
+    ratios = inlier_ratios(CalibrationFit([fit], [], constants), best)
+    agree = agreeing(ratios)
     found = areas(fit.frames, best.X_CW, np.inf)[0]
     iou = intersection_over_union(found)
-    rows = zip(fit.frames.frames, E_total(found), iou, shares, agree, strict=True)
+    rows = zip(fit.frames.frames, E_total(found), iou, ratios, agree, strict=True)
     misfits = [
-        FrameMisfit(frame.name, float(off), float(one), float(share), bool(agrees))
-        for frame, off, one, share, agrees in rows
+        FrameMisfit(frame.name, float(off), float(one), float(ratio), bool(agrees))
+        for frame, off, one, ratio, agrees in rows
     ]
     # A frame that contradicts fits no pose, so it tells none from another.
     counted = [one[agree] for one in pieces]
@@ -347,6 +288,12 @@ def describe_fitted(
         np.array([np.linalg.inv(X) for X in alike[1:]]).reshape(-1, 4, 4),
     )
     return camera, covariance, as_good
+
+
+def spread(frames: Sequence[PosedFrame], most: int = 8) -> list[PosedFrame]:
+    """Some of many frames, from the first to the last."""
+    count = min(len(frames), most)
+    return [frames[k] for k in np.linspace(0, len(frames) - 1, count).round().astype(int)]
 
 
 def mean_misfit(frames: PosedFrames, X_CW: Array, side: float) -> Array:

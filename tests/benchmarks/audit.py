@@ -30,7 +30,7 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.registration.contradictions import Audit, audit_frames
-from drake_pose.registration.freed_frames import FrameFreer, FreedFrame, SeenFrame
+from drake_pose.registration.per_frame_fit import FrameFit, PerFrameFit, SeenFrame
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
@@ -119,11 +119,11 @@ class Scene:
             {self.camera.name: self.masks[k] if mask is None else mask},
         )
 
-    def freer(self, camera: PinholeCamera | None = None) -> FrameFreer:
+    def fit(self, camera: PinholeCamera | None = None) -> PerFrameFit:
         """Frees its frames."""
         body = self._body
         frames = [self.frame(k) for k in range(len(self.poses))]
-        return FrameFreer(body.kinematics, (body.few, body.all), [camera or self.camera], frames)
+        return PerFrameFit(body.kinematics, (body.few, body.all), [camera or self.camera], frames)
 
     def turned(self, k: int, joint: int) -> Array:
         """A frame's positions, those of a joint off."""
@@ -216,19 +216,19 @@ class Benchmark:
     def run(self, seed: int) -> None:
         """Adds a scene."""
         scene = Scene(self._model, self._tree, self._body, seed)
-        freer = scene.freer()
+        fit = scene.fit()
         begin = time.process_time()
-        freed = [freer.free(scene.frame(k)) for k in range(_FRAMES)]
-        self._count(audit_frames(freer, freed), None)
+        fitted = [fit.fit(scene.frame(k)) for k in range(_FRAMES)]
+        self._count(audit_frames(fit, fitted), None)
         self.counts.seconds += time.process_time() - begin
         for kind, cause, k, frame in self._changed(scene):
-            others = [*freed[:k], freer.free(frame), *freed[k + 1 :]]
-            found = audit_frames(freer, others)
+            others = [*fitted[:k], fit.fit(frame), *fitted[k + 1 :]]
+            found = audit_frames(fit, others)
             finding = found.frames[k].finding
             names = [] if finding is None else [finding.name, *finding.rivals]
             self._note(kind, finding is not None, cause in ("", *names), str(finding))
             self._count(found, k)
-        self._all_frames(scene, freer)
+        self._all_frames(scene, fit)
 
     def _changed(self, scene: Scene) -> Iterator[tuple[str, str, int, SeenFrame]]:
         """Changes of one frame that show: their kind, the cause's name, the frame, and it."""
@@ -253,7 +253,7 @@ class Benchmark:
     def _shows(self, scene: Scene, k: int, mask: Mask) -> bool:
         return outline_shift(scene.segments[k], mask) >= _SHOWS
 
-    def _all_frames(self, scene: Scene, freer: FrameFreer) -> None:
+    def _all_frames(self, scene: Scene, fit: PerFrameFit) -> None:
         """Changes that are the same in all frames, of which some are audited."""
         few = range(_FEW_FRAMES)
         joint, camera = scene.angle(), scene.moved_camera()
@@ -263,19 +263,17 @@ class Benchmark:
         ]
         if np.mean(off) >= _SHOWS:
             frames = [scene.frame(k, turned[k]) for k in few]
-            self._common(freer, frames, "joint, all frames", self._body.kinematics.names[joint])
+            self._common(fit, frames, "joint, all frames", self._body.kinematics.names[joint])
         off = [
             outline_shift(scene.segments[k], scene.look(camera, scene.poses[k]) >= 0) for k in few
         ]
         if np.mean(off) >= _SHOWS:
             frames = [scene.frame(k) for k in few]
-            self._common(scene.freer(camera), frames, "base, all frames", "base")
+            self._common(scene.fit(camera), frames, "base, all frames", "base")
 
-    def _common(
-        self, freer: FrameFreer, frames: Sequence[SeenFrame], kind: str, cause: str
-    ) -> None:
-        freed: list[FreedFrame] = [freer.free(frame) for frame in frames]
-        found = audit_frames(freer, freed)
+    def _common(self, fit: PerFrameFit, frames: Sequence[SeenFrame], kind: str, cause: str) -> None:
+        fitted: list[FrameFit] = [fit.fit(frame) for frame in frames]
+        found = audit_frames(fit, fitted)
         named = [name for one in found.common for name in (one.name, *one.rivals)]
         self._note(kind, bool(named), cause in named, str(found.common))
         self.counts.frames += len(found.frames)

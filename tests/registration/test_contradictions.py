@@ -8,9 +8,9 @@ import pytest
 
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.camera.models import PinholeCamera
-from drake_pose.errors import MaskError, SettingsError
-from drake_pose.registration.contradictions import Audit, AuditSettings, Finding, audit_frames
-from drake_pose.registration.freed_frames import FrameFreer, SeenFrame
+from drake_pose.errors import MaskError
+from drake_pose.registration.contradictions import Audit, Finding, audit_frames
+from drake_pose.registration.per_frame_fit import PerFrameFit, SeenFrame
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.search.arms import arm_cameras
@@ -77,8 +77,8 @@ def audit(
             one.name: damaged(LabelRenderer(model, one).mask(q, X_WB), generator) for one in here
         }
         frames.append(SeenFrame(f"{k:04d}", values, masks))
-    freer = FrameFreer(kinematics, (body.few, body.all), told or taken, frames)
-    return audit_frames(freer, [freer.free(frame) for frame in frames])
+    fit = PerFrameFit(kinematics, (body.few, body.all), told or taken, frames)
+    return audit_frames(fit, [fit.fit(frame) for frame in frames])
 
 
 def finding_of(found: Audit, frame: int) -> Finding:
@@ -144,24 +144,18 @@ class TestAuditFrames:
         assert "base" in found.common[0].rivals
 
 
-class TestFrameFreer:
+class TestPerFrameFit:
     def test_a_mask_of_another_size_is_named(self, body, poses, cameras) -> None:
         mask = np.ones((480, 640), bool)
         frame = SeenFrame("0007", poses[0], {"left": mask[:100]})
         with pytest.raises(MaskError, match=r"'left', frame '0007'.*640 x 480"):
-            FrameFreer(body.kinematics, (body.few, body.all), cameras[:1], [frame])
+            PerFrameFit(body.kinematics, (body.few, body.all), cameras[:1], [frame])
         good = SeenFrame("0000", poses[0], {"left": mask})
-        freer = FrameFreer(body.kinematics, (body.few, body.all), cameras[:1], [good])
+        fit = PerFrameFit(body.kinematics, (body.few, body.all), cameras[:1], [good])
         with pytest.raises(MaskError, match="frame '0007'"):
-            freer.free(frame)
+            fit.fit(frame)
 
     def test_empty_masks_show_no_body(self, body, poses, cameras) -> None:
         frame = SeenFrame("0000", poses[0], {"left": np.zeros((480, 640), bool)})
         with pytest.raises(MaskError, match="no mask shows the body"):
-            FrameFreer(body.kinematics, (body.few, body.all), cameras[:1], [frame])
-
-
-@pytest.mark.parametrize("name", ["chance", "pixels", "angle", "shift"])
-def test_settings_are_positive(name: str) -> None:
-    with pytest.raises(SettingsError, match=name):
-        AuditSettings(**{name: 0.0})
+            PerFrameFit(body.kinematics, (body.few, body.all), cameras[:1], [frame])

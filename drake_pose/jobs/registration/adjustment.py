@@ -15,7 +15,7 @@ from drake_pose.jobs.registration.inputs import RegistrationInputs
 from drake_pose.jobs.registration.zeros import misfits_now
 from drake_pose.person.shape import shape_parts, shape_values
 from drake_pose.registration.bundle_adjustment import BundleAdjustment, CommonShape
-from drake_pose.registration.freed_frames import SeenFrame
+from drake_pose.registration.per_frame_fit import SeenFrame
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import RegisteredCamera, RegistrationBody
 

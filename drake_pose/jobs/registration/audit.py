@@ -22,7 +22,7 @@ from drake_pose.jobs.registration.audit_result import summarize, write_result
 from drake_pose.jobs.registration.known_positions import KnownPositions, read_known_positions
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.registration.contradictions import Audit, audit_frames
-from drake_pose.registration.freed_frames import FrameFreer, SeenFrame
+from drake_pose.registration.per_frame_fit import PerFrameFit, SeenFrame
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.results.folder import require_empty
 from drake_pose.results.settings import EstimateSettings
@@ -174,19 +174,19 @@ def _audit(inputs: AuditInputs, on_frame: OnFrame | None) -> tuple[Audit, list[s
     body = RegistrationBody(inputs.tree)
     picks = np.linspace(0, len(inputs.frames) - 1, min(len(inputs.frames), _SAMPLE)).round()
     sample = [inputs.read(inputs.frames[int(k)]) for k in picks]
-    freer = FrameFreer(body.kinematics, (body.few, body.all), inputs.cameras, sample)
-    freed, unseen = [], []
+    fit = PerFrameFit(body.kinematics, (body.few, body.all), inputs.cameras, sample)
+    fitted, unseen = [], []
     for done, frame in enumerate(inputs.frames):
         seen = inputs.read(frame)
         if seen.masks:
-            freed.append(freer.free(seen))
+            fitted.append(fit.fit(seen))
         else:
             unseen.append(frame)
         if on_frame is not None:
             on_frame(done + 1)
-    if not freed:
+    if not fitted:
         raise MaskError(f"{inputs.scene.path}: no mask shows the body; it must be white in them")
-    return audit_frames(freer, freed), unseen
+    return audit_frames(fit, fitted), unseen
 
 
 def _overlaid(

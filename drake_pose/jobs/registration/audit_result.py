@@ -14,7 +14,7 @@ from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.registration.contradictions import Audit, Finding, FrameAudit
-from drake_pose.registration.freed_frames import SeenFrame
+from drake_pose.registration.per_frame_fit import SeenFrame
 from drake_pose.results.folder import OVERLAY, ResultFolder
 from drake_pose.results.overlay import draw_overlay, encode_png
 from drake_pose.results.summary import file_digest, versions
@@ -125,7 +125,7 @@ def _numbers(one: Finding) -> dict[str, Any]:
         "shift_mm": 1e3 * one.shift,
         "shift_sd_mm": 1e3 * one.shift_sd,
         "pixels": one.pixels,
-        "chance": one.chance,
+        "chance": one.p_value,
         "rivals": list(one.rivals),
         "joints": dict(one.joints),
     }
@@ -134,8 +134,8 @@ def _numbers(one: Finding) -> dict[str, Any]:
 def _describe_frame(one: FrameAudit) -> dict[str, Any]:
     return {
         "agrees": one.finding is None,
-        "fits": dict(one.shares),
-        "fits_when_freed": dict(one.explained),
+        "fits": dict(one.given),
+        "fits_when_freed": dict(one.fitted),
         "pixels": one.pixels,
     }
 
@@ -151,10 +151,10 @@ def _say_frame(one: FrameAudit) -> str:
     found = one.finding
     assert found is not None
     if found.kind == "unexplained":
-        worst = min(one.explained, key=lambda name: one.explained[name])
+        worst = min(one.fitted, key=lambda name: one.fitted[name])
         return (
             f"frame '{one.frame}': no positions near those given explain it: in camera '{worst}' "
-            f"{percent(one.explained[worst])} of the contours fit at best"
+            f"{percent(one.fitted[worst])} of the contours fit at best"
         )
     if found.kind == "joints":
         named = sorted(found.joints.items(), key=lambda item: -abs(item[1]))

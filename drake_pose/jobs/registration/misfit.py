@@ -19,7 +19,7 @@ from drake_pose.registration.register import (
     CameraSearch,
     RegisteredCamera,
     RegistrationBody,
-    RegistrationSettings,
+    spread,
 )
 from drake_pose.results.texts import percent
 
@@ -36,7 +36,7 @@ _FOCAL_OFF, _FOCAL_DEVIATIONS, _FOCAL_WRONG = 0.03, 4.0, 0.06
 # A camera on a link is not determined that is less sure [rad, m].
 _UNTOLD = 0.04
 # What else may be the case is tried roughly, in so many frames.
-_ROUGH_SEARCH, _ROUGH_FRAMES = RegistrationSettings(rotations=2000, fitted=15), 5
+_ROUGH_FRAMES = 5
 # Something else explains the masks better that leaves less than this share of what was left.
 _MUCH_BETTER = 0.6
 
@@ -62,7 +62,7 @@ def find_misfit(found: RegisteredCamera) -> Misfit | None:
     """What is wrong with a pose that does not explain the masks; None where it does."""
     agreeing = [frame for frame in found.frames if frame.agrees]
     left = _left(found)
-    share = float(np.mean(np.sort([frame.share for frame in found.frames])[-2:]))
+    share = float(np.mean(np.sort([frame.inlier_ratio for frame in found.frames])[-2:]))
     if len(found.frames) > 1 and len(agreeing) < 2:
         return Misfit(
             left,
@@ -94,7 +94,7 @@ def require_explained(
     misfit = find_misfit(found)
     if misfit is None:
         return
-    search = search.with_settings(_ROUGH_SEARCH)
+    search = search.rough()
     better = [
         text
         for text, other, seen in _others(found.camera, frames)
@@ -164,8 +164,7 @@ def _others(
     camera: PinholeCamera, frames: Sequence[PosedFrame]
 ) -> Iterator[tuple[str, PinholeCamera, list[PosedFrame]]]:
     """What else may be the case: a text, and the camera and frames as they would be then."""
-    count = min(len(frames), _ROUGH_FRAMES)
-    some = [frames[k] for k in np.linspace(0, len(frames) - 1, count).round().astype(int)]
+    some = spread(frames, _ROUGH_FRAMES)
     turned = [
         PosedFrame(frame.name, frame.values, np.ascontiguousarray(frame.mask[:, ::-1]))
         for frame in some

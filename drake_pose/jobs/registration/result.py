@@ -66,7 +66,7 @@ def describe_camera(
                 "agrees": frame.agrees,
                 "E_total": frame.E_total,
                 "iou": frame.iou,
-                "share": frame.share,
+                "share": frame.inlier_ratio,
             }
             for frame in found.frames
         },

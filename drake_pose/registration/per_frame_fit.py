@@ -1,7 +1,7 @@
 """Each frame fitted by itself, its joints and cameras free to move a little from where they are.
 
-What is given is where a fit begins, and what it should not leave. So contours that are far off are
-found, too, and what is left of the distances is linear in what is given about where the fit ends.
+What is given is where a fit begins, and its prior. What is left of the distances is linear in what
+is given about where the fit ends.
 """
 
 from __future__ import annotations
@@ -52,6 +52,8 @@ _SPACING = 1.0 / 100.0
 # Where given values cost no more than so many times what they do once they are freed, distances are
 # linear about them: what hardly shows may have moved far.
 _FITS_ALREADY = 1.3
+# How far joints, and cameras about the body, may be off: standard deviations [rad, m].
+_ANGLE, _SHIFT, _CAMERA_TURN, _CAMERA_SHIFT = 0.1, 0.02, 0.05, 0.05
 # Silhouettes may be as much too wide on all sides, or too narrow [pixel].
 _WIDTHS = np.linspace(-3.0, 3.0, 5)
 # What a fit's unknowns are held by: contours err by about so much along about so much [pixel].
@@ -60,13 +62,7 @@ _POINT_ERROR, _ERROR_LENGTH = 4.0, 100.0
 
 @dataclass(frozen=True, eq=False)
 class SeenFrame:
-    """A frame: what is given of the body, and what cameras have seen of it.
-
-    Args:
-        name: of the frame.
-        values: (m,) of the body's pose tree, as encoders say [rad or m].
-        masks: (H, W) the silhouette by camera.
-    """
+    """A frame: values (m,) of the pose tree [rad or m], and the silhouettes (H, W) by camera."""
 
     name: str
     values: Array
@@ -74,51 +70,32 @@ class SeenFrame:
 
 
 @dataclass(frozen=True, eq=False)
-class Reach:
-    """How far what is given may be off: standard deviations of what a fit may move.
-
-    Args:
-        angle: of a joint [rad].
-        shift: of a joint [m].
-        camera_turn: of a camera about the body [rad].
-        camera_shift: of a camera, or of the base [m].
-    """
-
-    angle: float = 0.1
-    shift: float = 0.02
-    camera_turn: float = 0.05
-    camera_shift: float = 0.05
-
-
-@dataclass(frozen=True, eq=False)
-class FreedFrame:
-    """A frame whose joints and cameras were freed.
+class FrameFit:
+    """A frame whose joints and cameras were fitted.
 
     Args:
         name: of the frame.
-        change: (p,) by how much they were moved.
         pictures: the contours compared with each camera's silhouette where the fit ended, and told
-            as distances from what is given; the p values are the joints' and POSE_NAMES of each
+            as distances from what is given; their values are the joints' and POSE_NAMES of each
             camera.
         cameras: of the pictures.
-        shares: before and after, by camera, of both contours' lengths, what fits.
+        inlier_ratios: before and after, by camera.
         weights: (nodes,) how much of the contours of each node was compared [pixel].
     """
 
     name: str
-    change: Array
     pictures: tuple[Picture, ...]
     cameras: tuple[str, ...]
-    shares: tuple[Mapping[str, float], Mapping[str, float]]
+    inlier_ratios: tuple[Mapping[str, float], Mapping[str, float]]
     weights: Array
 
 
-class FrameFreer:
+class PerFrameFit:
     """Fits frames, each by itself, with all that is given free to move.
 
     Attributes:
         names: of the p values that move: the joints, and POSE_NAMES of each camera.
-        size: the root of the silhouettes' median area [pixel], the unit of length of a fit.
+        deviations: (p,) how far what is given may be off: standard deviations [rad or m].
 
     Args:
         kinematics: the pose tree's.
@@ -126,7 +103,6 @@ class FrameFreer:
             with which they are compared in the end.
         cameras: the cameras, where they are said to stand.
         frames: some frames, which tell how large silhouettes are, and where the body is.
-        reach: how far what is given may be off.
 
     Raises:
         MaskError: a mask of another size than its camera's picture, or no mask shows the body.
@@ -138,14 +114,12 @@ class FrameFreer:
         outlines: tuple[Sequence[Outline], Sequence[Outline]],
         cameras: Sequence[Camera],
         frames: Sequence[SeenFrame],
-        reach: Reach | None = None,
     ) -> None:
-        reach = reach or Reach()
         self._cameras = tuple(cameras)
-        self.size = common_size(cameras, frames)
-        noise = Noise(deviation=1.0, correlation=0.5 / self.size**3)
+        self._size = common_size(cameras, frames)
+        noise = Noise(deviation=1.0, correlation=0.5 / self._size**3)
         self._few, self.contours = (
-            ContourFit(kinematics, one, noise, _STEPS, pixels=self.size) for one in outlines
+            ContourFit(kinematics, one, noise, _STEPS, pixels=self._size) for one in outlines
         )
         places = [kinematics.poses(frame.values)[:, :3, 3].mean(axis=0) for frame in frames]
         pivot = np.mean(places, axis=0)
@@ -156,10 +130,10 @@ class FrameFreer:
         looks = tuple(f"{camera.name}.{name}" for camera in cameras for name in POSE_NAMES)
         self.names = (*self.joints, *looks)
         worth = _POINT_ERROR * np.sqrt(_ERROR_LENGTH)
-        of_joints = np.where(kinematics.is_angle[joints], reach.angle, reach.shift)
+        of_joints = np.where(kinematics.is_angle[joints], _ANGLE, _SHIFT)
         turns = [name.startswith("turn") for name in POSE_NAMES]
         self.is_angle = np.concatenate([kinematics.is_angle[joints], *([turns] * len(cameras))])
-        of_camera = [reach.camera_turn] * 3 + [reach.camera_shift] * 3
+        of_camera = [_CAMERA_TURN] * 3 + [_CAMERA_SHIFT] * 3
         self.deviations = np.concatenate([of_joints, *([of_camera] * len(cameras))])
         body = self._few.body
         unknown = choose(
@@ -169,10 +143,10 @@ class FrameFreer:
         )
         self._entries = unknown.entries
         self._fit = FramesFit(
-            body, cameras, unknown, pivot=pivot, noise=noise, steps=_STEPS, pixels=self.size
+            body, cameras, unknown, pivot=pivot, noise=noise, steps=_STEPS, pixels=self._size
         )
 
-    def free(self, frame: SeenFrame) -> FreedFrame:
+    def fit(self, frame: SeenFrame) -> FrameFit:
         """Fits a frame.
 
         Raises:
@@ -198,15 +172,14 @@ class FrameFreer:
         told = after
         if _cost(before) <= _FITS_ALREADY * _cost(after):
             theta, told, change, widths = held, before, np.zeros_like(change), own
-        return FreedFrame(
+        return FrameFit(
             frame.name,
-            change[0],
             *self._pictures(told, theta, change[0]),
-            (self._shares(before, frame), self._shares(after, frame)),
+            (self._inlier_ratios(before, frame), self._inlier_ratios(after, frame)),
             _weights(told),
         )
 
-    def _shares(self, compared: Comparison, frame: SeenFrame) -> dict[str, float]:
+    def _inlier_ratios(self, compared: Comparison, frame: SeenFrame) -> dict[str, float]:
         return {
             camera.name: inlier_ratio_of(compared.sums[c])
             for c, camera in enumerate(self._cameras)
@@ -232,9 +205,9 @@ class FrameFreer:
         return _WIDTHS[best] + np.clip(step, -1.0, 1.0) * (_WIDTHS[1] - _WIDTHS[0])
 
     def base_moves(self) -> Array:
-        """(p, 6) how what is freed follows a turn [rad] and a shift [m] of the base in the world.
+        """(p, 6) how what is free follows a turn [rad] and shift [m] of the base, in deviations.
 
-        In units of the deviations. All cameras see the base move about their common pivot.
+        All cameras see the base move about their common pivot.
         """
         moves = np.zeros((len(self.names), 6))
         for c, camera in enumerate(self._cameras):
@@ -250,7 +223,7 @@ class FrameFreer:
         return theta
 
     def _evidence(self, frame: SeenFrame) -> Evidence:
-        spacing = max(1.0, round(_SPACING * self.size))
+        spacing = max(1.0, round(_SPACING * self._size))
         edges = []
         for camera in self._cameras:
             mask = frame.masks.get(camera.name)

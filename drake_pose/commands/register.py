@@ -115,8 +115,7 @@ def audit(
 
 def _print_registration(result: SceneRegistration) -> None:
     """A row a frame and camera, then where each camera stands and how sure that is."""
-    from drake_pose.jobs.registration.report import PARAMETERS, parameter_rows
-    from drake_pose.jobs.registration.result import CAMERAS
+    from drake_pose.jobs.registration.result import CAMERAS, PARAMETERS, parameter_rows
     from drake_pose.results.folder import REPORT
 
     console = output_console()

@@ -15,7 +15,7 @@ from drake_pose.errors import CameraError, SceneError
 from drake_pose.jobs.estimate.inputs import make_tree
 from drake_pose.jobs.masks.settings import MaskSettings
 from drake_pose.jobs.masks.sources import CAMERAS, FoundMask, Source
-from drake_pose.jobs.registration.known_positions import read_known_positions
+from drake_pose.jobs.registration.positions import read_known_positions
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.search.segmentation.pose_and_mask import (
     FoundPose,

@@ -1,9 +1,9 @@
-"""A scene, its cameras and joint positions in; which of them contradict the rest, out."""
+"""Which frames, cameras or joints contradict the rest in a scene: read, found, told, written."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,15 +18,17 @@ from drake_pose.camera.models import Camera
 from drake_pose.errors import MaskError, SceneError
 from drake_pose.jobs.estimate.inputs import make_tree, select_cameras, select_seen_frames
 from drake_pose.jobs.estimate.scene_checks import check_scene, frame_ranges, texts_of
-from drake_pose.jobs.registration.audit_result import summarize, write_result
-from drake_pose.jobs.registration.known_positions import KnownPositions, read_known_positions
+from drake_pose.jobs.registration.positions import KnownPositions, read_known_positions
 from drake_pose.jobs.registration.settings import AuditSettings
-from drake_pose.registration.contradictions import Audit, audit_frames
+from drake_pose.registration.contradictions import Audit, Finding, FrameAudit, audit_frames
 from drake_pose.registration.per_frame_fit import PerFrameFit, SeenFrame
 from drake_pose.registration.register import RegistrationBody
-from drake_pose.results.folder import require_empty
+from drake_pose.results.folder import OVERLAY, ResultFolder, require_empty
+from drake_pose.results.overlay import draw_overlay, encode_png
 from drake_pose.results.settings import EstimateSettings
-from drake_pose.results.summary import mask_digests
+from drake_pose.results.summary import file_digest, mask_digests, versions
+from drake_pose.results.texts import percent
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import Scene, load_scene
 
 OnFrame = Callable[[int], None]
@@ -34,21 +36,13 @@ OnFrame = Callable[[int], None]
 
 # So many frames tell how large silhouettes are, and where the body is.
 _SAMPLE = 20
+# As many joints are named in words.
+_NAMED = 3
 
 
 @dataclass(frozen=True)
-class AuditInputs:
-    """What is audited.
-
-    Args:
-        scene: the recorded scene.
-        model: the robot.
-        tree: its pose tree, as it stands in the world.
-        cameras: the cameras.
-        frames: the frames' names.
-        positions: where all joints are in each frame.
-        warnings: what the user should know of the input.
-    """
+class _Inputs:
+    """What is audited."""
 
     scene: Scene
     model: ArticulatedModel
@@ -71,14 +65,7 @@ class AuditInputs:
 
 @dataclass(frozen=True, eq=False)
 class SceneAudit:
-    """What contradicts the rest in a scene.
-
-    Args:
-        audit: what was found.
-        summary: what summary.json holds.
-        warnings: what the user should know.
-        folder: the result folder, if one was written.
-    """
+    """What contradicts the rest in a scene; summary: what summary.json holds."""
 
     audit: Audit
     summary: Mapping[str, Any]
@@ -100,15 +87,11 @@ def audit_scene(
     """Finds which frames, cameras or joints contradict the rest, in time linear in the frames.
 
     Args:
-        scene: the scene's folder: cameras.yaml and masks/<camera>/<frame>.png.
         model: the robot's model file. It stands in the world as the file has it.
-        joints: joint positions by frame, a CSV file with the column frame and one for each joint
-            [rad or m].
+        joints: joint positions by frame (CSV) [rad or m].
         out: folder for the result, new or empty; None writes nothing.
-        settings: which cameras and frames.
         cameras: a camera file in place of the scene's own.
-        overlay: whether overlays of what contradicts are written.
-        on_frame: hears of every frame that is done.
+        on_frame: called after each frame.
 
     Raises:
         DrakePoseError: names the file, camera, frame or joint at fault.
@@ -117,9 +100,12 @@ def audit_scene(
     folder = None if out is None else Path(out)
     if folder is not None:
         require_empty(folder)
-    paths = Path(scene), Path(model), Path(joints)
-    own = None if cameras is None else Path(cameras)
-    inputs = _read_inputs(paths, own, settings)
+    files = {
+        "model": Path(model),
+        "cameras": Path(cameras or Path(scene) / "cameras.yaml"),
+        "joints": Path(joints),
+    }
+    inputs = _read_inputs(Path(scene), files, None if cameras is None else Path(cameras), settings)
     begin = time.perf_counter()
     found, unseen = _audit(inputs, on_frame)
     seconds = time.perf_counter() - begin
@@ -133,22 +119,52 @@ def audit_scene(
             f"{agreeing} of {len(found.frames)} frames agree with each other: which of them are "
             "right is told by their being near to what is given, not by their number"
         )
-    summary = summarize(found, (*paths, own), settings, warnings, seconds)
-    summary["unseen"] = unseen
-    names = [camera.name for camera in inputs.cameras]
-    for frame, record in summary["frames"].items():
-        record["masks"] = mask_digests(inputs.scene, names, frame)
+    summary = {
+        **_summarize(inputs, found),
+        "seconds": seconds,
+        "warnings": warnings,
+        "scene": str(scene),
+        **{name: str(file) for name, file in files.items()},
+        "settings": settings.as_json(),
+        "sha256": {name: file_digest(file) for name, file in files.items()},
+        "versions": versions(),
+        "unseen": unseen,
+    }
     if folder is not None:
-        write_result(folder, inputs.model, inputs.tree, _overlaid(inputs, found, overlay), summary)
+        _write_result(folder, inputs, found.contradicting if overlay else (), summary)
     return SceneAudit(found, summary, tuple(warnings), folder)
 
 
+def _summarize(inputs: _Inputs, found: Audit) -> dict[str, Any]:
+    """What was found, as summary.json holds it."""
+    names = [camera.name for camera in inputs.cameras]
+    return {
+        "contradictions": describe_contradictions(found),
+        "frame_count": len(found.frames),
+        "agreeing_count": len(found.frames) - len(found.contradicting),
+        "frames": {
+            one.frame: {
+                "agrees": one.finding is None,
+                "fits": dict(one.given),
+                "fits_when_freed": dict(one.fitted),
+                "pixels": one.pixels,
+                "masks": mask_digests(inputs.scene, names, one.frame),
+            }
+            for one in found.frames
+        },
+        "error_sizes_px": {
+            name: float(size)
+            for name, size in found.sizes._asdict().items()
+            if name not in ("noise", "repeated")
+        },
+    }
+
+
 def _read_inputs(
-    paths: tuple[Path, Path, Path], camera_file: Path | None, settings: AuditSettings
-) -> AuditInputs:
-    scene_path, model_path, joints_path = paths
-    cameras = None if camera_file is None else load_cameras(camera_file)
-    checked = check_scene(load_scene(scene_path, cameras))
+    scene_path: Path, files: Mapping[str, Path], own: Path | None, settings: AuditSettings
+) -> _Inputs:
+    """Reads and checks everything; own: a camera file in place of the scene's."""
+    checked = check_scene(load_scene(scene_path, None if own is None else load_cameras(own)))
     scene = checked.scene
     if scene.scale_unknown:
         raise SceneError(
@@ -157,19 +173,19 @@ def _read_inputs(
         )
     chosen = select_cameras(scene, settings.cameras)
     frames = select_seen_frames(scene, chosen, settings.frames)
-    model = load_model(model_path, package_paths=settings.packages)
+    model = load_model(files["model"], package_paths=settings.packages)
     tree = make_tree(model, EstimateSettings(hold=settings.hold), None)
-    positions = read_known_positions(joints_path, TreeKinematics(tree))
+    positions = read_known_positions(files["joints"], TreeKinematics(tree))
     warnings = [*texts_of(*checked.warnings), *model.warnings, *positions.warnings]
     if positions.are_one_pose(positions.of(frame, chosen[0].name) for frame in frames):
         warnings.append(
             "all frames show the robot in one pose, to a degree: errors of a joint's zero and of a "
             "camera that are the same in all frames can hardly be told apart"
         )
-    return AuditInputs(scene, model, tree, chosen, frames, positions, tuple(warnings))
+    return _Inputs(scene, model, tree, chosen, frames, positions, tuple(warnings))
 
 
-def _audit(inputs: AuditInputs, on_frame: OnFrame | None) -> tuple[Audit, list[str]]:
+def _audit(inputs: _Inputs, on_frame: OnFrame | None) -> tuple[Audit, list[str]]:
     """What was found, and the frames of which no mask shows anything."""
     body = RegistrationBody(inputs.tree)
     picks = np.linspace(0, len(inputs.frames) - 1, min(len(inputs.frames), _SAMPLE)).round()
@@ -189,15 +205,94 @@ def _audit(inputs: AuditInputs, on_frame: OnFrame | None) -> tuple[Audit, list[s
     return audit_frames(fit, fitted), unseen
 
 
-def _overlaid(
-    inputs: AuditInputs, found: Audit, overlay: bool
-) -> Sequence[tuple[Camera, SeenFrame]]:
-    """The pictures that are drawn: those of the frames that contradict the others."""
-    if not overlay:
-        return []
-    cameras = {camera.name: camera for camera in inputs.cameras}
-    return [
-        (cameras[name], frame)
-        for frame in map(inputs.read, found.contradicting)
-        for name in frame.masks
+def describe_contradictions(found: Audit) -> list[dict[str, Any]]:
+    """What contradicts the rest, worst first: joints, cameras and the base, then frames."""
+    common = [
+        {"what": one.kind, "name": one.name, "text": _say_common(one), **_numbers(one)}
+        for one in found.common
     ]
+    frames = [
+        {"what": "frame", "name": one.frame, "text": _say_frame(one), **_numbers(one.finding)}
+        for one in sorted(found.frames, key=lambda one: -one.pixels)
+        if one.finding is not None
+    ]
+    return common + frames
+
+
+def _write_result(
+    path: Path, inputs: _Inputs, drawn: tuple[str, ...], summary: Mapping[str, Any]
+) -> None:
+    """The summary, and the robot at its encoders' positions over the masks of some frames."""
+    folder, tree = ResultFolder(path, (), False), inputs.tree
+    kinematics = TreeKinematics(tree)
+    cameras = {camera.name: camera for camera in inputs.cameras}
+    renderers: dict[str, LabelRenderer] = {}
+    for frame in map(inputs.read, drawn):
+        q, X_WB = tree.positions_from(kinematics.split(frame.values))
+        for name, mask in frame.masks.items():
+            renderer = renderers.setdefault(name, LabelRenderer(inputs.model, cameras[name]))
+            segments = renderer.segments(q, X_WB)
+            fits = percent(summary["frames"][frame.name]["fits"][name])
+            title = f"{name}  frame {frame.name}  CONTRADICTS the others  {fits} fits"
+            picture = draw_overlay(mask, segments >= 0, segments, [title])
+            folder.write(f"{OVERLAY}/{name}/{frame.name}.png", encode_png(picture))
+    folder.write_summary(summary)
+
+
+def _numbers(one: Finding) -> dict[str, Any]:
+    """A finding's numbers: lengths in mm, angles in degrees."""
+    return {
+        "cause": one.kind,
+        "cause_name": one.name,
+        "angle_deg": float(np.degrees(one.angle)),
+        "angle_sd_deg": float(np.degrees(one.angle_sd)),
+        "shift_mm": 1e3 * one.shift,
+        "shift_sd_mm": 1e3 * one.shift_sd,
+        "pixels": one.pixels,
+        "chance": one.p_value,
+        "rivals": list(one.rivals),
+        "joints": dict(one.joints),
+    }
+
+
+def _say_common(one: Finding) -> str:
+    """A contradiction of all frames in words."""
+    rivals = f" (or {', '.join(one.rivals)}: the masks cannot tell)" if one.rivals else ""
+    return f"{_name(one)}{rivals}: off {_amount(one)} in all frames that agree, {_pixels(one)}"
+
+
+def _say_frame(one: FrameAudit) -> str:
+    """A frame that contradicts the others in words."""
+    found = one.finding
+    assert found is not None
+    if found.kind == "unexplained":
+        worst = min(one.fitted, key=lambda name: one.fitted[name])
+        return (
+            f"frame '{one.frame}': no positions near those given explain it: in camera '{worst}' "
+            f"{percent(one.fitted[worst])} of the contours fit at best"
+        )
+    if found.kind == "joints":
+        named = sorted(found.joints.items(), key=lambda item: -abs(item[1]))
+        joints = ", ".join(name for name, _ in named[:_NAMED])
+        more = f" ({joints} most)" if joints else ""
+        return f"frame '{one.frame}': is of other positions: joints are off{more}, {_pixels(found)}"
+    rivals = f" (or {', '.join(found.rivals)}: the masks cannot tell)" if found.rivals else ""
+    return f"frame '{one.frame}': {_name(found)}{rivals} is off {_amount(found)}, {_pixels(found)}"
+
+
+def _name(one: Finding) -> str:
+    return "the base" if one.kind == "base" else f"{one.kind} '{one.name}'"
+
+
+def _amount(one: Finding) -> str:
+    """By how much, with standard deviations."""
+    parts = []
+    if one.angle_sd > 0.0:
+        parts.append(f"{np.degrees(one.angle):.2f} +- {np.degrees(one.angle_sd):.2f} degrees")
+    if one.shift_sd > 0.0:
+        parts.append(f"{1e3 * one.shift:.1f} +- {1e3 * one.shift_sd:.1f} mm")
+    return "by " + " and ".join(parts)
+
+
+def _pixels(one: Finding) -> str:
+    return f"outlines by {one.pixels:.1f} pixels"

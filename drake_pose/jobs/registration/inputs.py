@@ -26,9 +26,9 @@ from drake_pose.jobs.estimate.inputs import make_tree, select_seen_frames
 from drake_pose.jobs.estimate.measurements import read_true_angles
 from drake_pose.jobs.estimate.person_choice import missing_for_person
 from drake_pose.jobs.estimate.scene_checks import check_scene, texts_of
-from drake_pose.jobs.registration.estimated_positions import estimate_positions
-from drake_pose.jobs.registration.known_positions import (
+from drake_pose.jobs.registration.positions import (
     KnownPositions,
+    estimate_positions,
     put_on_base,
     read_known_positions,
 )
@@ -61,17 +61,14 @@ class RegistrationInputs:
     Args:
         scene: the recorded scene; cameras whose X_WC is missing stand at the world's origin.
         model: the robot.
-        tree: its pose tree, as it stands in the world; or for cameras that ride on a link, as it
-            stands in the link's frame, which is the world of all poses then.
+        tree: its pose tree in the world, or in the frame of the link on which the cameras ride.
         seen: the tree's nodes that the masks show; None: all.
-        standing: the object that the cameras see from their link, whose place is not known; None:
-            they see the robot. Until it is found it is at the world's origin in the tree.
-        searched: the cameras that are to be found.
-        held: the others that have an X_WC.
+        standing: the object that the cameras see from their link, if it is not the robot. Until it
+            is found it is at the world's origin in the tree.
+        searched, held: the cameras that are to be found, and the others that have an X_WC.
         frames: what each of these cameras sees, by name.
         zeros, lengths: the joints and links whose zeros and lengths are to be found.
         left_out: cameras without X_WC that are not to be found.
-        warnings: what the user should know of the input.
         is_estimate: whether the positions were estimated, so that they are off.
         girths: (nodes,) how many times as wide as the model's the nodes are; None: as the model's.
     """
@@ -98,11 +95,8 @@ def read_inputs(
     """Reads and checks everything.
 
     Args:
-        scene_path: the scene's folder.
-        model_path: the model file.
         joints_path: the table of joint positions; None: they are estimated from the cameras
             whose place is known.
-        settings: the settings.
 
     Raises:
         DrakePoseError: names the file, camera, frame or joint at fault.
@@ -132,7 +126,10 @@ def read_inputs(
     pinholes = [_require_pinhole(scene_path, file.cameras[name]) for name in searched]
     held = _select_held(file, searched, settings)
     if joints_path is None:
-        positions = estimate_positions(scene_path, model, kinematics, held, _of_estimate(settings))
+        asked = EstimateSettings(
+            frames=settings.frames, hold=settings.hold, packages=settings.packages
+        )
+        positions = estimate_positions(scene_path, model, kinematics, held, asked)
     else:
         on_link = settings.on is not None
         positions = read_known_positions(joints_path, kinematics, on_link, table)
@@ -168,20 +165,12 @@ def _select_held(
     ]
 
 
-def _of_estimate(settings: RegistrationSettings) -> EstimateSettings:
-    return EstimateSettings(frames=settings.frames, hold=settings.hold, packages=settings.packages)
-
-
 def _require_held(
     path: Path,
     held: Sequence[PinholeCamera],
     frames: Mapping[str, Sequence[PosedFrame]],
 ) -> None:
-    """Refuses estimated positions that no camera whose place is known can hold in the world.
-
-    Raises:
-        SceneError: says what is missing.
-    """
+    """Refuses estimated positions that no camera whose place is known can hold in the world."""
     if not any(frames[camera.name] for camera in held):
         raise SceneError(
             f"{path}: the joint positions were estimated, so they are fitted together with the "
@@ -210,11 +199,7 @@ def _spread_frames(
     positions: KnownPositions,
     wanted: Sequence[str],
 ) -> tuple[str, ...]:
-    """Frames with positions which the cameras see, as many as tell more than the first ones do.
-
-    Raises:
-        SceneError: a camera sees the body in none of them.
-    """
+    """Frames with positions which the cameras see, as many as tell more than the first ones do."""
     asked = select_frames(scene.frames, wanted, str(scene.path))
     known = [frame for frame in asked if positions.has(frame)]
     for camera in cameras:
@@ -335,13 +320,7 @@ def _require_pinhole(path: Path, camera: Camera) -> PinholeCamera:
 def _read_frames(
     scene: Scene, camera: PinholeCamera, positions: KnownPositions, wanted: Sequence[str]
 ) -> tuple[PosedFrame, ...]:
-    """All frames of a camera that is to be found; a bad one is refused.
-
-    Where positions were estimated, a picture without the body is none.
-
-    Raises:
-        MaskError: a mask that cannot be used, or the camera sees the body in none.
-    """
+    """All frames of a camera that is to be found; a bad one is refused."""
     found = []
     for frame in select_seen_frames(scene, [camera], wanted):
         values = positions.of(frame, camera.name)
@@ -384,38 +363,25 @@ def _check_poses(
     """Says so where all frames show one pose of the robot; before an object it is refused."""
     if standing is not None:
         require_turns(camera.name, standing, frames)
-    if positions.is_estimate:
-        return _check_estimated_poses(camera, frames, positions)
-    if not positions.are_one_pose(frame.values for frame in frames):
+    rows, estimated = (frame.values for frame in frames), positions.is_estimate
+    if not positions.are_one_pose(rows, _ESTIMATES_DIFFER if estimated else 1.0):
         return []
-    what = (
-        f"there is one frame, '{frames[0].name}'"
-        if len(frames) == 1
-        else f"all {len(frames)} frames show the robot in one pose, to a degree"
+    if len(frames) == 1:
+        what = f"there is one frame, '{frames[0].name}'"
+    elif estimated:
+        what = f"the body stands still in all {len(frames)} frames"
+    else:
+        what = f"all {len(frames)} frames show the robot in one pose, to a degree"
+    why = (
+        "what its surface lacks pulls the camera to one side unnoticed, about the body above all, "
+        "and no frame can be found to contradict the others; take frames in which it turns, moves "
+        "its limbs and walks about"
+        if estimated
+        else "errors of that mask and of the joints' zeros cannot be told from a camera elsewhere, "
+        "no frame can be found to contradict the others, and a mirrored pose may look alike; take "
+        "five or more poses that differ much"
     )
-    return [
-        f"camera '{camera.name}': {what}: errors of that mask and of the joints' zeros cannot be "
-        "told from a camera elsewhere, no frame can be found to contradict the others, and a "
-        "mirrored pose may look alike; take five or more poses that differ much"
-    ]
-
-
-def _check_estimated_poses(
-    camera: PinholeCamera, frames: Sequence[PosedFrame], positions: KnownPositions
-) -> list[str]:
-    """Says so where all frames show one pose of the body, as far as an estimate can tell."""
-    if not positions.are_one_pose((frame.values for frame in frames), _ESTIMATES_DIFFER):
-        return []
-    what = (
-        f"there is one frame, '{frames[0].name}'"
-        if len(frames) == 1
-        else f"the body stands still in all {len(frames)} frames"
-    )
-    return [
-        f"camera '{camera.name}': {what}: what its surface lacks pulls the camera to one side "
-        "unnoticed, about the body above all, and no frame can be found to contradict the others; "
-        "take frames in which it turns, moves its limbs and walks about"
-    ]
+    return [f"camera '{camera.name}': {what}: {why}"]
 
 
 def _say_of_body(

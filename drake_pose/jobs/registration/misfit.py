@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -26,7 +26,7 @@ from drake_pose.results.texts import percent
 # Of the contours in the two frames that fit best, this share fits at least. A robot that is the
 # masks' leaves 0.83 and more, with holes and tools; mirrored masks, another robot's or exchanged
 # frames 0.6 at most.
-_LEAST_SHARE = 0.65
+_LEAST_INLIER_RATIO = 0.65
 # Focal lengths that are tried where nothing fits, over the camera's.
 _FOCALS = (0.5, 0.7, 1.4, 2.0)
 # A focal length is wrong that differs from the one which the masks tell by so much, and by so many
@@ -45,36 +45,21 @@ Search = CameraSearch | ObjectSearch
 """What finds a camera, and may find it again with other settings."""
 
 
-@dataclass(frozen=True)
-class Misfit:
-    """What a camera's pose leaves, where it explains too little.
-
-    Args:
-        E_total: in the median of the frames that agree.
-        reason: what is too little.
-    """
-
-    E_total: float
-    reason: str
-
-
-def find_misfit(found: RegisteredCamera) -> Misfit | None:
+def find_misfit(found: RegisteredCamera) -> str | None:
     """What is wrong with a pose that does not explain the masks; None where it does."""
     agreeing = [frame for frame in found.frames if frame.agrees]
     left = _left(found)
-    share = float(np.mean(np.sort([frame.inlier_ratio for frame in found.frames])[-2:]))
+    ratio = float(np.mean(np.sort([frame.inlier_ratio for frame in found.frames])[-2:]))
     if len(found.frames) > 1 and len(agreeing) < 2:
-        return Misfit(
-            left,
+        return (
             f"no two of its {len(found.frames)} frames agree on one; at best frame "
-            f"'{agreeing[0].frame}' fits alone",
+            f"'{agreeing[0].frame}' fits alone"
         )
-    if left < BADLY_EXPLAINED and share >= _LEAST_SHARE:
+    if left < BADLY_EXPLAINED and ratio >= _LEAST_INLIER_RATIO:
         return None
-    return Misfit(
-        left,
+    return (
         f"body and silhouettes differ by {percent(left)} of the silhouettes' area at best, and of "
-        f"the contours {percent(share)} fit",
+        f"the contours {percent(ratio)} fit"
     )
 
 
@@ -82,11 +67,6 @@ def require_explained(
     search: Search, found: RegisteredCamera, frames: Sequence[PosedFrame]
 ) -> None:
     """Refuses a pose that does not explain even those frames that agree best.
-
-    Args:
-        search: what found it.
-        found: the pose.
-        frames: what the camera sees.
 
     Raises:
         RegistrationError: says how much remains, what would fit, and what to look at.
@@ -98,7 +78,7 @@ def require_explained(
     better = [
         text
         for text, other, seen in _others(found.camera, frames)
-        if _explains(search, other, seen, misfit.E_total)
+        if _explains(search, other, seen, _left(found))
     ]
     advice = "; ".join(better) or (
         "are these masks of this robot or object, are the joint positions those of these frames, "
@@ -106,7 +86,7 @@ def require_explained(
         "principal point the camera's, are the pictures free of distortion?"
     )
     raise RegistrationError(
-        f"camera '{found.camera.name}': no pose explains its masks: {misfit.reason}; {advice} "
+        f"camera '{found.camera.name}': no pose explains its masks: {misfit}; {advice} "
         "Nothing was written"
     )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 
 from drake_pose.body.model import OBJECT_POSITIONS
-from drake_pose.camera.models import Camera, PinholeCamera
+from drake_pose.camera.models import Camera
 from drake_pose.jobs.estimate.fit_checks import BADLY_EXPLAINED
 from drake_pose.jobs.estimate.scene_checks import frame_ranges
-from drake_pose.jobs.registration.adjustment import adjust_bundle
 from drake_pose.jobs.registration.inputs import (
     RegistrationInputs,
     read_inputs,
@@ -25,18 +24,17 @@ from drake_pose.jobs.registration.misfit import (
     require_determined,
     require_explained,
 )
-from drake_pose.jobs.registration.result import describe_camera, summarize, write_result
-from drake_pose.jobs.registration.settings import RegistrationSettings
-from drake_pose.jobs.registration.zeros import (
-    corrected_urdf,
-    describe_lengths,
-    describe_zeros,
-    find_zeros,
+from drake_pose.jobs.registration.refit import adjust_bundle, corrected_urdf, find_zeros
+from drake_pose.jobs.registration.result import (
+    describe_camera,
+    describe_parameters,
     say_zeros,
+    summarize,
+    write_result,
 )
-from drake_pose.registration.joint_zeros import JointCalibration
+from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.registration.object_search import ObjectSearch
-from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
+from drake_pose.registration.posed_frames import PosedFrames
 from drake_pose.registration.register import (
     CameraSearch,
     ObjectPose,
@@ -60,8 +58,6 @@ class SceneRegistration:
         cameras: all cameras of the scene whose pose is known now, in its order.
         registered: those that were found, with how well they fit, by name.
         summary: what summary.json holds.
-        warnings: what the user should know.
-        folder: the result folder, if one was written.
     """
 
     cameras: Mapping[str, Camera]
@@ -84,16 +80,12 @@ def register_scene(
     """Finds where a scene's cameras stand; no guess is needed.
 
     Args:
-        scene: the scene's folder: cameras.yaml, in which X_WC may be missing, and
-            masks/<camera>/<frame>.png.
+        scene: the folder with cameras.yaml, in which X_WC may be missing, and masks.
         model: the robot's model file. It stands in the world as the file has it.
-        joints: joint positions by frame, a CSV file with the column frame and one for each joint
-            [rad or m]. None: they are estimated from the cameras whose X_WC is known, and fitted
-            together with those that are found.
+        joints: joint positions by frame (CSV) [rad or m]. None: they are estimated from the cameras
+            whose X_WC is known, and fitted together with those that are found.
         out: folder for the result, new or empty; None writes nothing.
-        settings: which cameras and frames.
-        overlay: whether overlays are written.
-        on_camera: hears of every camera that is done.
+        on_camera: called after each camera.
 
     Raises:
         RegistrationError: no pose of a camera explains its masks. Nothing is written then.
@@ -106,69 +98,106 @@ def register_scene(
         require_empty(folder)
     inputs = read_inputs(*paths, settings)
     body = RegistrationBody(inputs.tree, inputs.seen, girths=inputs.girths)
-    warnings = [*inputs.warnings, *_check_held(inputs, body)]
-    registered, described, body = _search(inputs, body, settings, warnings, on_camera)
-    inputs = replace(inputs, tree=body.tree)
-    urdf = None
+    search = _Search(inputs, settings, body)
+    warnings = [*inputs.warnings, *_check_held(inputs, search.body)]
+    warnings += search.run(on_camera)
+    inputs, registered = replace(inputs, tree=search.body.tree), search.registered
+    start = time.perf_counter()
+    urdf, parameters = None, dict[str, Any]()
     if inputs.is_estimate:
-        registered, described, inputs, body = _adjust(inputs, body, registered, described)
+        registered, inputs, body = adjust_bundle(inputs, search.body, registered)
+        for found in registered.values():
+            require_explained(CameraSearch(body), found, inputs.frames[found.camera.name])
     # Cameras that see one object are found one after another, but it stands in one place.
     several = inputs.standing is not None and len(registered) > 1
     if settings.zeros or settings.lengths or settings.focal or several:
-        start = time.perf_counter()
-        registered, corrected, zeros = find_zeros(inputs, settings, body, registered)
-        seconds = (time.perf_counter() - start) / len(registered)
-        described = _describe_again(registered, described, body, zeros, seconds)
+        registered, corrected, zeros = find_zeros(inputs, settings, search.body, registered)
+        parameters = describe_parameters(zeros, search.body.kinematics)
         warnings += say_zeros(zeros)
         urdf = corrected_urdf(inputs, zeros, folder)
         inputs = corrected
-    cameras = _placed_cameras(inputs, registered)
+    more = (time.perf_counter() - start) / len(registered)
+    described = search.describe(registered, more, parameters)
+    cameras = {
+        name: registered[name].camera if name in registered else camera
+        for name, camera in inputs.scene.cameras.items()
+        if name not in inputs.left_out
+    }
     summary = summarize(paths, settings, described, warnings)
     if folder is not None:
         write_result(folder, inputs, cameras, registered, summary, overlay, urdf)
     return SceneRegistration(cameras, registered, summary, tuple(warnings), folder)
 
 
-def _search(
-    inputs: RegistrationInputs,
-    body: RegistrationBody,
-    settings: RegistrationSettings,
-    warnings: list[str],
-    on_camera: OnCamera | None,
-) -> tuple[dict[str, RegisteredCamera], dict[str, dict[str, Any]], RegistrationBody]:
-    """Each camera by itself, its part of the summary, and the body; warnings are added to.
+class _Search:
+    """The search for each camera by itself.
 
     An object whose place is not known is found with the first camera, and then stands there.
-
-    Raises:
-        RegistrationError: no pose of a camera explains its masks.
     """
-    standing, seen = inputs.standing, None
-    search: Search = CameraSearch(body) if standing is None else ObjectSearch(standing)
-    registered, described = dict[str, RegisteredCamera](), dict[str, dict[str, Any]]()
-    for camera in inputs.searched:
-        start = time.perf_counter()
-        found = search.register(camera, inputs.frames[camera.name])
-        if not inputs.is_estimate:
-            require_explained(search, found, inputs.frames[camera.name])
-        if standing is not None:
-            require_determined(found)
-            if found.seen_object is not None:
-                seen, body = found.seen_object, standing.body(found.seen_object.X_WT)
-                search = CameraSearch(body)
-                warnings += _say_object(seen)
-            found = replace(found, seen_object=seen)
-        if not inputs.is_estimate:
-            warnings += check_focal_length(body, found, inputs.frames[camera.name])
-        registered[camera.name] = found
-        next_pose = _suggestion(body, found, settings)
-        seconds = time.perf_counter() - start
-        described[camera.name] = describe_camera(found, seconds, next_pose, settings.on)
-        warnings += _warnings_of(found)
-        if on_camera is not None:
-            on_camera(len(registered))
-    warnings += say_common(registered.values())
-    return registered, described, body
+
+    def __init__(
+        self, inputs: RegistrationInputs, settings: RegistrationSettings, body: RegistrationBody
+    ) -> None:
+        self._inputs, self._settings, self.body = inputs, settings, body
+        self.registered = dict[str, RegisteredCamera]()
+        self.seconds = dict[str, float]()
+        self.suggestions = dict[str, dict[str, Any] | None]()
+
+    def run(self, on_camera: OnCamera | None) -> list[str]:
+        """Finds all cameras; returns warnings.
+
+        Raises:
+            RegistrationError: no pose of a camera explains its masks.
+        """
+        inputs, standing, seen = self._inputs, self._inputs.standing, None
+        search: Search = CameraSearch(self.body) if standing is None else ObjectSearch(standing)
+        warnings: list[str] = []
+        for camera in inputs.searched:
+            start, frames = time.perf_counter(), inputs.frames[camera.name]
+            found = search.register(camera, frames)
+            if not inputs.is_estimate:
+                require_explained(search, found, frames)
+            if standing is not None:
+                require_determined(found)
+                if found.seen_object is not None:
+                    seen, self.body = found.seen_object, standing.body(found.seen_object.X_WT)
+                    search = CameraSearch(self.body)
+                    warnings += _say_object(seen)
+                found = replace(found, seen_object=seen)
+            if not inputs.is_estimate:
+                warnings += check_focal_length(self.body, found, frames)
+            self.registered[camera.name] = found
+            self.suggestions[camera.name] = self._suggestion(found)
+            self.seconds[camera.name] = time.perf_counter() - start
+            warnings += _warnings_of(found)
+            if on_camera is not None:
+                on_camera(len(self.registered))
+        return warnings + say_common(self.registered.values())
+
+    def describe(
+        self, registered: Mapping[str, RegisteredCamera], more: float, parameters: dict[str, Any]
+    ) -> dict[str, dict[str, Any]]:
+        """The cameras' parts of the summary, each of which took so long more [s]."""
+        link = self._settings.on
+        return {
+            name: describe_camera(one, self.seconds[name] + more, self.suggestions[name], link)
+            | parameters
+            for name, one in registered.items()
+        }
+
+    def _suggestion(self, found: RegisteredCamera) -> dict[str, Any] | None:
+        """Joint positions that would tell a camera's poses apart; None: one pose, not asked for."""
+        if not self._settings.suggest or not len(found.alternatives):
+            return None
+        poses = [found.camera.X_WC, *found.alternatives]
+        told = suggest_pose(self.body, found.camera, poses, self._settings.keep_out)
+        if told is None:
+            return None
+        values = zip(self.body.kinematics.names, told.values.tolist(), strict=True)
+        return {
+            "positions": {name: value for name, value in values if name not in OBJECT_POSITIONS},
+            "difference": told.difference,
+        }
 
 
 def _say_object(seen: ObjectPose) -> list[str]:
@@ -186,82 +215,6 @@ def _say_object(seen: ObjectPose) -> list[str]:
             "target in summary.json; where the camera is does not depend on it"
         )
     return texts
-
-
-def _adjust(
-    inputs: RegistrationInputs,
-    body: RegistrationBody,
-    registered: Mapping[str, RegisteredCamera],
-    described: Mapping[str, dict[str, Any]],
-) -> tuple[
-    dict[str, RegisteredCamera], dict[str, dict[str, Any]], RegistrationInputs, RegistrationBody
-]:
-    """The cameras fitted together with the positions that were estimated, and all that follows.
-
-    Raises:
-        RegistrationError: even so they do not explain their masks.
-    """
-    start = time.perf_counter()
-    adjusted, inputs, body = adjust_bundle(inputs, body, registered)
-    for found in adjusted.values():
-        require_explained(CameraSearch(body), found, inputs.frames[found.camera.name])
-    seconds = (time.perf_counter() - start) / len(adjusted)
-    again = {
-        name: describe_camera(found, described[name]["seconds"] + seconds)
-        for name, found in adjusted.items()
-    }
-    return adjusted, again, inputs, body
-
-
-def _suggestion(
-    body: RegistrationBody, found: RegisteredCamera, settings: RegistrationSettings
-) -> dict[str, Any] | None:
-    """Joint positions that would tell a camera's poses apart; None: one pose, or not asked for."""
-    if not settings.suggest or not len(found.alternatives):
-        return None
-    poses = [found.camera.X_WC, *found.alternatives]
-    told = suggest_pose(body, found.camera, poses, settings.keep_out)
-    if told is None:
-        return None
-    values = zip(body.kinematics.names, told.values.tolist(), strict=True)
-    return {
-        "positions": {name: value for name, value in values if name not in OBJECT_POSITIONS},
-        "difference": told.difference,
-    }
-
-
-def _placed_cameras(
-    inputs: RegistrationInputs, registered: Mapping[str, RegisteredCamera]
-) -> dict[str, Camera]:
-    """All cameras of the scene whose pose is known now."""
-    return {
-        name: registered[name].camera if name in registered else camera
-        for name, camera in inputs.scene.cameras.items()
-        if name not in inputs.left_out
-    }
-
-
-def _describe_again(
-    registered: Mapping[str, RegisteredCamera],
-    before: Mapping[str, dict[str, Any]],
-    body: RegistrationBody,
-    zeros: JointCalibration,
-    seconds: float,
-) -> dict[str, dict[str, Any]]:
-    """The cameras' parts of the summary with zeros and lengths, which took so long more [s]."""
-    told = {"zeros": describe_zeros(zeros, body.kinematics), "lengths": describe_lengths(zeros)}
-    return {
-        name: {
-            **describe_camera(
-                found,
-                before[name]["seconds"] + seconds,
-                before[name]["suggestion"],
-                before[name].get("link"),
-            ),
-            **told,
-        }
-        for name, found in registered.items()
-    }
 
 
 def say_common(registered: Iterable[RegisteredCamera]) -> list[str]:
@@ -327,7 +280,8 @@ def _check_held(inputs: RegistrationInputs, body: RegistrationBody) -> list[str]
         frames = inputs.frames[camera.name]
         if not frames:
             continue
-        left = float(np.median(_misfits(body, camera, frames)))
+        posed = PosedFrames(body.kinematics, body.all, camera, frames)
+        left = float(np.median(E_total(areas(posed, camera.X_CW[None], np.inf)[0])))
         if left >= BADLY_EXPLAINED:
             texts.append(
                 f"camera '{camera.name}' is held at its X_WC, but the robot is not seen there: "
@@ -336,11 +290,3 @@ def _check_held(inputs: RegistrationInputs, body: RegistrationBody) -> list[str]
                 f"--camera {camera.name}"
             )
     return texts
-
-
-def _misfits(
-    body: RegistrationBody, camera: PinholeCamera, frames: Sequence[PosedFrame]
-) -> np.ndarray:
-    """(frames,) E_total at the camera's own pose."""
-    posed = PosedFrames(body.kinematics, body.all, camera, frames)
-    return E_total(areas(posed, camera.X_CW[None], np.inf)[0])

@@ -1,10 +1,11 @@
-"""What a registration writes: the cameras, how sure they are, pictures, a summary."""
+"""What a registration writes: the cameras, how sure they are, pictures, a summary, a page."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+from urllib.parse import quote
 
 import numpy as np
 import yaml
@@ -14,11 +15,12 @@ from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.files import dump_cameras
 from drake_pose.camera.models import Camera
 from drake_pose.jobs.registration.inputs import RegistrationInputs
-from drake_pose.jobs.registration.report import make_registration_report
 from drake_pose.jobs.registration.settings import RegistrationSettings
+from drake_pose.registration.joint_zeros import JointCalibration
 from drake_pose.registration.register import ObjectPose, RegisteredCamera
 from drake_pose.results.folder import OVERLAY, REPORT, ResultFolder, without_nan
 from drake_pose.results.overlay import draw_overlay, encode_png
+from drake_pose.results.report_page import Picture, page_template, small_picture
 from drake_pose.results.summary import file_digest, versions
 from drake_pose.results.texts import percent
 from drake_pose.silhouette.areas.outline import outline_from_mesh
@@ -28,6 +30,15 @@ from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 Array = NDArray[np.float64]
 
 CAMERAS, REGISTRATION = "cameras.yaml", "registration.yaml"
+
+# So many pictures of each camera are shown: those that fit worst and best, and some between.
+_PICTURES = 6
+PARAMETERS = (
+    ("zeros", "Zeros, to be added to positions", "joint", "zero"),
+    ("lengths", "Lengths, by how much links are longer", "link", "length"),
+)
+"""Keys of the summary that hold parameters of the robot: title, what they are of, what they are."""
+
 
 _ERROR_NAMES = ("turn_x", "turn_y", "turn_z", "x", "y", "z")
 
@@ -84,6 +95,46 @@ def _describe_object(seen: ObjectPose) -> dict[str, Any]:
         "round_about": seen.round_about.tolist(),
         "families": [{"X_WT": X.tolist()} for X in (seen.X_WT, *seen.alternatives)],
     }
+
+
+def describe_parameters(
+    found: JointCalibration, kinematics: TreeKinematics
+) -> dict[str, dict[str, Any]]:
+    """Zeros in degrees or mm, lengths in percent, by name; None where it is not determined."""
+    described: dict[str, dict[str, Any]] = {"zeros": {}, "lengths": {}}
+    for kind, several in (("zeros", found.zeros), ("lengths", found.lengths)):
+        for one in several:
+            unit, factor = ("percent", 1e2)
+            if kind == "zeros":
+                turns = kinematics.is_angle[kinematics.names.index(one.name)]
+                unit, factor = ("deg", float(np.degrees(1.0))) if turns else ("mm", 1e3)
+            numbers = {"value": one.value, "sd": one.deviation, "low": one.low, "high": one.high}
+            described[kind][one.name] = {
+                "determined": one.determined,
+                "significant": one.significant,
+                **{
+                    f"{key}_{unit}": factor * value if one.determined else None
+                    for key, value in numbers.items()
+                },
+                "gauge": list(one.gauge),
+            }
+    return described
+
+
+def say_zeros(found: JointCalibration) -> list[str]:
+    """What a user should know of zeros and lengths."""
+    asked = [(f"joint '{one.name}': its zero", one) for one in found.zeros]
+    asked += [(f"link '{one.name}': its length", one) for one in found.lengths]
+    texts = []
+    for what, one in asked:
+        if not one.determined:
+            goes_with = f" it goes with {', '.join(one.gauge)};" if one.gauge else ""
+            texts.append(
+                f"{what} is not determined by these silhouettes and was left as it is;{goes_with} "
+                "frames in which the robot stands otherwise, or a part of it that does not move "
+                "with this one, would tell it"
+            )
+    return texts
 
 
 def summarize(
@@ -158,6 +209,74 @@ def write_result(
     folder.write(REPORT, make_registration_report(path, summary).encode())
     links = {name: one["link"] for name, one in summary["cameras"].items() if "link" in one}
     folder.write(CAMERAS, dump_cameras(cameras, links).encode())
+
+
+class ParameterRow(NamedTuple):
+    """A zero or a length as it is shown: with units, and what to make of it."""
+
+    name: str
+    value: str
+    interval: str
+    word: str
+
+
+def parameter_rows(parameters: Mapping[str, Mapping[str, Any]]) -> list[ParameterRow]:
+    """The zeros or the lengths of a camera's part of summary.json, as they are shown."""
+    rows = []
+    for name, one in parameters.items():
+        if not one["determined"]:
+            goes_with = f", goes with {', '.join(one['gauge'])}" if one["gauge"] else ""
+            rows.append(ParameterRow(name, "", "", f"not determined{goes_with}"))
+            continue
+        key = next(key for key in one if key.startswith("value_"))
+        unit = key.removeprefix("value_")
+        rows.append(
+            ParameterRow(
+                name,
+                f"{one[key]:.3f} {'%' if unit == 'percent' else unit}",
+                f"{one[f'low_{unit}']:.3f} to {one[f'high_{unit}']:.3f}",
+                "significant" if one["significant"] else "as good as 0",
+            )
+        )
+    return rows
+
+
+def make_registration_report(folder: Path, summary: Mapping[str, Any]) -> str:
+    """The page report.html, with the overlays in the result's folder."""
+    # Cameras see one robot: its zeros and lengths are the same in all their parts.
+    first = next(iter(summary["cameras"].values()))
+    return page_template("drake_pose.jobs.registration", "report_template.html.j2").render(
+        summary=summary,
+        title=Path(str(summary["scene"])).name or str(summary["scene"]),
+        model=Path(str(summary["model"])).name,
+        target=first.get("target"),
+        parameters=[
+            (title, of, what, parameter_rows(first[key]))
+            for key, title, of, what in PARAMETERS
+            if first[key]
+        ],
+        pictures=[
+            picture
+            for camera, one in summary["cameras"].items()
+            for picture in _pick_pictures(folder, camera, one["frames"])
+        ],
+    )
+
+
+def _pick_pictures(folder: Path, camera: str, frames: Mapping[str, Any]) -> list[Picture]:
+    """Overlays of a camera's frames from the worst to the best, as far as they were written."""
+    in_order = sorted(frames, key=lambda frame: float(-frames[frame]["E_total"]))
+    count = min(_PICTURES, len(in_order))
+    chosen = [in_order[k] for k in np.linspace(0, len(in_order) - 1, count).round().astype(int)]
+    pictures = []
+    for frame in chosen:
+        place = f"{OVERLAY}/{camera}/{frame}.png"
+        if (folder / place).is_file():
+            uri = small_picture((folder / place).read_bytes())
+            if uri:
+                error = float(frames[frame]["E_total"])
+                pictures.append(Picture(camera, frame, error, uri, quote(place)))
+    return pictures
 
 
 def _uncertainty(found: RegisteredCamera, summary: Mapping[str, Any]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from drake_pose.body.model import load_model
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.errors import SceneError
 from drake_pose.jobs.estimate.measurements import read_true_angles
-from drake_pose.jobs.registration.known_positions import (
+from drake_pose.jobs.registration.positions import (
     KnownPositions,
     put_on_base,
     read_known_positions,

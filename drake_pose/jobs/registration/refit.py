@@ -1,4 +1,8 @@
-"""Zeros of joints, lengths of links and focal lengths, asked for beside the cameras' poses."""
+"""Cameras fitted once more, together with what is unknown of the body beside them.
+
+Positions that were estimated are off, and so would the cameras be; zeros of joints, lengths of
+links and focal lengths are the same in all frames.
+"""
 
 from __future__ import annotations
 
@@ -7,33 +11,82 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from drake_pose.body.files.urdf_shape import with_shifted_joints, with_zeros
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.jobs.registration.inputs import (
-    RegistrationInputs,
-    make_registration_tree,
-)
+from drake_pose.jobs.estimate.person_choice import missing_for_person
+from drake_pose.jobs.registration.inputs import RegistrationInputs, make_registration_tree
 from drake_pose.jobs.registration.settings import RegistrationSettings
+from drake_pose.person.shape import shape_parts, shape_values
+from drake_pose.registration.bundle_adjustment import BundleAdjustment, CommonShape
 from drake_pose.registration.joint_zeros import (
     JointCalibration,
     calibrate_joints,
     lengthened_joints,
 )
+from drake_pose.registration.per_frame_fit import SeenFrame
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import FrameMisfit, RegisteredCamera, RegistrationBody
 from drake_pose.registration.start_poses import E_total, areas, intersection_over_union
+
+Registered = Mapping[str, RegisteredCamera]
+
+
+def adjust_bundle(
+    inputs: RegistrationInputs,
+    body: RegistrationBody,
+    registered: Registered,
+) -> tuple[dict[str, RegisteredCamera], RegistrationInputs, RegistrationBody]:
+    """The cameras, the frames' estimated positions and the body, fitted to what all cameras see."""
+    frames = _seen_frames(inputs, registered)
+    cameras = [*inputs.held, *(found.camera for found in registered.values())]
+    shape = CommonShape(np.zeros(len(body.kinematics.names), np.bool_))
+    if not missing_for_person(inputs.model):
+        shape = CommonShape(shape_values(inputs.tree), *shape_parts(inputs.tree))
+    fitted = BundleAdjustment(
+        body.kinematics, body.few, cameras, tuple(registered), frames, shape
+    ).fit()
+    values = {frame.name: values for frame, values in zip(frames, fitted.values, strict=True)}
+    moved = {
+        name: tuple(PosedFrame(one.name, values[one.name], one.mask) for one in own)
+        for name, own in inputs.frames.items()
+    }
+    girths = fitted.girths * (1.0 if inputs.girths is None else inputs.girths)
+    worn = RegistrationBody(inputs.tree, inputs.seen, girths=girths)
+    result = {}
+    for camera, covariance in zip(fitted.cameras, fitted.covariances, strict=True):
+        before = registered[camera.name]
+        misfits = misfits_now(
+            PosedFrames(worn.kinematics, worn.all, camera, moved[camera.name]), before
+        )
+        result[camera.name] = replace(before, camera=camera, covariance=covariance, frames=misfits)
+    return result, replace(inputs, frames=moved), worn
+
+
+def _seen_frames(
+    inputs: RegistrationInputs, registered: Mapping[str, RegisteredCamera]
+) -> list[SeenFrame]:
+    """What all cameras see, but for pictures that contradict the positions."""
+    frames: dict[str, SeenFrame] = {}
+    for name in (*(camera.name for camera in inputs.held), *registered):
+        wrong = registered[name].contradictions if name in registered else ()
+        for one in inputs.frames[name]:
+            before = frames.get(one.name)
+            masks = {} if before is None else dict(before.masks)
+            if one.name not in wrong:
+                masks[name] = one.mask
+            frames[one.name] = SeenFrame(one.name, one.values, masks)
+    return list(frames.values())
 
 
 def find_zeros(
     inputs: RegistrationInputs,
     settings: RegistrationSettings,
     body: RegistrationBody,
-    registered: Mapping[str, RegisteredCamera],
+    registered: Registered,
 ) -> tuple[dict[str, RegisteredCamera], RegistrationInputs, JointCalibration]:
     """The cameras, and the robot and the frames' positions, with what was found.
 
@@ -93,70 +146,12 @@ def misfits_now(frames: PosedFrames, before: RegisteredCamera) -> tuple[FrameMis
     )
 
 
-def describe_zeros(found: JointCalibration, kinematics: TreeKinematics) -> dict[str, Any]:
-    """The zeros by name, angles in degrees and lengths in mm; None where it is not determined."""
-    described = {}
-    for zero in found.zeros:
-        angle = bool(kinematics.is_angle[kinematics.names.index(zero.name)])
-        unit, factor = ("deg", np.degrees(1.0)) if angle else ("mm", 1e3)
-        numbers = {"value": zero.value, "sd": zero.deviation, "low": zero.low, "high": zero.high}
-        described[zero.name] = {
-            "determined": zero.determined,
-            "significant": zero.significant,
-            **{
-                f"{key}_{unit}": float(factor * value) if zero.determined else None
-                for key, value in numbers.items()
-            },
-            "gauge": list(zero.gauge),
-        }
-    return described
-
-
-def describe_lengths(found: JointCalibration) -> dict[str, Any]:
-    """By how much links are longer, by name; None where it is not determined."""
-    described = {}
-    for one in found.lengths:
-        numbers = {"value": one.value, "sd": one.deviation, "low": one.low, "high": one.high}
-        described[one.name] = {
-            "determined": one.determined,
-            "significant": one.significant,
-            **{
-                f"{key}_percent": 1e2 * value if one.determined else None
-                for key, value in numbers.items()
-            },
-            "gauge": list(one.gauge),
-        }
-    return described
-
-
-def say_zeros(found: JointCalibration) -> list[str]:
-    """What a user should know of zeros and lengths."""
-    asked = [(f"joint '{one.name}': its zero", one) for one in found.zeros]
-    asked += [(f"link '{one.name}': its length", one) for one in found.lengths]
-    texts = []
-    for what, one in asked:
-        if not one.determined:
-            goes_with = f" it goes with {', '.join(one.gauge)};" if one.gauge else ""
-            texts.append(
-                f"{what} is not determined by these silhouettes and was left as it is;{goes_with} "
-                "frames in which the robot stands otherwise, or a part of it that does not move "
-                "with this one, would tell it"
-            )
-    return texts
-
-
 def corrected_urdf(
     inputs: RegistrationInputs, found: JointCalibration, folder: Path | None
 ) -> bytes | None:
     """The URDF with zeros and lengths in its joints' origins; its meshes as seen from a folder.
 
-    Args:
-        inputs: with the model as it was read.
-        found: zeros and lengths.
-        folder: where it is to be written; None: nowhere.
-
-    Returns:
-        None where it is not asked for, or the model is no URDF.
+    None where there is no folder, nothing was asked for, or the model is no URDF.
     """
     model, tree = inputs.model.path, inputs.tree
     if folder is None or not inputs.model.changes_shape or not (found.zeros or found.lengths):

@@ -1,10 +1,10 @@
-"""Joint positions of every frame, from a table, checked before anything is made of them."""
+"""Joint positions of every frame: from a table, or estimated from cameras whose place is known."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +15,15 @@ from drake_pose.body.files.urdf_shape import BASE_JOINTS
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.camera.models import Camera
 from drake_pose.errors import SceneError
 from drake_pose.jobs.estimate.measurements import TrueAngles, read_true_angles
+from drake_pose.jobs.estimate.person_choice import missing_for_person
+from drake_pose.jobs.estimate.scene import estimate_scene
+from drake_pose.person.shape import shape_parts
 from drake_pose.results.folder import base_pose
+from drake_pose.results.options import frame_number
+from drake_pose.results.settings import EstimateSettings
 
 Array = NDArray[np.float64]
 
@@ -41,18 +47,15 @@ class KnownPositions:
         kinematics: of the pose tree.
         table: its columns and rows.
         order: (m,) the column of each value of the pose tree; -1: it is held.
-        held: (m,) the values that are held [rad or m]; others are not looked at.
         warnings: what the user should know of it.
         is_estimate: whether they were estimated, so that they are off.
-        girths: (nodes,) how many times as wide as the model's the nodes were found to be; None: as
-            the model's.
+        girths: (nodes,) how many times as wide as the model's the nodes were found to be.
     """
 
     path: Path
     kinematics: TreeKinematics
     table: TrueAngles
     order: NDArray[np.intp]
-    held: Array
     warnings: tuple[str, ...] = ()
     is_estimate: bool = False
     girths: Array | None = None
@@ -73,7 +76,7 @@ class KnownPositions:
                 f"{self.path}: has no row of frame '{frame}', which camera '{camera}' has a mask "
                 "of; add the joint positions of that moment, or leave the frame out (--frame)"
             )
-        return np.where(self.order < 0, self.held, values[self.order])
+        return np.where(self.order < 0, self.kinematics.lower, values[self.order])
 
     def are_one_pose(self, rows: Iterable[Array], times: float = 1.0) -> bool:
         """Whether the joints are at the same place in all of some rows (m,).
@@ -115,7 +118,6 @@ def read_known_positions(
     """Reads a table with the column frame and one for each joint that is not held.
 
     Args:
-        path: the table.
         kinematics: of the pose tree, whose model's positions the columns are.
         unobserved: whether there may be columns of joints that move nothing that is seen.
         table: what was read of it before; None: nothing was.
@@ -132,7 +134,8 @@ def read_known_positions(
     missing = [name for name in asked if name not in table.names]
     if missing:
         raise SceneError(
-            f"{path}: has no column for {_joints(missing)} of {model.path.name}; give the position "
+            f"{path}: has no column for joint{'s' if len(missing) > 1 else ''} "
+            f"{', '.join(missing)} of {model.path.name}; give the position "
             "of every joint in every frame [rad or m], or hold those that did not move: "
             f"--hold {missing[0]}=VALUE [deg or m]"
         )
@@ -152,9 +155,7 @@ def read_known_positions(
         dtype=np.intp,
     )
     warnings = _check_units(table, order, kinematics)
-    return KnownPositions(
-        path, kinematics, table, order, kinematics.lower, warnings, table.is_estimate
-    )
+    return KnownPositions(path, kinematics, table, order, warnings, table.is_estimate)
 
 
 def _as_they_are(table: TrueAngles, tree: PoseTree) -> set[str]:
@@ -209,5 +210,64 @@ def _check_units(
     return tuple(warnings)
 
 
-def _joints(names: list[str]) -> str:
-    return f"joint{'s' if len(names) > 1 else ''} {', '.join(names)}"
+def estimate_positions(
+    scene_path: Path,
+    model: ArticulatedModel,
+    kinematics: TreeKinematics,
+    known: Sequence[Camera],
+    settings: EstimateSettings,
+) -> KnownPositions:
+    """Joint positions of the frames in which the known cameras tell them.
+
+    Raises:
+        SceneError: there are too few such cameras, or they see the body in no frame.
+        DrakePoseError: as for an estimate.
+    """
+    names = tuple(camera.name for camera in known)
+    _require_enough(scene_path, model, names)
+    found = estimate_scene(scene_path, model.path, None, replace(settings, cameras=names))
+    values: dict[int | str, Array] = {}
+    for row in found.rows:
+        if row.found:
+            number = frame_number(row.frame)
+            values[row.frame if number is None else number] = row.q
+    if not values:
+        raise SceneError(
+            f"{scene_path}: camera {', '.join(names)}, whose X_WC is known, sees the body in no "
+            "frame well enough to tell its pose, so nothing tells where the others are: give its "
+            "joint positions (--joints), or cameras with X_WC that see it"
+        )
+    index = [found.position_names.index(name) for name in kinematics.names]
+    table = TrueAngles(scene_path, found.position_names, values)
+    return KnownPositions(
+        scene_path,
+        kinematics,
+        table,
+        np.array(index, dtype=np.intp),
+        found.warnings,
+        is_estimate=True,
+        girths=_girths(kinematics.tree, found.summary.get("girths", {})),
+    )
+
+
+def _require_enough(path: Path, model: ArticulatedModel, names: Sequence[str]) -> None:
+    """Refuses to begin where known cameras are too few for the body."""
+    if not names:
+        raise SceneError(
+            f"{path}: neither a camera's place nor the body's joint positions are known: give X_WC "
+            "of one camera or more (of two for a person), or joint positions (--joints)"
+        )
+    if len(names) < 2 and not missing_for_person(model):
+        raise SceneError(
+            f"{path}: {names[0]} is the only camera that has an X_WC, and one camera does not tell "
+            "where a person is: give X_WC of two cameras or more, or the person's joint positions "
+            "(--joints)"
+        )
+
+
+def _girths(tree: PoseTree, of_parts: Mapping[str, float]) -> Array | None:
+    """(nodes,) of the girths by part; None where there are none."""
+    if not of_parts:
+        return None
+    parts, groups = shape_parts(tree)
+    return np.array([of_parts.get(parts[group], 1.0) for group in groups])

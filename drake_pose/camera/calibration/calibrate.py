@@ -27,6 +27,8 @@ from drake_pose.errors import CameraError, UnknownNameError
 
 Array = NDArray[np.float64]
 
+# A picture is spoilt whose error is above this many pixels, and times its camera's median.
+_SPOILT_PIXELS, _SPOILT_MEDIANS = 0.5, 4.0
 _LARGEST_FOCAL_DEVIATION = 0.05
 # Mirrored pictures agree with the other cameras this much better once they are turned.
 _BETTER = 0.25
@@ -42,8 +44,6 @@ class CalibrationSettings:
         lens: "none" (no distortion), "standard" (k1, k2, p1, p2) or "full" (k3 too).
         drop_spoilt: go on without the pictures that spoil the calibration instead of refusing.
         leave_out: cameras ("left"), or pictures ("left/0007"), not to be used.
-        spoilt_factor: a picture is spoilt whose error is this many times its camera's median, ...
-        spoilt_pixels: ... and above this [pixel].
         largest_error: a calibration whose camera has a larger error is refused [pixel].
 
     Raises:
@@ -54,8 +54,6 @@ class CalibrationSettings:
     lens: str = "standard"
     drop_spoilt: bool = False
     leave_out: Collection[str] = field(default=())
-    spoilt_factor: float = 4.0
-    spoilt_pixels: float = 0.5
     largest_error: float = 2.0
 
     def __post_init__(self) -> None:
@@ -66,9 +64,8 @@ class CalibrationSettings:
         kind, _, name = self.world.partition(":")
         if self.world and (kind not in ("board", "camera") or not name):
             raise CameraError(f"world must be board:FRAME or camera:NAME, not '{self.world}'")
-        for name in ("spoilt_factor", "spoilt_pixels", "largest_error"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
-                raise CameraError(f"{name} must be positive, not {getattr(self, name)}")
+        if not 0.0 < self.largest_error < np.inf:
+            raise CameraError(f"largest_error must be positive, not {self.largest_error}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +192,7 @@ def _own_lens(
         estimate = estimate_lens(name, points, frames, size, settings.lens)
         worst = max(estimate.errors, key=lambda frame: estimate.errors[frame])
         # One spoilt picture also harms the others' errors: the worst goes first, then look again.
-        if estimate.errors[worst] <= _limit(estimate.errors.values(), settings):
+        if estimate.errors[worst] <= _limit(estimate.errors.values()):
             break
         reason = f"its corners are {estimate.errors[worst]:.2f} pixel off the camera's own lens"
         spoilt[name, worst] = reason
@@ -221,7 +218,7 @@ def _adjusted_rig(
     spoilt: dict[Picture, str] = {}
     while len(detections) > 1:
         rig = adjust_rig(points, detections, rig, settings.lens, robust=True)
-        worst = _disagreeing(rig.errors(points, detections), settings)
+        worst = _disagreeing(rig.errors(points, detections))
         if not worst:
             break
         spoilt |= worst
@@ -235,15 +232,13 @@ def _adjusted_rig(
     return adjust_rig(points, detections, rig, settings.lens, robust=False), spoilt
 
 
-def _disagreeing(
-    errors: Mapping[Picture, float], settings: CalibrationSettings
-) -> dict[Picture, str]:
+def _disagreeing(errors: Mapping[Picture, float]) -> dict[Picture, str]:
     """At each instant the picture that contradicts the other cameras' most, if one does.
 
     One at a time: it has drawn the board away from where the others saw it. Of two cameras that
     disagree both pictures are in doubt.
     """
-    limit = _limit(errors.values(), settings)
+    limit = _limit(errors.values())
     spoilt: dict[Picture, str] = {}
     for frame in {frame for _, frame in errors}:
         seers = [camera for camera, one in errors if one == frame]
@@ -323,9 +318,9 @@ def _is_mirrored(
     return bool(np.median(exchanged) < _BETTER * np.median(straight))
 
 
-def _limit(errors: Iterable[float], settings: CalibrationSettings) -> float:
+def _limit(errors: Iterable[float]) -> float:
     """Above which error a picture is spoilt [pixel]."""
-    return max(settings.spoilt_pixels, settings.spoilt_factor * float(np.median([*errors])))
+    return max(_SPOILT_PIXELS, _SPOILT_MEDIANS * float(np.median([*errors])))
 
 
 def _refuse(spoilt: Mapping[Picture, str], settings: CalibrationSettings) -> None:

@@ -25,7 +25,7 @@ from drake_pose.silhouette.segmentation.mask_pictures import (
     mask_of_video_picture,
     read_mask_picture,
 )
-from drake_pose.silhouette.segmentation.network import NetworkInput, SegmentationNetwork
+from drake_pose.silhouette.segmentation.network import SegmentationNetwork
 
 # This many pictures of a recording make its median.
 _MOST = 60
@@ -108,10 +108,8 @@ def segment_by_network(source: Source, file: Path, settings: MaskSettings) -> It
     Raises:
         SettingsError: the network cannot be read, or does not take the pictures.
     """
-    taken = NetworkInput(
-        settings.network_size, settings.network_mean, settings.network_std, settings.network_bgr
-    )
-    network = SegmentationNetwork(file, taken, settings.classes)
+    taken = (settings.network_size, settings.network_mean, settings.network_std)
+    network = SegmentationNetwork(file, settings.classes, *taken, settings.network_bgr)
     for camera in source.names:
         for frame, where, picture in source.read(camera):
             try:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -18,31 +17,6 @@ Mask = NDArray[np.bool_]
 Array = NDArray[np.float32]
 
 
-@dataclass(frozen=True)
-class NetworkInput:
-    """How a picture is put into a network: ``(picture / 255 - mean) / std``.
-
-    Args:
-        size: width and height that pictures are brought to [pixel]; None: they stay as they are.
-        mean, std: of red, green and blue.
-        bgr: whether the network takes blue, green, red.
-
-    Raises:
-        SettingsError: a size or standard deviation that is not positive.
-    """
-
-    size: tuple[int, ...] | None = None
-    mean: tuple[float, ...] = (0.0, 0.0, 0.0)
-    std: tuple[float, ...] = (1.0, 1.0, 1.0)
-    bgr: bool = False
-
-    def __post_init__(self) -> None:
-        if self.size is not None and min(self.size) < 1:
-            raise SettingsError("a network's size needs a width and a height of one pixel or more")
-        if min(self.std) <= 0.0:
-            raise SettingsError("standard deviations of a network's input must be positive")
-
-
 class SegmentationNetwork:
     """A network that says for each pixel which class it is of.
 
@@ -51,16 +25,32 @@ class SegmentationNetwork:
 
     Args:
         file: an ONNX file.
-        taken: how pictures are put into it.
         classes: the numbers of the classes that are the object; ``all``: each but 0. None are
             needed where there are two classes at most.
+        size: width and height that pictures are brought to [pixel]; None: they stay as they are.
+        mean, std: of red, green and blue; the network takes ``(picture / 255 - mean) / std``.
+        bgr: whether it takes blue, green, red.
 
     Raises:
-        SettingsError: OpenCV cannot read the file, or a class is no number.
+        SettingsError: OpenCV cannot read the file, a class is no number, or a size or standard
+            deviation is not positive.
     """
 
-    def __init__(self, file: Path, taken: NetworkInput, classes: Sequence[str] = ()) -> None:
-        self._file, self._taken, self._classes = file, taken, tuple(classes)
+    def __init__(
+        self,
+        file: Path,
+        classes: Sequence[str] = (),
+        size: Sequence[int] | None = None,
+        mean: Sequence[float] = (0.0, 0.0, 0.0),
+        std: Sequence[float] = (1.0, 1.0, 1.0),
+        bgr: bool = False,
+    ) -> None:
+        self._file, self._classes = file, tuple(classes)
+        self._size, self._mean, self._std, self._bgr = size, mean, std, bgr
+        if size is not None and min(size) < 1:
+            raise SettingsError("a network's size needs a width and a height of one pixel or more")
+        if min(std) <= 0.0:
+            raise SettingsError("standard deviations of a network's input must be positive")
         for name in classes:
             if name != ALL and not name.isdecimal():
                 raise SettingsError(f"{file}: a network's classes are numbers, not '{name}'")
@@ -78,11 +68,10 @@ class SegmentationNetwork:
             SettingsError: the network does not take such pictures, or its output is of another
                 form, or has no such class.
         """
-        taken = self._taken
-        values = (picture.astype(np.float32) / 255.0 - taken.mean) / taken.std
-        if taken.size is not None:
-            values = np.asarray(cv2.resize(values, taken.size, interpolation=cv2.INTER_LINEAR))
-        values = values[:, :, ::-1] if taken.bgr else values
+        values = (picture.astype(np.float32) / 255.0 - np.asarray(self._mean)) / self._std
+        if self._size is not None:
+            values = np.asarray(cv2.resize(values, self._size, interpolation=cv2.INTER_LINEAR))
+        values = values[:, :, ::-1] if self._bgr else values
         self._network.setInput(np.ascontiguousarray(values.transpose(2, 0, 1)[None], np.float32))
         try:
             output = np.asarray(self._network.forward())

@@ -26,27 +26,20 @@ _HALF = 128
 
 
 def read_picture(path: Path, error_type: type[DrakePoseError]) -> Picture:
-    """Reads a PNG or JPEG picture.
-
-    Returns:
-        (H, W, 3) red, green, blue.
+    """Reads a PNG or JPEG picture (H, W, 3) red, green, blue.
 
     Raises:
         error_type: names the file; when it is no whole picture.
     """
-    picture = decode_picture(
-        read_picture_file(path, error_type), cv2.IMREAD_COLOR, path, error_type
-    )
+    data = read_picture_file(path, error_type)
+    picture = decode_picture(data, cv2.IMREAD_COLOR, path, error_type)
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
 def read_person_mask(path: Path, error_type: type[DrakePoseError]) -> Mask:
-    """Reads a PNG or JPEG picture of a mask; it may be empty, where nobody is seen.
+    """Reads a PNG or JPEG picture of a mask (H, W); it may be empty, where nobody is seen.
 
     A PNG is black and one other colour; a JPEG, whose values its compression blurs, dark and light.
-
-    Returns:
-        (H, W), True on the person.
 
     Raises:
         error_type: names the file; when it is no whole picture, or no mask.
@@ -130,19 +123,16 @@ def check_png(data: bytes, path: Path, error_type: type[DrakePoseError]) -> tupl
         raise error_type(f"{path}: not a PNG picture")
     position, kind = len(_PNG), b""
     while kind != b"IEND":
-        header = data[position : position + 8]
-        if len(header) < 8:
-            raise error_type(f"{path}: the PNG picture is cut short")
-        length, kind = struct.unpack(">I4s", header)
-        end = position + 8 + length
-        checksum = data[end : end + 4]
+        header, begin = data[position : position + 8], position + 8
+        length, kind = struct.unpack(">I4s", header) if len(header) == 8 else (0, b"")
+        checksum = data[begin + length : begin + length + 4]
         if len(checksum) < 4:
             raise error_type(f"{path}: the PNG picture is cut short")
-        if struct.unpack(">I", checksum)[0] != zlib.crc32(data[position + 4 : end]):
+        is_header = kind == b"IHDR" and length == 13
+        whole = struct.unpack(">I", checksum)[0] == zlib.crc32(data[begin - 4 : begin + length])
+        if not whole or (position == len(_PNG) and not is_header):
             raise error_type(f"{path}: the PNG picture is damaged")
-        if position == len(_PNG) and (kind != b"IHDR" or length != 13):
-            raise error_type(f"{path}: the PNG picture is damaged")
-        position = end + 4
+        position = begin + length + 4
     width, height = struct.unpack(">II", data[16:24])
     return width, height
 

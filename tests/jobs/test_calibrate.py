@@ -40,7 +40,12 @@ def taken(tmp_path_factory):
 def report(taken, tmp_path_factory):
     folder = taken[0]
     out = tmp_path_factory.mktemp("out") / "cameras.yaml"
-    return calibrate_folder(folder, folder / "board.yaml", out)
+    settings = CalibrationSettings(leave_out=["c1/9998", f"c0/{first_frame(folder)}"])
+    return calibrate_folder(folder, folder / "board.yaml", out, settings)
+
+
+def first_frame(folder):
+    return min(path.stem for path in (folder / "images" / "c0").iterdir())
 
 
 def test_known_cameras_come_back_from_pictures(taken, report):
@@ -55,12 +60,13 @@ def test_known_cameras_come_back_from_pictures(taken, report):
         assert report.calibration.lenses[name].focal_x == pytest.approx(true.focal, rel=0.02)
 
 
-def test_bad_pictures_are_named_and_harm_nothing(report):
+def test_bad_pictures_are_named_and_harm_nothing(taken, report):
     assert report.seen.not_found == (("c1", "9998"),)
     assert set(report.seen.unreadable) == {("c2", "9999")}
     text = "\n".join(report.warnings)
     assert "'9998'" in text
     assert "9999.png" in text
+    assert f"camera 'c0', picture '{first_frame(taken[0])}' left out: left out on request" in text
 
 
 def test_json_and_table(report):
@@ -97,54 +103,20 @@ def test_undistorted_pictures_fit_the_written_cameras(taken, report, tmp_path):
     assert checked >= 4
 
 
-def test_spoilt_picture_is_named_and_dropped_on_request(taken, tmp_path):
-    folder, _, _ = taken
-    for name in ("c0", "c1"):
-        place = tmp_path / "images" / name
-        place.mkdir(parents=True)
-        for file in (folder / "images" / name).glob("0*.png"):
-            (place / file.name).write_bytes(file.read_bytes())
-    (tmp_path / "board.yaml").write_text(BOARD_YAML)
-    shared = sorted(
-        {p.name for p in (tmp_path / "images/c0").iterdir()}
-        & {p.name for p in (tmp_path / "images/c1").iterdir()}
-    )
-    late = tmp_path / "images" / "c1" / shared[0]
-    late.write_bytes((tmp_path / "images" / "c1" / shared[1]).read_bytes())
-    with pytest.raises(CameraError, match=f"camera 'c1', picture '{late.stem}'"):
-        calibrate_folder(tmp_path, tmp_path / "board.yaml")
-    found = calibrate_folder(
-        tmp_path, tmp_path / "board.yaml", settings=CalibrationSettings(drop_spoilt=True)
-    )
-    assert ("c1", late.stem) in found.calibration.left_out
-    assert any(late.stem in line for line in found.warnings)
-
-
 @pytest.mark.parametrize(
-    ("prepare", "message"),
+    ("pictures", "message"),
     [
-        (lambda folder: None, "holds no picture"),
-        (lambda folder: _picture(folder, "c0/1.png", (20, 30)), "found in 0 pictures"),
-        (
-            lambda folder: (
-                _picture(folder, "c0/1.png", (20, 30)),
-                _picture(folder, "c0/2.png", (30, 20)),
-            ),
-            r"2\.png: 20 x 30 pixels",
-        ),
-        (
-            lambda folder: (
-                _picture(folder, "c0/1.png", (20, 30)),
-                _picture(folder, "c0/1.jpg", (20, 30)),
-            ),
-            "twice",
-        ),
+        ({}, "holds no picture"),
+        ({"c0/1.png": (20, 30)}, "found in 0 pictures"),
+        ({"c0/1.png": (20, 30), "c0/2.png": (30, 20)}, r"2\.png: 20 x 30 pixels"),
+        ({"c0/1.png": (20, 30), "c0/1.jpg": (20, 30)}, "twice"),
     ],
 )
-def test_folders_that_cannot_be_used(tmp_path, prepare, message):
-    (tmp_path / "images").mkdir()
+def test_folders_that_cannot_be_used(tmp_path, pictures, message):
+    (tmp_path / "images" / "c0").mkdir(parents=True)
     (tmp_path / "board.yaml").write_text(BOARD_YAML)
-    prepare(tmp_path)
+    for name, shape in pictures.items():
+        cv2.imwrite(str(tmp_path / "images" / name), np.zeros(shape, np.uint8))
     with pytest.raises(CameraError, match=message):
         calibrate_folder(tmp_path, tmp_path / "board.yaml")
 
@@ -157,9 +129,3 @@ def test_missing_folder_and_unknown_camera(taken, tmp_path):
         calibrate_folder(
             folder, folder / "board.yaml", settings=CalibrationSettings(leave_out=["c7"])
         )
-
-
-def _picture(folder, name, shape):
-    path = folder / "images" / name
-    path.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(path), np.zeros(shape, np.uint8))

@@ -39,16 +39,6 @@ def filmed(tmp_path):
 
 
 @pytest.mark.slow
-def test_model_finds_its_masks_from_a_pose_five_degrees_off(filmed, tmp_path):
-    start = write_start(tmp_path / "start.csv", filmed)
-    settings = MaskSettings(model=filmed.model, start=start)
-    result = make_masks(filmed.folder, tmp_path / "out", settings)
-    assert result.count == 16
-    assert agreements(tmp_path / "out", filmed).min() > 0.92
-    assert np.median(agreements(tmp_path / "out", filmed)) > 0.95
-
-
-@pytest.mark.slow
 def test_single_still_is_cut_in_the_band_of_its_rough_pose(tmp_path):
     scene = write_pictures(tmp_path / "scene", [(20.0, -60.0)], seed=4)
     start = write_start(tmp_path / "start.csv", scene, off=2.0)
@@ -58,7 +48,7 @@ def test_single_still_is_cut_in_the_band_of_its_rough_pose(tmp_path):
 
 
 @pytest.mark.slow
-def test_pictures_without_the_object_are_refused_and_named(filmed, tmp_path):
+def test_masks_are_found_from_poses_five_degrees_off_and_empty_rooms_named(filmed, tmp_path):
     start = write_start(tmp_path / "start.csv", filmed)
     for camera in ("front", "side"):
         room = cv2.imread(str(filmed.folder / "background" / f"{camera}.png"))
@@ -66,9 +56,12 @@ def test_pictures_without_the_object_are_refused_and_named(filmed, tmp_path):
     settings = MaskSettings(model=filmed.model, start=start)
     result = make_masks(filmed.folder, tmp_path / "out", settings)
     made = load_scene(tmp_path / "out")
+    assert result.count == 14
     assert not any(frame == "0004" for _, frame in made.masks)
     assert sum("0004.png: " in text and "not" in text for text in result.warnings) == 2
-    assert agreements(tmp_path / "out", filmed).min() > 0.9
+    values = agreements(tmp_path / "out", filmed)
+    assert values.min() > 0.9
+    assert np.median(values) > 0.95
 
 
 @pytest.mark.slow
@@ -106,23 +99,23 @@ def test_background_is_told_from_pictures_of_another_exposure():
     """A square that moves before a room, half the pictures redder and darker."""
     rng = np.random.default_rng(2)
     room = texture(rng)
-    pictures, masks, chances = [], [], []
+    pictures, masks, probabilities = [], [], []
     for k in range(8):
         mask = np.zeros(room.shape[:2], bool)
         mask[40:100, 15 * k : 15 * k + 40] = True
-        chance = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 5.0).clip(0.01, 0.99)
+        probability = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 5.0).clip(0.01, 0.99)
         picture = np.where(mask[:, :, None], 255.0 - room, room)
         picture = picture * ((0.9, 0.7, 0.6) if k % 2 else (1.0, 1.0, 1.0))
         pictures.append(
             (picture + 2.0 * rng.standard_normal(room.shape)).clip(0, 255).astype(np.uint8)
         )
         masks.append(mask)
-        chances.append(chance)
+        probabilities.append(probability)
     differs = np.abs(255.0 - 2.0 * room).max(axis=2) > 60.0
-    for ratio, mask in zip(tell_from_background(pictures, chances), masks, strict=True):
+    for ratio, mask in zip(tell_from_background(pictures, probabilities), masks, strict=True):
         assert (ratio[~mask] < 0.0).mean() > 0.97
         assert (ratio[mask & differs] > 0.0).mean() > 0.97
-    alone = tell_from_background(pictures[:1], chances[:1])
+    alone = tell_from_background(pictures[:1], probabilities[:1])
     assert not alone[0].any()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections import deque
 
 import cv2
 import numpy as np
@@ -31,17 +32,13 @@ class DeviceSource(FrameSource):
     A slow reader never sees old pictures: those that were not read in time are gone. A camera that
     cannot be opened or fails is reported once and opened again, after growing pauses.
 
-    Args:
-        specification: of kind device; its location is a number or an address.
-        clock: gives the time stamps [s].
+    Its location is a number or an address; the clock gives the time stamps [s].
     """
 
     def __init__(self, specification: SourceSpecification, clock: Clock) -> None:
         super().__init__(specification)
         self._clock = clock
-        self._lock = threading.Lock()
-        self._newest: TimedPicture | None = None
-        self._useless = False
+        self._newest: deque[TimedPicture] = deque(maxlen=1)
         self._failed = False
         self._stop = threading.Event()
         self._thread = threading.Thread(
@@ -52,7 +49,7 @@ class DeviceSource(FrameSource):
     @property
     def ended(self) -> bool:
         """Whether it was closed, or gives pictures of a wrong size."""
-        return self._stop.is_set() or self._useless
+        return self._stop.is_set()
 
     def close(self) -> None:
         """Ends the thread, which lets go of the camera."""
@@ -60,21 +57,16 @@ class DeviceSource(FrameSource):
         self._thread.join(_PATIENCE)
 
     def _read(self) -> TimedPicture | None:
-        with self._lock:
-            newest, self._newest = self._newest, None
-        return newest
+        return self._newest.pop() if self._newest else None
 
     def _run(self) -> None:
         """Reads until closed; opens the camera again and again."""
         pause, count = FIRST_PAUSE, 0
         while not self.ended:
-            capture = self._open()
+            before, capture = count, self._open()
             if capture is not None:
-                before = count
                 count = self._keep_newest(capture, count)
                 capture.release()
-                if count > before:
-                    pause = FIRST_PAUSE
             if self.ended:
                 return
             if not self._failed:
@@ -83,6 +75,7 @@ class DeviceSource(FrameSource):
                     f"'{self.specification.location}' {what}; it is tried again until it answers"
                 )
                 self._failed = True
+            pause = FIRST_PAUSE if count > before else pause
             self._stop.wait(pause)
             pause = min(2.0 * pause, LONGEST_PAUSE)
 
@@ -117,13 +110,12 @@ class DeviceSource(FrameSource):
             rgb = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
             if wrong := self.wrong_size(rgb):
                 self.report(f"'{self.specification.location}' {wrong}")
-                self._useless = True
+                self._stop.set()
                 return count
             seen = mask_of_picture(rgb) if self.specification.gives_masks else rgb
             if self._failed:
                 self.report(f"'{self.specification.location}' answers again")
                 self._failed = False
-            with self._lock:
-                self._newest = TimedPicture(time, f"{count:06d}", seen)
+            self._newest.append(TimedPicture(time, f"{count:06d}", seen))
             count += 1
         return count

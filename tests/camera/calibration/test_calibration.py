@@ -300,15 +300,19 @@ class TestLens:
             lens.undistort(white.T)
 
 
+CHECKER = "kind: checkerboard\nsquares: [9, 6]\nsquare_length: 0.03\n"
+MARKERS = (
+    "kind: charuco\nsquares: [7, 5]\nsquare_length: 0.04\nmarker_length: 0.03\n"
+    "dictionary: DICT_5X5_100\n"
+)
+
+
 class TestBoardFiles:
     def test_good_files(self, tmp_path):
         path = tmp_path / "board.yaml"
-        path.write_text("kind: checkerboard\nsquares: [9, 6]\nsquare_length: 0.03\n")
+        path.write_text(CHECKER)
         assert load_board(path) == Board("checkerboard", 9, 6, 0.03)
-        path.write_text(
-            "kind: charuco\nsquares: [7, 5]\nsquare_length: 0.04\nmarker_length: 0.03\n"
-            "dictionary: DICT_5X5_100\n"
-        )
+        path.write_text(MARKERS)
         board = load_board(path)
         assert len(board.points) == 24
         assert board.points[0].tolist() == pytest.approx([0.04, 0.16, 0.0])
@@ -317,21 +321,14 @@ class TestBoardFiles:
         ("text", "message"),
         [
             ("kind: circles\n", "kind"),
-            ("kind: checkerboard\nsquares: [9, 6]\n", "square_length"),
-            ("kind: checkerboard\nsquares: 9\nsquare_length: 1\n", "squares"),
-            ("kind: checkerboard\nsquares: [9, 2]\nsquare_length: 1\n", "squares"),
-            ("kind: checkerboard\nsquares: [9, 6]\nsquare_length: -1\n", "square_length"),
-            ("kind: checkerboard\nsquares: [9, 6]\nsquare_length: 1\ncolour: red\n", "colour"),
-            (
-                "kind: charuco\nsquares: [7, 5]\nsquare_length: 0.04\nmarker_length: 0.05\n"
-                "dictionary: 4X4_50\n",
-                "marker_length",
-            ),
-            (
-                "kind: charuco\nsquares: [7, 5]\nsquare_length: 0.04\nmarker_length: 0.03\n"
-                "dictionary: 3X3\n",
-                "dictionary",
-            ),
+            (CHECKER.replace("square_length: 0.03", ""), "lacks square_length"),
+            (CHECKER.replace("[9, 6]", "9"), "squares"),
+            (CHECKER.replace("[9, 6]", "[9, 2]"), "squares"),
+            (CHECKER.replace("0.03", "-1"), "square_length"),
+            (CHECKER + "colour: red\n", "colour"),
+            (MARKERS.replace("0.03", "0.05"), "marker_length"),
+            (MARKERS.replace("5X5", "3X3"), "dictionary"),
+            (MARKERS + "legacy_pattern: 3\n", "legacy_pattern"),
         ],
     )
     def test_bad_files_are_named(self, tmp_path, text, message):

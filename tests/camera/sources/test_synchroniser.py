@@ -6,20 +6,9 @@ import pytest
 from drake_pose.camera.sources.synchroniser import CameraChange, Synchroniser
 from drake_pose.errors import SettingsError, UnknownNameError
 
-PERIOD = 0.1
 
-
-def streams(generator, cameras, moments, jitter, lost):
-    """By camera, the moments it saw and its time stamps; neither order nor count is known to it."""
-    found = {}
-    for name in cameras:
-        seen = np.flatnonzero(generator.random(moments) >= lost)
-        found[name] = [(PERIOD * k + generator.uniform(0.0, jitter), int(k)) for k in seen]
-    return found
-
-
-def play(synchroniser, recorded, delays, now=None):
-    """Adds pictures in the order in which they arrive; the moments as (time, items)."""
+def play(synchroniser, recorded, delays):
+    """Adds pictures in the order in which they arrive; the moments that come out."""
     arrivals = sorted(
         (time + delay, camera, time, k)
         for camera, stream in recorded.items()
@@ -28,37 +17,13 @@ def play(synchroniser, recorded, delays, now=None):
     found = []
     for _, camera, time, k in arrivals:
         synchroniser.add(camera, time, k)
-        while (moment := synchroniser.take(now)) is not None:
+        while (moment := synchroniser.take()) is not None:
             found.append(moment)
     for camera in recorded:
         synchroniser.finish(camera)
     while (moment := synchroniser.take()) is not None:
         found.append(moment)
     return found
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_jittered_streams_with_drops_are_grouped_by_their_true_moments(seed):
-    generator = np.random.default_rng(seed)
-    cameras = [f"c{k}" for k in range(generator.integers(2, 6))]
-    recorded = streams(generator, cameras, 60, 0.4 * PERIOD, 0.2)
-    # Pictures arrive late and across each other, but every camera's own in order.
-    delays = {
-        name: 0.5 * PERIOD * generator.random() + 0.1 * PERIOD * generator.random(len(stream))
-        for name, stream in recorded.items()
-    }
-    synchroniser = Synchroniser(cameras, 0.5 * PERIOD, 20 * PERIOD)
-    found = play(synchroniser, recorded, delays)
-    truth = {}
-    for name, stream in recorded.items():
-        for time, k in stream:
-            truth.setdefault(k, {})[name] = time
-    assert len(found) == len(truth)
-    for moment, k in zip(found, sorted(truth), strict=True):
-        assert dict(moment.items) == dict.fromkeys(truth[k], k)
-        assert moment.time == min(truth[k].values())
-    assert not any(synchroniser.late.values())
-    assert not synchroniser.take_changes()
 
 
 def brute_force(recorded, tolerance):
@@ -77,16 +42,19 @@ def brute_force(recorded, tolerance):
     return found
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(6))
 def test_streams_of_any_rate_are_grouped_as_brute_force_groups_them(seed):
-    generator = np.random.default_rng(100 + seed)
+    generator = np.random.default_rng(seed)
     recorded = {
         f"c{k}": [(float(t), i) for i, t in enumerate(np.cumsum(generator.exponential(0.1, 80)))]
-        for k in range(3)
+        for k in range(generator.integers(2, 5))
     }
-    none = {name: np.zeros(len(stream)) for name, stream in recorded.items()}
-    found = play(Synchroniser(recorded, 0.04, 1e9), recorded, none)
+    # Pictures arrive late and across each other, but every camera's own in order.
+    delays = {name: np.sort(generator.random(80)) for name in recorded}
+    synchroniser = Synchroniser(recorded, 0.04, 1e9)
+    found = play(synchroniser, recorded, delays)
     assert [(one.time, dict(one.items)) for one in found] == brute_force(recorded, 0.04)
+    assert not synchroniser.take_changes()
 
 
 def test_camera_that_stops_is_waited_for_left_out_and_taken_back():
@@ -126,16 +94,16 @@ def test_camera_that_never_gave_a_picture_is_reported_so():
     assert math.isnan(change.time)
 
 
-def test_what_cannot_be_is_refused():
-    for cameras, tolerance, patience in (
-        ([], 0.1, 0.1),
-        (["a", "a"], 0.1, 0.1),
-        (["a"], -0.1, 0.1),
-        (["a"], 0.1, 0.05),
-        (["a"], 0.1, math.inf),
-    ):
-        with pytest.raises(SettingsError):
-            Synchroniser(cameras, tolerance, patience)
+@pytest.mark.parametrize(
+    ("cameras", "tolerance", "patience"),
+    [([], 0.1, 0.1), (["a", "a"], 0.1, 0.1), (["a"], -0.1, 0.1), (["a"], 0.1, 0.05)],
+)
+def test_what_cannot_be_is_refused(cameras, tolerance, patience):
+    with pytest.raises(SettingsError):
+        Synchroniser(cameras, tolerance, patience)
+
+
+def test_pictures_that_cannot_be_used():
     synchroniser = Synchroniser(["a"], 0.1, 0.1)
     with pytest.raises(UnknownNameError, match="'b'"):
         synchroniser.add("b", 0.0, None)

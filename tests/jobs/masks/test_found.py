@@ -14,7 +14,6 @@ from drake_pose.commands.main import app
 from drake_pose.errors import DrakePoseError, MaskError, SceneError, SettingsError
 from tests.cli import CliRunner
 from tests.jobs.masks.rooms import iou, moving, write_pictures
-from tests.jobs.scenes import NAMES, read_rows
 
 
 @pytest.fixture(scope="module")
@@ -59,21 +58,6 @@ def test_empty_room_beside_the_pictures_is_used(filmed, pictures, tmp_path):
     assert overlay.shape == (160, 200, 3)
 
 
-@pytest.mark.slow
-def test_angles_come_out_where_pictures_went_in(tmp_path, runner: CliRunner):
-    scene = write_pictures(tmp_path / "scene", moving(5), ("front", "side"))
-    shutil.rmtree(scene.folder / "masks")
-    done = runner.invoke(app, ["masks", str(scene.folder), "--out", str(tmp_path / "made")])
-    assert done.exit_code == 0, done.output
-    command = ["estimate", str(tmp_path / "made"), "--model", str(scene.model), "--no-replay"]
-    done = runner.invoke(app, [*command, "--no-overlay", "--out", str(tmp_path / "angles")])
-    assert done.exit_code == 0, done.output
-    rows = {row["frame"]: row for row in read_rows(tmp_path / "angles" / "poses.csv")}
-    for frame, q in scene.truth.items():
-        found = [float(rows[frame][name]) for name in NAMES]
-        assert np.degrees(np.abs(found - q)).max() < 5.0
-
-
 def test_median_of_a_recording_finds_what_moves(filmed, pictures, tmp_path):
     shutil.rmtree(pictures / "background")
     result = make_masks(pictures, tmp_path / "out", MaskSettings(background="median"))
@@ -88,13 +72,6 @@ def test_median_of_a_body_that_hardly_moves_says_that_it_is_no_background(tmp_pa
     result = make_masks(
         scene.folder / "images", tmp_path / "out", MaskSettings(background="median")
     )
-    assert sum("no good background" in text for text in result.warnings) == 1
-
-
-@pytest.mark.slow
-def test_median_of_ten_stills_of_an_arm_says_that_it_is_no_background(shared_data, tmp_path):
-    source = shared_data / "franka_one_view"
-    result = make_masks(source / "images", tmp_path / "out", MaskSettings(background="median"))
     assert sum("no good background" in text for text in result.warnings) == 1
 
 

@@ -13,7 +13,6 @@ class StagedDiagram:
     """A diagram, and what is computed in it before its state is updated.
 
     Args:
-        diagram: the whole diagram.
         stages: the output ports of each stage, in their order: whoever evaluates one after the
             other sees what each costs.
     """
@@ -25,7 +24,6 @@ class StagedDiagram:
         """Have a stage compute what it has not computed yet.
 
         Args:
-            context: the diagram's.
             stage: one of stages.
         """
         for port in self.stages[stage]:

@@ -43,7 +43,6 @@ class ClusterPool(WorkerPool):
     At most one task a thread is under way, so that none waits at a worker that may die.
 
     Args:
-        client: of the cluster.
         work: what does a task.
     """
 

@@ -91,13 +91,11 @@ class Watchers:
     """Workers that watch cameras.
 
     Attributes:
-        client: of the cluster.
         groups: of cameras, one for each worker.
         reports: what the user should know and was not told yet.
         overdue: says up to which time stamp a camera's pictures come too late [s].
 
     Args:
-        client: of the cluster.
         specifications: of the cameras' sources.
         spacings: from edge point to edge point, by camera [pixel].
         waits: whether a worker that does not answer is waited for, as a recording can.

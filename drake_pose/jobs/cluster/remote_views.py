@@ -32,8 +32,6 @@ class ClusterSensors(LocalSensors):
     another one, or itself when it was started again, goes on with its cameras.
 
     Args:
-        client: of the cluster.
-        scene: the cameras and where their pictures come from.
         live: whether the computer's clock decides; where not given, if a camera is live.
         tolerance: how far apart the pictures of one moment may be [s].
         clock: the one of live cameras' time stamps; machines share none but that of the day.

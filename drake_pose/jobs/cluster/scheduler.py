@@ -166,7 +166,6 @@ def require_fit_workers(client: Client, out: Path | None = None) -> None:
     """Looks whether the workers have this drake_pose, and see the folder of the result.
 
     Args:
-        client: of the cluster.
         out: the result's folder, which all machines must share; None: there is none.
 
     Raises:

@@ -67,11 +67,9 @@ def capture_live(
     Ctrl-C ends the capture, and keeps everything.
 
     Args:
-        scene: the cameras and where their pictures come from.
         out: the result's folder, empty or not there.
         model_path: a person with landmarks.yaml beside it; the bundled one with shape joints where
             not given.
-        settings: how.
         open_sensors: opens the sensors; where not given the scene's, in this process. Called once
             more for the frames that give the person's shape.
         on_report: called at once when cameras stop and return, and with bad pictures.
@@ -118,7 +116,6 @@ def record_frames(
     Args:
         method: what summary.json calls it.
         diagram: of the capture, with the sensors.
-        sensors: its sensors.
         watch: hands frames to ``result``.
         result: under way.
         settings: how long, and whether with a replay.

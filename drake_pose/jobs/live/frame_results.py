@@ -35,7 +35,6 @@ class LiveResult:
     """What came out of a live capture.
 
     Args:
-        estimate: the estimate, as that of a recorded scene.
         interrupted: whether Ctrl-C ended it.
         troubles: what the user should know and was not told while it ran.
     """
@@ -52,8 +51,6 @@ class LiveWriter:
         writer: of the folder.
 
     Args:
-        scene: the cameras and where their pictures come from.
-        model: the person.
         tracker: made for the person's pose tree; gives its surfaces.
         out: the result's folder, empty or not there.
         period: time between two frames [s].

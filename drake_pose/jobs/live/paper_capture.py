@@ -59,7 +59,6 @@ def capture_paper(
     ends the capture, and keeps everything.
 
     Args:
-        scene: the cameras and where their colour pictures come from.
         out: the result's folder, empty or not there.
         model_path: a person of the same build as the bundled one, which is taken where not given;
             its measures are taken as they are.

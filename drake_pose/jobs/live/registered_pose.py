@@ -43,8 +43,6 @@ class RegisteredPoseSearch:
     """Looks for the registered pose in a scene's pictures: upright, both arms spread.
 
     Args:
-        scene: the cameras and where their pictures come from.
-        model: the person.
         face_camera: which camera sees the face; None: there is none.
         faces: templates of the person's face; needed where there is a face camera.
 

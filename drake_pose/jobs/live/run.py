@@ -105,7 +105,6 @@ class FrameWatch:
     """A monitor that notes each new moment of a diagram of build_live_capture or the paper's.
 
     Args:
-        diagram: the diagram.
         cameras: the names of its cameras.
         on_frame: called with each frame.
         view: before a camera's name, the output with what the camera's picture says.

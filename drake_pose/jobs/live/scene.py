@@ -112,7 +112,6 @@ def take_empty_room(folder: Path, count: int, patience: float = _PATIENCE) -> di
 
     Args:
         folder: has cameras.yaml and sources.yaml.
-        count: how many pictures of each camera.
         patience: how long it is waited for pictures [s].
 
     Returns:

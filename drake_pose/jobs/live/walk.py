@@ -56,7 +56,6 @@ class Player:
     """What moves the avatar.
 
     Args:
-        model: the person.
         q: (n, nq) positions [rad or m], nan where the person was not found; None: keys alone.
         rate_hz: frames a second.
     """
@@ -75,7 +74,6 @@ def recorded_player(
     """Plays the poses of a result folder, as `drake-pose capture` writes it.
 
     Args:
-        result: the folder.
         model_path: the model it was captured with; the bundled one that its summary names where
             not given.
         rate_hz: its frames a second; those in its summary where not given.
@@ -152,7 +150,6 @@ def walk(
 
     Args:
         player: what moves it.
-        meshcat: the page.
         seconds: how long; the recording's length where not given, without end for keys alone.
         speed: seconds walked a second; 0: as fast as the machine can.
         on_command: called when the command changes, with its words, "" for none.
@@ -206,8 +203,6 @@ def walk_live(
     Recorded sources are played as if they were live.
 
     Args:
-        scene: the cameras and where their pictures come from.
-        meshcat: the page.
         model_path: a person with landmarks.yaml beside it; the bundled one where not given.
         shape: a result of capture with the same person, whose lengths and girths are taken; the
             model's where not given.

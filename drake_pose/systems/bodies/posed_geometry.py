@@ -54,7 +54,6 @@ def pose_plant(
     """Finalize a plant, and let positions in its own order pose its geometry.
 
     Args:
-        builder: the diagram under construction.
         scene_graph: where the plant is registered as a source.
         plant: the plant, not finalized yet.
         positions: (nq,) its positions.
@@ -81,8 +80,6 @@ def add_avatar(
     """Show a body in Meshcat, in a SceneGraph of its own that no sensor sees.
 
     Args:
-        builder: the diagram under construction.
-        model: the body.
         positions: (nq,) in its plant's order; while they are nan it stands at its model's default.
         meshcat: where it is drawn.
         prefix: the path below which it is drawn.

@@ -63,8 +63,6 @@ class MeshcatSkin(LeafSystem):
         - positions
 
     Args:
-        meshcat: where to draw.
-        skin: the skin.
         position_count: how many positions its model has.
         path: where in Meshcat's tree.
         colour: in place of the bands' own colours.
@@ -134,9 +132,7 @@ def add_skin(
     """Add a model's skin to a diagram, so that cameras see it; nothing where it has none.
 
     Args:
-        builder: the diagram under construction.
         scene_graph: the SceneGraph that the body's rigid parts are in.
-        model: the body.
         positions: the body's positions (nq,) in its model's order.
         name: of the new source and, with ``_skin_poser``, of the new system.
         labels: the render label of each link, by name; Drake's own are the links' body indices.
@@ -167,9 +163,6 @@ def add_meshcat_skin(
     """Show a model's skin in Meshcat; nothing where it has none.
 
     Args:
-        builder: the diagram under construction.
-        meshcat: where to draw.
-        model: the body.
         positions: the body's positions (nq,) in its model's order.
         name: of the skin in Meshcat's tree and, with ``_meshcat_skin``, of the new system.
         colour: in place of the bands' own colours.

@@ -100,20 +100,12 @@ class CameraRegistration(LeafSystem):
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, offset, self._update)
 
     def online_state(self, context: Context) -> OnlineState:
-        """What is known in a context.
-
-        Args:
-            context: this system's.
-        """
+        """What is known in a context."""
         state: OnlineState = context.get_abstract_state(int(self._state)).get_value()
         return state
 
     def registered_camera(self, context: Context) -> PinholeCamera | None:
-        """The camera with its pose, for searches and estimators; None unless the status is 1.
-
-        Args:
-            context: this system's.
-        """
+        """The camera with its pose, for searches and estimators; None unless the status is 1."""
         believed = self._believed(context)
         return None if believed is None else believed.camera
 

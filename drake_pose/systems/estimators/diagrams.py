@@ -50,8 +50,6 @@ class MatchingDiagram:
     """A diagram that matches silhouettes, and the parts of it that one asks afterwards.
 
     Args:
-        diagram: the whole diagram.
-        matcher: the matcher in it.
         positions_log: logs ``estimated_positions`` once a period.
         error_log: logs ``error`` once a period.
         player: what plays the masks; None where a camera is simulated.
@@ -83,8 +81,6 @@ def build_recorded_matching(
     """Wire recorded masks to the matcher: MaskPlayer -> SilhouetteMatcher -> logs, Meshcat.
 
     Args:
-        scene: the recorded scene.
-        search: the search, made for the body's pose tree.
         cameras: the cameras to use, matched together.
         frames: the frames to play; all where not given.
         root_positions: the root's position (3,) in the world for each frame [m]; the pose tree's
@@ -145,8 +141,6 @@ def build_simulated_matching(
     second body in the same SceneGraph, which the sensors do not see.
 
     Args:
-        search: the search, made for the body's pose tree.
-        cameras: where the sensors are.
         true_positions: the true body's positions (nq,), constant or over time.
         period: time between two images, and two matches [s].
         meshcat: where to show both bodies; nowhere where not given.
@@ -183,10 +177,6 @@ def add_simulated_cameras(
     """Add a body that moves on a given trajectory, and RgbdSensors that see it.
 
     Args:
-        builder: the diagram under construction.
-        scene_graph: where the body's geometry goes.
-        model: the body.
-        cameras: where the sensors are.
         true_positions: the body's positions (nq,), constant or over time.
 
     Returns:
@@ -262,9 +252,6 @@ def add_posed_body(
     """Add a body that stands as is estimated, for the eye only: no sensor sees it.
 
     Args:
-        builder: the diagram under construction.
-        scene_graph: where the body's geometry goes.
-        model: the body.
         estimator: its output ``estimated_positions`` poses the body.
         name: prefix of the body's name in the SceneGraph.
         colour: in place of the body's own colours.
@@ -311,7 +298,6 @@ class RegistrationDiagram:
     """A diagram that registers a simulated camera, and the parts of it that one asks afterwards.
 
     Args:
-        diagram: the whole diagram.
         registration: the system in it that finds the camera.
         sensor: the simulated camera; ``sensor.SetX_PB(context, X_WC)`` moves it.
         status_log: logs ``status`` once a period.
@@ -334,7 +320,6 @@ def build_simulated_registration(
 
     Args:
         registration: the body, the camera's intrinsics, and settings.
-        camera: where the sensor is.
         true_positions: the body's positions (nq,), constant or over time; they are measured without
             an error.
         period: time between two images, and two updates [s].

@@ -83,7 +83,6 @@ class AxisSensor(LeafSystem):
     Args:
         observation: what is measured.
         transition: (n, n) one step of the filter's prediction.
-        camera: where the images come from.
 
     Raises:
         SettingsError: a transition of another size than the state's.
@@ -158,7 +157,6 @@ class StateMatcher(LeafSystem):
     Args:
         search: the search, made for the pose tree of the observation's body.
         observation: says what a state is.
-        camera: where the images come from.
 
     Raises:
         SettingsError: the search is made for another tree.
@@ -269,9 +267,7 @@ def add_hand_tracking(
     """Wire label images to a filter of all free positions, inside the model's limits and couplings.
 
     Args:
-        builder: the diagram under construction.
         search: asked in the first frame, and when the track is lost; its tree says what is free.
-        camera: where the images come from.
         axes: start and end of each segment's axis (3,), (3,) in its link's frame, by name [m].
         label_image: the images, labelled by the links' indices.
         period: time between two frames [s].
@@ -352,7 +348,6 @@ def build_hand_tracking(
 
     Args:
         search: as there, with ``camera``, ``axes``, ``period``, ``tracking`` and ``settings``.
-        camera: where the sensor is.
         axes: of the segments.
         true_positions: the true body's positions (nq,), constant or over time.
         period: time between two images [s].

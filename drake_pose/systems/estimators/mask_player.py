@@ -35,7 +35,6 @@ class MaskPlayer(LeafSystem):
     has no mask of a frame, its image is all background, which a matcher leaves out.
 
     Args:
-        scene: the recorded scene.
         cameras: the cameras to play, in the order of the output ports.
         frames: the frames to play; all of the scene's where not given.
         period: time between two frames [s]; by the scene's frame rate where not given.

@@ -87,7 +87,6 @@ class SilhouetteMatcher(LeafSystem):
     first, one after another. All are NaN where the search does not say, as one without examination.
 
     Args:
-        search: the search, made for the body's pose tree.
         cameras: the calibrated cameras, in the order of the input ports.
         period: time between two matches [s].
         offset: time of the first match [s].

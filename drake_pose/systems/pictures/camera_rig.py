@@ -37,7 +37,6 @@ class CameraRig:
     another thread gives wrong images.
 
     Args:
-        diagram: the whole diagram.
         cameras: by name, in the order of the ports.
         sensors: the RgbdSensor of each camera.
     """
@@ -50,7 +49,6 @@ class CameraRig:
         """Pose the body.
 
         Args:
-            context: the diagram's.
             q: (nq,) the plant's positions [rad or m].
         """
         self.diagram.GetInputPort("positions").FixValue(context, q)
@@ -86,7 +84,6 @@ def build_camera_rig(
     """Wire a body and the cameras that see it.
 
     Args:
-        model: the body.
         cameras: any number, anywhere: from circle_of_cameras or load_cameras.
         true_positions: the body's positions (nq,) over time; where not given, the diagram has the
             input ``positions``.
@@ -124,7 +121,6 @@ def add_cameras(
     at the moment it is parsed.
 
     Args:
-        builder: the diagram under construction.
         scene_graph: what the cameras see.
         cameras: pinhole cameras by name.
         background: red, green, blue of the empty picture, 0 to 1.

@@ -85,7 +85,6 @@ class Walker(LeafSystem):
         model: the person, with the links head, left_foot and right_foot.
         standing: (nq,) avatar_positions until somebody was seen [rad or m].
         period: time between two frames [s].
-        settings: thresholds and speeds.
         settle: how long the person must stand still at first [s]; 0: the first pose is the rest.
 
     Raises:
@@ -290,13 +289,11 @@ def build_walk(
     The diagram's outputs are ``walker_pose`` and ``command``.
 
     Args:
-        model: the person.
         meshcat: where all is drawn.
         positions: the person's positions (nq,) over time, in a room with z upward, nan where not
             found; or what adds the systems that give them; None: the keys alone.
         stride: (n, nq) one stride on the spot that ends standing, for the keys.
         period: time between two frames [s].
-        settings: thresholds and speeds.
         settle: how long the person must stand still at first [s]; 0: the first pose is the rest.
     """
     draw_garden(meshcat)

@@ -27,9 +27,7 @@ _RETRY, _LONGEST_RETRY = 3.0, 60.0
 class RemoteKeeper:
     """Asks a worker for sums over its cameras; see EdgeKeeper.
 
-    Attributes:
-        answers: how many sums came.
-        bytes: sent and received.
+    answers: how many sums came.
     """
 
     def __init__(self, cameras: Iterable[str], report: Callable[[str], None]) -> None:
@@ -40,7 +38,7 @@ class RemoteKeeper:
         self._is_ready = False
         self._sent_at = self._retry_at = 0.0
         self._retry_pause = _RETRY
-        self.answers = self.bytes = 0
+        self.answers = 0
 
     def move_to(self, line: Line | None) -> None:
         """Says by which connection the worker is asked."""
@@ -72,7 +70,6 @@ class RemoteKeeper:
             return None
         self._retry_pause, self._is_reported = _RETRY, False
         self.answers += bool(data)
-        self.bytes += len(data)
         return unpack_sum(data) if data else None
 
     def close(self) -> None:
@@ -89,7 +86,6 @@ class RemoteKeeper:
                 self._put_off("cannot be asked for")
             return False
         self._sent_at = now
-        self.bytes += len(data)
         return True
 
     def _put_off(self, why: str) -> None:

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import (
-    BasicVector,
     Context,
     DependencyTicket,
     EventStatus,
@@ -135,11 +134,11 @@ class PictureCapture(LeafSystem):
         self._changes: dict[str, list[CameraChange]] = {name: [] for name in self._sources}
         self._reports: list[str] = []
         self.skipped = 0
-        self._state = self.DeclareDiscreteState(np.array([0.0, math.nan, 0.0]))
-        ticket = {self.discrete_state_ticket(self._state)}
-        self._declare_outputs(cameras, ticket)
-        self.DeclareVectorOutputPort("time", 1, self._calc_time, ticket)
-        self.DeclareVectorOutputPort("fresh", 1, self._calc_fresh, ticket)
+        self._time = self.DeclareDiscreteState(np.array([math.nan]))
+        self._fresh = self.DeclareDiscreteState(1)
+        self._declare_outputs(cameras, {self.discrete_state_ticket(self._time)})
+        self.DeclareStateOutputPort("time", self._time)
+        self.DeclareStateOutputPort("fresh", self._fresh)
         self.DeclarePeriodicUnrestrictedUpdateEvent(self.period, 0.0, self._look)
 
     def _declare_outputs(
@@ -200,10 +199,8 @@ class PictureCapture(LeafSystem):
             self._feed(name, source, now + _ROUNDING * self.period)
         moment = self._take(now)
         self._note_changes()
-        index, shown, _ = context.get_discrete_state(self._state).value()
-        values = state.get_mutable_discrete_state(self._state)
+        state.get_mutable_discrete_state(self._fresh).SetFromVector([float(moment is not None)])
         if moment is None:
-            values.SetFromVector([index, shown, 0.0])
             ended = all(source.ended for source in self._sources.values())
             rest = any(self._synchroniser.waiting(name) for name in self._sources)
             if ended and not rest and not any(self._pending.values()):
@@ -212,7 +209,7 @@ class PictureCapture(LeafSystem):
         self._moment = moment
         for name in moment.items:
             self._used[name] += 1
-        values.SetFromVector([index + 1.0, moment.time, 1.0])
+        state.get_mutable_discrete_state(self._time).SetFromVector([moment.time])
         return EventStatus.Succeeded()
 
     def _is_opening(self) -> bool:
@@ -301,12 +298,6 @@ class PictureCapture(LeafSystem):
             fill(image, picture)
 
         return calc
-
-    def _calc_time(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state(self._state).value()[1:2])
-
-    def _calc_fresh(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state(self._state).value()[2:])
 
 
 def usual_period(sources: Mapping[str, FrameSource]) -> float:

@@ -41,11 +41,9 @@ _ROTATIONS = ("Zrotation", "Xrotation", "Yrotation")
 
 @dataclass(frozen=True, eq=False)
 class SkeletonJoint:
-    """A joint of the file.
+    """A joint of the file: the link whose origin it is ("world": where several parts stand).
 
-    Args:
-        link: the plant's link whose origin it is; "world" where several parts stand in the world.
-        parent: index of the joint before it; -1 for the root.
+    parent: index of the joint before it; -1 for the root.
     """
 
     link: str
@@ -53,12 +51,7 @@ class SkeletonJoint:
 
 
 def skeleton_of(model: ArticulatedModel, q: Array) -> tuple[SkeletonJoint, ...]:
-    """The joints, parents before children.
-
-    Args:
-        model: the model.
-        q: (frames, nq) positions [rad or m], which tell the lengths that stay the same.
-    """
+    """The joints, parents before children; q (frames, nq) tells the lengths that stay the same."""
     names, children = model.link_names, _children(model, q)
     branches = [0] * len(names)
 
@@ -99,7 +92,7 @@ def _children(model: ArticulatedModel, q: Array) -> list[list[tuple[int, str]]]:
 def motion_as_bvh(
     model: ArticulatedModel, q: Array, X_WB: Array | None, rate_hz: float
 ) -> tuple[str, int]:
-    """A BVH file of a motion.
+    """The text of a BVH file of a motion, and how many of its frames were filled.
 
     Args:
         model: the model.
@@ -107,9 +100,6 @@ def motion_as_bvh(
             one known before it, or by the first one known.
         X_WB: (frames, 4, 4) poses of the plant's world in the scene's; None: the same world.
         rate_hz: frames a second.
-
-    Returns:
-        The text, and how many frames were filled.
 
     Raises:
         SettingsError: no frame has a pose.

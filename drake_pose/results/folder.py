@@ -10,7 +10,7 @@ import csv
 import io
 import json
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
@@ -91,8 +91,8 @@ class ResultFolder:
         resume: go on with a folder that holds a part of the result.
 
     Raises:
-        OutputError: if the folder is not empty and ``resume`` is not given, or cannot be written,
-            or what it holds cannot be resumed.
+        OutputError: here and in all methods: if the folder is not empty and ``resume`` is not
+            given, or cannot be written, or what it holds cannot be resumed.
     """
 
     def __init__(
@@ -117,11 +117,7 @@ class ResultFolder:
         return ["frame", *self.position_names, *base, *FIT_COLUMNS]
 
     def open(self) -> None:
-        """Begin poses.csv, with the rows that were read for a resumption.
-
-        Raises:
-            OutputError: if it cannot be written.
-        """
+        """Begin poses.csv, with the rows that were read for a resumption."""
         self._write_rows()
         try:
             self._file = (self.path / POSES).open("a", newline="", encoding="utf-8")
@@ -132,9 +128,6 @@ class ResultFolder:
         """Close poses.csv and put its rows in the order of ``frames``.
 
         A job that was resumed for other frames has written them behind the earlier ones.
-
-        Raises:
-            OutputError: if it cannot be written.
         """
         self.close()
         place = {frame: index for index, frame in enumerate(frames)}
@@ -150,15 +143,11 @@ class ResultFolder:
             self._file = None
 
     def add(self, row: PoseRow) -> None:
-        """Write the row of a finished frame.
-
-        Raises:
-            OutputError: if it cannot be written, or the folder is not open.
-        """
+        """Write the row of a finished frame."""
         if self._file is None:
             raise OutputError(f"{self.path / POSES}: is not open")
         try:
-            csv.writer(self._file, lineterminator="\n").writerow(self._cells(row))
+            self._file.write(csv_text(self._cells(row)))
             self._file.flush()
         except OSError as error:
             raise _cannot_write(self.path / POSES, error) from error
@@ -173,27 +162,12 @@ class ResultFolder:
         self.rows = [row for row in self.rows if row.frame not in frames]
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
-        """Write summary.json; numbers that are not finite become null.
-
-        Raises:
-            OutputError: if it cannot be written.
-        """
+        """Write summary.json; numbers that are not finite become null."""
         text = json.dumps(without_nan(summary), indent=2, allow_nan=False, ensure_ascii=False)
         self.write(SUMMARY, (text + "\n").encode())
 
     def write(self, name: str, data: bytes) -> Path:
-        """Write a file in the folder all at once, making the folders it needs.
-
-        Args:
-            name: the file's path within the folder.
-            data: its content.
-
-        Returns:
-            The file's path.
-
-        Raises:
-            OutputError: if it cannot be written.
-        """
+        """Write a file, by its path within the folder, all at once, making the folders it needs."""
         path = self.path / name
         temporary = path.with_name(path.name + ".part")
         try:
@@ -205,11 +179,8 @@ class ResultFolder:
         return path
 
     def _write_rows(self) -> None:
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(self.header)
-        writer.writerows(self._cells(row) for row in self.rows)
-        self.write(POSES, text.getvalue().encode())
+        text = csv_text(self.header, [self._cells(row) for row in self.rows])
+        self.write(POSES, text.encode())
 
     def _cells(self, row: PoseRow) -> list[str]:
         base: Sequence[float] | np.ndarray = ()
@@ -243,12 +214,15 @@ class ResultFolder:
         return PoseRow(cells[0], numbers[:count], base, float(numbers[-2]), float(numbers[-1]))
 
 
-def require_empty(path: Path) -> None:
-    """Refuses a folder that exists and holds something, and a place where none can be.
+def csv_text(header: Sequence[object], rows: Iterable[Sequence[object]] = ()) -> str:
+    """The text of a table of comma-separated values."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([header, *rows])
+    return text.getvalue()
 
-    Raises:
-        OutputError: names the folder, or the file that lies in its place.
-    """
+
+def require_empty(path: Path) -> None:
+    """Refuses (OutputError) a folder that holds something, and a place where none can be."""
     _require_no_file(path)
     if path.is_dir() and any(path.iterdir()):
         raise OutputError(
@@ -268,11 +242,7 @@ def _require_no_file(path: Path) -> None:
 
 
 def read_summary(path: Path) -> dict[str, Any]:
-    """Reads the summary.json of a result folder.
-
-    Raises:
-        OutputError: if there is none, or it is damaged.
-    """
+    """Reads the summary.json of a result folder; OutputError: there is none, or it is damaged."""
     file = path / SUMMARY
     try:
         summary = json.loads(file.read_text(encoding="utf-8"))

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from drake_pose.body.model import ArticulatedModel
+from drake_pose.results.folder import csv_text
 from drake_pose.results.summary import FrameRecord, JointRecord
 from drake_pose.search.estimates import JointEstimate, PoseSet
 
@@ -84,7 +83,7 @@ def _record(
 
 def joint_table(records: Mapping[str, FrameRecord]) -> str:
     """Returns the text of joints.csv."""
-    return _table(
+    return csv_text(
         JOINT_COLUMNS,
         [
             [frame, name, *_ends(joint), record.family_count]
@@ -96,7 +95,7 @@ def joint_table(records: Mapping[str, FrameRecord]) -> str:
 
 def family_table(records: Mapping[str, FrameRecord]) -> str:
     """Returns the text of families.csv."""
-    return _table(
+    return csv_text(
         FAMILY_COLUMNS,
         [
             [frame, number, name, "" if one.value is None else _number(one.value), *_ends(one)]
@@ -114,11 +113,3 @@ def _ends(joint: JointRecord) -> list[str]:
 
 def _number(value: float) -> str:
     return f"{value:.6g}"
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(rows)
-    return text.getvalue()

@@ -25,6 +25,7 @@ from drake_pose.results.folder import (
     ResultFolder,
     base_cells,
     base_pose,
+    csv_text,
 )
 from drake_pose.silhouette.pictures.scenes import Scene
 
@@ -89,13 +90,9 @@ def write_motion(
 def joint_centres(
     model: ArticulatedModel, landmarks: Mapping[str, Landmark], q: Array, X_WB: Array | None = None
 ) -> Array:
-    """The landmarks (frames, n, 3) in the scene's world [m]; nan where q is.
+    """The landmarks (frames, n, 3) in the scene's world [m] at q (frames, nq); nan where q is.
 
-    Args:
-        model: the model.
-        landmarks: as load_landmarks gives them.
-        q: (frames, nq) positions [rad or m].
-        X_WB: (frames, 4, 4) poses of the plant's world in the scene's; None: the same world.
+    X_WB: (frames, 4, 4) poses of the plant's world in the scene's; None: the same world.
     """
     places = np.full((len(q), len(landmarks), 3), np.nan)
     for k, positions in enumerate(q):
@@ -106,19 +103,16 @@ def joint_centres(
 
 
 def centres_as_csv(frames: Sequence[str], names: Sequence[str], places: Array) -> str:
-    """joint_centres.csv: frame, joint, x, y, z [m]; frames without a pose are left out.
-
-    Args:
-        frames: the frames' names.
-        names: the joints'.
-        places: (frames, joints, 3) in the world [m].
-    """
-    lines = ["frame,joint,x,y,z"]
-    for frame, row in zip(frames, places, strict=True):
-        if np.isfinite(row).all():
-            for name, (x, y, z) in zip(names, row, strict=True):
-                lines.append(f"{frame},{name},{x:.4f},{y:.4f},{z:.4f}")
-    return "\n".join(lines) + "\n"
+    """joint_centres.csv: frame, joint, x, y, z [m] of places (frames, joints, 3); without nan."""
+    return csv_text(
+        ["frame", "joint", "x", "y", "z"],
+        [
+            [frame, name, *(f"{number:.4f}" for number in place)]
+            for frame, row in zip(frames, places, strict=True)
+            if np.isfinite(row).all()
+            for name, place in zip(names, row, strict=True)
+        ],
+    )
 
 
 def centres_as_trc(names: Sequence[str], places: Array, rate_hz: float, name: str = TRC) -> str:

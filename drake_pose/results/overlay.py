@@ -25,19 +25,12 @@ _MARGIN = 0.12
 def paint_agreement(
     mask: np.ndarray, body: np.ndarray, segments: np.ndarray | None = None
 ) -> np.ndarray:
-    """Colours every pixel by whether silhouette and body agree there.
+    """Colours (H, W, 3) every pixel by whether silhouette and body agree there.
 
-    Args:
-        mask: (H, W) bool, the silhouette.
-        body: (H, W) bool, where the estimated body is seen.
-        segments: (H, W) int, which segment is seen; borders between two segments are drawn.
-
-    Returns:
-        (H, W, 3) uint8, red, green, blue: AGREEMENT_RGB where both are, MISSING_RGB where the
-        silhouette alone is, EXCESS_RGB where the body alone is.
+    AGREEMENT_RGB where both are, MISSING_RGB where the silhouette alone is, EXCESS_RGB where the
+    body alone is. Borders between two segments (H, W) are drawn.
     """
-    picture = np.empty((*mask.shape, 3), dtype=np.uint8)
-    picture[:] = BACKGROUND_RGB
+    picture = np.full((*mask.shape, 3), BACKGROUND_RGB, dtype=np.uint8)
     picture[mask & body] = AGREEMENT_RGB
     picture[mask & ~body] = MISSING_RGB
     picture[body & ~mask] = EXCESS_RGB
@@ -65,9 +58,7 @@ def draw_overlay(
     window = (slice(*rows), slice(*columns))
     picture = paint_agreement(mask, body, segments)[window]
     height, width = picture.shape[:2]
-    scale = _enlargement(height, width)
-    picture = np.repeat(np.repeat(picture, scale, axis=0), scale, axis=1)
-    picture = _widen(picture, _LEAST_WIDTH)
+    picture = _widen(_enlarged(picture, _enlargement(height, width)), _LEAST_WIDTH)
     area = max(1, int(mask.sum()))
     legend = [
         (AGREEMENT_RGB, f"agreement {100.0 * (mask & body).sum() / area:.1f} %"),
@@ -82,15 +73,10 @@ def draw_overlay(
 def draw_over_picture(
     picture: np.ndarray, body: np.ndarray, segments: np.ndarray | None, title: Sequence[str]
 ) -> np.ndarray:
-    """Draws the body's contour, and the borders between its parts, over a camera's picture.
+    """Draws the body's contour, and the borders between its parts, over a picture (H, W, 3).
 
-    Args:
-        picture: (H, W, 3) uint8, red, green, blue.
-        body, segments, title: as of draw_overlay.
-
-    Returns:
-        (h, w, 3) uint8, red, green, blue: the surroundings of the body; the whole picture where no
-        pose was found.
+    The other arguments and the result are those of draw_overlay; the whole picture where no pose
+    was found.
     """
     painted = picture.copy()
     contours, _ = cv2.findContours(body.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
@@ -105,26 +91,16 @@ def draw_over_picture(
 def draw_shapes(
     mask: np.ndarray, shapes: Sequence[np.ndarray], names: Sequence[str], title: Sequence[str]
 ) -> np.ndarray:
-    """Draws the contours of one or two bodies over a silhouette, one over the other.
+    """Draws the contours of one or two bodies (H, W) over a silhouette, one over the other.
 
-    Args:
-        mask: (H, W) bool, the silhouette.
-        shapes: (H, W) bool each, where a body is seen.
-        names: of the shapes, for the legend.
-        title: lines of text above the picture.
-
-    Returns:
-        (h, w, 3) uint8, red, green, blue: the surroundings of all, enlarged as by draw_overlay.
+    names: of the shapes, for the legend; title and result as of draw_overlay.
     """
     colours = (MISSING_RGB, EXCESS_RGB)[: len(shapes)]
     rows, columns = _surroundings(np.logical_or.reduce([mask, *shapes]))
     window = (slice(*rows), slice(*columns))
     scale = _enlargement(rows[1] - rows[0], columns[1] - columns[0])
-    grown = [
-        np.repeat(np.repeat(one[window], scale, axis=0), scale, axis=1) for one in (mask, *shapes)
-    ]
-    picture = np.empty((*grown[0].shape, 3), dtype=np.uint8)
-    picture[:] = BACKGROUND_RGB
+    grown = [_enlarged(one[window], scale) for one in (mask, *shapes)]
+    picture = np.full((*grown[0].shape, 3), BACKGROUND_RGB, dtype=np.uint8)
     picture[grown[0]] = AGREEMENT_RGB
     for shape, colour in zip(grown[1:], colours, strict=True):
         contours, _ = cv2.findContours(shape.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
@@ -170,17 +146,17 @@ def _enlargement(height: int, width: int) -> int:
     return max(1, min(_LEAST_HEIGHT // height, 2 * _LEAST_WIDTH // width, 8))
 
 
+def _enlarged(picture: np.ndarray, scale: int) -> np.ndarray:
+    return np.repeat(np.repeat(picture, scale, axis=0), scale, axis=1)
+
+
 def _widen(picture: np.ndarray, width: int) -> np.ndarray:
     """Pads a picture with background on both sides, so that the text below it has room."""
-    missing = max(0, width - picture.shape[1])
-    left = missing // 2
-    return np.stack(
-        [
-            np.pad(picture[:, :, k], ((0, 0), (left, missing - left)), constant_values=value)
-            for k, value in enumerate(BACKGROUND_RGB)
-        ],
-        axis=2,
-    )
+    height, own = picture.shape[:2]
+    left = max(0, width - own) // 2
+    wide = np.full((height, max(width, own), 3), BACKGROUND_RGB, dtype=np.uint8)
+    wide[:, left : left + own] = picture
+    return wide
 
 
 def _text_band(lines: Sequence[str], width: int) -> np.ndarray:

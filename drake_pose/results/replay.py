@@ -31,7 +31,7 @@ def make_replay(
     cameras: Sequence[Camera],
     period: float,
 ) -> str:
-    """Records poses of a body in Meshcat.
+    """The page that Meshcat records of poses of a body.
 
     Args:
         model: the body.
@@ -40,9 +40,6 @@ def make_replay(
         cameras: drawn where they are.
         period: time between two frames [s]. Frames a second or more apart stand still, others
             are played as a motion.
-
-    Returns:
-        The page.
     """
     # Port 0: any free one. The server lives for a moment only, and listens on this machine alone.
     logger = logging.getLogger("drake")

@@ -128,12 +128,7 @@ def make_report(content: ReportContent) -> str:
 
 
 def page_template(package: str, name: str) -> Template:
-    """A page's template, which may use the style of all pages.
-
-    Args:
-        package: where the template's file is.
-        name: of the file.
-    """
+    """A page's template, a file of a package, which may use the style of all pages."""
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )

@@ -25,13 +25,7 @@ _SHARE = 0.2
 
 @dataclass(frozen=True)
 class Curve:
-    """A curve of a plot.
-
-    Args:
-        label: for the legend.
-        path: of the SVG picture; "" where there is no point.
-        dots: whether each point stands alone, and needs to be seen.
-    """
+    """A curve: its label, the path of the SVG picture, and whether each point stands alone."""
 
     label: str
     path: str
@@ -122,12 +116,7 @@ def plot_curves(
 
 
 def draw_grid(frames: Sequence[str], rows: Sequence[tuple[str, Sequence[str]]]) -> Grid:
-    """Draws what state each row has in each frame, neighbours of one state as one bar.
-
-    Args:
-        frames: the frames' names.
-        rows: name and (frames,) states of each row.
-    """
+    """Draws what state each row, a name and (frames,) states, has; equal neighbours are a bar."""
     width = (WIDTH - _GRID_LEFT - _RIGHT) / max(1, len(frames))
     drawn = []
     for number, (name, states) in enumerate(rows):

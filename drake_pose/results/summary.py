@@ -30,10 +30,8 @@ _PACKAGES = ("drake", "numpy", "numba", "opencv-python-headless")
 class JointRecord:
     """What is known of one value of the pose tree, as JointEstimate [deg or m].
 
-    Args:
-        determined: whether it lies between low and high; else these are the ends of what was seen.
-        low, high: the interval or range.
-        value: of the pose that stands for a family; None over all families.
+    low and high are the ends of its interval, or of what was seen where it is not determined; value
+    is that of the pose that stands for a family, None over all families.
     """
 
     determined: bool
@@ -107,7 +105,7 @@ def _joint_records(values: Mapping[str, Any]) -> dict[str, JointRecord]:
 
 
 def describe_job(scene: Path, model: Path, settings: EstimateSettings) -> dict[str, Any]:
-    """Returns what is estimated from what and how, as plain JSON values.
+    """What is estimated from what and how, as plain JSON values.
 
     The files' SHA-256 tell whether a job that is resumed is still the same.
     """
@@ -134,11 +132,7 @@ def mask_digests(scene: Scene, cameras: Iterable[str], frame: str) -> dict[str, 
 
 
 def check_same_job(job: Mapping[str, Any], recorded: Mapping[str, Any], folder: Path) -> None:
-    """Refuses to resume a job with other files or settings; other frames are allowed.
-
-    Raises:
-        OutputError: names the folder and what differs.
-    """
+    """Refuses (OutputError) to resume a job with other files or settings, but other frames."""
     for name in ("model", "cameras"):
         if recorded.get("sha256", {}).get(name) != job["sha256"][name]:
             raise OutputError(
@@ -160,7 +154,7 @@ def summarize(
     complete: bool,
     more: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Returns the content of summary.json.
+    """The content of summary.json.
 
     Args:
         job: from describe_job.
@@ -204,9 +198,7 @@ def camera_warnings(
 ) -> tuple[str, ...]:
     """Which cameras agree much less than the others, where there are three or more.
 
-    Args:
-        records: of the frames.
-        known: warnings that were given before; a camera that they name is not named again.
+    A camera that earlier warnings (known) name is not named again.
     """
     means = {name: float(one["mean_iou"]) for name, one in describe_cameras(records).items()}
     if len(means) < 3:

@@ -109,17 +109,6 @@ def test_person_is_captured_and_a_corrupt_picture_costs_only_itself(
     assert all(float(row["high"]) - float(row["low"]) < 40.0 for row in known)
 
 
-@pytest.mark.slow
-def test_camera_that_moved_since_calibration_is_named(tmp_path: Path) -> None:
-    scene = record_person(tmp_path / "scene", FRAMES, moved="camera_2")
-    captured = capture_scene(scene.folder, tmp_path / "out", scene.person.path, replay=False)
-    # It has no say, but one can see why.
-    assert "camera_2" not in captured.summary["cameras"]
-    assert len(list((tmp_path / "out" / "overlay" / "camera_2").iterdir())) == FRAMES
-    assert [text for text in captured.warnings if "camera_2" in text]
-    assert not [text for text in captured.warnings if "camera_0" in text]
-
-
 def test_estimate_follows_a_person_and_says_so(
     recording: PersonScene, known: list[int], runner: CliRunner, tmp_path: Path
 ) -> None:
@@ -202,7 +191,7 @@ def test_the_command_capture_takes_the_bundled_person(
     def note(scene, model, out, settings, **options):
         asked.update(options, model=model, settings=settings)
 
-    monkeypatch.setattr("drake_pose.commands.capture.run_estimate", note)
+    monkeypatch.setattr("drake_pose.commands.capture.estimate", note)
     out = tmp_path / "out"
     options = ["--out", str(out), "--no-overlay", "--frame", "1"]
     assert runner.invoke(app, ["capture", str(recording.folder), *options]).exit_code == 0

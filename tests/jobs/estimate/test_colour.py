@@ -55,18 +55,6 @@ def test_pictures_and_a_start_are_enough(recording):
     assert np.median(errors(estimate, truth)) < 1.5
 
 
-@pytest.mark.slow
-def test_pictures_and_a_mask_of_the_first_frame_are_enough(recording, tmp_path):
-    scene, model, truth, _ = recording
-    copy = tmp_path / "scene"
-    shutil.copytree(scene, copy)
-    (copy / "masks" / "front").mkdir(parents=True)
-    shutil.copy(scene.parent / "first.png", copy / "masks" / "front" / "0000.png")
-    estimate = estimate_scene(copy, model)
-    assert estimate.found_count == FRAMES
-    assert np.median(errors(estimate, truth)) < 1.5
-
-
 @pytest.fixture(scope="module")
 def filmed(recording, tmp_path_factory):
     """The same scene with a video in place of the pictures."""

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 import trimesh
-import yaml
 
 from drake_pose.commands.main import app
 from drake_pose.errors import SettingsError
@@ -79,22 +78,6 @@ def test_estimate_and_its_resumption(
     resumed = run(*arguments, *package, "--frame", "0:1", "--resume")
     assert resumed.exit_code == 0, resumed.output
     assert json.loads((out / "summary.json").read_text())["found_count"] == 2
-
-
-@pytest.mark.slow
-def test_batch(tmp_path: Path, tiny_scene: TinyScene, far: tuple[Path, Path]) -> None:
-    model, folder = far
-    scene = {"scene": str(tiny_scene.folder), "model": str(model), "frames": "0", "interval": 20}
-    jobs = tmp_path / "jobs.yaml"
-    job = {"defaults": {"replay": False, "overlay": False}, "scenes": {"one": scene}}
-    jobs.write_text(yaml.safe_dump(job))
-    assert_names_option(run("batch", jobs, "--out", tmp_path / "refused"))
-    job["defaults"]["packages"] = {"parts": str(folder.relative_to(tmp_path))}
-    jobs.write_text(yaml.safe_dump(job))
-    result = run("batch", jobs, "--out", tmp_path / "out")
-    assert result.exit_code == 0, result.output
-    summary = json.loads((tmp_path / "out" / "one" / "summary.json").read_text())
-    assert summary["settings"]["packages"] == {"parts": str(folder)}
 
 
 def test_capture_and_walk(tmp_path: Path, tiny_scene: TinyScene, far: tuple[Path, Path]) -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from drake_pose.camera.rigs import FACE_CAMERA
 from drake_pose.errors import SettingsError
-from drake_pose.person.date.capture import CaptureSetup, see_person
+from drake_pose.person.date.capture import CaptureSetup
 from drake_pose.person.date.faces import (
     cut_face,
     face_direction,
@@ -18,7 +18,6 @@ from drake_pose.person.date.features import find_features
 from drake_pose.person.date.recognition import measure_contour, recognise, similarity
 from drake_pose.person.date.skeleton import FEATURES, rotation
 from drake_pose.person.date.skin_blobs import SkinColour, skin_blobs
-from drake_pose.silhouette.segmentation.background import learn_background, person_region
 from tests.person.studio import shared_studio
 
 
@@ -188,23 +187,6 @@ class TestCapture:
         errors = np.linalg.norm(found.places - calibrated.features(q), axis=1)
         assert (found.support > 0).all()
         assert errors.max() < 0.03, dict(zip(FEATURES, errors, strict=True))
-
-    def test_background_instead_of_a_mask(self, studio):
-        generator = np.random.default_rng(5)
-        away = studio.posed()
-        away[2] = -8.0
-        empty = studio.picture(away, "camera_0").astype(float)
-        shots = [
-            np.clip(empty + generator.normal(0, 2, empty.shape), 0, 255).astype(np.uint8)
-            for _ in range(5)
-        ]
-        q = studio.posed(left_upper_arm_z=60)
-        background = learn_background(shots)
-        found = person_region(studio.picture(q, "camera_0"), background)
-        true = studio.mask(q, "camera_0")
-        assert (found & true).sum() / (found | true).sum() > 0.93
-        with pytest.raises(SettingsError, match="region"):
-            see_person(shots[0], true[:-1], SkinColour())
 
     def test_too_few_cameras(self, studio, calibrated):
         with pytest.raises(SettingsError, match="two cameras"):

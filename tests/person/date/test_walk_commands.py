@@ -97,13 +97,6 @@ def test_command_begins_late_and_ends_early():
     assert found == [0, 1, 1, 0, 0, -1, -1, 0, 1]
 
 
-def test_noise_at_the_threshold_does_not_flicker():
-    generator = np.random.default_rng(3)
-    noise = generator.normal(0.0, 0.02, 300)
-    found = [c[1] for c in commands([stance(), *(stance(ahead=0.18 + n) for n in noise)])]
-    assert np.count_nonzero(np.diff(found)) == 1
-
-
 def test_leaning_stepping_aside_and_being_lost_do_not_walk():
     assert commands([stance(ahead=0.4, feet_ahead=0.0)]) == [NO_COMMAND]
     assert commands([stance(ahead=0.0, feet_ahead=-0.4)]) == [NO_COMMAND]

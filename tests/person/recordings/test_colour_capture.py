@@ -102,26 +102,6 @@ def test_a_loss_is_said_and_a_start_goes_on(person, cameras, recording):
     assert np.mean(joint_errors(person, found.q[-1], recording[2][-1])) < 20.0
 
 
-def test_nothing_is_found_before_it_is_said_where_the_person_is(person, cameras, recording):
-    found = capture_by_colour(
-        person.pose_tree(), given(cameras, recording, {4: recording[2][4]}), ()
-    )
-    assert np.isnan(found.captured.q[:4]).all()
-    assert np.isfinite(found.captured.q[4:]).all()
-    assert np.isfinite(found.distances[4:]).all()
-
-
-@pytest.mark.slow
-def test_followed_from_masks_of_the_first_frame(person, cameras, recording):
-    def masks(k):
-        return recording[1][k] if k == 0 else {}
-
-    found = capture_by_colour(person.pose_tree(), given(cameras, recording, {}, masks), (0,))
-    assert found.masked == (0,)
-    errors = joint_errors(person, found.captured.q[-1], recording[2][-1])
-    assert np.mean(errors) < 20.0
-
-
 class TestLearning:
     def test_masks_say_which_colours_are_the_persons(self, person, cameras, recording):
         """Of a model that is 4 cm off, colours are learned right where the masks are known."""

@@ -1,6 +1,5 @@
 """The paper's ready diagram, before a person that Drake renders."""
 
-import cv2
 import numpy as np
 import pytest
 from pydrake.common.value import AbstractValue
@@ -11,8 +10,6 @@ from pydrake.systems.sensors import ImageRgba8U
 from pydrake.trajectories import PiecewisePolynomial
 
 from drake_pose.camera.rigs import FACE_CAMERA
-from drake_pose.camera.sources.files import open_source
-from drake_pose.camera.sources.frame_source import SourceSpecification
 from drake_pose.errors import SettingsError
 from drake_pose.person.date.body_pose import estimate_pose, waist_of
 from drake_pose.person.date.capture import CaptureSettings, CaptureSetup, see_person
@@ -25,7 +22,6 @@ from drake_pose.systems.colour_images import picture_to_colour_image
 from drake_pose.systems.date.capture import build_paper_capture
 from drake_pose.systems.date.pose_estimator import PaperPoseEstimator
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
-from drake_pose.systems.pictures.picture_capture import PictureCapture
 from tests.person.studio import shared_studio
 
 PERIOD = 0.1
@@ -223,28 +219,6 @@ class TestPaperCapture:
         np.testing.assert_allclose(run(lambda time: time == 0.0), start, atol=0.08)
         assert np.abs(run(lambda time: 1.0) - run(lambda time: time == 0.0)).max() > 0.05
         np.testing.assert_allclose(run(lambda time: 1.0), moved, atol=0.05)
-
-    def test_recorded_pictures_are_a_source(self, setup, film, tmp_path):
-        _, pictures = film
-        sources = {}
-        cameras = {**setup.cameras, FACE_CAMERA: setup.face_camera}
-        for name, camera in cameras.items():
-            folder = tmp_path / name
-            folder.mkdir()
-            for k, shots in enumerate(pictures[1:4]):
-                cv2.imwrite(str(folder / f"{k}.png"), shots[name][:, :, ::-1])
-            specification = SourceSpecification(
-                name, "folder", str(folder), camera.width, camera.height, 1 / PERIOD, "empty"
-            )
-            sources[name] = open_source(specification)
-        source = PictureCapture(sources, cameras)
-        capture = build_paper_capture(setup, source, PERIOD)
-        simulator = Simulator(capture.diagram)
-        simulator.AdvanceTo(10 * PERIOD)
-        found = capture.diagram.GetOutputPort("estimated_positions").Eval(simulator.get_context())
-        run = Run(build_paper_capture(setup, period=PERIOD))
-        expected = [run.step(shots) for shots in pictures[1:4]][-1]
-        np.testing.assert_array_equal(found, expected)
 
     def test_stages_are_what_the_pose_needs(self, setup, film):
         capture = build_paper_capture(setup, period=PERIOD)

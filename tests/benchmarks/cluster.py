@@ -9,38 +9,34 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
 import yaml
-from rich.console import Console
-from rich.table import Table
 
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.camera.files import save_cameras
-from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.camera.rigs import FACE_CAMERA
 from drake_pose.jobs.batch.batch import run_batch
 from drake_pose.jobs.batch.job import SceneJob
 from drake_pose.jobs.batch.workers import ClusterPool
 from drake_pose.jobs.cluster.remote_views import ClusterSensors
 from drake_pose.jobs.cluster.scheduler import open_cluster
-from drake_pose.jobs.live.run import FrameWatch, LiveFrame, run_live
+from drake_pose.jobs.live.run import FrameWatch, run_live
 from drake_pose.jobs.live.scene import LiveScene, load_live_scene
+from drake_pose.papers.date_capture import Studio
 from drake_pose.papers.kameda import experiment_camera
-from drake_pose.person.date.skeleton import load_skeleton
 from drake_pose.person.date.walking_motion import make_motion
 from drake_pose.person.shape import tracker_of_person
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.systems.person.live_capture import LiveSensors, build_live_capture
-from drake_pose.systems.pictures.camera_rig import build_camera_rig
+from tests.benchmarks.scenes import print_table
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -50,46 +46,29 @@ _CAMERAS, _SIZE, _RATE_HZ = 8, (640, 480), 30.0
 # How many frames of Date's motions, which take twelve seconds in all.
 _FRAMES, _MOTION_FRAMES = 60, 360
 _FAR_AWAY = -9.0
-_GIGA = 1e9
 
 
-@dataclass(frozen=True)
-class BatchFigures:
-    """A batch. workers: how many, 0: this process; seconds: the wall's; bytes_a_frame: on disk."""
+class BatchFigures(NamedTuple):
+    """Of a batch, the wall's and the processor's seconds, and bytes a frame on disk."""
 
-    workers: int
     frames: int
     seconds: float
     processor_seconds: float
     bytes_a_frame: float
 
 
-@dataclass(frozen=True)
-class LiveFigures:
-    """A live capture of a recording, as fast as can be.
+class LiveFigures(NamedTuple):
+    """Of a live capture of a recording, as fast as can be.
 
-    Args:
-        workers: how many; 0: this process.
-        cameras: how many.
-        frames: how many.
-        seconds: the wall's [s].
-        centre_seconds: of the processor in this process, a frame in the median [s].
-        view_seconds: of the workers' processors for one view [s]; nan where there are none.
-        view_bytes: of one view on its way; nan where there is none.
+    The wall's seconds, the processor's in this process, a frame in the median, those of the
+    workers' processors for one view, and its bytes on its way; nan where there are no workers.
     """
 
-    workers: int
-    cameras: int
     frames: int
     seconds: float
     centre_seconds: float
     view_seconds: float = float("nan")
     view_bytes: float = float("nan")
-
-    @property
-    def throughput(self) -> float:
-        """Cameras x frames a second."""
-        return self.cameras * self.frames / self.seconds
 
 
 def write_stills(folder: Path, count: int = _STILLS) -> SceneJob:
@@ -116,181 +95,115 @@ def write_stills(folder: Path, count: int = _STILLS) -> SceneJob:
     return SceneJob("stills", folder, model_path, settings, replay=False, chunk=_CHUNK)
 
 
-def write_studio(folder: Path, frames: int = _FRAMES) -> LiveScene:
+def write_studio(folder: Path) -> LiveScene:
     """Videos of a simulated person before eight cameras, and pictures of the empty room."""
-    model = load_model(bundled_model("person"), check=False)
-    poses = make_motion(load_skeleton(model), _MOTION_FRAMES, 0).q[:frames]
-    cameras = circle_of_cameras(_CAMERAS, size=_SIZE, face_camera=False)
+    studio = Studio.build(_CAMERAS + 1, _SIZE, np.random.default_rng(0))
+    poses = make_motion(studio.skeleton, _MOTION_FRAMES, 0).q[:_FRAMES]
+    cameras = {name: one for name, one in studio.cameras.items() if name != FACE_CAMERA}
     save_cameras(folder / "cameras.yaml", list(cameras.values()))
-    rig = build_camera_rig(model, cameras)
-    context = rig.diagram.CreateDefaultContext()
     away = poses[0].copy()
-    away[model.position_index("position_z")] = _FAR_AWAY
-    rig.set_positions(context, away)
+    away[studio.model.position_index("position_z")] = _FAR_AWAY
+
+    def seen(q: np.ndarray, name: str) -> np.ndarray:
+        return cv2.cvtColor(studio.side_by_side([q], name), cv2.COLOR_RGB2BGR)
+
     entries = {}
     for name in cameras:
         (folder / "empty" / name).mkdir(parents=True)
-        empty = cv2.cvtColor(rig.picture(context, name), cv2.COLOR_RGB2BGR)
-        cv2.imwrite(str(folder / "empty" / name / "0.png"), empty)
+        cv2.imwrite(str(folder / "empty" / name / "0.png"), seen(away, name))
         entries[name] = {
             "kind": "video", "location": f"{name}.avi", "background": f"empty/{name}",
         }  # fmt: skip
-    (folder / "sources.yaml").write_text(yaml.safe_dump(entries), encoding="utf-8")
-    code = cv2.VideoWriter.fourcc(*"MJPG")
-    writers = {
-        name: cv2.VideoWriter(str(folder / f"{name}.avi"), code, _RATE_HZ, _SIZE)
-        for name in cameras
-    }
-    for q in poses:
-        rig.set_positions(context, q)
-        for name, writer in writers.items():
-            writer.write(cv2.cvtColor(rig.picture(context, name), cv2.COLOR_RGB2BGR))
-    for writer in writers.values():
+        code = cv2.VideoWriter.fourcc(*"MJPG")
+        writer = cv2.VideoWriter(str(folder / f"{name}.avi"), code, _RATE_HZ, _SIZE)
+        for q in poses:
+            writer.write(seen(q, name))
         writer.release()
+    (folder / "sources.yaml").write_text(yaml.safe_dump(entries), encoding="utf-8")
     return load_live_scene(folder)
 
 
-def measure_batch(job: SceneJob, out: Path, workers: int, client: Client | None) -> BatchFigures:
-    """Times a batch; what the workers need to start is not counted."""
-    if client is not None:
-        run_batch(warm_up_jobs(job, workers), out / "warm_up", ClusterPool(client))
+def measure_batch(job: SceneJob, out: Path, client: Client | None) -> BatchFigures:
+    """Times a batch; what is loaded or compiled once, or what workers need to start, is not."""
+    pool = None if client is None else ClusterPool(client)
+    settings = replace(job.settings, frames=("0000",))
+    warm_up = [replace(job, name=f"warm_up_{k}", settings=settings) for k in range(2)]
+    run_batch(warm_up, out / "warm_up", pool)
     begin, processor = time.perf_counter(), time.process_time()
-    result = run_batch([job], out / "out", None if client is None else ClusterPool(client))
+    result = run_batch([job], out / "out", pool)
     seconds, processor = time.perf_counter() - begin, time.process_time() - processor
     frames = result.scenes[job.name].frame_count
     size = sum(path.stat().st_size for path in (out / "out").rglob("*") if path.is_file())
-    return BatchFigures(workers, frames, seconds, processor, size / frames)
+    return BatchFigures(frames, seconds, processor, size / frames)
 
 
-def warm_up_jobs(job: SceneJob, count: int) -> list[SceneJob]:
-    """This many jobs of one frame each: whatever is loaded or compiled once is not timed."""
-    settings = replace(job.settings, frames=("0000",))
-    return [replace(job, name=f"warm_up_{k}", settings=settings) for k in range(count)]
-
-
-def measure_live(scene: LiveScene, workers: int, client: Client | None) -> LiveFigures:
+def measure_live(scene: LiveScene, client: Client | None) -> LiveFigures:
     """Captures a recording as fast as can be."""
     sensors: LiveSensors = scene.open_sensors() if client is None else ClusterSensors(client, scene)
     tracker = tracker_of_person(load_model(bundled_model("person"), check=False).pose_tree(), None)
     diagram = build_live_capture(tracker, scene.cameras, sensors)
     times: list[tuple[float, float]] = []
-
-    def note(_: LiveFrame) -> None:
-        times.append((time.perf_counter(), time.process_time()))
-
+    watch = FrameWatch(
+        diagram,
+        scene.cameras,
+        lambda _: times.append((time.perf_counter(), time.process_time())),
+    )
     try:
-        run_live(
-            diagram, sensors, None, lambda _: None, monitor=FrameWatch(diagram, scene.cameras, note)
-        )
+        run_live(diagram, sensors, None, lambda _: None, monitor=watch)
     finally:
         sensors.close()
     # In the first frame the person is searched, not followed.
     walls, processors = np.diff(times, axis=0).T
-    seconds, centre = float(walls.sum()), float(np.median(processors))
-    figures = LiveFigures(workers, len(scene.cameras), len(walls), seconds, centre)
+    figures = LiveFigures(len(walls), float(walls.sum()), float(np.median(processors)))
     if not isinstance(sensors, ClusterSensors):
         return figures
     groups = sensors.watchers.groups
     views = sum(group.views for group in groups)
-    return replace(
-        figures,
+    return figures._replace(
         view_seconds=sum(group.seconds for group in groups) / views,
         view_bytes=sum(group.view_bytes for group in groups) / views,
     )
 
 
-def fewer_cameras(scene: LiveScene, count: int) -> LiveScene:
-    """The first cameras of a scene."""
-    names = list(scene.cameras)[:count]
-    return replace(
-        scene,
-        cameras={name: scene.cameras[name] for name in names},
-        specifications={name: scene.specifications[name] for name in names},
-    )
-
-
-def batch_table(found: list[BatchFigures]) -> Table:
-    """Frames a second, and those of this process as the unit."""
-    table = Table(title=f"Batch: {found[0].frames} stills in chunks of {_CHUNK}")
-    for heading in ("who", "frames a second", "ratio"):
-        table.add_column(heading, justify="right")
-    for one in found:
-        ratio = found[0].seconds / one.seconds
-        table.add_row(_who(one.workers), f"{one.frames / one.seconds:.2f}", f"{ratio:.2f}")
-    return table
-
-
-def live_table(found: list[LiveFigures]) -> Table:
-    """Cameras x frames a second, and those of this process as the unit."""
-    table = Table(title=f"Live: {found[0].cameras} cameras of {_SIZE[0]} x {_SIZE[1]}")
-    for heading in ("who", "cameras x frames a second", "ratio", "centre, a frame"):
-        table.add_column(heading, justify="right")
-    for one in found:
-        table.add_row(
-            _who(one.workers),
-            f"{one.throughput:.0f}",
-            f"{one.throughput / found[0].throughput:.2f}",
-            f"{1e3 * one.centre_seconds:.1f} ms",
-        )
-    return table
-
-
-def needs_table(batch: BatchFigures, live: LiveFigures) -> Table:
-    """What 100 cameras at 30 Hz and ten million frames would need.
-
-    Args:
-        batch: this process's.
-        live: a capture by two workers.
-    """
-    per_second = 100 * _RATE_HZ
-    table = Table(title="What more would need")
-    table.add_column("for")
-    table.add_column("needs")
-    picture = 3 * _SIZE[0] * _SIZE[1]
+def print_needs(batch: BatchFigures, live: LiveFigures) -> None:
+    """What 100 cameras at 30 Hz and ten million stills would need, by figures of two workers."""
+    views, picture = 100 * _RATE_HZ, 3 * _SIZE[0] * _SIZE[1]
+    hours = 1e7 * batch.processor_seconds / batch.frames / 3600
+    one = f"{1e3 * live.view_seconds:.2f} ms, {live.view_bytes:.0f} bytes (its picture: {picture})"
+    megabits = [f"{8e-6 * views * size:.0f}" for size in (live.view_bytes, picture)]
     rows = (
-        ("one view", f"{1e3 * live.view_seconds:.2f} ms, {live.view_bytes:.0f} bytes "
-                     f"(its picture: {picture})"),
-        ("100 cameras at 30 Hz: workers", f"{per_second * live.view_seconds:.1f} cores"),
-        ("100 cameras at 30 Hz: network",
-         f"{8e-6 * per_second * live.view_bytes:.0f} Mbit/s of views "
-         f"(pictures: {8e-6 * per_second * picture:.0f})"),
-        ("ten million stills", f"{1e7 * batch.processor_seconds / batch.frames / 3600:.0f} core "
-                               f"hours, {1e7 * batch.bytes_a_frame / _GIGA:.0f} GB"),
-    )  # fmt: skip
-    for row in rows:
-        table.add_row(*row)
-    return table
-
-
-@contextmanager
-def _clients() -> Iterator[dict[int, Client | None]]:
-    """Nobody, one worker, two workers."""
-    with open_cluster(1) as one, open_cluster(2) as two:
-        yield {0: None, 1: one, 2: two}
-
-
-def _who(workers: int) -> str:
-    return "this process" if not workers else f"{workers} worker{'s' if workers > 1 else ''}"
+        ("one view", one),
+        ("100 cameras at 30 Hz: workers", f"{views * live.view_seconds:.1f} cores"),
+        ("its network", f"{megabits[0]} Mbit/s of views (pictures: {megabits[1]})"),
+        ("ten million stills", f"{hours:.0f} core hours, {1e-2 * batch.bytes_a_frame:.0f} GB"),
+    )
+    print_table("What more would need", ("for", "needs"), rows)
 
 
 def main() -> None:
     """Print what workers bring on this machine."""
-    console = Console()
-    with tempfile.TemporaryDirectory() as name, _clients() as clients:
-        folder = Path(name)
+    with tempfile.TemporaryDirectory() as name, open_cluster(1) as one, open_cluster(2) as two:
+        folder, who = Path(name), {"this process": None, "1 worker": one, "2 workers": two}
         for part in ("stills", "studio"):
             (folder / part).mkdir()
         job, scene = write_stills(folder / "stills"), write_studio(folder / "studio")
-        run_batch(warm_up_jobs(job, 1), folder / "warm_up")
-        measure_live(fewer_cameras(scene, 2), 0, None)
-        batch = [
-            measure_batch(job, folder / f"batch_{workers}", workers, client)
-            for workers, client in clients.items()
-        ]
-        console.print(batch_table(batch))
-        live = [measure_live(scene, workers, client) for workers, client in clients.items()]
-        console.print(live_table(live))
-    console.print(needs_table(batch[0], live[2]))
+        batches = [measure_batch(job, folder / f"batch_{k}", who[k]) for k in who]
+        measure_live(scene, None)
+        lives = [measure_live(scene, client) for client in who.values()]
+    rows = [
+        (k, f"{b.frames / b.seconds:.2f}", f"{batches[0].seconds / b.seconds:.2f}")
+        for k, b in zip(who, batches, strict=True)
+    ]
+    title = f"Batch: {_STILLS} stills in chunks of {_CHUNK}"
+    print_table(title, ("who", "frames a second", "ratio"), rows)
+    rates = [_CAMERAS * one.frames / one.seconds for one in lives]
+    shown = [
+        (k, f"{rate:.0f}", f"{rate / rates[0]:.2f}", f"{1e3 * one.centre_seconds:.1f} ms")
+        for k, rate, one in zip(who, rates, lives, strict=True)
+    ]
+    headings = ("who", "cameras x frames a second", "ratio", "main process, a frame")
+    print_table(f"Live: {_CAMERAS} cameras of {_SIZE[0]} x {_SIZE[1]}", headings, shown)
+    print_needs(batches[0], lives[2])
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Benchmark of tracking by colour: an arm that moves before rooms, beside tracking by exact masks.
+"""Benchmark of tracking by colour: an arm or a person that moves before rooms, beside exact masks.
 
-Run as ``python -m tests.benchmarks.colour MODEL [--seed N] [--frames N] [--size W H]
-[--easy]``; MODEL is the file of an arm, such as the LBR Med 7's. Drake's renderer draws it before
-textured walls, in two cameras; each row of the table is one run of one motion. The seed is of the
-motion and of the room.
+Run as ``python -m tests.benchmarks.colour [MODEL] [--seed N] [--frames N] [--size W H] [--easy]``;
+MODEL is the file of an arm, such as the LBR Med 7's, which two cameras see; without it the bundled
+person walks about, turns and swings arms and legs before four. Drake's renderer draws them before
+textured walls; each row of the table is one run of one motion, the seed is of motion and room.
 """
 
 from __future__ import annotations
@@ -11,9 +11,10 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -36,20 +37,28 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.multibody.tree import RigidBody, SpatialInertia
 from pydrake.systems.framework import Diagram, DiagramBuilder
-from rich.console import Console
-from rich.table import Table
 
+from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.landmarks import landmark_positions, load_landmarks
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.camera.drake import camera_to_drake
 from drake_pose.camera.models import PinholeCamera
+from drake_pose.camera.rigs import circle_of_cameras, look_at
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.tracking.contour_tracker import ContourTracker
+from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.jobs.estimate.inputs import make_tree
+from drake_pose.person.colour_views import ColourViews, KnownColours
+from drake_pose.person.pose_tracker import PersonPoseTracker
+from drake_pose.person.views import FrameViews, edge_spacing, see_silhouette
 from drake_pose.results.settings import EstimateSettings
+from tests.benchmarks.scenes import print_table
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
+Swing = tuple[Array, Array, Array, Array]
+"""Middles and amplitudes [rad or m], speeds [rad/s] and phases [rad]."""
 
 _SIZE, _RATE = (640, 480), 30.0
 # The focal length of pictures, over their height.
@@ -74,20 +83,16 @@ _COLOURS = (
 _GREYS = ((0.8,) * 3, (0.65,) * 3, (0.7,) * 3, (0.55,) * 3)
 _SPEED, _FASTEST = 2.8, 4.0
 _BOXES = 6
-# A frame is wrong where a joint is off by more [degrees].
-_WRONG = 10.0
+# How far a person walks [m], stands at rest [m], turns and swings [rad].
+_WALK, _RISE, _HEIGHT, _TURN, _NOD, _SWING = 0.25, 0.05, 1.55, 0.8, 0.15, 0.9
+# A frame is wrong where a joint is off by more [degrees], or a person's joint centre [mm].
+_WRONG_JOINT, _WRONG_CENTRE = 10.0, 150.0
 
 
 @dataclass(frozen=True)
 class Room:
-    """What stands about an arm.
-
-    Args:
-        name: of the table's row.
-        grey: whether arm and room are.
-        noise: of every pixel, of 255.
-        boxes: how many move about behind the arm.
-        post: whether one moves between the arm and the cameras.
+    """What stands about a body: grey or coloured, a pixel's noise (of 255), how many boxes move
+    about behind it, and whether a post moves between it and the cameras.
     """
 
     name: str
@@ -106,15 +111,8 @@ ROOMS = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """What is shown of a moment.
-
-    Args:
-        q: (nq,) the truth.
-        pictures: of each camera.
-        masks: exact, of each camera.
-    """
+class Frame(NamedTuple):
+    """The truth (nq,), and each camera's picture and exact mask of a moment."""
 
     q: Array
     pictures: list[Picture]
@@ -122,46 +120,70 @@ class Frame:
 
 
 @dataclass(frozen=True, eq=False)
-class ColourOutcome:
+class Outcome:
     """How one sequence was followed.
 
     Args:
-        errors: (frames, joints) [degrees].
-        deviations: (frames, joints) as the tracker says [degrees].
+        errors: (frames, joints) of joints [degrees], or of a person's joint centres [mm].
+        deviations: (frames, joints) as the tracker says [degrees]; nan of a person.
         lost: (frames,) whether the track was said to be.
         milliseconds: of the processor, for a frame.
+        limit: what is wrong is off by more.
     """
 
     errors: Array
     deviations: Array
     lost: Mask
     milliseconds: float
+    limit: float
 
     @property
-    def inside(self) -> float:
-        """The share of truths within two standard deviations."""
-        return float(np.mean(self.errors < 2.0 * self.deviations))
+    def inside(self) -> tuple[float, float]:
+        """The ratio of truths within two standard deviations; that in frames not said lost."""
+        held = self.errors < 2.0 * self.deviations
+        kept = held[~self.lost]
+        return float(held.mean()), float(kept.mean()) if kept.size else 0.0
 
     @property
     def wrong(self) -> Mask:
         """(frames,) where a joint is far off."""
-        return self.errors.max(axis=1) > _WRONG
+        return np.asarray(self.errors.max(axis=1) > self.limit)
+
+
+def arm_swing(model: ArticulatedModel, rng: np.random.Generator) -> Swing:
+    """Of all joints, as fast as may be."""
+    n = len(model.position_names)
+    low, high = np.maximum(model.lower, -2.9), np.minimum(model.upper, 2.9)
+    amplitude = rng.uniform(0.5, 0.9, n) * np.minimum(0.45 * (high - low), 1.2)
+    middle = (low + high) / 2 + rng.uniform(-0.2, 0.2, n)
+    speed = np.minimum(rng.uniform(0.5, 1.0, n) * _SPEED / amplitude, _FASTEST)
+    return middle, amplitude, speed, rng.uniform(0.0, 2.0 * np.pi, n)
+
+
+def person_swing(model: ArticulatedModel, rng: np.random.Generator) -> Swing:
+    """Who walks about, turns, and swings arms and legs."""
+    names, n = model.position_names, len(model.position_names)
+    low, high = np.maximum(model.lower, -2.9), np.minimum(model.upper, 2.9)
+    middle, amplitude, speed = np.zeros((3, n))
+    for k, name in enumerate(names):
+        if name.startswith("position_"):
+            amplitude[k] = _RISE if name == "position_z" else _WALK
+            middle[k] = _HEIGHT if name == "position_z" else 0.0
+            speed[k] = rng.uniform(0.8, 1.6)
+        elif name.startswith(("head_", "neck_")):
+            turns = name == "head_y"
+            amplitude[k], speed[k] = (_TURN, 1.0) if turns else (_NOD, 1.5)
+            middle[k] = rng.uniform(-3.0, 3.0) if turns else 0.0
+        else:
+            amplitude[k] = rng.uniform(0.4, 1.0) * min(0.35 * (high[k] - low[k]), _SWING)
+            ends = low[k] + amplitude[k], high[k] - amplitude[k]
+            middle[k] = np.clip(0.25 * (low[k] + high[k]), *ends)
+            speed[k] = rng.uniform(1.5, 3.0)
+    return middle, amplitude, speed, rng.uniform(0.0, 2.0 * np.pi, n)
 
 
 class ColourScene:
-    """An arm that moves before a room, drawn by Drake.
-
-    Attributes:
-        cameras: what is seen by.
-        rng: what room and motion are drawn from.
-
-    Args:
-        model: the arm.
-        room: what stands about it.
-        seed: of the room and the motion.
-        folder: where walls' textures are written.
-        size: of the pictures, width and height [pixel].
-    """
+    """A person or an arm that moves before a room, drawn by Drake; textures lie in a folder."""
 
     def __init__(
         self,
@@ -171,11 +193,23 @@ class ColourScene:
         folder: Path,
         size: tuple[int, int] = _SIZE,
     ) -> None:
-        self.rng, self._room, self._folder = np.random.default_rng(seed), room, folder
-        self.cameras: tuple[PinholeCamera, ...] = tuple(
-            _camera(f"camera{k}", eye, size) for k, eye in enumerate(_EYES)
-        )
+        self._model, self._rng, self._room = model, np.random.default_rng(seed), room
+        self._folder = folder
         self._joints, self._default = len(model.position_names), model.default_positions
+        self.cameras: Mapping[str, PinholeCamera]
+        if is_person(model):
+            field = np.radians(50.0)
+            self.cameras = circle_of_cameras(
+                4, radius=2.6, field_of_view=field, face_camera=False, size=size
+            )
+        else:
+            focal, centre = _FOCAL * size[1], (size[0] / 2 - 0.5, size[1] / 2 - 0.5)
+            self.cameras = {
+                f"camera{k}": PinholeCamera(
+                    f"camera{k}", *size, focal, focal, *centre, look_at(eye, (0.0, 0.0, 0.5))
+                )
+                for k, eye in enumerate(_EYES)
+            }
         builder = DiagramBuilder()
         self._plant, self._scene = AddMultibodyPlantSceneGraph(builder, 0.0)
         model.add_to(self._plant, self._scene)
@@ -201,13 +235,14 @@ class ColourScene:
 
     def frames(self, count: int) -> Iterator[Frame]:
         """The frames of the motion, drawn one by one."""
-        swing, paths = self.draw_swing(), self._draw_paths()
+        draw_swing = person_swing if is_person(self._model) else arm_swing
+        middle, amplitude, speed, phase = draw_swing(self._model, self._rng)
+        paths = self._draw_paths()
         context = self._diagram.CreateDefaultContext()
         own = self._plant.GetMyMutableContextFromRoot(context)
         query = self._scene.get_query_output_port()
         for k in range(count):
             moment = k / _RATE
-            middle, amplitude, speed, phase = swing
             q = middle + amplitude * np.sin(speed * moment + phase)
             q[self._held] = self._default[self._held]
             positions = self._plant.GetPositions(own).copy()
@@ -223,30 +258,20 @@ class ColourScene:
     def _draw(self, q: Array, query: QueryObject) -> Frame:
         """What the cameras see."""
         pictures, masks, world = [], [], self._scene.world_frame_id()
-        for camera in self.cameras:
+        for camera in self.cameras.values():
             color, _, X_WC = camera_to_drake(camera, renderer_name=_RENDERER)
             picture = query.RenderColorImage(color, world, X_WC).data[..., :3].copy()
             labels = query.RenderLabelImage(color, world, X_WC).data[..., 0]
             if self._room.noise:
-                noisy = picture + self.rng.normal(0.0, self._room.noise, picture.shape)
+                noisy = picture + self._rng.normal(0.0, self._room.noise, picture.shape)
                 picture = noisy.clip(0, 255).astype(np.uint8)
             pictures.append(picture)
             masks.append((labels < int(_OTHERS) // 2) & (labels >= 0))
         return Frame(q, pictures, masks)
 
-    def draw_swing(self) -> tuple[Array, Array, Array, Array]:
-        """Middles and amplitudes [rad], speeds [rad/s] and phases [rad] of the joints' swings."""
-        rng, n = self.rng, self._joints
-        low = np.maximum(self._plant.GetPositionLowerLimits()[:n], -2.9)
-        high = np.minimum(self._plant.GetPositionUpperLimits()[:n], 2.9)
-        amplitude = rng.uniform(0.5, 0.9, n) * np.minimum(0.45 * (high - low), 1.2)
-        middle = (low + high) / 2 + rng.uniform(-0.2, 0.2, n)
-        speed = np.minimum(rng.uniform(0.5, 1.0, n) * _SPEED / amplitude, _FASTEST)
-        return middle, amplitude, speed, rng.uniform(0.0, 2.0 * np.pi, n)
-
-    def _draw_paths(self) -> list[tuple[Array, Array, Array, Array]]:
+    def _draw_paths(self) -> list[Swing]:
         """Of each box: the middle and the amplitude [m], speed [rad/s] and phase [rad]."""
-        rng = self.rng
+        rng = self._rng
         return [
             (
                 rng.uniform(-2.5, 2.5, 3) + np.array([0.0, 0.0, 1.0]),
@@ -290,7 +315,7 @@ class ColourScene:
     def _add_walls(self) -> None:
         for k, (sides, place) in enumerate(_WALLS):
             path = self._folder / f"wall{k}.png"
-            _write_texture(path, self.rng, self._room.grey)
+            _write_texture(path, self._rng, self._room.grey)
             self._show(
                 self._plant.world_body(), RigidTransform(place), Box(*sides), (1.0,) * 3, path
             )
@@ -301,8 +326,8 @@ class ColourScene:
 
     def _add_box(self, number: int) -> RigidBody:
         body = self._add_body(f"box{number}")
-        shape = Box(*self.rng.uniform(0.3, 0.9, 3))
-        colour = self.rng.random(3)
+        shape = Box(*self._rng.uniform(0.3, 0.9, 3))
+        colour = self._rng.random(3)
         self._show(body, RigidTransform(), shape, tuple(colour))
         return body
 
@@ -312,21 +337,7 @@ class ColourScene:
         return body
 
 
-def _camera(name: str, eye: Sequence[float], size: tuple[int, int]) -> PinholeCamera:
-    """A camera that looks at the arm's middle."""
-    ahead = np.array([0.0, 0.0, 0.5]) - eye
-    ahead /= np.linalg.norm(ahead)
-    right = np.cross(ahead, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    X_WC = np.eye(4)
-    X_WC[:3, :3] = np.column_stack([right, np.cross(ahead, right), ahead])
-    X_WC[:3, 3] = eye
-    (width, height), focal = size, _FOCAL * size[1]
-    centre = (width / 2 - 0.5, height / 2 - 0.5)
-    return PinholeCamera(name, width, height, focal, focal, *centre, X_WC)
-
-
-def _behind(path: tuple[Array, Array, Array, Array], moment: float) -> Array:
+def _behind(path: Swing, moment: float) -> Array:
     """(3,) where a box is at a moment [s]: on the far side of the arm [m]."""
     middle, amplitude, speed, phase = path
     p_W = middle + amplitude * np.sin(speed * moment + phase)
@@ -351,9 +362,14 @@ def _write_texture(path: Path, rng: np.random.Generator, grey: bool) -> None:
     cv2.imwrite(str(path), (picture * 255.0).clip(0, 255).astype(np.uint8))
 
 
-def follow(
+def is_person(model: ArticulatedModel) -> bool:
+    """Whether it is the bundled person, who is followed as one."""
+    return model.path == bundled_model("person")
+
+
+def follow_arm(
     observation: ContourObservation, frames: Sequence[Frame], by_colour: bool
-) -> ColourOutcome:
+) -> Outcome:
     """Follows an arm that is known in the first frame, by its colours or by exact masks.
 
     The last joint is left out: the flange is round.
@@ -372,88 +388,99 @@ def follow(
         errors.append(np.abs(observation.positions(belief.mean)[0] - frame.q)[joints])
         deviations.append(belief.deviations()[: len(joints)])
         lost.append(track.lost)
-    return ColourOutcome(
-        np.degrees(errors[1:]),
-        np.degrees(deviations[1:]),
-        np.array(lost[1:]),
-        1e3 * float(np.median(seconds[1:])),
-    )
+    every = np.degrees(errors[1:]), np.degrees(deviations[1:]), np.array(lost[1:])
+    return Outcome(*every, 1e3 * float(np.median(seconds[1:])), _WRONG_JOINT)
+
+
+def follow_person(
+    model: ArticulatedModel,
+    cameras: Sequence[PinholeCamera],
+    frames: Sequence[Frame],
+    by_colour: bool,
+) -> Outcome:
+    """Follows a person who is known in the first frame, whose masks are given in both cases."""
+    tracker = PersonPoseTracker(ContourFit(model.pose_tree()))
+    landmarks = load_landmarks(model.path)
+    state = tracker.start(tracker.values(frames[0].q))
+    known: KnownColours = {}
+    errors, lost, seconds = [], [], []
+    for k, frame in enumerate(frames):
+        start = time.process_time()
+        pairs = list(zip(cameras, frame.masks, strict=True))
+        if by_colour:
+            views = ColourViews(cameras, frame.pictures, known)
+            if k > 0:
+                state = tracker.follow_by_colour(state, views)
+            regions = None if k else {camera.name: mask for camera, mask in pairs}
+            if not state.is_lost:
+                known = views.learned(tracker.fit, state.values, regions)
+        else:
+            seen = [see_silhouette(mask, edge_spacing(camera)) for camera, mask in pairs]
+            state = tracker.follow(state, FrameViews(cameras, seen)) or state
+        seconds.append(time.process_time() - start)
+        places = [
+            np.array(landmark_positions(model, landmarks, q))
+            for q in (tracker.positions(state.values), frame.q)
+        ]
+        errors.append(1e3 * np.linalg.norm(places[0] - places[1], axis=1))
+        lost.append(state.is_lost)
+    off = np.array(errors[1:])
+    spent = 1e3 * float(np.median(seconds[1:]))
+    return Outcome(off, np.full(off.shape, np.nan), np.array(lost[1:]), spent, _WRONG_CENTRE)
 
 
 def measure_room(
-    model: ArticulatedModel,
-    room: Room,
-    seed: int,
-    count: int,
-    size: tuple[int, int] = _SIZE,
-) -> tuple[ColourOutcome, ...]:
-    """Follows an arm before one room by exact masks and by colour.
-
-    Args:
-        model: the arm.
-        room: what stands about it.
-        seed: of the room and the motion.
-        count: how many frames.
-        size: of the pictures, width and height [pixel].
-    """
+    model: ArticulatedModel, room: Room, seed: int, count: int, size: tuple[int, int] = _SIZE
+) -> tuple[Outcome, Outcome]:
+    """Follows an arm or a person before one room, by exact masks and by colour."""
     with tempfile.TemporaryDirectory() as folder:
         scene = ColourScene(model, room, seed, Path(folder), size)
         frames = list(scene.frames(count))
-    observation = ContourObservation(make_tree(model, EstimateSettings(), None), scene.cameras)
-    follow(observation, frames[:2], True)
-    return follow(observation, frames, False), follow(observation, frames, True)
+    cameras = tuple(scene.cameras.values())
+    if is_person(model):
+        masks = follow_person(model, cameras, frames, False)
+        return masks, follow_person(model, cameras, frames, True)
+    observation = ContourObservation(make_tree(model, EstimateSettings(), None), cameras)
+    follow_arm(observation, frames[:2], True)
+    return follow_arm(observation, frames, False), follow_arm(observation, frames, True)
 
 
-def colour_table(
-    model: ArticulatedModel,
-    seed: int,
-    count: int,
-    size: tuple[int, int] = _SIZE,
-    rooms: Sequence[Room] = ROOMS,
-) -> Table:
-    """Errors of each room's run; arguments as of measure_room."""
-    table = Table(title=f"{count - 1} frames, seed {seed}; errors in degrees, median / p95")
-    for heading in ("", "masks", "colour", "ratio", "within 2 sd", "not lost", "lost", "wrong",
-                    "not said", "CPU ms, masks", "colour"):  # fmt: skip
-        table.add_column(heading, justify="right" if heading else "left")
-    for room in rooms:
-        masks, colour = measure_room(model, room, seed, count, size)
-        medians = [float(np.median(one.errors)) for one in (masks, colour)]
-        kept = ~colour.lost
-        held = np.mean(colour.errors[kept] < 2.0 * colour.deviations[kept]) if kept.any() else 0.0
-        table.add_row(
-            room.name,
-            *(f"{np.median(one.errors):.2f} / {np.percentile(one.errors, 95):.1f}"
-              for one in (masks, colour)),
-            f"{medians[1] / medians[0]:.1f}",
-            f"{colour.inside:.2f}",
-            f"{held:.2f}",
-            str(np.count_nonzero(colour.lost)),
-            str(np.count_nonzero(colour.wrong)),
-            str(np.count_nonzero(colour.wrong & kept)),
-            f"{masks.milliseconds:.0f}",
-            f"{colour.milliseconds:.0f}",
-        )  # fmt: skip
-    return table
+def _row(name: str, masks: Outcome, colour: Outcome) -> tuple[str, ...]:
+    both = (masks, colour)
+    errors = [(np.mean(x.errors), np.median(x.errors), np.percentile(x.errors, 95)) for x in both]
+    return (
+        name,
+        *(f"{mean:.1f}, {median:.2f}, {p95:.1f}" for mean, median, p95 in errors),
+        *(f"{ratio:.2f}" for ratio in colour.inside),
+        str(np.count_nonzero(colour.lost)),
+        str(np.count_nonzero(colour.wrong)),
+        str(np.count_nonzero(colour.wrong & ~colour.lost)),
+        *(f"{one.milliseconds:.0f}" for one in both),
+    )
 
 
 def main() -> None:
-    """Print how well an arm is followed by colour alone, and when the track is said to be lost."""
+    """Print how well an arm or a person is followed by colour alone, and when it is said lost."""
     parser = argparse.ArgumentParser(description="Tracking by colour: errors and times.")
-    parser.add_argument("model", type=Path, help="the model file of an arm")
+    parser.add_argument("model", type=Path, nargs="?", help="the model file of an arm")
     parser.add_argument("--seed", type=int, default=0, help="of the rooms and the motion")
-    parser.add_argument("--frames", type=int, default=90, help="of each run")
-    parser.add_argument(
-        "--size", type=int, nargs=2, default=_SIZE, metavar=("WIDTH", "HEIGHT"),
-        help="of the pictures [pixel]",
-    )  # fmt: skip
+    parser.add_argument("--frames", type=int, help="of each run")
+    parser.add_argument("--size", type=int, nargs=2, default=_SIZE, help="of the pictures [pixel]")
     parser.add_argument("--easy", action="store_true", help="the first room alone")
     asked = parser.parse_args()
-    model = load_model(asked.model, check=False)
-    rooms = ROOMS[:1] if asked.easy else ROOMS
-    Console(width=160).print(
-        colour_table(model, asked.seed, asked.frames, tuple(asked.size), rooms)
-    )
+    model = load_model(asked.model or bundled_model("person"), check=False)
+    frames = asked.frames or (90 if asked.model else 60)
+    rows = [
+        _row(room.name, *measure_room(model, room, asked.seed, frames, tuple(asked.size)))
+        for room in (ROOMS[:1] if asked.easy else ROOMS)
+    ]
+    unit = "degrees" if asked.model else "mm"
+    print_table(
+        f"{frames - 1} frames, seed {asked.seed}; errors in {unit}: mean, median, p95",
+        ("", "masks", "colour", "within 2 sd", "not lost", "lost", "wrong", "not said",
+         "CPU ms, masks", "colour"),
+        rows,
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -12,12 +12,10 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import load_model
@@ -30,6 +28,7 @@ from drake_pose.results.settings import EstimateSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.silhouette.pictures.scenes import load_scene
+from tests.benchmarks.scenes import print_table
 from tests.benchmarks.speed import measure_kernel
 
 _SEQUENCE_FRAMES = 24
@@ -38,34 +37,21 @@ _IMAGES = 20
 _ARM_JOINTS = ("A1", "A2", "A3", "A4")
 
 
-@dataclass(frozen=True)
-class Work:
-    """One row: an estimate of a scene.
-
-    Args:
-        name: what is done.
-        scene: its folder.
-        model: the body's model file.
-        settings: of the estimate.
-        first: so many frames are not counted, as the search is asked in them.
-        joints: whose errors are told, by joint_angles.csv beside the scene.
+class Work(NamedTuple):
+    """One row: an estimate of a scene with a model. So many frames are not counted, as the search
+    is asked in them; the errors of some joints are told, by joint_angles.csv beside the scene.
     """
 
     name: str
     scene: Path
     model: Path
-    settings: EstimateSettings = field(default_factory=EstimateSettings)
-    first: int = 0
+    settings: EstimateSettings = EstimateSettings()
+    uncounted: int = 0
     joints: tuple[str, ...] = ()
 
 
 def works(data: Path | None, folder: Path) -> Iterator[Work]:
-    """The rows whose scenes are there.
-
-    Args:
-        data: the folder of scenes; None: there is none.
-        folder: an empty folder for what is drawn.
-    """
+    """The rows whose scenes are there; what is drawn goes to a folder."""
     yield Work(
         "demo: man, one view", demo_scene(), bundled_model("man"), demo_settings(demo_scene())
     )
@@ -76,7 +62,7 @@ def works(data: Path | None, folder: Path) -> Iterator[Work]:
         model = arm / "med7" / "med7.urdf"
         yield Work("arm, two views, one pose", arm, model, joints=_ARM_JOINTS)
         drawn = draw_arm_sequence(arm, folder / "arm_sequence")
-        yield Work("arm, two views, sequence", drawn, model, first=2, joints=_ARM_JOINTS)
+        yield Work("arm, two views, sequence", drawn, model, uncounted=2, joints=_ARM_JOINTS)
     if human.is_dir():
         settings = EstimateSettings(
             frames=("0010", "0011"),
@@ -92,17 +78,11 @@ def works(data: Path | None, folder: Path) -> Iterator[Work]:
     if sequence.is_dir():
         right = bundled_model("hand").with_name("right_hand.urdf")
         frames = EstimateSettings(frames=(f"0000:{_SEQUENCE_FRAMES - 1:04d}",))
-        yield Work("hand, sequence, no camera known", sequence, right, frames, first=1)
+        yield Work("hand, sequence, no camera known", sequence, right, frames, uncounted=1)
 
 
 def draw_arm_sequence(arm: Path, out: Path, frames: int = _SEQUENCE_FRAMES) -> Path:
-    """The recorded arm on its way from its first pose to its second, drawn by Drake.
-
-    Args:
-        arm: the recorded scene: cameras.yaml, joint_angles.csv, med7/med7.urdf.
-        out: the new scene's folder.
-        frames: how many.
-    """
+    """A scene of the recorded arm on its way from its first pose to its second, drawn by Drake."""
     model, scene = load_model(arm / "med7" / "med7.urdf", check=False), load_scene(arm)
     with (arm / "joint_angles.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.reader(file))
@@ -134,11 +114,11 @@ def measure(work: Work) -> tuple[float, float, str]:
     def note(*_: object) -> None:
         ends.append(time.process_time())
 
-    for _ in range(2 if work.first == 0 else 1):
+    for _ in range(2 if work.uncounted == 0 else 1):
         ends.clear()
         found = estimate_scene(work.scene, work.model, None, work.settings, on_frame=note)
-    seconds = np.diff(ends)[work.first :]
-    rows = found.rows[work.first :]
+    seconds = np.diff(ends)[work.uncounted :]
+    rows = found.rows[work.uncounted :]
     E_total = float(np.mean([row.error for row in rows]))
     return float(np.median(seconds)), E_total, _error(work, rows, found.position_names)
 
@@ -159,39 +139,29 @@ def _error(work: Work, rows: tuple[PoseRow, ...], names: tuple[str, ...]) -> str
     return f"{work.joints[0]} to {work.joints[-1]}: {np.median(near):.2f} deg in the median"
 
 
-def estimates_table(data: Path | None, folder: Path, label_image: float) -> Table:
-    """All rows.
-
-    Args:
-        data, folder: as in works.
-        label_image: the time of one of Drake's label images of one segment here [s].
-    """
-    table = Table(title="Estimates: CPU time a frame, one core")
-    for heading in ("work", "a frame", "label images", "E_total", "error"):
-        table.add_column(heading, justify="left" if heading in ("work", "error") else "right")
+def _rows(data: Path | None, folder: Path) -> Iterator[tuple[str, ...]]:
+    label_image = measure_kernel().label_image_microseconds * 1e-6
     for work in works(data, folder):
         seconds, E_total, error = measure(work)
-        table.add_row(
-            work.name, f"{seconds:.3f} s", f"{seconds / label_image:.0f}", f"{E_total:.2%}", error
-        )
+        yield work.name, f"{seconds:.3f} s", f"{seconds / label_image:.0f}", f"{E_total:.2%}", error
     plain = continuous_figures(run_experiment(continuous_search(), _IMAGES, seed=1))
-    seconds = float(plain["median_seconds"] or 0.0) + float(plain["mean_interval_seconds"] or 0.0)
-    table.add_row(
+    seconds = plain["median_seconds"] + plain["mean_interval_seconds"]
+    yield (
         "continuous angles, one view, exact masks",
         f"{seconds:.3f} s",
         f"{seconds / label_image:.0f}",
         f"{plain['median_e_total']:.2%}",
         f"intervals hold {plain['interval_coverage']:.0%}, {plain['determined']:.0%} determined",
     )
-    return table
 
 
 def main() -> None:
     """Print what estimates cost and reach here."""
     data = Path(sys.argv[1]) if len(sys.argv) > 1 else None
-    label_image = measure_kernel().label_image_microseconds * 1e-6
     with tempfile.TemporaryDirectory() as folder:
-        Console(width=120).print(estimates_table(data, Path(folder), label_image))
+        headings = ("work", "a frame", "label images", "E_total", "error")
+        title = "Estimates: CPU time a frame, one core"
+        print_table(title, headings, _rows(data, Path(folder)))
 
 
 if __name__ == "__main__":

@@ -13,18 +13,16 @@ import json
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.table import Table
 
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.results.settings import EstimateSettings
+from tests.benchmarks.scenes import print_table
 
 Array = NDArray[np.float64]
 
@@ -34,20 +32,13 @@ FLEXIONS = tuple(
 )
 
 
-@dataclass(frozen=True, eq=False)
-class HandOutcome:
+class HandOutcome(NamedTuple):
     """How one sequence was estimated.
 
-    Args:
-        errors: (frames, 12) of FLEXIONS [deg].
-        inside: (frames, 12) whether the truth lies in the interval that is given; no interval holds
-            nothing.
-        widths: (frames, 12) of these intervals [deg]; nan where there is none.
-        lengths: estimated over true length of palm, first and second bone (4, 3) of FINGERS; nan
-            where none are given.
-        E_total: in the mean.
-        families: how many explanations of the sequence are given, in the median.
-        milliseconds: of the processor a frame: all of it, the fit of the body included.
+    (frames, 12) errors of FLEXIONS, whether the truth lies in the interval given and its width
+    [deg], nan where there is none; (4, 3) estimated over true length of palm, first and second bone
+    of FINGERS; E_total in the mean, explanations in the median, milliseconds of the processor a
+    frame, the fit of the body included.
     """
 
     errors: Array
@@ -60,11 +51,7 @@ class HandOutcome:
 
 
 def measure_sequence(folder: Path) -> HandOutcome:
-    """Estimates a sequence and compares it with the truth beside it.
-
-    Args:
-        folder: with masks, scene.yaml, joint_angles.csv; lengths.json lies above it.
-    """
+    """Estimates a sequence and compares it with joint_angles.csv, and lengths.json above it."""
     model = bundled_model("hand").with_name("right_hand.urdf")
     begin = time.process_time()
     found = estimate_scene(folder, model, None, EstimateSettings(), overlay=False)
@@ -108,32 +95,33 @@ def _compare(summary: Mapping[str, Any], true: Mapping[str, Any]) -> Array:
     return ratios
 
 
+def _row(folder: Path) -> tuple[str, ...]:
+    one = measure_sequence(folder)
+    print(folder.name, file=sys.stderr)
+    return (
+        folder.name,
+        f"{np.median(np.abs(one.errors)):.1f}",
+        f"{np.abs(one.errors).mean():.1f}",
+        f"{one.inside.mean():.0%}",
+        f"{np.nanmedian(one.widths):.0f}",
+        f"{np.median(np.abs(one.lengths - 1.0)):.0%}",
+        *(f"{ratio:.2f}" for ratio in np.median(one.lengths, axis=0)),
+        f"{one.E_total:.1%}",
+        str(one.families),
+        f"{one.milliseconds:.0f}",
+    )
+
+
 def main() -> None:
     """Print what each sequence comes to."""
     data = Path(sys.argv[1])
     names = sys.argv[2:] or sorted(path.parent.name for path in data.glob("*/scene.yaml"))
-    table = Table(title="Hands in sequences, camera unknown")
-    for heading in (
+    headings = (
         *("sequence", "flexions off, median", "mean", "inside", "intervals", "lengths off"),
         *("palm", "1st bone", "2nd", "E_total", "families", "ms a frame"),
-    ):
-        table.add_column(heading, justify="left" if heading == "sequence" else "right")
-    for name in names:
-        one = measure_sequence(data / name)
-        table.add_row(
-            name,
-            f"{np.median(np.abs(one.errors)):.1f}",
-            f"{np.abs(one.errors).mean():.1f}",
-            f"{one.inside.mean():.0%}",
-            f"{np.nanmedian(one.widths):.0f}",
-            f"{np.median(np.abs(one.lengths - 1.0)):.0%}",
-            *(f"{ratio:.2f}" for ratio in np.median(one.lengths, axis=0)),
-            f"{one.E_total:.1%}",
-            str(one.families),
-            f"{one.milliseconds:.0f}",
-        )
-        print(name, file=sys.stderr)
-    Console(width=140).print(table)
+    )
+    rows = [_row(data / name) for name in names]
+    print_table("Hands in sequences, camera unknown", headings, rows)
 
 
 if __name__ == "__main__":

@@ -6,45 +6,22 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from rich.console import Console
-from rich.table import Table
+from tests.benchmarks.scenes import print_table
 
 LIMIT_MIB = 1536
 """No command takes more on the project's own data [MiB]."""
 
 
-@dataclass(frozen=True)
-class PeakMemory:
-    """What one command took.
-
-    Args:
-        words: the command line, without the program.
-        exit_code: 0 if it did its work.
-        mebibytes: the most memory that its process had, or one of its workers [MiB].
-        seconds: of the processor, with the workers [s].
-    """
-
-    words: tuple[str, ...]
-    exit_code: int
-    mebibytes: float
-    seconds: float
-
-
 def measure_memory(
     words: Sequence[str], program: Sequence[str] = ("-m", "drake_pose.commands.main")
-) -> PeakMemory:
-    """Runs a command in a process of its own.
+) -> tuple[int, float, float]:
+    """Runs a command in a process of its own: its exit status, peak memory [MiB], CPU seconds.
 
-    Linux never counts less than what the process that measures had, so that this one should have
-    little.
-
-    Args:
-        words: as on the command line, without the program.
-        program: what Python runs.
+    The memory is the most that it had, or one of its workers; Linux never counts less than what the
+    process that measures had, so that this one should have little.
     """
     quiet = subprocess.DEVNULL
     process = subprocess.Popen(
@@ -55,16 +32,11 @@ def measure_memory(
     process.returncode = os.waitstatus_to_exitcode(status)
     # macOS counts bytes, Linux kibibytes.
     unit = 1024**2 if sys.platform == "darwin" else 1024
-    seconds = usage.ru_utime + usage.ru_stime
-    return PeakMemory(tuple(words), process.returncode, usage.ru_maxrss / unit, seconds)
+    return process.returncode, usage.ru_maxrss / unit, usage.ru_utime + usage.ru_stime
 
 
 def benchmark_commands(folder: Path) -> list[list[str]]:
-    """Command lines that need no data but the project's own.
-
-    Args:
-        folder: for their results.
-    """
+    """Command lines that need no data but the project's own; a folder for their results."""
     kameda = ["reproduce", "kameda", "--images"]
     return [
         ["demo", "--out", str(folder / "demo")],
@@ -78,29 +50,19 @@ def benchmark_commands(folder: Path) -> list[list[str]]:
     ]
 
 
-def memory_table() -> Table:
-    """What each of the commands takes."""
-    table = Table(title=f"Peak memory of a process (limit: {LIMIT_MIB} MiB)")
-    table.add_column("drake-pose ...")
-    for heading in ("peak", "CPU", "exit"):
-        table.add_column(heading, justify="right")
-    with tempfile.TemporaryDirectory(prefix="drake_pose_") as folder:
-        for words in benchmark_commands(Path(folder)):
-            took = measure_memory(words)
-            shown = " ".join(words).replace(f"{folder}{os.sep}", "")
-            beyond = " (too much)" if took.mebibytes > LIMIT_MIB else ""
-            table.add_row(
-                shown,
-                f"{took.mebibytes:.0f} MiB{beyond}",
-                f"{took.seconds:.0f} s",
-                str(took.exit_code),
-            )
-    return table
+def _rows(folder: Path) -> Iterator[tuple[str, ...]]:
+    for words in benchmark_commands(folder):
+        status, peak, seconds = measure_memory(words)
+        shown = " ".join(words).replace(f"{folder}{os.sep}", "")
+        beyond = " (too much)" if peak > LIMIT_MIB else ""
+        yield shown, f"{peak:.0f} MiB{beyond}", f"{seconds:.0f} s", str(status)
 
 
 def main() -> None:
     """Print the table."""
-    Console().print(memory_table())
+    with tempfile.TemporaryDirectory(prefix="drake_pose_") as folder:
+        title = f"Peak memory of a process (limit: {LIMIT_MIB} MiB)"
+        print_table(title, ("drake-pose ...", "peak", "CPU", "exit"), _rows(Path(folder)))
 
 
 if __name__ == "__main__":

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import tempfile
 import time
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from pydrake.geometry import MakeRenderEngineVtk, RenderEngineVtkParams
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import RgbdSensor
-from rich.console import Console
-from rich.table import Table
 
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import load_model
@@ -23,12 +21,12 @@ from drake_pose.camera.models import PinholeCamera
 from drake_pose.camera.rigs import look_at
 from drake_pose.silhouette.pictures.label_images import EMPTY, label_data
 from drake_pose.systems.pictures.silhouette_camera import SilhouetteCamera
+from tests.benchmarks.scenes import print_table
 from tests.benchmarks.speed import limb_mesh, obj_text
 
 _RENDERER = "benchmark"
 _BEND = 0.7
 _ROUNDS = 5
-
 ARM_LINKS = 15
 _LINK = """
 <link name="link_{k}"><visual><origin xyz="0 0 0.06"/><geometry>
@@ -38,19 +36,11 @@ _LINK = """
   <limit lower="-1" upper="1" effort="1" velocity="1"/></joint>"""
 
 
-@dataclass(frozen=True)
-class CameraFigures:
-    """What a label image costs, poses of the bodies included.
-
-    Args:
-        links, triangles: of the model.
-        ours: mean CPU time of an image of SilhouetteCamera [s].
-        drakes: the same of RgbdSensor [s].
-        worst, mean: pixels whose labels differ, over the body's pixels.
+class CameraFigures(NamedTuple):
+    """The mean CPU time of an image of SilhouetteCamera and of RgbdSensor [s], poses of the bodies
+    included, and the pixels whose labels differ, over the body's pixels.
     """
 
-    links: int
-    triangles: int
     ours: float
     drakes: float
     worst: float
@@ -58,11 +48,7 @@ class CameraFigures:
 
 
 def arm_model(folder: Path) -> ParsedModel:
-    """An arm of 15 links of 480 triangles, each 13 cm long and 12 cm from the next.
-
-    Args:
-        folder: where its files are written.
-    """
+    """An arm of 15 links of 480 triangles, 13 cm long, 12 cm apart; its files lie in a folder."""
     mesh = folder / "link.obj"
     mesh.write_text(obj_text(limb_mesh(16, 16)))
     links = [
@@ -81,13 +67,7 @@ def arm_model(folder: Path) -> ParsedModel:
 
 
 def measure_camera(model: ParsedModel, camera: PinholeCamera, poses: int = 100) -> CameraFigures:
-    """Compares labels and CPU time of both cameras over random poses.
-
-    Args:
-        model: the body; joints are bent by up to 0.7 rad.
-        camera: where both cameras are.
-        poses: how many.
-    """
+    """Compares labels and CPU time of both cameras over random poses, bent by up to 0.7 rad."""
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
     model.add_to(plant, scene_graph)
@@ -104,71 +84,50 @@ def measure_camera(model: ParsedModel, camera: PinholeCamera, poses: int = 100) 
     low, high = np.maximum(model.lower, -_BEND), np.minimum(model.upper, _BEND)
     held = np.char.startswith(np.array(model.position_names), "position_")
     q = np.where(held, 0.0, rng.uniform(low, np.maximum(low, high), (poses, len(low))))
-    outputs = ours.GetOutputPort("label_image"), sensor.label_image_output_port()
-    images = [_images(diagram, plant, context, port, q) for port in outputs]
-    bodies = [labels != EMPTY for labels in images[1][0]]
-    shares = [
-        np.count_nonzero(one != other) / np.count_nonzero(body)
-        for one, other, body in zip(images[0][0], images[1][0], bodies, strict=True)
+    own = plant.GetMyMutableContextFromRoot(context)
+    labels, seconds = [], []
+    for port in (ours.GetOutputPort("label_image"), sensor.label_image_output_port()):
+        port_context = port.get_system().GetMyContextFromRoot(context)
+        port.Eval(port_context)
+        images, spent = [], np.zeros((poses, _ROUNDS))
+        for k, positions in enumerate(q):
+            for j in range(_ROUNDS):
+                plant.SetPositions(own, positions)
+                start = time.process_time()
+                image = port.Eval(port_context)
+                spent[k, j] = time.process_time() - start
+            images.append(label_data(image).copy())
+        labels.append(images)
+        seconds.append(float(spent.min(axis=1).mean()))
+    differing = [
+        np.count_nonzero(one != other) / np.count_nonzero(other != EMPTY)
+        for one, other in zip(*labels, strict=True)
     ]
-    triangles = sum(len(mesh.triangles) for mesh in model.link_meshes.values())
-    return CameraFigures(
-        len(model.link_meshes),
-        triangles,
-        images[0][1],
-        images[1][1],
-        max(shares),
-        float(np.mean(shares)),
-    )
-
-
-def _images(
-    diagram: Diagram, plant: MultibodyPlant, context: Context, port: OutputPort, q: np.ndarray
-) -> tuple[list[np.ndarray], float]:
-    """The label images of poses q (n, nq), and the mean CPU time of one, least of rounds [s]."""
-    own = port.get_system().GetMyContextFromRoot(context)
-    plant_context = plant.GetMyMutableContextFromRoot(context)
-    images, seconds = [], []
-    port.Eval(own)
-    for positions in q:
-        rounds = []
-        for _ in range(_ROUNDS):
-            plant.SetPositions(plant_context, positions)
-            start = time.process_time()
-            image = port.Eval(own)
-            rounds.append(time.process_time() - start)
-        seconds.append(min(rounds))
-        images.append(label_data(image).copy())
-    return images, float(np.mean(seconds))
+    return CameraFigures(*seconds, max(differing), float(np.mean(differing)))
 
 
 def main() -> None:
     """Print what a label image of 640 x 480 pixels costs with and without a renderer."""
-    table = Table(title="A label image, 640 x 480 pixels, CPU time (least of 5, mean of 100 poses)")
-    for heading in ("body", "links", "triangles", "SilhouetteCamera", "RgbdSensor", "ratio",
-                    "labels differ, worst", "mean"):  # fmt: skip
-        table.add_column(heading, justify="right")
+    rows = []
     with tempfile.TemporaryDirectory() as folder:
-        arm, man = arm_model(Path(folder)), load_model(bundled_model("man"))
         for name, model, eye, target in (
-            ("arm", arm, (2.0, 0.0, 0.6), (0.0, 0.0, 0.6)),
-            ("man", man, (2.5, 0.0, 0.3), (0.0, 0.0, 0.0)),
+            ("arm", arm_model(Path(folder)), (2.0, 0.0, 0.6), (0.0, 0.0, 0.6)),
+            ("man", load_model(bundled_model("man")), (2.5, 0.0, 0.3), (0.0, 0.0, 0.0)),
         ):
-            camera = PinholeCamera(
-                "front", 640, 480, 540.0, 540.0, 319.5, 239.5, look_at(eye, target)
-            )
+            X_WC = look_at(eye, target)
+            camera = PinholeCamera("front", 640, 480, 540.0, 540.0, 319.5, 239.5, X_WC)
             one = measure_camera(model, camera)
-            table.add_row(
-                name,
-                str(one.links),
-                f"{one.triangles:,}",
-                f"{one.ours * 1e3:.2f} ms",
-                f"{one.drakes * 1e3:.2f} ms",
-                f"{one.drakes / one.ours:.1f}",
-                f"{one.worst:.3%}",
-                f"{one.mean:.3%}",
-            )
-    Console(width=140).print(table)
+            triangles = sum(len(mesh.triangles) for mesh in model.link_meshes.values())
+            times = f"{one.ours * 1e3:.2f} ms", f"{one.drakes * 1e3:.2f} ms"
+            ratio, differ = f"{one.drakes / one.ours:.1f}", f"{one.worst:.3%}"
+            links = str(len(model.link_meshes))
+            rows.append((name, links, f"{triangles:,}", *times, ratio, differ, f"{one.mean:.3%}"))
+    print_table(
+        "A label image, 640 x 480 pixels, CPU time (least of 5, mean of 100 poses)",
+        ("body", "links", "triangles", "SilhouetteCamera", "RgbdSensor", "ratio",
+         "labels differ, worst", "mean"),
+        rows,
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import resource
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import cv2
 import numpy as np
+import trimesh
 from pydrake.common import MemoryFile
 from pydrake.geometry import (
     FramePoseVector,
@@ -22,9 +23,8 @@ from pydrake.geometry import (
     RenderLabel,
     SceneGraph,
 )
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 from rich.console import Console
-from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from drake_pose.body.files.packages import bundled_model
@@ -43,37 +43,25 @@ from drake_pose.person.date.walking_motion import FEWEST_FRAMES, MOTIONS, make_m
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import prefix_sums, score_bodies
 from drake_pose.systems.colour_images import picture_to_colour_image
+from tests.benchmarks.scenes import print_table
 from tests.silhouette.agreement import measure_agreement
 
 _RENDERER = "benchmark"
-_SIDE = 700
-_SCALE = 226.0
-"""Kameda's: 2.26 pixels a centimetre."""
-
-_RADIUS = 0.088
-_LENGTH = 0.44
-_CANDIDATES = 1000
-_IMAGES = 30
+# Kameda's: 2.26 pixels a centimetre.
+_SIDE, _SCALE = 700, 226.0
+_RADIUS, _LENGTH = 0.088, 0.44
+_CANDIDATES, _IMAGES = 1000, 30
+_CAMERAS, _FRAMES = (4, 8, 16), 12
 
 
-@dataclass(frozen=True)
-class KernelFigures:
-    """What one segment costs in one core, in one process.
-
-    Args:
-        triangles: the segment's triangles.
-        kernel_microseconds: time to score one candidate against two sets [us].
-        label_image_microseconds: time of one Drake label image of the segment [us].
+class KernelFigures(NamedTuple):
+    """Of one segment, its triangles, and the time to score one candidate against two sets and of
+    one Drake label image [us].
     """
 
     triangles: int
     kernel_microseconds: float
     label_image_microseconds: float
-
-    @property
-    def ratio(self) -> float:
-        """Candidates scored in the time of one label image."""
-        return self.label_image_microseconds / self.kernel_microseconds
 
 
 def measure_kernel(columns: int = 14, rows: int = 16, seed: int = 0) -> KernelFigures:
@@ -101,24 +89,10 @@ def measure_kernel(columns: int = 14, rows: int = 16, seed: int = 0) -> KernelFi
 
 
 def limb_mesh(columns: int, rows: int) -> TriangleMesh:
-    """Returns a closed ellipsoid of 2 columns (rows - 1) triangles."""
-    polar = np.pi * np.arange(1, rows) / rows
-    around = 2.0 * np.pi * np.arange(columns) / columns
-    ring = np.column_stack([np.cos(around), np.sin(around), np.zeros(columns)])
-    rings = ring * np.sin(polar)[:, None, None]
-    rings[:, :, 2] = np.cos(polar)[:, None]
-    unit = np.vstack([[[0.0, 0.0, 1.0]], rings.reshape(-1, 3), [[0.0, 0.0, -1.0]]])
-    following = np.roll(np.arange(columns), -1)
-    last = len(unit) - 1
-    triangles = [[0, 1 + a, 1 + b] for a, b in enumerate(following)]
-    for first in range(1, 1 + columns * (rows - 2), columns):
-        for a, b in enumerate(following):
-            lower = first + columns
-            triangles += [[first + a, lower + a, lower + b], [first + a, lower + b, first + b]]
-    first = last - columns
-    triangles += [[first + a, last, first + b] for a, b in enumerate(following)]
+    """Returns a closed ellipsoid of 2 columns (rows - 1) triangles; columns is even."""
+    sphere = trimesh.creation.uv_sphere(count=[rows + 1, columns // 2])
     semi_axes = np.array([_RADIUS, _RADIUS, 0.5 * _LENGTH])
-    return TriangleMesh(unit * semi_axes, np.array(triangles, dtype=np.int32))
+    return TriangleMesh(sphere.vertices * semi_axes, np.asarray(sphere.faces, dtype=np.int32))
 
 
 def _label_images(
@@ -137,9 +111,7 @@ def _label_images(
     scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(RenderEngineVtkParams()))
     context = scene_graph.CreateDefaultContext()
     color, _, X_WC = camera_to_drake(camera, renderer_name=_RENDERER)
-    poses = [
-        RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), X[:3, 3]) for X in X_CN
-    ]
+    poses = [RigidTransform(X) for X in X_CN]
 
     def render() -> None:
         for pose in poses:
@@ -154,11 +126,8 @@ def _label_images(
 
 def obj_text(mesh: TriangleMesh) -> str:
     """Returns a mesh as OBJ text with normals, which Drake's VTK engine insists on."""
-    normals = mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True)
-    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in mesh.vertices.tolist()]
-    lines += [f"vn {x!r} {y!r} {z!r}" for x, y, z in normals.tolist()]
-    lines += [f"f {a}//{a} {b}//{b} {c}//{c}" for a, b, c in (mesh.triangles + 1).tolist()]
-    return "\n".join(lines) + "\n"
+    surface = trimesh.Trimesh(mesh.vertices, mesh.triangles, process=False)
+    return str(surface.export(file_type="obj", include_normals=True))
 
 
 def _fastest(function: Callable[[], object], repeats: int) -> float:
@@ -172,19 +141,10 @@ def _fastest(function: Callable[[], object], repeats: int) -> float:
     return min(times)
 
 
-CAMERAS = (4, 8, 16)
-_FRAMES = 12
-
-
 def measure_cost(cameras: int, size: tuple[int, int] = (640, 480), seed: int = 0) -> np.ndarray:
     """Processor time of region and edge, and of the pose (2,), a frame [ms], the medians.
 
-    The person walks, and is known where the measurement begins.
-
-    Args:
-        cameras: how many, the face camera included.
-        size: width and height of the pictures [pixel].
-        seed: of noise and motion.
+    A person walks before this many cameras, the face camera included, and is known at first.
     """
     studio = Studio.build(cameras, size, np.random.default_rng([seed, 1]))
     motion = make_motion(studio.skeleton, 4 * FEWEST_FRAMES, seed)
@@ -203,62 +163,48 @@ def measure_cost(cameras: int, size: tuple[int, int] = (640, 480), seed: int = 0
     return np.asarray(np.median(laps, axis=0))
 
 
-def cost_table(counts: Sequence[int] = CAMERAS) -> Table:
-    """The cost for each number of cameras, and for each camera."""
-    table = Table(title="Date, all silhouettes, 640 x 480, one core: milliseconds a frame")
-    for heading in ("cameras", "region and edge", "pose", "all", "a camera"):
-        table.add_column(heading, justify="right")
-    for cameras in counts:
-        seen, pose = measure_cost(cameras)
-        whole = seen + pose
-        each = whole / cameras
-        table.add_row(str(cameras), *(f"{cost:.1f}" for cost in (seen, pose, whole, each)))
-    return table
-
-
-def main() -> None:
-    """Print what kernel, agreement with Drake, Date's capture and experiment A come to here."""
-    console = Console()
-    table = Table(title="One segment, 700 x 700 pixels, one core")
-    for heading in ("triangles", "kernel, a candidate", "Drake label image", "ratio"):
-        table.add_column(heading, justify="right")
-    for columns, rows in ((14, 16), (72, 71)):
-        figures = measure_kernel(columns, rows)
-        table.add_row(
-            str(figures.triangles),
-            f"{figures.kernel_microseconds:.1f} us",
-            f"{figures.label_image_microseconds:.0f} us",
-            f"{figures.ratio:.0f}",
-        )
-    console.print(table)
-    console.print(_agreement_table())
-    console.print(cost_table())
-    start = time.process_time()
-    result = run_experiment(experiment_search())
-    seconds = time.process_time() - start
-    console.print(grid_table([[result]]))
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    console.print(f"experiment A: {seconds:.1f} s CPU on one core; peak memory {memory:.0f} MiB")
-
-
-def _agreement_table() -> Table:
+def _agreement_rows() -> Iterator[tuple[str, ...]]:
     """The span kernel against Drake's label images, 200 random poses of each bundled body."""
-    table = Table(title="XOR of the kernel's masks and Drake's, 200 random poses")
-    for heading in ("body", "projection", "worst", "mean"):
-        table.add_column(heading)
     parallel = experiment_camera()
-    pinhole = PinholeCamera(
-        "front", 700, 700, 1130.0, 1130.0, parallel.center_x, parallel.center_y, parallel.X_WC
-    )
+    centre = parallel.center_x, parallel.center_y
+    pinhole = PinholeCamera("front", _SIDE, _SIDE, 1130.0, 1130.0, *centre, parallel.X_WC)
     cameras: dict[str, Camera] = {"parallel": parallel, "pinhole": pinhole}
     held = dict.fromkeys(("position_x", "position_y", "position_z"), 0.0)
     for name in ("woman", "man"):
         model = load_model(bundled_model(name))
         for projection, camera in cameras.items():
-            share, differing, _ = measure_agreement(model, camera, held=held)
-            worst, mean = f"{share:.3%}", f"{differing:.4%}"
-            table.add_row(name, projection, worst, mean)
-    return table
+            worst, mean, _ = measure_agreement(model, camera, held=held)
+            yield name, projection, f"{worst:.3%}", f"{mean:.4%}"
+
+
+def main() -> None:
+    """Print what kernel, agreement with Drake, Date's capture and experiment A come to here."""
+    rows = []
+    for columns, rings in ((14, 16), (72, 71)):
+        triangles, kernel, image = measure_kernel(columns, rings)
+        rows.append(
+            (str(triangles), f"{kernel:.1f} us", f"{image:.0f} us", f"{image / kernel:.0f}")
+        )
+    headings: tuple[str, ...] = ("triangles", "kernel, a candidate", "Drake label image", "ratio")
+    print_table("One segment, 700 x 700 pixels, one core", headings, rows)
+    title = "XOR of the kernel's masks and Drake's, 200 random poses"
+    print_table(title, ("body", "projection", "worst", "mean"), _agreement_rows())
+    rows = []
+    for cameras in _CAMERAS:
+        seen, pose = measure_cost(cameras)
+        costs = (seen, pose, seen + pose, (seen + pose) / cameras)
+        rows.append((str(cameras), *(f"{cost:.1f}" for cost in costs)))
+    headings = ("cameras", "region and edge", "pose", "all", "a camera")
+    title = "Date, all silhouettes, 640 x 480, one core: milliseconds a frame"
+    print_table(title, headings, rows)
+    start = time.process_time()
+    result = run_experiment(experiment_search())
+    seconds = time.process_time() - start
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    Console().print(
+        grid_table([[result]]),
+        f"experiment A: {seconds:.1f} s CPU on one core; peak memory {memory:.0f} MiB",
+    )
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""Robot arms before a camera that may stand anywhere, and damaged silhouettes of them."""
+"""What benchmarks share: arms before a camera anywhere, damaged silhouettes of them, a table."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
@@ -10,6 +10,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
 
 from drake_pose.body.model import load_model
 from drake_pose.camera.models import PinholeCamera
@@ -19,19 +21,21 @@ from drake_pose.registration.register import RegistrationBody
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
+Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _WIDTH, _HEIGHT, _FOCAL = 640, 480, 600.0
 _DISTANCE = (1.0, 1.7)
-_MIDDLE = np.array([0.0, 0.0, 0.35])
-_MIDDLE_SD = 0.1
+_MIDDLE, _MIDDLE_SD = np.array([0.0, 0.0, 0.35]), 0.1
 # A silhouette of fewer pixels is of an arm that is hardly in the picture: another pose is drawn.
 _LEAST_PIXELS = 3000
 # After so many poses of which too little is seen, another camera is drawn.
 _TRIES = 30
-_MOST_MORPHED = 2
-_HOLES = 0.03
-_HOLE_RADII = (3, 9)
+_MOST_MORPHED, _HOLES, _HOLE_RADII = 2, 0.03, (3, 9)
+_ARMS = {
+    "LBR Med 7": "arm_two_views/med7/med7.urdf",
+    "Franka Panda": "franka_one_view/panda/panda.urdf",
+}
 _XARM = "cmeel.prefix/share/example-robot-data/robots/xarm_description/urdf/xarm7.urdf"
 # Each: its axis, the box's sides and length [m].
 _BOXES = (
@@ -43,24 +47,22 @@ _BOXES = (
 )
 
 
+def print_table(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Print a table whose first column is left-aligned, the others right."""
+    table = Table(title=title)
+    for k, heading in enumerate(headings):
+        table.add_column(heading, justify="right" if k else "left")
+    for row in rows:
+        table.add_row(*row)
+    Console(width=150).print(table)
+
+
 def arm_files(data: Path | None, folder: Path) -> dict[str, Path]:
-    """Model files of arms, by name.
-
-    Args:
-        data: a folder of scenes; None: there is none.
-        folder: where a file may be written.
-
-    Returns:
-        those that are there: two of the scenes' and the xArm7 of example-robot-data; else an arm of
-        boxes.
-    """
-    places = []
-    if data is not None:
-        places.append(("LBR Med 7", data / "arm_two_views" / "med7" / "med7.urdf"))
-        places.append(("Franka Panda", data / "franka_one_view" / "panda" / "panda.urdf"))
+    """Model files of arms that are there: scenes', the xArm7's; else a box arm's, in a folder."""
+    places = {} if data is None else {name: data / path for name, path in _ARMS.items()}
     with suppress(PackageNotFoundError):
-        places.append(("xArm7", Path(str(distribution("example-robot-data").locate_file(_XARM)))))
-    found = {name: path for name, path in places if path.is_file()}
+        places["xArm7"] = Path(str(distribution("example-robot-data").locate_file(_XARM)))
+    found = {name: path for name, path in places.items() if path.is_file()}
     return found or {"boxes": write_box_arm(folder / "boxes.urdf")}
 
 
@@ -88,31 +90,26 @@ def load_arm(path: Path) -> RegistrationBody:
 def draw_arm(
     body: RegistrationBody, count: int, rng: np.random.Generator
 ) -> tuple[PinholeCamera, list[PosedFrame]]:
-    """An arm in random poses inside its limits, before a camera from any side, turned anyhow.
-
-    Args:
-        body: the arm.
-        count: how many frames.
-        rng: the source of chance.
-
-    Returns:
-        the camera with its true pose, and the frames with exact masks.
-    """
+    """An arm in random poses, before a camera from any side, turned anyhow; masks are exact."""
     while True:
         camera = _random_camera(rng)
-        renderer = LabelRenderer(body.tree.model, camera)
         frames: list[PosedFrame] = []
         for _ in range(count + _TRIES):
             values = random_values(body, rng)
-            q, X_WB = body.tree.positions_from(body.kinematics.split(values))
-            mask = renderer.mask(q, X_WB)
+            mask = segments(body, camera, values) >= 0
             if np.count_nonzero(mask) >= _LEAST_PIXELS:
                 frames.append(PosedFrame(f"{len(frames):04d}", values, mask))
             if len(frames) == count:
                 return camera, frames
 
 
-def random_values(body: RegistrationBody, rng: np.random.Generator) -> NDArray[np.float64]:
+def segments(body: RegistrationBody, camera: PinholeCamera, values: Array) -> NDArray[np.int16]:
+    """(H, W) segments of the arm, below 0 where it is not."""
+    q, X_WB = body.tree.positions_from(body.kinematics.split(values))
+    return np.asarray(LabelRenderer(body.tree.model, camera).segments(q, X_WB))
+
+
+def random_values(body: RegistrationBody, rng: np.random.Generator) -> Array:
     """Positions (m,) inside the joints' limits; those that have none turn all around."""
     lower, upper = body.kinematics.lower, body.kinematics.upper
     return rng.uniform(
@@ -132,12 +129,8 @@ def _random_camera(rng: np.random.Generator) -> PinholeCamera:
     return PinholeCamera("camera", _WIDTH, _HEIGHT, _FOCAL, _FOCAL, *centre, X_WC)
 
 
-def damage(frames: Sequence[PosedFrame], rng: np.random.Generator) -> list[PosedFrame]:
-    """Each mask eroded or dilated by up to two pixels, with holes of 3 % of its area."""
-    return [PosedFrame(frame.name, frame.values, _damage(frame.mask, rng)) for frame in frames]
-
-
-def _damage(mask: Mask, rng: np.random.Generator) -> Mask:
+def damaged(mask: Mask, rng: np.random.Generator) -> Mask:
+    """A mask eroded or dilated by up to two pixels, with holes of 3 % of its area."""
     size = int(rng.integers(-_MOST_MORPHED, _MOST_MORPHED + 1))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(size) + 1,) * 2)
     drawn = (cv2.dilate if size > 0 else cv2.erode)(mask.astype(np.uint8), disc)

@@ -26,30 +26,38 @@ from drake_pose.jobs.masks.settings import MaskSettings
 from drake_pose.jobs.masks.sources import CAMERAS, SCENE, UNNAMED, FoundMask, Source, open_source
 from drake_pose.results.folder import OVERLAY, SUMMARY, require_empty
 from drake_pose.silhouette.pictures.masks import write_mask
-from drake_pose.silhouette.segmentation.judging import doubt_mask, largest_patch, refuse_mask
 
 BACKGROUND, MASKS = "background", "masks"
 _PARTIAL = "masks.part"
 # Of the mask's outline in an overlay, (red, green, blue): Okabe and Ito's vermilion.
 _OUTLINE_RGB = (213, 94, 0)
+# A second patch of this fraction of the largest one's area may be another object.
+_SECOND = 0.25
+# Beyond this fraction of the picture no surroundings are seen.
+_FULL = 0.98
+# Of the picture's border; an object that is cut off covers less of it, the background more.
+_BORDER = 0.6
 
 
 @dataclass(frozen=True)
 class SceneMasks:
-    """What was written.
+    """What was written: the scene's folder, and what its ``summary.json`` holds.
 
-    Attributes:
-        folder: the scene.
-        count: how many masks it has.
-        summary: what ``summary.json`` holds: by camera and frame each mask's area [pixel], or why
-            there is none, and its warnings.
-        warnings: all of them, each with the picture's name.
+    By camera and frame that is each mask's area [pixel], or why there is none, and its warnings.
     """
 
     folder: Path
-    count: int
     summary: Mapping[str, Any]
-    warnings: tuple[str, ...]
+
+    @property
+    def count(self) -> int:
+        """How many masks the scene has."""
+        return int(self.summary["mask_count"])
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """All warnings, each with the picture's name."""
+        return tuple(self.summary["warnings"])
 
 
 def make_masks(
@@ -177,7 +185,7 @@ class _Writer:
             (self._folder / _PARTIAL).rename(self._folder / MASKS)
         except OSError as error:
             raise OutputError(f"{self._folder}: cannot be written: {error.strerror}") from error
-        return SceneMasks(self._folder, self._count, summary, tuple(warnings))
+        return SceneMasks(self._folder, summary)
 
     def _write_scene_file(self) -> None:
         """The source's own, or what a video says."""
@@ -215,3 +223,40 @@ def _draw_outline(picture: Picture, mask: np.ndarray, refused: bool) -> np.ndarr
     contours, _ = cv2.findContours(mask.view(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(drawn, contours, -1, _OUTLINE_RGB[::-1], 1)
     return np.asarray(cv2.imencode(".jpg", drawn)[1])
+
+
+def refuse_mask(mask: np.ndarray) -> str:
+    """Why a mask (H, W) cannot be used: it is empty or full; "" where it can."""
+    if not mask.any():
+        return "the object is not found: the mask is empty"
+    if mask.mean() >= _FULL:
+        return "the mask fills the picture: nothing tells the object from the rest"
+    return ""
+
+
+def doubt_mask(mask: np.ndarray) -> list[str]:
+    """Why a mask (H, W) that is not empty may show something else."""
+    warnings = []
+    border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean()
+    if border > _BORDER:
+        warnings.append(
+            f"the mask covers {border:.0%} of the picture's border: is it the background?"
+        )
+    _, _, statistics, middles = cv2.connectedComponentsWithStats(mask.view(np.uint8))
+    areas = statistics[1:, cv2.CC_STAT_AREA]
+    first, second = [*np.argsort(-areas, kind="stable"), 0][:2]
+    if len(areas) > 1 and areas[second] > _SECOND * areas[first]:
+        (x0, y0), (x1, y1) = np.rint(middles[[1 + first, 1 + second]]).astype(int)
+        warnings.append(
+            f"there are two patches, of {areas[first]} pixels about ({x0}, {y0}) and of "
+            f"{areas[second]} about ({x1}, {y1}): two objects? --largest keeps the larger one"
+        )
+    return warnings
+
+
+def largest_patch(mask: np.ndarray) -> np.ndarray:
+    """The largest connected patch of a mask (H, W); what is empty stays so."""
+    count, labels, statistics, _ = cv2.connectedComponentsWithStats(mask.view(np.uint8))
+    if count <= 2:
+        return mask
+    return np.asarray(labels == 1 + int(np.argmax(statistics[1:, cv2.CC_STAT_AREA])))

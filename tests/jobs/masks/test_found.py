@@ -12,6 +12,7 @@ from onnx import TensorProto, helper, numpy_helper
 from drake_pose import MaskSettings, load_scene, make_masks
 from drake_pose.commands.main import app
 from drake_pose.errors import DrakePoseError, MaskError, SceneError, SettingsError
+from drake_pose.jobs.masks.masks import doubt_mask, largest_patch, refuse_mask
 from tests.cli import CliRunner
 from tests.jobs.masks.rooms import iou, moving, write_pictures
 
@@ -211,3 +212,20 @@ def test_what_is_no_network_is_refused(still, tmp_path, runner: CliRunner):
     done = runner.invoke(app, [*command, "--network-size", "80,60", "--class", "2", "--json"])
     assert done.exit_code == 0, (done.output, good)
     assert json.loads(done.stdout)["settings"]["network_size"] == [80, 60]
+
+
+def test_masks_of_nothing_of_all_and_of_two_objects_are_judged():
+    mask = np.zeros((40, 60), bool)
+    assert "not found" in refuse_mask(mask)
+    assert "fills" in refuse_mask(~mask)
+    assert "background" in doubt_mask(~mask)[0]
+    mask[5:20, 10:30] = True
+    alone = mask.copy()
+    assert refuse_mask(mask) == ""
+    assert doubt_mask(mask) == []
+    mask[25:35, 40:55] = True
+    (text,) = doubt_mask(mask)
+    assert "two objects" in text
+    assert "(20, 12)" in text
+    assert (largest_patch(mask) == alone).all()
+    assert not largest_patch(np.zeros_like(mask)).any()

@@ -6,7 +6,6 @@ import pytest
 from PIL import Image
 
 from drake_pose.errors import MaskError
-from drake_pose.silhouette.segmentation.judging import doubt_mask, largest_patch, refuse_mask
 from drake_pose.silhouette.segmentation.mask_pictures import (
     mask_of_video_picture,
     read_mask_picture,
@@ -114,16 +113,3 @@ def test_a_video_of_pictures_is_no_video_of_masks(classes):
     grey = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
     with pytest.raises(MaskError, match=r"a\.mp4.*no mask but a picture"):
         mask_of_video_picture(grey, "a.mp4")
-
-
-def test_judgement(classes):
-    assert refuse_mask(classes == 1) == ""
-    assert doubt_mask(classes == 1) == []
-    assert "not found" in refuse_mask(classes > 9)
-    assert "fills" in refuse_mask(classes < 9)
-    (text,) = doubt_mask(classes > 0)
-    assert "two objects" in text
-    assert "(20, 12)" in text
-    assert "background" in doubt_mask(classes == 0)[0]
-    assert (largest_patch(classes > 0) == (classes == 1)).all()
-    assert not largest_patch(classes > 9).any()

@@ -110,7 +110,7 @@ def capture(
     has_sources = (scene / "sources.yaml").is_file()
     _check(scene, method, of_masks, has_sources, live)
     if method == "person" and not has_sources:
-        from drake_pose.jobs.estimate.capture import bundled_person
+        from drake_pose.jobs.estimate.person_choice import bundled_person
 
         given = {one.name: getattr(settings, one.name) for one in fields(settings)}
         estimate(

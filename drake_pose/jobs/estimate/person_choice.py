@@ -1,9 +1,11 @@
-"""Whether a scene is that of a person who is followed by all silhouettes at once."""
+"""The bundled person, and whether a scene is that of a person who is followed."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
+from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.landmarks import landmarks_file, load_landmarks
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.camera.models import Camera
@@ -11,6 +13,11 @@ from drake_pose.errors import ModelError, SceneError
 from drake_pose.person.body_plan import PERSON_LANDMARKS
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.silhouette.pictures.scenes import Scene
+
+
+def bundled_person() -> Path:
+    """The bundled person whose lengths are found with the pose."""
+    return bundled_model("person").with_name("person_shape.urdf")
 
 
 def follows_person(

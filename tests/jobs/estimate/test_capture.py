@@ -12,7 +12,7 @@ from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.commands.main import app
 from drake_pose.errors import ModelError, SceneError, SettingsError
 from drake_pose.fit.contour_fit import ContourFit
-from drake_pose.jobs.estimate.capture import capture_scene
+from drake_pose.jobs.estimate.person_choice import bundled_person
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.person.recordings.checked_capture import CheckedCapture
 from drake_pose.person.recordings.person_capture import PersonCapture
@@ -278,7 +278,7 @@ def test_what_the_method_person_cannot_do_is_refused(
         EstimateSettings(method="person", hold={"head_y": 1.0})
     hand = bundled_model("hand")
     with pytest.raises(ModelError, match=r"left_ankle.*landmarks\.yaml"):
-        capture_scene(recording.folder, tmp_path / "out", hand)
+        estimate_scene(recording.folder, hand, tmp_path / "out", EstimateSettings(method="person"))
     assert not (tmp_path / "out").exists()
 
 
@@ -291,4 +291,4 @@ def test_one_camera_is_too_few(tmp_path: Path) -> None:
     mask[40:80, 60:90] = True
     write_mask(path, mask)
     with pytest.raises(SceneError, match="two calibrated cameras"):
-        capture_scene(tmp_path, tmp_path / "out")
+        estimate_scene(tmp_path, bundled_person(), None, EstimateSettings(method="person"))

@@ -45,20 +45,19 @@ autodoc_preserve_defaults = True
 autosummary_generate = False
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
+napoleon_use_rtype = False
+# Two modules may have a type of the same name.
+suppress_warnings = ["ref.python"]
 napoleon_attr_annotations = False
 python_maximum_signature_line_length = 80
 
 # Other projects' pages are in the net, which a build does not need.
 nitpick_ignore_regex = [
-    (
-        "py:.*",
-        r"(np|numpy|pydrake|rich|cyclopts|distributed|pathlib|collections|enum|jinja2|numba|cv2|scipy|trimesh|asyncio|http|socketserver|PIL)\..*",
-    ),
-    # Drake's classes that are imported for type checkers alone.
-    ("py:class", "ColorRenderCamera|DepthRenderCamera|RenderCameraCore|CameraInfo"),
-    ("py:class", "RigidTransform|Diagram|OutputPort|Meshcat"),
-    # Names of types.
-    ("py:class", "Array|Turning|Motions"),
+    ("py:.*", r"(np|numpy|pydrake|rich|distributed|pathlib|collections|enum|jinja2|numba)\..*"),
+    ("py:.*", r"(cv2|scipy|trimesh|asyncio|http|socketserver|PIL|xml|types|typing|aiohttp)\..*"),
+    # An argument that is raised; names of types, and what is imported for type checkers alone.
+    ("py:exc", "error_type"),
+    ("py:class", r"[A-Z]\w*|threading\.Event"),
 ]
 
 
@@ -132,7 +131,9 @@ def _exists(target: str) -> bool:
 def prepare_docstring(
     app: Sphinx, what: str, name: str, value: Any, options: Any, lines: list[str]
 ) -> None:
-    """Before napoleon: names that share a line are parted."""
+    """Before napoleon: names that share a line are parted; what an attribute's says is no type."""
+    if what in ("attribute", "data", "property"):
+        lines[:0] = ["..", ""]
     for k, line in enumerate(lines):
         # Those of errors are parted by Sphinx itself.
         if (names := re.match(r"\s+\w+(, \w+)+: ", line)) and "Error" not in names.group():

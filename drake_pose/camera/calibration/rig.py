@@ -1,7 +1,7 @@
 """Lenses and poses of cameras that saw a board, and where it was.
 
 Each camera's lens by Zhang's method (OpenCV's calibrateCamera); first poses from pairs of cameras,
-chained; then everything at once: the sum over all corners of |pi_c(X_RC^-1 X_RB p_B) - uv|^2.
+chained; then everything at once: the sum over all corners of ``|pi_c(X_RC^-1 X_RB p_B) - uv|^2``.
 """
 
 from __future__ import annotations

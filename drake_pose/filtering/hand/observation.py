@@ -92,7 +92,7 @@ class HandObservation:
         return np.array([name.startswith("alpha") for name in MEASURED])
 
     def predict(self, x: Array) -> tuple[Array, Array]:
-        """Features and their Jacobian (13), and the scale |q|^2.
+        """Features and their Jacobian (13), and the scale ``|q|^2``.
 
         Args:
             x: (n,) a state as in ``HAND_STATE``.

@@ -21,7 +21,7 @@ MEASUREMENTS = 37
 
 @compiled
 def scaled_rotation(q: Array) -> tuple[Array, Array]:
-    """The matrix |q|^2 R(q) (3, 3) of any quaternion (w, x, y, z), and its derivatives (4, 3, 3).
+    """The matrix ``|q|^2 R(q)`` (3, 3) of a quaternion (w, x, y, z), and its derivatives (4, 3, 3).
 
     A polynomial of second degree: the quaternion's squared norm is the scale.
     """

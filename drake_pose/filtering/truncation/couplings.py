@@ -31,7 +31,7 @@ _UNITS = {"": 1.0, "rad": 1.0, "m": 1.0, "deg": math.pi / 180.0, "mm": 1e-3}
 
 @dataclass
 class Difference:
-    """lower <= first - second <= upper, or |first - second| <= within.
+    """``lower <= first - second <= upper`` or ``|first - second| <= within``.
 
     Attributes:
         within, lower, upper: bounds in ``unit``; what is not given does not bound.

@@ -1,7 +1,7 @@
 """Where a picture differs from the empty background (Date et al., 3.1.1).
 
-|picture - mean| > 5 sigma in a channel, then opening, closing, and patches by size. OpenCV's MOG2
-and KNN are worse here: IoU 0.57, 0.18 and 0.17 with noise of 8 grey levels.
+``|picture - mean| > 5 sigma`` in a channel, then opening, closing, and patches by size. OpenCV's
+MOG2 and KNN are worse here: IoU 0.57, 0.18 and 0.17 with noise of 8 grey levels.
 """
 
 from __future__ import annotations

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from drake_pose.body.files.packages import bundled_model
-from drake_pose.body.landmarks import landmark_positions, load_landmarks
 from drake_pose.camera.files import save_cameras
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.commands.main import app
@@ -20,7 +19,6 @@ from drake_pose.person.recordings.persons_in_view import ViewFaults
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.silhouette.pictures.masks import write_mask
 from tests.cli import CliRunner
-from tests.jobs.bvh_reader import read_bvh
 from tests.jobs.persons import PersonScene, record_person
 from tests.jobs.scenes import read_rows
 
@@ -126,27 +124,6 @@ def test_estimate_follows_a_person_and_says_so(
     assert summary["mean_iou"] > 0.94
     assert {path.parent.name for path in out.glob("overlay/*/*.png")} == set(summary["cameras"])
     assert len(list(out.glob("overlay/*/*.png"))) == 4 * FRAMES
-
-
-def test_files_of_motion_hold_the_persons_joints(
-    recording: PersonScene, known: list[int], tmp_path: Path
-) -> None:
-    out = tmp_path / "out"
-    estimate_scene(recording.folder, recording.person.path, out, replay=False, overlay=False)
-    landmarks = load_landmarks(recording.person.path)
-    centres = read_rows(out / "joint_centres.csv")
-    places = read_bvh((out / "motion.bvh").read_text()).places()
-    for k, q in enumerate(recording.truth):
-        truth = landmark_positions(recording.person, landmarks, q)
-        rows = [row for row in centres if row["frame"] == f"{k:04d}"]
-        assert [row["joint"] for row in rows] == list(landmarks)
-        found = np.array([[float(row[axis]) for axis in "xyz"] for row in rows])
-        np.testing.assert_allclose(found, truth, atol=1e-4)
-        x, y, z = 100.0 * truth[list(landmarks).index("left_elbow")]
-        np.testing.assert_allclose(places["left_forearm"][k], [x, z, -y], atol=0.01)
-    assert "NumFrames\tNumMarkers" in (out / "joint_centres.trc").read_text()
-    assert f"nRows={FRAMES}" in (out / "positions.mot").read_text()
-    assert not (out / "overlay").exists()
 
 
 def test_deviations_become_intervals_of_95_percent(

@@ -78,16 +78,3 @@ def test_estimate_and_its_resumption(
     resumed = run(*arguments, *package, "--frame", "0:1", "--resume")
     assert resumed.exit_code == 0, resumed.output
     assert json.loads((out / "summary.json").read_text())["found_count"] == 2
-
-
-def test_capture_and_walk(tmp_path: Path, tiny_scene: TinyScene, far: tuple[Path, Path]) -> None:
-    model, folder = far
-    recorded = ("capture", tiny_scene.folder, "--out", tmp_path / "out", "--model", model)
-    played = ("walk", tmp_path, "--rate", 30, "--no-browser", "--model", model)
-    for arguments in (recorded, played):
-        assert_names_option(run(*arguments))
-        told = run(*arguments, "--package", f"parts={folder}")
-        # With its package the model is read, and is then found to be none of a person.
-        assert told.exit_code == 1
-        assert "package" not in told.stderr
-    assert run("walk", "--simulate", "--package", f"parts={folder}").exit_code == 2

@@ -1,10 +1,7 @@
-import json
 from pathlib import Path
 
 import numpy as np
-import pytest
 
-from drake_pose.commands.main import app
 from drake_pose.jobs.estimate.matching import sequence_tracking
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.results.settings import EstimateSettings
@@ -38,13 +35,6 @@ def test_a_sequence_is_matched_first_tracked_and_matched_after_a_cut(tmp_path: P
     assert np.median(errors) < 1.0
 
 
-def test_stills_are_matched_one_by_one(tmp_path: Path) -> None:
-    scene = write_sequence(tmp_path / "scene", "sequence: false\n")
-    settings = EstimateSettings(interval=20.0, method="paper", frames=("0000", "0006"))
-    result = estimate_scene(scene.folder, scene.model, settings=settings, replay=False)
-    assert all(record.stopped_by != TRACKED for record in result.records.values())
-
-
 def test_a_sequence_need_not_be_tracked(tmp_path: Path) -> None:
     """Unrelated stills whose scene.yaml says otherwise: as if it did not."""
     said = write_sequence(tmp_path / "said", "sequence: true\nframe_rate_hz: 30\n")
@@ -59,33 +49,6 @@ def test_a_sequence_need_not_be_tracked(tmp_path: Path) -> None:
         assert result.summary["settings"]["track"] is track
         found.append([row.q for row in result.rows])
     np.testing.assert_array_equal(found[0], found[1])
-
-
-def test_the_command_has_the_option(tmp_path: Path) -> None:
-    scene = write_sequence(tmp_path / "scene", "sequence: true\nframe_rate_hz: 30\n")
-    (scene.model.parent / "landmarks.yaml").write_text(
-        "landmarks:\n  hook: {link: jib, point: [0, 0, 0.4]}\n"
-    )
-    made = {}
-    for option in ("--track", "--no-track"):
-        out = tmp_path / option
-        with pytest.raises(SystemExit) as ended:
-            app(
-                [
-                    *("estimate", str(scene.folder), "--model", str(scene.model)),
-                    *("--out", str(out), "--method", "paper", "--interval", "20"),
-                    *("--frame", "0000:0002", "--no-replay", option),
-                ]
-            )
-        assert ended.value.code == 0
-        files = {path.name for path in out.iterdir()}
-        assert files > {
-            "joint_centres.csv", "joint_centres.trc", "positions.mot", "motion.bvh", "report.html"
-        }  # fmt: skip
-        frames = json.loads((out / "summary.json").read_text())["frames"]
-        made[option] = sum(frame["stopped_by"] == TRACKED for frame in frames.values())
-    assert made["--track"] >= 2
-    assert made["--no-track"] == 0
 
 
 def test_how_a_scene_is_tracked(tiny_scene: TinyScene) -> None:

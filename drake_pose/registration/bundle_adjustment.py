@@ -96,12 +96,8 @@ class BundleAdjustment:
     """Fits poses and cameras together.
 
     Args:
-        kinematics: the pose tree's.
-        outlines: a surface for each node.
         cameras: all cameras, those that are unknown near where they stand.
-        unknown: the names of these.
         frames: what they see, and about which values of the body.
-        shape: what else is unknown of the body.
 
     Raises:
         MaskError: a mask of another size than its camera's picture, or no mask shows the body.

@@ -88,7 +88,6 @@ class CalibrationFit:
         names: of the shared unknowns: those of each camera, then the constants.
 
     Args:
-        fits: the cameras.
         which: for each camera the frames that count.
         constants: (k,) the body's parameters to which an unknown constant is added in all frames:
             values of the pose tree, and lengths.
@@ -146,7 +145,6 @@ class CalibrationFit:
             start: from where the unknowns count.
             own: (frames that count, 1) their widths [pixel].
             shared: (u,) what is shared.
-            step: scale and spacing.
         """
         now = self._moved(start, shared)
         parts = [

@@ -33,14 +33,11 @@ class CameraFit:
     """Fits a camera's pose; rounds' lengths are in the root of the silhouettes' median area.
 
     Attributes:
-        frames: what the camera sees.
         values: (frames, n) of the pose tree; and lengths of links, which are 0.
         names: of these n parameters of the body.
         noise: what a point of contour is worth: a pixel of it counts one.
-        contours: compares contours and edges.
 
     Args:
-        frames: what the camera sees.
         spacing: from one point of a silhouette's edge to the next [root of the area].
         offsets: joints whose places on their links are unknown.
     """
@@ -60,12 +57,7 @@ class CameraFit:
         self._evidence = frames.evidence(max(1.0, round(spacing * frames.size)))
 
     def fit(self, X_CW: Array, rounds: Sequence[AnnealingStage]) -> Array:
-        """X_CW (4, 4) fitted to all frames from where it starts, silhouettes as wide as they are.
-
-        Args:
-            X_CW: (4, 4) where to start.
-            rounds: the parts of the fit.
-        """
+        """X_CW (4, 4) fitted to all frames from where it starts; silhouettes keep their widths."""
         found = self._frames_fit(self.placed(X_CW)).fit(
             self._evidence,
             self.values,
@@ -87,9 +79,6 @@ class CameraFit:
         """A frame's contours compared with its edges.
 
         Args:
-            X_CW: (4, 4) the world's pose in the camera.
-            frame: which.
-            step: scale and spacing.
             width: the silhouette is too wide by so much on all sides [pixel].
             values: (n,) the body's parameters; None: the frame's own.
             log_focal: the logarithm of the focal length's growth.
@@ -102,9 +91,7 @@ class CameraFit:
         """(frames, k, k) costs by squares of the pictures of a side [pixel].
 
         Args:
-            X_CW: (4, 4) the world's pose in the camera.
             widths: (frames,) by which silhouettes are too wide on all sides [pixel].
-            step: scale and spacing.
             side: of the squares.
         """
         return np.array(

@@ -35,7 +35,7 @@ from drake_pose.registration.calibration_fit import (
 from drake_pose.registration.camera_fit import CameraFit
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import RegisteredCamera, RegistrationBody
-from drake_pose.registration.uncertainty import calibration_uncertainty, pose_covariance
+from drake_pose.registration.uncertainty import calibration_covariance, pose_covariance
 
 Array = NDArray[np.float64]
 
@@ -59,7 +59,6 @@ class KinematicParameter:
     """What is added to an encoder's positions, or by what share of it a link is longer.
 
     Args:
-        name: of the position or link.
         value: what is to be added [rad, m or 1]; 0 where it is not determined.
         deviation: its standard deviation; infinite where it is not determined.
         low, high: the ends of its 95 % interval.
@@ -87,17 +86,12 @@ class JointCalibration:
     """Zeros and lengths, and the cameras with them.
 
     Args:
-        zeros: of the joints that were asked for.
-        lengths: of the links that were asked for.
+        zeros, lengths: of the joints and links that were asked for.
         cameras: with the poses and focal lengths that fit these.
-        covariances: (cameras, 6, 6) of their poses' errors: a rotation vector [rad] and a shift [m]
-            in the world.
-        focal_deviations: (cameras,) standard deviations of focal lengths, as shares of them; 0
-            where they were held.
-        gains: (cameras,) by how much the share of the contours that fits grew.
+        covariances: (cameras, 6, 6), see ``RegisteredCamera``.
+        focal_deviations: (cameras,) standard deviations over the focal lengths; 0: held.
         object_values: (6,) by how much an object stands elsewhere whose place is not known,
-            OBJECT_POSITIONS; empty where there is none.
-        object_covariance: (6, 6) of these.
+            OBJECT_POSITIONS, and object_covariance: (6, 6); empty where there is none.
     """
 
     zeros: tuple[KinematicParameter, ...]
@@ -105,7 +99,6 @@ class JointCalibration:
     cameras: tuple[PinholeCamera, ...]
     covariances: Array
     focal_deviations: Array
-    gains: Array
     object_values: Array
     object_covariance: Array
 
@@ -152,7 +145,6 @@ def calibrate_joints(
     """The zeros of some joints and lengths of links, fitted together with the cameras' poses.
 
     Args:
-        body: the body.
         cameras: as they were registered with the model's zeros and lengths.
         frames: what each of them sees.
         names: of the positions whose zeros are asked for.
@@ -182,8 +174,8 @@ def calibrate_joints(
     sought = asked
     while True:
         constants = [fits[0].names.index(name) for name in [*standing, *sought]]
-        fit, found, before = _fit(fits, X_CW, constants, focal)
-        covariance = _as_the_cost_bends(fit, found, calibration_uncertainty(fit, found).covariance)
+        fit, found = _fit(fits, X_CW, constants, focal)
+        covariance = _as_the_cost_bends(fit, found, calibration_covariance(fit, found))
         values = _constants(fit, found, covariance, sought)
         told |= values
         # The cameras shall fit what is answered: nothing is added where it cannot be told.
@@ -191,25 +183,25 @@ def calibrate_joints(
         if len(sought) == len(values):
             break
     return _describe(
-        fit, found, covariance, before, [told[name] for name in names],
+        fit, found, covariance, [told[name] for name in names],
         [replace(told[length_name(link)], name=link) for link in lengths],
     )  # fmt: skip
 
 
 def _fit(
     fits: Sequence[CameraFit], X_CW: Sequence[Array], constants: Sequence[int], focal: bool
-) -> tuple[CalibrationFit, Calibration, list[Array]]:
-    """The last fit, what it found, and the shares that fitted before."""
+) -> tuple[CalibrationFit, Calibration]:
+    """The last fit, and what it found."""
     found = start_calibration(fits, X_CW, len(constants))
     # Constants that are off let good frames contradict, so all count at first.
     fit = CalibrationFit(fits, [np.arange(len(one.values)) for one in fits], constants, focal)
-    before = _shares(fit, found)
     for k in range(_AGAIN):
         if k > 0:
-            which = [np.flatnonzero(agreeing(one)) for one in _shares(fit, found)]
+            ratios = [inlier_ratios(fit, found, c) for c in range(len(fits))]
+            which = [np.flatnonzero(agreeing(one)) for one in ratios]
             fit = CalibrationFit(fits, which, constants, focal)
         found = fit.fit(found, ROUNDS_WITH_CONSTANTS)
-    return fit, found, before
+    return fit, found
 
 
 def _as_the_cost_bends(fit: CalibrationFit, found: Calibration, covariance: Array) -> Array:
@@ -227,16 +219,10 @@ def _as_the_cost_bends(fit: CalibrationFit, found: Calibration, covariance: Arra
     return found_covariance
 
 
-def _shares(fit: CalibrationFit, found: Calibration) -> list[Array]:
-    """For each camera (frames,) what fits."""
-    return [inlier_ratios(fit, found, c) for c in range(len(fit.fits))]
-
-
 def _describe(
     fit: CalibrationFit,
     found: Calibration,
     covariance: Array,
-    before: Sequence[Array],
     zeros: Sequence[KinematicParameter],
     lengths: Sequence[KinematicParameter],
 ) -> JointCalibration:
@@ -249,57 +235,41 @@ def _describe(
         cameras.append(own.placed(found.X_CW[c], float(found.log_focal[c])))
         if fit.per_camera > 6:
             focal[c] = math.sqrt(covariance[c * fit.per_camera + 6, c * fit.per_camera + 6])
-    after = _shares(fit, found)
-    gains = [b.mean() - a.mean() for a, b in zip(before, after, strict=True)]
     first = len(fit.names) - len(fit.constants)
     standing = [k for k, name in enumerate(fit.names[first:]) if name in OBJECT_POSITIONS]
     places = first + np.array(standing, dtype=np.intp)
     return JointCalibration(
         tuple(zeros), tuple(lengths), tuple(cameras), np.array(covariances), focal,
-        np.array(gains), found.constants[standing], covariance[np.ix_(places, places)],
+        found.constants[standing], covariance[np.ix_(places, places)],
     )  # fmt: skip
 
 
 def _constants(
     fit: CalibrationFit, found: Calibration, covariance: Array, names: Sequence[str]
 ) -> dict[str, KinematicParameter]:
-    """Some constants by name, each with its interval."""
+    """Some constants by name, each with its interval, or what it goes with where that is all."""
     pictures = sum(len(which) for which in fit.which)
     freedom = max(1, _PICTURE_MOTIONS * pictures - len(fit.names))
     first = len(fit.names) - len(fit.constants)
-    is_length = fit.constants >= len(fit.fits[0].frames.kinematics.names)
+    lengths = len(fit.fits[0].frames.kinematics.names)
     told = {}
-    for k, (value, one) in enumerate(zip(found.constants, is_length.tolist(), strict=True)):
-        if fit.names[first + k] in names:
-            told[fit.names[first + k]] = _constant(
-                fit, covariance, first + k, float(value), freedom, (one, len(names))
-            )
+    for k, (index, value) in enumerate(zip(fit.constants, found.constants.tolist(), strict=True)):
+        name, deviation = fit.names[first + k], math.sqrt(covariance[first + k, first + k])
+        if name not in names:
+            continue
+        if deviation > _DETERMINED * CONSTANT_DEVIATION:
+            along = covariance[:, first + k] / np.sqrt(np.diag(covariance)) / deviation
+            others = [j for j in range(len(along)) if j != first + k]
+            gauge = tuple(fit.names[j] for j in others if abs(along[j]) > _GOES_WITH)
+            ends = (-math.inf, math.inf)
+            told[name] = KinematicParameter(name, 0.0, math.inf, *ends, False, gauge)
+            continue
+        width = float(stdtrit(freedom, 1.0 - 0.5 * _LEVEL)) * deviation
+        p_value = 2.0 * float(stdtr(freedom, -abs(value) / deviation)) * len(names)
+        low, middle, high = value - width, value, value + width
+        if index >= lengths:
+            # A length was fitted as a logarithm.
+            deviation *= math.exp(value)
+            low, middle, high = math.expm1(low), math.expm1(middle), math.expm1(high)
+        told[name] = KinematicParameter(name, middle, deviation, low, high, p_value < _LEVEL)
     return told
-
-
-def _constant(
-    fit: CalibrationFit,
-    covariance: Array,
-    index: int,
-    value: float,
-    freedom: int,
-    what: tuple[bool, int],
-) -> KinematicParameter:
-    """A zero or length with its interval, or what it goes with where that is all.
-
-    Whether it is a length is told, and how many constants are asked for.
-    """
-    is_length, count = what
-    name, deviation = fit.names[index], math.sqrt(covariance[index, index])
-    if deviation > _DETERMINED * CONSTANT_DEVIATION:
-        along = covariance[:, index] / np.sqrt(np.diag(covariance)) / deviation
-        gauge = [n for j, n in enumerate(fit.names) if j != index and abs(along[j]) > _GOES_WITH]
-        return KinematicParameter(name, 0.0, math.inf, -math.inf, math.inf, False, tuple(gauge))
-    width = float(stdtrit(freedom, 1.0 - 0.5 * _LEVEL)) * deviation
-    chance = 2.0 * float(stdtr(freedom, -abs(value) / deviation)) * count
-    low, middle, high = value - width, value, value + width
-    if is_length:
-        # A length was fitted as a logarithm.
-        deviation *= math.exp(value)
-        low, middle, high = math.expm1(low), math.expm1(middle), math.expm1(high)
-    return KinematicParameter(name, middle, deviation, low, high, chance < _LEVEL)

@@ -117,16 +117,8 @@ class OnlineState:
 class OnlineRegistration:
     """Registers a camera while frames come in.
 
-    Attributes:
-        body: the body.
-        camera: the camera's intrinsics.
-        settings: which frames are kept, and when the camera has been moved.
-
     Args:
-        body: the body.
         camera: the camera's intrinsics; its pose is not used.
-        settings: which frames are kept, and when the camera has been moved.
-        search: finds the camera; by default with default settings.
     """
 
     def __init__(

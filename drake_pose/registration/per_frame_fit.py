@@ -74,7 +74,6 @@ class FrameFit:
     """A frame whose joints and cameras were fitted.
 
     Args:
-        name: of the frame.
         pictures: the contours compared with each camera's silhouette where the fit ended, and told
             as distances from what is given; their values are the joints' and POSE_NAMES of each
             camera.
@@ -98,7 +97,6 @@ class PerFrameFit:
         deviations: (p,) how far what is given may be off: standard deviations [rad or m].
 
     Args:
-        kinematics: the pose tree's.
         outlines: a surface for each node: of few triangles, with which frames are fitted, and all,
             with which they are compared in the end.
         cameras: the cameras, where they are said to stand.

@@ -27,7 +27,6 @@ class PosedFrame:
     """One picture of a body at known joint positions.
 
     Args:
-        name: of the frame.
         values: (m,) of the body's pose tree [rad or m].
         mask: (H, W) the silhouette.
     """
@@ -41,18 +40,9 @@ class PosedFrames:
     """All that a camera sees, as a search and a fit take it.
 
     Attributes:
-        kinematics: the pose tree's.
-        outlines: a surface for each node.
         camera: the camera; its pose is not used.
-        frames: the frames.
         X_WN: (frames, nodes, 4, 4) the nodes' poses.
         size: the root of the silhouettes' median area [pixel].
-
-    Args:
-        kinematics: the pose tree's.
-        outlines: a surface for each node.
-        camera: the camera.
-        frames: what it sees.
 
     Raises:
         MaskError: a mask of another size than the camera's picture, or an empty one.

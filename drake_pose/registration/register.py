@@ -41,7 +41,7 @@ from drake_pose.registration.start_poses import (
     place_by_bounds,
     spread_rotations,
 )
-from drake_pose.registration.uncertainty import calibration_uncertainty, pose_covariance
+from drake_pose.registration.uncertainty import calibration_covariance, pose_covariance
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
 
@@ -81,7 +81,6 @@ class RegistrationBody:
         very_few, few, all: a surface for each node.
 
     Args:
-        tree: the pose tree.
         seen: the nodes that silhouettes show; all where None.
         fewest: so many triangles a node has where it has very few.
         girths: (nodes,) how many times as wide nodes are across their y axes as the model's; 1
@@ -170,9 +169,8 @@ class RegisteredCamera(_UncertainPose):
 
     Args:
         camera: with its pose X_WC.
-        covariance: (6, 6) of the pose's error: a rotation vector [rad] by which the camera is
-            turned, and a shift [m], both along the world's axes.
-        frames: how well each frame fits.
+        covariance: (6, 6) of the pose's error: a rotation vector [rad] and a shift [m], both along
+            the world's axes.
         alternatives: (n, 4, 4) other poses X_WC that fit no worse, as far as can be told.
         seen_object: where the object stands that was seen, if its place was not known.
     """
@@ -280,7 +278,7 @@ def describe_fitted(
     # Fits that began apart may have ended in one pose.
     alike = distinct(fit.frames, [fitted[k][1].X_CW[0] for k in as_good])
     own = CalibrationFit([fit], [np.flatnonzero(agree)], constants)
-    covariance = calibration_uncertainty(own, best).covariance
+    covariance = calibration_covariance(own, best)
     camera = RegisteredCamera(
         fit.frames.camera.with_pose(np.linalg.inv(X_CW)),
         pose_covariance(partial(fit.moved, X_CW), covariance[:6, :6]),

@@ -6,6 +6,7 @@ import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +22,6 @@ from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.errors import RegistrationError, SettingsError
 from drake_pose.fit.surface_distance import surface_distance
 from drake_pose.fit.surfaces import FEW, few_triangles
-from drake_pose.registration.hand_eye import turns_between
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import ObjectPose, RegistrationBody
 from drake_pose.silhouette.areas.bending import TreeSurfaces
@@ -74,10 +74,8 @@ class StandingObject:
         radius: of a ball about its middle [m].
 
     Args:
-        robot: the robot.
         link: of the robot, whose frame L is the world of poses with it.
         held: positions of the robot that are held [rad or m].
-        tree: the object's pose tree.
 
     Raises:
         SettingsError: the object has joints that are not held, or no joint moves the link.
@@ -160,7 +158,6 @@ class StandingObject:
         """(6, 6) of the pose's error in the world: a rotation vector [rad] and a shift [m].
 
         Args:
-            X_WT: (4, 4) its pose.
             covariance: (6, 6) of OBJECT_POSITIONS.
         """
         R = X_WT[:3, :3]
@@ -228,6 +225,21 @@ def _with_products(rotations: list[Array], own: list[Array]) -> list[Array]:
         if all(np.trace(R.T @ other) < 2.999 for other in found):
             found.append(R)
     return found
+
+
+def turns_between(R_WL: Array) -> Array:
+    """(3,) how far a hand turns about its three main axes, from picture to picture [rad].
+
+    Root mean squares of the turns between all pairs of its rotations R_WL (n, 3, 3), the largest
+    first. Where the second one is 0 the hand turns about one axis alone.
+    """
+    pairs = list(combinations(range(len(R_WL)), 2))
+    if not pairs:
+        return np.zeros(3)
+    i, j = np.array(pairs).T
+    turns = Rotation.from_matrix(np.swapaxes(R_WL[i], 1, 2) @ R_WL[j]).as_rotvec()
+    spread = np.sqrt(np.linalg.eigvalsh(turns.T @ turns / len(turns))[::-1].clip(min=0.0))
+    return np.asarray(spread)
 
 
 def require_turns(

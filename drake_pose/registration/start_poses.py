@@ -50,7 +50,6 @@ def place_by_bounds(frames: PosedFrames, R_CW: Array) -> Array:
     off say little (Geman and McClure's weights).
 
     Args:
-        frames: what the camera sees.
         R_CW: (n, 3, 3) the camera's rotations.
     """
     bodies = [np.einsum("nij,pj->npi", R_CW, points) for points in frames.points]
@@ -93,11 +92,9 @@ def add_bound_equations(
     """Adds the normal equations of a frame's bounds to H (n, 3, 3) and g (n, 3).
 
     Args:
-        frames: what the camera sees.
         p_C: (n, points, 3) the body in the camera.
         bound: the silhouette's bounds, and which of them count.
         robust: whether what is far off says little.
-        H, g: added to.
     """
     f, c = _intrinsics(frames)
     rows = np.arange(len(p_C))
@@ -139,7 +136,6 @@ def areas(frames: PosedFrames, X_CW: Array, side: float) -> Array:
     """The areas of body, silhouette and what both share, in frames seen from some poses.
 
     Args:
-        frames: what the camera sees.
         X_CW: (n, 4, 4) the world's poses in the camera.
         side: the root of the silhouettes' area in the pictures that are compared [pixel], if the
             camera's are not smaller.

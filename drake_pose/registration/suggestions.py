@@ -52,12 +52,8 @@ def suggest_pose(
     """The pose, of random ones inside the limits, whose silhouettes differ most.
 
     Args:
-        body: the body.
-        camera: its intrinsics.
         X_WC: the camera's poses that are to be told apart, (4, 4) each, two or more.
         keep_out: what the body must not touch; points of its surfaces are asked.
-        tried: so many poses are tried.
-        seed: of the random draws.
 
     Returns:
         None where no pose was found that is seen from all camera poses and touches nothing.

@@ -1,17 +1,13 @@
 """How sure a camera's pose is, where contours do not err point by point.
 
-As for a pose of the body (``fit.covariance``) there are the noise of points, the surface
-of a part in all frames alike, its edge in one mask, and each frame as a whole, whose joint
-positions or picture may be a little off. How large these are is told by what is left of the
-distances, at the scale at which the pose was fitted, and how far they reach by what each frame
-alone would have the pose be: the frames' pulls scatter as their errors say, or by a factor more or
-less. How wide each mask is was fitted, and is as unsure as that.
+There are the noise of points, the surface of a part in all frames alike, its edge in one mask, and
+each frame as a whole (``fit.covariance``). How large these are is told by what is left of the
+distances at the scale of the fit; frames' pulls scatter as these say, or by a factor more.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,25 +41,8 @@ _TOLD = 1e-3
 _PARTS_ERR, _NO_BETTER = 0.2, 1.0
 
 
-class Uncertainty(NamedTuple):
-    """How sure a calibration is.
-
-    Attributes:
-        covariance: (u, u) of the shared unknowns, by the names of the fit.
-        information: (u, u) what the contours say of them, if each point erred by itself.
-    """
-
-    covariance: Array
-    information: Array
-
-
-def calibration_uncertainty(fit: CalibrationFit, found: Calibration) -> Uncertainty:
-    """How sure the shared unknowns of a calibration are.
-
-    Args:
-        fit: what fitted it.
-        found: the calibration.
-    """
+def calibration_covariance(fit: CalibrationFit, found: Calibration) -> Array:
+    """(u, u) of the errors of a calibration's shared unknowns, by the names of its fit."""
     shared = len(fit.names)
     seen = _distances(fit, found, _FITTED)
     is_angle = np.zeros(seen.X.shape[1], bool)
@@ -75,13 +54,7 @@ def calibration_uncertainty(fit: CalibrationFit, found: Calibration) -> Uncertai
         unseen = _unseen_errors(fit, found, c, trusted)
         at = np.arange(len(unseen)) + c * len(unseen)
         covariance[at, at] += unseen**2
-    H = seen.information
-    width_gain = np.linalg.solve(
-        H[shared:, shared:] + 1e-9 * np.eye(len(H) - shared), H[shared:, :shared]
-    )
-    return Uncertainty(
-        covariance[:shared, :shared], H[:shared, :shared] - H[:shared, shared:] @ width_gain
-    )
+    return covariance[:shared, :shared]
 
 
 def _distances(fit: CalibrationFit, found: Calibration, step: AnnealingStage) -> Distances:
@@ -135,11 +108,9 @@ def _scatter(seen: Distances, sizes: ErrorSizes, shared: int) -> float:
 def _calibration_error(seen: Distances) -> float:
     """By how much a calibration may be off that no frame contradicts [pixel].
 
-    Intrinsics that are wrong, and a lens that was not quite undone, err alike in all frames: the
-    pose follows, and nothing is left of it. Where parts are seen to err, a calibration is not
-    trusted beyond a pixel either; where all else is exact, it is taken to be. How far parts err
-    shows at a scale at which nothing is left out because it is off. What comes again where a part
-    stands still may be the part's surface: none of it counts as noise here.
+    Wrong intrinsics err alike in all frames: the pose follows, and nothing is left of it. So where
+    parts are seen to err, a calibration is not trusted beyond a pixel either. What comes again
+    where a part stands still may be the part's surface: none of it counts as noise here.
     """
     seen = seen._replace(effects=seen.effects._replace(repeated=seen.effects.noise))
     sizes = estimate_sizes(seen, np.zeros(seen.X.shape[1], bool), 0.0, _PRIOR_DEVIATION)

@@ -12,8 +12,7 @@ from pathlib import Path
 import pytest
 
 import drake_pose
-from drake_pose.commands.main import app
-from tests.cli import CliRunner
+from tests.cli import run_command
 from tests.jobs.scenes import TinyScene, read_rows, write_scene
 
 PROGRAM = [sys.executable, "-m", "drake_pose.commands.main"]
@@ -46,31 +45,31 @@ def test_help_imports_nothing_heavy() -> None:
         (["reproduce", "kameda"], ["drake-pose reproduce kameda --images 20", "head"]),
     ],
 )
-def test_help_teaches(command: list[str], words: list[str], runner: CliRunner) -> None:
-    result = runner.invoke(app, [*command, "--help"])
+def test_help_teaches(command: list[str], words: list[str]) -> None:
+    result = run_command([*command, "--help"])
     assert result.exit_code == 0
     for word in words:
         assert word in plain(result.stdout)
 
 
-def test_version(runner: CliRunner) -> None:
-    result = runner.invoke(app, ["--version"])
+def test_version() -> None:
+    result = run_command(["--version"])
     assert result.stdout == f"drake-pose {drake_pose.__version__}\n"
 
 
-def test_check_of_a_fit_model(tiny_scene: TinyScene, runner: CliRunner) -> None:
-    result = runner.invoke(app, ["check", str(tiny_scene.model)])
+def test_check_of_a_fit_model(tiny_scene: TinyScene) -> None:
+    result = run_command(["check", str(tiny_scene.model)])
     assert result.exit_code == 0, result.output
     assert "crane: 3 segments" in result.stdout
     assert re.search(r"lift +-91\.67\d* \.\. 91\.67\d* deg", result.stdout)
     assert "fit for use" in result.stderr
 
 
-def test_check_as_json(tiny_scene: TinyScene, runner: CliRunner, tmp_path: Path) -> None:
-    report = json.loads(runner.invoke(app, ["check", str(tiny_scene.model), "--json"]).stdout)
+def test_check_as_json(tiny_scene: TinyScene, tmp_path: Path) -> None:
+    report = json.loads(run_command(["check", str(tiny_scene.model), "--json"]).stdout)
     assert report["usable"] is True
     assert [node["name"] for node in report["nodes"]] == ["base", "boom", "jib"]
-    result = runner.invoke(app, ["check", str(tmp_path / "nowhere.urdf"), "--json"])
+    result = run_command(["check", str(tmp_path / "nowhere.urdf"), "--json"])
     assert result.exit_code == 1
     report = json.loads(result.stdout)
     assert report["usable"] is False

@@ -2,13 +2,12 @@
 
 import copy
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body.model import ArticulatedModel
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, SettingsError
 from drake_pose.registration.online_registration import (
@@ -22,7 +21,6 @@ from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import FrameMisfit, RegisteredCamera, RegistrationBody
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.registration.test_register import looking_at
-from tests.search.arms import arm_urdf
 
 NOT_REGISTERED, REGISTERED, CONTRADICTED = CameraStatus
 SEEN = np.ones((480, 640), dtype=bool)
@@ -71,18 +69,6 @@ class ScriptedSearch:
         covariance = np.diag(np.full(6, self.deviation**2))
         alternatives = np.tile(np.eye(4), (others, 1, 1))
         return RegisteredCamera(camera_at(PLACES[place]), covariance, tuple(misfits), alternatives)
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> ArticulatedModel:
-    path: Path = tmp_path_factory.mktemp("arm") / "arm.urdf"
-    path.write_text(arm_urdf())
-    return load_model(path)
-
-
-@pytest.fixture(scope="module")
-def body(model: ArticulatedModel) -> RegistrationBody:
-    return RegistrationBody(model.pose_tree())
 
 
 @pytest.fixture

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from drake_pose.body.model import ArticulatedModel
-from drake_pose.errors import MaskError, RegistrationError
+from drake_pose.errors import RegistrationError
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import CameraSearch, RegistrationBody
 from drake_pose.registration.start_poses import spread_rotations
@@ -47,40 +48,18 @@ class TestCameraSearch:
         assert shift < 3e-3
         assert turn < np.radians(0.15)
 
-    def test_refuses_what_shows_nothing(
-        self, model: ArticulatedModel, body: RegistrationBody
-    ) -> None:
+    def test_refuses_to_begin_without_frames(self, body: RegistrationBody) -> None:
         camera = looking_at(np.array([1.6, 0.4, 0.5]), np.array([0.0, 0.0, 0.4]), 0.1)
         with pytest.raises(RegistrationError, match="'eye': no frame"):
             CameraSearch(body).register(camera, [])
-        empty = PosedFrame("0007", body.kinematics.lower, np.zeros((480, 640), bool))
-        with pytest.raises(MaskError, match="frame '0007'"):
-            CameraSearch(body).register(camera, [empty])
 
 
 class TestSpreadRotations:
     def test_no_rotation_is_far_from_all(self) -> None:
         R = spread_rotations(3000)
         assert np.allclose(R @ np.swapaxes(R, 1, 2), np.eye(3), atol=1e-12)
-        rng = np.random.default_rng(3)
-        q = rng.normal(size=(500, 4))
-        w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
-        trace_parts = np.einsum("nij,kij->kn", R, _matrices(w, x, y, z))
+        others = Rotation.random(500, random_state=3).as_matrix()
+        trace_parts = np.einsum("nij,kij->kn", R, others)
         nearest = np.arccos(np.clip(0.5 * (trace_parts.max(axis=1) - 1.0), -1.0, 1.0))
         # A ball of this radius about each would hold all rotations about twice over.
         assert np.degrees(nearest.max()) < 16.0
-
-
-def _matrices(w: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """(n, 3, 3) of unit quaternions."""
-    return np.moveaxis(
-        np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-            ]
-        ),
-        2,
-        0,
-    )

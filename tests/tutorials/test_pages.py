@@ -15,7 +15,7 @@ from drake_pose.camera.sources.files import load_sources
 from drake_pose.commands.main import app
 from drake_pose.filtering.truncation.couplings import load_couplings
 from drake_pose.jobs.batch.job import read_job
-from tests.cli import CliRunner
+from tests.cli import run_command
 
 ROOT = Path(__file__).resolve().parents[2]
 TUTORIALS = ROOT / "tutorials"
@@ -69,7 +69,7 @@ def test_the_readme_s_command_runs_as_pasted(
         (tmp_path / name).symlink_to(ROOT / name)
     monkeypatch.chdir(tmp_path)
     (words,) = [line for line in shell_lines(TEXTS["README.md"]) if line[0] == "drake-pose"]
-    result = CliRunner().invoke(app, words[1:])
+    result = run_command(words[1:])
     assert result.exit_code == 0, result.output
     out = tmp_path / words[words.index("--out") + 1]
     for file in ("report.html", "poses.csv", "joints.csv", "families.csv"):
@@ -93,7 +93,7 @@ def test_every_command_has_an_example() -> None:
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
 def test_command_line_examples_use_options_that_exist(words: list[str]) -> None:
     command = words[:2] if words[0] == "reproduce" else words[:1]
-    shown = CliRunner().invoke(app, [*command, "--help"], env=ENVIRONMENT)
+    shown = run_command([*command, "--help"], env=ENVIRONMENT)
     assert shown.exit_code == 0
     known = set(re.findall(r"--[a-z][a-z-]*", shown.output))
     used = {word for word in words if word.startswith("--")}
@@ -106,7 +106,7 @@ def test_options_named_in_the_text_exist() -> None:
         for command in ("estimate", "register", "masks", "capture", "batch", "walk", "calibrate")
     ]
     commands += [["reproduce", paper] for paper in ("kameda", "shimada", "date", "all")]
-    shown = [CliRunner().invoke(app, [*one, "--help"], env=ENVIRONMENT) for one in commands]
+    shown = [run_command([*one, "--help"], env=ENVIRONMENT) for one in commands]
     known = {word for one in shown for word in re.findall(r"--[a-z][a-z-]*", one.output)}
     named = {word for text in SHOWN.values() for word in re.findall(r"`(--[a-z][a-z-]*)", text)}
     assert {"--json", "--resume", "--package"} <= named

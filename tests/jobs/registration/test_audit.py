@@ -8,17 +8,16 @@ import numpy as np
 import pytest
 
 from drake_pose.camera.files import save_cameras
-from drake_pose.commands.main import app
 from drake_pose.errors import CameraError, MaskError, SceneError
 from drake_pose.jobs.registration.audit import audit_scene
 from drake_pose.silhouette.pictures.masks import write_mask
-from tests.cli import CliRunner, Result
+from tests.cli import Result, run_command
 from tests.jobs.registration.arm_scenes import JOINTS, ArmScene, write_arm_scene
 
 
-def run(runner: CliRunner, scene: ArmScene, *more: str) -> Result:
+def run(scene: ArmScene, *more: str) -> Result:
     given = ["--model", str(scene.model), "--joints", str(scene.joints)]
-    return runner.invoke(app, ["audit", str(scene.folder), *given, *more])
+    return run_command(["audit", str(scene.folder), *given, *more])
 
 
 @pytest.fixture(scope="module")
@@ -34,11 +33,11 @@ def audited(tmp_path_factory: pytest.TempPathFactory) -> ArmScene:
 
 @pytest.fixture(scope="module")
 def found(
-    audited: ArmScene, tmp_path_factory: pytest.TempPathFactory, runner: CliRunner
+    audited: ArmScene, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, dict[str, Any]]:
     """The result folder, and what the command printed as JSON."""
     out = tmp_path_factory.mktemp("audit") / "out"
-    result = run(runner, audited, "--out", str(out), "--json")
+    result = run(audited, "--out", str(out), "--json")
     assert result.exit_code == 0, result.output
     return out, json.loads(result.stdout)
 
@@ -57,8 +56,8 @@ class TestAudit:
         drawn = sorted(path.relative_to(found[0]) for path in found[0].rglob("*.png"))
         assert drawn == [Path("overlay/left/0002.png"), Path("overlay/right/0002.png")]
 
-    def test_without_out_the_table_is_printed(self, audited, runner: CliRunner) -> None:
-        result = run(runner, audited, "--frame", "0:4")
+    def test_without_out_the_table_is_printed(self, audited) -> None:
+        result = run(audited, "--frame", "0:4")
         assert result.exit_code == 0, result.output
         assert "frame '0002'" in result.stdout
         assert "4 of 5 frames agree" in result.stdout

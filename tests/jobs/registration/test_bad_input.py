@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.cli import CliRunner
 from tests.jobs.estimate.test_bad_input import assert_refused
 from tests.jobs.registration.arm_scenes import ArmScene
 from tests.jobs.registration.test_register import run
@@ -110,33 +109,31 @@ BEFORE_WORK: dict[str, tuple[Spoil, list[str]]] = {
 
 
 @pytest.mark.parametrize("case", BEFORE_WORK)
-def test_bad_input_is_refused_before_work(
-    case: str, own_arm: ArmScene, runner: CliRunner, tmp_path: Path
-) -> None:
+def test_bad_input_is_refused_before_work(case: str, own_arm: ArmScene, tmp_path: Path) -> None:
     spoil, parts = BEFORE_WORK[case]
     spoil(own_arm)
-    assert_refused(run(runner, own_arm, tmp_path / "out"), *parts)
+    assert_refused(run(own_arm, tmp_path / "out"), *parts)
     assert not (tmp_path / "out").exists()
 
 
-def test_unknown_names_are_refused(arm_scene: ArmScene, runner: CliRunner, tmp_path: Path) -> None:
+def test_unknown_names_are_refused(arm_scene: ArmScene, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    assert_refused(run(runner, arm_scene, out, "--camera", "top"), "'top'", "left, right")
-    assert_refused(run(runner, arm_scene, out, "--frame", "9"), "'9'", "0004")
-    assert_refused(run(runner, arm_scene, out, "--hold", "nose=3"), "'nose'")
-    assert_refused(run(runner, arm_scene, out, "--hold", "nose"), "NAME=NUMBER", status=2)
+    assert_refused(run(arm_scene, out, "--camera", "top"), "'top'", "left, right")
+    assert_refused(run(arm_scene, out, "--frame", "9"), "'9'", "0004")
+    assert_refused(run(arm_scene, out, "--hold", "nose=3"), "'nose'")
+    assert_refused(run(arm_scene, out, "--hold", "nose"), "NAME=NUMBER", status=2)
     (tmp_path / "letter.txt").write_text("Do not lose me.")
-    assert_refused(run(runner, arm_scene, tmp_path), "not empty")
+    assert_refused(run(arm_scene, tmp_path), "not empty")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.9, 1.15])
 def test_a_focal_length_that_is_not_the_camera_s(
-    factor: float, own_arm: ArmScene, runner: CliRunner, tmp_path: Path
+    factor: float, own_arm: ArmScene, tmp_path: Path
 ) -> None:
     true = own_arm.cameras["left"].focal_x
     own_arm.edit_cameras("left", focal_x=factor * true, focal_y=factor * true)
-    result = run(runner, own_arm, tmp_path / "out")
+    result = run(own_arm, tmp_path / "out")
     assert_refused(result, "camera 'left': its masks tell a focal length", "Nothing was written")
     told = float(re.search(r"a focal length of (\d+) pixels", result.stderr)[1])
     assert told == pytest.approx(true, rel=0.03)
@@ -156,9 +153,9 @@ class TestNoPoseExplains:
         ids=["mirrored", "focal length", "one row off", "something else"],
     )
     def test_nothing_is_written(
-        self, spoil: Spoil, part: str, own_arm: ArmScene, runner: CliRunner, tmp_path: Path
+        self, spoil: Spoil, part: str, own_arm: ArmScene, tmp_path: Path
     ) -> None:
         spoil(own_arm)
-        result = run(runner, own_arm, tmp_path / "out")
+        result = run(own_arm, tmp_path / "out")
         assert_refused(result, "camera 'left': no pose explains its masks", part)
         assert not (tmp_path / "out").exists()

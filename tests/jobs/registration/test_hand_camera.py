@@ -10,9 +10,8 @@ import yaml
 
 from drake_pose.body.model import load_model
 from drake_pose.camera.files import load_camera_file, load_cameras
-from drake_pose.commands.main import app
 from drake_pose.errors import CameraError
-from tests.cli import CliRunner
+from tests.cli import run_command
 from tests.jobs.registration.arm_scenes import ArmScene, pose_errors
 from tests.jobs.registration.hand_camera import X_LC, write_hand_camera
 
@@ -27,11 +26,9 @@ def arguments(scene: ArmScene, out: Path, *more: str) -> list[str]:
     return ["register", str(scene.folder), *given, *more]
 
 
-def test_the_camera_is_found_on_its_link(
-    hand_camera: ArmScene, runner: CliRunner, tmp_path: Path
-) -> None:
+def test_the_camera_is_found_on_its_link(hand_camera: ArmScene, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    result = runner.invoke(app, arguments(hand_camera, out, "--on", "flange", "--json"))
+    result = run_command(arguments(hand_camera, out, "--on", "flange", "--json"))
     assert result.exit_code == 0, result.output
     found = json.loads(result.stdout)
     assert found["warnings"] == []
@@ -56,15 +53,13 @@ def test_the_camera_is_found_on_its_link(
 
 
 @pytest.mark.slow
-def test_lengths_between_the_base_and_the_camera(
-    hand_camera: ArmScene, runner: CliRunner, tmp_path: Path
-) -> None:
+def test_lengths_between_the_base_and_the_camera(hand_camera: ArmScene, tmp_path: Path) -> None:
     right, short = hand_camera.model.read_text(), tmp_path / "short.urdf"
     assert right.count('"0 0 0.35"') == 1
     short.write_text(right.replace('"0 0 0.35"', '"0 0 0.34"'))
     given = ["--on", "flange", "--lengths", "shoulder", "--lengths", "elbow", "--json"]
     scene, out = replace(hand_camera, model=short), tmp_path / "out"
-    result = runner.invoke(app, arguments(scene, out, *given))
+    result = run_command(arguments(scene, out, *given))
     assert result.exit_code == 0, result.output
     found = json.loads(result.stdout)
     off = 100.0 * (0.35 / 0.34 - 1.0)
@@ -86,12 +81,10 @@ def test_lengths_between_the_base_and_the_camera(
 
 
 @pytest.mark.slow
-def test_lengths_that_no_picture_tells_apart(
-    hand_camera: ArmScene, runner: CliRunner, tmp_path: Path
-) -> None:
+def test_lengths_that_no_picture_tells_apart(hand_camera: ArmScene, tmp_path: Path) -> None:
     # Shoulder and roll are in line, and neither is seen: only their sum is told.
     given = ["--on", "flange", "--lengths", "shoulder", "--lengths", "roll", "--json"]
-    result = runner.invoke(app, arguments(hand_camera, tmp_path / "out", *given))
+    result = run_command(arguments(hand_camera, tmp_path / "out", *given))
     assert result.exit_code == 0, result.output
     lengths = json.loads(result.stdout)["lengths"]
     assert not lengths["shoulder"]["determined"]
@@ -107,18 +100,16 @@ def test_lengths_that_no_picture_tells_apart(
     ],
 )
 def test_what_is_refused_before_work(
-    more: list[str], said: str, hand_camera: ArmScene, runner: CliRunner, tmp_path: Path
+    more: list[str], said: str, hand_camera: ArmScene, tmp_path: Path
 ) -> None:
-    result = runner.invoke(app, arguments(hand_camera, tmp_path / "out", *more))
+    result = run_command(arguments(hand_camera, tmp_path / "out", *more))
     assert result.exit_code == 1
     assert said in " ".join(result.stderr.split())
     assert not (tmp_path / "out").exists()
 
 
-def test_a_base_without_looks_is_named(
-    arm_scene: ArmScene, runner: CliRunner, tmp_path: Path
-) -> None:
-    result = runner.invoke(app, arguments(arm_scene, tmp_path / "out", "--on", "hand"))
+def test_a_base_without_looks_is_named(arm_scene: ArmScene, tmp_path: Path) -> None:
+    result = run_command(arguments(arm_scene, tmp_path / "out", "--on", "hand"))
     assert result.exit_code == 1
     assert "no link that is seen stands still" in " ".join(result.stderr.split())
 

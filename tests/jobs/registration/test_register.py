@@ -14,29 +14,28 @@ import yaml
 from drake_pose.body.model import load_model
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.camera.files import load_cameras
-from drake_pose.commands.main import app
 from drake_pose.jobs.registration.register import register_scene, say_common
 from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.registration.register import FrameMisfit, RegisteredCamera
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import load_scene
-from tests.cli import CliRunner, Result
+from tests.cli import Result, run_command
 from tests.jobs.registration.arm_scenes import ArmScene, pose_errors
 from tests.search.arms import arm_cameras
 
 
-def run(runner: CliRunner, scene: ArmScene, out: Path, *more: str) -> Result:
+def run(scene: ArmScene, out: Path, *more: str) -> Result:
     given = ["--model", str(scene.model), "--joints", str(scene.joints), "--out", str(out)]
-    return runner.invoke(app, ["register", str(scene.folder), *given, *more])
+    return run_command(["register", str(scene.folder), *given, *more])
 
 
 @pytest.fixture(scope="module")
 def registered(
-    arm_scene: ArmScene, tmp_path_factory: pytest.TempPathFactory, runner: CliRunner
+    arm_scene: ArmScene, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, dict[str, Any], Result]:
     """The camera without X_WC, found on the command line: folder, JSON, all that was said."""
     out = tmp_path_factory.mktemp("registered") / "out"
-    result = run(runner, arm_scene, out, "--json")
+    result = run(arm_scene, out, "--json")
     assert result.exit_code == 0, result.output
     return out, json.loads(result.stdout), result
 
@@ -104,11 +103,9 @@ class TestRegister:
         assert list(load_scene(tmp_path / "scene").cameras) == ["left", "right"]
 
 
-def test_estimate_says_how_a_missing_pose_is_found(
-    arm_scene: ArmScene, runner: CliRunner, tmp_path: Path
-) -> None:
+def test_estimate_says_how_a_missing_pose_is_found(arm_scene: ArmScene, tmp_path: Path) -> None:
     given = ["--model", str(arm_scene.model), "--out", str(tmp_path / "out")]
-    result = runner.invoke(app, ["estimate", str(arm_scene.folder), *given])
+    result = run_command(["estimate", str(arm_scene.folder), *given])
     assert result.exit_code == 1
     assert "camera 'left': a pinhole camera needs X_WC; drake-pose register" in result.stderr
 
@@ -116,12 +113,12 @@ def test_estimate_says_how_a_missing_pose_is_found(
 @pytest.mark.slow
 class TestOnTheTerminal:
     def test_a_camera_that_has_a_pose_is_found_anew(
-        self, own_arm: ArmScene, runner: CliRunner, tmp_path: Path
+        self, own_arm: ArmScene, tmp_path: Path
     ) -> None:
         wrong = np.eye(4)
         wrong[:3, 3] = [1.0, 0.3, -0.4]
         own_arm.edit_cameras("right", X_WC=wrong.tolist())
-        result = run(runner, own_arm, tmp_path / "out", "--camera", "right", "--no-overlay")
+        result = run(own_arm, tmp_path / "out", "--camera", "right", "--no-overlay")
         assert result.exit_code == 0, result.output
         # Nobody knows where the other one stands, and nobody asked.
         assert "camera 'left' has no X_WC" in result.stderr
@@ -133,20 +130,18 @@ class TestOnTheTerminal:
         assert "cameras.yaml" in result.stdout
 
     def test_a_held_camera_that_looks_elsewhere_is_named(
-        self, own_arm: ArmScene, runner: CliRunner, tmp_path: Path
+        self, own_arm: ArmScene, tmp_path: Path
     ) -> None:
         elsewhere = np.array(own_arm.cameras["right"].X_WC)
         elsewhere[:3, 3] += [0.0, 0.8, 0.0]
         own_arm.edit_cameras("right", X_WC=elsewhere.tolist())
-        result = run(runner, own_arm, tmp_path / "out")
+        result = run(own_arm, tmp_path / "out")
         assert result.exit_code == 0, result.output
         assert "camera 'right' is held at its X_WC, but the robot is not seen" in result.stderr
         assert "--camera right" in result.stderr
 
-    def test_one_pose_is_warned_of(
-        self, own_arm: ArmScene, runner: CliRunner, tmp_path: Path
-    ) -> None:
-        result = run(runner, own_arm, tmp_path / "out", "--frame", "2", "--json")
+    def test_one_pose_is_warned_of(self, own_arm: ArmScene, tmp_path: Path) -> None:
+        result = run(own_arm, tmp_path / "out", "--frame", "2", "--json")
         assert result.exit_code == 0, result.output
         assert "camera 'left': there is one frame, '0002'" in result.stderr
         assert list(json.loads(result.stdout)["frames"]) == ["0002"]
@@ -199,13 +194,11 @@ class TestRecordedArms:
         for frame, iou in zip(one.frames, (0.87, 0.94, 0.92, 0.95, 0.93), strict=True):
             assert frame.iou == pytest.approx(iou, abs=0.01)
 
-    def test_frames_that_contradict_their_angles(
-        self, shared_data: Path, runner: CliRunner, tmp_path: Path
-    ) -> None:
+    def test_frames_that_contradict_their_angles(self, shared_data: Path, tmp_path: Path) -> None:
         folder = shared_data / "franka_one_view"
         panda = folder / "panda" / "panda.urdf"
         scene = ArmScene(folder, panda, folder / "joint_angles.csv", {})
-        result = run(runner, scene, tmp_path / "out", "--json")
+        result = run(scene, tmp_path / "out", "--json")
         assert result.exit_code == 0, result.output
         found = json.loads(result.stdout)
         assert found["contradictions"] == [f"{k:04d}" for k in range(2, 10)]
@@ -234,9 +227,7 @@ def test_cameras_tell_together_whose_fault_a_frame_is() -> None:
 
 
 class TestZeros:
-    def test_zeros_are_found_and_written_to_a_urdf(
-        self, own_arm: ArmScene, tmp_path: Path, runner: CliRunner
-    ) -> None:
+    def test_zeros_are_found_and_written_to_a_urdf(self, own_arm: ArmScene, tmp_path: Path) -> None:
         off = np.radians(3.0)
         rows = own_arm.rows()
         column = rows[0].index("elbow_turn")
@@ -245,7 +236,7 @@ class TestZeros:
         own_arm.write_rows(rows)
         out = tmp_path / "out"
         given = ["--zeros", "shoulder_turn", "--zeros", "elbow_turn", "--json"]
-        result = run(runner, own_arm, out, *given)
+        result = run(own_arm, out, *given)
         assert result.exit_code == 0, result.output
         zeros = json.loads(result.stdout)["zeros"]
         assert zeros["elbow_turn"]["value_deg"] == pytest.approx(3.0, abs=0.3)
@@ -267,9 +258,9 @@ class TestZeros:
         np.testing.assert_allclose(places[1], places[0], atol=1e-9)
         np.testing.assert_allclose(corrected.lower + _zeros(zeros, rows[0][1:]), right.lower)
 
-    def test_too_few_frames(self, own_arm: ArmScene, tmp_path: Path, runner: CliRunner) -> None:
+    def test_too_few_frames(self, own_arm: ArmScene, tmp_path: Path) -> None:
         out = tmp_path / "out"
-        result = run(runner, own_arm, out, "--zeros", "all", "--frame", "0000")
+        result = run(own_arm, out, "--zeros", "all", "--frame", "0000")
         assert result.exit_code == 1
         assert "more frames" in result.stderr
         assert not out.exists()
@@ -277,13 +268,13 @@ class TestZeros:
 
 class TestLengths:
     def test_lengths_are_found_and_written_to_a_urdf(
-        self, own_arm: ArmScene, tmp_path: Path, runner: CliRunner
+        self, own_arm: ArmScene, tmp_path: Path
     ) -> None:
         right, out = load_model(own_arm.model), tmp_path / "out"
         short = own_arm.model.read_text().replace('"0 0 0.35"', '"0 0 0.34"')
         (tmp_path / "short.urdf").write_text(short)
         given = ["--lengths", "shoulder", "--lengths", "turret", "--json"]
-        result = run(runner, replace(own_arm, model=tmp_path / "short.urdf"), out, *given)
+        result = run(replace(own_arm, model=tmp_path / "short.urdf"), out, *given)
         assert result.exit_code == 0, result.output
         summary = json.loads(result.stdout)
         found = summary["lengths"]
@@ -322,9 +313,9 @@ class TestLengths:
         ],
     )
     def test_unknown_names_are_refused_before_work(
-        self, given: list[str], said: str, arm_scene: ArmScene, tmp_path: Path, runner: CliRunner
+        self, given: list[str], said: str, arm_scene: ArmScene, tmp_path: Path
     ) -> None:
-        result = run(runner, arm_scene, tmp_path / "out", *given)
+        result = run(arm_scene, tmp_path / "out", *given)
         assert result.exit_code == 1
         assert said in " ".join(result.stderr.split())
 

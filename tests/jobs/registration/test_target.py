@@ -9,8 +9,7 @@ import pytest
 import yaml
 
 from drake_pose.camera.files import load_camera_file
-from drake_pose.commands.main import app
-from tests.cli import CliRunner
+from tests.cli import run_command
 from tests.jobs.registration.arm_scenes import pose_errors
 from tests.jobs.registration.hand_camera import X_LC
 from tests.jobs.registration.target_scenes import (
@@ -31,8 +30,8 @@ def arguments(scene: TargetScene, out: Path, *more: str) -> list[str]:
     return ["register", str(scene.arm.folder), *given, *more]
 
 
-def register(scene: TargetScene, out: Path, runner: CliRunner, *more: str) -> dict:
-    result = runner.invoke(app, arguments(scene, out, "--json", "--no-overlay", *more))
+def register(scene: TargetScene, out: Path, *more: str) -> dict:
+    result = run_command(arguments(scene, out, "--json", "--no-overlay", *more))
     assert result.exit_code == 0, result.output
     return json.loads(result.stdout)
 
@@ -49,11 +48,9 @@ def bracket(tmp_path_factory: pytest.TempPathFactory) -> TargetScene:
 
 
 @pytest.mark.slow
-def test_camera_and_target_are_found(
-    bracket: TargetScene, runner: CliRunner, tmp_path: Path
-) -> None:
+def test_camera_and_target_are_found(bracket: TargetScene, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    result = runner.invoke(app, arguments(bracket, out, "--json"))
+    result = run_command(arguments(bracket, out, "--json"))
     assert result.exit_code == 0, result.output
     found = json.loads(result.stdout)
     assert found["warnings"] == []
@@ -81,11 +78,9 @@ def test_camera_and_target_are_found(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("looks", "links"), [(BRACKET, SIX), (BOX, LINKS), (BOX, SIX)])
-def test_two_arms_and_two_targets(
-    looks: str, links: tuple, runner: CliRunner, tmp_path: Path
-) -> None:
+def test_two_arms_and_two_targets(looks: str, links: tuple, tmp_path: Path) -> None:
     scene = write_target_scene(tmp_path, looks, links, seed=2, size=(320, 240))
-    found = register(scene, tmp_path / "out", runner)
+    found = register(scene, tmp_path / "out")
     millimetres, degrees = pose_errors(np.array(found["X_LC"]), X_LC)
     assert millimetres < 1.0
     assert degrees < 0.1
@@ -98,10 +93,10 @@ def test_two_arms_and_two_targets(
 
 
 @pytest.mark.slow
-def test_damaged_masks_and_a_wrong_one(runner: CliRunner, tmp_path: Path) -> None:
+def test_damaged_masks_and_a_wrong_one(tmp_path: Path) -> None:
     scene = write_target_scene(tmp_path, BRACKET, SIX, seed=3)
     damage_masks(scene.arm.folder / "masks" / "wrist", 3, "0005.png")
-    found = register(scene, tmp_path / "out", runner)
+    found = register(scene, tmp_path / "out")
     assert found["contradictions"] == ["0005"]
     assert any("contradict the others" in text for text in found["warnings"])
     millimetres, degrees = pose_errors(np.array(found["X_LC"]), X_LC)
@@ -111,9 +106,9 @@ def test_damaged_masks_and_a_wrong_one(runner: CliRunner, tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_a_round_target_leaves_its_own_turn_open_alone(runner: CliRunner, tmp_path: Path) -> None:
+def test_a_round_target_leaves_its_own_turn_open_alone(tmp_path: Path) -> None:
     scene = write_target_scene(tmp_path, CAN, SIX, seed=1, size=(320, 240))
-    found = register(scene, tmp_path / "out", runner)
+    found = register(scene, tmp_path / "out")
     millimetres, degrees = pose_errors(np.array(found["X_LC"]), X_LC)
     assert millimetres < 1.0
     assert degrees < 0.1
@@ -129,9 +124,7 @@ def test_a_round_target_leaves_its_own_turn_open_alone(runner: CliRunner, tmp_pa
 
 
 @pytest.mark.slow
-def test_zeros_beside_camera_and_target(
-    bracket: TargetScene, runner: CliRunner, tmp_path: Path
-) -> None:
+def test_zeros_beside_camera_and_target(bracket: TargetScene, tmp_path: Path) -> None:
     rows = bracket.arm.rows()
     column = rows[0].index("elbow_turn")
     arm = bracket.arm.copy(tmp_path)
@@ -144,7 +137,7 @@ def test_zeros_beside_camera_and_target(
     )
     scene = TargetScene(arm, bracket.target, bracket.X_WT)
     given = ["--zeros", "elbow_turn", "--zeros", "turret_turn"]
-    found = register(scene, tmp_path / "out", runner, *given)
+    found = register(scene, tmp_path / "out", *given)
     zero = found["zeros"]["elbow_turn"]
     assert zero["value_deg"] == pytest.approx(2.0, abs=0.3)
     assert zero["significant"]
@@ -155,14 +148,12 @@ def test_zeros_beside_camera_and_target(
 
 
 @pytest.mark.slow
-def test_lengths_beside_camera_and_target(
-    bracket: TargetScene, runner: CliRunner, tmp_path: Path
-) -> None:
+def test_lengths_beside_camera_and_target(bracket: TargetScene, tmp_path: Path) -> None:
     right, short = bracket.arm.model.read_text(), tmp_path / "short.urdf"
     assert right.count('"0 0 0.35"') == 1
     short.write_text(right.replace('"0 0 0.35"', '"0 0 0.34"'))
     scene = replace(bracket, arm=replace(bracket.arm, model=short))
-    found = register(scene, tmp_path / "out", runner, "--lengths", "shoulder")
+    found = register(scene, tmp_path / "out", "--lengths", "shoulder")
     one, off = found["lengths"]["shoulder"], 100.0 * (0.35 / 0.34 - 1.0)
     assert one["low_percent"] < off < one["high_percent"]
     assert one["value_percent"] == pytest.approx(off, abs=1.0)
@@ -183,17 +174,17 @@ def test_lengths_beside_camera_and_target(
     ],
 )
 def test_what_is_refused_before_work(
-    more: list[str], said: str, bracket: TargetScene, runner: CliRunner, tmp_path: Path
+    more: list[str], said: str, bracket: TargetScene, tmp_path: Path
 ) -> None:
-    result = runner.invoke(app, arguments(bracket, tmp_path / "out", *more))
+    result = run_command(arguments(bracket, tmp_path / "out", *more))
     assert result.exit_code == 1, result.output
     assert said in " ".join(result.stderr.split())
     assert not (tmp_path / "out").exists()
 
 
-def test_a_hand_that_turns_about_one_axis_is_refused(runner: CliRunner, tmp_path: Path) -> None:
+def test_a_hand_that_turns_about_one_axis_is_refused(tmp_path: Path) -> None:
     scene = write_target_scene(tmp_path, links=SIX, seed=5, count=5, size=(320, 240), moving=5)
-    result = runner.invoke(app, arguments(scene, tmp_path / "out"))
+    result = run_command(arguments(scene, tmp_path / "out"))
     assert result.exit_code == 1
     said = " ".join(result.stderr.split())
     assert "about one axis" in said
@@ -201,30 +192,26 @@ def test_a_hand_that_turns_about_one_axis_is_refused(runner: CliRunner, tmp_path
     assert not (tmp_path / "out").exists()
 
 
-def test_a_target_with_joints_is_refused(
-    bracket: TargetScene, runner: CliRunner, tmp_path: Path
-) -> None:
+def test_a_target_with_joints_is_refused(bracket: TargetScene, tmp_path: Path) -> None:
     scene = TargetScene(bracket.arm, bracket.arm.model, bracket.X_WT)
-    result = runner.invoke(app, arguments(scene, tmp_path / "out"))
+    result = run_command(arguments(scene, tmp_path / "out"))
     assert result.exit_code == 1
     assert "must be rigid" in " ".join(result.stderr.split())
 
 
-def test_a_target_needs_a_link(bracket: TargetScene, runner: CliRunner, tmp_path: Path) -> None:
+def test_a_target_needs_a_link(bracket: TargetScene, tmp_path: Path) -> None:
     given = [one for one in arguments(bracket, tmp_path / "out") if one not in ("--on", "flange")]
-    result = runner.invoke(app, given)
+    result = run_command(given)
     assert result.exit_code == 1
     assert "--on LINK" in " ".join(result.stderr.split())
 
 
 @pytest.mark.slow
-def test_masks_of_another_target_are_refused(
-    bracket: TargetScene, runner: CliRunner, tmp_path: Path
-) -> None:
+def test_masks_of_another_target_are_refused(bracket: TargetScene, tmp_path: Path) -> None:
     other = tmp_path / "other.urdf"
     other.write_text(bracket.target.read_text().replace("0.05 0.08 0.12", "0.15 0.02 0.3"))
     scene = TargetScene(bracket.arm, other, bracket.X_WT)
-    result = runner.invoke(app, arguments(scene, tmp_path / "out", "--frame", "0000:0003"))
+    result = run_command(arguments(scene, tmp_path / "out", "--frame", "0000:0003"))
     assert result.exit_code == 1, result.output
     assert "Nothing was written" in " ".join(result.stderr.split())
     assert not (tmp_path / "out").exists()

@@ -13,19 +13,18 @@ from scipy.spatial.transform import Rotation
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.camera.files import load_cameras
-from drake_pose.commands.main import app
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask
-from tests.cli import CliRunner, Result
+from tests.cli import Result, run_command
 from tests.jobs.estimate.test_bad_input import assert_refused
 from tests.jobs.registration.arm_scenes import JOINTS, ArmScene, pose_errors
 
 BASE = ("base_x", "base_y", "base_z", "base_qw", "base_qx", "base_qy", "base_qz")
 
 
-def run(runner: CliRunner, scene: Path, model: Path, out: Path, *more: str) -> Result:
+def run(scene: Path, model: Path, out: Path, *more: str) -> Result:
     given = ["--model", str(model), "--out", str(out)]
-    return runner.invoke(app, ["register", str(scene), *given, *more])
+    return run_command(["register", str(scene), *given, *more])
 
 
 def errors_in_deviations(out: Path, name: str, true: np.ndarray) -> np.ndarray:
@@ -60,10 +59,10 @@ def write_free_arm(scene: ArmScene, seed: int = 7) -> None:
 @pytest.mark.slow
 class TestArm:
     def test_positions_are_estimated_by_the_other_camera(
-        self, arm_scene: ArmScene, runner: CliRunner, tmp_path: Path
+        self, arm_scene: ArmScene, tmp_path: Path
     ) -> None:
         out = tmp_path / "out"
-        result = run(runner, arm_scene.folder, arm_scene.model, out, "--json")
+        result = run(arm_scene.folder, arm_scene.model, out, "--json")
         assert result.exit_code == 0, result.output
         true = arm_scene.cameras["left"].X_WC
         X_WC = load_cameras(out / "cameras.yaml")["left"].X_WC
@@ -74,11 +73,11 @@ class TestArm:
         assert json.loads(result.stdout)["joints"] is None
 
     def test_the_base_moves_and_the_table_is_an_estimate_s(
-        self, own_arm: ArmScene, runner: CliRunner, tmp_path: Path
+        self, own_arm: ArmScene, tmp_path: Path
     ) -> None:
         write_free_arm(own_arm)
         out, given = tmp_path / "out", ["--joints", str(own_arm.joints), "--json"]
-        result = run(runner, own_arm.folder, own_arm.model, out, *given)
+        result = run(own_arm.folder, own_arm.model, out, *given)
         assert result.exit_code == 0, result.output
         true = own_arm.cameras["left"].X_WC
         millimetres, degrees = pose_errors(load_cameras(out / "cameras.yaml")["left"].X_WC, true)
@@ -91,12 +90,10 @@ class TestArm:
 
 @pytest.mark.slow
 class TestRealData:
-    def test_an_arm_without_encoders(
-        self, shared_data: Path, runner: CliRunner, tmp_path: Path
-    ) -> None:
+    def test_an_arm_without_encoders(self, shared_data: Path, tmp_path: Path) -> None:
         source, out = shared_data / "arm_two_views", tmp_path / "out"
         model = source / "med7" / "med7.urdf"
-        result = run(runner, source, model, out, "--camera", "right", "--json")
+        result = run(source, model, out, "--camera", "right", "--json")
         assert result.exit_code == 0, result.output
         true = load_cameras(source / "cameras.yaml")["right"].X_WC
         millimetres, degrees = pose_errors(load_cameras(out / "cameras.yaml")["right"].X_WC, true)
@@ -105,11 +102,11 @@ class TestRealData:
         assert degrees < 0.7
         assert np.abs(errors_in_deviations(out, "right", true)).max() < 3.0
 
-    def test_a_person(self, shared_data: Path, runner: CliRunner, tmp_path: Path) -> None:
+    def test_a_person(self, shared_data: Path, tmp_path: Path) -> None:
         source, out = shared_data / "human_four_views", tmp_path / "out"
         model = bundled_model("person").with_name("person_shape.urdf")
         given = ["--camera", "cam03", "--frame", "0:19", "--json"]
-        result = run(runner, source, model, out, *given)
+        result = run(source, model, out, *given)
         assert result.exit_code == 0, result.output
         true = load_cameras(source / "cameras.yaml")["cam03"].X_WC
         millimetres, degrees = pose_errors(load_cameras(out / "cameras.yaml")["cam03"].X_WC, true)
@@ -120,37 +117,31 @@ class TestRealData:
 
 
 class TestRefused:
-    def test_nothing_is_known(self, own_arm: ArmScene, runner: CliRunner, tmp_path: Path) -> None:
+    def test_nothing_is_known(self, own_arm: ArmScene, tmp_path: Path) -> None:
         own_arm.edit_cameras("right", X_WC=None)
-        result = run(runner, own_arm.folder, own_arm.model, tmp_path / "out")
+        result = run(own_arm.folder, own_arm.model, tmp_path / "out")
         assert_refused(result, "neither a camera's place nor", "X_WC of one camera", "--joints")
         assert not (tmp_path / "out").exists()
 
-    def test_a_person_before_one_known_camera(
-        self, arm_scene: ArmScene, runner: CliRunner, tmp_path: Path
-    ) -> None:
+    def test_a_person_before_one_known_camera(self, arm_scene: ArmScene, tmp_path: Path) -> None:
         person = bundled_model("person").with_name("person_shape.urdf")
-        result = run(runner, arm_scene.folder, person, tmp_path / "out")
+        result = run(arm_scene.folder, person, tmp_path / "out")
         assert_refused(result, "right is the only camera", "two cameras or more")
 
     @pytest.mark.parametrize("more", [["--zeros", "all"], ["--focal"], ["--on", "hand"]])
     def test_what_needs_measured_positions(
-        self, more: list[str], arm_scene: ArmScene, runner: CliRunner, tmp_path: Path
+        self, more: list[str], arm_scene: ArmScene, tmp_path: Path
     ) -> None:
-        result = run(runner, arm_scene.folder, arm_scene.model, tmp_path / "out", *more)
+        result = run(arm_scene.folder, arm_scene.model, tmp_path / "out", *more)
         assert_refused(result, f"{more[0]} needs measured joint positions")
 
-    def test_no_moment_in_common(
-        self, own_arm: ArmScene, runner: CliRunner, tmp_path: Path
-    ) -> None:
+    def test_no_moment_in_common(self, own_arm: ArmScene, tmp_path: Path) -> None:
         own_arm.write_rows([["frame", *JOINTS, "error", "seconds"], [7, *([0.1] * 5), 0.1, 1.0]])
         given = ["--joints", str(own_arm.joints)]
-        result = run(runner, own_arm.folder, own_arm.model, tmp_path / "out", *given)
+        result = run(own_arm.folder, own_arm.model, tmp_path / "out", *given)
         assert_refused(result, "camera 'left' has no mask of a frame in which")
 
-    def test_an_estimate_without_its_cameras(
-        self, own_arm: ArmScene, runner: CliRunner, tmp_path: Path
-    ) -> None:
+    def test_an_estimate_without_its_cameras(self, own_arm: ArmScene, tmp_path: Path) -> None:
         rows = own_arm.rows()
         own_arm.write_rows(
             [
@@ -160,18 +151,16 @@ class TestRefused:
         )
         shutil.rmtree(own_arm.folder / "masks" / "right")
         given = ["--joints", str(own_arm.joints)]
-        result = run(runner, own_arm.folder, own_arm.model, tmp_path / "out", *given)
+        result = run(own_arm.folder, own_arm.model, tmp_path / "out", *given)
         assert_refused(result, "no camera with an X_WC has a mask of those frames")
 
 
 @pytest.mark.slow
-def test_a_body_that_stands_still_is_warned_of(
-    own_arm: ArmScene, runner: CliRunner, tmp_path: Path
-) -> None:
+def test_a_body_that_stands_still_is_warned_of(own_arm: ArmScene, tmp_path: Path) -> None:
     with own_arm.joints.open(newline="") as file:
         rows = list(csv.reader(file))
     own_arm.write_rows([[*rows[0], "error", "seconds"], [*rows[1], 0.1, 1.0]])
     given = ["--joints", str(own_arm.joints)]
-    result = run(runner, own_arm.folder, own_arm.model, tmp_path / "out", *given)
+    result = run(own_arm.folder, own_arm.model, tmp_path / "out", *given)
     assert result.exit_code == 0, result.output
     assert "camera 'left': there is one frame, '0000'" in " ".join(result.stderr.split())

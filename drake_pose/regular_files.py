@@ -8,21 +8,17 @@ import stat
 from pathlib import Path
 
 _END = 1 << 20
-_KINDS = (
-    (stat.S_ISDIR, "it is a folder, not a file"),
-    (stat.S_ISFIFO, "it is a named pipe, not a file"),
-    (stat.S_ISSOCK, "it is a socket, not a file"),
-    (stat.S_ISCHR, "it is a device, not a file"),
-    (stat.S_ISBLK, "it is a device, not a file"),
-)
+_KINDS = {
+    stat.S_IFDIR: "folder",
+    stat.S_IFIFO: "named pipe",
+    stat.S_IFSOCK: "socket",
+    stat.S_IFCHR: "device",
+    stat.S_IFBLK: "device",
+}
 
 
 def read_regular(path: Path, limit: int = -1) -> bytes:
-    """A file's content.
-
-    Args:
-        path: the file; a link to one is as good.
-        limit: at most this many bytes of it are read; all where negative.
+    """A file's content, or that of what a link leads to; at most ``limit`` bytes, if not negative.
 
     Raises:
         OSError: it cannot be read, or is no regular file; strerror says which.
@@ -50,16 +46,13 @@ def digest(path: Path) -> str:
 
 
 def require_regular(path: Path) -> int:
-    """Refuses what is no regular file without opening it: a pipe would wait for its writer.
-
-    Returns:
-        The file's size [byte].
+    """A file's size [byte], without opening it: a pipe would wait for its writer.
 
     Raises:
-        OSError: strerror says what it is.
+        OSError: it is no regular file; strerror says what it is.
     """
     status = path.stat()
-    for is_kind, text in _KINDS:
-        if is_kind(status.st_mode):
-            raise OSError(errno.EINVAL, text, str(path))
+    kind = _KINDS.get(stat.S_IFMT(status.st_mode))
+    if kind is not None:
+        raise OSError(errno.EINVAL, f"it is a {kind}, not a file", str(path))
     return status.st_size

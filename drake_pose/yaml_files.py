@@ -49,11 +49,8 @@ def read_yaml(path: Path, error_type: type[DrakePoseError], *, tags: bool = Fals
 
     Args:
         path: the file.
-        error_type: what is raised.
+        error_type: raised, with the file's name, when it cannot be read or is no small YAML file.
         tags: keep local tags of mappings, as Drake's files have them, under the key ``_tag``.
-
-    Raises:
-        error_type: names the file; when it cannot be read, is too large, or is no YAML file.
     """
     try:
         data = read_regular(path, _LARGEST_FILE + 1)

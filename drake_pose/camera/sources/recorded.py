@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import re
 from pathlib import Path
@@ -24,8 +22,8 @@ from drake_pose.camera.sources.frame_source import (
     SourceSpecification,
     TimedPicture,
 )
+from drake_pose.csv_files import read_csv
 from drake_pose.errors import SceneError
-from drake_pose.regular_files import read_regular
 
 TIME_STAMPS = "timestamps.csv"
 
@@ -209,21 +207,17 @@ def read_time_stamps(path: Path) -> dict[str, float]:
     Raises:
         SceneError: names the file and the line.
     """
-    try:
-        text = read_regular(path).decode("utf-8-sig")
-        reader = csv.DictReader(io.StringIO(text, newline=""))
-        if not {"frame", "time"} <= set(reader.fieldnames or ()):
-            raise SceneError(f"{path}: needs the columns frame and time [s] in its first line")
-        rows = [(reader.line_num, row["frame"], row["time"]) for row in reader]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise SceneError(f"{path}: cannot be read: {error}") from error
+    header, rows = read_csv(path, SceneError)
+    if not {"frame", "time"} <= set(header):
+        raise SceneError(f"{path}: needs the columns frame and time [s] in its first line")
     found: dict[str, float] = {}
-    for line, frame, text in rows:
+    for line, row in rows:
+        frame = row[header.index("frame")]
         if frame in found:
             raise SceneError(f"{path}: line {line}: has frame {frame} twice")
         try:
-            time = float(text)
-        except (TypeError, ValueError):
+            time = float(row[header.index("time")])
+        except ValueError:
             time = math.nan
         if not math.isfinite(time):
             raise SceneError(f"{path}: line {line}: the time must be a number of seconds")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,8 +11,8 @@ import numpy as np
 
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.camera.models import Camera
+from drake_pose.csv_files import read_csv
 from drake_pose.errors import SceneError, SettingsError, UnknownNameError
-from drake_pose.regular_files import read_regular
 from drake_pose.results.folder import BASE_COLUMNS, FIT_COLUMNS
 from drake_pose.results.options import frame_number
 from drake_pose.results.settings import EstimateSettings
@@ -56,7 +54,7 @@ def read_joint_centres(path: Path, joint: str, frames: Sequence[str]) -> dict[st
         SceneError: if the file cannot be read, or a frame has no row.
         UnknownNameError: if no row is of that joint.
     """
-    header, rows = _read_csv(path)
+    header, rows = read_csv(path, SceneError)
     if header != list(_CENTRE_COLUMNS):
         raise SceneError(f"{path}: the first line must be {','.join(_CENTRE_COLUMNS)}")
     by_number: dict[int, np.ndarray] = {}
@@ -90,7 +88,7 @@ def read_true_angles(path: Path, position_names: Sequence[str]) -> TrueAngles:
         SceneError: if the file cannot be read, or gives a column or a frame twice.
         UnknownNameError: if the model has no position of a column's name.
     """
-    header, rows = _read_csv(path)
+    header, rows = read_csv(path, SceneError)
     if len(header) < 2 or header[0] != "frame":
         raise SceneError(f"{path}: the first line must be frame, then names of positions")
     is_estimate = tuple(header[-2:]) == FIT_COLUMNS
@@ -127,26 +125,6 @@ def _frame_key(cell: str) -> int | str:
 def angle_difference(a: float, b: float) -> float:
     """Returns a - b, turned by full turns into -pi..pi [rad]."""
     return math.remainder(a - b, 2.0 * math.pi)
-
-
-def _read_csv(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Returns the first line's columns, and each other line with its number."""
-    try:
-        text = read_regular(path).decode("utf-8-sig")
-        reader = csv.reader(io.StringIO(text, newline=""))
-        lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader if row]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not a CSV file"
-        raise SceneError(f"{path}: cannot read it: {reason}") from error
-    if not lines:
-        raise SceneError(f"{path}: is empty")
-    header = lines[0][1]
-    for line, row in lines[1:]:
-        if len(row) != len(header):
-            raise SceneError(
-                f"{path}: line {line} has {len(row)} columns, but the first has {len(header)}"
-            )
-    return header, lines[1:]
 
 
 def _numbers(cells: Sequence[str], path: Path, line: int) -> np.ndarray:

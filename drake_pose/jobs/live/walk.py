@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import time
 import webbrowser
@@ -19,6 +18,7 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.csv_files import read_csv
 from drake_pose.errors import OutputError, SettingsError
 from drake_pose.jobs.estimate.person_choice import bundled_person
 from drake_pose.jobs.live.capture import shape_of_result
@@ -93,20 +93,19 @@ def recorded_player(
         if not model_path.is_file():
             raise OutputError(f"{result}: its model '{name}' is not a bundled one; give --model")
     model = load_model(model_path, package_paths=packages)
-    path, columns = result / POSES, list(model.position_names)
+    path = result / POSES
+    header, rows = read_csv(path, OutputError)
+    missing = [name for name in model.position_names if name not in header]
+    if missing:
+        raise OutputError(
+            f"{path}: has no column '{missing[0]}', which {model.path.name} needs; give the model "
+            "it was captured with"
+        )
+    columns = [header.index(name) for name in model.position_names]
     try:
-        with path.open(newline="", encoding="utf-8") as stream:
-            reader = csv.DictReader(stream)
-            missing = [name for name in columns if name not in (reader.fieldnames or ())]
-            if missing:
-                raise OutputError(
-                    f"{path}: has no column '{missing[0]}', which {model.path.name} needs; give "
-                    "the model it was captured with"
-                )
-            q = np.array([[float(row[name] or "nan") for name in columns] for row in reader])
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be read: {error.strerror}") from error
-    except (ValueError, TypeError):
+        q = np.array([[float(row[k] or "nan") for k in columns] for _, row in rows])
+        q = q.reshape(-1, len(columns))
+    except ValueError:
         raise OutputError(f"{path}: is damaged: there is a cell that is no number") from None
     if not np.isfinite(q).all(axis=-1).any():
         raise OutputError(f"{path}: nobody was found in any frame, so nobody can walk")

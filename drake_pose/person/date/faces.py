@@ -6,8 +6,6 @@ known directions; the nearest template's direction is the answer.
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,9 +17,9 @@ from numpy.typing import NDArray
 
 from drake_pose.camera.models import Camera
 from drake_pose.camera.picture_files import SUFFIXES, read_picture
+from drake_pose.csv_files import read_csv
 from drake_pose.errors import SceneError, SettingsError
 from drake_pose.person.date.skin_blobs import Blobs, SkinColour, skin_blobs
-from drake_pose.regular_files import read_regular
 from drake_pose.silhouette.segmentation.background import (
     Background,
     learn_background,
@@ -199,19 +197,11 @@ def learn_recorded_faces(folder: Path, skin: SkinColour | None = None) -> FaceTe
 
 def _read_directions(path: Path) -> list[tuple[str, float, float]]:
     """Picture, turn and nod [deg] of each line."""
-    try:
-        text = read_regular(path).decode("utf-8-sig")
-        rows = list(csv.reader(io.StringIO(text, newline="")))
-    except OSError as error:
-        raise SceneError(f"{path}: cannot read the directions: {error.strerror}") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise SceneError(f"{path}: is no table of comma-separated values: {error}") from error
-    if not rows or [cell.strip() for cell in rows[0]] != _COLUMNS:
+    header, rows = read_csv(path, SceneError)
+    if header != _COLUMNS:
         raise SceneError(f"{path}: the first line must be {','.join(_COLUMNS)}")
     table: dict[str, tuple[str, float, float]] = {}
-    for number, row in enumerate(rows[1:], 2):
-        if not row:
-            continue
+    for number, row in rows:
         line = _read_line(row, f"{path}, line {number}")
         if line[0] in table:
             raise SceneError(f"{path}, line {number}: '{line[0]}' has a line already")
@@ -220,9 +210,8 @@ def _read_directions(path: Path) -> list[tuple[str, float, float]]:
 
 
 def _read_line(row: list[str], where: str) -> tuple[str, float, float]:
-    cells = [cell.strip() for cell in row]
     try:
-        name, turn, nod = cells[0], *(float(cell) for cell in cells[1:])
+        name, turn, nod = row[0], *(float(cell) for cell in row[1:])
     except ValueError as error:
         raise SceneError(f"{where}: expected a picture and two angles [deg]: {error}") from error
     if Path(name).name != name or Path(name).suffix.lower() not in SUFFIXES:

@@ -60,9 +60,9 @@ class TestRecordedFaces:
     @pytest.mark.parametrize(
         ("text", "message"),
         [
-            ("", "first line must be picture,turn,nod"),
+            ("", "is empty"),
             ("picture,turn\n", "first line must be picture,turn,nod"),
-            ("picture,turn,nod\n+0_+10.png,1\n", "line 2: expected a picture and two angles"),
+            ("picture,turn,nod\n+0_+10.png,1\n", "line 2 has 2 columns"),
             ("picture,turn,nod\n+0_+10.png,a,1\n", "line 2: expected a picture and two angles"),
             ("picture,turn,nod\n../x.png,1,1\n", r"line 2: '\.\./x\.png' is no picture"),
             ("picture,turn,nod\n+0_+10.png,nan,1\n", "line 2: turn and nod"),

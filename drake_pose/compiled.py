@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any, TypeVar, overload
 
 import numpy as np
-from numba import njit
+from numba import njit, types
 from numba.core.caching import FunctionCache, NullCache
 from numba.core.dispatcher import Dispatcher
 
@@ -67,7 +67,18 @@ def compiled(function: Any = None, **options: Any) -> Any:
         with suppress(RuntimeError):  # numba's way to say that no folder can be written.
             cache = _SharedCache(kernel.py_func)
         setattr(kernel, "_cache", cache)  # noqa: B010 - numba's type hints do not know it.
+        kernel.get_call_template = _without_literals(kernel.get_call_template)
     return kernel
+
+
+def _without_literals(find_template: Callable[..., Any]) -> Callable[..., Any]:
+    """Lets kernels call a kernel as one of plain numbers: else it is compiled for each literal."""
+
+    def find(args: Any, kws: Any) -> Any:
+        plain = {name: types.unliteral(kind) for name, kind in kws.items()}
+        return find_template(tuple(types.unliteral(kind) for kind in args), plain)
+
+    return find
 
 
 class _SharedCache(FunctionCache):
@@ -92,13 +103,10 @@ class _SharedCache(FunctionCache):
         return found
 
     def _load(self, sig: Any, target_context: Any) -> Any:
-        """The stored kernel, or None; what cannot be read any more is thrown away.
-
-        A stored kernel names the modules of its arguments' types, which another version of this
-        package may have moved.
-        """
+        """The stored kernel, or None; what cannot be read any more is thrown away."""
         try:
             return super().load_overload(sig, target_context)
+        # It names the modules of its arguments' types, which may have moved since.
         except (ImportError, AttributeError, EOFError, pickle.UnpicklingError):
             self.flush()
             return None

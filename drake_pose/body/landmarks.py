@@ -84,7 +84,6 @@ def landmark_positions(
     """The landmarks (n, 3) in the world [m], in the mapping's order.
 
     Args:
-        model: the model.
         landmarks: as load_landmarks gives them.
         q: (nq,) the plant's positions.
         X_WB: (4, 4) pose of the plant's world frame in the world; None for the identity.
@@ -110,7 +109,6 @@ def landmarks_of_nodes(tree: PoseTree, landmarks: Mapping[str, Landmark]) -> Nod
     """The landmarks in the frames of a tree's nodes, for many poses at little cost.
 
     Args:
-        tree: the tree.
         landmarks: as load_landmarks gives them; a link may be welded to a node's link.
 
     Raises:

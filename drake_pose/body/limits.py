@@ -42,27 +42,29 @@ _WIDEST_ANGLE, _WIDEST_SCREW, _WIDEST_LENGTH = 4.0 * _FULL_TURN, 100.0 * _FULL_T
 _ROUNDING = 1e-9
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Positions:
     """What a plant's q means; all in the plant's order, arrays (nq,) and read-only.
 
     Attributes:
-        names, kinds: of each position.
-        lower, upper: the limits; one turn about the default position for an angle without.
-        defaults: Drake's default positions, moved inside the limits.
+        position_names: one unique name a position: the joint's name, or ``joint_suffix`` for joints
+            of several positions.
+        position_kinds: "angle" [rad], "length" [m] or "quaternion" for each position.
+        lower, upper: limits [rad or m]; half a turn either side of the default position for a joint
+            that turns freely; infinite for the pose of a floating body, and for slides without
+            limits.
+        default_positions: Drake's default positions moved inside the limits.
         periodic: angles that look the same after a full turn: all but those of screws.
         turns_freely: angles without limits, or with limits so wide that they mean none.
-        warnings: what was made of limits that could not be taken as they are written.
     """
 
-    names: tuple[str, ...]
-    kinds: tuple[PositionKind, ...]
+    position_names: tuple[str, ...]
+    position_kinds: tuple[PositionKind, ...]
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
-    defaults: NDArray[np.float64]
+    default_positions: NDArray[np.float64]
     periodic: NDArray[np.bool_]
     turns_freely: NDArray[np.bool_]
-    warnings: tuple[str, ...]
 
 
 def turns_around(
@@ -93,11 +95,10 @@ def nearest_turn(
 
 def describe_positions(
     plant: MultibodyPlant, given: Mapping[str, tuple[float, float]], where: str
-) -> Positions:
-    """Names, kinds and limits of all positions of a finalized plant.
+) -> tuple[Positions, list[str]]:
+    """Names, kinds and limits of all positions of a finalized plant, and warnings.
 
     Args:
-        plant: the plant.
         given: limits (lower, upper) [rad or m] by position name that replace the plant's own.
         where: the model's file, for messages.
 
@@ -141,19 +142,14 @@ def describe_positions(
     defaults = np.clip(defaults, lower, upper)
     for array in (lower, upper, defaults, periodic, free):
         array.setflags(write=False)
-    return Positions(
-        tuple(names), tuple(kinds), lower, upper, defaults, periodic, free, tuple(warnings)
-    )
+    positions = Positions(tuple(names), tuple(kinds), lower, upper, defaults, periodic, free)
+    return positions, warnings
 
 
 def _written_limits(
     joint: Joint, names: list[str], given: Mapping[str, tuple[float, float]]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The limits (k,) of one joint: those given, else the file's.
-
-    Raises:
-        ModelError: a limit is NaN, or they are crossed.
-    """
+    """The limits (k,) of one joint: those given, else the file's."""
     lower = np.array(joint.position_lower_limits(), dtype=np.float64)
     upper = np.array(joint.position_upper_limits(), dtype=np.float64)
     for index, name in enumerate(names):
@@ -190,20 +186,7 @@ def _remarks(
     limits: tuple[NDArray[np.float64], NDArray[np.float64]],
     turn: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> list[str]:
-    """What is said of limits that are too wide; nothing of a joint that has none at all.
-
-    Args:
-        joint: the joint.
-        names: (k,) of its positions.
-        wide: (k,) which limits are too wide.
-        limits: (k,) as they are written.
-        turn: (k,) what is searched of an angle.
-
-    Raises:
-        ModelError: an angle with one limit, of which nobody knows what the other is meant to be,
-            or a screw with limits that cannot be searched. A screw may have none: Drake's parser
-            reads none for screws.
-    """
+    """What is said of limits that are too wide; nothing of a joint that has none at all."""
     remarks = []
     for index in np.flatnonzero(wide):
         low, high = float(limits[0][index]), float(limits[1][index])

@@ -4,7 +4,6 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +31,7 @@ from drake_pose.body.files.urdf_shape import (
     with_shifted_joints,
     without_visuals,
 )
-from drake_pose.body.limits import Positions, describe_positions
+from drake_pose.body.limits import describe_positions
 from drake_pose.body.parsed_model import ParsedModel, link_names
 from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.body.surfaces.skin_file import SkinBand, load_skin
@@ -159,11 +158,8 @@ class ArticulatedModel(ParsedModel):
         rpy = Rotation.from_matrix(X_WB[:3, :3]).as_euler("xyz")
         text = with_base_joints(self._urdf_text(), X_WB[:3, 3].tolist(), rpy.tolist())
         moved = self._changed(text, self.skin)
-        positions = describe_positions(moved.plant, self._source.limits, str(self.path))
-        return replace(
-            moved,
-            **_position_fields(positions),
-        )
+        positions, _ = describe_positions(moved.plant, self._source.limits, str(self.path))
+        return replace(moved, **vars(positions))
 
     def before_object(
         self, link: str, mesh: TriangleMesh, X_WO: NDArray[np.float64]
@@ -174,7 +170,6 @@ class ArticulatedModel(ParsedModel):
         dots. The robot's base stands where it does at the default positions, welded to the world.
 
         Args:
-            link: the link.
             mesh: the object's surface in its frame O.
             X_WO: (4, 4) where it stands at OBJECT_POSITIONS of zero.
 
@@ -190,13 +185,13 @@ class ArticulatedModel(ParsedModel):
         _weld_bases(self, plant)
         _add_object(plant, X_WO)
         plant.Finalize()
-        positions = describe_positions(plant, self._source.limits, str(self.path))
+        positions, _ = describe_positions(plant, self._source.limits, str(self.path))
         dot = TriangleMesh(_DOT * np.eye(3), np.array([[0, 1, 2]]))
         return replace(
             self,
             plant=plant,
             scene_graph=scene_graph,
-            **_position_fields(positions),
+            **vars(positions),
             link_meshes=MappingProxyType({self.link_names[0]: dot, link: dot, OBJECT: mesh}),
             skin=(),
         )
@@ -266,7 +261,7 @@ def read_model(
     plant, scene_graph, instances, warnings = _parse(path, source)
     try:
         plant.Finalize()
-        positions = describe_positions(plant, {**source.limits, **limits}, str(path))
+        positions, remarks = describe_positions(plant, {**source.limits, **limits}, str(path))
     # Drake ends the process, which Python sees as SystemExit, at some values.
     except (ModelError, RuntimeError, SystemExit) as error:
         raise ModelError(f"{path}: {error}") from error
@@ -276,25 +271,12 @@ def read_model(
         name=plant.GetModelInstanceName(instances[0]),
         plant=plant,
         scene_graph=scene_graph,
-        **_position_fields(positions),
+        **vars(positions),
         link_meshes=MappingProxyType(meshes),
         skin=load_skin(path, link_names(plant)),
-        warnings=tuple(limit_kinds([*warnings, *positions.warnings])),
+        warnings=tuple(limit_kinds([*warnings, *remarks])),
         _source=source,
     )
-
-
-def _position_fields(positions: Positions) -> dict[str, Any]:
-    """What a model says of its plant's positions, by the names of its fields."""
-    return {
-        "position_names": positions.names,
-        "position_kinds": positions.kinds,
-        "lower": positions.lower,
-        "upper": positions.upper,
-        "default_positions": positions.defaults,
-        "periodic": positions.periodic,
-        "turns_freely": positions.turns_freely,
-    }
 
 
 def _parse(

@@ -4,14 +4,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex
 
 from drake_pose.body.files.parsing import ModelSource
-from drake_pose.body.limits import PositionKind
+from drake_pose.body.limits import Positions
 from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.body.surfaces.skin_file import SkinBand
 from drake_pose.body.surfaces.visual_geometry import make_drawable
@@ -19,24 +17,13 @@ from drake_pose.errors import UnknownNameError
 
 
 @dataclass(frozen=True, eq=False)
-class ParsedModel:
+class ParsedModel(Positions):
     """What a model file says, as Drake understands it. Never changes.
 
     Attributes:
-        path: the model file.
         name: the model's name (that of its first model instance).
         plant: a finalized MultibodyPlant, to make contexts from; do not change it.
         scene_graph: the SceneGraph the plant's geometry is registered with.
-        position_names: one unique name a position, in the plant's order: the joint's name, or
-            ``joint_suffix`` for joints of several positions.
-        position_kinds: "angle" [rad], "length" [m] or "quaternion" for each position.
-        lower, upper: (nq,) limits [rad or m], read-only; half a turn either side of the default
-            position for a joint that turns freely; infinite for the pose of a floating body, and
-            for slides without limits.
-        default_positions: (nq,) Drake's default positions moved inside the limits, read-only.
-        periodic: (nq,) bool, read-only: angles that look the same after a full turn.
-        turns_freely: (nq,) bool, read-only: angles without limits, or with limits more than four
-            turns apart, which mean none.
         link_meshes: the visual geometry of each link that has some, in the link's frame.
         skin: the bands of surface that bend with the joints, from the file beside the model's
             (``load_skin``); usually none.
@@ -48,13 +35,6 @@ class ParsedModel:
     name: str
     plant: MultibodyPlant
     scene_graph: SceneGraph
-    position_names: tuple[str, ...]
-    position_kinds: tuple[PositionKind, ...]
-    lower: NDArray[np.float64]
-    upper: NDArray[np.float64]
-    default_positions: NDArray[np.float64]
-    periodic: NDArray[np.bool_]
-    turns_freely: NDArray[np.bool_]
     link_meshes: Mapping[str, TriangleMesh]
     skin: tuple[SkinBand, ...]
     warnings: tuple[str, ...]

@@ -48,7 +48,6 @@ class ModelReport:
     """What was found in a model file.
 
     Attributes:
-        path: the file.
         name: the model's name; empty where it cannot be read.
         nodes: the nodes of the plant's own pose tree.
         warnings: what may surprise, but does not hinder.
@@ -110,8 +109,6 @@ def model_warnings(
     """Everything worth knowing before a model is used; at most ten warnings of a kind.
 
     Args:
-        model: the model.
-        tree: its pose tree.
         given: names of the positions that are held as the user wants.
     """
     warnings = list(model.warnings)
@@ -169,15 +166,12 @@ def _symmetry_warnings(model: ArticulatedModel) -> list[str]:
 
 
 def _is_symmetric(mesh: TriangleMesh, X_turn: NDArray[np.float64]) -> bool:
-    """Whether a surface looks the same from all around the axis of a quarter turn X_turn.
-
-    Points spread evenly over the surface are sorted by height along the axis and by direction about
-    it; the largest distance from the axis must be the same in every direction at each height.
-    """
+    """Whether a surface looks the same from all around the axis of a quarter turn X_turn."""
     axis = Rotation.from_matrix(X_turn[:3, :3]).as_rotvec()
     axis /= np.linalg.norm(axis)
     center = np.linalg.lstsq(np.eye(3) - X_turn[:3, :3], X_turn[:3, 3], rcond=None)[0]
     side = np.linalg.svd(axis[None])[2][1]
+    # At each height the largest distance from the axis is the same in every direction.
     points = _spread_points(mesh, 40_000) - center
     height, x, y = points @ axis, points @ side, points @ np.cross(axis, side)
     radius = np.hypot(x, y)

@@ -17,7 +17,6 @@ def cure_directives(path: Path, finder: FileFinder, cure_file: Callable[[Path], 
     The text keeps the file's tags and aliases, which are Drake's business.
 
     Args:
-        path: the file.
         finder: resolves the names of files.
         cure_file: makes a file that stands in for a model or further directives.
 

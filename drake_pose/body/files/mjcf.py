@@ -106,10 +106,7 @@ def cure_mjcf(path: Path) -> str:
 
 
 def _expand_includes(element: ElementTree.Element, folder: Path, chain: tuple[Path, ...]) -> None:
-    """Replace each <include> by the children of the included file's outermost element.
-
-    Paths are relative to the main file's folder or else to the including file's, as in MuJoCo.
-    """
+    """Replace each <include> by the children of the included file's outermost element."""
     for index, child in reversed(list(enumerate(element))):
         if child.tag != "include":
             _expand_includes(child, folder, chain)
@@ -154,11 +151,7 @@ def _merge_compilers(root: ElementTree.Element) -> dict[str, str]:
 
 
 def _write_out_defaults(root: ElementTree.Element) -> None:
-    """Give every element what its class says and it does not; remove the classes.
-
-    Raises:
-        ModelError: a class that no <default> defines.
-    """
+    """Give every element what its class says and it does not; remove the classes."""
     classes: dict[str, _Settings] = {"main": {}}
     for default in root.findall("default"):
         _read_class(default, classes["main"], classes)
@@ -212,10 +205,7 @@ def _completed(own: dict[str, str], outer: dict[str, str]) -> dict[str, str]:
 
 
 def _choose_geoms(root: ElementTree.Element, compiler: dict[str, str]) -> None:
-    """Leave geoms no collision, and only the looks that MuJoCo's viewer draws: groups 0 to 2.
-
-    A geom that is not drawn stays where a body's inertia is computed from its geoms.
-    """
+    """Leave geoms no collision, and only the looks that MuJoCo's viewer draws: groups 0 to 2."""
     opaque = {
         material.get("name"): bool(numbers(material, "rgba", 4, "1 1 1 1")[3] > 0.0)
         for material in root.iterfind("asset/material")

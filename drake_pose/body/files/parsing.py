@@ -49,14 +49,12 @@ class ModelSource:
     """A model file and the cured text that is parsed in its place.
 
     Attributes:
-        path: the file.
         text: what Drake parses.
         kind: what Drake's parser calls that kind of text.
         warnings: what of the file is not read, or not enforced, each once.
         limits: limits (lower, upper) [rad] by position name that Drake's parser passes over.
 
     Args:
-        path: the file.
         package_paths: packages, name to folder.
 
     Raises:

@@ -39,10 +39,7 @@ def check_in_child(
 
 @functools.lru_cache(maxsize=64)
 def _check(path: str, packages: str, limits: str, digest: str) -> None:
-    """Raise why the model cannot be used; digest only tells versions of the file apart.
-
-    A refusal is not remembered: a missing mesh or package may have been put in place since.
-    """
+    """Raise why the model cannot be used; digest only tells versions of the file apart."""
     end = _CHECKER.ask({"path": path, "packages": packages, "limits": limits})
     if end["status"] is None:
         raise ModelError(

@@ -62,7 +62,6 @@ def cure_sdf(
     """The text of an SDFormat file that Drake reads; it may be parsed from anywhere.
 
     Args:
-        path: the file.
         finder: resolves the names of mesh files and included models.
         warn: hears what is not read, or not enforced.
         cure_file: makes a file that stands in for an included model.

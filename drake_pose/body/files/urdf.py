@@ -53,7 +53,6 @@ def cure_urdf(path: Path, finder: FileFinder, warn: Warn) -> str:
     """The text of a URDF file that Drake reads as URDF means it; it may be parsed from anywhere.
 
     Args:
-        path: the file.
         finder: resolves the names of mesh files.
         warn: hears what is not read, or not enforced.
 
@@ -207,11 +206,7 @@ def mimic_warning(follower: str, leader: str) -> str:
 
 
 def _give_colours(root: ElementTree.Element) -> None:
-    """Write out each visual's colour without a name, which Drake wants to be unique.
-
-    Where materials of the same name differ, a name alone means the first of them. Textures are
-    left out: neither silhouettes nor Meshcat show them.
-    """
+    """Write out each visual's colour without a name, which Drake wants to be unique."""
     everywhere = root.findall("material")
     own = [one for visual in root.iterfind("link/visual") for one in visual.iterfind("material")]
     colours: dict[str, str] = {}

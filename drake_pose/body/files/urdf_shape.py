@@ -58,7 +58,6 @@ def with_zeros(text: str, zeros: Mapping[str, float]) -> str:
     other way: they are where they were.
 
     Args:
-        text: the URDF.
         zeros: what is to be added to joints' readings, by name [rad or m].
     """
     root = ElementTree.fromstring(text)
@@ -87,7 +86,6 @@ def with_shifted_joints(text: str, shifts: Mapping[str, Sequence[float]]) -> str
     """A URDF text in which joints stand elsewhere on their parent links.
 
     Args:
-        text: the URDF.
         shifts: (3,) by joint, along the axes of its parent link's frame [m].
     """
     root = ElementTree.fromstring(text)
@@ -102,7 +100,6 @@ def with_moved_looks(text: str, moves: Mapping[str, Sequence[float]]) -> str:
     """A URDF text in which links look as if they were elsewhere, the joints they carry with them.
 
     Args:
-        text: the URDF.
         moves: (3,) by link, along the axes of its frame [m].
     """
     root = ElementTree.fromstring(text)
@@ -128,7 +125,6 @@ def with_base_joints(text: str, place: Sequence[float], rpy: Sequence[float]) ->
     """A URDF text whose whole model is moved by BASE_JOINTS.
 
     Args:
-        text: the URDF.
         place: (3,) where it stands where they are 0 [m].
         rpy: (3,) and how it is turned there, as in an origin [rad].
     """

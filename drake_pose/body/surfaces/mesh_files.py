@@ -31,7 +31,6 @@ def read_mesh_file(path: Path, scale: NDArray[np.float64] | None = None) -> Tria
     """The triangles of an OBJ, glTF, GLB, STL, DAE or MuJoCo's MSH file.
 
     Args:
-        path: the mesh file.
         scale: (3,) factors along x, y and z; None for the file's own size.
 
     Returns:
@@ -126,10 +125,8 @@ def _read_stl(path: Path) -> TriangleMesh:
 
 
 def _read_msh(path: Path) -> TriangleMesh:
-    """A file of MuJoCo's own binary format: four counts, float32 vertices, ..., int32 faces.
-
-    Source: MuJoCo's XML reference, section "mesh".
-    """
+    """A file of MuJoCo's own binary format: four counts, float32 vertices, ..., int32 faces."""
+    # Source: MuJoCo's XML reference, section "mesh".
     data = path.read_bytes()
     counts = np.frombuffer(data[:16].ljust(16, b"\0"), "<i4").astype(np.int64)
     vertices, normals, coordinates, faces = counts
@@ -145,11 +142,7 @@ def _read_msh(path: Path) -> TriangleMesh:
 
 
 def _read_dae(path: Path) -> TriangleMesh:
-    """A COLLADA file, all its parts at their places, in metres; textures are not looked at.
-
-    As in RViz and Gazebo, for which robots' files are written, <unit> is applied (pinocchio does
-    not), and <up_axis> is not: a mesh is placed by the file's own axes. Drake itself reads no DAE.
-    """
+    """A COLLADA file, all its parts at their places, in metres; textures are not looked at."""
     try:
         import collada  # Slow to import, and needed for DAE files alone.
     except ModuleNotFoundError as error:
@@ -168,15 +161,14 @@ def _read_dae(path: Path) -> TriangleMesh:
     except (*_READER_ERRORS, collada.common.DaeError) as error:
         raise ModelError(f"mesh file {path} cannot be read: {error}") from error
     mesh = join_meshes(parts)
+    # As in RViz and Gazebo, <unit> is applied (pinocchio does not), and <up_axis> is not.
     unit = document.assetInfo.unitmeter
     return TriangleMesh(mesh.vertices * (1.0 if unit is None else unit), mesh.triangles)
 
 
 def _shapes_of_dae(path: Path) -> bytes:
-    """The text of a COLLADA file without colours and textures.
-
-    A material that names a missing texture would take its triangles with it.
-    """
+    """The text of a COLLADA file without colours and textures."""
+    # A material that names a missing texture would take its triangles with it.
     root = ElementTree.parse(path).getroot()
     for parent in list(root.iter()):
         parent[:] = [child for child in parent if child.tag.rpartition("}")[2] not in _DAE_LOOKS]
@@ -251,7 +243,6 @@ def write_obj(mesh: TriangleMesh, name: str) -> Path:
     """Write an OBJ file with normals into this process's temporary folder.
 
     Args:
-        mesh: the surface.
         name: what the file's name begins with.
     """
     triangles = mesh.triangles

@@ -66,10 +66,7 @@ def _sphere_points(
 
 
 def _closed_rings(points: NDArray[np.float64]) -> TriangleMesh:
-    """Triangles between rings of points (rings, points of a ring, 3); each ring is closed.
-
-    Looking from outside, rings run from top to bottom and points anticlockwise seen from the top.
-    """
+    """Triangles between rings of points (rings, points of a ring, 3); each ring is closed."""
     rings, count, _ = points.shape
     index = np.arange(rings * count).reshape(rings, count)
     above, below = index[:-1], index[1:]

@@ -80,7 +80,6 @@ def load_skin(model_path: Path, link_names: Sequence[str]) -> tuple[SkinBand, ..
     weight rises smoothly from 0 at ``begin`` to 1 at ``end``; and ``colour`` (r, g, b; optional).
 
     Args:
-        model_path: the model file.
         link_names: the model's links.
 
     Raises:

@@ -171,8 +171,6 @@ def base_of_chain(
     """How the joints from the world to a node can take up the node's pose.
 
     Args:
-        model: the model.
-        graph: its links and joints.
         chain: the edges from the world outwards to the anchor group.
         node: the tree's node of the anchor group.
         held: positions that stay as they are, if the others suffice.

@@ -65,7 +65,6 @@ def find_joint(
     """Writes the upper rows of a joint's transform as it is walked, or a derivative.
 
     Args:
-        steps: the joints.
         step: which of them.
         values: its values and any after them [rad or m].
         share: how far it goes of its way to them.

@@ -43,9 +43,6 @@ def joint_offsets(tree: PoseTree) -> tuple[JointOffset, ...]:
 
     That origin is where the part's own joint stands, or the world's. Joints without an offset are
     left out.
-
-    Args:
-        tree: the pose tree.
     """
     model, plant, kinematics = tree.model, tree.model.plant, PlantKinematics(tree.model)
 

@@ -94,7 +94,6 @@ def build_link_graph(model: ParsedModel, preferred_frame: str | None) -> LinkGra
     """Walk the plant outwards from the world.
 
     Args:
-        model: the model.
         preferred_frame: a link whose frame its group shall have; None for the first with geometry.
 
     Raises:

@@ -98,8 +98,6 @@ def find_skin(
     """The band between two groups that are a node's parent and the node; None where there is none.
 
     Args:
-        model: the model.
-        graph: its links and joints.
         parent, group: the two groups.
         steps: the joints from the one to the other.
     """
@@ -121,8 +119,6 @@ def require_placed(
     """Refuse a model with a band that no node of the tree carries.
 
     Args:
-        model: the model.
-        graph: its links and joints.
         pairs: the groups of each node's parent and the node.
 
     Raises:
@@ -150,9 +146,6 @@ class ModelSkin:
 
     Attributes:
         bands: the bands, as the model declares them.
-
-    Args:
-        model: the model.
 
     Raises:
         ModelError: a band does not join two neighbours.

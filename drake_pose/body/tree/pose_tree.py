@@ -75,7 +75,6 @@ class NodePlacement:
     Attributes:
         X_PA: (4, 4) constant part: the identity but for roots.
         rotation: the RootRotation of a root that is turned by one, else None.
-        steps: the joints.
     """
 
     X_PA: NDArray[np.float64]
@@ -88,12 +87,12 @@ class PoseTree:
     """All nodes of an object, parents before children. Never changes.
 
     Attributes:
-        model: the model.
         nodes: the nodes; the order depends on the model and the root alone.
         leaves: indices of the nodes without children.
         held: values of positions that are not searched, by index into q.
         unobserved_positions: names of positions that move nothing that is seen, or that the root's
             pose replaces; they keep their default values.
+        placements: how the values of each node place it.
         root: name of the root node; "world" where the plant's own roots are kept.
     """
 
@@ -103,7 +102,7 @@ class PoseTree:
     held: Mapping[int, float]
     unobserved_positions: tuple[str, ...]
     root: str
-    _placements: tuple[NodePlacement, ...] = field(repr=False)
+    placements: tuple[NodePlacement, ...] = field(repr=False)
     _base: BasePose = field(repr=False)
     _rebuild: "Callable[[NDArray[np.float64]], PoseTree] | None" = field(default=None, repr=False)
 
@@ -112,14 +111,9 @@ class PoseTree:
         object.__setattr__(self, "held", MappingProxyType(dict(self.held)))
 
     @property
-    def placements(self) -> tuple[NodePlacement, ...]:
-        """How the values of each node place it."""
-        return self._placements
-
-    @property
     def turns_root_freely(self) -> bool:
         """Whether the first root is turned by a rotation vector, in all ways."""
-        rotation = self._placements[0].rotation
+        rotation = self.placements[0].rotation
         return rotation is not None and rotation.kind == "free"
 
     def with_root_position(self, root_position: NDArray[np.float64]) -> "PoseTree":
@@ -168,7 +162,7 @@ class PoseTree:
             UnknownNameError: ``intervals`` names something that does not exist.
         """
         intervals = self._checked_intervals(intervals or {}, interval, length_interval)
-        rotation = self._placements[node].rotation
+        rotation = self.placements[node].rotation
         if rotation is not None and rotation.kind == "free":
             return even_rotations(rotation.interval or interval)
         lower, upper = self.value_bounds(node)
@@ -218,7 +212,7 @@ class PoseTree:
 
     def _limits(self, node: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """As value_limits, but one turn of what turns freely."""
-        rotation = self._placements[node].rotation
+        rotation = self.placements[node].rotation
         if rotation is not None:
             return np.array(rotation.lower), np.array(rotation.upper)
         positions = list(self.nodes[node].positions)
@@ -230,7 +224,7 @@ class PoseTree:
 
     def _periodic(self, node: int) -> NDArray[np.bool_]:
         """Which of a node's values (k,) are angles that look the same after a full turn."""
-        rotation = self._placements[node].rotation
+        rotation = self.placements[node].rotation
         if rotation is not None:
             return np.full(len(rotation.lower), rotation.kind == "limited")
         return self.model.periodic[list(self.nodes[node].positions)]
@@ -248,7 +242,7 @@ class PoseTree:
                 f"node '{self.nodes[node].name}': values of shape (n, {width}) expected for "
                 f"{self.nodes[node].value_names}, got {values.shape}"
             )
-        placement = self._placements[node]
+        placement = self.placements[node]
         X = np.broadcast_to(placement.X_PA, (len(values), 4, 4)).copy()
         if placement.rotation is not None:
             X[:, :3, :3] = X[:, :3, :3] @ placement.rotation.rotations(values)
@@ -279,7 +273,7 @@ class PoseTree:
         return [self._default_values(node) for node in range(len(self.nodes))]
 
     def _default_values(self, node: int) -> NDArray[np.float64]:
-        rotation = self._placements[node].rotation
+        rotation = self.placements[node].rotation
         if rotation is not None:
             return np.array(0.5 * (rotation.lower + rotation.upper))
         q = self.model.default_positions
@@ -347,7 +341,7 @@ class PoseTree:
         """
         q = np.asarray(q, dtype=np.float64)
         values = []
-        for node, placement in zip(self.nodes, self._placements, strict=True):
+        for node, placement in zip(self.nodes, self.placements, strict=True):
             if placement.rotation is None:
                 values.append(q[list(node.positions)])
                 continue
@@ -356,13 +350,6 @@ class PoseTree:
             R_WN = R_BN if X_WB is None else X_WB[:3, :3] @ R_BN
             values.append(placement.rotation.values_from(R_WN))
         return values
-
-    def base_within_limits(self, q: NDArray[np.float64]) -> bool:
-        """Whether the base positions that positions_from solved for lie inside their limits."""
-        index = list(self._base.positions)
-        margin = 1e-9
-        lower, upper = self.model.lower[index] - margin, self.model.upper[index] + margin
-        return bool(np.all((q[index] >= lower) & (q[index] <= upper)))
 
     def _checked_intervals(
         self, intervals: Mapping[str, float], interval: float, length_interval: float

@@ -144,12 +144,8 @@ def _children(branches: list[Branch], group: int) -> list[int]:
 
 
 def _branches(graph: LinkGraph, start: int) -> list[Branch]:
-    """The nodes reached from a group without crossing a floating joint, breadth first.
-
-    Groups without geometry vanish where they end a chain (with the chain) or merely continue one.
-    The start is always the first branch, but for the world's group without geometry, whose
-    children then have no parent (-1).
-    """
+    """The nodes reached from a group without crossing a floating joint, breadth first."""
+    # Groups without geometry vanish where they end a chain (with it) or merely continue one.
     edges_at = {
         group: [edge for edge in graph.edges_at(group) if edge.joint_map is not None]
         for group in range(len(graph.groups))
@@ -377,7 +373,7 @@ def _assemble(
             name for index, name in enumerate(model.position_names) if index not in moved
         ),
         root=root,
-        _placements=tuple(placements),
+        placements=tuple(placements),
         _base=base,
     )
 

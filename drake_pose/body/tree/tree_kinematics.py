@@ -60,7 +60,6 @@ class TreeKinematics:
     """A pose tree's kinematics, compiled.
 
     Attributes:
-        tree: the pose tree.
         names: the names of the m values, node after node.
         value_nodes: (m,) the node of each value.
         lower, upper: (m,) limits [rad or m]; equal where a value is held, infinite where it is an
@@ -68,9 +67,6 @@ class TreeKinematics:
         is_angle: (m,) whether a value is an angle [rad], else a length [m].
         turns_around: (m,) whether it is an angle that can take every direction.
         packed: the tree as ``find_motions`` takes it.
-
-    Args:
-        tree: the pose tree.
     """
 
     def __init__(self, tree: PoseTree) -> None:
@@ -227,10 +223,8 @@ def _write_twist(X_WA: np.ndarray, M: np.ndarray, twist: np.ndarray) -> None:
 
 @compiled
 def _turn_freely(X_WA: np.ndarray, r: np.ndarray, X: np.ndarray, twists: np.ndarray) -> None:
-    """Writes the rotation X (3, 4) of a vector (3,), and the twists (3, 6) of its components.
-
-    Rodrigues's formula; its derivative is the left Jacobian of SO(3), J = I + b K + c K^2.
-    """
+    """Writes the rotation X (3, 4) of a vector (3,), and the twists (3, 6) of its components."""
+    # Rodrigues's formula; its derivative is the left Jacobian of SO(3), J = I + b K + c K^2.
     angle = math.sqrt(r[0] ** 2 + r[1] ** 2 + r[2] ** 2)
     if angle > 1e-4:
         a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2

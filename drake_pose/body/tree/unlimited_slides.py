@@ -17,7 +17,6 @@ def placing_slides(
     MJCF have two of them): they are not searched, and root_position moves the object.
 
     Args:
-        model: the model.
         objects: for each object that hangs on the world, the positions between the two.
         held: positions that are held already, with their values.
 

@@ -26,7 +26,7 @@ from drake_pose.search.starts.coarse_kernel import (
     score_samples,
     unite_pairs,
 )
-from drake_pose.silhouette.pictures.signed_distances import signed_distances
+from drake_pose.silhouette.pictures.mask_agreement import signed_distances
 
 _WORDS = 4
 _LEVELS = 10

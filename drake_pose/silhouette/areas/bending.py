@@ -75,9 +75,6 @@ class TreeSurfaces:
         rigid: the rigid part of each node, in the node's frame.
         bending: for each node its rigid part and its band; None for a node without one.
         skins: for each node its band's motion; None for a node without one.
-
-    Args:
-        tree: the pose tree.
     """
 
     def __init__(self, tree: PoseTree) -> None:

@@ -48,7 +48,6 @@ def paint_labels(
     """Draws which surface is nearest at each pixel centre.
 
     Args:
-        packed: the surfaces.
         labels: (nodes,) int16 their labels, not negative, none of them the empty one.
         closed: (nodes,) bool which of them are closed and have their triangles run around
             counter-clockwise seen from outside: only what is turned to the camera is drawn.
@@ -184,11 +183,8 @@ def _draw_node(
 def _draw_triangle(
     p: np.ndarray, b: int, c: int, label: int, image: np.ndarray, contest: _Contest
 ) -> None:
-    """Draws the triangle 0, b, c of points p (n, 3) of pixel and nearness where it contends.
-
-    Nearness grows towards the camera and is linear in the picture: 1 / z, or -z where rays are
-    parallel.
-    """
+    """Draws the triangle 0, b, c of points p (n, 3) of pixel and nearness where it contends."""
+    # Nearness grows towards the camera and is linear in the picture: 1 / z, or -z (parallel).
     bounds, depths = contest.bounds, contest.depths
     ua, va, da = p[0, 0], p[0, 1], p[0, 2]
     ub, vb, db = p[b, 0], p[b, 1], p[b, 2]

@@ -89,8 +89,6 @@ def clip_triangle(
     """Writes u, v and 1 / depth of the corners of a triangle's part beyond a pinhole's near plane.
 
     Args:
-        packed: the surfaces.
-        node: the surface.
         t: the triangle among its own.
         X_CN: (nodes, 3 or 4, 4) the poses.
         camera: (8,) kernel parameters.

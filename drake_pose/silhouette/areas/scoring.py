@@ -33,7 +33,6 @@ def score_bodies(
     Args:
         surfaces: the body's surfaces.
         X_CN: (n, nodes, 4, 4) their poses in the camera.
-        camera: the camera.
         prefixes: (k, H, W + 1) int32 prefix sums of the sets; k may be 0.
         bands: for each of the bending surfaces (n, v, 3) its band's vertices in its frame N at each
             pose [m].
@@ -91,10 +90,8 @@ def draw_labels(
     """Returns (H, W) int16 the label of the surface that is seen in each pixel, the nearest one.
 
     Args:
-        outlines: the surfaces.
         labels: (nodes,) the label of each.
         X_CN: (nodes, 4, 4) their poses in the camera.
-        camera: the camera.
         empty: the label of pixels that show none.
     """
     packed, poses = _check_body(outlines, np.asarray(X_CN)[None])
@@ -119,7 +116,6 @@ def subtract_body(
         prefix: (H, W + 1) int32 its prefix sums, C-contiguous; changed in place.
         outlines: the body's surfaces, or its only one.
         X_CN: (nodes, 4, 4) their poses in the camera (one surface: (4, 4) will do).
-        camera: the camera.
 
     Raises:
         ValueError: when an array has the wrong shape or type, or cannot be changed in place.

@@ -243,10 +243,7 @@ def find_spans(
 def _find_many_spans(
     row: int, count: int, crossings: np.ndarray, changes: np.ndarray, spans: np.ndarray
 ) -> int:
-    """As find_spans for any number of crossings.
-
-    Few are sorted; where they are so many that sorting takes longer, all pixels are passed.
-    """
+    """As find_spans for any number of crossings."""
     found, winding, start = 0, 0, 0
     if count <= _LONGEST_SORT:
         for i in range(1, count):

@@ -22,7 +22,6 @@ def require_visible(outlines: Sequence[Outline], X_CN: np.ndarray, camera: Camer
     Args:
         outlines: the body's surfaces.
         X_CN: (nodes, 4, 4) their poses in the camera.
-        camera: the camera.
 
     Raises:
         CameraError: names the camera; when the body is wholly behind it, when the camera is inside
@@ -74,11 +73,8 @@ def _in_camera(outline: Outline, X_CN: np.ndarray) -> np.ndarray:
 
 
 def _winding_at_origin(corners: np.ndarray) -> float:
-    """Returns how often triangles (m, 3, 3) enclose the origin: 1 inside a closed surface.
-
-    The solid angle of a triangle is that of van Oosterom and Strackee (1983), equation 8. Surfaces
-    with holes give fractions (Jacobson, Kavan and Sorkine-Hornung 2013).
-    """
+    """Returns how often triangles (m, 3, 3) enclose the origin: 1 inside a closed surface."""
+    # Solid angles: van Oosterom and Strackee (1983), equation 8.
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     la, lb, lc = (np.linalg.norm(side, axis=1) for side in (a, b, c))
     numerator = np.einsum("ij,ij->i", a, np.cross(b, c))

@@ -57,7 +57,6 @@ def draw_bits(
 
     Args:
         celled: the surface; if it has a band of skin, the band is that of the pair's sample.
-        view: the silhouette.
         X_WP: (g, 4, 4) poses of the parent.
         X_PN: (n, 4, 4) poses of the node in its parent at its samples.
         pairs: (m, 2) int32 parent pose and sample.
@@ -132,10 +131,7 @@ def _walk_cell(
     rows: Rows,
     scratch: _Scratch,
 ) -> bool:
-    """Walks the contour edges of the cell exactly as the span kernel does.
-
-    False, and nothing done, where the cell's edges will not do.
-    """
+    """Walks the contour edges of the cell exactly as the span kernel does."""
     packed, counts, reach = celled.packed, rows.counts, rows.reach
     if packed.planes.shape[1] == 0:
         return True
@@ -222,12 +218,7 @@ def _gather_spans(
     spans: np.ndarray,
     areas: np.ndarray,
 ) -> tuple[int, np.ndarray]:
-    """Reads the rows' spans and empties the rows.
-
-    Returns:
-        The number of spans in the window, -1 where more than the limit lies outside, and the spans
-        (n, 3) row, a, b [window].
-    """
+    """Reads the rows' spans and empties the rows."""
     window, inside, band = view.window, view.inside, view.band
     first_row, end_row = window[0], window[0] + window[2]
     first_column, width = window[1], window[3]

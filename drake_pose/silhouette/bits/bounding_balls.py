@@ -23,7 +23,6 @@ def sift_by_balls(
     """Leaves out poses at which a ball inside the surface shows that too much lies outside.
 
     Args:
-        view: the silhouette.
         X_WP: (g, 4, 4) poses of the parent.
         p_PB: (n, k, 3) places of k balls in the parent's frame at each sample of the node [m].
         radii: (k,) of the balls [m].
@@ -60,25 +59,19 @@ def sift_by_balls(
             if not (-0.5 < u < camera[6] - 0.5 and -0.5 < v < camera[7] - 0.5):
                 continue
             if limit < 1.0:
-                outside = _leaves(view.nearest, window, u, v, radius - 1e-6)
+                # A disc that leaves the silhouette: a pixel outside lies in it.
+                row, column = round(v), round(u)
+                r, c = row - window[0], column - window[1]
+                if 0 <= r < window[2] and 0 <= c < window[3] and view.nearest[r, c] >= 0:
+                    row = view.nearest[r, c] // NEAREST_STRIDE
+                    column = view.nearest[r, c] % NEAREST_STRIDE
+                outside = (u - column) ** 2 + (v - row) ** 2 < max(0.0, radius - 1e-6) ** 2
             else:
                 outside = _square_outside(view.sums, window, camera, u, v, 0.7071 * radius) > limit
             if outside:
                 left[i] = False
                 break
     return left
-
-
-@compiled
-def _leaves(nearest: np.ndarray, window: np.ndarray, u: float, v: float, radius: float) -> bool:
-    """Returns whether a disc whose centre is in the picture surely leaves the silhouette."""
-    row, column = round(v), round(u)
-    r, c = row - window[0], column - window[1]
-    if 0 <= r < window[2] and 0 <= c < window[3]:
-        place = nearest[r, c]
-        if place >= 0:
-            row, column = place // NEAREST_STRIDE, place % NEAREST_STRIDE
-    return (u - column) ** 2 + (v - row) ** 2 < radius * radius and radius > 0.0
 
 
 @compiled
@@ -105,7 +98,6 @@ def draw_discs(
     """Draws discs that hold the picture of a ball as bits of the silhouette.
 
     Args:
-        view: the silhouette.
         X_WP: (g, 4, 4) poses of the frame that the ball is fixed in.
         p_PB: (3,) its centre [m].
         radius: its radius [m].

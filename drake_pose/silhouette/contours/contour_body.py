@@ -51,10 +51,8 @@ def contour_body(
     """Returns a body made ready for a camera.
 
     Args:
-        outlines: the surfaces.
         X_CN: (nodes, 4, 4) about where they are in the camera: a pinhole sees near surfaces from
             many directions. At other poses the contour is the same but may take longer.
-        camera: the camera.
         rigid: how many of the surfaces keep their shape; those after them, whose vertices will be
             moved, get no cells. None: all.
     """
@@ -176,7 +174,6 @@ def find_body_segments(
     Edges with an end nearer than a pinhole's near plane are left out.
 
     Args:
-        body: the body.
         X_CN: (surfaces, 4, 4) the surfaces' poses in the camera.
         camera: (8,) kernel parameters of the camera.
         wanted: (surfaces,) bool.

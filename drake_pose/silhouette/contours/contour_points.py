@@ -90,7 +90,6 @@ def sample_contour(
     """Returns the arrays of ContourPoints.
 
     Args:
-        packed: the surfaces.
         segments: their projected contour edges.
         camera: (8,) kernel parameters of the camera.
         first: where the first line is [pixel].

@@ -60,7 +60,6 @@ def divide_outline(
     """Returns the surface with its cells.
 
     Args:
-        outline: the surface.
         spread: how far the directions in which a camera sees the surface's points may differ from
             that of its ball's centre [rad]: 0 for parallel rays.
         band: the band of skin that belongs to the surface, at rest; it gets no cells.

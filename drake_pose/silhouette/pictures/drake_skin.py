@@ -36,11 +36,9 @@ class DeformableSkin:
     """A model's bands in a SceneGraph, as a source of their own.
 
     Attributes:
-        skin: the bands.
         source: the source; connect or fix its configuration port.
 
     Args:
-        skin: the bands.
         scene_graph: where they go.
         labels: the render label of each band's child link, by name; 0 for those left out.
         name: of the source.

@@ -36,10 +36,6 @@ _DEPTH_MARGIN = 0.01
 class LabelRenderer:
     """Renders label images of a model with RenderEngineVtk, without a display or a diagram.
 
-    Args:
-        model: the model.
-        camera: the camera.
-
     Raises:
         CameraError: on rendering, when Drake cannot draw for the camera.
         RuntimeError: on rendering in another thread than the one that made the renderer: the

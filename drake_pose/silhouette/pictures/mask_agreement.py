@@ -1,4 +1,4 @@
-"""How silhouettes agree with the body that was found in them."""
+"""How silhouettes agree with the body that was found in them, and where their edges are."""
 
 from __future__ import annotations
 
@@ -48,3 +48,16 @@ def edge_area(mask: np.ndarray) -> int:
     """How many pixels of a mask (H, W) bool lie on its edge."""
     inner = cv2.erode(mask.view(np.uint8), _CROSS)
     return int(np.count_nonzero(mask)) - int(np.count_nonzero(inner))
+
+
+def signed_distances(mask: np.ndarray) -> np.ndarray:
+    """(H, W) float32 distance from the edge of a mask, half way between pixels; positive outside.
+
+    Beyond the picture's edge nothing is known: it is no edge of the mask.
+    """
+    inside = np.asarray(mask, dtype=np.uint8)
+    if inside.all():
+        return np.full(mask.shape, -float(max(mask.shape)), dtype=np.float32)
+    within = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    beyond = cv2.distanceTransform(1 - inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.where(inside > 0, 0.5 - within, beyond - 0.5).astype(np.float32)

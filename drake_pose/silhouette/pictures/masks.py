@@ -23,7 +23,6 @@ def read_mask(
     """Reads a mask: a PNG picture of black (0) and one other value or colour, the object.
 
     Args:
-        path: the file.
         width, height: the size the mask must have [pixel], where known.
         may_be_empty: whether a picture that shows nothing is as good as any.
 

@@ -177,10 +177,7 @@ def _list_pictures(folder: Path) -> tuple[list[Path], tuple[str, ...]]:
 def _join_frames(
     files: Mapping[str, list[Path]],
 ) -> tuple[dict[tuple[str, str], Path], tuple[str, ...], dict[tuple[str, str], tuple[Path, ...]]]:
-    """Masks by camera and frame, the frames, and what is there twice.
-
-    A single camera's frames are told apart by their whole names: they may be unrelated stills.
-    """
+    """Masks by camera and frame, the frames, and what is there twice."""
     stems = {file: file.stem for own in files.values() for file in own}
     spelt = sorted(set(stems.values()), key=lambda stem: (-len(stem), stem))
     keys = {stem: natural_key(stem) for stem in spelt}

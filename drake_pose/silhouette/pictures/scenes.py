@@ -41,7 +41,6 @@ class Scene:
     """A folder of masks, and the cameras that took them.
 
     Args:
-        path: the folder.
         cameras: the cameras by name, in the camera file's order.
         frames: the frames' names in natural order, 2 before 10; a frame may lack some cameras.
         masks: the mask file of (camera, frame).
@@ -155,7 +154,6 @@ def load_scene(path: str | Path, cameras: Mapping[str, Camera] | None = None) ->
     that are not in the camera file are left over, see `Scene.leftovers`.
 
     Args:
-        path: the folder.
         cameras: the cameras, where the folder has no `cameras.yaml`, or to be used instead of it.
 
     Raises:

@@ -17,9 +17,6 @@ VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg")
 class VideoPictures:
     """The pictures of a video, counted from 0.
 
-    Args:
-        path: the file.
-
     Raises:
         SceneError: it is not a video that OpenCV can read.
     """

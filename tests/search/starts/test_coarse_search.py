@@ -17,7 +17,7 @@ from drake_pose.search.starts.coarse_search import (
     CoarseSettings,
     _spread_points,
 )
-from drake_pose.silhouette.pictures.signed_distances import signed_distances
+from drake_pose.silhouette.pictures.mask_agreement import signed_distances
 from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_pose, draw_view, split
 
 SETTINGS = CoarseSettings()

@@ -67,7 +67,8 @@ def compiled(function: Any = None, **options: Any) -> Any:
         with suppress(RuntimeError):  # numba's way to say that no folder can be written.
             cache = _SharedCache(kernel.py_func)
         setattr(kernel, "_cache", cache)  # noqa: B010 - numba's type hints do not know it.
-        kernel.get_call_template = _without_literals(kernel.get_call_template)
+        plain = _without_literals(kernel.get_call_template)
+        setattr(kernel, "get_call_template", plain)  # noqa: B010 - as above.
     return kernel
 
 

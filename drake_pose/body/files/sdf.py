@@ -5,14 +5,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 from drake_pose.body.files.packages import FileFinder
-from drake_pose.body.files.urdf import Warn, mimic_warning
+from drake_pose.body.files.urdf import mimic_warning
 from drake_pose.body.files.xml_files import (
+    Warn,
     close_loops,
+    colour_text,
     leave_out,
     read_limits,
     read_numbers,
     read_xml,
     refuse_macros,
+    require_scale,
     require_size,
     xml_text,
 )
@@ -63,7 +66,7 @@ def cure_sdf(
 
     Args:
         finder: resolves the names of mesh files and included models.
-        warn: hears what is not read, or not enforced.
+        warn: takes what is not read, or not enforced.
         cure_file: makes a file that stands in for an included model.
 
     Returns:
@@ -136,7 +139,9 @@ def _check_visual(visual: ElementTree.Element, where: str, path: Path, finder: F
     _check_poses(visual, where)
     for material in visual.findall("material"):
         for colour in material.findall("diffuse"):
-            _limit_colour(material, colour)
+            colour.text = colour_text(colour.text)
+            if colour.text is None:
+                material.remove(colour)
     for shape in visual.findall("geometry/*"):
         kind = shape.tag.removeprefix("drake:")
         if kind not in _SIZES:
@@ -151,17 +156,6 @@ def _check_visual(visual: ElementTree.Element, where: str, path: Path, finder: F
             _check_mesh(shape, where, path, finder)
 
 
-def _limit_colour(material: ElementTree.Element, colour: ElementTree.Element) -> None:
-    """Bring a colour between 0 and 1; leave it out where it is none."""
-    count = 3 if len((colour.text or "").split()) == 3 else 4
-    try:
-        numbers = read_numbers(colour.text, count, "")
-    except ModelError:
-        material.remove(colour)
-        return
-    colour.text = " ".join(f"{min(max(number, 0.0), 1.0):g}" for number in numbers)
-
-
 def _check_mesh(mesh: ElementTree.Element, where: str, path: Path, finder: FileFinder) -> None:
     uri = mesh.find("uri")
     name = "" if uri is None else (uri.text or "").strip()
@@ -174,8 +168,8 @@ def _check_mesh(mesh: ElementTree.Element, where: str, path: Path, finder: FileF
             "into a file of its own"
         )
     scale = mesh.findtext("scale")
-    if scale is not None and 0.0 in read_numbers(scale, 3, f"{where}: scale of mesh '{name}'"):
-        raise ModelError(f"{where}: scale of mesh '{name}' is '{scale}'; no factor may be 0")
+    if scale is not None:
+        require_scale(scale, 3, f"{where}: scale of mesh '{name}'")
 
 
 def _leave_out_constraints(model: ElementTree.Element, warn: Warn) -> None:

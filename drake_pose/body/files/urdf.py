@@ -7,19 +7,20 @@ Drake refuses many files because of them.
 import math
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
-from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 
 from drake_pose.body.files.packages import FileFinder
 from drake_pose.body.files.xml_files import (
     OLD_XACRO_ELEMENTS,
+    Warn,
     close_loops,
+    colour_text,
     leave_out,
     read_limits,
     read_numbers,
     read_xml,
     refuse_macros,
+    require_scale,
     require_size,
     xml_text,
 )
@@ -46,7 +47,6 @@ _SIZES = {
     "ellipsoid": (("a", 1, False), ("b", 1, False), ("c", 1, False)),
     "mesh": (),
 }
-Warn = Callable[[str], None]
 
 
 def cure_urdf(path: Path, finder: FileFinder, warn: Warn) -> str:
@@ -54,7 +54,7 @@ def cure_urdf(path: Path, finder: FileFinder, warn: Warn) -> str:
 
     Args:
         finder: resolves the names of mesh files.
-        warn: hears what is not read, or not enforced.
+        warn: takes what is not read, or not enforced.
 
     Raises:
         ModelError: names the link, joint or mesh at fault.
@@ -155,9 +155,7 @@ def _check_mesh(mesh: ElementTree.Element, where: str, path: Path, finder: FileF
         return
     text = mesh.get("scale", "")
     count = 1 if len(text.split()) == 1 else 3
-    scale = read_numbers(text, count, f"{where}: scale of mesh '{name}'")
-    if 0.0 in scale:
-        raise ModelError(f"{where}: scale of mesh '{name}' is '{text}'; no factor may be 0")
+    require_scale(text, count, f"{where}: scale of mesh '{name}'")
     mesh.set("scale", " ".join(text.split() * (3 // count)))
 
 
@@ -227,8 +225,5 @@ def _give_colours(root: ElementTree.Element) -> None:
 
 def _colour(material: ElementTree.Element) -> str | None:
     """The colour of a material, its parts within 0 and 1; None: it has none that can be read."""
-    for colour in material.iterfind("color"):
-        with suppress(ModelError):
-            rgba = [min(max(part, 0.0), 1.0) for part in read_numbers(colour.get("rgba"), 4, "")]
-            return " ".join(f"{part:g}" for part in rgba)
-    return None
+    texts = (colour.get("rgba", "") for colour in material.iterfind("color"))
+    return next((colour for t in texts if len(t.split()) == 4 and (colour := colour_text(t))), None)

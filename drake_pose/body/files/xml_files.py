@@ -110,6 +110,21 @@ def require_size(text: str | None, count: int, where: str, *, zero: bool = False
             raise ModelError(f"{where} is '{text}'; it {least}")
 
 
+def colour_text(text: str | None) -> str | None:
+    """Three or four parts of a colour, brought between 0 and 1; None where it is none."""
+    count = 3 if len((text or "").split()) == 3 else 4
+    try:
+        return " ".join(f"{min(max(part, 0.0), 1.0):g}" for part in read_numbers(text, count, ""))
+    except ModelError:
+        return None
+
+
+def require_scale(text: str, count: int, where: str) -> None:
+    """Refuse what is no scale of a mesh; ``where`` names the link and the mesh."""
+    if 0.0 in read_numbers(text, count, where):
+        raise ModelError(f"{where} is '{text}'; no factor may be 0")
+
+
 def read_limits(
     lower_text: str | None, upper_text: str | None, name: str
 ) -> tuple[float | None, float | None]:
@@ -147,7 +162,7 @@ def leave_out(
         root: the outermost element; it is changed.
         read: by element, the children that are read; all are where an element is not named.
         known: elements that say nothing of kinematics and looks; no word is lost on them.
-        warn: hears of all others.
+        warn: takes a warning of each of the others.
     """
     waiting = [root]
     while waiting:
@@ -173,7 +188,7 @@ def close_loops(
     Args:
         joints: all joints of a model.
         ends: the two links of each.
-        warn: hears of each that closes a loop.
+        warn: takes a warning of each that closes a loop.
     """
     group: dict[str, str] = {}
 

@@ -1,6 +1,6 @@
 """The plant's base: which base positions, or which pose of the plant, put the root where it is."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 
 from drake_pose.body.limits import nearest_turn, one_turn
 from drake_pose.body.parsed_model import ParsedModel
-from drake_pose.body.tree.joint_map import JointMap, inverse_transforms
+from drake_pose.body.tree.joint_map import ChainStep, chain_transforms, inverse_transforms
 from drake_pose.body.tree.link_graph import JointEdge, LinkGraph, PlantKinematics
 from drake_pose.errors import ModelError
 
@@ -35,7 +35,7 @@ class BasePose:
         node: the tree's node that the base positions or the world are known from.
         body: the plant's body of that node.
         positions: the base positions in q that are solved for.
-        maps: for "joints", the base joints from the world outwards.
+        steps: for "joints", the base joints from the world outwards.
         chain: for "joints", their positions in q; those that are not solved for are held.
         joint: for "floating", the joint's index.
     """
@@ -45,7 +45,7 @@ class BasePose:
     node: int = -1
     body: int = 0
     positions: tuple[int, ...] = ()
-    maps: tuple[JointMap, ...] = ()
+    steps: tuple[ChainStep, ...] = ()
     chain: tuple[int, ...] = ()
     joint: int = -1
 
@@ -106,10 +106,10 @@ class BasePose:
             return every
 
         def residual(values: NDArray[np.float64]) -> NDArray[np.float64]:
-            return (chain_pose(self.maps, completed(values)) - X_WA)[:3].reshape(12)
+            return (chain_transforms(self.steps, completed(values)[None])[0] - X_WA)[:3].reshape(12)
 
         def jacobian(values: NDArray[np.float64]) -> NDArray[np.float64]:
-            return chain_jacobian(self.maps, completed(values))[:, solved]
+            return chain_jacobian(self.steps, completed(values))[:, solved]
 
         random = np.random.default_rng(0)
         starts = [q[index]] + [
@@ -135,30 +135,14 @@ class BasePose:
         return outside
 
 
-def chain_pose(maps: tuple[JointMap, ...], values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The pose (4, 4) at the end of a chain of joints at values (k,)."""
-    return _chain_poses(maps, values[None])[0]
-
-
-def chain_jacobian(maps: tuple[JointMap, ...], values: NDArray[np.float64]) -> NDArray[np.float64]:
+def chain_jacobian(steps: Sequence[ChainStep], values: NDArray[np.float64]) -> NDArray[np.float64]:
     """How the upper three rows of a chain's end pose change with its values: (12, k).
 
     By complex steps, which are exact to rounding: a joint map is analytic in its values.
     """
-    steps = values + 1j * _COMPLEX_STEP * np.eye(len(values))
-    change = _chain_poses(maps, steps).imag / _COMPLEX_STEP
+    stepped = values + 1j * _COMPLEX_STEP * np.eye(len(values))
+    change = chain_transforms(steps, stepped).imag / _COMPLEX_STEP
     return np.asarray(change[:, :3].reshape(len(values), 12).T, dtype=np.float64)
-
-
-def _chain_poses(maps: tuple[JointMap, ...], values: NDArray[Any]) -> NDArray[Any]:
-    """Poses (n, 4, 4) at the end of a chain of joints at real or complex values (n, k)."""
-    X = np.broadcast_to(np.eye(4), (len(values), 4, 4))
-    start = 0
-    for joint_map in maps:
-        stop = start + joint_map.position_count
-        X = X @ joint_map.transforms(values[:, start:stop])
-        start = stop
-    return X
 
 
 def base_of_chain(
@@ -183,17 +167,17 @@ def base_of_chain(
             "floating", node=node, body=body, positions=edge.positions, joint=edge.joint
         )
     positions = tuple(position for edge in chain for position in edge.positions)
-    maps = tuple(edge.joint_map for edge in chain if edge.joint_map is not None)
+    steps = tuple(ChainStep(e.joint_map, inverted=False) for e in chain if e.joint_map is not None)
     values = model.default_positions[list(positions)] + 0.1
     if len(positions) <= 12:
-        slopes = chain_jacobian(maps, values)
+        slopes = chain_jacobian(steps, values)
         for solved in (~np.isin(positions, list(held)), np.ones(len(positions), dtype=np.bool_)):
             if np.linalg.matrix_rank(slopes[:, solved], tol=1e-5) >= 6:
                 taken = tuple(
                     p for p, is_solved in zip(positions, solved, strict=True) if is_solved
                 )
                 return BasePose(
-                    "joints", node=node, body=body, positions=taken, maps=maps, chain=positions
+                    "joints", node=node, body=body, positions=taken, steps=steps, chain=positions
                 )
     return BasePose("placed", node=node, body=body)
 

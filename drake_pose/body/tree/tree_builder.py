@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.body.parsed_model import ParsedModel
-from drake_pose.body.tree.base_pose import BasePose, base_of_chain, chain_pose
-from drake_pose.body.tree.joint_map import ChainStep
+from drake_pose.body.tree.base_pose import BasePose, base_of_chain
+from drake_pose.body.tree.joint_map import ChainStep, chain_transforms
 from drake_pose.body.tree.link_graph import JointEdge, LinkGraph, PlantKinematics, build_link_graph
 from drake_pose.body.tree.node_skin import find_skin, require_placed
 from drake_pose.body.tree.pose_tree import NodePlacement, PoseTree, PoseTreeNode
@@ -243,17 +243,17 @@ def _solve_translations(
     model: ParsedModel, chain: Chain, translations: tuple[int, ...], p_WN: NDArray[np.float64]
 ) -> dict[int, float]:
     """Values of the leading translations that put the chain's end at p_WN for any rotation."""
-    maps = tuple(edge.joint_map for edge in chain if edge.joint_map is not None)
+    steps = [ChainStep(e.joint_map, inverted=False) for e in chain if e.joint_map is not None]
     positions = [position for edge in chain for position in edge.positions]
     values = model.default_positions[positions].copy()
     values[:3] = 0.0
-    origin = chain_pose(maps, values)[:3, 3]
-    columns = [chain_pose(maps, values + unit)[:3, 3] - origin for unit in np.eye(len(values))[:3]]
-    matrix = np.array(columns).T
+    units = np.eye(len(values))[:3]
+    origin = chain_transforms(steps, values[None])[0, :3, 3]
+    matrix = (chain_transforms(steps, values + units)[:, :3, 3] - origin).T
     names = [model.position_names[index] for index in translations]
     turned = values.copy()
     turned[3:] += 0.5
-    if np.abs(chain_pose(maps, turned)[:3, 3] - origin).max() > 1e-9:
+    if np.abs(chain_transforms(steps, turned[None])[0, :3, 3] - origin).max() > 1e-9:
         raise ModelError(
             f"{model.path}: the root link's origin moves when its joints turn, so the joints "
             f"{', '.join(names)} cannot hold it at root_position; hold them yourself instead"

@@ -11,7 +11,7 @@ from drake_pose.search.grid.pair_kernel import Reaches, unite_masks
 from drake_pose.search.grid.sampled_body import SampledBody
 from drake_pose.silhouette.bits.bit_kernel import draw_bits
 from drake_pose.silhouette.bits.bit_view import WORD, BitView, make_bit_view
-from drake_pose.silhouette.bits.bounding_balls import draw_discs, sift_by_balls
+from drake_pose.silhouette.bits.bounding_balls import draw_discs, prune_by_balls
 
 _ONE, _ALL = 1, 2
 
@@ -291,7 +291,7 @@ class PoseStore:
         pairs[:, 1] = np.tile(np.arange(len(X_PN)), len(X_WP))
         limit = self._limit(node)
         for view in self.pictures.bit_views:
-            left = sift_by_balls(
+            left = prune_by_balls(
                 view, X_WP, self.body.p_PB[node], self.body.ball_radii[node], pairs, limit
             )
             pairs = pairs[left]

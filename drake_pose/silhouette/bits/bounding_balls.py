@@ -12,7 +12,7 @@ from drake_pose.silhouette.bits.bit_view import NEAREST_STRIDE, WORD, BitView
 
 
 @compiled
-def sift_by_balls(
+def prune_by_balls(
     view: BitView,
     X_WP: np.ndarray,
     p_PB: np.ndarray,

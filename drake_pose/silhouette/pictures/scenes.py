@@ -28,7 +28,7 @@ from drake_pose.yaml_files import read_yaml
 
 _FIELDS = ("sequence", "frame_rate_hz")
 
-# A camera nobody knows looks along the world's -x: the picture's right is y, its up is z.
+# An uncalibrated camera looks along the world's -x: the picture's right is y, its up is z.
 _LOOKING_BACK = np.array(
     [[0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
@@ -46,8 +46,8 @@ class Scene:
         masks: the mask file of (camera, frame).
         sequence: whether the frames follow each other in time.
         frame_rate_hz: frames a second, where the scene says.
-        scale_unknown: whether nobody knows the cameras: each is a parallel camera that looks along
-            the world's -x, and its pixels_per_metre and what it looks at are to be found.
+        scale_unknown: whether the cameras are uncalibrated: each is a parallel camera that looks
+            along the world's -x, and its pixels_per_metre and what it looks at are to be found.
         leftovers: what lies in the folder and is not used.
         images: the files, pictures or videos, of (camera, frame) of a sequence that has masks of
             few frames, or none: where a camera has no mask the body is tracked by its colours.
@@ -150,7 +150,7 @@ def load_scene(path: str | Path, cameras: Mapping[str, Camera] | None = None) ->
     `images/<camera>/<frame>.png` or `.jpg`, or a video `videos/<camera>.mp4`, where it has no
     masks. With a single camera the masks
     may lie in `masks/<frame>.png`. Such masks need no camera file: without one they were taken by
-    a camera that nobody knows, or by several where the pictures' sizes differ. Masks of cameras
+    an uncalibrated camera, or by several where the pictures' sizes differ. Masks of cameras
     that are not in the camera file are left over, see `Scene.leftovers`.
 
     Args:

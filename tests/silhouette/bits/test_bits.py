@@ -12,7 +12,7 @@ from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.bits.bit_kernel import draw_bits
 from drake_pose.silhouette.bits.bit_view import NEAREST_STRIDE, BitView, make_bit_view
-from drake_pose.silhouette.bits.bounding_balls import draw_discs, sift_by_balls
+from drake_pose.silhouette.bits.bounding_balls import draw_discs, prune_by_balls
 from drake_pose.silhouette.contours.direction_cells import divide_outline
 
 _POSES = 120
@@ -139,7 +139,7 @@ def test_nothing_has_no_balls() -> None:
 
 @pytest.mark.parametrize("camera", picture_cameras(), ids=lambda camera: camera.name)
 @pytest.mark.parametrize("limit", [0.0, 40.0])
-def test_sifting_loses_no_pose_inside_the_limit(camera: Camera, limit: float) -> None:
+def test_pruning_loses_no_pose_inside_the_limit(camera: Camera, limit: float) -> None:
     outline = thick_surface()
     mask = np.zeros((70, 90), dtype=bool)
     mask[10:60, 15:80] = True
@@ -148,7 +148,7 @@ def test_sifting_loses_no_pose_inside_the_limit(camera: Camera, limit: float) ->
     X_WN = random_poses(8)
     balls = VisualHull(outline).spread_balls(8)
     p_PB = balls[:, :3] @ np.swapaxes(X_WN[:, :3, :3], 1, 2) + X_WN[:, None, :3, 3]
-    left = sift_by_balls(view, np.eye(4)[None], p_PB, balls[:, 3].copy(), pairs(), limit)
+    left = prune_by_balls(view, np.eye(4)[None], p_PB, balls[:, 3].copy(), pairs(), limit)
     masks = [draw_mask([outline], X[None], camera) for X in X_WN]
     outside = np.array([int((drawn & ~mask).sum()) for drawn in masks])
     assert left[outside <= limit].all()

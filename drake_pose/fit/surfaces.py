@@ -7,10 +7,11 @@ from functools import lru_cache
 
 import fast_simplification
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from drake_pose.body.surfaces.mesh import TriangleMesh
-from drake_pose.fit.surface_distance import surface_distance
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
 
@@ -36,6 +37,8 @@ _ENOUGH = 1.1
 _GRIDS = 10.0, 20.0, 40.0
 # A process that estimates or audits many scenes of a body simplifies its surfaces once.
 _REMEMBERED = 256
+# Points of a surface whose distances from another are measured.
+_POINTS = 300
 
 
 def few_rigid_triangles(surfaces: TreeSurfaces, count: int) -> TreeSurfaces:
@@ -128,3 +131,45 @@ def _collapsed(outline: Outline, count: int, unit: float) -> Outline:
 def _size(outline: Outline) -> float:
     """The diagonal of the box around a surface [m]."""
     return float(np.linalg.norm(np.ptp(outline.vertices, axis=0)))
+
+
+def surface_distance(one: Outline, other: Outline) -> float:
+    """The root mean square distance of two surfaces [m]; infinite where one has no triangles.
+
+    From points spread evenly over each to the nearest point of the other: what one lacks counts as
+    much as what it has too much.
+    """
+    if len(one.triangles) == 0 or len(other.triangles) == 0:
+        return np.inf
+    squares = _squared_distances(one, other), _squared_distances(other, one)
+    return float(np.sqrt(0.5 * (squares[0].mean() + squares[1].mean())))
+
+
+def _squared_distances(one: Outline, other: Outline) -> Array:
+    """(n,) of points spread over a surface to another one's triangles."""
+    points, corners = _spread(one), other.vertices[other.triangles]
+    centers = corners.mean(axis=1)
+    radii = np.linalg.norm(corners - centers[:, None], axis=2).max(axis=1)
+    nearest = cKDTree(other.vertices).query(points)[0]
+    # Nothing in the ball around a triangle is nearer than what was found.
+    about = cKDTree(centers).query_ball_point(points, nearest + radii.max())
+    pairs = []
+    for i, found in enumerate(about):
+        apart = np.linalg.norm(centers[found] - points[i], axis=1)
+        near = np.array(found, dtype=np.intp)[apart <= nearest[i] + radii[found]]
+        pairs.append(np.column_stack([np.full(len(near), i), near]))
+    owners, triangles = np.concatenate(pairs).T
+    closest = trimesh.triangles.closest_point(corners[triangles], points[owners])
+    squares = nearest**2
+    np.fmin.at(squares, owners, ((closest - points[owners]) ** 2).sum(axis=1))
+    return squares
+
+
+def _spread(outline: Outline) -> Array:
+    """Points (n, 3) of a surface, as many in equal areas."""
+    generator = np.random.default_rng(0)
+    areas = np.cumsum(np.linalg.norm(outline.planes[:, :3], axis=1))
+    where = np.searchsorted(areas, areas[-1] * (np.arange(_POINTS) + 0.5) / _POINTS)
+    a, b, c = outline.vertices[outline.triangles[where]].transpose(1, 0, 2)
+    across, along = generator.uniform(size=(2, _POINTS, 1))
+    return a + np.sqrt(across) * ((b - a) + along * (c - b))

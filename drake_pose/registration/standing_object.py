@@ -20,8 +20,7 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.errors import RegistrationError, SettingsError
-from drake_pose.fit.surface_distance import surface_distance
-from drake_pose.fit.surfaces import FEW, few_triangles
+from drake_pose.fit.surfaces import FEW, few_triangles, surface_distance
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import ObjectPose, RegistrationBody
 from drake_pose.silhouette.areas.bending import TreeSurfaces

@@ -8,8 +8,7 @@ import trimesh
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.body.surfaces.mesh import TriangleMesh
-from drake_pose.fit.surface_distance import surface_distance
-from drake_pose.fit.surfaces import FEW, VERY_FEW, few_triangles
+from drake_pose.fit.surfaces import FEW, VERY_FEW, few_triangles, surface_distance
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 

@@ -21,8 +21,7 @@ from drake_pose.camera.models import ParallelCamera
 from drake_pose.compiled import is_stored
 from drake_pose.fit.kernel import collect
 from drake_pose.fit.surfaces import few_triangles
-from drake_pose.search.continuous.multi_start import MultiStartSearch
-from drake_pose.search.continuous.multi_start_settings import MEDIUM
+from drake_pose.search.continuous.multi_start import MEDIUM, MultiStartSearch
 from drake_pose.search.continuous.views_fit import ViewsFit
 from drake_pose.search.estimates import View
 

@@ -35,8 +35,7 @@ from drake_pose.jobs.estimate.scene_checks import (
 )
 from drake_pose.results.options import select_frames
 from drake_pose.results.settings import EstimateSettings, RootTurns
-from drake_pose.search.continuous.multi_start import MultiStartSearch
-from drake_pose.search.continuous.multi_start_settings import MultiStartSettings
+from drake_pose.search.continuous.multi_start import MultiStartSearch, MultiStartSettings
 from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
 from drake_pose.search.estimates import PoseEstimate
 from drake_pose.search.kameda.search import PaperSearch

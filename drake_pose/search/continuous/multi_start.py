@@ -9,10 +9,12 @@ other (``self_motions``).
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 
 from drake_pose.body.tree.pose_tree import PoseTree
@@ -20,14 +22,7 @@ from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.errors import SettingsError
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import few_triangles
-from drake_pose.search.continuous.equivalent_poses import RobustFamilies
-from drake_pose.search.continuous.mask_noise import without_specks
-from drake_pose.search.continuous.multi_start_settings import (
-    COARSE,
-    FINAL,
-    MEDIUM,
-    MultiStartSettings,
-)
+from drake_pose.search.continuous.equivalent_poses import RobustFamilies, RobustFamilySettings
 from drake_pose.search.continuous.views_fit import (
     FittedPose,
     ViewsFit,
@@ -36,12 +31,71 @@ from drake_pose.search.continuous.views_fit import (
 )
 from drake_pose.search.estimates import PoseEstimate, PoseSet, SearchStatistics, View
 from drake_pose.search.grid.beam.search import BeamSearch
-from drake_pose.search.grid.families.examination import examine
+from drake_pose.search.grid.families.examination import ExaminationSettings, examine
 from drake_pose.search.grid.sampled_body import SampledBody
 from drake_pose.search.scoring import Scoring
-from drake_pose.search.starts.coarse_search import CoarsePoses, CoarseSearch
+from drake_pose.search.settings import BeamSearchSettings
+from drake_pose.search.starts.coarse_search import CoarsePoses, CoarseSearch, CoarseSettings
 from drake_pose.search.starts.self_motions import counter_turns, flips
 from drake_pose.silhouette.areas.scoring import score_bodies
+
+# Connected pixels, or holes, no larger than this are specks [pixel].
+_SPECK = 6
+# Masks are left alone whose specks have a smaller share of the silhouette's area.
+_SPECKLED = 0.02
+_WINDOW = 5
+
+COARSE = (AnnealingStage(0.1, 0.04, 3), AnnealingStage(0.05, 0.04, 3))
+MEDIUM = (AnnealingStage(0.05, 0.026, 4), AnnealingStage(0.025, 0.026, 4))
+FINAL = (AnnealingStage(0.0125, 0.0125, 6),)
+
+
+@dataclass(frozen=True)
+class MultiStartSettings:
+    """Parameters of the multi-start search.
+
+    Args:
+        beam: of the search on the grid. Its time limit is that of the multi-start search.
+        continuous: False: nothing but the search on the grid is run.
+        coarse: of the search for coarse poses.
+        starts: how many coarse poses are refined.
+        apart: coarse poses differ where some part of the body is seen so far away, as a share of
+            the root of the silhouettes' mean area.
+        survivors: how many of them are refined further.
+        finalists: how many are refined to the end.
+        rounds: how often other explanations are sought about the best poses.
+        sought_about: about how many of them.
+        tried: how many other explanations of each are refined.
+        flipped: how many more, made by flips of its joints, are refined.
+        families: of the answer as a set; None: only the best pose is wanted.
+        examination: of an answer on the grid.
+
+    Raises:
+        SettingsError: if a value is out of its range.
+    """
+
+    beam: BeamSearchSettings = field(default_factory=BeamSearchSettings)
+    continuous: bool = True
+    coarse: CoarseSettings = field(default_factory=CoarseSettings)
+    starts: int = 40
+    apart: float = 0.13
+    survivors: int = 12
+    finalists: int = 4
+    rounds: int = 2
+    sought_about: int = 3
+    tried: int = 6
+    flipped: int = 3
+    families: RobustFamilySettings | None = field(default_factory=RobustFamilySettings)
+    examination: ExaminationSettings | None = field(default_factory=ExaminationSettings)
+
+    def __post_init__(self) -> None:
+        for name in ("starts", "survivors", "finalists", "sought_about", "tried", "flipped"):
+            if getattr(self, name) < 1:
+                raise SettingsError(f"{name} must be 1 or more, not {getattr(self, name)}")
+        if self.rounds < 0:
+            raise SettingsError(f"rounds must be 0 or more, not {self.rounds}")
+        if not (math.isfinite(self.apart) and self.apart >= 0.0):
+            raise SettingsError(f"apart must be 0 or more, not {self.apart}")
 
 
 class MultiStartSearch:
@@ -256,3 +310,30 @@ class _MultiStartRun:
             pose_set=self._pose_set(scoring),
             statistics=SearchStatistics(self.fit.evaluations, first),
         )
+
+
+def without_specks(mask: np.ndarray) -> np.ndarray:
+    """A mask without salt and pepper noise; one with few specks stays as it is.
+
+    A median over 5 x 5 pixels takes specks away, but also what is thinner than three pixels, so it
+    is only used where specks are many.
+
+    Args:
+        mask: (H, W) bool.
+
+    Returns:
+        (H, W) bool, not empty if the mask is not.
+    """
+    inside = mask.astype(np.uint8)
+    specks = sum(_speck_area(side) for side in (inside, 1 - inside))
+    if specks <= _SPECKLED * np.count_nonzero(mask):
+        return mask
+    cleaned = cv2.medianBlur(inside, _WINDOW) > 0
+    return cleaned if cleaned.any() else mask
+
+
+def _speck_area(inside: np.ndarray) -> int:
+    """The area of all small connected parts of a mask [pixel]."""
+    _, _, statistics, _ = cv2.connectedComponentsWithStats(inside, connectivity=4)
+    areas = statistics[1:, cv2.CC_STAT_AREA]
+    return int(areas[areas <= _SPECK].sum())

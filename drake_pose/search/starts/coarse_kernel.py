@@ -39,8 +39,8 @@ class CoarseView(NamedTuple):
     slack: float
 
 
-class Room(NamedTuple):
-    """Room for what one hypothesis's samples are seen to do; see make_room.
+class ScratchBuffers(NamedTuple):
+    """What one hypothesis's samples are seen to do; see _make_buffers.
 
     columns, rows: (n,) float32 [cell], column -1: not seen; scales: (n,) float32 [pixel/m]; costs:
     (n,) float32 [pixel]; covered: (n, 4) uint64.
@@ -82,9 +82,9 @@ def fill_cover(
 
 
 @compiled
-def _make_room(count: int) -> Room:
-    """Room for this many samples."""
-    return Room(
+def _make_buffers(count: int) -> ScratchBuffers:
+    """Buffers for this many samples."""
+    return ScratchBuffers(
         np.empty(count, dtype=np.float32),
         np.empty(count, dtype=np.float32),
         np.empty(count, dtype=np.float32),
@@ -95,9 +95,9 @@ def _make_room(count: int) -> Room:
 
 @compiled
 def _project_ball(
-    view: CoarseView, X_CP: np.ndarray, p_PB: np.ndarray, first: int, room: Room
+    view: CoarseView, X_CP: np.ndarray, p_PB: np.ndarray, first: int, buffers: ScratchBuffers
 ) -> None:
-    """Writes where a ball is seen at samples from the first on: room's columns, rows, scales.
+    """Writes where a ball is seen at samples from the first on: columns, rows, scales.
 
     Single precision, and no branches: the processor does many samples at once.
     """
@@ -116,7 +116,7 @@ def _project_ball(
     zx, zy, zz = np.float32(X_CP[2, 0]), np.float32(X_CP[2, 1]), np.float32(X_CP[2, 2])
     x0, y0, z0 = np.float32(X_CP[0, 3]), np.float32(X_CP[1, 3]), np.float32(X_CP[2, 3])
     parallel = camera[0] != 0.0
-    for k in range(room.rows.shape[0]):
+    for k in range(buffers.rows.shape[0]):
         p, q, r = p_PB[0, first + k], p_PB[1, first + k], p_PB[2, first + k]
         depth = one if parallel else zx * p + zy * q + zz * r + z0
         nearness = one / max(depth, least)
@@ -124,16 +124,16 @@ def _project_ball(
         row = focal_y * (yx * p + yy * q + yz * r + y0) * nearness + center_y
         seen = (depth >= least) & (column > low_x) & (column < high_x)
         seen = seen & (row > low_y) & (row < high_y)
-        room.columns[k] = column
-        room.rows[k] = row
-        room.scales[k] = pixels * nearness if seen else np.float32(0.0)
+        buffers.columns[k] = column
+        buffers.rows[k] = row
+        buffers.scales[k] = pixels * nearness if seen else np.float32(0.0)
 
 
 @compiled
 def _look_at_samples(
-    view: CoarseView, X_CP: np.ndarray, balls: Balls, first: int, room: Room
+    view: CoarseView, X_CP: np.ndarray, balls: Balls, first: int, buffers: ScratchBuffers
 ) -> None:
-    """Writes what a node costs and covers at samples from the first on: room's costs, covered."""
+    """Writes what a node costs and covers at samples from the first on: costs, covered."""
     zero, one, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)
     tiny = np.float32(1e-9)
     slack, parts = np.float32(view.slack), np.float32(view.parts)
@@ -141,17 +141,17 @@ def _look_at_samples(
     least = np.float32(view.radii[0])
     steps = np.float32((levels - 1) / (view.radii[levels - 1] - view.radii[0]))
     area = np.float32(balls.area * view.camera[2] / view.camera[1])
-    for k in range(room.costs.shape[0]):
-        room.costs[k] = zero
+    for k in range(buffers.costs.shape[0]):
+        buffers.costs[k] = zero
         for word in range(4):
-            room.covered[k, word] = np.uint64(0)
+            buffers.covered[k, word] = np.uint64(0)
     for ball in range(balls.radii.shape[0]):
-        _project_ball(view, X_CP, balls.p_PB[ball], first, room)
-        for k in range(room.costs.shape[0]):
-            scale = room.scales[k]
+        _project_ball(view, X_CP, balls.p_PB[ball], first, buffers)
+        for k in range(buffers.costs.shape[0]):
+            scale = buffers.scales[k]
             if scale == zero:
                 continue
-            column, row = room.columns[k], room.rows[k]
+            column, row = buffers.columns[k], buffers.rows[k]
             radius = scale * balls.radii[ball]
             share = one
             if zero <= column < columns and zero <= row < rows:
@@ -161,11 +161,11 @@ def _look_at_samples(
                     max(zero, min(np.float32(levels - 1), (radius + slack - least) * steps))
                 )
                 i, j = int(row), int(column)
-                room.covered[k, 0] |= view.cover[level, i, j, 0]
-                room.covered[k, 1] |= view.cover[level, i, j, 1]
-                room.covered[k, 2] |= view.cover[level, i, j, 2]
-                room.covered[k, 3] |= view.cover[level, i, j, 3]
-            room.costs[k] += scale * scale * area * share
+                buffers.covered[k, 0] |= view.cover[level, i, j, 0]
+                buffers.covered[k, 1] |= view.cover[level, i, j, 1]
+                buffers.covered[k, 2] |= view.cover[level, i, j, 2]
+                buffers.covered[k, 3] |= view.cover[level, i, j, 3]
+            buffers.costs[k] += scale * scale * area * share
 
 
 @compiled
@@ -188,14 +188,14 @@ def score_samples(
         scores: (B, n) added to [pixel].
     """
     count = scores.shape[1]
-    room = _make_room(count)
+    buffers = _make_buffers(count)
     for h in range(X_CP.shape[0]):
-        _look_at_samples(view, X_CP[h], balls, 0, room)
+        _look_at_samples(view, X_CP[h], balls, 0, buffers)
         for k in range(count):
             gain = 0
             for word in range(4):
-                gain += int(count_bits(room.covered[k, word] & ~masks[h, word]))
-            scores[h, k] += outside_weight * room.costs[k] - gain * view.point_area
+                gain += int(count_bits(buffers.covered[k, word] & ~masks[h, word]))
+            scores[h, k] += outside_weight * buffers.costs[k] - gain * view.point_area
 
 
 @compiled
@@ -204,9 +204,9 @@ def unite_pairs(
 ) -> np.ndarray:
     """The points (m, 4) that pairs (m, 2) of a hypothesis and a sample cover in one view."""
     united = np.empty((pairs.shape[0], 4), dtype=np.uint64)
-    room = _make_room(1)
+    buffers = _make_buffers(1)
     for m in range(pairs.shape[0]):
-        _look_at_samples(view, X_CP[pairs[m, 0]], balls, pairs[m, 1], room)
+        _look_at_samples(view, X_CP[pairs[m, 0]], balls, pairs[m, 1], buffers)
         for word in range(4):
-            united[m, word] = masks[pairs[m, 0], word] | room.covered[0, word]
+            united[m, word] = masks[pairs[m, 0], word] | buffers.covered[0, word]
     return united

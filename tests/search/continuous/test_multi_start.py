@@ -6,8 +6,7 @@ import pytest
 
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.errors import SettingsError
-from drake_pose.search.continuous.multi_start import MultiStartSearch
-from drake_pose.search.continuous.multi_start_settings import MultiStartSettings
+from drake_pose.search.continuous.multi_start import MultiStartSearch, MultiStartSettings
 from drake_pose.search.estimates import PoseEstimate, View
 from drake_pose.search.settings import BeamSearchSettings
 from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_pose, draw_view, split

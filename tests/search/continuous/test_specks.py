@@ -1,6 +1,6 @@
 import numpy as np
 
-from drake_pose.search.continuous.mask_noise import without_specks
+from drake_pose.search.continuous.multi_start import without_specks
 
 
 def shape() -> np.ndarray:

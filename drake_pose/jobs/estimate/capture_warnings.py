@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from drake_pose.jobs.estimate.scene_checks import SceneWarning, frame_ranges
+from drake_pose.jobs.estimate.scene_checks import frame_ranges
 from drake_pose.person.recordings.checked_capture import CheckedCapture, MovedCamera
 from drake_pose.person.recordings.persons_in_view import ViewFaults
 from drake_pose.person.recordings.rig_faults import RigFault
@@ -15,7 +15,7 @@ from drake_pose.person.recordings.rig_faults import RigFault
 _FITS_BADLY = 0.6
 
 
-def describe_faults(checked: CheckedCapture, frames: Sequence[str]) -> tuple[SceneWarning, ...]:
+def describe_faults(checked: CheckedCapture, frames: Sequence[str]) -> tuple[str, ...]:
     """All that was wrong with a recording whose frames have these names."""
     return (
         *describe_views(checked.views, frames),
@@ -25,27 +25,25 @@ def describe_faults(checked: CheckedCapture, frames: Sequence[str]) -> tuple[Sce
     )
 
 
-def describe_views(views: ViewFaults, frames: Sequence[str]) -> tuple[SceneWarning, ...]:
+def describe_views(views: ViewFaults, frames: Sequence[str]) -> tuple[str, ...]:
     """Warnings of who was in view or was not."""
     found = []
     if views.nobody:
         names = [frames[k] for k in views.nobody]
-        text = (
+        found.append(
             f"frame {frame_ranges(names, frames)}: fewer than two cameras see the person; no pose"
         )
-        found.append(SceneWarning("nobody in view", text, (), tuple(names)))
     for camera, indices in views.blind.items():
         names = [frames[k] for k in indices]
-        text = (
+        found.append(
             f"camera '{camera}' sees nobody in frame {frame_ranges(names, frames)}, where others "
             "see the person: left out there"
         )
-        found.append(SceneWarning("camera sees nobody", text, (camera,), tuple(names)))
     found += _describe_others(views, frames)
     return tuple(found)
 
 
-def _describe_others(views: ViewFaults, frames: Sequence[str]) -> list[SceneWarning]:
+def _describe_others(views: ViewFaults, frames: Sequence[str]) -> list[str]:
     """One warning for all cameras: others walk through all views at once."""
     if not views.others:
         return []
@@ -59,10 +57,10 @@ def _describe_others(views: ViewFaults, frames: Sequence[str]) -> list[SceneWarn
         merged = sorted({k for own in views.merged.values() for k in own})
         listed = frame_ranges([frames[k] for k in merged], frames)
         text += f"; in {_cameras(list(views.merged))} both are one silhouette (frame {listed})"
-    return [SceneWarning("others in view", text, tuple(views.others), tuple(names))]
+    return [text]
 
 
-def describe_fit(shares: Sequence[float], frames: Sequence[str]) -> tuple[SceneWarning, ...]:
+def describe_fit(shares: Sequence[float], frames: Sequence[str]) -> tuple[str, ...]:
     """A warning of a person of whose contours too little fits in the frames with a pose."""
     known = [share for share in shares if share > 0.0]
     usual = float(np.median(known)) if known else 1.0
@@ -72,10 +70,10 @@ def describe_fit(shares: Sequence[float], frames: Sequence[str]) -> tuple[SceneW
         f"only {100.0 * usual:.0f} % of the contours fit in the median frame, where 90 % are "
         "usual: do the masks show one person, and are cameras.yaml and the folders' names right?"
     )
-    return (SceneWarning("fits badly", text, (), tuple(frames)),)
+    return (text,)
 
 
-def describe_rig(rig: RigFault | None) -> tuple[SceneWarning, ...]:
+def describe_rig(rig: RigFault | None) -> tuple[str, ...]:
     """Warnings of a calibration that the silhouettes contradict as a whole."""
     if rig is None:
         return ()
@@ -86,26 +84,24 @@ def describe_rig(rig: RigFault | None) -> tuple[SceneWarning, ...]:
             f"{unfit} until the masks of {_cameras(rig.exchanged)} are exchanged: done for this "
             "result; correct the folders' names, or those in cameras.yaml"
         )
-        return (SceneWarning("cameras exchanged", text, rig.exchanged),)
+        return (text,)
     if rig.mirrored:
         text = (
             f"{unfit} until the masks of {_cameras(rig.mirrored)} are mirrored, left for right: "
             "done for this result, as cameras.yaml is taken for right; if the cameras were "
             "calibrated from mirrored pictures, left and right are exchanged in it: calibrate again"
         )
-        return (SceneWarning("mirrored", text, rig.mirrored),)
+        return (text,)
     text = f"{unfit}: are cameras.yaml, the folders' names or the masks wrong?"
-    return (SceneWarning("rig contradicts", text, tuple(rig.filled)),)
+    return (text,)
 
 
-def describe_cameras(
-    cameras: Sequence[MovedCamera], frames: Sequence[str]
-) -> tuple[SceneWarning, ...]:
+def describe_cameras(cameras: Sequence[MovedCamera], frames: Sequence[str]) -> tuple[str, ...]:
     """Warnings of cameras that contradict the others."""
     return tuple(_describe_camera(one, frames) for one in cameras)
 
 
-def _describe_camera(one: MovedCamera, frames: Sequence[str]) -> SceneWarning:
+def _describe_camera(one: MovedCamera, frames: Sequence[str]) -> str:
     """What is said of a camera that contradicts the others."""
     fault, motion = one.fault, one.fault.motion
     since = "" if one.first == 0 else f" since frame {frames[one.first]}"
@@ -126,8 +122,7 @@ def _describe_camera(one: MovedCamera, frames: Sequence[str]) -> SceneWarning:
             f"contours fit what they see, {100.0 * fault.others_share:.0f} % of theirs do; "
             f"{action}. Are its masks poor, mirrored or another camera's, or has it moved far?"
         )
-    kind = "camera moved" if fault.is_explained else "camera contradicts"
-    return SceneWarning(kind, text, (fault.name, *fault.rivals), tuple(frames[one.first :]))
+    return text
 
 
 def _cameras(names: Sequence[str], word: str = "and") -> str:

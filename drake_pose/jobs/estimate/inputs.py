@@ -31,7 +31,6 @@ from drake_pose.jobs.estimate.scene_checks import (
     check_scene,
     check_upright,
     leave_out_unreadable,
-    texts_of,
 )
 from drake_pose.results.options import select_frames
 from drake_pose.results.settings import EstimateSettings, RootTurns
@@ -105,7 +104,7 @@ def read_inputs(
     truth = _read_truth(scene_path, truth_path, model)
     starts = read_starts(scene, cameras, frames, model, settings)
     if (scene.images or not starts) and follows_person(scene, cameras, model, settings):
-        texts = (*texts_of(*checked.warnings, *check_upright(cameras)), *model.warnings)
+        texts = (*checked.warnings, *check_upright(cameras), *model.warnings)
         return Inputs(scene, model, cameras, frames, None, None, truth, texts, starts)
     root_positions: Mapping[str, np.ndarray] | None = None
     position: np.ndarray | None = None
@@ -122,7 +121,7 @@ def read_inputs(
         search = _make_search(make_tree(model, settings, position), settings, model)
     read = _check_pictures(scene, cameras, frames, search)
     of_model = model_warnings(model, search.tree, settings.hold)
-    texts = (*texts_of(*checked.warnings, *read.warnings), *of_model)
+    texts = (*checked.warnings, *read.warnings, *of_model)
     return Inputs(read.scene, model, cameras, frames, search, root_positions, truth, texts, starts)
 
 

@@ -16,11 +16,9 @@ from drake_pose.jobs.estimate.capture_warnings import describe_faults
 from drake_pose.jobs.estimate.inputs import Inputs
 from drake_pose.jobs.estimate.result import Drawn, FinishedFrame, OnStage, ResultWriter
 from drake_pose.jobs.estimate.scene_checks import (
-    SceneWarning,
     describe_unreadable,
     frame_ranges,
     require_readable,
-    texts_of,
 )
 from drake_pose.person.recordings.checked_capture import capture_checked
 from drake_pose.person.recordings.colour_capture import ColourRecording, capture_by_colour
@@ -51,7 +49,7 @@ class _Followed:
 
     captured: PersonCapture
     read: ReadFrame
-    faults: tuple[SceneWarning, ...]
+    faults: tuple[str, ...]
     distances: NDArray[np.float64] | None = None
 
 
@@ -89,7 +87,7 @@ def follow_person(
     def finished() -> Iterator[FinishedFrame]:
         for index in range(len(inputs.frames)):
             yield _finished_frame(inputs, result, followed, reader, index, seconds, overlay)
-        result.warn(texts_of(*reader.warnings(), *followed.faults))
+        result.warn((*reader.warnings(), *followed.faults))
 
     return finished()
 
@@ -125,7 +123,7 @@ def _follow_colours(inputs: Inputs, reader: _Reader, _track: bool) -> _Followed:
     )
     tree = inputs.model.pose_tree()
     found = capture_by_colour(tree, recording, masked, on_frame=reader.count_followed)
-    faults: tuple[SceneWarning, ...] = ()
+    faults: tuple[str, ...] = ()
     if found.checked is not None:
         faults = describe_faults(found.checked, [frames[k] for k in found.masked])
     lost = [frame for frame, q in zip(frames, found.captured.q, strict=True) if np.isnan(q).any()]
@@ -135,7 +133,7 @@ def _follow_colours(inputs: Inputs, reader: _Reader, _track: bool) -> _Followed:
             "fits the colours; masks of two cameras in such a frame, or its row in --start "
             "FILE.csv, say where the person is"
         )
-        faults += (SceneWarning("lost", text, (), tuple(lost)),)
+        faults += (text,)
     return _Followed(found.captured, reader, faults, found.distances)
 
 
@@ -191,7 +189,7 @@ class _Reader:
         if self.on_stage is not None:
             self.on_stage("following", self._followed, len(self._inputs.frames))
 
-    def warnings(self) -> tuple[SceneWarning, ...]:
+    def warnings(self) -> tuple[str, ...]:
         """Which masks were left out, and why."""
         return describe_unreadable(self._refused, self._inputs.scene)
 

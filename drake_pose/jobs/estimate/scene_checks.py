@@ -25,28 +25,11 @@ _LISTED = 6
 
 
 @dataclass(frozen=True)
-class SceneWarning:
-    """A fault that does not stop the work.
-
-    Args:
-        kind: one word or two, the same for all faults of a kind.
-        text: names the camera and the frames, and what to do.
-        cameras: the cameras at fault; names of folders, where they are no cameras.
-        frames: the frames it is about; none where it is about all.
-    """
-
-    kind: str
-    text: str
-    cameras: tuple[str, ...] = ()
-    frames: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
 class CheckedScene:
     """A scene without what cannot be used, and what was wrong with it."""
 
     scene: Scene
-    warnings: tuple[SceneWarning, ...]
+    warnings: tuple[str, ...]
 
 
 def check_scene(scene: Scene) -> CheckedScene:
@@ -72,7 +55,7 @@ def check_scene(scene: Scene) -> CheckedScene:
     return CheckedScene(scene, tuple(warnings))
 
 
-def check_upright(cameras: Sequence[Camera]) -> tuple[SceneWarning, ...]:
+def check_upright(cameras: Sequence[Camera]) -> tuple[str, ...]:
     """Whether the pictures' up is the world's z, as it must be where a person is to stand."""
     up = -np.mean([camera.X_WC[:3, 1] for camera in cameras], axis=0)
     axis = int(np.argmax(np.abs(up)))
@@ -82,12 +65,7 @@ def check_upright(cameras: Sequence[Camera]) -> tuple[SceneWarning, ...]:
         f"cameras.yaml: up in the pictures is the world's {'+' if up[axis] > 0.0 else '-'}"
         f"{'xyz'[axis]}, but should be +z: the world lies on its side or upside down; turn X_WC"
     )
-    return (SceneWarning("world not upright", text, tuple(camera.name for camera in cameras)),)
-
-
-def texts_of(*warnings: SceneWarning) -> tuple[str, ...]:
-    """The warnings' texts."""
-    return tuple(warning.text for warning in warnings)
+    return (text,)
 
 
 def leave_out_unreadable(
@@ -122,17 +100,14 @@ def require_readable(refused: Mapping[tuple[str, str], str], scene: Scene) -> No
         raise SceneError(f"{scene.path}: none of {len(refused)} masks can be used: {first}")
 
 
-def describe_unreadable(
-    refused: Mapping[tuple[str, str], str], scene: Scene
-) -> tuple[SceneWarning, ...]:
+def describe_unreadable(refused: Mapping[tuple[str, str], str], scene: Scene) -> tuple[str, ...]:
     """One warning a camera of what is wrong with the masks of (camera, frame)."""
     found = []
     for camera in dict.fromkeys(name for name, _ in refused):
         frames = [frame for name, frame in refused if name == camera]
         listed = frame_ranges(frames, scene.frames)
         first = refused[camera, frames[0]]
-        text = f"frame {listed} without camera '{camera}': {first}"
-        found.append(SceneWarning("unreadable", text, (camera,), tuple(frames)))
+        found.append(f"frame {listed} without camera '{camera}': {first}")
     return tuple(found)
 
 
@@ -199,21 +174,16 @@ def _has_changed(scene: Scene, names: Sequence[str], last: str, frame: str) -> b
     return bool(changes) and float(np.median(changes)) > _CHANGED
 
 
-def _describe_frozen(scene: Scene, frozen: Mapping[str, Sequence[str]]) -> list[SceneWarning]:
+def _describe_frozen(scene: Scene, frozen: Mapping[str, Sequence[str]]) -> list[str]:
     return [
-        SceneWarning(
-            "duplicate frames",
-            f"camera '{name}' shows its last picture again in frame "
-            f"{frame_ranges(frames, scene.frames)}, while the others' changed: left out there; did "
-            "the camera stand still, or drop frames?",
-            (name,),
-            tuple(frames),
-        )
+        f"camera '{name}' shows its last picture again in frame "
+        f"{frame_ranges(frames, scene.frames)}, while the others' changed: left out there; did "
+        "the camera stand still, or drop frames?"
         for name, frames in frozen.items()
     ]
 
 
-def _check_repeated(scene: Scene, repeats: set[tuple[str, str]]) -> list[SceneWarning]:
+def _check_repeated(scene: Scene, repeats: set[tuple[str, str]]) -> list[str]:
     """Frames that are the last one again in every camera."""
     repeated = []
     for last, frame in zip(scene.frames, scene.frames[1:], strict=False):
@@ -224,38 +194,40 @@ def _check_repeated(scene: Scene, repeats: set[tuple[str, str]]) -> list[SceneWa
         return []
     listed = frame_ranges(repeated, scene.frames)
     text = f"frame {listed}: all cameras show the frame before again; was it recorded twice?"
-    return [SceneWarning("duplicate frames", text, (), tuple(repeated))]
+    return [text]
 
 
-def _check_leftovers(scene: Scene) -> list[SceneWarning]:
+def _check_leftovers(scene: Scene) -> list[str]:
     """Folders without calibration, cameras without masks, files that are not used."""
     found = []
     unused = [name for name in scene.cameras if not any(owner == name for owner, _ in scene.masks)]
     for name, count in scene.leftovers.uncalibrated.items():
         close = close_names(name, unused)
         advice = f"is it '{close[0]}'?" if close else "calibrate it"
-        text = (
+        found.append(
             f"masks/{name}: no camera '{name}' in cameras.yaml; its {count} masks are left out: "
             f"{advice}"
         )
-        found.append(SceneWarning("without calibration", text, (name,)))
     for name in unused:
-        text = f"camera '{name}' of cameras.yaml has no masks in masks/{name}; the others go on"
-        found.append(SceneWarning("without masks", text, (name,)))
+        found.append(
+            f"camera '{name}' of cameras.yaml has no masks in masks/{name}; the others go on"
+        )
     for (name, frame), files in scene.leftovers.doubled.items():
         used = scene.masks[name, frame].name
         others = ", ".join(file.name for file in files)
-        text = f"camera '{name}', frame {frame}: {used} is used, {others} is the same frame again"
-        found.append(SceneWarning("duplicate frames", text, (name,), (frame,)))
+        found.append(
+            f"camera '{name}', frame {frame}: {used} is used, {others} is the same frame again"
+        )
     for name, names in scene.leftovers.foreign.items():
         folder = f"masks/{name}" if name else "masks"
         more = f" and {len(names) - 1} more" if len(names) > 1 else ""
-        text = f"{folder}: {names[0]}{more} left out: masks are PNG pictures in masks/<camera>"
-        found.append(SceneWarning("other files", text, (name,) if name else ()))
+        found.append(
+            f"{folder}: {names[0]}{more} left out: masks are PNG pictures in masks/<camera>"
+        )
     return found
 
 
-def _check_counts(scene: Scene) -> list[SceneWarning]:
+def _check_counts(scene: Scene) -> list[str]:
     """Cameras that lack frames which others have."""
     counts = {
         name: sum((name, frame) in scene.masks for frame in scene.frames) for name in scene.cameras
@@ -265,15 +237,14 @@ def _check_counts(scene: Scene) -> list[SceneWarning]:
         lacking = [frame for frame in scene.frames if (name, frame) not in scene.masks]
         if not count or not lacking:
             continue
-        text = (
+        found.append(
             f"camera '{name}' has {count} of {len(scene.frames)} frames; it lacks "
             f"{frame_ranges(lacking, scene.frames)}, where the others go on without it"
         )
-        found.append(SceneWarning("frames missing", text, (name,), tuple(lacking)))
     return found
 
 
-def _check_gaps(scene: Scene) -> list[SceneWarning]:
+def _check_gaps(scene: Scene) -> list[str]:
     """Numbers that no camera has between frames that are numbered one by one."""
     keys = [natural_key(frame) for frame in scene.frames]
     if len(keys) < 3 or any(key[:-2] != keys[0][:-2] or key[-1][0] for key in keys):
@@ -291,5 +262,4 @@ def _check_gaps(scene: Scene) -> list[SceneWarning]:
         f"{missing} frames dropped by all cameras {', '.join(texts)}{rest}; the times of all later "
         "frames count on without them"
     )
-    frames = tuple(scene.frames[k + 1] for k in wide)
-    return [SceneWarning("dropped frames", text, (), frames)]
+    return [text]

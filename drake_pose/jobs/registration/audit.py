@@ -17,7 +17,7 @@ from drake_pose.camera.files import load_cameras
 from drake_pose.camera.models import Camera
 from drake_pose.errors import MaskError, SceneError
 from drake_pose.jobs.estimate.inputs import make_tree, select_cameras, select_seen_frames
-from drake_pose.jobs.estimate.scene_checks import check_scene, frame_ranges, texts_of
+from drake_pose.jobs.estimate.scene_checks import check_scene, frame_ranges
 from drake_pose.jobs.registration.positions import KnownPositions, read_known_positions
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.registration.contradictions import Audit, Finding, FrameAudit, audit_frames
@@ -176,7 +176,7 @@ def _read_inputs(
     model = load_model(files["model"], package_paths=settings.packages)
     tree = make_tree(model, EstimateSettings(hold=settings.hold), None)
     positions = read_known_positions(files["joints"], TreeKinematics(tree))
-    warnings = [*texts_of(*checked.warnings), *model.warnings, *positions.warnings]
+    warnings = [*checked.warnings, *model.warnings, *positions.warnings]
     if positions.are_one_pose(positions.of(frame, chosen[0].name) for frame in frames):
         warnings.append(
             "all frames show the robot in one pose, to a degree: errors of a joint's zero and of a "

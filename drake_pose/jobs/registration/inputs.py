@@ -25,7 +25,7 @@ from drake_pose.errors import (
 from drake_pose.jobs.estimate.inputs import make_tree, select_seen_frames
 from drake_pose.jobs.estimate.measurements import read_true_angles
 from drake_pose.jobs.estimate.person_choice import missing_for_person
-from drake_pose.jobs.estimate.scene_checks import check_scene, texts_of
+from drake_pose.jobs.estimate.scene_checks import check_scene
 from drake_pose.jobs.registration.positions import (
     KnownPositions,
     estimate_positions,
@@ -142,7 +142,7 @@ def read_inputs(
     if positions.is_estimate:
         _require_held(scene_path, held, frames)
     left_out = [name for name in unplaced if name not in searched]
-    warnings = [*texts_of(*checked.warnings), *model.warnings, *positions.warnings]
+    warnings = [*checked.warnings, *model.warnings, *positions.warnings]
     warnings += [_say_left_out(name) for name in left_out]
     warnings += _say_of_body(model, pinholes, frames, positions, standing)
     return RegistrationInputs(

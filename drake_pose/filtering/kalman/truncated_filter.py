@@ -18,8 +18,8 @@ from drake_pose.filtering.kalman.hypotheses import (
     prune,
 )
 from drake_pose.filtering.kalman.repeated_views import (
-    AnchoredObservation,
     View,
+    anchored,
     begin_repeated_view,
     next_view,
 )
@@ -263,7 +263,7 @@ class TruncatedFilter:
             repeated = begin_repeated_view(
                 model, hypothesis.free, hypothesis.belief, hypothesis.tangent
             )
-        updated = update(repeated.belief, y, AnchoredObservation(model, repeated.tangent))
+        updated = update(repeated.belief, y, anchored(model, repeated.tangent))
         repeated = replace(repeated, belief=updated.belief)
         updated = replace(updated, belief=repeated.state())
         truncated = self._truncate(updated.belief, hypothesis.sites)

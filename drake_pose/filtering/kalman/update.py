@@ -54,6 +54,29 @@ class ObservationModel(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
+class LinearObservation:
+    """The ``ObservationModel`` h + H (x - at), without mirrors.
+
+    names (m), variances (m,) and wraps (m,) as of the protocol; at (n,); h (m,); H (m, n).
+    """
+
+    names: tuple[str, ...]
+    variances: Array
+    wraps: NDArray[np.bool_]
+    at: Array
+    h: Array
+    H: Array
+
+    def predict(self, x: Array) -> tuple[Array, Array]:
+        """Its value (m,) and H."""
+        return self.h + self.H @ (x - self.at), self.H
+
+    def mirrors(self, belief: Belief) -> list[Array]:
+        """None."""
+        return []
+
+
+@dataclass(frozen=True, eq=False)
 class Updated:
     """A belief after a measurement.
 

@@ -12,7 +12,7 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.body_state import BodyState, Mask
-from drake_pose.filtering.state import Belief
+from drake_pose.filtering.kalman.update import LinearObservation
 from drake_pose.fit.camera_sums import REACH, Views
 from drake_pose.fit.colours import (
     ColourSettings,
@@ -90,47 +90,23 @@ class Seen(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class ContourMeasurement:
-    """What masks say of a pose near one state: an ``ObservationModel``, linear, made for one frame.
+class ContourMeasurement(LinearObservation):
+    """What masks say of a pose near one state, made for one frame.
 
     The distances of hundreds of contour points are summed to normal equations, and these are as
     many numbers with noise 1 as there are directions of the state that they tell something about.
 
     Attributes:
-        names: (k) of the numbers.
         y: (k,) what was measured, 0 at ``at``.
-        H: (k, n) the slope.
-        at: (n,) the state.
         share: of the contour that the model shows, what has an edge beside it.
         distance: root mean square of their distances, robustly weighted [pixel].
         part_distances: (nodes,) of each part in the pictures [pixel]; 0 where they say too little.
     """
 
-    names: tuple[str, ...]
     y: Array
-    H: Array
-    at: Array
     share: float
     distance: float
     part_distances: Array
-
-    @property
-    def variances(self) -> Array:
-        """(k,) 1."""
-        return np.ones(len(self.y))
-
-    @property
-    def wraps(self) -> NDArray[np.bool_]:
-        """(k,) no number is an angle."""
-        return np.zeros(len(self.y), dtype=np.bool_)
-
-    def predict(self, x: Array) -> tuple[Array, Array]:
-        """H (x - at) (k,), and H."""
-        return self.H @ (x - self.at), self.H
-
-    def mirrors(self, belief: Belief) -> list[Array]:
-        """None."""
-        return []
 
 
 class ContourObservation(BodyState):
@@ -310,6 +286,9 @@ class ContourObservation(BodyState):
         contour = compared.sums[:, :-1].sum(axis=(0, 1))
         return ContourMeasurement(
             names=tuple(f"contour_{k}" for k in range(len(root))),
+            variances=np.ones(len(root)),
+            wraps=np.zeros(len(root), dtype=np.bool_),
+            h=np.zeros(len(root)),
             y=-(turns.T @ slopes) / root,
             H=slope,
             at=x,

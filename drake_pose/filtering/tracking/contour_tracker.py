@@ -14,6 +14,7 @@ from drake_pose.filtering.kalman.truncated_filter import (
     FilterState,
     TruncatedFilter,
 )
+from drake_pose.filtering.kalman.update import LinearObservation
 from drake_pose.filtering.measurements.contour import ContourMeasurement, ContourObservation, Seen
 from drake_pose.filtering.state import Belief
 from drake_pose.fit.colours import Histograms, Picture
@@ -123,9 +124,13 @@ class ContourTracker:
         self.observation, self.settings = observation, settings or TrackingSettings()
         layout = observation.layout
         scale = {name: period**2 * self.acceleration(name) for name in layout.moving}
+        size = len(layout)
+        none = np.zeros(0)
+        # Frames bring their own measurements.
+        nothing = LinearObservation((), none, none > 0, np.zeros(size), none, np.zeros((0, size)))
         self.filter = TruncatedFilter(
             layout,
-            _Nothing(len(layout)),
+            nothing,
             observation.inequalities(),
             layout.process_noise(scale),
             # A frame's numbers are not those of the frame before: there are no views to keep.
@@ -258,22 +263,3 @@ class ContourTracker:
         moved = found - expected.best.mean
         belief = Belief(found, expected.best.covariance + np.outer(moved, moved))
         return replace(self.filter.start(belief), step=state.step)
-
-
-class _Nothing:
-    """The measurement of a filter whose frames bring their own."""
-
-    names: tuple[str, ...] = ()
-    variances = np.zeros(0)
-    wraps = np.zeros(0, dtype=np.bool_)
-
-    def __init__(self, size: int) -> None:
-        self._size = size
-
-    def predict(self, x: Array) -> tuple[Array, Array]:
-        """Nothing."""
-        return np.zeros(0), np.zeros((0, self._size))
-
-    def mirrors(self, belief: Belief) -> list[Array]:
-        """None."""
-        return []

@@ -65,12 +65,7 @@ class PaperSearch:
         self.sampled = SampledTree(tree, self.settings)
 
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
-        """Estimate the pose that the views show.
-
-        Args:
-            views: one or several silhouettes of the same instant.
-            root_position: (3,), the root's known position in the world [m], where it is not the
-                pose tree's own.
+        """Estimate the pose that the views show; see ``PoseSearch``.
 
         Returns:
             The best pose found; ``found`` is False where none was.

@@ -4,8 +4,8 @@ import pytest
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.hand.observation import HAND_STATE
 from drake_pose.filtering.kalman.repeated_views import (
-    AnchoredObservation,
     RepeatedView,
+    anchored,
     begin_repeated_view,
     measure_curvature,
     next_view,
@@ -91,12 +91,12 @@ def test_a_thousand_frames_tell_the_sum_of_state_and_offset_and_no_more():
     """Against the closed form: prior, offset and mean noise as one normal distribution."""
     prior = Belief(np.zeros(1), np.array([[0.09]]))
     repeated = begin_repeated_view(Parabola(), prior, prior, np.zeros(1))
-    anchored = AnchoredObservation(Parabola(), repeated.tangent)
+    tangent = anchored(Parabola(), repeated.tangent)
     C = measure_curvature(Parabola(), prior)[0]
     frames, y = 1000, 0.4
     for _ in range(frames):
         repeated = RepeatedView(
-            repeated.tangent, update(repeated.belief, np.array([y]), anchored).belief
+            repeated.tangent, update(repeated.belief, np.array([y]), tangent).belief
         )
     noise = Parabola.variances[0] / frames + C
     assert repeated.state().covariance[0, 0] == pytest.approx(1 / (1 / 0.09 + 1 / noise), rel=1e-6)
@@ -108,14 +108,14 @@ def test_a_thousand_frames_tell_the_sum_of_state_and_offset_and_no_more():
 def test_the_anchored_jacobian_against_differences(hand):
     _, observation, sequence = hand
     x = sequence.states[5]
-    anchored = AnchoredObservation(observation, x)
+    tangent = anchored(observation, x)
     n, m = len(x), len(observation.names)
     z = np.r_[sequence.states[6], np.random.default_rng(0).normal(size=m)]
-    h, H = anchored.predict(z)
+    h, H = tangent.predict(z)
     step = np.random.default_rng(1).normal(size=n + m) * 1e-3
-    np.testing.assert_allclose(anchored.predict(z + step)[0] - h, H @ step, atol=1e-9)
+    np.testing.assert_allclose(tangent.predict(z + step)[0] - h, H @ step, atol=1e-9)
     h0, _ = observation.predict(x)
-    np.testing.assert_allclose(anchored.predict(np.r_[x, np.zeros(m)])[0], h0)
+    np.testing.assert_allclose(tangent.predict(np.r_[x, np.zeros(m)])[0], h0)
 
 
 def test_offsets_stay_while_the_state_moves(hand):

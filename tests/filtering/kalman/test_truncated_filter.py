@@ -144,24 +144,6 @@ def test_the_estimate_stays_inside_and_none_does_not(truncation):
     assert truncation == "clip" or states[0].hypotheses[0].active
 
 
-def test_figure_9_two_hypotheses_are_born_and_a_constraint_kills_the_wrong_one():
-    """The angle's sign cannot be seen; a limit on the angle knows it, once it is far enough."""
-    rows = from_bounds(["angle", "length"], [-0.15, 0.9], [1.5, 1.1])
-    f = make_filter(Segment(depth_only=True, deviation=0.002), rows, reject_below=-2.0)
-    state = f.start(Belief(np.array([0.05, 0.02, 1.0]), np.diag([0.02, 1e-3, 1e-6])))
-    history, killed = [], []
-    for t in range(1, 26):
-        angle = 0.05 + 0.02 * t
-        state = f.update(f.predict(state), np.array([np.cos(angle)]))
-        history.append(len(state.hypotheses))
-        killed += [r for r in state.rejections if r.reason == "constraint"]
-    assert max(history) >= 2
-    assert history[-1] == 1
-    assert state.best.mean[0] == pytest.approx(angle, abs=0.05)
-    assert killed
-    assert all(r.row.startswith("angle >= -0.15") and r.c < -2 for r in killed)
-
-
 def test_weights_add_up_and_the_cap_holds():
     rows = from_bounds(["angle", "length"], [-1.5, 0.9], [1.5, 1.1])
     f = make_filter(Segment(depth_only=True, deviation=0.002), rows, hypothesis_cap=2)

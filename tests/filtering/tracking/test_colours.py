@@ -11,7 +11,7 @@ from drake_pose.fit.colours import ColourSettings, part_distances, weigh_parts
 from drake_pose.fit.contour_fit import Comparison
 from drake_pose.fit.kernel import COMPARED, SQUARES, WEIGHT
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from tests.filtering.tracking.test_match_and_track import PERIOD, swings
+from tests.filtering.tracking.test_match_and_track import PERIOD
 from tests.search.bodies import forked_body, near_camera
 
 SIDE = 480
@@ -132,37 +132,6 @@ def test_a_body_like_its_background_says_nothing(observation, renderer):
     assert observation.measure(observation.look([None], [plain], colours), x) is None
     tracker = ContourTracker(observation, PERIOD)
     assert tracker.follow(tracker.start(x), [None], pictures=[plain]).lost
-
-
-def test_followed_by_colour_almost_as_well_as_by_masks(observation, renderer):
-    """Noise and a background that moves; the first frame has a mask, later ones have not."""
-    generator = np.random.default_rng(5)
-    background = room(generator)
-    truth = swings(25, np.array([0.1, 0.9, -0.8]), 0.25, generator)
-    tracker = ContourTracker(observation, PERIOD)
-    tracks = [tracker.start(observation.state(truth[0])) for _ in range(3)]
-    errors = []
-    for k, q in enumerate(truth):
-        mask = renderer.mask(q)
-        moved = np.roll(background, 2 * k, axis=1)
-        picture = painted(mask, moved, generator)
-        by_mask = tracker.follow(tracks[0], [mask], k == 0)
-        by_colour = tracker.follow(
-            tracks[1], [mask if k == 0 else None], k == 0, pictures=[picture]
-        )
-        # This one never gets a mask.
-        by_start = tracker.follow(tracks[2], [None], k == 0, pictures=[picture])
-        tracks = [by_mask, by_colour, by_start]
-        assert not any(track.lost for track in tracks)
-        errors.append(
-            [
-                np.degrees(np.abs(observation.positions(track.state.best.mean)[0] - q)).mean()
-                for track in tracks
-            ]
-        )
-    of_mask, of_colour, of_start = np.median(errors[3:], axis=0)
-    assert of_colour < max(2.0 * of_mask, 1.5)
-    assert of_start < max(2.0 * of_mask, 1.5)
 
 
 def test_a_covered_lens_is_a_loss_that_teaches_nothing(observation, renderer):

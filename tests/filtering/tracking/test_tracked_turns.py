@@ -20,6 +20,7 @@ def model(tmp_path):
     return crane(tmp_path)
 
 
+@pytest.mark.slow
 def test_turns_are_counted_while_a_body_is_followed(model):
     """Drake's pictures of two turns at 240 degrees a second; the search is asked now and then."""
     front = camera("front")

@@ -28,7 +28,7 @@ def search_of(maker: ProblemMaker, examination: ExaminationSettings | None) -> B
 def test_what_is_proved_is_the_best_of_the_grid(maker: ProblemMaker) -> None:
     examined = search_of(maker, ExaminationSettings(proof_poses=10**6, family_poses=10**6))
     generator = np.random.default_rng(5)
-    for noise in (0.0, 0.003, 0.01, 0.03) * 4:
+    for noise in (0.0, 0.003, 0.01, 0.03) * 2:
         problem = maker.make(generator, views=1, noise=noise, on_grid=noise == 0.0)
         result = examined.match(problem.views)
         best = problem.best[1]
@@ -74,7 +74,7 @@ def test_a_worse_pose_is_replaced(maker: ProblemMaker) -> None:
 def test_without_time_nothing_is_proved_but_what_is_exact(maker: ProblemMaker) -> None:
     hasty = search_of(maker, ExaminationSettings(proof_time_limit=0.0, family_time_limit=0.0))
     generator = np.random.default_rng(6)
-    for noise in (0.0, 0.01) * 4:
+    for noise in (0.0, 0.01) * 2:
         problem = maker.make(generator, views=1, noise=noise, on_grid=noise == 0.0)
         result = hasty.match(problem.views)
         assert result.lower_bound <= problem.best[1] <= result.J

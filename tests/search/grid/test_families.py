@@ -7,11 +7,6 @@ import numpy as np
 import pytest
 
 from drake_pose.errors import SettingsError
-from drake_pose.papers.kameda import (
-    beam_experiment_search,
-    draw_values,
-    experiment_camera,
-)
 from drake_pose.search.estimates import JointEstimate, View
 from drake_pose.search.grid.branch_and_bound.bounded_poses import BoundLimits
 from drake_pose.search.grid.families.examination import ExaminationSettings
@@ -23,9 +18,8 @@ from drake_pose.search.grid.families.search import (
     samples_at,
 )
 from drake_pose.search.grid.families.split import cluster_samples
-from drake_pose.search.scoring import Scoring
 from tests.search.bodies import box_link, forked_body, joint, load_body, swinging_chain
-from tests.search.grid_problems import GridProblem, ProblemMaker, show_pose
+from tests.search.grid_problems import GridProblem, ProblemMaker
 
 
 @pytest.fixture(scope="module")
@@ -200,32 +194,6 @@ def test_a_pose_off_the_grid_has_no_samples(tmp_path: Path) -> None:
     sampled = ProblemMaker(swinging_chain(tmp_path, 2).pose_tree(), 0.5).body.sampled
     assert samples_at(sampled, [np.array([0.5]), np.array([-1.0])]) is not None
     assert samples_at(sampled, [np.array([0.5]), np.array([-0.9])]) is None
-
-
-@pytest.mark.slow
-def test_experiment_a_the_truth_is_in_the_set_and_all_members_look_alike() -> None:
-    search, camera = beam_experiment_search(), experiment_camera()
-    generator = np.random.default_rng(26)
-    sizes, complete = [], []
-    for _ in range(12):
-        values = draw_values(search, "grid", generator)
-        view = show_pose(search.sampled, values, camera)
-        true_samples = samples_at(search.sampled, values)
-        assert true_samples is not None
-        found = search.match([view])
-        samples = samples_at(search.sampled, found.node_values)
-        assert samples is not None
-        answer = find_families(search.body, [view], samples, found.J)
-        assert answer.contains(values)
-        members = answer.graph.draw(10, generator)
-        scoring = Scoring(search.sampled, [view])
-        assert scoring.J(scoring.sampled.poses(members), members).max() == 0.0
-        flat = np.concatenate(values)
-        assert all(report.holds(v) for report, v in zip(answer.joints, flat, strict=True))
-        sizes.append(answer.size)
-        complete.append(answer.complete)
-    assert all(complete)
-    assert max(sizes) > 1.0
 
 
 def test_a_report_holds_what_lies_between() -> None:

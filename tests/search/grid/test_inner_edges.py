@@ -8,11 +8,6 @@ import numpy as np
 import pytest
 
 from drake_pose.errors import SettingsError
-from drake_pose.papers.kameda import (
-    beam_experiment_search,
-    draw_values,
-    experiment_camera,
-)
 from drake_pose.search.grid.families.inner_edges import (
     EdgeErrors,
     choose_by_edges,
@@ -168,26 +163,3 @@ def test_noise_on_the_edges_leaves_the_true_pose(
         assert not choice.rules_out(samples)
         left.append(choice.left)
     assert np.median(left) <= 5
-
-
-@pytest.mark.slow
-def test_experiment_a_edges_never_speak_against_the_truth() -> None:
-    search, camera = beam_experiment_search(), experiment_camera()
-    generator = np.random.default_rng(77)
-    renderer = LabelRenderer(search.tree.model, camera)
-    before, after = 0.0, 0
-    for _ in range(12):
-        values = draw_values(search, "grid", generator)
-        view = show_pose(search.sampled, values, camera)
-        samples = samples_at(search.sampled, values)
-        assert samples is not None
-        answer = find_families(search.body, [view], samples, 0.0)
-        if not 1.0 < answer.size <= 100.0:
-            continue
-        seen = renderer.segments(*search.tree.positions_from(values))
-        edges = [edges_of_labels(seen, view.mask)]
-        choice = choose_by_edges(answer, edges, [renderer.segments])
-        left = {tuple(row) for row in choice.samples[: choice.left].tolist()}
-        assert tuple(samples.tolist()) in left
-        before, after = before + answer.size, after + choice.left
-    assert after < 0.5 * before

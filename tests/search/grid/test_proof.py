@@ -24,7 +24,7 @@ def test_proves_what_brute_force_finds(
     makers: list[ProblemMaker], noise: float, on_grid: bool, views: int
 ) -> None:
     generator = np.random.default_rng(11)
-    for number in range(16):
+    for number in range(8):
         problem = makers[number % 2].make(generator, views=views, noise=noise, on_grid=on_grid)
         # From the best pose, and from any.
         start = int(np.argmin(problem.Js)) if number % 4 < 2 else int(generator.integers(100))
@@ -72,12 +72,3 @@ def test_an_exact_pose_needs_no_search(makers: list[ProblemMaker]) -> None:
     proof = prove_optimal(problem.body, problem.views, samples, J, BoundLimits(time_limit=0.0))
     assert proof.proved
     assert proof.states == 0
-
-
-def test_a_mask_that_no_pose_explains(makers: list[ProblemMaker]) -> None:
-    problem = makers[1].make(np.random.default_rng(14), views=1, noise=0.1, on_grid=False)
-    samples, J = problem.best
-    assert J > 300.0
-    proof = prove_optimal(problem.body, problem.views, samples, J)
-    assert proof.proved
-    assert proof.J == J

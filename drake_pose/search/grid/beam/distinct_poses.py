@@ -11,6 +11,8 @@ from drake_pose.search.scoring import Scoring
 # How many times the poses asked for are looked at in one go, and scored in full.
 _LOOKED_AT = 8
 _SCORED = 2
+# Of nodes: masks (n, nodes, W) uint64, areas (n, nodes), and what adds nothing (n, nodes) bool.
+_Looks = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -71,14 +73,15 @@ class Gathering:
         nodes = len(scoring.sampled.values)
         samples = self._different_samples(nodes)
         chosen = np.empty((0, nodes), dtype=samples.dtype)
-        looks = _Looks.of(pictures, chosen, scoring.sampled.poses(chosen))
+        looks = _draw(pictures, chosen, scoring.sampled.poses(chosen))
         chunk = _LOOKED_AT * count
         for begin in range(0, len(samples), chunk):
             more = samples[begin : begin + chunk]
-            looks = looks.joined(_Looks.of(pictures, more, scoring.sampled.poses(more)))
-            kept = _find_different(looks, len(chosen), _SCORED * count, alike)
+            drawn = _draw(pictures, more, scoring.sampled.poses(more))
+            masks, areas, hidden = (np.concatenate(both) for both in zip(looks, drawn, strict=True))
+            kept = _find_different((masks, areas, hidden), len(chosen), _SCORED * count, alike)
             chosen = np.concatenate([chosen, more])[kept]
-            looks = looks.only(kept)
+            looks = masks[kept], areas[kept], hidden[kept]
             if len(chosen) >= _SCORED * count:
                 break
         X_WN = scoring.sampled.poses(chosen)
@@ -102,37 +105,15 @@ class Gathering:
         return np.asarray(samples[np.sort(first)])
 
 
-@dataclass(frozen=True)
-class _Looks:
-    """What nodes look like: masks (n, nodes, W) uint64, areas (n, nodes) and hidden (n, nodes)."""
-
-    masks: np.ndarray
-    areas: np.ndarray
-    hidden: np.ndarray
-
-    @staticmethod
-    def of(pictures: Pictures, samples: np.ndarray, X_WN: np.ndarray) -> "_Looks":
-        """Draw all nodes at samples (n, nodes) and poses (n, nodes, 4, 4)."""
-        shape = X_WN.shape[:2]
-        masks = np.zeros((*shape, int(pictures.part_starts[-1])), dtype=np.uint64)
-        areas = np.zeros(shape, dtype=np.int64)
-        far = np.zeros(shape, dtype=np.int64)
-        for node in range(shape[1]):
-            drawn = pictures.draw_node(node, samples[:, node], X_WN[:, node], masks[:, node])
-            areas[:, node], far[:, node] = drawn.sum(axis=1), drawn[:, 2]
-        return _Looks(masks, areas, _find_hidden(masks, far))
-
-    def joined(self, others: "_Looks") -> "_Looks":
-        """These and others."""
-        return _Looks(
-            np.concatenate([self.masks, others.masks]),
-            np.concatenate([self.areas, others.areas]),
-            np.concatenate([self.hidden, others.hidden]),
-        )
-
-    def only(self, kept: np.ndarray) -> "_Looks":
-        """Those at indices (m,)."""
-        return _Looks(self.masks[kept], self.areas[kept], self.hidden[kept])
+def _draw(pictures: Pictures, samples: np.ndarray, X_WN: np.ndarray) -> _Looks:
+    """What all nodes look like at samples (n, nodes) and poses (n, nodes, 4, 4)."""
+    shape = X_WN.shape[:2]
+    masks = np.zeros((*shape, int(pictures.part_starts[-1])), dtype=np.uint64)
+    areas, far = np.zeros(shape, dtype=np.int64), np.zeros(shape, dtype=np.int64)
+    for node in range(shape[1]):
+        drawn = pictures.draw_node(node, samples[:, node], X_WN[:, node], masks[:, node])
+        areas[:, node], far[:, node] = drawn.sum(axis=1), drawn[:, 2]
+    return masks, areas, _find_hidden(masks, far)
 
 
 def _find_hidden(masks: np.ndarray, far: np.ndarray) -> np.ndarray:
@@ -146,13 +127,14 @@ def _find_hidden(masks: np.ndarray, far: np.ndarray) -> np.ndarray:
 
 def _find_different(looks: _Looks, known: int, count: int, alike: float) -> np.ndarray:
     """The first poses that do not look like one before, (m,) int64, at most ``count``."""
+    masks, areas, hidden = looks
     chosen = list(range(known))
-    for i in range(known, len(looks.masks)):
+    for i in range(known, len(masks)):
         if len(chosen) == count:
             break
-        common = np.bitwise_count(looks.masks[i] & looks.masks[chosen]).sum(axis=2, dtype=np.int64)
-        union = looks.areas[i] + looks.areas[chosen] - common
-        same = (common >= alike * union) | (looks.hidden[i] & looks.hidden[chosen])
+        common = np.bitwise_count(masks[i] & masks[chosen]).sum(axis=2, dtype=np.int64)
+        union = areas[i] + areas[chosen] - common
+        same = (common >= alike * union) | (hidden[i] & hidden[chosen])
         if not same.all(axis=1).any():
             chosen.append(i)
     return np.array(chosen, dtype=np.int64)

@@ -42,13 +42,7 @@ class Hypotheses:
 
     def chosen(self, kept: np.ndarray) -> "Hypotheses":
         """Some of them, by their indices."""
-        return Hypotheses(
-            self.masks[kept],
-            self.poses[kept],
-            self.hashes[kept],
-            self.covered[kept],
-            self.outside[kept],
-        )
+        return Hypotheses(*(array[kept] for array in vars(self).values()))
 
 
 class Beam:

@@ -56,12 +56,7 @@ class BeamSearch:
         self.sampled = self.body.sampled
 
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
-        """Estimate the pose that the views show.
-
-        Args:
-            views: one or several silhouettes of the same instant.
-            root_position: (3,), the root's known position in the world [m], where it is not the
-                pose tree's own.
+        """Estimate the pose that the views show; see ``PoseSearch``.
 
         Returns:
             The best pose found. ``stopped_by`` is "exact" if J = 0, "end" if all stages were run,
@@ -72,7 +67,8 @@ class BeamSearch:
             SettingsError: if there is no view.
         """
         start = time.perf_counter()
-        run = self._run(views, root_position, None)
+        run = self._prepare(views, root_position)
+        run.search()
         result = run.result(time.perf_counter() - start)
         if self.examination is not None:
             result = examine(self.body, views, result, self.examination, root_position)
@@ -87,19 +83,12 @@ class BeamSearch:
         Where so much fits roughly that its poses fill a gigabyte, as in a picture of another body
         that may be turned anyhow, they end, too.
 
-        Args:
-            views: one or several silhouettes of the same instant.
-            root_position: as in match.
-
         Returns:
             A pose whose J is 0, or None.
-
-        Raises:
-            SettingsError: if there is no view.
         """
         start = time.perf_counter()
         exact = tuple(stage for stage in self.settings.stages if stage.outside_share == 0.0)
-        run = self._prepare(views, root_position, None)
+        run = self._prepare(views, root_position)
         run.most_bytes = _MOST_BYTES
         run.run_stages(exact)
         if run.J > 0:
@@ -120,8 +109,7 @@ class BeamSearch:
         poses that leave the silhouette a little.
 
         Args:
-            views: one or several silhouettes of the same instant.
-            root_position: as in match.
+            views, root_position: as in match.
             count: at most this many.
             alike: two poses look alike if each node's pictures in both have so much of their union
                 in common in all views, or it is hidden in both, covering nothing that other nodes
@@ -135,24 +123,15 @@ class BeamSearch:
         """
         check_choice(count, alike)
         gathering = Gathering()
-        run = self._run(views, root_position, gathering)
-        return gathering.choose(run.scoring, run.pictures(exact=False), count, alike)
-
-    def _run(
-        self,
-        views: Sequence[View],
-        root_position: np.ndarray | None,
-        gathering: Gathering | None,
-    ) -> "_Run":
         run = self._prepare(views, root_position, gathering)
         run.search()
-        return run
+        return gathering.choose(run.scoring, run.pictures(exact=False), count, alike)
 
     def _prepare(
         self,
         views: Sequence[View],
         root_position: np.ndarray | None,
-        gathering: Gathering | None,
+        gathering: Gathering | None = None,
     ) -> "_Run":
         if not views:
             raise SettingsError("a match needs at least one view, but none was given")

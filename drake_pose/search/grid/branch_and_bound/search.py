@@ -81,10 +81,7 @@ class _States:
         return len(self.poses)
 
     def chosen(self, kept: np.ndarray) -> "_States":
-        return _States(
-            self.masks[kept], self.poses[kept], self.hashes[kept], self.far[kept],
-            self.outside[kept], self.lows[kept], self.costs[kept],
-        )  # fmt: skip
+        return _States(*(array[kept] for array in vars(self).values()))
 
 
 def branch_and_bound(

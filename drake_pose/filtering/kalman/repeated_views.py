@@ -19,9 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from drake_pose.filtering.factors import factor_of
 from drake_pose.filtering.kalman.update import LinearObservation, ObservationModel, difference
-from drake_pose.filtering.state import Belief
+from drake_pose.filtering.state import Belief, factor_of
 
 Array = NDArray[np.float64]
 

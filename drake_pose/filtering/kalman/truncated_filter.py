@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.factors import check_moments
 from drake_pose.filtering.kalman.hypotheses import (
     Hypothesis,
     Rejection,
@@ -30,7 +29,7 @@ from drake_pose.filtering.kalman.update import (
     limited_update,
     update,
 )
-from drake_pose.filtering.state import Belief, StateLayout, make_belief, name_flaws
+from drake_pose.filtering.state import Belief, StateLayout, check_moments, make_belief, name_flaws
 from drake_pose.filtering.truncation.inequalities import Inequalities, inner_point
 from drake_pose.filtering.truncation.truncated_normal import (
     Truncated,

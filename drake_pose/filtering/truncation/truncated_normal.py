@@ -6,13 +6,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.factors import (
+from drake_pose.filtering.state import (
+    Belief,
     check_moments,
     covariance_from,
     factor_and_kind,
     factor_of,
 )
-from drake_pose.filtering.state import Belief
 from drake_pose.filtering.truncation.inequalities import Inequalities
 from drake_pose.filtering.truncation.kernels import apply_sites, cut_one_by_one, propagate
 

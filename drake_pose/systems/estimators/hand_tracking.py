@@ -31,9 +31,8 @@ from pydrake.trajectories import Trajectory
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.kalman.truncated_filter import FilterSettings, TruncatedFilter
-from drake_pose.filtering.measurements.axes import AxisObservation
+from drake_pose.filtering.measurements.axes import AxisObservation, AxisSettings, Ends
 from drake_pose.filtering.measurements.contour import ContourObservation
-from drake_pose.filtering.measurements.segment_axes import AxisSettings, Ends
 from drake_pose.filtering.state import Belief
 from drake_pose.filtering.tracking.contour_tracker import ContourTracker, TrackingSettings
 from drake_pose.filtering.truncation.couplings import model_inequalities

@@ -12,9 +12,8 @@ from drake_pose.filtering.hand.observation import (
     plant_positions,
 )
 from drake_pose.filtering.kalman.update import update, with_variances
-from drake_pose.filtering.measurements.axes import AxisObservation, _independent
+from drake_pose.filtering.measurements.axes import Axis, AxisObservation, _independent
 from drake_pose.filtering.measurements.contour import ContourObservation
-from drake_pose.filtering.measurements.segment_axes import Axis
 from drake_pose.filtering.state import Belief
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.filtering.measurements.test_segment_axes import (

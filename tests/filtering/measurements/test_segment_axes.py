@@ -14,7 +14,7 @@ from drake_pose.filtering.hand.observation import (
     HandObservation,
     plant_positions,
 )
-from drake_pose.filtering.measurements.segment_axes import AxisObserver, AxisSettings
+from drake_pose.filtering.measurements.axes import AxisObserver, AxisSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
 SIDE = 400

@@ -10,14 +10,15 @@ from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import JointEstimate, View
 from drake_pose.search.grid.branch_and_bound.bounded_poses import BoundLimits
 from drake_pose.search.grid.families.examination import ExaminationSettings
-from drake_pose.search.grid.families.joint_estimates import estimate_joints, grid_steps
 from drake_pose.search.grid.families.search import (
     GridPoseSet,
+    cluster_samples,
     contour_length,
+    estimate_joints,
     find_families,
+    grid_steps,
     samples_at,
 )
-from drake_pose.search.grid.families.split import cluster_samples
 from tests.search.bodies import box_link, forked_body, joint, load_body, swinging_chain
 from tests.search.grid_problems import GridProblem, ProblemMaker
 

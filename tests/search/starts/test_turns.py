@@ -9,7 +9,7 @@ from drake_pose.search.continuous.multi_start import MultiStartSearch
 from drake_pose.search.continuous.search import ContinuousSearch
 from drake_pose.search.grid.beam.search import BeamSearch
 from drake_pose.search.grid.families.examination import ExaminationSettings
-from drake_pose.search.grid.families.joint_estimates import _joined
+from drake_pose.search.grid.families.search import _joined
 from tests.search.turning import crane, views_of
 
 

@@ -18,8 +18,9 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
 from drake_pose.search.grid.beam.distinct_poses import Gathering, GridPoses, check_choice
-from drake_pose.search.grid.beam.hypotheses import Beam, Hypotheses
-from drake_pose.search.grid.beam.limb_search import (
+from drake_pose.search.grid.beam.hypotheses import (
+    Beam,
+    Hypotheses,
     search_limbs_again,
     turn_single_nodes,
 )

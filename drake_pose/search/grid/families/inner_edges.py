@@ -18,8 +18,7 @@ from scipy.special import logsumexp
 from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import JointEstimate
 from drake_pose.search.grid.branch_and_bound.partial_pose_graph import PartialPoseGraph
-from drake_pose.search.grid.families.joint_estimates import estimate_joints
-from drake_pose.search.grid.families.search import GridPoseSet
+from drake_pose.search.grid.families.search import GridPoseSet, estimate_joints
 
 RenderSegments = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Draws a pose, q (nq,) and X_WB (4, 4): (H, W) int the segment seen at each pixel, -1 for none.

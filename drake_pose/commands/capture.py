@@ -122,8 +122,7 @@ def capture(
     from drake_pose.jobs.live.capture import LiveSettings
 
     how = LiveSettings(live.seconds, live.shape, live.fit_shape, replay, settings.packages)
-    run = _capture_paper if method == "paper" else _capture_live
-    _print_result(run(scene, out, model, how, live), json)
+    _print_result(_capture_live(scene, out, model, method, how, live), json)
 
 
 def _check(scene: Path, method: str, of_masks: bool, has_sources: bool, live: LiveOptions) -> None:
@@ -169,16 +168,23 @@ def _capture_live(
     folder: Path,
     out: Path,
     model: Path | None,
+    method: str,
     settings: LiveSettings,
     live: LiveOptions,
 ) -> LiveResult:
-    """Captures as the pictures come, here or on workers."""
+    """Captures as the pictures come, here or on workers, or by the paper's stages."""
     from drake_pose.jobs.live.capture import capture_live
-    from drake_pose.jobs.live.scene import hush_opencv, load_live_scene
+    from drake_pose.jobs.live.paper_capture import FaceFolder, capture_paper
+    from drake_pose.jobs.live.scene import hush_opencv, is_live_scene, load_live_scene
     from drake_pose.systems.person.live_capture import LiveSensors
 
+    if method == "paper" and folder.is_dir() and not is_live_scene(folder):
+        raise SceneError(
+            f"{folder}: has no sources.yaml; the paper's method looks for skin in colour pictures, "
+            "which masks do not show: name the pictures and those of the empty room there"
+        )
     hush_opencv()
-    with workers_of(live.workers, live.scheduler) as client:
+    with workers_of(live.workers, live.scheduler) as client, FrameProgress() as progress:
         # Workers may have another working folder.
         scene = load_live_scene(folder if client is None else folder.absolute())
 
@@ -189,42 +195,19 @@ def _capture_live(
 
             return opener(client, live.tolerance)(scene)
 
-        with FrameProgress() as progress:
-            return capture_live(
-                scene, out, model, settings, sensors, warn,
-                lambda count, _: progress.show_stage("frames", count, None),
-            )  # fmt: skip
+        def show(count: int, _: bool) -> None:
+            progress.show_stage("frames", count, None)
 
-
-def _capture_paper(
-    folder: Path,
-    out: Path,
-    model: Path | None,
-    settings: LiveSettings,
-    live: LiveOptions,
-) -> LiveResult:
-    """Captures by the paper's stages."""
-    from drake_pose.jobs.live.paper_capture import FaceFolder, capture_paper
-    from drake_pose.jobs.live.scene import hush_opencv, is_live_scene, load_live_scene
-
-    if folder.is_dir() and not is_live_scene(folder):
-        raise SceneError(
-            f"{folder}: has no sources.yaml; the paper's method looks for skin in colour pictures, "
-            "which masks do not show: name the pictures and those of the empty room there"
-        )
-    hush_opencv()
-    scene = load_live_scene(folder)
-    face = None
-    if live.face_camera is not None and live.faces is not None:
-        face = FaceFolder(live.face_camera, live.faces)
-    if any(one.live for one in scene.specifications.values()):
-        say("drake-pose: stand upright before the cameras, both arms spread to the sides")
-    with FrameProgress() as progress:
+        if method == "person":
+            return capture_live(scene, out, model, settings, sensors, warn, show)
+        face = None
+        if live.face_camera is not None and live.faces is not None:
+            face = FaceFolder(live.face_camera, live.faces)
+        if any(one.live for one in scene.specifications.values()):
+            say("drake-pose: stand upright before the cameras, both arms spread to the sides")
         return capture_paper(
             scene, out, model, settings, face,
-            lambda: scene.open_sensors(tolerance=live.tolerance),
-            warn,
-            lambda count, _: progress.show_stage("frames", count, None),
+            lambda: scene.open_sensors(tolerance=live.tolerance), warn, show,
         )  # fmt: skip
 
 

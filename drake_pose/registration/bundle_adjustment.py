@@ -1,8 +1,8 @@
 """A body's poses in all frames and the cameras that nobody measured, fitted together.
 
-Joint positions that were estimated from some cameras are off, and a camera that is found from them
-is off with them. So all are fitted to all silhouettes at once (bundle adjustment), lengths and
-girths that all frames share among them; cameras whose places are known hold the whole.
+Cameras that are found from estimated joint positions are off with them. So all are fitted to all
+silhouettes at once (bundle adjustment), lengths and girths that all frames share among them;
+cameras whose places are known hold the whole.
 """
 
 from __future__ import annotations

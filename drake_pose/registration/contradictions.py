@@ -150,17 +150,12 @@ class FrameInformation(NamedTuple):
 
 
 class _Sum(NamedTuple):
-    """What some frames tell together, each by the scale of its errors: sums of N, h, of_surface."""
+    """Sums over frames of N, h and of_surface, each by the scale of the frame's errors."""
 
     frames: int
     N: Array
     h: Array
     of_surface: Array
-
-    @classmethod
-    def of_none(cls, told: FrameInformation) -> _Sum:
-        """What no frames tell, of as many numbers as one."""
-        return cls(0, *(np.zeros_like(one) for one in (told.N, told.h, told.of_surface)))
 
     def with_frame(self, told: FrameInformation, sign: float) -> _Sum:
         """With another frame, or without one of them: sign -1."""
@@ -301,7 +296,8 @@ class _Auditor:
 
     def _sum(self, kept: Mask) -> _Sum:
         """What some frames tell together."""
-        total = _Sum.of_none(self._told[0])
+        first = self._told[0]
+        total = _Sum(0, *(np.zeros_like(one) for one in (first.N, first.h, first.of_surface)))
         for k in np.flatnonzero(kept):
             total = total.with_frame(self._told[k], 1.0)
         return total

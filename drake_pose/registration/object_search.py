@@ -233,9 +233,7 @@ class ObjectSearch:
     def _apart(self, poses: Sequence[Array], alike: bool = False) -> list[Array]:
         """Those of some poses (4, 4) of the object that are apart from all before them.
 
-        Args:
-            poses: in any frame.
-            alike: whether those at which it looks alike are one.
+        alike: whether those at which it looks alike are one.
         """
         turns = self._standing.symmetry.turns if alike else np.eye(4)[None]
         kept: list[Array] = []

@@ -92,9 +92,8 @@ class OnlineState:
     """What is known of a camera; never changed, so that copies share it.
 
     Args:
-        keyframes: the kept frames, oldest first.
-        contradicting: the last frames that contradict the pose, oldest first; the body stands
-            differently in all of them.
+        keyframes, contradicting: the frames kept, and the last ones that contradict the pose, the
+            oldest first; the body stands differently in all of them.
         registered: the camera as it was found; None: not yet.
         contradictions: how many frames without a gap have contradicted the pose.
         moves: how often the camera was found elsewhere.
@@ -141,11 +140,9 @@ class OnlineRegistration:
         return CameraStatus.REGISTERED
 
     def next(self, state: OnlineState, frame: PosedFrame) -> OnlineState:
-        """What is known after another frame; one without any pixel of the body says nothing.
+        """What is known after another frame, which must not be changed any more.
 
-        Args:
-            state: what was known before; at first ``OnlineState()``.
-            frame: the frame; it may be kept, and must not be changed any more.
+        One without any pixel of the body says nothing; at first a state is ``OnlineState()``.
 
         Raises:
             MaskError: a mask of another size than the camera's picture.

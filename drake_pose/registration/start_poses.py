@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from drake_pose.registration.posed_frames import PosedFrames
 from drake_pose.silhouette.areas.scoring import score_bodies
@@ -29,18 +30,8 @@ def spread_rotations(count: int) -> Array:
     d = 2.0 * np.pi * s
     r, R = np.sqrt(t), np.sqrt(1.0 - t)
     a, b = d / _PHI, d / _PSI
-    x, y, z, w = r * np.sin(a), r * np.cos(a), R * np.sin(b), R * np.cos(b)
-    return np.moveaxis(
-        np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-            ]
-        ),
-        2,
-        0,
-    )
+    q = np.stack([r * np.sin(a), r * np.cos(a), R * np.sin(b), R * np.cos(b)], axis=-1)
+    return Rotation.from_quat(q).as_matrix()
 
 
 def place_by_bounds(frames: PosedFrames, R_CW: Array) -> Array:

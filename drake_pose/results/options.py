@@ -1,4 +1,7 @@
-"""Texts of options and of job files to plain values: `NAME=VALUE`, `X,Y,Z`, frame ranges, ..."""
+"""Texts of options and of job files to plain values: `NAME=VALUE`, `X,Y,Z`, frame ranges, ...
+
+All raise a SettingsError where a text has another form.
+"""
 
 from __future__ import annotations
 
@@ -55,11 +58,7 @@ def from_text(
 
 
 def parse_number(text: str) -> float:
-    """Returns a finite number.
-
-    Raises:
-        SettingsError: it is none.
-    """
+    """Returns a finite number."""
     try:
         number = float(text)
     except ValueError:
@@ -70,11 +69,7 @@ def parse_number(text: str) -> float:
 
 
 def parse_assignments(texts: Iterable[str]) -> dict[str, float]:
-    """Returns the values of ``NAME=NUMBER`` texts by name.
-
-    Raises:
-        SettingsError: a text has another form, or a name is given twice.
-    """
+    """Returns the values of ``NAME=NUMBER`` texts by name."""
     values: dict[str, float] = {}
     for text in texts:
         name, equals, number = text.rpartition("=")
@@ -87,11 +82,7 @@ def parse_assignments(texts: Iterable[str]) -> dict[str, float]:
 
 
 def parse_packages(texts: Iterable[str]) -> dict[str, Path]:
-    """Returns the absolute folders of ``NAME=FOLDER`` texts by package.
-
-    Raises:
-        SettingsError: a text has another form, a name is given twice, or there is no folder.
-    """
+    """Returns the absolute folders of ``NAME=FOLDER`` texts by package."""
     folders: dict[str, Path] = {}
     for text in texts:
         name, equals, folder = text.partition("=")
@@ -106,11 +97,7 @@ def parse_packages(texts: Iterable[str]) -> dict[str, Path]:
 
 
 def parse_numbers(text: str, count: int) -> tuple[float, ...]:
-    """Returns so many numbers of a text ``A,B,...``.
-
-    Raises:
-        SettingsError: the text has another form.
-    """
+    """Returns so many numbers of a text ``A,B,...``."""
     parts = text.split(",")
     if len(parts) != count:
         raise SettingsError(f"'{text}' must be {count} numbers with commas between them")
@@ -118,11 +105,7 @@ def parse_numbers(text: str, count: int) -> tuple[float, ...]:
 
 
 def parse_size(text: str) -> tuple[int, ...]:
-    """Returns width and height of a text ``W,H`` [pixel].
-
-    Raises:
-        SettingsError: the text has another form.
-    """
+    """Returns width and height of a text ``W,H`` [pixel]."""
     sides = parse_numbers(text, 2)
     if any(side < 1 or side != int(side) for side in sides):
         raise SettingsError(f"'{text}' must be two whole numbers of pixels")
@@ -130,11 +113,7 @@ def parse_size(text: str) -> tuple[int, ...]:
 
 
 def parse_boxes(texts: Iterable[str]) -> tuple[tuple[Corner, Corner], ...]:
-    """Returns the least and the largest corner of each text ``X,Y,Z:X,Y,Z`` of two corners [m].
-
-    Raises:
-        SettingsError: a text has another form.
-    """
+    """Returns the least and the largest corner of each text ``X,Y,Z:X,Y,Z`` of two corners [m]."""
     boxes = []
     for text in texts:
         corners = text.split(":")
@@ -147,11 +126,7 @@ def parse_boxes(texts: Iterable[str]) -> tuple[tuple[Corner, Corner], ...]:
 
 
 def parse_root_position(text: str) -> Corner | tuple[Path, str] | Literal["unknown"]:
-    """Returns a position ``X,Y,Z`` [m], file and joint of ``FILE.csv:JOINT``, or ``unknown``.
-
-    Raises:
-        SettingsError: the text has none of these forms.
-    """
+    """Returns a position ``X,Y,Z`` [m], file and joint of ``FILE.csv:JOINT``, or ``unknown``."""
     if text == "unknown":
         return "unknown"
     if text.count(",") == 2:
@@ -169,9 +144,6 @@ def parse_root_rotation(text: str) -> Literal["fixed", "free"] | RotationLimits:
     """Returns ``fixed``, ``free``, or limits of the angles about the root's axes [deg].
 
     The limits' text is like ``y=-180:180,z=-10:10``; the order is the order of rotation.
-
-    Raises:
-        SettingsError: the text has another form, or a lower limit exceeds the upper one.
     """
     if text == "fixed":
         return "fixed"

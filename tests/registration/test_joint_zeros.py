@@ -23,6 +23,7 @@ def misread(frames: list[PosedFrame], zeros: np.ndarray) -> list[PosedFrame]:
 
 
 class TestCalibrateJoints:
+    @pytest.mark.slow
     @pytest.mark.parametrize("off", [np.radians([2.0, 0.0, -2.0]), np.zeros(3)])
     def test_finds_zeros(
         self, model: ArticulatedModel, body: RegistrationBody, off: np.ndarray
@@ -31,7 +32,7 @@ class TestCalibrateJoints:
         zeros = np.zeros(len(body.kinematics.names))
         zeros[[body.kinematics.names.index(name) for name in NAMES]] = off
         frames = misread(see(model, body, camera, 8, 4), zeros)
-        registered = CameraSearch(body).register(camera, frames)
+        registered = CameraSearch(body).refine(camera, frames)
         found = calibrate_joints(body, [registered], [frames], NAMES)
         for zero, true in zip(found.zeros, off, strict=True):
             assert zero.value == pytest.approx(true, abs=np.radians(0.2))
@@ -47,7 +48,7 @@ class TestCalibrateJoints:
         camera = looking_at(np.array([1.6, 0.4, 0.5]), MIDDLE, 0.1)
         frames = see(model, body, camera, 8, 4)
         wrong = type(camera)("eye", 640, 480, 612.0, 612.0, 319.5, 239.5, np.eye(4))
-        registered = CameraSearch(body).register(wrong, frames)
+        registered = CameraSearch(body).refine(wrong, frames)
         found = calibrate_joints(body, [registered], [frames], [], focal=True)
         assert found.cameras[0].focal_x == pytest.approx(600.0, rel=0.004)
         assert abs(found.cameras[0].focal_x - 600.0) < 4.0 * 600.0 * found.focal_deviations[0]
@@ -64,7 +65,7 @@ class TestCalibrateJoints:
         for seed, place in enumerate(places):
             camera = looking_at(place, MIDDLE, 0.1)
             frames.append(misread(see(model, body, camera, 4, seed), off))
-            registered.append(CameraSearch(body).register(camera, frames[-1]))
+            registered.append(CameraSearch(body).refine(camera, frames[-1]))
             alone.append(calibrate_joints(body, registered[-1:], frames[-1:], ["elbow_turn"]))
         found = calibrate_joints(
             body, registered, frames, ["elbow_turn"], lengths=["shoulder", "elbow"]
@@ -87,7 +88,7 @@ class TestCalibrateJoints:
         """All that is seen of this arm hangs on its first joint."""
         camera = looking_at(np.array([1.6, 0.4, 0.5]), MIDDLE, 0.1)
         frames = see(model, body, camera, 5, 4)
-        registered = CameraSearch(body).register(camera, frames)
+        registered = CameraSearch(body).refine(camera, frames)
         found = calibrate_joints(body, [registered], [frames], ["turret_turn"])
         assert not found.zeros[0].determined
         assert not found.zeros[0].significant
@@ -96,7 +97,7 @@ class TestCalibrateJoints:
     def test_refuses(self, model: ArticulatedModel, body: RegistrationBody) -> None:
         camera = looking_at(np.array([1.6, 0.4, 0.5]), MIDDLE, 0.1)
         frames = see(model, body, camera, 1, 4)
-        registered = CameraSearch(body).register(camera, frames)
+        registered = CameraSearch(body).refine(camera, frames)
         with pytest.raises(UnknownNameError, match="knee"):
             calibrate_joints(body, [registered], [frames], ["knee"])
         with pytest.raises(UnknownNameError, match=r"no link with a length 'hand'.*turret"):

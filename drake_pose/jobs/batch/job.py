@@ -32,12 +32,8 @@ class SceneJob:
 
     Args:
         name: of the result's folder.
-        scene: the scene's folder.
-        model: the body's model file.
-        settings: of the estimate.
         truth: measured joint positions to compare with.
-        chunk: frames in a chunk; the recording of a person who is followed is never cut, nor is
-            one that is audited.
+        chunk: frames in a chunk; a person's recording, and a scene that is audited, is never cut.
         audit: the table of joint positions that the scene is audited against; None: the scene is
             estimated.
         camera_file: for an audit, in place of the scene's cameras.yaml.

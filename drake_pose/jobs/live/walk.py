@@ -207,11 +207,9 @@ def walk_live(
             model's where not given.
         seconds: how long; without end, or until the recordings end, where not given.
         open_sensors: opens the sensors; those of the scene in this process where not given.
-        on_command: called when the command changes, with its words, "" for none.
-        on_report: called at once when cameras stop and return, with bad pictures, and when the
-            person is found or lost.
+        on_command: as for walk, like ``settings``.
+        on_report: told of cameras that stop and return, bad pictures, a person found or lost.
         packages: folders of packages that the model's ``package://`` names mean, by name.
-        settings: what is a command.
 
     Returns:
         As walk; found_share of the periods in which the person was known; and warnings.

@@ -213,8 +213,7 @@ def _adjusted_rig(
     settings: CalibrationSettings,
 ) -> tuple[Rig, dict[Picture, str]]:
     """Everything at once; spoilt pictures are taken out of `detections` or refused."""
-    rig = chain_rig(points, detections, lenses)
-    original = {name: dict(frames) for name, frames in detections.items()}
+    rig = chain_rig(lenses)
     spoilt: dict[Picture, str] = {}
     while len(detections) > 1:
         rig = adjust_rig(points, detections, rig, settings.lens, robust=True)
@@ -222,7 +221,7 @@ def _adjusted_rig(
         if not worst:
             break
         spoilt |= worst
-        _require_true_cameras(points, spoilt, original, lenses)
+        _require_true_cameras(spoilt, lenses)
         for camera, frame in worst:
             del detections[camera][frame]
         left = {frame for frames in detections.values() for frame in frames}
@@ -259,24 +258,19 @@ def _disagreeing(errors: Mapping[Picture, float]) -> dict[Picture, str]:
     return dict(sorted(spoilt.items()))
 
 
-def _require_true_cameras(
-    points: Array,
-    spoilt: Collection[Picture],
-    detections: Detections,
-    lenses: Mapping[str, LensEstimate],
-) -> None:
+def _require_true_cameras(spoilt: Collection[Picture], lenses: Mapping[str, LensEstimate]) -> None:
     """Refuses a camera most of whose shared pictures contradict the others, and says why."""
     counts = Counter(camera for camera, _ in spoilt)
-    for name, frames in detections.items():
-        others = {frame for other in detections if other != name for frame in detections[other]}
-        shared = [frame for frame in frames if frame in others]
+    for name, own in lenses.items():
+        others = {frame for other in lenses if other != name for frame in lenses[other].X_CB}
+        shared = [frame for frame in own.X_CB if frame in others]
         bad = sum((name, frame) in spoilt for frame in shared)
         blamed_more = any(count > bad for other, count in counts.items() if other != name)
         if 2 * bad <= len(shared) or blamed_more:
             continue
         # Of two cameras nobody can say which is wrong.
-        who = " or ".join(f"camera '{n}'" for n in (detections if len(detections) == 2 else [name]))
-        if _is_mirrored(points, detections, lenses, name):
+        who = " or ".join(f"camera '{n}'" for n in (lenses if len(lenses) == 2 else [name]))
+        if _is_mirrored(lenses, name):
             raise CameraError(
                 f"{who}: its pictures are mirrored: they agree with the other cameras only when "
                 "left and right are exchanged; switch mirroring off"
@@ -288,34 +282,31 @@ def _require_true_cameras(
         )
 
 
-def _is_mirrored(
-    points: Array, detections: Detections, lenses: Mapping[str, LensEstimate], name: str
-) -> bool:
+def _is_mirrored(lenses: Mapping[str, LensEstimate], name: str) -> bool:
     """Whether a camera agrees with the others once its pictures are turned left to right.
 
     A checkerboard looks like a board in a mirror too, but moves the wrong way.
     """
-    lens = lenses[name].lens
+    own = lenses[name]
+    size = own.lens.width, own.lens.height
     # The colours of a board of an even number of columns fit only where rows are exchanged, with
     # an odd number columns; squares are one more than corners.
-    numbers = np.arange(len(points)).reshape(len(np.unique(points[:, 1])), -1)
+    numbers = np.arange(len(own.points)).reshape(len(np.unique(own.points[:, 1])), -1)
     numbers = numbers[::-1] if len(numbers) % 2 == 0 else numbers[:, ::-1]
     turned = {}
-    for frame, seen in detections[name].items():
+    for frame, seen in own.detections.items():
         corners = numbers.ravel()[seen.corners]
         order = np.argsort(corners)
-        uv = [lens.width - 1.0, 0.0] + seen.uv * [-1.0, 1.0]
+        uv = [size[0] - 1.0, 0.0] + seen.uv * [-1.0, 1.0]
         turned[frame] = Detection(corners[order], uv[order])
     try:
-        estimate = estimate_lens(name, points, turned, (lens.width, lens.height))
+        estimate = estimate_lens(name, own.points, turned, size)
     except CameraError:
         return False
-    others = [other for other in detections if {*detections[other]} & {*turned}]
-    others.remove(name)
-    straight = [pair_pose(points, detections, lenses, other, name)[1] for other in others]
-    detections, lenses = {**detections, name: turned}, {**lenses, name: estimate}
-    exchanged = [pair_pose(points, detections, lenses, other, name)[1] for other in others]
-    return bool(np.median(exchanged) < _BETTER * np.median(straight))
+    others = [one for one in lenses.values() if one is not own and set(one.X_CB) & set(own.X_CB)]
+    as_seen = np.median([pair_pose(other, own)[1] for other in others])
+    as_turned = np.median([pair_pose(other, estimate)[1] for other in others])
+    return bool(as_turned < _BETTER * as_seen)
 
 
 def _limit(errors: Iterable[float]) -> float:

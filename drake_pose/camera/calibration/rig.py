@@ -67,16 +67,24 @@ class LensEstimate:
     """A lens as one camera's pictures alone give it.
 
     Args:
+        points: (n, 3) the board's corners in its frame B [m].
+        detections: the board in the camera's pictures, by frame.
         lens: the lens.
         X_CB: (4, 4) by frame: the board's pose in the camera [m].
         errors: by frame: root mean square distance of the corners [pixel].
         focal_deviation: standard deviation of the focal length over the focal length.
     """
 
+    points: Array
+    detections: Mapping[str, Detection]
     lens: Lens
     X_CB: Mapping[str, Array]
     errors: Mapping[str, float]
     focal_deviation: float
+
+    def error(self, frame: str, X_CB: Array) -> float:
+        """Root mean square corner distance of a picture with the board at X_CB (4, 4) [pixel]."""
+        return _error(self.points, self.detections[frame], self.lens, X_CB)
 
 
 def estimate_lens(
@@ -121,6 +129,8 @@ def estimate_lens(
     row = np.array([*numbers, *np.ravel(distortion)[: _LENS - 4]])
     vectors = np.hstack([np.reshape(turns, (-1, 3)), np.reshape(shifts, (-1, 3))])
     return LensEstimate(
+        points,
+        dict(detections),
         Lens.from_numbers(size, row),
         {frame: _pose(vector) for frame, vector in zip(detections, vectors, strict=True)},
         dict(zip(detections, np.ravel(errors).tolist(), strict=True)),
@@ -149,20 +159,20 @@ def require_shared_pictures(detections: Detections) -> None:
     )
 
 
-def chain_rig(points: Array, detections: Detections, lenses: Mapping[str, LensEstimate]) -> Rig:
+def chain_rig(estimates: Mapping[str, LensEstimate]) -> Rig:
     """A rig of the most trustworthy pairs of cameras, in the first one's frame.
 
     Raises:
         CameraError: when the cameras fall into groups that share no picture.
     """
-    require_shared_pictures(detections)
-    names = list(detections)
+    require_shared_pictures({name: one.detections for name, one in estimates.items()})
+    cameras = list(estimates.values())
     pairs: dict[tuple[int, int], Array] = {}
-    costs = np.zeros((len(names), len(names)))
-    for i, j in combinations(range(len(names)), 2):
-        shared = len(set(detections[names[i]]) & set(detections[names[j]]))
+    costs = np.zeros((len(cameras), len(cameras)))
+    for i, j in combinations(range(len(cameras)), 2):
+        shared = len(set(cameras[i].X_CB) & set(cameras[j].X_CB))
         if shared:
-            X_ij, error = pair_pose(points, detections, lenses, names[i], names[j])
+            X_ij, error = pair_pose(cameras[i], cameras[j])
             pairs[i, j], pairs[j, i] = X_ij, inverse_pose(X_ij)
             # More shared instants and a smaller error make a better link; both stay positive.
             costs[i, j] = (1.0 + min(error, 1e6)) / shared
@@ -170,51 +180,33 @@ def chain_rig(points: Array, detections: Detections, lenses: Mapping[str, LensEs
     poses = {0: np.eye(4)}
     for child in order[1:]:
         poses[child] = poses[parents[child]] @ pairs[parents[child], child]
-    X_RC = {name: poses[i] for i, name in enumerate(names)}
     X_RB = {}
-    for frame in dict.fromkeys(frame for seen in detections.values() for frame in seen):
+    for frame in dict.fromkeys(frame for camera in cameras for frame in camera.X_CB):
         # Every camera that saw the board proposes; the smallest median error wins.
-        seers = [name for name in names if frame in detections[name]]
-        proposals = [X_RC[name] @ lenses[name].X_CB[frame] for name in seers]
+        seers = [(camera, poses[i]) for i, camera in enumerate(cameras) if frame in camera.X_CB]
+        proposals = [X_RC @ camera.X_CB[frame] for camera, X_RC in seers]
         errors = [
-            np.median(
-                [
-                    _error(points, detections[n][frame], lenses[n].lens, inverse_pose(X_RC[n]) @ X)
-                    for n in seers
-                ]
-            )
+            np.median([camera.error(frame, inverse_pose(X_RC) @ X) for camera, X_RC in seers])
             for X in proposals
         ]
         X_RB[frame] = proposals[int(np.argmin(errors))]
-    return Rig({name: estimate.lens for name, estimate in lenses.items()}, X_RC, X_RB)
+    lenses = {name: estimate.lens for name, estimate in estimates.items()}
+    return Rig(lenses, {name: poses[i] for i, name in enumerate(estimates)}, X_RB)
 
 
-def pair_pose(
-    points: Array,
-    detections: Detections,
-    lenses: Mapping[str, LensEstimate],
-    first: str,
-    second: str,
-) -> tuple[Array, float]:
-    """The second camera's pose in the first's frame (4, 4), from the instants both saw the board.
+def pair_pose(a: LensEstimate, b: LensEstimate) -> tuple[Array, float]:
+    """The pose X_AB (4, 4) of two cameras that saw the board at the same instants, and its error.
 
     Every shared instant proposes a pose; the one wins that explains the other instants best by
-    its median, so that a minority of spoilt pictures does no harm.
-
-    Returns:
-        The pose and the median error [pixel].
+    its median [pixel], so that a minority of spoilt pictures does no harm.
     """
-    a, b = lenses[first], lenses[second]
-    shared = [frame for frame in detections[first] if frame in detections[second]]
+    shared = [frame for frame in a.X_CB if frame in b.X_CB]
     proposals = []
     for proposer in shared:
         X_AB = a.X_CB[proposer] @ inverse_pose(b.X_CB[proposer])
         # A proposer explains itself: it has no say where others can be asked.
         asked = [frame for frame in shared if frame != proposer] or shared
-        errors = [
-            _error(points, detections[first][frame], a.lens, X_AB @ b.X_CB[frame])
-            for frame in asked
-        ]
+        errors = [a.error(frame, X_AB @ b.X_CB[frame]) for frame in asked]
         proposals.append((X_AB, float(np.median(errors))))
     return min(proposals, key=lambda proposal: proposal[1])
 

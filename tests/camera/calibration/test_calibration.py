@@ -292,7 +292,7 @@ class TestLens:
             load_lenses(path)
 
     def test_undistorted_picture_was_seen_to_its_edges(self):
-        lens = calibrate(rig(1, 12)[2]).lenses["c0"]
+        lens = calibrate(rig(2, 12)[2]).lenses["c0"]
         assert lens.distortion[0] < 0  # A barrel.
         white = np.full((480, 640), 255, np.uint8)
         assert lens.undistort(white).min() == 255

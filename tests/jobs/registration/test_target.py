@@ -1,7 +1,6 @@
 """`drake-pose register --on LINK --target FILE`: a camera on a hand, from masks of an object."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -77,7 +76,7 @@ def test_camera_and_target_are_found(bracket: TargetScene, tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("looks", "links"), [(BRACKET, SIX), (BOX, LINKS), (BOX, SIX)])
+@pytest.mark.parametrize(("looks", "links"), [(BRACKET, SIX), (BOX, LINKS)])
 def test_two_arms_and_two_targets(looks: str, links: tuple, tmp_path: Path) -> None:
     scene = write_target_scene(tmp_path, looks, links, seed=2, size=(320, 240))
     found = register(scene, tmp_path / "out")
@@ -145,22 +144,6 @@ def test_zeros_beside_camera_and_target(bracket: TargetScene, tmp_path: Path) ->
     assert not found["zeros"]["turret_turn"]["determined"]
     assert any(name.startswith("target_") for name in found["zeros"]["turret_turn"]["gauge"])
     assert pose_errors(np.array(found["X_LC"]), X_LC)[0] < 2.0
-
-
-@pytest.mark.slow
-def test_lengths_beside_camera_and_target(bracket: TargetScene, tmp_path: Path) -> None:
-    right, short = bracket.arm.model.read_text(), tmp_path / "short.urdf"
-    assert right.count('"0 0 0.35"') == 1
-    short.write_text(right.replace('"0 0 0.35"', '"0 0 0.34"'))
-    scene = replace(bracket, arm=replace(bracket.arm, model=short))
-    found = register(scene, tmp_path / "out", "--lengths", "shoulder")
-    one, off = found["lengths"]["shoulder"], 100.0 * (0.35 / 0.34 - 1.0)
-    assert one["low_percent"] < off < one["high_percent"]
-    assert one["value_percent"] == pytest.approx(off, abs=1.0)
-    assert one["significant"]
-    assert pose_errors(np.array(found["X_LC"]), X_LC)[0] < 2.0
-    assert pose_errors(np.array(found["target"]["X_WT"]), bracket.X_WT)[0] < 2.0
-    assert found["mean_iou"] > 0.98
 
 
 @pytest.mark.parametrize(

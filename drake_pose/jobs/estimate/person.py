@@ -21,7 +21,7 @@ from drake_pose.jobs.estimate.scene_checks import (
     require_readable,
 )
 from drake_pose.person.recordings.checked_capture import capture_checked
-from drake_pose.person.recordings.colour_capture import ColourRecording, capture_by_colour
+from drake_pose.person.recordings.colour_capture import capture_by_colour
 from drake_pose.person.recordings.person_capture import PersonCapture
 from drake_pose.person.recordings.persons_in_view import ReadFrame
 from drake_pose.results.folder import PoseRow
@@ -114,15 +114,16 @@ def _follow_colours(inputs: Inputs, reader: _Reader, _track: bool) -> _Followed:
             f"frame, '{frames[0]}', has fewer: add them (drake-pose masks), or --start FILE.csv"
         )
     order = {frame: k for k, frame in enumerate(frames)}
-    recording = ColourRecording(
+    found = capture_by_colour(
+        inputs.model.pose_tree(),
         reader.cameras,
         len(frames),
+        masked,
         reader,
         lambda index: _read_pictures(inputs, frames[index]),
         {order[frame]: q for frame, q in inputs.starts.items()},
+        reader.count_followed,
     )
-    tree = inputs.model.pose_tree()
-    found = capture_by_colour(tree, recording, masked, on_frame=reader.count_followed)
     faults: tuple[str, ...] = ()
     if found.checked is not None:
         faults = describe_faults(found.checked, [frames[k] for k in found.masked])

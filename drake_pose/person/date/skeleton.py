@@ -176,7 +176,7 @@ def load_skeleton(model: ArticulatedModel) -> Skeleton:
     return Skeleton(
         model=model,
         R_WA=X_WN[nodes["head"], :3, :3],
-        face_H=_middle(tree, nodes["head"]),
+        face_H=_middle(head.mesh),
         neck_H=_offset(X_WN[nodes["head"]], X_WN[nodes["trunk"]]),
         head_positions=np.array([i for i in head.positions if model.position_kinds[i] == "length"]),
         head_axes=_axes(model, head_angles, "head"),
@@ -217,11 +217,8 @@ def _limb(tree: PoseTree, nodes: Mapping[str, int], X_WN: Array, name: str) -> L
     if len(positions) != 4:
         raise ModelError(f"{tree.model.path}: '{upper}' and '{lower}' must have 3 + 1 positions")
     X_UL = np.linalg.inv(X_WN[nodes[upper]]) @ X_WN[nodes[lower]]
-    if end in nodes:
-        X_LE = np.linalg.inv(X_WN[nodes[lower]]) @ X_WN[nodes[end]]
-        end_L = X_LE[:3, :3] @ _middle(tree, nodes[end]) + X_LE[:3, 3]
-    else:
-        end_L = _welded_middle(tree, lower, end, X_WN[nodes[lower]])
+    end_L = _end_middle(tree.model, lower, end)
+    meshes = [tree.model.link_meshes[segment] for segment in (upper, lower)]
     return Limb(
         name=name,
         root_T=_offset(X_WN[nodes["trunk"]], X_WN[nodes[upper]]),
@@ -233,14 +230,11 @@ def _limb(tree: PoseTree, nodes: Mapping[str, int], X_WN: Array, name: str) -> L
         upper=tree.model.upper[list(positions)],
         half_widths=np.array(
             [
-                _half_width(tree.model.link_meshes[upper].vertices, X_UL[:3, 3]),
-                _half_width(tree.model.link_meshes[lower].vertices, end_L),
+                _half_width(mesh.vertices, along)
+                for mesh, along in zip(meshes, (X_UL[:3, 3], end_L), strict=True)
             ]
         ),
-        surfaces=(
-            _surface_points(tree.model.link_meshes[upper]),
-            _surface_points(tree.model.link_meshes[lower]),
-        ),
+        surfaces=(_surface_points(meshes[0]), _surface_points(meshes[1])),
     )
 
 
@@ -262,14 +256,8 @@ def _offset(X_WA: Array, X_WB: Array) -> Array:
     return np.asarray(X_WA[:3, :3].T @ (X_WB[:3, 3] - X_WA[:3, 3]))
 
 
-def _middle(tree: PoseTree, node: int) -> Array:
-    """(3,) the middle of a node's surface, weighed by area."""
-    return _area_middle(tree.nodes[node].mesh.vertices, tree.nodes[node].mesh.triangles)
-
-
-def _welded_middle(tree: PoseTree, lower: str, end: str, X_WL: Array) -> Array:
-    """(3,) the middle of a welded hand or foot in the frame of the segment it is welded to."""
-    model = tree.model
+def _end_middle(model: ParsedModel, lower: str, end: str) -> Array:
+    """(3,) the middle of a hand or foot in the frame of the segment before it."""
     if end not in model.link_meshes:
         raise ModelError(f"{model.path}: there must be a link '{end}' with visual geometry")
     plant = model.plant
@@ -277,9 +265,7 @@ def _welded_middle(tree: PoseTree, lower: str, end: str, X_WL: Array) -> Array:
     plant.SetPositions(context, np.zeros(len(model.position_names)))
     frame = plant.GetBodyByName(lower).body_frame()
     X_LE = plant.GetBodyByName(end).body_frame().CalcPose(context, frame).GetAsMatrix4()
-    mesh = model.link_meshes[end]
-    middle = _area_middle(mesh.vertices, mesh.triangles)
-    return np.asarray(X_LE[:3, :3] @ middle + X_LE[:3, 3])
+    return np.asarray(X_LE[:3, :3] @ _middle(model.link_meshes[end]) + X_LE[:3, 3])
 
 
 def _half_width(vertices: Array, along: Array) -> float:
@@ -290,18 +276,18 @@ def _half_width(vertices: Array, along: Array) -> float:
 
 def _surface_points(mesh: TriangleMesh) -> Array:
     """(m, 3) middles of triangles, one for each of m equal parts of the surface's area."""
-    middles, area = _triangle_middles(mesh.vertices, mesh.triangles)
+    middles, area = _triangle_middles(mesh)
     parts = (np.arange(_POINTS_ON_SURFACE) + 0.5) / _POINTS_ON_SURFACE * area.sum()
     return middles[np.minimum(np.searchsorted(np.cumsum(area), parts), len(area) - 1)]
 
 
-def _area_middle(vertices: Array, triangles: NDArray[np.int32]) -> Array:
+def _middle(mesh: TriangleMesh) -> Array:
     """(3,) the middle of a surface, weighed by area."""
-    middles, area = _triangle_middles(vertices, triangles)
+    middles, area = _triangle_middles(mesh)
     return np.asarray((area[:, None] * middles).sum(axis=0) / area.sum())
 
 
-def _triangle_middles(vertices: Array, triangles: NDArray[np.int32]) -> tuple[Array, Array]:
+def _triangle_middles(mesh: TriangleMesh) -> tuple[Array, Array]:
     """(n, 3) middles of triangles, and what is proportional to their areas (n,)."""
-    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    a, b, c = (mesh.vertices[mesh.triangles[:, k]] for k in range(3))
     return (a + b + c) / 3.0, np.linalg.norm(np.cross(b - a, c - a), axis=1)

@@ -6,7 +6,7 @@ followed by these colours. After a loss the next masks, or positions that are gi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +25,7 @@ from drake_pose.person.search import LENIENT
 from drake_pose.person.shape import NOISE, shape_values
 
 Array = NDArray[np.float64]
+ReadPictures = Callable[[int], Mapping[str, Picture]]
 
 # Silhouettes of fewer cameras do not tell where a person is.
 _FEWEST = 2
@@ -48,29 +49,14 @@ class ColourCapture:
     distances: Array
 
 
-@dataclass(frozen=True, eq=False)
-class ColourRecording:
-    """What is there of a recording.
-
-    Args:
-        cameras: by name.
-        count: how many frames there are.
-        masks: gives the masks of a frame; none in most.
-        pictures: gives the pictures (H, W, 3) of a frame by camera.
-        starts: the plant's positions (nq,) by frame, where they are about known.
-    """
-
-    cameras: Mapping[str, Camera]
-    count: int
-    masks: ReadFrame
-    pictures: Callable[[int], Mapping[str, Picture]]
-    starts: Mapping[int, Array]
-
-
 def capture_by_colour(
     tree: PoseTree,
-    recording: ColourRecording,
+    cameras: Mapping[str, Camera],
+    count: int,
     masked: tuple[int, ...],
+    masks: ReadFrame,
+    pictures: ReadPictures,
+    starts: Mapping[int, Array],
     on_frame: Callable[[int], None] | None = None,
 ) -> ColourCapture:
     """Captures a recording of few masks.
@@ -78,23 +64,26 @@ def capture_by_colour(
     Args:
         tree: of a model with the landmarks of a person. Its shape joints are fitted to the frames
             with masks; without any they stay where the first start has them.
-        recording: masks, pictures and starts.
+        cameras: by name.
+        count: how many frames there are.
         masked: the frames that have masks.
+        masks: gives the masks of a frame; none in most.
+        pictures: gives the pictures (H, W, 3) of a frame by camera.
+        starts: the plant's positions (nq,) by frame, where they are about known.
         on_frame: called after each frame.
 
     Raises:
         ModelError: the model has no landmarks of trunk, arms and legs.
         SettingsError: in none of the frames with masks two cameras see a person.
     """
-    masked = tuple(k for k in masked if len(recording.masks(k)) >= _FEWEST)
+    masked = tuple(k for k in masked if len(masks(k)) >= _FEWEST)
     checked = None
     if masked:
-        checked = capture_checked(
-            tree, recording.cameras, lambda k: recording.masks(masked[k]), len(masked)
-        )
-    follower = _Follower(tree, recording, checked, masked)
-    for frame in range(recording.count):
-        follower.follow(frame)
+        checked = capture_checked(tree, cameras, lambda k: masks(masked[k]), len(masked))
+    follower = _Follower(tree, count, checked, masked)
+    for frame in range(count):
+        seen = pictures(frame)
+        follower.follow(frame, [cameras[k] for k in seen], list(seen.values()), starts.get(frame))
         if on_frame is not None:
             on_frame(frame)
     return ColourCapture(follower.captured, checked, masked, follower.distances)
@@ -106,11 +95,11 @@ class _Follower:
     def __init__(
         self,
         tree: PoseTree,
-        recording: ColourRecording,
+        count: int,
         checked: CheckedCapture | None,
         masked: tuple[int, ...],
     ) -> None:
-        self._recording, self._checked = recording, checked
+        self._checked = checked
         self._places = {frame: k for k, frame in enumerate(masked)}
         own = None if checked is None else checked.captured
         shape = None if own is None else own.shape
@@ -119,24 +108,27 @@ class _Follower:
         self._tracker = PersonPoseTracker(fit, LENIENT, shape_values(tree), rest)
         self._state: TrackState | None = None
         self._known: KnownColours = {}
-        size = recording.count, len(tree.model.position_names)
+        size = count, len(tree.model.position_names)
         unknown = np.full(size, np.nan)
         self.captured = PersonCapture(
             unknown, np.zeros(size[0]), shape, fit.outlines, tree, unknown.copy()
         )
         self.distances = np.full(size[0], np.nan)
 
-    def follow(self, frame: int) -> None:
-        """The next frame."""
-        recording, tracker = self._recording, self._tracker
-        pictures = recording.pictures(frame)
-        cameras = [recording.cameras[name] for name in pictures]
-        views = ColourViews(cameras, list(pictures.values()), self._known)
+    def follow(
+        self,
+        frame: int,
+        cameras: Sequence[Camera],
+        pictures: Sequence[Picture],
+        start: Array | None,
+    ) -> None:
+        """The next frame; start: where the person is about known to be."""
+        tracker = self._tracker
+        views = ColourViews(cameras, pictures, self._known)
         if self._follow_masks(frame, views):
             return
         if self._state is not None:
             self._state = tracker.follow_by_colour(self._state, views)
-        start = recording.starts.get(frame)
         if start is not None and (self._state is None or self._state.is_lost):
             began = tracker.start(tracker.values(start))
             if not self._known:

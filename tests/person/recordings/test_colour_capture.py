@@ -11,7 +11,7 @@ from drake_pose.fit.colour_lines import BESIDE, ON
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.colour_views import ColourViews
 from drake_pose.person.pose_tracker import PersonPoseTracker
-from drake_pose.person.recordings.colour_capture import ColourRecording, capture_by_colour
+from drake_pose.person.recordings.colour_capture import capture_by_colour
 from drake_pose.person.shape import NOISE
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.person.recordings.test_person_capture import stepping
@@ -66,15 +66,15 @@ def joint_errors(person, found, truth):
     return 1e3 * np.linalg.norm(np.array(places[0]) - np.array(places[1]), axis=1)
 
 
-def given(cameras, recording, starts, masks=lambda _: {}, pictures=None):
+def given(cameras, recording, starts, pictures=None):
     pictures = recording[0] if pictures is None else pictures
-    return ColourRecording(cameras, FRAMES, masks, lambda k: pictures[k], starts)
+    return cameras, FRAMES, (), lambda _: {}, lambda k: pictures[k], starts
 
 
 def test_followed_from_a_start_without_any_mask(person, cameras, recording):
     heard = []
     captured = capture_by_colour(
-        person.pose_tree(), given(cameras, recording, {0: recording[2][0]}), (),
+        person.pose_tree(), *given(cameras, recording, {0: recording[2][0]}),
         on_frame=heard.append,
     ).captured  # fmt: skip
     assert heard == list(range(FRAMES))
@@ -94,7 +94,7 @@ def test_a_loss_is_said_and_a_start_goes_on(person, cameras, recording):
     pictures = [*recording[0][:3], grey, grey, *recording[0][5:]]
     starts = {0: recording[2][0], 5: recording[2][5]}
     found = capture_by_colour(
-        person.pose_tree(), given(cameras, recording, starts, pictures=pictures), ()
+        person.pose_tree(), *given(cameras, recording, starts, pictures=pictures)
     ).captured
     lost = np.isnan(found.q).any(axis=1)
     assert lost.tolist() == [False] * 3 + [True] * 2 + [False] * 3

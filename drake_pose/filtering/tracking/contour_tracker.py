@@ -23,6 +23,16 @@ Array = NDArray[np.float64]
 
 # A frame's pose that changes by less is settled [rad, m].
 _STANDSTILL = 1e-3
+# Standard deviations at the start: angles [rad], the root's position and other lengths [m], the
+# logarithm of an unknown scale, and lengths that never change [m].
+_START_ANGLE, _START_LENGTH, _START_GROWTH, _CONSTANT_LENGTH = 0.2, 0.03, 0.1, 0.03
+# The track is lost when the contour and the masks' edge are further apart than this [pixel], or a
+# smaller share of the contour has an edge beside it.
+_LOST_DISTANCE, _LOST_SHARE = 12.0, 0.6
+
+LOST_COLOUR_DISTANCE = 1.5
+"""And where a part's contour is further than this from that of a picture [pixel]: lines are looked
+at so closely that a wrong pose cannot put them much further off. Such a part teaches no colours."""
 
 
 @dataclass(frozen=True)
@@ -34,20 +44,7 @@ class TrackingSettings:
         length_acceleration: of the root's, and of joints that slide [m/s^2].
         growth_acceleration: of the logarithm of a scale that is unknown [1/s^2].
         memory: time in which a rate that is not seen fades [s]: a hidden limb comes to rest.
-        start_angle: standard deviation of the angles at the start [rad].
-        start_length: of the root's position and other lengths at the start [m].
-        start_growth: of the logarithm of a scale that is unknown at the start.
-        constant_length: of what never changes, such as lengths of segments, at the start [m].
         rounds: how often the contour is compared anew in each frame.
-        lost_distance: the track is lost when the contour and the masks' edge are further apart
-            than this [pixel].
-        lost_colour_distance: and where pictures are compared, further than this at any part
-            [pixel]: lines are looked at so closely that a wrong pose cannot put them much further
-            off. Such a part teaches no colours, and its joints are no surer than other parts and
-            the motion say.
-        lost_share: and when a smaller share of the contour than this has an edge beside it.
-        lost_growth: and when E_total is this many times what it was after the last match ...
-        lost_margin: ... and larger than that by this.
         root_moves: whether the root may be elsewhere than where the tree holds it.
         scale_unknown: whether the scale of the one parallel camera is unknown, and may drift.
         rest_time: in about this time joints that are not seen come to the middle of their limits
@@ -62,16 +59,7 @@ class TrackingSettings:
     length_acceleration: float = 5.0
     growth_acceleration: float = 0.1
     memory: float = 0.15
-    start_angle: float = 0.2
-    start_length: float = 0.03
-    start_growth: float = 0.1
-    constant_length: float = 0.03
     rounds: int = 4
-    lost_distance: float = 12.0
-    lost_colour_distance: float = 1.5
-    lost_share: float = 0.6
-    lost_growth: float = 1.5
-    lost_margin: float = 0.1
     root_moves: bool = False
     scale_unknown: bool = False
     rest_time: float | None = None
@@ -149,9 +137,9 @@ class ContourTracker:
     def _start_deviation(self, name: str) -> float:
         """Of what moves at the start [rad, m or 1]."""
         if name == GROWTH:
-            return self.settings.start_growth
+            return _START_GROWTH
         angle = self.observation.is_angle(name)
-        return self.settings.start_angle if angle else self.settings.start_length
+        return _START_ANGLE if angle else _START_LENGTH
 
     def start(self, x: Array) -> Track:
         """Begin at a state (n,), for example the matcher's, as sure of it as the settings say."""
@@ -164,7 +152,7 @@ class ContourTracker:
         for name in layout.names:
             index = layout.index(name)
             if name in layout.constant:
-                deviations[index] = settings.constant_length
+                deviations[index] = _CONSTANT_LENGTH
             elif name in layout.moving:
                 deviations[index] = self._start_deviation(name)
             else:
@@ -240,10 +228,9 @@ class ContourTracker:
 
     def _astray(self, measurement: ContourMeasurement) -> Mask:
         """(nodes,) parts that are not where pictures show them; all where the whole body is not."""
-        settings = self.settings
-        whole = measurement.distance > settings.lost_distance
-        whole |= measurement.share < settings.lost_share
-        return (measurement.part_distances > settings.lost_colour_distance) | whole
+        whole = measurement.distance > _LOST_DISTANCE
+        whole |= measurement.share < _LOST_SHARE
+        return (measurement.part_distances > LOST_COLOUR_DISTANCE) | whole
 
     def _unsure(
         self,

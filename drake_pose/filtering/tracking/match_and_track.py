@@ -21,6 +21,9 @@ from drake_pose.silhouette.pictures.mask_agreement import edge_area
 
 Array = NDArray[np.float64]
 
+# A track is lost when E_total is this many times what it was after the last match, and this more.
+_LOST_GROWTH, _LOST_MARGIN = 1.5, 0.1
+
 
 @dataclass(frozen=True, eq=False)
 class Followed:
@@ -197,7 +200,7 @@ class MatchAndTrack:
     def _is_lost(
         self, track: Track, result: PoseEstimate, reference: float, has_masks: bool
     ) -> bool:
-        limit = self.settings.lost_growth * reference + self.settings.lost_margin
+        limit = _LOST_GROWTH * reference + _LOST_MARGIN
         return track.lost or (has_masks and result.E_total > min(limit, UNEXPLAINED))
 
     def _difference(self, track: Track, frame: _Frame) -> tuple[float, float]:

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 SKIP_ABOVE = 5.0
 """Rows with a larger c_k are left out: they would move the mean by less than 2e-6 deviations."""
 
-_PATIENCE = 25
+_SWEEPS, _PATIENCE = 400, 25
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +136,6 @@ def truncate_sequential(
     mean: ArrayLike,
     covariance: ArrayLike,
     inequalities: Inequalities,
-    skip_above: float = SKIP_ABOVE,
 ) -> Truncated:
     """Truncate by one row after the other: (21) to (29) of Shimada et al.
 
@@ -150,7 +149,6 @@ def truncate_sequential(
         mean: (n,) q_0.
         covariance: (n, n) Q_0.
         inequalities: K rows over the same n elements.
-        skip_above: rows with a larger c_k are left out.
 
     Raises:
         SettingsError: sizes that do not fit, NaN, an indefinite covariance, or a row without
@@ -160,8 +158,8 @@ def truncate_sequential(
     factor, definite = factor_and_kind(Q)
     normalised_margins(q, Q, inequalities)
     c = np.empty(len(inequalities))
-    total = cut_one_by_one(q, factor, inequalities.phi, inequalities.b, skip_above, c)
-    return Truncated(q, covariance_from(factor, definite), c, c <= skip_above, total)
+    total = cut_one_by_one(q, factor, inequalities.phi, inequalities.b, SKIP_ABOVE, c)
+    return Truncated(q, covariance_from(factor, definite), c, c <= SKIP_ABOVE, total)
 
 
 def truncate_joint(
@@ -169,7 +167,6 @@ def truncate_joint(
     covariance: ArrayLike,
     rows: JointRows | Inequalities,
     tolerance: float = 1e-9,
-    sweep_limit: int = 400,
     start: Array | None = None,
 ) -> Truncated:
     """Truncate by all rows at once: moments by expectation propagation.
@@ -196,19 +193,19 @@ def truncate_joint(
     sites = np.zeros((len(joint.directions), 2))
     if start is not None:
         sites[:] = start
-    q, factor, log_probability = _settle(q, factor, joint, sites, tolerance, sweep_limit)
+    q, factor, log_probability = _settle(q, factor, joint, sites, tolerance)
     active = (c <= SKIP_ABOVE) & (sites[joint.group, 0] > 0)
     covariance_after = covariance_from(factor, definite)
     return Truncated(q, covariance_after, c, active, log_probability, sites)
 
 
 def _settle(
-    q: Array, factor: Array, joint: JointRows, sites: Array, tolerance: float, sweep_limit: int
+    q: Array, factor: Array, joint: JointRows, sites: Array, tolerance: float
 ) -> tuple[Array, Array, float]:
     """Expectation propagation from sites (S, 2), which are moved: mean, factor, log probability."""
     base = factor_of(covariance_from(factor[joint.used], False))
     free = q, factor
-    for limit in (sweep_limit, _PATIENCE * sweep_limit):
+    for limit in (_SWEEPS, _PATIENCE * _SWEEPS):
         log_probability, sweeps = propagate(
             free[0][joint.used],
             base,

@@ -5,7 +5,7 @@ import pytest
 
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.measurements.contour import ContourObservation
-from drake_pose.filtering.tracking.contour_tracker import ContourTracker
+from drake_pose.filtering.tracking.contour_tracker import LOST_COLOUR_DISTANCE, ContourTracker
 from drake_pose.fit.colour_lines import BESIDE, COLOURS, ON
 from drake_pose.fit.colours import ColourSettings, part_distances, weigh_parts
 from drake_pose.fit.contour_fit import Comparison
@@ -184,7 +184,7 @@ def test_a_part_that_is_astray_makes_its_own_joints_unsure(observation, renderer
     after = tracker.follow(track, [None], pictures=[picture])
     assert after.lost
     parts = after.measurement.part_distances
-    astray = parts > tracker.settings.lost_colour_distance
+    astray = parts > LOST_COLOUR_DISTANCE
     assert 0 < np.count_nonzero(astray) < len(parts)
     before, now = (
         tracker.filter.predict(track.state).best.deviations(),

@@ -137,7 +137,7 @@ def test_lost_when_the_body_is_elsewhere(body):
     assert waited.measurement is None
 
 
-@pytest.mark.parametrize("bad", [{"rounds": 0}, {"memory": -1.0}, {"lost_share": math.nan}])
+@pytest.mark.parametrize("bad", [{"rounds": 0}, {"memory": -1.0}, {"rest_time": math.nan}])
 def test_bad_settings_are_named(bad):
     with pytest.raises(SettingsError, match=next(iter(bad))):
         TrackingSettings(**bad)

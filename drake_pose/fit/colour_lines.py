@@ -34,7 +34,6 @@ from drake_pose.fit.kernel import (
 )  # fmt: skip
 from drake_pose.silhouette.areas.outline import PackedOutlines
 from drake_pose.silhouette.contours.contour_points import sample_contour
-from drake_pose.silhouette.contours.contour_segments import find_segments
 
 Array = NDArray[np.float64]
 Histograms = NDArray[np.float32]
@@ -96,10 +95,7 @@ def compare_lines(
     """
     unit, scale, spacing, worth = weights
     X_CN = seen_from(camera[0], X_WN)
-    segments = find_segments(packed, X_CN, camera[1])
-    uv, normals, lengths, nodes, p_N, _, clearances = sample_contour(
-        packed, segments, camera[1], 0.0, spacing, True
-    )
+    uv, normals, lengths, nodes, p_N, clearances = sample_contour(packed, X_CN, camera[1], spacing)
     noise = (scale / 2.5) ** 2
     rows, p, w = np.empty((2, 3)), np.empty(3), np.empty(12)
     blocks, on, beside = _line_arrays()
@@ -229,10 +225,7 @@ def learn_colours(
             beside it. (0, 0): that is not known.
     """
     X_CN = seen_from(camera[0], X_WN)
-    segments = find_segments(packed, X_CN, camera[1])
-    uv, normals, _, nodes, _, _, clearances = sample_contour(
-        packed, segments, camera[1], 0.0, spacing, True
-    )
+    uv, normals, _, nodes, _, clearances = sample_contour(packed, X_CN, camera[1], spacing)
     counts = np.zeros((len(histograms), 2, COLOURS), dtype=np.float32)
     totals = np.zeros((len(histograms), 2))
     blocks, on, beside = _line_arrays()

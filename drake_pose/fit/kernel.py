@@ -20,12 +20,10 @@ from drake_pose.compiled import compiled
 from drake_pose.fit.evidence import Evidence
 from drake_pose.fit.point_motion import picture_rows
 from drake_pose.silhouette.areas.outline import PackedOutlines
-from drake_pose.silhouette.contours.contour_points import sample_contour
-from drake_pose.silhouette.contours.contour_segments import find_segments
+from drake_pose.silhouette.contours.contour_points import ContourPoints, sample_contour
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 # Contours correspond only where their normals point alike: at least this cosine.
 _ALIKE = 0.3
@@ -115,8 +113,7 @@ def compare_contours(
         if begin == end:
             continue
         X_CN = seen_from(cameras[0][c], X_WN)
-        segments = find_segments(packed, X_CN, cameras[1][c])
-        contour = sample_contour(packed, segments, cameras[1][c], 0.0, weights[c, 2], True)
+        contour = sample_contour(packed, X_CN, cameras[1][c], weights[c, 2])
         edge = (uv[begin:end], normals[begin:end], lengths[begin:end])
         camera = (cameras[0][c], cameras[1][c])
         add = (A[c], b[c], sums[c], pieces[c])
@@ -125,7 +122,7 @@ def compare_contours(
 
 @compiled
 def _add_camera(
-    contour: tuple[Array, Array, Array, Indices, Array, Mask, Array],
+    contour: ContourPoints,
     edge: tuple[Array, Array, Array],
     X_WN: Array,
     camera: tuple[Array, Array],
@@ -134,10 +131,10 @@ def _add_camera(
     add: tuple[Array, Array, Array, Array],
     side: float,
 ) -> None:
-    """compare_contours for one camera; contour: the arrays of ContourPoints; add: its outputs."""
+    """compare_contours for one camera; add: its outputs."""
     A, b, sums, pieces = add
     unit, scale, _, worth = weights
-    uv, normals, lengths, nodes, p_N, _, _ = contour
+    uv, normals, lengths, nodes, p_N, _ = contour
     edge_uv, edge_normals, edge_lengths = edge
     of_point, of_edge = nearest_alike(uv, normals, edge_uv, edge_normals, reach * scale)
     rows, p, w = np.empty((2, 3)), np.empty(3), np.empty(12)

@@ -9,17 +9,13 @@ on the contour to rounding, and sums over the points times their lengths are sum
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from drake_pose.camera.models import Camera
 from drake_pose.compiled import compiled
-from drake_pose.errors import SettingsError
-from drake_pose.silhouette.areas.outline import Outline, PackedOutlines, pack
+from drake_pose.silhouette.areas.outline import PackedOutlines
 from drake_pose.silhouette.contours.contour_segments import (
-    Segments,
     find_crossings,
     find_line_spans,
     find_segments,
@@ -35,7 +31,6 @@ class ContourPoints(NamedTuple):
         lengths: (n,) the length of contour that each stands for [pixel].
         nodes: (n,) int64 the surface each lies on.
         p_N: (n, 3) the point of that surface, in its frame N [m].
-        in_rows: (n,) bool whether a row crosses the contour there, else a column.
         clearances: (n, 2) how far along the normals it is inwards to where the silhouette ends
             again, and outwards to where it begins again, inf where it does not, as if the
             contour there were parallel to here [pixel].
@@ -46,68 +41,34 @@ class ContourPoints(NamedTuple):
     lengths: np.ndarray
     nodes: np.ndarray
     p_N: np.ndarray
-    in_rows: np.ndarray
     clearances: np.ndarray
-
-
-def find_contour_points(
-    outlines: Sequence[Outline], X_CN: np.ndarray, camera: Camera, spacing: float = 1.0
-) -> ContourPoints:
-    """Returns points of the visible contour of the union of surfaces.
-
-    Args:
-        outlines: the body's surfaces.
-        X_CN: (nodes, 4, 4) their poses in the camera; for a parallel camera their rotations may be
-            scaled uniformly.
-        camera: the camera. Triangles that reach nearer than its near plane are left out.
-        spacing: from row to row and from column to column [pixel]; the first row and column are
-            pixel centres, and with a spacing of 1 all are.
-
-    Raises:
-        SettingsError: when the spacing is not positive.
-        ValueError: when the poses have the wrong shape.
-    """
-    if not spacing > 0.0:
-        raise SettingsError(f"the spacing of contour points must be positive, not {spacing}")
-    poses = np.ascontiguousarray(X_CN, dtype=np.float64)
-    if poses.shape != (len(outlines), 4, 4):
-        raise ValueError(f"poses must be ({len(outlines)}, 4, 4), not {poses.shape}")
-    packed = pack(tuple(outlines))
-    parameters = camera.kernel_parameters()
-    segments = find_segments(packed, poses, parameters)
-    return ContourPoints(*sample_contour(packed, segments, parameters, 0.0, spacing, True))
 
 
 @compiled
 def sample_contour(
-    packed: PackedOutlines,
-    segments: Segments,
-    camera: np.ndarray,
-    first: float,
-    spacing: float,
-    in_columns: bool,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the arrays of ContourPoints.
+    packed: PackedOutlines, X_CN: np.ndarray, camera: np.ndarray, spacing: float
+) -> ContourPoints:
+    """Points of the visible contour of the union of surfaces.
 
     Args:
-        segments: their projected contour edges.
-        camera: (8,) kernel parameters of the camera.
-        first: where the first line is [pixel].
-        spacing: from line to line [pixel].
-        in_columns: whether flat contours are sampled by columns; else all are by rows.
+        packed: the surfaces.
+        X_CN: (nodes, 4, 4) their poses in the camera; for a parallel camera their rotations may be
+            scaled uniformly.
+        camera: (8,) kernel parameters. Triangles nearer than its near plane are left out.
+        spacing: from row to row and from column to column [pixel], positive; the first row and
+            column are pixel centres, and with a spacing of 1 all are.
     """
+    segments = find_segments(packed, X_CN, camera)
     ends = segments.ends
     crossings = [(np.zeros(1, np.int64), np.zeros(1), np.zeros(1, np.int64)) for _ in range(0)]
     capacity = 0
     for across in range(2):
-        lines = int((camera[7 - across] - 1.0 - first) / spacing) + 1
-        if across == 1 and not in_columns:
-            lines = 0
-        crossings.append(find_crossings(segments, across, first, spacing, lines))
+        lines = int((camera[7 - across] - 1.0) / spacing) + 1
+        crossings.append(find_crossings(segments, across, 0.0, spacing, lines))
         capacity += len(crossings[across][1])
     uv, normals, lengths = np.empty((capacity, 2)), np.empty((capacity, 2)), np.empty(capacity)
     nodes, p_N = np.empty(capacity, dtype=np.int64), np.empty((capacity, 3))
-    in_rows, clearances = np.empty(capacity, dtype=np.bool_), np.empty((capacity, 2))
+    clearances = np.empty((capacity, 2))
     spans = np.empty((capacity // 2 + 1, 2), dtype=np.int64)
     count = 0
     for across in range(2):
@@ -120,9 +81,7 @@ def sample_contour(
                 place, s = places[crossing], owners[crossing]
                 du, dv = ends[s, 2] - ends[s, 0], ends[s, 3] - ends[s, 1]
                 steep = abs(dv) >= abs(du)
-                if in_columns and steep != (across == 0):
-                    continue
-                if not (-0.5 <= place <= extent):
+                if steep != (across == 0) or not -0.5 <= place <= extent:
                     continue
                 size = np.sqrt(du * du + dv * dv)
                 n0, n1 = dv / size, -du / size
@@ -131,8 +90,8 @@ def sample_contour(
                 sign = sign if k % 2 == 1 else -sign
                 normals[count, 0], normals[count, 1] = sign * n0, sign * n1
                 lengths[count] = spacing / abs(normals[count, across])
-                uv[count, across], uv[count, 1 - across] = place, first + line * spacing
-                share = (first + line * spacing - ends[s, 1 - across]) / (dv if across == 0 else du)
+                uv[count, across], uv[count, 1 - across] = place, line * spacing
+                share = (line * spacing - ends[s, 1 - across]) / (dv if across == 0 else du)
                 # Straight in the picture is not at even pace along the edge (perspective).
                 near, far = segments.depths[s, 0], segments.depths[s, 1]
                 share = share * near / (share * near + (1.0 - share) * far)
@@ -141,7 +100,7 @@ def sample_contour(
                     p_N[count, i] = (1.0 - share) * packed.points[i, a] + share * packed.points[
                         i, b
                     ]
-                nodes[count], in_rows[count] = segments.nodes[s], across == 0
+                nodes[count] = segments.nodes[s]
                 straight = abs(normals[count, across])
                 clearances[count, 0] = straight * (
                     places[spans[k // 2, 1]] - places[spans[k // 2, 0]]
@@ -152,12 +111,11 @@ def sample_contour(
                 elif k % 2 == 0 and k > 0:
                     clearances[count, 1] = straight * (place - places[spans[k // 2 - 1, 1]])
                 count += 1
-    return (
+    return ContourPoints(
         uv[:count],
         normals[:count],
         lengths[:count],
         nodes[:count],
         p_N[:count],
-        in_rows[:count],
         clearances[:count],
     )

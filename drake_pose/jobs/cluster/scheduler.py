@@ -50,10 +50,10 @@ def open_cluster(workers: int | None = None, scheduler: str | None = None) -> It
         ClusterError: distributed is not installed, or the scheduler cannot be reached or has no
             workers, or these have another drake_pose.
     """
-    if find_spec("distributed") is None:
+    if not all(find_spec(name) for name in ("distributed", "zmq")):
         raise ClusterError(
-            'workers need Dask distributed: pip install "drake_pose[cluster]"; or do without them: '
-            "--workers 0"
+            'workers need Dask distributed and pyzmq: pip install "drake_pose[cluster]"; or do '
+            "without them: --workers 0"
         )
     opened = _embedded(workers) if scheduler is None else _connected(scheduler)
     with _quiet(), opened as client:

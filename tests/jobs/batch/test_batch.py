@@ -292,8 +292,9 @@ def test_what_is_no_address_of_a_scheduler_is_named(address):
         pass
 
 
-def test_missing_extra_is_named(jobs, scenes, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "distributed", None)
+@pytest.mark.parametrize("missing", ["distributed", "zmq"])
+def test_missing_extra_is_named(missing, jobs, scenes, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, missing, None)
     result = CliRunner().invoke(
         app, ["batch", str(scenes / "jobs.yaml"), "--out", str(tmp_path / "out")]
     )

@@ -2,12 +2,9 @@
 
 import csv
 import json
-import time
 
-import cv2
 import numpy as np
 import pytest
-import yaml
 
 from drake_pose.commands.main import app
 from drake_pose.errors import SceneError, SettingsError
@@ -17,7 +14,7 @@ from drake_pose.jobs.live.scene import load_live_scene
 from drake_pose.person.date.recognition import registered_positions
 from drake_pose.person.date.skeleton import load_skeleton
 from tests.cli import CliRunner
-from tests.jobs.live_scenes import RATE_HZ, load_person, standing, write_studio
+from tests.jobs.live_scenes import load_person, standing, write_studio
 
 PLACE = (0.12, -0.1, 1.55)
 HEADING = 0.3
@@ -81,105 +78,6 @@ def test_person_is_followed_from_the_registered_pose_on(studio, person, skeleton
         assert np.linalg.norm(elbow) < 0.08
     assert (out / "joint_centres.trc").is_file()
     assert "as published" in (out / "report.html").read_text()
-
-
-class Devices:
-    """Recordings that stand for cv2.VideoCapture: what is shown goes on with the frames captured.
-
-    So a slow machine sees all of it. One camera fails for a while.
-    """
-
-    FAILS = (3, range(10, 14))
-
-    def __init__(self, folder):
-        self.shown = 0
-        self._pictures = {}
-        for path in folder.glob("*.avi"):
-            recording = cv2.VideoCapture(str(path))
-            pictures = []
-            while (read := recording.read())[0]:
-                pictures.append(read[1])
-            self._pictures[int(path.stem.rsplit("_", 1)[1])] = pictures
-
-    def open(self, number):
-        return Device(self, number)
-
-    def works(self, number):
-        camera, shown = self.FAILS
-        return number != camera or self.shown not in shown
-
-    def picture(self, number):
-        return self._pictures[number][min(self.shown, len(self._pictures[number]) - 1)]
-
-
-class Device:
-    def __init__(self, devices, number):
-        self._devices, self._number = devices, number
-
-    def isOpened(self):
-        return self._devices.works(self._number)
-
-    def set(self, what, value):
-        return True
-
-    def read(self):
-        time.sleep(1.0 / RATE_HZ)
-        if not self.isOpened():
-            return False, None
-        return True, self._devices.picture(self._number)
-
-    def release(self):
-        pass
-
-
-@pytest.mark.slow
-def test_person_before_live_cameras_is_followed(person, skeleton, path, tmp_path, monkeypatch):
-    shown = path[5:]
-    goal, last = shown[-1], len(shown) + 8
-    folder = tmp_path / "live"
-    folder.mkdir()
-    write_studio(folder, person, shown, "videos", cameras=6, size=(320, 240))
-    devices = Devices(folder)
-    entries = yaml.safe_load((folder / "sources.yaml").read_text())
-    for number, entry in enumerate(entries.values()):
-        entry |= {"kind": "device", "location": number, "rate_hz": RATE_HZ}
-    (folder / "sources.yaml").write_text(yaml.safe_dump(entries))
-    monkeypatch.setattr(cv2, "VideoCapture", devices.open)
-    monkeypatch.setattr("drake_pose.camera.sources.live.FIRST_PAUSE", 0.05)
-    reports, heard = [], []
-
-    def on_frame(count, found):
-        heard.append(found)
-        devices.shown = count
-        is_back = any("'camera_3' returned" in text for text in reports)
-        if (count >= last and is_back) or count == 40 * last:
-            raise KeyboardInterrupt
-
-    result = capture_paper(
-        load_live_scene(folder),
-        tmp_path / "out",
-        person.path,
-        LiveSettings(replay=False),
-        on_report=reports.append,
-        on_frame=on_frame,
-    )
-    assert result.interrupted
-    with (tmp_path / "out" / "poses.csv").open(newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    assert [row["error"] != "" for row in rows] == heard
-    assert all(heard[1:])
-    for row, q in ((rows[1], shown[0]), (rows[-1], goal)):
-        found = np.array([float(row[name]) for name in person.position_names])
-        off = np.linalg.norm(skeleton.features(found) - skeleton.features(q), axis=1)
-        assert max(off[:3]) < 0.06
-        assert max(off[3:]) < 0.08
-    sources = json.loads((tmp_path / "out" / "summary.json").read_text())["sources"]
-    assert {one["kind"] for one in sources.values()} == {"device"}
-    told = "\n".join(reports)
-    assert "'3' stopped; it is tried again" in told
-    assert "'3' answers again" in told
-    changes = [change["what"] for change in sources["camera_3"]["changes"]]
-    assert changes[:2] == ["stopped", "returned"]
 
 
 @pytest.mark.slow

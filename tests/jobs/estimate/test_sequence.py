@@ -1,7 +1,9 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+from drake_pose.jobs.estimate.body_fit import _StartedSearch
 from drake_pose.jobs.estimate.matching import sequence_tracking
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.results.settings import EstimateSettings
@@ -70,6 +72,15 @@ def test_how_a_scene_is_tracked(tiny_scene: TinyScene) -> None:
     moved = sequence_tracking(video, RootPlacementSearch.__new__(RootPlacementSearch))
     assert moved is not None
     assert moved.root_moves
+
+
+def test_a_track_goes_on_from_what_is_known_and_searches_after_a_loss() -> None:
+    search, known = _StartedSearch.__new__(_StartedSearch), object()
+    search.first = known
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(RootPlacementSearch, "match", lambda *_: "searched")
+        assert search.match([]) is known
+        assert search.match([]) == "searched"
 
 
 class _Known:

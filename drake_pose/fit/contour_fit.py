@@ -1,4 +1,9 @@
-"""One pose from all silhouettes at once: the contours of body and silhouettes drawn together."""
+"""One pose from all silhouettes at once: the contours of body and silhouettes drawn together.
+
+The cost of a pose theta, with r_i the distance of a point of either contour from the other, l_i the
+length that it stands for, s the scale of a stage and w what a unit of contour is worth:
+C(theta) = w sum_i l_i r_i^2 / (1 + (r_i / s)^2) + (theta - m)^T P (theta - m).
+"""
 
 from __future__ import annotations
 

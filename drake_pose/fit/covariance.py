@@ -314,3 +314,13 @@ def distances_covariance(seen: Distances, sizes: ErrorSizes) -> Array:
 def _apriori(is_angle: NDArray[np.bool_]) -> Array:
     """(m, m) information: as much as an even distribution over its range has variance."""
     return np.diag(12.0 / np.where(is_angle, 2.0 * np.pi, _PLACE) ** 2)
+
+
+def excess(pieces: Array, others: Array) -> float:
+    """By how many standard deviations costs by pieces are above others of the same shape.
+
+    Vuong's test (1989): how differences scatter from piece to piece of the pictures tells how large
+    that of the whole may be by chance. What no pose explains costs all of them alike.
+    """
+    more = pieces - others
+    return float(more.sum() / max(np.sqrt(float((more**2).sum())), 1e-9))

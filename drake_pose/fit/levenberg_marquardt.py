@@ -1,5 +1,7 @@
 """Levenberg and Marquardt's method inside limits, for frames that share some of their unknowns.
 
+(H + d diag(H) + e mean(diag(H)) I) x = -g; unknowns at a limit that x would leave are held.
+
 The scale of the cost shrinks from round to round, so first everything within reach pulls and in the
 end only what fits (graduated non-convexity, Blake and Zisserman 1987). Frames couple through what
 they share: each frame's own unknowns are eliminated first (Schur complement). Those of frames that
@@ -280,7 +282,7 @@ def _solved(
             for column in range(len(free)):
                 block[row, column] = H[frame, free[row], free[column]]
         _damp(block, shares)
-        _solve(block, right)
+        solve_in_place(block, right)
         for row in range(len(free)):
             steps[frame, free[row]] = right[row, 0]
             for k in range(q):
@@ -293,7 +295,7 @@ def _solved(
         right[row, 0] = -s[loose[row]]
         for column in range(len(loose)):
             block[row, column] = S[loose[row], loose[column]]
-    _solve(block, right)
+    solve_in_place(block, right)
     change = np.zeros(q)
     for k in range(len(loose)):
         change[loose[k]] = right[k, 0]
@@ -305,7 +307,7 @@ def _solved(
 
 
 @compiled
-def _solve(A: Array, B: Array) -> None:
+def solve_in_place(A: Array, B: Array) -> None:
     """Puts A^-1 B (n, m) in place of B, by elimination with pivots; A (n, n) is lost.
 
     LAPACK gains nothing on matrices this small, and takes long to be compiled in.

@@ -163,7 +163,7 @@ def continuous_figures(result: ExperimentResult) -> dict[str, Any]:
                 known.append(error)
                 held.append(joint.holds(float(value)))
     E_total = [trial.result.E_total for trial in result.trials]
-    intervals = search.settings.refinement.intervals
+    intervals = search.settings.intervals
     return {
         "images": len(result.trials),
         "views": len(result.cameras),

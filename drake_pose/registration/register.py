@@ -21,8 +21,8 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
+from drake_pose.fit.covariance import excess
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
-from drake_pose.fit.significance import excess
 from drake_pose.fit.surfaces import FEW, VERY_FEW, few_triangles, with_girths
 from drake_pose.registration.calibration_fit import (
     TOLD_APART,

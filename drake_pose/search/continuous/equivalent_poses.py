@@ -4,7 +4,7 @@ Two questions are put to the silhouettes. How far a pose may be off that is righ
 where parts, masks and cameras err together (``fit.covariance``), as 95 % intervals; a value that
 may go far is moved step by step, the others following, until what does not fit any more is
 significant. Whether another pose fits as well: other optima that were found, and flipped joints,
-make families of their own unless they are significantly worse (``fit.significance``). What no pose
+make families of their own unless significantly worse (``fit.covariance.excess``). What no pose
 explains, such as a part that is missing in a mask, costs all of them alike and says nothing.
 """
 
@@ -18,9 +18,8 @@ import numpy as np
 from scipy.special import stdtrit
 
 from drake_pose.errors import SettingsError
-from drake_pose.fit.covariance import ErrorSizes, estimate_sizes, values_covariance
+from drake_pose.fit.covariance import ErrorSizes, estimate_sizes, excess, values_covariance
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
-from drake_pose.fit.significance import excess
 from drake_pose.search.continuous.views_fit import FittedPose, ViewsFit
 from drake_pose.search.estimates import JointEstimate, PoseFamily, PoseSet
 from drake_pose.search.starts.self_motions import Flip, flips

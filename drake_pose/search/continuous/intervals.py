@@ -27,8 +27,7 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import JointEstimate, PoseFamily, PoseSet
 from drake_pose.search.raster_fit.body import Freedom
-from drake_pose.search.raster_fit.passes import FINE_PASSES
-from drake_pose.search.raster_fit.problem import RefinementProblem
+from drake_pose.search.raster_fit.problem import FINE_PASSES, RefinementProblem
 
 # The variance of a border that lies anywhere between two pixel centres [pixel^2].
 _PIXEL_VARIANCE = 1.0 / 12.0
@@ -112,7 +111,6 @@ def find_intervals(
     others: Sequence[np.ndarray],
     parameters: np.ndarray,
     settings: IntervalSettings,
-    extra: Sequence[int] = (),
 ) -> Intervals:
     """What the silhouettes say of each value.
 
@@ -121,9 +119,8 @@ def find_intervals(
         others: (m + 4,) each: other poses that are as good, best first.
         parameters: (m + 4,) the best pose, refined.
         settings: the parameters.
-        extra: of the four parameters after the tree's values those that are unknown.
     """
-    covariance = _covariance(problem, parameters, problem.body.freedom(None, extra), settings)
+    covariance = _covariance(problem, parameters, problem.body.freedom(), settings)
     z = float(ndtri(0.5 + 0.5 * settings.confidence))
     margins = z * np.sqrt(np.diag(covariance))
     tolerance = settings.tolerance * problem.border_length

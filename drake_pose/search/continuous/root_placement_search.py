@@ -25,8 +25,13 @@ from drake_pose.search.grid.beam.hypotheses import Beam, Hypotheses
 from drake_pose.search.grid.beam.search import BeamSearch
 from drake_pose.search.grid.node_poses import Pictures, PoseStore, coarsen
 from drake_pose.search.raster_fit.body import RefinementBody
-from drake_pose.search.raster_fit.passes import COARSE_PASSES, FINE_PASSES, Pass, descend
-from drake_pose.search.raster_fit.problem import RefinementProblem
+from drake_pose.search.raster_fit.problem import (
+    COARSE_PASSES,
+    FINE_PASSES,
+    Pass,
+    RefinementProblem,
+    descend,
+)
 from drake_pose.search.settings import BeamSearchSettings, Stage
 from drake_pose.search.starts.neighbourhood import NeighbourhoodSearch
 from drake_pose.search.starts.part_placement import PartSearch

@@ -21,16 +21,15 @@ from drake_pose.search.continuous.intervals import (
 from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
 from drake_pose.search.grid.beam.search import BeamSearch
 from drake_pose.search.raster_fit.body import RefinementBody
-from drake_pose.search.raster_fit.passes import (
+from drake_pose.search.raster_fit.problem import (
     COARSE_PASSES,
     FINE_PASSES,
     LAST_PASSES,
-    Pass,
+    RefinementProblem,
     descend,
 )
-from drake_pose.search.raster_fit.problem import RefinementProblem
 from drake_pose.search.settings import BeamSearchSettings, Stage
-from drake_pose.search.starts.neighbourhood import NeighbourhoodSearch, NeighbourhoodSettings
+from drake_pose.search.starts.neighbourhood import NeighbourhoodSearch
 from drake_pose.search.starts.part_placement import PartSearch
 
 # No other start is searched on where one has led to this many times what is enough.
@@ -57,30 +56,6 @@ _GRIDS = (
 
 
 @dataclass(frozen=True)
-class RefinementSettings:
-    """Parameters of a refinement.
-
-    Args:
-        passes: of the descent to the local optimum.
-        extra: which of root shift along x, y, z (0, 1, 2) and growth (3) are unknown, too.
-        escape: how parts are placed anew; None: they are not.
-        enough: wrong pixels, as a share of the length of the silhouettes' borders, of a pose that
-            is not searched on; a little more than the pixels' own noise.
-        intervals: how intervals are found; None: they are not.
-    """
-
-    passes: tuple[Pass, ...] = COARSE_PASSES + FINE_PASSES
-    extra: tuple[int, ...] = ()
-    escape: NeighbourhoodSettings | None = field(default_factory=NeighbourhoodSettings)
-    enough: float = 0.03
-    intervals: IntervalSettings | None = field(default_factory=IntervalSettings)
-
-    def __post_init__(self) -> None:
-        if not self.enough >= 0.0:
-            raise SettingsError(f"enough must be 0 or more, not {self.enough}")
-
-
-@dataclass(frozen=True)
 class ContinuousSearchSettings:
     """Parameters of the continuous search.
 
@@ -89,21 +64,24 @@ class ContinuousSearchSettings:
             only where none before has led to a good pose.
         starts: how many poses of each that do not look alike are refined.
         alike: as in ``BeamSearch.best_poses``.
-        escapes: of how many of these parts are placed anew, the best first.
-        refinement: of the refinement.
+        enough: wrong pixels, as a share of the length of the silhouettes' borders, of a pose that
+            is not searched on; a little more than the pixels' own noise.
+        intervals: how intervals are found; None: they are not.
         time_limit: the search returns its best pose so far after this time [s]; None: no limit.
     """
 
     grids: tuple[BeamSearchSettings, ...] = _GRIDS
     starts: int = 4
     alike: float = 0.5
-    escapes: int = 1
-    refinement: RefinementSettings = field(default_factory=RefinementSettings)
+    enough: float = 0.03
+    intervals: IntervalSettings | None = field(default_factory=IntervalSettings)
     time_limit: float | None = None
 
     def __post_init__(self) -> None:
-        if self.starts < 1 or self.escapes < 1:
-            raise SettingsError("starts and escapes must be 1 or more")
+        if self.starts < 1:
+            raise SettingsError(f"starts must be 1 or more, not {self.starts}")
+        if not self.enough >= 0.0:
+            raise SettingsError(f"enough must be 0 or more, not {self.enough}")
         if not self.grids:
             raise SettingsError("a continuous search needs at least one grid")
 
@@ -118,35 +96,59 @@ class _Reached(NamedTuple):
     about: NeighbourhoodSearch
 
 
-class Refiner:
-    """Refines poses of one body.
+class ContinuousSearch:
+    """Matches silhouettes with a pose tree whose values are continuous.
 
     Args:
         tree: the pose tree.
         settings: the parameters.
-        grids: for each node its values (n, k) that are tried when parts are placed anew; None:
-            the tree's sampling grid at 20 degrees.
     """
 
-    def __init__(
-        self,
-        tree: PoseTree,
-        settings: RefinementSettings | None = None,
-        grids: Sequence[np.ndarray] | None = None,
-    ) -> None:
+    def __init__(self, tree: PoseTree, settings: ContinuousSearchSettings | None = None) -> None:
         self.tree = tree
-        self.settings = settings or RefinementSettings()
+        self.settings = settings or ContinuousSearchSettings()
+        self._grids = [BeamSearch(tree, grid) for grid in self.settings.grids]
+        self.sampled = self._grids[0].sampled
         self.body = RefinementBody(tree)
-        if grids is None:
-            grids = [tree.grid(i, math.radians(20.0)) for i in range(len(tree.nodes))]
-        self._parts = PartSearch(self.body, grids)
+        self._parts = PartSearch(self.body, self.sampled.values)
+
+    def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
+        """Estimate the pose that the views show.
+
+        Args:
+            views: one or several silhouettes of the same instant.
+            root_position: (3,), the root's known position in the world [m], where it is not the
+                pose tree's own.
+
+        Raises:
+            SettingsError: if there is no view.
+        """
+        begin = time.perf_counter()
+        limit = self.settings.time_limit
+        deadline = math.inf if limit is None else begin + limit
+        rounds = self._starts(views, root_position)
+        starts = next((starts for starts in rounds if starts), ())
+        if not starts:
+            seconds = time.perf_counter() - begin
+            return PoseEstimate.nothing(self.tree, stopped_by="time_limit", seconds=seconds)
+        grid_seconds = time.perf_counter() - begin
+        refined = self.refine(views, starts, root_position, deadline, rounds)
+        return replace(refined, seconds=refined.seconds + grid_seconds)
+
+    def _starts(
+        self, views: Sequence[View], root_position: np.ndarray | None
+    ) -> Iterator[Sequence[Sequence[np.ndarray]]]:
+        """Each grid's best poses, made when they are asked for."""
+        for grid in self._grids:
+            yield grid.best_poses(
+                views, root_position, self.settings.starts, self.settings.alike
+            ).node_values
 
     def refine(
         self,
         views: Sequence[View],
         starts: Sequence[Sequence[np.ndarray]],
         root_position: np.ndarray | None = None,
-        escapes: int = 1,
         deadline: float = math.inf,
         others: Iterable[Sequence[Sequence[np.ndarray]]] = (),
     ) -> PoseEstimate:
@@ -156,7 +158,6 @@ class Refiner:
             views: one or several silhouettes of the same instant.
             starts: node values of each pose to start from, at least one.
             root_position: (3,) the root's position [m], where it is not the tree's own.
-            escapes: how many of the refined poses are searched on by placing parts anew.
             deadline: what has begun then is ended by the shortest way (``time.perf_counter``).
             others: more poses to start from, taken one round after another while none has led to a
                 good pose. Two rounds that end equally well end the search: the body fits no better.
@@ -169,7 +170,7 @@ class Refiner:
         begin = time.perf_counter()
         poses = [self.body.parameters(start, root_position) for start in starts]
         problem = RefinementProblem(self.body, views, poses[0])
-        reached = self._descend_all(problem, poses, escapes, deadline)
+        reached = self._descend_all(problem, poses, deadline)
         rounds = iter(others)
         fair = _FAIR * self.settings.enough * problem.border_length
         while reached.J > fair and time.perf_counter() < deadline:
@@ -179,7 +180,7 @@ class Refiner:
             poses = [self.body.parameters(start, root_position) for start in more]
             if not poses:
                 continue
-            again = self._descend_all(problem, poses, escapes, deadline)
+            again = self._descend_all(problem, poses, deadline)
             reached, worse = sorted((reached, again), key=lambda one: one.J)
             if worse.J <= _AGREEING * reached.J:
                 break
@@ -192,63 +193,45 @@ class Refiner:
         intervals, settings = None, self.settings
         if settings.intervals is not None:
             reached, found = self._find_others(problem, reached, settings.intervals)
-            intervals = find_intervals(
-                problem, found, reached.parameters, settings.intervals, settings.extra
-            )
+            intervals = find_intervals(problem, found, reached.parameters, settings.intervals)
         end = time.perf_counter()
         stopped_by = "end" if in_time else "time_limit"
         return self._answer(problem, reached, intervals, (middle - begin, end - middle), stopped_by)
 
     def _descend_all(
-        self,
-        problem: RefinementProblem,
-        poses: Sequence[np.ndarray],
-        escapes: int,
-        deadline: float,
+        self, problem: RefinementProblem, poses: Sequence[np.ndarray], deadline: float
     ) -> _Reached:
-        """The best pose reached."""
-        settings = self.settings
-        freedom = self.body.freedom(None, settings.extra)
-        passes = settings.passes if len(poses) == 1 else COARSE_PASSES
+        """The best pose reached, its parts placed anew."""
+        freedom = self.body.freedom()
         steps = 0
         coarse: list[tuple[int, int, np.ndarray]] = []
         for pose in poses:
             if coarse and time.perf_counter() > deadline:
                 break
-            parameters, _, count = descend(problem, pose, freedom, passes)
+            parameters, _, count = descend(problem, pose, freedom, COARSE_PASSES)
             coarse.append((problem.J(parameters), len(coarse), parameters))
             steps += count
-        coarse.sort(key=lambda entry: entry[:2])
-        enough = settings.enough * problem.border_length
-        about = NeighbourhoodSearch(problem, self._parts, settings.escape)
-        best = _Reached(coarse[0][2], coarse[0][0], coarse[0][0], 0, about)
-        for index, (_, _, parameters) in enumerate(coarse[:escapes]):
-            if index > 0 and (best.J <= _FAIR * enough or time.perf_counter() > deadline):
-                break
-            parameters, _, count = descend(problem, parameters, freedom, FINE_PASSES)
-            steps += count
-            about = NeighbourhoodSearch(problem, self._parts, settings.escape)
-            if settings.escape is not None:
-                parameters, _ = about.improve(parameters, enough, deadline)
-            J = float(problem.J(parameters))
-            if J < best.J:
-                best = best._replace(parameters=parameters, J=J, about=about)
-        return best._replace(steps=steps)
+        first_J, _, start = min(coarse, key=lambda entry: entry[:2])
+        parameters, _, count = descend(problem, start, freedom, FINE_PASSES)
+        about = NeighbourhoodSearch(problem, self._parts)
+        enough = self.settings.enough * problem.border_length
+        parameters, J = about.improve(parameters, enough, deadline)
+        if first_J <= J:
+            parameters, J = start, first_J
+        return _Reached(parameters, J, first_J, steps + count, about)
 
     def _descend_last(
         self, problem: RefinementProblem, reached: _Reached, deadline: float
     ) -> _Reached:
         """What was reached, improved all over, as near its optimum as there is time."""
-        parameters = reached.parameters
-        if self.settings.escape is not None:
-            parameters, _ = reached.about.improve(parameters, 0.0, deadline, everywhere=True)
+        parameters, _ = reached.about.improve(reached.parameters, 0.0, deadline, everywhere=True)
         return self._end(problem, reached, parameters)
 
     def _end(
         self, problem: RefinementProblem, reached: _Reached, parameters: np.ndarray
     ) -> _Reached:
         """What was reached from there, if it is better."""
-        freedom = self.body.freedom(None, self.settings.extra)
+        freedom = self.body.freedom()
         last, _, steps = descend(problem, parameters, freedom, LAST_PASSES)
         steps += reached.steps
         best = min((reached.parameters, parameters, last), key=problem.J)
@@ -299,53 +282,3 @@ class Refiner:
                 reached.steps, reached.first_J, interval_seconds=seconds[1]
             ),
         )
-
-
-class ContinuousSearch:
-    """Matches silhouettes with a pose tree whose values are continuous.
-
-    Args:
-        tree: the pose tree.
-        settings: the parameters.
-    """
-
-    def __init__(self, tree: PoseTree, settings: ContinuousSearchSettings | None = None) -> None:
-        self.tree = tree
-        self.settings = settings or ContinuousSearchSettings()
-        self._grids = [BeamSearch(tree, grid) for grid in self.settings.grids]
-        self.sampled = self._grids[0].sampled
-        self._refiner = Refiner(tree, self.settings.refinement, self.sampled.values)
-
-    def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
-        """Estimate the pose that the views show.
-
-        Args:
-            views: one or several silhouettes of the same instant.
-            root_position: (3,), the root's known position in the world [m], where it is not the
-                pose tree's own.
-
-        Raises:
-            SettingsError: if there is no view.
-        """
-        begin = time.perf_counter()
-        limit = self.settings.time_limit
-        deadline = math.inf if limit is None else begin + limit
-        rounds = self._starts(views, root_position)
-        starts = next((starts for starts in rounds if starts), ())
-        if not starts:
-            seconds = time.perf_counter() - begin
-            return PoseEstimate.nothing(self.tree, stopped_by="time_limit", seconds=seconds)
-        grid_seconds = time.perf_counter() - begin
-        refined = self._refiner.refine(
-            views, starts, root_position, self.settings.escapes, deadline, rounds
-        )
-        return replace(refined, seconds=refined.seconds + grid_seconds)
-
-    def _starts(
-        self, views: Sequence[View], root_position: np.ndarray | None
-    ) -> Iterator[Sequence[Sequence[np.ndarray]]]:
-        """Each grid's best poses, made when they are asked for."""
-        for grid in self._grids:
-            yield grid.best_poses(
-                views, root_position, self.settings.starts, self.settings.alike
-            ).node_values

@@ -1,20 +1,181 @@
-"""A pose tree ready for refinement: parameters, their limits, and what moves with them."""
+"""A pose tree ready for refinement: its parameters, the poses and motions of its surfaces."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
+from drake_pose.body.tree.joint_kernel import PackedBand, PackedSteps, place_band
+from drake_pose.body.tree.node_skin import NodeSkin
 from drake_pose.body.tree.pose_tree import PoseTree
-from drake_pose.body.tree.tree_kinematics import Motions, TreeKinematics
+from drake_pose.body.tree.tree_kinematics import Motions, PackedTree, TreeKinematics, find_motions
+from drake_pose.compiled import compiled, copy_into
 from drake_pose.errors import SettingsError
-from drake_pose.search.raster_fit.placing import Surfaces, pack_bands, place_nodes
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import Outline, edge_records
+from drake_pose.silhouette.contours.contour_body import move_surface
 
 _EXTRA = 4
+
+
+class PackedBands(NamedTuple):
+    """All bands of a body one after the other; what is not told here is as in PackedBand.
+
+    starts: (bands + 1, 4) int64 where each band's joints, levels, vertices and triangles begin;
+    values: (bands, 2) int64 where its node's values begin and end; triangles: (t, 3) int32 indices
+    into the band's own vertices.
+    """
+
+    starts: np.ndarray
+    values: np.ndarray
+    triangles: np.ndarray
+    sizes: np.ndarray
+    inverted: np.ndarray
+    coefficient_starts: np.ndarray
+    coefficients: np.ndarray
+    levels: np.ndarray
+    which: np.ndarray
+    points: np.ndarray
+    turned: np.ndarray
+
+
+class Surfaces(NamedTuple):
+    """What the poses of a body's surfaces are made of.
+
+    tree: the pose tree; bands: its bands; nodes: (surfaces,) int64 the node of each surface, bands
+    last; firsts: (bands, 2) int64 each band's first vertex and triangle among those of all
+    surfaces; rooted: (nodes,) bool which go with the first root; turning: (m,) bool which of the
+    tree's values move any of these.
+    """
+
+    tree: PackedTree
+    bands: PackedBands
+    nodes: np.ndarray
+    firsts: np.ndarray
+    rooted: np.ndarray
+    turning: np.ndarray
+
+
+def pack_bands(skins: Mapping[int, NodeSkin], columns: Sequence[np.ndarray]) -> PackedBands:
+    """The bands in arrays.
+
+    Args:
+        skins: by node.
+        columns: for each node the indices of its values.
+    """
+    packed = [skin.packed for skin in skins.values()]
+    triangles = [np.zeros((0, 3), dtype=np.int32), *(skin.triangles for skin in skins.values())]
+    counts = [
+        (len(band.steps.sizes), len(band.levels), len(band.which), len(skin.triangles))
+        for band, skin in zip(packed, skins.values(), strict=True)
+    ]
+    rows = np.cumsum([0, *(len(band.steps.coefficients) for band in packed)])
+    values = [(columns[node][0], columns[node][-1] + 1) for node in skins]
+    empty = np.zeros(0, dtype=np.int64)
+    return PackedBands(
+        starts=np.cumsum([(0, 0, 0, 0), *counts], axis=0).astype(np.int64),
+        values=np.array(values, dtype=np.int64).reshape(-1, 2),
+        triangles=np.concatenate(triangles),
+        sizes=np.concatenate([empty, *(band.steps.sizes for band in packed)]),
+        inverted=np.concatenate(
+            [empty.astype(np.bool_), *(band.steps.inverted for band in packed)]
+        ),
+        coefficient_starts=np.concatenate(
+            [empty, *(b.steps.starts + n for b, n in zip(packed, rows, strict=False))]
+        ),
+        coefficients=np.vstack([np.zeros((0, 16)), *(band.steps.coefficients for band in packed)]),
+        levels=np.concatenate([np.zeros(0), *(band.levels for band in packed)]),
+        which=np.concatenate([empty, *(band.which for band in packed)]),
+        points=np.vstack([np.zeros((0, 3)), *(band.points for band in packed)]),
+        turned=np.array([bool(band.turned[0]) for band in packed], dtype=np.bool_),
+    )
+
+
+@compiled
+def place_nodes(surfaces: Surfaces, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Poses X_WN (nodes, 4, 4), scaled where the body has grown, and twists (m + 4, 7).
+
+    Args:
+        surfaces: the body.
+        parameters: (m + 4,) the tree's values, the first root's shift and the logarithm of growth.
+    """
+    count = parameters.shape[0] - 4
+    X_WN, turns = find_motions(surfaces.tree, parameters[:count])
+    twists = np.zeros((count + 4, 7))
+    copy_into(twists, turns)
+    size = np.exp(parameters[count + 3])
+    p_WR = X_WN[0, :3, 3].copy()
+    shift = parameters[count : count + 3]
+    center = p_WR + shift - size * p_WR
+    for node in range(X_WN.shape[0]):
+        if surfaces.rooted[node]:
+            for i in range(3):
+                for j in range(3):
+                    X_WN[node, i, j] *= size
+                X_WN[node, i, 3] = center[i] + size * X_WN[node, i, 3]
+    for k in range(count):
+        if surfaces.turning[k]:
+            for i in range(3):
+                a, b = (i + 1) % 3, (i + 2) % 3
+                turned = twists[k, a] * center[b] - twists[k, b] * center[a]
+                twists[k, 3 + i] = size * turns[k, 3 + i] - turned
+    for i in range(3):
+        twists[count + i, 3 + i] = 1.0
+        twists[count + 3, 3 + i] = -(p_WR[i] + shift[i])
+    twists[count + 3, 6] = 1.0
+    return X_WN, twists
+
+
+@compiled
+def place_surfaces(
+    surfaces: Surfaces,
+    parameters: np.ndarray,
+    bent: np.ndarray,
+    points: np.ndarray,
+    planes: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Poses X_WS (surfaces, 4, 4) and the twists (m + 4, 7); bends the bands.
+
+    Args:
+        surfaces: the body.
+        parameters: (m + 4,).
+        bent: (m + 4,) the parameters at which the bands are now; written.
+        points, planes: those of a ContourBody of all surfaces; written.
+    """
+    bands = surfaces.bands
+    for b in range(bands.values.shape[0]):
+        first, end = bands.values[b]
+        changed = False
+        for k in range(first, end):
+            changed = changed or parameters[k] != bent[k]
+            bent[k] = parameters[k]
+        if changed:
+            s, level, v, t = bands.starts[b]
+            s_end, level_end, v_end, t_end = bands.starts[b + 1]
+            placed = np.empty((1, v_end - v, 3))
+            band = PackedBand(
+                PackedSteps(
+                    bands.sizes[s:s_end], bands.inverted[s:s_end],
+                    bands.coefficient_starts[s:s_end],
+                    bands.coefficients,
+                ), bands.levels[level:level_end], bands.which[v:v_end],
+                bands.points[v:v_end], bands.turned[b : b + 1],
+            )  # fmt: skip
+            place_band(band, parameters[first:end].copy().reshape(1, end - first), placed)
+            move_surface(
+                points[surfaces.firsts[b, 0] :],
+                planes[surfaces.firsts[b, 1] :],
+                bands.triangles[t:t_end],
+                placed[0],
+            )
+    X_WN, twists = place_nodes(surfaces, parameters)
+    X_WS = np.empty((surfaces.nodes.shape[0], 4, 4))
+    for s in range(X_WS.shape[0]):
+        copy_into(X_WS[s], X_WN[surfaces.nodes[s]])
+    return X_WS, twists
 
 
 @dataclass(frozen=True, eq=False)

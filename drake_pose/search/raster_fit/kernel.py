@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_pose.compiled import compiled
+from drake_pose.fit.kernel import seen_from
 from drake_pose.fit.point_motion import picture_rows, speed_along
 from drake_pose.search.raster_fit.lines import Border, compare_line, pixels_apart
 from drake_pose.silhouette.contours.contour_body import ContourBody, find_body_segments
@@ -137,18 +138,6 @@ def unite_spans(
 
 
 @compiled
-def _place_in_camera(X_CW: np.ndarray, X_WS: np.ndarray) -> np.ndarray:
-    """X_CS (surfaces, 4, 4)."""
-    X_CS = np.zeros_like(X_WS)
-    for s in range(X_WS.shape[0]):
-        for i in range(4):
-            for k in range(4):
-                for j in range(4):
-                    X_CS[s, i, j] += X_CW[i, k] * X_WS[s, k, j]
-    return X_CS
-
-
-@compiled
 def add_normal_equations(
     body: ContourBody,
     still: Border,
@@ -181,9 +170,7 @@ def add_normal_equations(
         The pixels that body or silhouette covers, but not both, as the rows looked at show them;
         the sum of all weights; and that of the weighted squares of the residuals.
     """
-    segments = find_body_segments(
-        body, _place_in_camera(X_CW, movements.X_WS), camera, movements.moved
-    )
+    segments = find_body_segments(body, seen_from(X_CW, movements.X_WS), camera, movements.moved)
     ends = segments.ends
     apart, total, squares = 0.0, 0.0, 0.0
     row = np.empty(movements.columns.shape[0])
@@ -275,7 +262,7 @@ def find_contour_border(
         wanted: (surfaces,) bool which.
         border: the silhouette's border.
     """
-    segments = find_body_segments(body, _place_in_camera(X_CW, X_WS), camera, wanted)
+    segments = find_body_segments(body, seen_from(X_CW, X_WS), camera, wanted)
     borders = []
     spans = np.empty((segments.ends.shape[0] + 1, 2), dtype=np.int64)
     for across in range(2):
@@ -315,7 +302,7 @@ def count_apart(
         border: the silhouette's border.
     """
     everything = np.ones(X_WS.shape[0], dtype=np.bool_)
-    segments = find_body_segments(body, _place_in_camera(X_CW, X_WS), camera, everything)
+    segments = find_body_segments(body, seen_from(X_CW, X_WS), camera, everything)
     width, height = int(camera[6]), int(camera[7])
     starts, places, owners = find_crossings(segments, 0, 0.0, 1.0, height)
     spans = np.empty((segments.ends.shape[0] + 1, 2), dtype=np.int64)

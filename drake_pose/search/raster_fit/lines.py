@@ -44,24 +44,10 @@ def find_border(mask: np.ndarray) -> Border:
     return Border(rows, row_places, columns, column_places, np.zeros(len(mask)))
 
 
-@compiled
 def _find_changes(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where the lines of pixels (n, m) change between 0 and 1: Border's starts and places."""
-    starts = np.zeros(pixels.shape[0] + 1, dtype=np.int64)
-    places = np.empty(pixels.size + pixels.shape[0])
-    count = 0
-    for line in range(pixels.shape[0]):
-        before = 0
-        for k in range(pixels.shape[1]):
-            if pixels[line, k] != before:
-                before = pixels[line, k]
-                places[count] = k - 0.5
-                count += 1
-        if before != 0:
-            places[count] = pixels.shape[1] - 0.5
-            count += 1
-        starts[line + 1] = count
-    return starts, places[:count].copy()
+    lines, places = np.nonzero(np.diff(np.pad(pixels, ((0, 0), (1, 1)))))
+    return np.searchsorted(lines, np.arange(len(pixels) + 1)), places - 0.5
 
 
 @compiled

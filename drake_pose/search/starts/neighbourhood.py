@@ -11,16 +11,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from drake_pose.errors import SettingsError
 from drake_pose.search.raster_fit.body import Freedom
 from drake_pose.search.raster_fit.lines import Border
-from drake_pose.search.raster_fit.passes import Pass, descend
-from drake_pose.search.raster_fit.problem import RefinementProblem
+from drake_pose.search.raster_fit.problem import Pass, RefinementProblem, descend
 from drake_pose.search.starts.depth_reflections import Reflection
 from drake_pose.search.starts.part_placement import Part, PartSearch
 
@@ -47,31 +44,12 @@ _EQUAL = 0.01
 _BETTER = 0.003
 # Errors that differ by a smaller share are the same.
 _SAME_ERROR = 0.1
-
-
-@dataclass(frozen=True)
-class NeighbourhoodSettings:
-    """Parameters of the search for better placements of parts.
-
-    Args:
-        proposals: how many placements of a part are refined.
-        least_error: parts with less wrong area near them are left alone until all are tried [share
-            of the area].
-        rounds: how often a part is tried at most before all are, and as often again then.
-
-    Raises:
-        SettingsError: if a value is out of its range.
-    """
-
-    proposals: int = 3
-    least_error: float = 0.001
-    rounds: int = 2
-
-    def __post_init__(self) -> None:
-        if self.proposals < 1 or self.rounds < 0:
-            raise SettingsError("proposals must be 1 or more, and rounds 0 or more")
-        if not self.least_error >= 0.0:
-            raise SettingsError(f"least_error must be 0 or more, not {self.least_error}")
+# How many placements of a part are refined.
+_PROPOSALS = 3
+# Parts with less wrong area near them are left alone until all are tried [share of the area].
+_LEAST_ERROR = 0.001
+# How often a part is tried at most before all are, and as often again then.
+_ROUNDS = 2
 
 
 class _Other(NamedTuple):
@@ -88,7 +66,6 @@ class NeighbourhoodSearch:
     Args:
         problem: the silhouettes.
         search: finds placements.
-        settings: the parameters.
         reflections: whether half of the body may be mirrored.
     """
 
@@ -96,13 +73,11 @@ class NeighbourhoodSearch:
         self,
         problem: RefinementProblem,
         search: PartSearch,
-        settings: NeighbourhoodSettings | None = None,
         *,
         reflections: bool = True,
     ) -> None:
         self.problem = problem
         self.search = search
-        self.settings = settings or NeighbourhoodSettings()
         # What is mirrored in the depth of one camera another one sees.
         mirrored = search.reflections if reflections and len(problem.views) == 1 else ()
         self._moves: tuple[Part | Reflection, ...] = (*search.parts, *mirrored)
@@ -137,9 +112,9 @@ class NeighbourhoodSearch:
             The parameters and their J.
         """
         J = float(self.problem.J(parameters))
-        rounds = self.settings.rounds * (2 if everywhere else 1)
+        rounds = _ROUNDS * (2 if everywhere else 1)
         same = _BETTER * self.problem.border_length
-        least = self.settings.least_error * self.problem.area
+        least = _LEAST_ERROR * self.problem.area
         last = np.inf if tries is None else int(self._tried.sum()) + tries
         while J > enough and self._tried.sum() < last and time.perf_counter() < deadline:
             errors = self._errors_near(parameters, J)
@@ -214,7 +189,7 @@ class NeighbourhoodSearch:
         if not erring:
             return starts
         alone = None if move.held else still
-        return starts + search.propose(problem, parameters, move, self.settings.proposals, alone)
+        return starts + search.propose(problem, parameters, move, _PROPOSALS, alone)
 
     def _try(
         self, parameters: np.ndarray, J: float, chosen: int, erring: bool
@@ -270,6 +245,6 @@ class NeighbourhoodSearch:
         near = J + _NEAR * length
         if near < apart <= J + _MENDED * length:
             refined, _, _ = descend(problem, refined, problem.body.freedom(), _WHOLE_PASSES)
-            mending = NeighbourhoodSearch(problem, self.search, self.settings, reflections=False)
+            mending = NeighbourhoodSearch(problem, self.search, reflections=False)
             refined, apart = mending.improve(refined, near, tries=_MENDINGS)
         return refined, apart

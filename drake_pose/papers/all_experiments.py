@@ -19,11 +19,7 @@ from drake_pose.errors import OutputError
 from drake_pose.filtering.kalman.truncated_filter import FilterSettings
 from drake_pose.papers.date import run_experiment as run_date
 from drake_pose.papers.date_pictures import save_pictures as save_date
-from drake_pose.papers.kameda import (
-    beam_experiment_search,
-    continuous_search,
-    experiment_search,
-)
+from drake_pose.papers.kameda import beam_experiment_search, continuous_search, experiment_search
 from drake_pose.papers.kameda import run_experiment as run_kameda
 from drake_pose.papers.kameda_figures import (
     PAPER,

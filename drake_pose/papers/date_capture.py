@@ -133,7 +133,7 @@ class Seen(NamedTuple):
     faces: tuple[Picture, ...]
 
 
-class Track:
+class _StagedRun:
     """A ready diagram that is run frame by frame, each stage by the clock.
 
     Attributes:
@@ -150,14 +150,6 @@ class Track:
     def context(self) -> Context:
         """The diagram's."""
         return self._simulator.get_mutable_context()
-
-    def step(self, images: Images) -> Array:
-        """The positions (nq,) of one more frame."""
-        raise NotImplementedError
-
-    def destroyed(self, q: Array, generator: np.random.Generator) -> Track:
-        """A track that has lost the person, who was at q (nq,)."""
-        raise NotImplementedError
 
     def _begin_frame(self) -> None:
         """Goes to just before the next frame's update, which so sees the images that follow."""
@@ -183,7 +175,7 @@ class Track:
         self.milliseconds.append(laps)
 
 
-class PaperTrack(Track):
+class PaperTrack(_StagedRun):
     """The paper's way, with its search for elbows and knees or without.
 
     A frame whose pose was recognised adds no milliseconds.
@@ -261,15 +253,8 @@ class PaperTrack(Track):
         return track
 
 
-class SilhouetteTrack(Track):
-    """All silhouettes at once.
-
-    Args:
-        capture: the diagram.
-        tracker: what it follows with.
-        shared: another track of the same diagram, whose silhouettes of each frame are used, too, as
-            it stepped before; None: the images are looked at.
-    """
+class SilhouetteTrack(_StagedRun):
+    """All silhouettes at once; those of another track of the same diagram that stepped before."""
 
     def __init__(
         self,
@@ -339,3 +324,6 @@ class SilhouetteTrack(Track):
     def _set_state(self, state: TrackState) -> None:
         person = self._capture.person
         person.set_person(person.GetMyMutableContextFromRoot(self.context), state)
+
+
+Track = PaperTrack | SilhouetteTrack

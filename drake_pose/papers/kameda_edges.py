@@ -38,12 +38,7 @@ _WRONG = 0.25
 def settle_by_edges(
     result: ExperimentResult, count: Count = uncounted, noise: float = 0.0
 ) -> dict[str, int]:
-    """Choose among the poses that look the same by their inner edges.
-
-    Args:
-        result: an experiment whose answers are sets.
-        count: counts the images.
-        noise: see noisy_edges; 0: the edges of the label image as they are.
+    """Choose among the poses that look the same by their inner edges, noisy or as they are.
 
     Returns:
         How many silhouettes are ``ambiguous``: more than one pose is as good; in how many of them

@@ -49,12 +49,7 @@ _KINDS: dict[str, tuple[str, Callable[[Trial], bool]]] = {
 def save_pictures(result: ExperimentResult, folder: Path) -> list[Path]:
     """Draw examples of each kind of outcome, a histogram of the effort, and poses as good.
 
-    Args:
-        result: the experiment.
-        folder: where the PNG files go; made if it is not there.
-
-    Returns:
-        The files written.
+    Returns the PNG files written.
     """
     figures = {}
     for name, (title, belongs) in _KINDS.items():
@@ -159,17 +154,11 @@ def _draw_chest_ranks(result: ExperimentResult, limit: int) -> Figure:
 
 
 def chest_ranks(result: ExperimentResult) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Where the true chest stands in its list of candidates, the head where it truly is.
+    """By image the true chest's rank in its list of candidates, from 1, and the lists' lengths.
 
-    The paper says that what the list's length K cuts off is why silhouettes are not matched (6.1,
-    figure 12).
-
-    Args:
-        result: of the paper's search; its r and its order, but no K.
-
-    Returns:
-        By image the true chest's rank, from 1; 0: it is not in the list, as it leaves the
-        silhouette by more than r. And the lists' lengths.
+    The head is where it truly is; r and the order are the search's, but there is no K, which the
+    paper says is why silhouettes are not matched (6.1, figure 12). 0: the true chest leaves the
+    silhouette by more than r.
     """
     search = result.search
     assert isinstance(search, PaperSearch)
@@ -213,21 +202,11 @@ def _chest_list(
 def save_families(
     path: Path, model: ParsedModel, answer: PoseSet, views: Sequence[View], most: int = 6
 ) -> Path:
-    """Draw the families side by side, a column each: what the silhouettes leave open.
+    """Draw the best families as columns of a PNG file: what the silhouettes leave open.
 
     For every camera the first row shows the segments of the family's representative in colours,
     the second where its body and the silhouette agree. Below stand the joints that are free in
     the family.
-
-    Args:
-        path: the PNG file.
-        model: the model.
-        answer: the families.
-        views: the silhouettes.
-        most: how many families are drawn, the best first.
-
-    Returns:
-        The file written.
     """
     families = answer.families[:most]
     renderers = [LabelRenderer(model, view.camera) for view in views]

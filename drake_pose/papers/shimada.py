@@ -2,9 +2,9 @@
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +21,7 @@ from drake_pose.filtering.hand.observation import (
     SPREADS,
     HandObservation,
 )
-from drake_pose.filtering.kalman.truncated_filter import (
-    FilterSettings,
-    TruncatedFilter,
-    Truncation,
-)
+from drake_pose.filtering.kalman.truncated_filter import FilterSettings, TruncatedFilter, Truncation
 from drake_pose.filtering.kalman.update import update
 from drake_pose.filtering.state import Belief
 from drake_pose.filtering.truncation.couplings import model_inequalities
@@ -36,13 +32,7 @@ from drake_pose.papers.shimada_motion import (
     SyntheticSequence,
     make_sequence,
 )
-from drake_pose.papers.tables import (
-    Count,
-    figure_table,
-    require_choice,
-    require_counts,
-    uncounted,
-)
+from drake_pose.papers.tables import Count, figure_table, require_choice, require_counts, uncounted
 
 Array = NDArray[np.float64]
 
@@ -55,6 +45,7 @@ LOST_ANGLE_ERROR = 20.0
 
 _LOST_LENGTH_ERROR = 5.0
 _LENGTHS = HAND_STATE.indices(LENGTHS)
+_R_13 = HAND_STATE.index("length_13")
 _ANGLES = HAND_STATE.indices((*SPREADS, *FLEXIONS))
 _ROWS = {
     "length_error_mean": ("length error, mean [pixel]", "{:.2f}"),
@@ -69,8 +60,7 @@ _ROWS = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Trial:
+class Trial(NamedTuple):
     """One sequence, filtered.
 
     Attributes:
@@ -78,8 +68,8 @@ class Trial:
         means, deviations: (55, n) of the best hypothesis after each frame.
         covariance: (n, n) of the last.
         milliseconds: (55,) of the processor for prediction and update; nan once it broke down.
-        bound_length_error: mean absolute error of the six lengths at the end [pixel] of a filter
-            linearised at the truth, without limits: what the measurements hold.
+        bound: (n,) what a filter would believe at the end that is linearised at the truth, without
+            limits: what the measurements hold.
     """
 
     sequence: SyntheticSequence
@@ -87,37 +77,7 @@ class Trial:
     deviations: Array
     covariance: Array
     milliseconds: Array
-    bound_length_error: float
-
-    @property
-    def length_error(self) -> float:
-        """Mean absolute error of the six lengths at the end [pixel]."""
-        return _length_error(self.means[-1], self.sequence)
-
-    @property
-    def angle_errors(self) -> Array:
-        """(55,) root mean square error of the eight joint angles [deg]."""
-        return angle_error(self.means, self.sequence.states)
-
-    @property
-    def inside(self) -> NDArray[np.bool_]:
-        """(14,) which lengths and angles are within 2 deviations of the truth at the end."""
-        watched = np.concatenate([_LENGTHS, _ANGLES])
-        errors = self.means[-1, watched] - self.sequence.states[-1, watched]
-        return np.asarray(np.abs(errors) < 2 * self.deviations[-1, watched])
-
-    @property
-    def nees(self) -> float:
-        """Normalised squared error of the six lengths at the end; 6 on average if honest."""
-        errors = self.means[-1, _LENGTHS] - self.sequence.states[-1, _LENGTHS]
-        covariance = self.covariance[np.ix_(_LENGTHS, _LENGTHS)]
-        return float(errors @ np.linalg.pinv(covariance, hermitian=True) @ errors)
-
-    @property
-    def lost(self) -> bool:
-        """Whether the lengths or the angles are far off at the end."""
-        good = self.length_error < _LOST_LENGTH_ERROR and self.angle_errors[-1] < LOST_ANGLE_ERROR
-        return not good
+    bound: Array
 
 
 @dataclass(frozen=True)
@@ -251,17 +211,12 @@ def _filter_sequence(hand_filter: TruncatedFilter, sequence: SyntheticSequence) 
                 # A plain filter that has run away has no covariance any more: it is lost.
                 broken = True
         means[t], deviations[t] = state.best.mean, state.best.deviations()
-    bound = _bound(hand_filter, sequence)
-    return Trial(sequence, means, deviations, state.best.covariance, milliseconds, bound)
+    covariance, bound = state.best.covariance, _bound(hand_filter, sequence)
+    return Trial(sequence, means, deviations, covariance, milliseconds, bound)
 
 
-def _length_error(mean: Array, sequence: SyntheticSequence) -> float:
-    errors = mean[_LENGTHS] - sequence.states[-1, _LENGTHS]
-    return PIXELS_PER_METRE * float(np.mean(np.abs(errors)))
-
-
-def _bound(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> float:
-    """The length error of a filter that linearises at the truth, without limits [pixel]."""
+def _bound(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> Array:
+    """(n,) what a filter believes at the end that linearises at the truth, without limits."""
     A = HAND_STATE.transition()
     U = HAND_STATE.process_noise(ACCELERATIONS)
     belief = sequence.guess
@@ -269,27 +224,40 @@ def _bound(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> float:
         if t:
             belief = Belief(A @ belief.mean, A @ belief.covariance @ A.T + U)
         belief = update(belief, y, hand_filter.observation, 1, truth).belief
-    return _length_error(belief.mean, sequence)
+    return belief.mean
 
 
-def _figures(trials: tuple[Trial, ...]) -> dict[str, float | int]:
-    errors = np.array([trial.length_error for trial in trials])
-    angles = np.array([trial.angle_errors for trial in trials])
+def _figures(trials: Sequence[Trial]) -> dict[str, float | int]:
+    """Figures of a case; a run's NEES of the six lengths is 6 on average if it is honest."""
+    truths = np.array([trial.sequence.states for trial in trials])
+    means = np.array([trial.means for trial in trials])
+    errors = (means - truths)[:, -1]
+    lengths, bounds = (
+        PIXELS_PER_METRE * np.mean(np.abs(off[:, _LENGTHS]), axis=1)
+        for off in (errors, [trial.bound for trial in trials] - truths[:, -1])
+    )
+    angles = angle_error(means, truths)
+    watched = np.concatenate([_LENGTHS, _ANGLES])
+    sigma = np.array([trial.deviations[-1] for trial in trials])
+    nees = np.array(
+        [
+            off @ np.linalg.pinv(trial.covariance[np.ix_(_LENGTHS, _LENGTHS)], hermitian=True) @ off
+            for trial, off in zip(trials, errors[:, _LENGTHS], strict=True)
+        ]
+    )
     low, high = chdtri(len(LENGTHS), [0.975, 0.025])
-    nees = np.array([trial.nees for trial in trials])
-    index = HAND_STATE.index("length_13")
-    r_13 = PIXELS_PER_METRE * np.array([trial.means[-1, index] for trial in trials])
-    true_r_13 = PIXELS_PER_METRE * trials[0].sequence.states[-1, index]
+    r_13 = PIXELS_PER_METRE * np.array([means[:, -1, _R_13], truths[:, -1, _R_13]])
+    lost = ~((lengths < _LOST_LENGTH_ERROR) & (angles[:, -1] < LOST_ANGLE_ERROR))
     return {
-        "length_error_mean": float(errors.mean()),
-        "length_error_p95": float(np.percentile(errors, 95)),
+        "length_error_mean": float(lengths.mean()),
+        "length_error_p95": float(np.percentile(lengths, 95)),
         "angle_rmse": float(np.sqrt(np.mean(angles**2))),
-        "inside_2sigma": float(np.mean([trial.inside for trial in trials])),
+        "inside_2sigma": float(np.mean((np.abs(errors) < 2 * sigma)[:, watched])),
         "nees_inside": float(np.mean((nees > low) & (nees < high))),
         "ms_per_update": float(np.nanmedian([trial.milliseconds for trial in trials])),
-        "lost": sum(trial.lost for trial in trials),
+        "lost": int(np.count_nonzero(lost)),
         "angle_rmse_at_end": float(np.sqrt(np.mean(angles[:, -1] ** 2))),
-        "r_13_mean": float(r_13.mean()),
-        "r_13_rmse": float(np.sqrt(np.mean((r_13 - true_r_13) ** 2))),
-        "bound_length_error_mean": float(np.mean([t.bound_length_error for t in trials])),
+        "r_13_mean": float(r_13[0].mean()),
+        "r_13_rmse": float(np.sqrt(np.mean((r_13[0] - r_13[1]) ** 2))),
+        "bound_length_error_mean": float(bounds.mean()),
     }

@@ -18,13 +18,7 @@ from drake_pose.papers.shimada import (
     experiment_settings,
 )
 from drake_pose.papers.shimada_motion import OBSERVED, SyntheticSequence, make_sequence
-from drake_pose.papers.tables import (
-    Count,
-    figure_table,
-    require_choice,
-    require_counts,
-    uncounted,
-)
+from drake_pose.papers.tables import Count, figure_table, require_choice, require_counts, uncounted
 
 Array = NDArray[np.float64]
 
@@ -58,16 +52,15 @@ _ROWS = {
 
 @dataclass(frozen=True, eq=False)
 class Fate:
-    """A hypothesis from its birth to its end.
+    """A hypothesis of one run from its birth to its end.
 
     Attributes:
-        run: number of the sequence.
         frames: (k,) the frames it lived in, from 1; the last is that of its end.
         means: (k, n) what it believed, in the end without the limits.
         weights: (k,) between 0 and 1; NaN in the end.
         reason, row, c: as for ``Rejection``; the reason is "" where it outlived the sequence.
-        error: of its joint angles when it was last believed, or in its only frame [deg], RMS.
-        kept_error: that of the heaviest hypothesis in the frame of its end.
+        error, kept_error: of the joint angles [deg], RMS: its own when it was last believed, and
+            that of the heaviest hypothesis in the frame of its end.
     """
 
     run: int
@@ -97,14 +90,9 @@ class Fate:
 
 @dataclass(frozen=True, eq=False)
 class HypothesesResult:
-    """What became of all hypotheses, mirrored ones and first ones.
+    """What became of all hypotheses, mirrored ones and first ones, and how they were made.
 
-    Attributes:
-        fates: theirs.
-        sequences: the truths.
-        final_errors: (runs,) of the heaviest hypothesis' joint angles in the last frame [deg].
-        inequalities: of the filter.
-        settings: how it was made, for the JSON.
+    final_errors: (runs,) of the heaviest hypothesis' joint angles in the last frame [deg].
     """
 
     fates: tuple[Fate, ...]

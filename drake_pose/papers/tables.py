@@ -33,22 +33,14 @@ def uncounted(_what: str, _total: int) -> Advance:
 
 
 def require_counts(**counts: int) -> None:
-    """Refuses counts below 1.
-
-    Raises:
-        SettingsError: names the first.
-    """
+    """Raises SettingsError, which names the first count below 1."""
     for name, count in counts.items():
         if count < 1:
             raise SettingsError(f"{name} must be 1 or more, not {count}")
 
 
 def require_choice(name: str, value: str, choices: Sequence[str]) -> None:
-    """Refuses a value that is none of the choices.
-
-    Raises:
-        SettingsError: names them.
-    """
+    """Raises SettingsError, which names the choices, where a value is none of them."""
     if value not in choices:
         raise SettingsError(f"{name} must be one of {', '.join(choices)}, not '{value}'")
 
@@ -58,9 +50,7 @@ def spread_over_seeds(
 ) -> dict[str, dict[str, float]]:
     """Mean, smallest and largest of every number over runs that differ in the seed alone.
 
-    Args:
-        runs: the figures of each.
-        without: keys that are no outcome.
+    Keys that are no outcome are left out.
     """
     spread = {}
     for key, first in runs[0].items():

@@ -227,6 +227,7 @@ def test_cameras_tell_together_whose_fault_a_frame_is() -> None:
 
 
 class TestZeros:
+    @pytest.mark.slow
     def test_zeros_are_found_and_written_to_a_urdf(self, own_arm: ArmScene, tmp_path: Path) -> None:
         off = np.radians(3.0)
         rows = own_arm.rows()
@@ -267,6 +268,7 @@ class TestZeros:
 
 
 class TestLengths:
+    @pytest.mark.slow
     def test_lengths_are_found_and_written_to_a_urdf(
         self, own_arm: ArmScene, tmp_path: Path
     ) -> None:

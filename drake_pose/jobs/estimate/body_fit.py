@@ -142,7 +142,7 @@ class _BodyFit:
         seconds = time.perf_counter() - begin
         self._more["body_fit_seconds"] = round(seconds, 3)
         known = {k: replace(one, seconds=seconds / len(known)) for k, one in known.items()}
-        started = _StartedSearch(search.tree, search.settings, search.placement)
+        started = _StartedSearch(search.tree, search.settings, search.scale_unknown)
         started.first = known[max(known)]
         by_frame = {self._inputs.frames[k]: one for k, one in known.items()}
         inputs = replace(self._inputs, search=started, known=by_frame)

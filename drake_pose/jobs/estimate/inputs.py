@@ -40,7 +40,7 @@ from drake_pose.search.estimates import PoseEstimate
 from drake_pose.search.kameda.search import PaperSearch
 from drake_pose.search.scoring import PoseSearch
 from drake_pose.search.settings import BeamSearchSettings, PaperSearchSettings
-from drake_pose.search.starts.root_placement import PlacementSettings, hub, turns_freely
+from drake_pose.search.starts.root_placement import hub, turns_freely
 from drake_pose.silhouette.areas.visibility import require_visible
 from drake_pose.silhouette.pictures.scenes import Scene, load_scene
 
@@ -313,7 +313,7 @@ def make_placement_search(
         rotation = RootRotation.free(interval_deg=_FREE_ROOT_INTERVAL)
         tree = model.pose_tree(hub(tree), root_position=first, root_rotation=rotation, held=held)
     beam = BeamSearchSettings(**_sampling(model, settings), time_limit=settings.time_limit)
-    return RootPlacementSearch(tree, beam, PlacementSettings(scale_unknown=scale_unknown))
+    return RootPlacementSearch(tree, beam, scale_unknown)
 
 
 def _check_pictures(

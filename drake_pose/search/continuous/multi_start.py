@@ -9,7 +9,6 @@ other (``self_motions``).
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -35,7 +34,13 @@ from drake_pose.search.grid.families.examination import ExaminationSettings, exa
 from drake_pose.search.grid.sampled_body import SampledBody
 from drake_pose.search.scoring import Scoring
 from drake_pose.search.settings import BeamSearchSettings
-from drake_pose.search.starts.coarse_search import CoarsePoses, CoarseSearch, CoarseSettings
+from drake_pose.search.starts.coarse_search import (
+    HYPOTHESES,
+    INTERVAL,
+    LENGTH_INTERVAL,
+    CoarsePoses,
+    CoarseSearch,
+)
 from drake_pose.search.starts.self_motions import counter_turns, flips
 from drake_pose.silhouette.areas.scoring import score_bodies
 
@@ -50,6 +55,16 @@ MEDIUM = (AnnealingStage(0.05, 0.026, 4), AnnealingStage(0.025, 0.026, 4))
 FINAL = (AnnealingStage(0.0125, 0.0125, 6),)
 
 
+# How many coarse poses are fitted, how many go on, and how many are fitted to the end.
+_STARTS, _SURVIVORS, _FINALISTS = 40, 12, 4
+# Coarse poses differ where some part of the body is seen so far away, as a share of the root of the
+# silhouettes' mean area.
+_APART = 0.13
+# About how many of the best poses others are sought; of each so many are fitted, and so many more
+# that are made by flips of its joints.
+_SOUGHT_ABOUT, _TRIED, _FLIPPED = 3, 6, 3
+
+
 @dataclass(frozen=True)
 class MultiStartSettings:
     """Parameters of the multi-start search.
@@ -57,16 +72,7 @@ class MultiStartSettings:
     Args:
         beam: of the search on the grid. Its time limit is that of the multi-start search.
         continuous: False: nothing but the search on the grid is run.
-        coarse: of the search for coarse poses.
-        starts: how many coarse poses are refined.
-        apart: coarse poses differ where some part of the body is seen so far away, as a share of
-            the root of the silhouettes' mean area.
-        survivors: how many of them are refined further.
-        finalists: how many are refined to the end.
         rounds: how often other explanations are sought about the best poses.
-        sought_about: about how many of them.
-        tried: how many other explanations of each are refined.
-        flipped: how many more, made by flips of its joints, are refined.
         families: of the answer as a set; None: only the best pose is wanted.
         examination: of an answer on the grid.
 
@@ -76,26 +82,13 @@ class MultiStartSettings:
 
     beam: BeamSearchSettings = field(default_factory=BeamSearchSettings)
     continuous: bool = True
-    coarse: CoarseSettings = field(default_factory=CoarseSettings)
-    starts: int = 40
-    apart: float = 0.13
-    survivors: int = 12
-    finalists: int = 4
     rounds: int = 2
-    sought_about: int = 3
-    tried: int = 6
-    flipped: int = 3
     families: RobustFamilySettings | None = field(default_factory=RobustFamilySettings)
     examination: ExaminationSettings | None = field(default_factory=ExaminationSettings)
 
     def __post_init__(self) -> None:
-        for name in ("starts", "survivors", "finalists", "sought_about", "tried", "flipped"):
-            if getattr(self, name) < 1:
-                raise SettingsError(f"{name} must be 1 or more, not {getattr(self, name)}")
         if self.rounds < 0:
             raise SettingsError(f"rounds must be 0 or more, not {self.rounds}")
-        if not (math.isfinite(self.apart) and self.apart >= 0.0):
-            raise SettingsError(f"apart must be 0 or more, not {self.apart}")
 
 
 class MultiStartSearch:
@@ -113,13 +106,12 @@ class MultiStartSearch:
         self._grid_search = BeamSearch(tree, beam, self.settings.examination)
         self.sampled = self._grid_search.sampled
         if self.settings.continuous:
-            coarse = self.settings.coarse
             self._body = SampledBody(
                 tree,
                 replace(
                     beam,
-                    interval=coarse.interval,
-                    length_interval=coarse.length_interval,
+                    interval=INTERVAL,
+                    length_interval=LENGTH_INTERVAL,
                     intervals={},
                 ),
             )
@@ -200,31 +192,28 @@ class _MultiStartRun:
 
     def search(self, settings: MultiStartSettings) -> None:
         """Find coarse poses, refine them, seek other explanations, and refine to the end."""
-        coarse_settings = settings.coarse
-        if not self._proceed():
-            coarse_settings = replace(coarse_settings, hypotheses=1)
-        search = CoarseSearch(self.body, self._views, coarse_settings)
-        starts = search.choose_distinct(search.find(), settings.starts, settings.apart)
+        search = CoarseSearch(self.body, self._views, HYPOTHESES if self._proceed() else 1)
+        starts = search.choose_distinct(search.find(), _STARTS, _APART)
         pool = refine_best(
             self.fit,
             self._values(starts),
-            [(COARSE, settings.survivors), (MEDIUM, settings.survivors)],
+            [(COARSE, _SURVIVORS), (MEDIUM, _SURVIVORS)],
             self._proceed,
         )
         self.first = pool[0]
         done: list[np.ndarray] = []
         for _ in range(settings.rounds):
             found = []
-            for pose in pool[: settings.sought_about]:
+            for pose in pool[:_SOUGHT_ABOUT]:
                 if any(pose.values is values for values in done) or not self._proceed():
                     continue
                 done.append(pose.values)
-                found += self._others(search, pose.values, settings)
-            pool = distinct([*pool, *found], settings.survivors, self.kinematics.turns_around)
+                found += self._others(search, pose.values)
+            pool = distinct([*pool, *found], _SURVIVORS, self.kinematics.turns_around)
         refined = refine_best(
             self.fit,
-            [pose.values for pose in pool[: settings.finalists]],
-            [(FINAL, settings.finalists)],
+            [pose.values for pose in pool[:_FINALISTS]],
+            [(FINAL, _FINALISTS)],
             self._proceed,
         )
         turned = [self.kinematics.nearest_turns(pose.values) for pose in refined]
@@ -240,23 +229,21 @@ class _MultiStartRun:
         self.stopped_by = "time_limit"
         return False
 
-    def _others(
-        self, search: CoarseSearch, values: np.ndarray, settings: MultiStartSettings
-    ) -> list[FittedPose]:
+    def _others(self, search: CoarseSearch, values: np.ndarray) -> list[FittedPose]:
         """Other explanations near a pose, refined."""
-        kinematics, interval = self.kinematics, settings.coarse.interval
+        kinematics = self.kinematics
         flipped = [flip.values for flip in flips(kinematics, values)]
-        tried = counter_turns(kinematics, values, interval)
+        tried = counter_turns(kinematics, values, INTERVAL)
         X_WN = kinematics.poses(values)
         for nodes in self._limbs():
             found = search.find_again(X_WN, nodes)
-            best = search.choose_distinct(found, settings.tried, settings.apart)
+            best = search.choose_distinct(found, _TRIED, _APART)
             tried += self._values(best, values)
         look = AnnealingStage(MEDIUM[0].scale, COARSE[0].spacing)
         best_looks = []
-        for group, count in ((flipped, settings.flipped), (tried, settings.tried)):
+        for group, count in ((flipped, _FLIPPED), (tried, _TRIED)):
             looks = [FittedPose(one, self.fit.cost(one, look)) for one in group]
-            best_looks += distinct(looks, count, kinematics.turns_around, 0.5 * interval)
+            best_looks += distinct(looks, count, kinematics.turns_around, 0.5 * INTERVAL)
         return [self.fit.refine(look.values, MEDIUM) for look in best_looks if self._proceed()]
 
     def _limbs(self) -> list[list[int]]:

@@ -37,7 +37,6 @@ from drake_pose.search.starts.neighbourhood import NeighbourhoodSearch
 from drake_pose.search.starts.part_placement import PartSearch
 from drake_pose.search.starts.root_placement import (
     Layer,
-    PlacementSettings,
     choose_root_samples,
     find_layers,
     place_body,
@@ -50,6 +49,12 @@ from drake_pose.silhouette.areas.scoring import prefix_sums, score_bodies
 
 # What may lie outside, as in the beam search's tolerant stages; the root is off by half a step.
 _OUTSIDE_SHARE, _OUTSIDE_WEIGHT = 0.6, 2
+# How many hypotheses are kept, shared among the scales or depths, and the share of them that may
+# have the root at one position.
+_HYPOTHESES, _QUOTA = 1000, 0.05
+# How many poses are refined from far; at how many of the root positions reached the poses are
+# searched again, and how many are refined to the end; and how many of each search again.
+_STARTS, _FINALISTS, _AGAIN = 24, 3, 4
 # The silhouettes are looked at with about this many pixels.
 _PIXELS = 1500
 # How many times the width are kept of the root alone.
@@ -89,7 +94,7 @@ class RootPlacementSearch:
     Args:
         tree: the pose tree; where its root is makes no difference.
         settings: the grids and the time limit; its stages are not used.
-        placement: what is unknown and how finely it is tried.
+        scale_unknown: the camera is parallel and its pixels_per_metre is not known.
 
     Raises:
         SettingsError: if the tree has several roots.
@@ -100,12 +105,12 @@ class RootPlacementSearch:
         self,
         tree: PoseTree,
         settings: BeamSearchSettings | None = None,
-        placement: PlacementSettings | None = None,
+        scale_unknown: bool = False,
     ) -> None:
         if sum(node.parent < 0 for node in tree.nodes) != 1:
             raise SettingsError("a root position can be searched only of a tree with one root")
         self.settings = settings or BeamSearchSettings()
-        self.placement = placement or PlacementSettings()
+        self.scale_unknown = scale_unknown
         p_WR = tree.node_poses(tree.default_values())[0, :3, 3]
         self.tree = tree.with_root_position(p_WR)
         self._grid = BeamSearch(
@@ -116,7 +121,7 @@ class RootPlacementSearch:
         self.sampled = self.body.sampled
         self._refined = RefinementBody(self.tree)
         self._parts = PartSearch(self._refined, self.sampled.values)
-        growth = _GROWTH if self.placement.scale_unknown else ()
+        growth = _GROWTH if self.scale_unknown else ()
         self._free = {
             True: self._refined.freedom(extra=(*_TRANSLATION, *growth)),
             False: self._refined.freedom(extra=growth),
@@ -140,9 +145,9 @@ class RootPlacementSearch:
         begin = time.perf_counter()
         limit = self.settings.time_limit
         deadline = math.inf if limit is None else begin + limit
-        layers = find_layers(self.body, views, self.placement, root_position)
+        layers = find_layers(self.body, views, self.scale_unknown, root_position)
         placed: list[_Placed] = []
-        width = math.ceil(self.placement.hypotheses / len(layers))
+        width = math.ceil(_HYPOTHESES / len(layers))
         runs = 0
         for outside_share in (_OUTSIDE_SHARE, math.inf):
             for layer in layers:
@@ -161,7 +166,7 @@ class RootPlacementSearch:
             )
         placed.sort(key=lambda one: one.J)
         first = placed[0].J / _area(views)
-        best = self._improve(placed[: self.placement.starts], root_position is None, deadline)
+        best = self._improve(placed[:_STARTS], root_position is None, deadline)
         stopped_by = "time_limit" if time.perf_counter() >= deadline else "end"
         result = self._answer(best, first, runs, stopped_by)
         return replace(result, seconds=time.perf_counter() - begin)
@@ -192,12 +197,12 @@ class RootPlacementSearch:
             p_WR = body.sampled.X_PN[0][root, :3, 3]
             parameters = self._refined.parameters(values, p_WR)
             found[root] = _Placed(layer.views, layer.scale, parameters, float(Js[i]))
-            if len(found) >= self.placement.starts:
+            if len(found) >= _STARTS:
                 break
         return list(found.values())
 
     def _quota(self, width: int) -> int:
-        return math.ceil(self.placement.quota * width)
+        return math.ceil(_QUOTA * width)
 
     def _grow(self, beam: Beam, width: int, places: np.ndarray) -> Hypotheses | None:
         """Whole poses, no root position having more than its quota at any time.
@@ -230,12 +235,12 @@ class RootPlacementSearch:
                 break
             pool.append(self._settle(start, COARSE_PASSES, moves))
         pool.sort(key=lambda one: one.J)
-        for one in self._elsewhere(pool)[: self.placement.finalists]:
+        for one in self._elsewhere(pool)[:_FINALISTS]:
             if time.perf_counter() < deadline:
                 pool += self._search_again(one, moves)
         pool.sort(key=lambda one: one.J)
         best = min([*pool, *starts], key=lambda one: one.J)
-        for one in pool[: self.placement.finalists]:
+        for one in pool[:_FINALISTS]:
             if time.perf_counter() >= deadline or best.J <= _ENOUGH * _area(best.views):
                 break
             best = min(best, self._finish(one, moves, deadline), key=lambda one: one.J)
@@ -246,7 +251,7 @@ class RootPlacementSearch:
         chosen: list[_Placed] = []
         there: list[np.ndarray] = []
         for one in pool:
-            here = whereabouts(one.views, self._root_of(one), self.placement)
+            here = whereabouts(one.views, self._root_of(one))
             if all(np.abs(here - other).max() >= 1.0 for other in there):
                 chosen.append(one)
                 there.append(here)
@@ -276,7 +281,7 @@ class RootPlacementSearch:
     def _search_again(self, start: _Placed, moves: bool) -> list[_Placed]:
         """Poses that the beam search finds with the root where it is, refined."""
         p_WR = self._root_of(start)
-        poses = self._grid.best_poses(start.views, p_WR, self.placement.again, _ALIKE)
+        poses = self._grid.best_poses(start.views, p_WR, _AGAIN, _ALIKE)
         return [
             self._settle(
                 replace(start, parameters=self._refined.parameters(values, p_WR)),

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_pose.camera.models import ParallelCamera
-from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import View
 from drake_pose.search.grid.sampled_body import SampledBody
 from drake_pose.search.starts.coarse_kernel import (
@@ -39,44 +38,22 @@ _PARTS = 4
 _LEAST_HYPOTHESES = 64
 # How many times the hypotheses kept are looked at for some that do not stand alike.
 _SPARE = 8
+INTERVAL, LENGTH_INTERVAL = math.radians(15.0), 0.05
+"""Sampling intervals of every angle [rad] and of every prismatic position [m]."""
+
+HYPOTHESES, _AGAIN = 2500, 300
+"""At most this many are kept after each node; fewer where a limb of a pose is searched again."""
+
+# Fewer are kept where a node's samples times the hypotheses exceed this.
+_EVALUATIONS = 150_000
+# Distances that do not count, as a share of the root of the silhouette's area.
+_SLACK = 0.05
+# What a pixel outside counts; one newly covered counts one.
+_OUTSIDE_WEIGHT = 0.8
+# Frames stand alike if points in them differ by less than about this share of the body's reach.
+_ALIKE = 0.04
 # Nodes come nearer to a camera than the root by this factor at most.
 _NEARER = 0.7
-
-
-@dataclass(frozen=True)
-class CoarseSettings:
-    """Parameters of the coarse search.
-
-    Args:
-        interval: sampling interval of every angle [rad].
-        length_interval: sampling interval of every prismatic position [m].
-        hypotheses: at most this many are kept after each node.
-        again_hypotheses: the same where a limb of a pose is searched again.
-        evaluations: fewer are kept where a node's samples times the hypotheses exceed this.
-        slack: distances that do not count, as a share of the root of the silhouette's area.
-        outside_weight: what a pixel outside counts; one newly covered counts one.
-        alike: frames stand alike if points in them differ by less than about this share of the
-            body's reach.
-    """
-
-    interval: float = math.radians(15.0)
-    length_interval: float = 0.05
-    hypotheses: int = 2500
-    again_hypotheses: int = 300
-    evaluations: int = 150_000
-    slack: float = 0.05
-    outside_weight: float = 0.8
-    alike: float = 0.04
-
-    def __post_init__(self) -> None:
-        for name in ("interval", "length_interval", "outside_weight", "alike"):
-            if not getattr(self, name) > 0.0:
-                raise SettingsError(f"{name} must be positive, not {getattr(self, name)}")
-        for name in ("hypotheses", "again_hypotheses", "evaluations"):
-            if getattr(self, name) < 1:
-                raise SettingsError(f"{name} must be 1 or more, not {getattr(self, name)}")
-        if not self.slack >= 0.0:
-            raise SettingsError(f"slack must be 0 or more, not {self.slack}")
 
 
 @dataclass(frozen=True)
@@ -105,15 +82,17 @@ class CoarseSearch:
     """Finds coarse poses of one body in the silhouettes of one instant.
 
     Args:
-        body: the body, sampled at the settings' intervals.
+        body: the body, sampled at the intervals above.
         views: the silhouettes.
-        settings: the parameters.
+        hypotheses: at most this many are kept after each node.
     """
 
-    def __init__(self, body: SampledBody, views: Sequence[View], settings: CoarseSettings) -> None:
+    def __init__(
+        self, body: SampledBody, views: Sequence[View], hypotheses: int = HYPOTHESES
+    ) -> None:
         self.body = body
-        self._settings = settings
-        self._views = _prepare_views(body, views, settings)
+        self._hypotheses = hypotheses
+        self._views = _prepare_views(body, views)
         self._size = _mean_size(views)
         self._nodes = body.sampled.tree.nodes
         self._reach = max(
@@ -136,7 +115,7 @@ class CoarseSearch:
         """Search all nodes."""
         nodes = range(len(self._nodes))
         start = np.tile(np.eye(4), (len(self._nodes), 1, 1))
-        return self._find(start, set(nodes), self._settings.hypotheses)
+        return self._find(start, set(nodes), self._hypotheses)
 
     def find_again(self, X_WN: np.ndarray, again: Sequence[int]) -> CoarsePoses:
         """Search some nodes of a pose again.
@@ -145,7 +124,7 @@ class CoarseSearch:
             X_WN: (nodes, 4, 4) the pose.
             again: the nodes; with a node all its descendants must be among them.
         """
-        return self._find(X_WN, set(again), self._settings.again_hypotheses)
+        return self._find(X_WN, set(again), _AGAIN)
 
     def _find(self, start: np.ndarray, wanted: set[int], hypotheses: int) -> CoarsePoses:
         nodes = self._nodes
@@ -211,16 +190,16 @@ class CoarseSearch:
         hypotheses: int,
     ) -> tuple[CoarsePoses, list[np.ndarray]]:
         """Place one more node in every hypothesis and keep the best."""
-        settings, balls = self._settings, self._balls[node]
+        balls = self._balls[node]
         X_PN = self.body.sampled.X_PN[node]
         X_CPs = [self._parent_in(view, node, poses.X_WN) for view in self._views]
         added = np.zeros((len(poses), len(X_PN)))
         for view, X_CP, mask in zip(self._views, X_CPs, masks, strict=True):
-            score_samples(view, X_CP, balls, mask, settings.outside_weight, added)
+            score_samples(view, X_CP, balls, mask, _OUTSIDE_WEIGHT, added)
         costs = (poses.costs[:, None] + added).ravel()
         following = [i for i in self.body.limb_order if i not in placed]
         widest = len(self.body.sampled.X_PN[following[0]]) if following else 1
-        width = min(hypotheses, max(_LEAST_HYPOTHESES, settings.evaluations // widest))
+        width = min(hypotheses, max(_LEAST_HYPOTHESES, _EVALUATIONS // widest))
         pool = min(len(costs), _SPARE * width)
         best = np.argpartition(costs, pool - 1)[:pool]
         best = best[np.lexsort((best, costs[best]))]
@@ -248,7 +227,7 @@ class CoarseSearch:
         lever = 0.15 * self._reach
         points = [X[..., :3, 3], X[..., :3, 3] + lever * X[..., :3, 0]]
         points.append(X[..., :3, 3] + lever * X[..., :3, 2])
-        cells = np.rint(np.concatenate(points, axis=1) / (self._settings.alike * self._reach))
+        cells = np.rint(np.concatenate(points, axis=1) / (_ALIKE * self._reach))
         cells = cells.reshape(len(X_WN), -1).astype(np.int64)
         # Any odd numbers will do; always the same, so that answers are.
         keys = np.random.default_rng(2718).integers(1, 2**62, cells.shape[1]) | 1
@@ -276,12 +255,10 @@ def _mean_size(views: Sequence[View]) -> float:
     return math.sqrt(float(np.mean([np.count_nonzero(view.mask) for view in views])))
 
 
-def _prepare_views(
-    body: SampledBody, views: Sequence[View], settings: CoarseSettings
-) -> list[CoarseView]:
+def _prepare_views(body: SampledBody, views: Sequence[View]) -> list[CoarseView]:
     """The silhouettes as the coarse search sees them."""
     size = _mean_size(views)
-    slack, least_cell = settings.slack * size, max(1.0, size / _CELLS)
+    slack, least_cell = _SLACK * size, max(1.0, size / _CELLS)
     largest = max(max((float(r.max(initial=0.0)) for r in body.ball_radii), default=0.0), 1e-6)
     seen = []
     for view in views:

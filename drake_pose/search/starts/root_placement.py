@@ -37,48 +37,12 @@ _HALF_CUBE = 0.75
 _FARTHEST = 60
 
 
-@dataclass(frozen=True)
-class PlacementSettings:
-    """What is unknown about the root, and how finely it is tried.
-
-    Args:
-        scale_unknown: the camera is parallel and its pixels_per_metre is not known.
-        positions_across: how many positions are tried across the silhouette.
-        ratio: of two scales or depths tried one after the other.
-        cut_off: where the silhouette touches the picture's edge the body may be larger by this
-            factor than it looks, and the root that share of the silhouette's extent, less one,
-            beyond the edge.
-        hypotheses: how many are kept, shared among the scales or depths.
-        quota: the share of them that may have the root at one position.
-        starts: how many poses are refined from far.
-        finalists: at how many of the root positions reached the poses are searched again; and how
-            many of all poses are refined to the end.
-        again: how many poses are refined of those found by each of these searches.
-
-    Raises:
-        SettingsError: if a value is out of its range.
-    """
-
-    scale_unknown: bool = False
-    positions_across: int = 12
-    ratio: float = 1.12
-    cut_off: float = 1.5
-    hypotheses: int = 1000
-    quota: float = 0.05
-    starts: int = 24
-    finalists: int = 3
-    again: int = 4
-
-    def __post_init__(self) -> None:
-        for name in ("positions_across", "hypotheses", "starts", "finalists", "again"):
-            if getattr(self, name) < 1:
-                raise SettingsError(f"{name} must be 1 or more, not {getattr(self, name)}")
-        if not 0.0 < self.quota <= 1.0:
-            raise SettingsError(f"quota must lie between 0 and 1, not {self.quota}")
-        if not 1.0 < self.ratio < 2.0:
-            raise SettingsError(f"ratio must lie between 1 and 2, not {self.ratio}")
-        if not self.cut_off >= 1.0:
-            raise SettingsError(f"cut_off must be 1 or more, not {self.cut_off}")
+# How many positions are tried across the silhouette, and the ratio of two scales or depths tried
+# one after the other.
+_POSITIONS_ACROSS, _RATIO = 12, 1.12
+# Where the silhouette touches the picture's edge the body may be larger by this factor than it
+# looks, and the root that share of the silhouette's extent, less one, beyond the edge.
+_CUT_OFF = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,14 +61,14 @@ class Layer:
 
 
 def find_layers(
-    body: SampledBody, views: Sequence[View], settings: PlacementSettings, known: np.ndarray | None
+    body: SampledBody, views: Sequence[View], scale_unknown: bool, known: np.ndarray | None
 ) -> list[Layer]:
     """Where the root can be, the likeliest scales and depths first.
 
     Args:
         body: the body, its root anywhere.
         views: the silhouettes.
-        settings: what is unknown.
+        scale_unknown: the camera is parallel and its pixels_per_metre is not known.
         known: (3,) the root's position [m] if only the scale is unknown.
 
     Raises:
@@ -112,25 +76,25 @@ def find_layers(
     """
     main = max(views, key=lambda view: int(view.mask.sum()))
     camera = main.camera
-    if settings.scale_unknown and (len(views) > 1 or not isinstance(camera, ParallelCamera)):
+    if scale_unknown and (len(views) > 1 or not isinstance(camera, ParallelCamera)):
         raise SettingsError(
             "an unknown scale needs one parallel camera, but there are: "
             f"{', '.join(view.camera.name for view in views)}; a pinhole's or several cameras' "
             "scale follows from their calibration"
         )
-    if known is not None and not settings.scale_unknown:
+    if known is not None and not scale_unknown:
         return [Layer(tuple(views), known[None], 1.0)]
-    sizes = _pixel_sizes(body, main, settings)
+    sizes = _pixel_sizes(body, main)
     if len(views) > 1:
         middle = _meeting_point(views)
         if middle is not None:
-            return [_space_layer(views, middle, sizes, settings)]
+            return [_space_layer(views, middle, sizes)]
     p_CR = _in_camera(camera, body.sampled.X_PN[0][0, :3, 3])
-    places = _picture_grid(main, settings)
+    places = _picture_grid(main)
     if not isinstance(camera, ParallelCamera):
         focal = 0.5 * (camera.focal_x + camera.focal_y)
         return [Layer(tuple(views), _lift(camera, places, focal / size), 1.0) for size in sizes]
-    scales = sizes / camera.pixels_per_metre if settings.scale_unknown else np.ones(1)
+    scales = sizes / camera.pixels_per_metre if scale_unknown else np.ones(1)
     layers = []
     for scale in scales:
         scaled = scale_camera(camera, float(scale))
@@ -177,7 +141,7 @@ def slide_root(camera: ParallelCamera, p_WR: np.ndarray, factor: float) -> np.nd
     return np.asarray(camera.X_WC[:3, :3] @ p_CR + camera.X_WC[:3, 3])
 
 
-def whereabouts(views: Sequence[View], p_WR: np.ndarray, settings: PlacementSettings) -> np.ndarray:
+def whereabouts(views: Sequence[View], p_WR: np.ndarray) -> np.ndarray:
     """Where a root (3,) is seen, and how large: 1 apart is one step of what is tried.
 
     Returns:
@@ -192,8 +156,8 @@ def whereabouts(views: Sequence[View], p_WR: np.ndarray, settings: PlacementSett
             size = camera.pixels_per_metre
         else:
             size = 1.0 / max(float(depth[0]), camera.near)
-        spacing = _extent(view.mask) / settings.positions_across
-        here += [*(place[0] / spacing), np.log(size) / np.log(settings.ratio)]
+        spacing = _extent(view.mask) / _POSITIONS_ACROSS
+        here += [*(place[0] / spacing), np.log(size) / np.log(_RATIO)]
     return np.array(here)
 
 
@@ -313,19 +277,19 @@ def _draw_root(
     return pictures
 
 
-def _pixel_sizes(body: SampledBody, view: View, settings: PlacementSettings) -> np.ndarray:
+def _pixel_sizes(body: SampledBody, view: View) -> np.ndarray:
     """How many pixels a metre at the body may have (n,), the likeliest first."""
     area = float(view.mask.sum())
     low, middle, high = np.quantile(_random_areas(body, view.camera), [_RARE, 0.5, 1.0 - _RARE])
     smallest, likely, largest = np.sqrt(area / np.array([high, middle, low]))
     if _touches_edge(view.mask):
-        largest *= settings.cut_off
-    step = np.log(settings.ratio)
+        largest *= _CUT_OFF
+    step = np.log(_RATIO)
     steps = np.arange(
         np.floor(np.log(smallest / likely) / step), np.ceil(np.log(largest / likely) / step) + 1
     )
     steps = steps[np.argsort(np.abs(steps), kind="stable")]
-    return np.asarray(likely * settings.ratio**steps)
+    return np.asarray(likely * _RATIO**steps)
 
 
 def _random_areas(body: SampledBody, camera: Camera) -> np.ndarray:
@@ -370,12 +334,12 @@ def _extent(mask: np.ndarray) -> float:
     return float(np.sqrt(np.prod(high - low + 1.0)))
 
 
-def _picture_grid(view: View, settings: PlacementSettings) -> np.ndarray:
+def _picture_grid(view: View) -> np.ndarray:
     """Places (n, 2) in the picture where the root can be seen, or beyond its edge [pixel]."""
     low, high = _box(view.mask)
     extent = _extent(view.mask)
-    spacing = extent / settings.positions_across
-    beyond = (settings.cut_off - 1.0) * extent
+    spacing = extent / _POSITIONS_ACROSS
+    beyond = (_CUT_OFF - 1.0) * extent
     size = np.array([view.camera.width, view.camera.height])
     low = np.where(low < 1, -beyond, low - 0.5 * spacing)
     high = np.where(high > size - 2, size - 1 + beyond, high + 0.5 * spacing)
@@ -425,21 +389,18 @@ def _meeting_point(views: Sequence[View]) -> np.ndarray | None:
     return np.asarray(np.linalg.solve(A, b))
 
 
-def _space_layer(
-    views: Sequence[View], middle: np.ndarray, sizes: np.ndarray, settings: PlacementSettings
-) -> Layer:
+def _space_layer(views: Sequence[View], middle: np.ndarray, sizes: np.ndarray) -> Layer:
     """A grid in space about a point, of which all views leave what lies in their silhouettes.
 
     Args:
         views: the silhouettes.
         middle: (3,) about the body's middle [m].
         sizes: the pixels a metre in the largest silhouette, the likeliest first.
-        settings: how finely.
     """
     main = max(views, key=lambda view: int(view.mask.sum()))
     extent = _extent(main.mask) / float(sizes[0])
-    half = _HALF_CUBE * extent * (settings.cut_off if _touches_edge(main.mask) else 1.0)
-    spacing = extent / settings.positions_across
+    half = _HALF_CUBE * extent * (_CUT_OFF if _touches_edge(main.mask) else 1.0)
+    spacing = extent / _POSITIONS_ACROSS
     steps = spacing * np.arange(-np.ceil(half / spacing), np.ceil(half / spacing) + 1)
     points = middle + np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
     for view in views:
@@ -447,8 +408,8 @@ def _space_layer(
         seen = np.ones(len(points), dtype=np.bool_)
         if not isinstance(view.camera, ParallelCamera):
             seen = depth > view.camera.near
-        wide = _extent(view.mask) / settings.positions_across
-        beyond = (settings.cut_off - 1.0) * _extent(view.mask)
+        wide = _extent(view.mask) / _POSITIONS_ACROSS
+        beyond = (_CUT_OFF - 1.0) * _extent(view.mask)
         seen[seen] = _near(view, places[seen], 0.75 * wide, beyond)
         points = points[seen]
     return Layer(tuple(views), points, 1.0)

@@ -7,20 +7,17 @@ import pytest
 
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import ParallelCamera
-from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import View
 from drake_pose.search.grid.sampled_body import SampledBody
 from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.search.starts.coarse_kernel import fill_cover, score_samples, unite_pairs
 from drake_pose.search.starts.coarse_search import (
+    INTERVAL,
     CoarseSearch,
-    CoarseSettings,
     _spread_points,
 )
 from drake_pose.silhouette.pictures.mask_agreement import signed_distances
 from tests.search.arms import arm_cameras, arm_tree, damaged_views, draw_pose, draw_view, split
-
-SETTINGS = CoarseSettings()
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +27,7 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> PoseTree:
 
 @pytest.fixture(scope="module")
 def body(tree: PoseTree) -> SampledBody:
-    return SampledBody(tree, BeamSearchSettings(interval=SETTINGS.interval))
+    return SampledBody(tree, BeamSearchSettings(interval=INTERVAL))
 
 
 def nearest(tree: PoseTree, X_WN: np.ndarray, values: np.ndarray) -> float:
@@ -44,7 +41,7 @@ def test_the_pose_is_among_the_few(tree: PoseTree, body: SampledBody) -> None:
     found = []
     for seed in range(10):
         values = draw_pose(tree, np.random.default_rng(40 + seed))
-        search = CoarseSearch(body, damaged_views(tree, values, seed), SETTINGS)
+        search = CoarseSearch(body, damaged_views(tree, values, seed))
         poses = search.choose_distinct(search.find(), 40, 0.13)
         assert 1 <= len(poses) <= 40
         assert (np.diff(poses.costs) >= 0.0).all()
@@ -55,7 +52,7 @@ def test_the_pose_is_among_the_few(tree: PoseTree, body: SampledBody) -> None:
 
 def test_poses_are_those_of_their_samples(tree: PoseTree, body: SampledBody) -> None:
     views = [draw_view(tree, draw_pose(tree, np.random.default_rng(1)), arm_cameras()[0])]
-    poses = CoarseSearch(body, views, SETTINGS).find()
+    poses = CoarseSearch(body, views).find()
     for samples, X_WN in zip(poses.samples[:20], poses.X_WN[:20], strict=True):
         values = [grid[t] for grid, t in zip(body.sampled.values, samples, strict=True)]
         np.testing.assert_allclose(X_WN, tree.node_poses(values), atol=1e-9)
@@ -66,11 +63,11 @@ def test_a_limb_searched_again_leaves_the_rest(tree: PoseTree, body: SampledBody
     views = [draw_view(tree, values, camera) for camera in arm_cameras()]
     X_WN = tree.node_poses(split(tree, values))
     hand = len(tree.nodes) - 1
-    poses = CoarseSearch(body, views, SETTINGS).find_again(X_WN, [hand])
+    poses = CoarseSearch(body, views).find_again(X_WN, [hand])
     np.testing.assert_array_equal(poses.X_WN[:, :hand], np.tile(X_WN[:hand], (len(poses), 1, 1, 1)))
     assert (poses.samples[:, :hand] == -1).all()
     best = body.sampled.values[hand][poses.samples[0, hand], 0]
-    assert abs(best - values[-1]) <= SETTINGS.interval
+    assert abs(best - values[-1]) <= INTERVAL
 
 
 @pytest.mark.parametrize("longer", [1e3, 1e9])
@@ -80,7 +77,7 @@ def test_a_lens_that_is_far_too_long_does_not_fill_the_memory(
     view = draw_view(tree, draw_pose(tree, np.random.default_rng(3)), arm_cameras()[0])
     focal = longer * arm_cameras()[0].focal_x
     wrong = View(replace(arm_cameras()[0], focal_x=focal, focal_y=focal), view.mask)
-    search = CoarseSearch(body, [wrong], SETTINGS)
+    search = CoarseSearch(body, [wrong])
     assert sum(view.cover.nbytes for view in search._views) < 1e8
     assert len(search.find()) >= 1
 
@@ -110,7 +107,7 @@ def test_scores_are_those_of_balls_looked_at_one_by_one(
     if parallel:
         middle = camera.center_x, camera.center_y
         camera = ParallelCamera("", camera.width, camera.height, 130.0, *middle, camera.X_WC)
-    search = CoarseSearch(body, [View(camera, seen.mask)], SETTINGS)
+    search = CoarseSearch(body, [View(camera, seen.mask)])
     (view,) = search._views
     distances, points = signed_distances(seen.mask), _spread_points(seen.mask)
     n, node = 20, 3
@@ -148,11 +145,3 @@ def test_scores_are_those_of_balls_looked_at_one_by_one(
     # What is covered already counts no more.
     assert (again[:, 2] >= 0.0).all()
     assert (again[:, 2] > scores[:, 2]).any()
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [("interval", 0.0), ("hypotheses", 0), ("slack", -1.0), ("alike", 0.0)]
-)
-def test_settings_out_of_range(name: str, value: float) -> None:
-    with pytest.raises(SettingsError, match=name):
-        CoarseSettings(**{name: value})

@@ -13,7 +13,6 @@ from drake_pose.search.estimates import View
 from drake_pose.search.grid.sampled_body import SampledBody
 from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.search.starts.root_placement import (
-    PlacementSettings,
     choose_root_samples,
     find_layers,
     whereabouts,
@@ -67,7 +66,7 @@ def test_position_and_scale_of_a_parallel_camera_are_found(body):
     camera = front_camera(160)
     mask = picture(body, camera, (0.0, 0.13, 0.31))
     told = ParallelCamera("front", 160, 160, 7.0, 79.5, 79.5, camera.X_WC)
-    search = RootPlacementSearch(body.pose_tree(), SETTINGS, PlacementSettings(scale_unknown=True))
+    search = RootPlacementSearch(body.pose_tree(), SETTINGS, scale_unknown=True)
     result = search.match([View(told, mask)])
     assert result.E_total < 0.04
     assert result.scale * 7.0 == pytest.approx(100.0, rel=0.04)
@@ -110,7 +109,7 @@ def test_what_touches_the_pictures_edge_may_reach_beyond_it(body):
     mask = picture(body, camera, (0.0, 0.1, 0.8))
     assert mask[0].any()
     search = RootPlacementSearch(body.pose_tree(), SETTINGS)
-    (layer,) = find_layers(search.body, [View(camera, mask)], search.placement, None)
+    (layer,) = find_layers(search.body, [View(camera, mask)], False, None)
     assert np.linalg.norm(layer.positions[:, 1:] - [0.1, 0.8], axis=1).min() < 0.04
 
 
@@ -173,33 +172,23 @@ def test_no_time_gives_an_answer_all_the_same(body):
 
 def test_scale_needs_one_parallel_camera(body):
     camera = PinholeCamera("eye", 200, 200, 300.0, 300.0, 99.5, 99.5, front_camera().X_WC)
-    search = RootPlacementSearch(body.pose_tree(), SETTINGS, PlacementSettings(scale_unknown=True))
+    search = RootPlacementSearch(body.pose_tree(), SETTINGS, scale_unknown=True)
     with pytest.raises(SettingsError, match="eye"):
         search.match([View(camera, np.ones((200, 200), dtype=np.bool_))])
     with pytest.raises(SettingsError, match="at least one view"):
         search.match([])
 
 
-def test_settings_are_checked():
-    with pytest.raises(SettingsError, match="quota"):
-        PlacementSettings(quota=0.0)
-    with pytest.raises(SettingsError, match="starts"):
-        PlacementSettings(starts=0)
-    with pytest.raises(SettingsError, match="ratio"):
-        PlacementSettings(ratio=1.0)
-    with pytest.raises(SettingsError, match="cut_off"):
-        PlacementSettings(cut_off=0.5)
-
-
 def test_whereabouts_count_the_steps_that_are_tried():
-    settings = PlacementSettings(positions_across=10, ratio=1.25)
     mask = np.zeros((200, 200), dtype=np.bool_)
-    mask[50:150, 50:150] = True
+    mask[50:170, 50:170] = True
     camera = PinholeCamera("eye", 200, 200, 300.0, 300.0, 99.5, 99.5, front_camera().X_WC)
-    near = whereabouts([View(camera, mask)], np.array([3.0, 0.0, 0.0]), settings)
-    far = whereabouts([View(camera, mask)], np.array([2.5, 0.0, 0.0]), settings)
-    aside = whereabouts([View(camera, mask)], np.array([3.0, 2.0 * 20.0 / 300.0, 0.0]), settings)
-    # The camera stands at x = 5; a tenth of the silhouette's extent is 10 pixels.
+    near = whereabouts([View(camera, mask)], np.array([5.0 - 1.12, 0.0, 0.0]))
+    far = whereabouts([View(camera, mask)], np.array([5.0 - 1.12**2, 0.0, 0.0]))
+    aside = whereabouts(
+        [View(camera, mask)], np.array([5.0 - 1.12, 2.0 * 10.0 / 300.0 * 1.12, 0.0])
+    )
+    # The camera stands at x = 5; a twelfth of the silhouette's extent is 10 pixels.
     assert near - far == pytest.approx([0.0, 0.0, 1.0])
     assert np.abs(aside - near) == pytest.approx([2.0, 0.0, 0.0])
 

@@ -89,10 +89,24 @@ def measure_kernel(columns: int = 14, rows: int = 16, seed: int = 0) -> KernelFi
 
 
 def limb_mesh(columns: int, rows: int) -> TriangleMesh:
-    """Returns a closed ellipsoid of 2 columns (rows - 1) triangles; columns is even."""
-    sphere = trimesh.creation.uv_sphere(count=[rows + 1, columns // 2])
+    """Returns a closed ellipsoid of 2 columns (rows - 1) triangles."""
+    polar = np.pi * np.arange(1, rows) / rows
+    around = 2.0 * np.pi * np.arange(columns) / columns
+    ring = np.column_stack([np.cos(around), np.sin(around), np.zeros(columns)])
+    rings = ring * np.sin(polar)[:, None, None]
+    rings[:, :, 2] = np.cos(polar)[:, None]
+    unit = np.vstack([[[0.0, 0.0, 1.0]], rings.reshape(-1, 3), [[0.0, 0.0, -1.0]]])
+    following = np.roll(np.arange(columns), -1)
+    last = len(unit) - 1
+    triangles = [[0, 1 + a, 1 + b] for a, b in enumerate(following)]
+    for first in range(1, 1 + columns * (rows - 2), columns):
+        for a, b in enumerate(following):
+            lower = first + columns
+            triangles += [[first + a, lower + a, lower + b], [first + a, lower + b, first + b]]
+    first = last - columns
+    triangles += [[first + a, last, first + b] for a, b in enumerate(following)]
     semi_axes = np.array([_RADIUS, _RADIUS, 0.5 * _LENGTH])
-    return TriangleMesh(sphere.vertices * semi_axes, np.asarray(sphere.faces, dtype=np.int32))
+    return TriangleMesh(unit * semi_axes, np.array(triangles, dtype=np.int32))
 
 
 def _label_images(

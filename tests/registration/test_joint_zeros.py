@@ -82,6 +82,7 @@ class TestCalibrateJoints:
             assert shift < 4e-3
             assert turn < np.radians(0.15)
 
+    @pytest.mark.slow
     def test_names_what_a_zero_cannot_be_told_from(
         self, model: ArticulatedModel, body: RegistrationBody
     ) -> None:

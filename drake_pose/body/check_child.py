@@ -1,7 +1,6 @@
-"""The process behind safety.py: it forks a child that reads a model as load_model would.
+"""The process behind safety.py: a line of JSON in, a child forked that reads a model, one out.
 
-Run as ``python -m drake_pose.body.check_child``: a question a line comes in, an answer a line goes
-out, both JSON. Only the children render: a process that forks after a render hangs.
+Only the children render: a process that forks after a render hangs.
 """
 
 import json

@@ -16,12 +16,7 @@ from drake_pose.yaml_files import read_yaml
 
 
 class Landmark(NamedTuple):
-    """A point of the object.
-
-    Attributes:
-        link: the link it is fixed to.
-        point: (3,) where it is in the link's frame [m].
-    """
+    """A point of the object: (3,) in the frame of the link it is fixed to [m]."""
 
     link: str
     point: NDArray[np.float64]
@@ -29,13 +24,7 @@ class Landmark(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class NodeLandmarks:
-    """Landmarks given in the frames of a pose tree's nodes.
-
-    Attributes:
-        names: of the landmarks.
-        nodes: (n,) index of each one's node.
-        points: (n, 3) where each is in its node's frame N [m].
-    """
+    """Landmarks at ``points`` (n, 3) [m] in the frames of a pose tree's ``nodes`` (n,)."""
 
     names: tuple[str, ...]
     nodes: NDArray[np.int64]
@@ -54,15 +43,12 @@ def landmarks_file(model_path: Path | str) -> Path:
 
 
 def load_landmarks(model_path: Path | str) -> dict[str, Landmark]:
-    """Read the landmarks beside a model file.
+    """Read the landmarks from ``landmarks.yaml`` in a model file's folder.
 
     The file maps each name to a link and a point in that link's frame [m]::
 
         landmarks:
           left_elbow: {link: left_forearm, point: [0, 0, 0]}
-
-    Args:
-        model_path: the model file; the landmarks are in ``landmarks.yaml`` in its folder.
 
     Raises:
         ModelError: the file cannot be read; the message names it and the entry.
@@ -84,7 +70,6 @@ def landmark_positions(
     """The landmarks (n, 3) in the world [m], in the mapping's order.
 
     Args:
-        landmarks: as load_landmarks gives them.
         q: (nq,) the plant's positions.
         X_WB: (4, 4) pose of the plant's world frame in the world; None for the identity.
 
@@ -106,10 +91,7 @@ def landmark_positions(
 
 
 def landmarks_of_nodes(tree: PoseTree, landmarks: Mapping[str, Landmark]) -> NodeLandmarks:
-    """The landmarks in the frames of a tree's nodes, for many poses at little cost.
-
-    Args:
-        landmarks: as load_landmarks gives them; a link may be welded to a node's link.
+    """The landmarks in the frames of a tree's nodes (welded links included), for many poses.
 
     Raises:
         UnknownNameError: a landmark's link does not exist.

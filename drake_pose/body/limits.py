@@ -47,12 +47,10 @@ class Positions:
     """What a plant's q means; all in the plant's order, arrays (nq,) and read-only.
 
     Attributes:
-        position_names: one unique name a position: the joint's name, or ``joint_suffix`` for joints
-            of several positions.
-        position_kinds: "angle" [rad], "length" [m] or "quaternion" for each position.
+        position_names: the joint's name, or ``joint_suffix`` for joints of several positions.
+        position_kinds: "angle" [rad], "length" [m] or "quaternion".
         lower, upper: limits [rad or m]; half a turn either side of the default position for a joint
-            that turns freely; infinite for the pose of a floating body, and for slides without
-            limits.
+            that turns freely; infinite for a floating body's pose and slides without limits.
         default_positions: Drake's default positions moved inside the limits.
         periodic: angles that look the same after a full turn: all but those of screws.
         turns_freely: angles without limits, or with limits so wide that they mean none.
@@ -85,7 +83,7 @@ def one_turn(
 def nearest_turn(
     values: NDArray[np.float64], near: NDArray[np.float64], periodic: NDArray[np.bool_] | bool
 ) -> NDArray[np.float64]:
-    """Values (k,), those that are periodic less the full turns that bring them nearest to others.
+    """Values (k,), periodic ones moved by full turns to within half a turn of ``near``.
 
     What is half a turn away on either side stays there.
     """
@@ -104,8 +102,7 @@ def describe_positions(
 
     Raises:
         UnknownNameError: ``given`` names a position that does not exist.
-        ModelError: a joint of an unknown type, or limits that cannot be searched; it names the
-            joint.
+        ModelError: names a joint of an unknown type, or with limits that cannot be searched.
     """
     names = plant.GetPositionNames(add_model_instance_prefix=False, always_add_suffix=False)
     scoped = plant.GetPositionNames(add_model_instance_prefix=True, always_add_suffix=False)

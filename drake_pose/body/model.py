@@ -56,10 +56,7 @@ _DOT = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class ArticulatedModel(ParsedModel):
-    """An articulated object, from which pose trees are made. Never changes.
-
-    What it consists of is described at ``ParsedModel``.
-    """
+    """An articulated object, from which pose trees are made (``ParsedModel``); never changes."""
 
     def pose_tree(
         self,
@@ -69,7 +66,7 @@ class ArticulatedModel(ParsedModel):
         root_rotation: RootRotation | None = None,
         held: Mapping[str, float] | None = None,
     ) -> PoseTree:
-        """The tree in which poses are searched; see ``drake_pose.body.tree.pose_tree.PoseTree``.
+        """The tree in which poses are searched (``drake_pose.body.tree.pose_tree.PoseTree``).
 
         Args:
             root: the link to start from; None for the one nearest to the plant's world.
@@ -88,9 +85,7 @@ class ArticulatedModel(ParsedModel):
     def without(self, links: Collection[str]) -> "ArticulatedModel":
         """The same without the looks of some links, and the skin between them and others.
 
-        Raises:
-            UnknownNameError: no link has that name.
-            ModelError: the file is no URDF, or nothing would be seen.
+        Raises UnknownNameError for an unknown link, ModelError for no URDF or nothing seen.
         """
         for name in links:
             self.link_index(name)
@@ -100,12 +95,8 @@ class ArticulatedModel(ParsedModel):
     def stretched(self, factors: Factors) -> "ArticulatedModel":
         """The same with some links longer or wider; positions mean what they did.
 
-        Args:
-            factors: for links by name, so many times (3,) their size along their frame's axes.
-
-        Raises:
-            UnknownNameError: no link has that name.
-            ModelError: the file is no URDF.
+        ``factors``: (3,) by link, along its frame's axes. Raises UnknownNameError for an unknown
+        link, ModelError for no URDF.
         """
         for name in factors:
             self.link_index(name)
@@ -125,36 +116,22 @@ class ArticulatedModel(ParsedModel):
     def with_shifted_joints(self, shifts: Mapping[str, Sequence[float]]) -> "ArticulatedModel":
         """The same with some joints elsewhere on their parent links, whose looks stay.
 
-        Args:
-            shifts: (3,) by joint, along the axes of its parent link's frame [m].
-
-        Raises:
-            ModelError: the file is no URDF.
+        ``shifts``: (3,) by joint, along its parent link's axes [m]. Raises ModelError for no URDF.
         """
         return self._changed(with_shifted_joints(self._urdf_text(), shifts), self.skin)
 
     def with_moved_looks(self, moves: Mapping[str, Sequence[float]]) -> "ArticulatedModel":
-        """The same with some links' looks, and the joints they carry, elsewhere in their frames.
+        """The same with some links' looks and joints elsewhere on them; bands of skin stay.
 
-        Bands of skin stay at their joints.
-
-        Args:
-            moves: (3,) by link, along the axes of its frame [m].
-
-        Raises:
-            UnknownNameError: no link has that name.
-            ModelError: the file is no URDF.
+        ``moves``: (3,) by link, along its frame's axes [m]. Raises UnknownNameError for an unknown
+        link, ModelError for no URDF.
         """
         for name in moves:
             self.link_index(name)
         return self._changed(with_moved_looks(self._urdf_text(), moves), self.skin)
 
     def with_base_joints(self, X_WB: NDArray[np.float64]) -> "ArticulatedModel":
-        """The same on BASE_JOINTS, which move all of it and are 0 where it stands at X_WB (4, 4).
-
-        Raises:
-            ModelError: the file is no URDF.
-        """
+        """The same on BASE_JOINTS, which are 0 at X_WB (4, 4); ModelError for no URDF."""
         rpy = Rotation.from_matrix(X_WB[:3, :3]).as_euler("xyz")
         text = with_base_joints(self._urdf_text(), X_WB[:3, 3].tolist(), rpy.tolist())
         moved = self._changed(text, self.skin)
@@ -167,15 +144,14 @@ class ArticulatedModel(ParsedModel):
         """The joints between the world and a link, and a rigid object that stands in the world.
 
         What matters to a camera on the link: only the object has looks, the world and the link are
-        dots. The robot's base stands where it does at the default positions, welded to the world.
+        dots. The robot's base stays where its default positions put it.
 
         Args:
             mesh: the object's surface in its frame O.
             X_WO: (4, 4) where it stands at OBJECT_POSITIONS of zero.
 
         Raises:
-            UnknownNameError: no link has that name.
-            ModelError: the file is refused in another plant.
+            UnknownNameError, ModelError: no such link; the file is refused in another plant.
         """
         self.link_index(link)
         plant, scene_graph = MultibodyPlant(time_step=0.0), SceneGraph()
@@ -235,10 +211,10 @@ def load_model(
         path: a URDF, SDFormat, MJCF (.xml) or model directives (.dmd.yaml) file.
         package_paths: folders for ``package://name/...``, by name. Others are looked for on the way
             up from the file and in ROS_PACKAGE_PATH; ``drake_pose`` is known already.
-        limits: limits (lower, upper) [rad or m] by position name, instead of the file's: the only
-            way to limit planar joints, whose limits Drake's parser does not read.
-        check: first read the file in a child process, so that a file that crashes Drake, hangs it
-            or eats all memory does not do so here. About a second, once for each file's content.
+        limits: (lower, upper) [rad or m] by position name instead of the file's; the only way to
+            limit planar joints, whose limits Drake's parser does not read.
+        check: first read the file in a child process, so that a file that crashes or hangs Drake or
+            eats all memory does not do so here. About a second, once for each file's content.
 
     Raises:
         ModelError: the file cannot be used; the message names the file and link or joint.

@@ -21,12 +21,9 @@ class ParsedModel(Positions):
     """What a model file says, as Drake understands it. Never changes.
 
     Attributes:
-        name: the model's name (that of its first model instance).
         plant: a finalized MultibodyPlant, to make contexts from; do not change it.
-        scene_graph: the SceneGraph the plant's geometry is registered with.
         link_meshes: the visual geometry of each link that has some, in the link's frame.
-        skin: the bands of surface that bend with the joints, from the file beside the model's
-            (``load_skin``); usually none.
+        skin: the bands of surface that bend with the joints (``load_skin``); usually none.
         warnings: what is not read of the file or not enforced, which limits were not taken as they
             are written, and what Drake remarked.
     """
@@ -47,7 +44,7 @@ class ParsedModel(Positions):
         *,
         prefix: str = "",
     ) -> list[ModelInstanceIndex]:
-        """Add the same model to another plant, for example one of a diagram.
+        """Add the same model to another plant, for example one of a diagram; its new instances.
 
         Mesh files that Drake would not draw are replaced as in this model. Add renderers to the
         SceneGraph after this call: Drake's VTK renderer rejects an OBJ file without normals at the
@@ -57,9 +54,6 @@ class ParsedModel(Positions):
             plant: a plant that is not finalized.
             scene_graph: the SceneGraph it is or shall be registered with; None for no geometry.
             prefix: put before the model's name, to tell several copies apart.
-
-        Returns:
-            The new model instances.
 
         Raises:
             ModelError: Drake refuses the model in that plant.
@@ -75,21 +69,13 @@ class ParsedModel(Positions):
         return link_names(self.plant)
 
     def link_index(self, name: str) -> int:
-        """The index of a link among the plant's bodies.
-
-        Raises:
-            UnknownNameError: no link has that name.
-        """
+        """The index of a link among the plant's bodies; UnknownNameError where there is none."""
         if name not in self.link_names:
             raise UnknownNameError("link", name, self.link_names, str(self.path))
         return self.link_names.index(name)
 
     def position_index(self, name: str) -> int:
-        """Where a position stands in q.
-
-        Raises:
-            UnknownNameError: no position has that name.
-        """
+        """Where a position stands in q; UnknownNameError where none has that name."""
         if name not in self.position_names:
             raise UnknownNameError("joint", name, self.position_names, str(self.path))
         return self.position_names.index(name)

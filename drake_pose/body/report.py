@@ -45,14 +45,7 @@ class NodeReport:
 
 @dataclass(frozen=True)
 class ModelReport:
-    """What was found in a model file.
-
-    Attributes:
-        name: the model's name; empty where it cannot be read.
-        nodes: the nodes of the plant's own pose tree.
-        warnings: what may surprise, but does not hinder.
-        errors: why the model cannot be used.
-    """
+    """What was found in a model file: the plant's nodes, surprises, and what forbids its use."""
 
     path: Path
     name: str
@@ -106,10 +99,9 @@ def _node_report(tree: PoseTree, node: PoseTreeNode) -> NodeReport:
 def model_warnings(
     model: ArticulatedModel, tree: PoseTree, given: Iterable[str] = ()
 ) -> tuple[str, ...]:
-    """Everything worth knowing before a model is used; at most ten warnings of a kind.
+    """Everything worth knowing before a model is used, at most ten warnings of a kind.
 
-    Args:
-        given: names of the positions that are held as the user wants.
+    ``given`` names the positions that are held as the user wants.
     """
     warnings = list(model.warnings)
     constraints = model.plant.num_constraints()

@@ -14,14 +14,7 @@ _NAMES_A_FILE = ("add_model", "add_directives")
 def cure_directives(path: Path, finder: FileFinder, cure_file: Callable[[Path], Path]) -> str:
     """The text of a directives file in which every file is one that stands in for it.
 
-    The text keeps the file's tags and aliases, which are Drake's business.
-
-    Args:
-        finder: resolves the names of files.
-        cure_file: makes a file that stands in for a model or further directives.
-
-    Raises:
-        ModelError: unreadable, no YAML, or a file that cannot be used.
+    Tags and aliases stay. Raises ModelError: unreadable, no YAML, or a file that cannot be used.
     """
     try:
         node = yaml.compose(path.read_bytes(), Loader=yaml.SafeLoader)

@@ -1,15 +1,10 @@
 """MJCF files made safe for Drake: what MuJoCo says of bodies, joints and looks, in plain elements.
 
 Drake 1.51 puts all but the last joint of a body at the parent's origin
-(``multibody/parsing/detail_mujoco_parser.cc``, ParseBody), which is wrong away from the zero pose.
-MuJoCo applies the joints of a body one after the other, each about its ``pos`` in the body's frame;
-that is the same as nested bodies with one joint each, which Drake reads rightly.
-
-Drake forgets inherited settings of an element that an inner class does not mention, ignores unknown
-classes, and starts again with ``autolimits`` at every <compiler>: here every element says all of
-itself. Source: MuJoCo's XML reference, sections "default" and "compiler", tried with MuJoCo 4.0.
-
-Collision is left out: it is never drawn, and Drake refuses meshes it cannot make a convex hull of.
+(``multibody/parsing/detail_mujoco_parser.cc``, ParseBody). MuJoCo applies the joints of a body one
+after the other, each about its ``pos`` in the body's frame: as nested bodies with one joint each.
+Drake also forgets inherited settings, so every element here says all of itself. Collision is left
+out. Source: MuJoCo's XML reference, "default" and "compiler", tried with MuJoCo 4.0.
 """
 
 import itertools
@@ -54,12 +49,7 @@ _Settings = dict[str, dict[str, str]]
 
 
 def cure_mjcf(path: Path) -> str:
-    """The text of an MJCF file that Drake reads with MuJoCo's kinematics and looks.
-
-    Asset paths in it are absolute, so it may be parsed from anywhere.
-
-    Args:
-        path: the main MJCF file.
+    """The text of an MJCF file, paths absolute, that Drake reads as MuJoCo does.
 
     Raises:
         ModelError: unreadable, no MJCF, an include that includes itself, a broken mesh, or an

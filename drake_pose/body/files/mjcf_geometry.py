@@ -29,12 +29,7 @@ _PLACED = ("body", "geom", "inertial")
 def write_out_poses(parent: ElementTree.Element, compiler: Mapping[str, str]) -> None:
     """Write the poses in a <worldbody> as ``pos`` and ``quat``, and replace its frames.
 
-    Args:
-        parent: a <worldbody>, <body> or <frame>, whose defaults are written out.
-        compiler: the <compiler>'s settings.
-
-    Raises:
-        ModelError: numbers that are none, or too few of them; the message names the element.
+    The defaults of ``parent`` are written out. Raises ModelError, which names the element.
     """
     for child in parent:
         if child.tag == "geom" and "fromto" in child.attrib:
@@ -180,13 +175,7 @@ def _move(
 def write_out_meshes(root: ElementTree.Element, folder: Path, compiler: Mapping[str, str]) -> None:
     """Give the meshes in use names and OBJ files that Drake draws; remove the others.
 
-    Args:
-        root: the outermost element, whose defaults are written out.
-        folder: the main file's.
-        compiler: the <compiler>'s settings.
-
-    Raises:
-        ModelError: a mesh that is missing or cannot be read; the message names it and its body.
+    The defaults of ``root`` are written out. Raises ModelError, which names a mesh and its body.
     """
     users: dict[str, str] = {}
     for body in [*root.iter("body"), *root.iter("worldbody")]:

@@ -27,11 +27,7 @@ _MOST_REPOSITORIES = 1000
 
 
 def package_folder() -> Path:
-    """The folder of bundled models: inside the wheel, or beside ``drake_pose`` in a checkout.
-
-    Raises:
-        ModelError: the installation holds no models.
-    """
+    """The folder of bundled models, in the wheel or checkout; ModelError where there is none."""
     library = Path(__file__).resolve().parents[2]
     for folder in (library / "urdf", library.parent / "urdf"):
         if (folder / "package.xml").is_file():
@@ -43,13 +39,9 @@ def package_folder() -> Path:
 
 
 def package_map(package_paths: Mapping[str, Path | str] | None = None) -> PackageMap:
-    """Drake's PackageMap with the package ``drake_pose`` in it, and nothing to download.
+    """Drake's PackageMap with ``drake_pose`` and further folders by name, and nothing to download.
 
-    Args:
-        package_paths: further packages, name to folder.
-
-    Raises:
-        ModelError: a folder does not exist, or the bundled models are missing.
+    Raises ModelError where a folder or the bundled models do not exist.
     """
     packages = PackageMap()
     # Drake would fetch its own models from the net, and wait for it.
@@ -68,28 +60,17 @@ class FileFinder:
     """The files that a model's ``package://``, ``model://``, ``file://`` and plain names mean.
 
     A package is, in this order, one that is given, a bundled one, a folder on the way up from the
-    file that names it, or a folder of the environment's search paths.
-
-    Args:
-        package_paths: packages, name to folder.
-
-    Raises:
-        ModelError: a folder does not exist.
+    file that names it, or a folder of the environment's search paths. Raises ModelError where a
+    folder does not exist.
     """
 
     def __init__(self, package_paths: Mapping[str, Path | str] | None = None) -> None:
         self._known = package_map(package_paths)
 
     def resolve(self, name: str, file: Path, what: str) -> Path:
-        """The absolute path of a file or folder that exists.
+        """The absolute path of a file or folder that a model file names; ``what`` is for messages.
 
-        Args:
-            name: as it is written.
-            file: the model file it is written in.
-            what: link and kind of thing, for messages.
-
-        Raises:
-            ModelError: the package is unknown, the file does not exist, or it is not a local one.
+        Raises ModelError: the package is unknown, the file does not exist, or it is not local.
         """
         uri = _URI.fullmatch(name.strip())
         if uri is None:
@@ -164,11 +145,7 @@ def _package_name(folder: Path) -> str | None:
 
 
 def bundled_model(name: str) -> Path:
-    """The file of a model that drake_pose ships, for example ``bundled_model("woman")``.
-
-    Raises:
-        UnknownNameError: no such model; the message lists those that exist.
-    """
+    """The file of a model that drake_pose ships, such as "woman"; UnknownNameError lists them."""
     folder = package_folder()
     known = {path.parent.name: path for path in sorted(folder.glob("*/*.urdf"))}
     named = {key: folder / key / f"{key}.urdf" for key in known}

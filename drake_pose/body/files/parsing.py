@@ -1,7 +1,4 @@
-"""One model file into one Drake plant, with every failure turned into a ModelError.
-
-Drake parses a cured text instead of the file, and cured stand-ins of the files that it names.
-"""
+"""One model file, as a cured text, into one Drake plant; every failure is a ModelError."""
 
 import copy
 import logging
@@ -46,16 +43,12 @@ _LONGEST_REASON = 1000
 
 
 class ModelSource:
-    """A model file and the cured text that is parsed in its place.
+    """A model file and the cured text that Drake parses in its place.
 
     Attributes:
-        text: what Drake parses.
         kind: what Drake's parser calls that kind of text.
         warnings: what of the file is not read, or not enforced, each once.
         limits: limits (lower, upper) [rad] by position name that Drake's parser passes over.
-
-    Args:
-        package_paths: packages, name to folder.
 
     Raises:
         ModelError: missing, unreadable, of an unknown kind, or it cannot be cured; the message
@@ -84,17 +77,12 @@ class ModelSource:
     def parse(
         self, plant: MultibodyPlant, scene_graph: SceneGraph | None, prefix: str = ""
     ) -> tuple[list[ModelInstanceIndex], list[str]]:
-        """Add the model to a plant.
+        """Add the model to a plant; its new instances, and what is worth knowing of the file.
 
         Args:
             plant: a plant that is not finalized.
-            scene_graph: the SceneGraph to register geometry with; None where the plant is
-                registered already.
+            scene_graph: to register geometry with; None where the plant is registered already.
             prefix: put before the model's name.
-
-        Returns:
-            The new model instances, and what is worth knowing of the file, Drake's warnings among
-            it.
 
         Raises:
             ModelError: Drake cannot read the model.
@@ -190,10 +178,7 @@ class ModelSource:
 
 
 def limit_kinds(warnings: Sequence[str]) -> list[str]:
-    """Warnings of which those that differ in names and numbers alone are at most ten.
-
-    The last of ten says how many more there are.
-    """
+    """Warnings, at most ten of those that differ in names and numbers alone, and their count."""
     by_kind: dict[str, list[str]] = {}
     for warning in warnings:
         by_kind.setdefault(_VARIABLE.sub("", warning), []).append(warning)

@@ -23,9 +23,8 @@ def check_in_child(
 ) -> None:
     """Read a model and prepare its drawing in a child process with a time and memory limit.
 
-    Drake 1.51 can crash on a broken glTF, a texture, a file that includes itself, and a YAML alias
-    bomb takes all memory; in the child none of these harms the caller. That it can be used is
-    remembered for as long as the file's content stays the same.
+    Drake 1.51 can crash on a broken glTF, a texture or a file that includes itself, and a YAML
+    alias bomb takes all memory. A success is remembered while the file's content stays the same.
 
     Raises:
         ModelError: the model cannot be used, or reading it crashed, hung or took too much memory.
@@ -60,10 +59,7 @@ def _check(path: str, packages: str, limits: str, digest: str) -> None:
 
 
 class _Checker:
-    """A process that has loaded Drake, and forks a child for each model: Drake is loaded once.
-
-    It ends by itself when it is not asked for a while, or when this process ends.
-    """
+    """A process that has loaded Drake and forks a child for each model, until idle too long."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

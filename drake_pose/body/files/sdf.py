@@ -64,10 +64,7 @@ def cure_sdf(
 ) -> tuple[str, Limits]:
     """The text of an SDFormat file that Drake reads; it may be parsed from anywhere.
 
-    Args:
-        finder: resolves the names of mesh files and included models.
-        warn: takes what is not read, or not enforced.
-        cure_file: makes a file that stands in for an included model.
+    ``cure_file`` makes a file that stands in for an included model.
 
     Returns:
         The text, and the limits (lower, upper) [rad] by position name of universal and screw

@@ -52,12 +52,7 @@ _SIZES = {
 def cure_urdf(path: Path, finder: FileFinder, warn: Warn) -> str:
     """The text of a URDF file that Drake reads as URDF means it; it may be parsed from anywhere.
 
-    Args:
-        finder: resolves the names of mesh files.
-        warn: takes what is not read, or not enforced.
-
-    Raises:
-        ModelError: names the link, joint or mesh at fault.
+    Raises ModelError, which names the link, joint or mesh at fault.
     """
     root = read_xml(path)
     if root.tag != "robot":

@@ -28,8 +28,7 @@ def without_visuals(text: str, links: Collection[str]) -> str:
 def stretched(text: str, factors: Factors) -> str:
     """A URDF text in which some links are longer or wider, with the joints that they carry.
 
-    Meshes are scaled, and so are the places of visuals and of joints on these links. A shape that
-    is no mesh is stretched as well as its kind allows: spheres and capsules by their mean factor.
+    A shape that is no mesh is stretched as its kind allows: spheres and capsules by the mean.
     """
     root = ElementTree.fromstring(text)
     for link in root.iterfind("link"):
@@ -52,13 +51,9 @@ def stretched(text: str, factors: Factors) -> str:
 
 
 def with_zeros(text: str, zeros: Mapping[str, float]) -> str:
-    """A URDF text in which joints stand further by constants where they read the same.
+    """A URDF text in which joints stand further by constants [rad or m] where they read the same.
 
-    Each joint's origin is turned about its axis, or shifted along it, and its limits are moved the
-    other way: they are where they were.
-
-    Args:
-        zeros: what is to be added to joints' readings, by name [rad or m].
+    Each joint's origin is turned about its axis, or shifted along it; its limits stay in place.
     """
     root = ElementTree.fromstring(text)
     for joint in root.iterfind("joint"):
@@ -83,11 +78,7 @@ def with_zeros(text: str, zeros: Mapping[str, float]) -> str:
 
 
 def with_shifted_joints(text: str, shifts: Mapping[str, Sequence[float]]) -> str:
-    """A URDF text in which joints stand elsewhere on their parent links.
-
-    Args:
-        shifts: (3,) by joint, along the axes of its parent link's frame [m].
-    """
+    """A URDF text in which joints stand elsewhere: (3,) along their parent links' axes [m]."""
     root = ElementTree.fromstring(text)
     for joint in root.iterfind("joint"):
         shift = shifts.get(joint.get("name", ""))
@@ -97,11 +88,7 @@ def with_shifted_joints(text: str, shifts: Mapping[str, Sequence[float]]) -> str
 
 
 def with_moved_looks(text: str, moves: Mapping[str, Sequence[float]]) -> str:
-    """A URDF text in which links look as if they were elsewhere, the joints they carry with them.
-
-    Args:
-        moves: (3,) by link, along the axes of its frame [m].
-    """
+    """A URDF text in which links look elsewhere, their joints too: (3,) along their axes [m]."""
     root = ElementTree.fromstring(text)
     moved = [
         (visual, moves.get(link.get("name", "")))
@@ -122,12 +109,7 @@ BASE_JOINTS = ("free_x", "free_y", "free_z", "free_turn_z", "free_turn_y", "free
 
 
 def with_base_joints(text: str, place: Sequence[float], rpy: Sequence[float]) -> str:
-    """A URDF text whose whole model is moved by BASE_JOINTS.
-
-    Args:
-        place: (3,) where it stands where they are 0 [m].
-        rpy: (3,) and how it is turned there, as in an origin [rad].
-    """
+    """A URDF text moved by BASE_JOINTS from a place (3,) [m], turned there by rpy (3,) [rad]."""
     root = ElementTree.fromstring(text)
     for element in root.iter():
         for key in ("name", "link"):

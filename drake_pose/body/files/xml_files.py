@@ -82,11 +82,7 @@ def _decoded(data: bytes) -> str:
 
 
 def read_numbers(text: str | None, count: int, where: str) -> list[float]:
-    """The finite numbers in a text.
-
-    Raises:
-        ModelError: it holds something else; ``where`` names link or joint and the value.
-    """
+    """The finite numbers in a text; else ModelError, in which ``where`` names link or joint."""
     words = (text or "").split()
     try:
         numbers = [float(word) for word in words]
@@ -99,11 +95,7 @@ def read_numbers(text: str | None, count: int, where: str) -> list[float]:
 
 
 def require_size(text: str | None, count: int, where: str, *, zero: bool = False) -> None:
-    """Refuse a size that is not above zero (or, where allowed, zero).
-
-    Raises:
-        ModelError: it is not; ``where`` names the link and the size.
-    """
+    """Raise ModelError for a size not above zero (or zero); ``where`` names the link."""
     for number in read_numbers(text, count, where):
         if number < 0.0 or (number == 0.0 and not zero):
             least = "must not be negative" if zero else "must be above 0"
@@ -128,11 +120,7 @@ def require_scale(text: str, count: int, where: str) -> None:
 def read_limits(
     lower_text: str | None, upper_text: str | None, name: str
 ) -> tuple[float | None, float | None]:
-    """The limits of a joint; None: not given, or infinite.
-
-    Raises:
-        ModelError: not a number, NaN, or crossed.
-    """
+    """The limits of a joint; None: not given, or infinite. ModelError for NaN or crossed ones."""
     texts = (lower_text, upper_text)
     try:
         values = [None if text is None else float(text) for text in texts]
@@ -156,13 +144,10 @@ def leave_out(
     known: Collection[str],
     warn: Warn,
 ) -> None:
-    """Remove the children that are not read; those with a prefix stay.
+    """Remove from an element the children that are not read; those with a prefix stay.
 
-    Args:
-        root: the outermost element; it is changed.
-        read: by element, the children that are read; all are where an element is not named.
-        known: elements that say nothing of kinematics and looks; no word is lost on them.
-        warn: takes a warning of each of the others.
+    ``read``: by element, the children that are read, all where an element is not named; ``known``:
+    elements that say nothing of kinematics and looks, of which ``warn`` is not told.
     """
     waiting = [root]
     while waiting:
@@ -183,13 +168,7 @@ def close_loops(
     ends: Sequence[Sequence[str]],
     warn: Warn,
 ) -> list[ElementTree.Element]:
-    """The joints that close a loop of links, without which there is a tree.
-
-    Args:
-        joints: all joints of a model.
-        ends: the two links of each.
-        warn: takes a warning of each that closes a loop.
-    """
+    """The joints that close a loop of links, told to ``warn``; ``ends``: the two links of each."""
     group: dict[str, str] = {}
 
     def find(link: str) -> str:
@@ -219,13 +198,7 @@ def close_loops(
 
 
 def refuse_macros(root: ElementTree.Element) -> None:
-    """Refuse a file that xacro has not expanded: links and joints would be missing.
-
-    A prefix that is declared, but not used, does no harm.
-
-    Raises:
-        ModelError: says what is left and how to expand it.
-    """
+    """Raise ModelError for a file that xacro has not expanded: links would be missing."""
     prefixes = {"xacro"}
     for name, value in root.attrib.items():
         if name.startswith("xmlns:") and "xacro" in value:

@@ -9,11 +9,9 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class TriangleMesh:
-    """A surface of triangles; not necessarily closed, not necessarily connected.
+    """A surface of triangles; not necessarily closed, not necessarily connected. Read-only.
 
-    Attributes:
-        vertices: (n, 3) float64 [m], read-only, expressed in the frame of the link that owns it.
-        triangles: (m, 3) int32, read-only, indices into ``vertices``.
+    ``vertices``: (n, 3) [m] in the frame of the link; ``triangles``: (m, 3) indices into them.
     """
 
     vertices: NDArray[np.float64]
@@ -39,21 +37,13 @@ class TriangleMesh:
         return len(self.triangles) == 0
 
     def transformed(self, X_AB: NDArray[np.float64]) -> "TriangleMesh":
-        """The same surface seen from frame A, given this mesh in frame B.
-
-        Args:
-            X_AB: (4, 4) pose of B in A.
-        """
+        """The same surface in frame A, given this mesh in frame B and X_AB (4, 4)."""
         vertices_A = self.vertices @ X_AB[:3, :3].T + X_AB[:3, 3]
         return TriangleMesh(vertices_A, self.triangles)
 
 
 def merge_duplicate_vertices(mesh: TriangleMesh) -> TriangleMesh:
-    """Join vertices that lie at exactly the same place and drop triangles without area by index.
-
-    Files repeat a vertex wherever its normal or texture coordinate changes. Two triangles share an
-    edge, which an outline needs to know, only when they share the vertices too.
-    """
+    """Join vertices at exactly the same place, and drop triangles that lose their area by it."""
     if mesh.is_empty:
         return TriangleMesh.empty()
     # As np.unique of rows, which takes five times as long for a million of them.

@@ -28,13 +28,9 @@ _R_DRAKE_GLTF = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 def read_mesh_file(path: Path, scale: NDArray[np.float64] | None = None) -> TriangleMesh:
-    """The triangles of an OBJ, glTF, GLB, STL, DAE or MuJoCo's MSH file.
+    """The triangles of an OBJ, glTF, GLB, STL, DAE or MuJoCo's MSH file, duplicate vertices merged.
 
-    Args:
-        scale: (3,) factors along x, y and z; None for the file's own size.
-
-    Returns:
-        The mesh, duplicate vertices merged.
+    ``scale``: (3,) factors along x, y and z.
 
     Raises:
         ModelError: unknown extension, unreadable, no triangle, or a coordinate that is not finite.
@@ -220,11 +216,7 @@ def workspace() -> Path:
 
 
 def drawable_file(path: Path) -> Path:
-    """An OBJ file with normals that shows what ``path`` shows, made on the first call.
-
-    Raises:
-        ModelError: as read_mesh_file.
-    """
+    """An OBJ file with normals, made on the first call, that shows what ``path`` shows."""
     path = path.resolve()
     return _drawable_version(path, path.stat().st_mtime_ns if path.exists() else 0)
 
@@ -240,11 +232,7 @@ _written: dict[Path, TriangleMesh] = {}
 
 
 def write_obj(mesh: TriangleMesh, name: str) -> Path:
-    """Write an OBJ file with normals into this process's temporary folder.
-
-    Args:
-        name: what the file's name begins with.
-    """
+    """Write an OBJ file with normals, whose name begins with ``name``, into a temporary folder."""
     triangles = mesh.triangles
     digest = hashlib.sha256(mesh.vertices.tobytes() + triangles.tobytes()).hexdigest()[:16]
     path = workspace() / f"{re.sub(r'[^A-Za-z0-9_-]', '_', name)}_{digest}.obj"

@@ -1,10 +1,7 @@
-"""Drake's primitive shapes as triangles, tessellated as Drake's VTK renderer does it.
+"""Drake's primitive shapes as triangles, with the vertices that its VTK renderer draws.
 
-RenderEngineVtk does not draw true spheres and cylinders but VTK's polyhedra with 50 sides. The
-vertices here are the same ones, so a silhouette made from them is the renderer's silhouette.
-Sources: RobotLocomotion/drake ``geometry/render_vtk/internal_render_engine_vtk_base.cc`` (which
-resolutions), Kitware/VTK ``vtkTexturedSphereSource`` and
-``vtkCylinderSource`` (where the vertices lie).
+Sources: RobotLocomotion/drake ``geometry/render_vtk/internal_render_engine_vtk_base.cc``
+(resolutions), Kitware/VTK ``vtkTexturedSphereSource`` and ``vtkCylinderSource`` (vertices).
 """
 
 import numpy as np

@@ -1,9 +1,7 @@
 """The skin: bands of surface between two links that bend with the joints between them.
 
-Kameda, Minoh, Ikeda (section 2): a node's surface has a rigid part and a part that deforms with the
-angles of the node's own joint and with nothing else. A band is a closed mesh drawn at rest, all
-joints at zero; each of its points follows the joints part of the way, by its weight: 0 at the
-parent's end, 1 at the child's.
+After Kameda, Minoh, Ikeda (section 2). A band is a closed mesh drawn at rest, all joints at zero;
+each point follows the joints by its weight, from 0 at the parent's end to 1 at the child's.
 """
 
 from collections.abc import Sequence
@@ -24,14 +22,11 @@ _COLOUR = (0.8, 0.8, 0.8)
 
 @dataclass(frozen=True, eq=False)
 class SkinBand:
-    """A band of surface between two links.
+    """A band of surface between two links; the parent is nearer to the world.
 
     Attributes:
-        parent: the link it starts at, the one nearer to the world.
-        child: the link it ends at.
         mesh: the closed band at rest (all joints at zero), in the child's frame.
-        weights: (n,) float64 read-only in 0..1: how far each vertex follows the joints between the
-            links; 0 stays with the parent, 1 goes with the child.
+        weights: (n,) float64 read-only in 0..1: 0 stays with the parent, 1 goes with the child.
         colour: (r, g, b) in 0..1.
     """
 
@@ -78,9 +73,6 @@ def load_skin(model_path: Path, link_names: Sequence[str]) -> tuple[SkinBand, ..
     the child's frame at rest, its path relative to the file; ``axis`` (3 numbers, in the child's
     frame), ``begin`` and ``end`` [m]: along the axis, measured from the child's origin, a vertex's
     weight rises smoothly from 0 at ``begin`` to 1 at ``end``; and ``colour`` (r, g, b; optional).
-
-    Args:
-        link_names: the model's links.
 
     Raises:
         ModelError: the file or a mesh cannot be used.

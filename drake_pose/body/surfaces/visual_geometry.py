@@ -1,8 +1,4 @@
-"""What Drake draws: the visual geometry of a parsed model as triangle meshes.
-
-Everything is read back from Drake's SceneGraph (perception role, which is what cameras see), so
-that URDF, SDFormat, MJCF and model directives all work alike.
-"""
+"""What Drake draws, read back from SceneGraph (perception role): visual geometry as triangles."""
 
 import itertools
 from collections.abc import Iterable
@@ -40,11 +36,7 @@ from drake_pose.errors import ModelError
 
 
 def shape_mesh(shape: Shape) -> TriangleMesh:
-    """A Drake shape as triangles in the geometry's own frame.
-
-    Raises:
-        ModelError: a mesh file that cannot be drawn, or a shape that has no surface here.
-    """
+    """A Drake shape as triangles in its own frame; ModelError where it has no surface here."""
     if isinstance(shape, Box):
         return box_mesh(shape.width(), shape.depth(), shape.height())
     if isinstance(shape, Sphere):
@@ -82,24 +74,14 @@ def _convex_mesh(shape: Convex) -> TriangleMesh:
 
 
 def body_mesh(plant: MultibodyPlant, scene_graph: SceneGraph, body: RigidBody) -> TriangleMesh:
-    """All visual geometry of one body, in the body's frame. Ground planes are left out.
-
-    Raises:
-        ModelError: geometry that cannot be drawn; the message names the link.
-    """
+    """One body's visual geometry in its frame, less ground planes; ModelError names the link."""
     return join_meshes(list(labelled_meshes(plant, scene_graph, body).values()))
 
 
 def labelled_meshes(
     plant: MultibodyPlant, scene_graph: SceneGraph, body: RigidBody
 ) -> dict[int, TriangleMesh]:
-    """The visual geometry of one body in the body's frame, by render label.
-
-    Ground planes and what is not to be rendered are left out.
-
-    Raises:
-        ModelError: geometry that cannot be drawn; the message names the link.
-    """
+    """What is rendered of a body, in its frame, by render label; ModelError names the link."""
     inspector = scene_graph.model_inspector()
     meshes: dict[int, list[TriangleMesh]] = {}
     for geometry in plant.GetVisualGeometriesForBody(body):
@@ -126,12 +108,7 @@ def make_drawable(
     """Replace mesh files that Drake's renderer would silently not draw, and hide ground planes.
 
     STL, DAE, GLB and OBJ without normals become OBJ with normals in a temporary folder. A half
-    space loses its perception role: it is no part of the object and would fill the picture.
-
-    Args:
-        plant: a plant whose geometry is registered.
-        scene_graph: the SceneGraph the plant is registered with.
-        instances: the model instances to look at; the world's own geometry is looked at too.
+    space loses its perception role. The world's own geometry is looked at with the instances'.
 
     Raises:
         ModelError: a mesh file cannot be drawn, or one must be replaced and scene_graph is None.

@@ -54,8 +54,7 @@ class BasePose:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Complete q (nq,) and find X_WB (4, 4), given all node poses X_WN (n_nodes, 4, 4).
 
-        Raises:
-            ModelError: no base positions give the root's pose.
+        Raises ModelError where no base positions give the root's pose.
         """
         if self.kind == "constant":
             return q, np.array(self.X_WB)
@@ -136,10 +135,7 @@ class BasePose:
 
 
 def chain_jacobian(steps: Sequence[ChainStep], values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How the upper three rows of a chain's end pose change with its values: (12, k).
-
-    By complex steps, which are exact to rounding: a joint map is analytic in its values.
-    """
+    """Derivative (12, k) of the upper rows of a chain's end pose, exact, by complex steps."""
     stepped = values + 1j * _COMPLEX_STEP * np.eye(len(values))
     change = chain_transforms(steps, stepped).imag / _COMPLEX_STEP
     return np.asarray(change[:, :3].reshape(len(values), 12).T, dtype=np.float64)
@@ -152,12 +148,9 @@ def base_of_chain(
     node: int,
     held: Collection[int] = (),
 ) -> BasePose:
-    """How the joints from the world to a node can take up the node's pose.
+    """How the joints from the world outwards to a node of the tree can take up the node's pose.
 
-    Args:
-        chain: the edges from the world outwards to the anchor group.
-        node: the tree's node of the anchor group.
-        held: positions that stay as they are, if the others suffice.
+    ``held`` positions stay as they are if the others suffice.
     """
     body = graph.groups[chain[-1].outer].body if chain else graph.groups[0].body
     floating = [edge for edge in chain if edge.joint_map is None]

@@ -1,9 +1,7 @@
 """A joint's values to transforms: measured from Drake's plant once, then evaluated on arrays.
 
-For revolute, prismatic, screw, universal, ball (roll-pitch-yaw) and planar joints every entry of
-the transform is, in each position separately, a combination of 1, cos q, sin q and q. Evaluating
-the plant at four values of each position therefore determines the transform for all values, and
-thousands of joint values cost one matrix product.
+Every entry of the transform of the supported joints is, in each position separately, a combination
+of 1, cos q, sin q and q, so the plant at four values of each position determines it for all values.
 """
 
 import itertools
@@ -33,9 +31,7 @@ def inverse_transforms(X: NDArray[np.float64]) -> NDArray[np.float64]:
 class JointMap:
     """The pose X_AC(values) of a joint's outer link frame C in its inner link frame A.
 
-    Attributes:
-        coefficients: (4^k, 16): one row for each product of basis functions of the k positions.
-        position_count: k.
+    ``coefficients``: (4^k, 16), a row for each product of basis functions of the k positions.
     """
 
     coefficients: NDArray[np.float64]
@@ -45,15 +41,9 @@ class JointMap:
     def measure(
         pose: Callable[[NDArray[np.float64]], NDArray[np.float64]], position_count: int, name: str
     ) -> "JointMap":
-        """Determine the map from the plant.
+        """Determine the map from X_AC (4, 4) of the plant at given values (k,), k at most three.
 
-        Args:
-            pose: X_AC (4, 4) at given values (k,), from the plant.
-            position_count: k, at most three.
-            name: the joint's name, for messages.
-
-        Raises:
-            ModelError: the joint does not move as this class assumes.
+        Raises ModelError, which names the joint, where it does not move as this class assumes.
         """
         samples = np.array(list(itertools.product(_SAMPLES, repeat=position_count)))
         samples = samples.reshape(-1, position_count)
@@ -89,10 +79,7 @@ class ChainStep:
 
 
 def chain_transforms(steps: Sequence[ChainStep], values: NDArray[Any]) -> NDArray[Any]:
-    """X (n, 4, 4) over several joints one after the other, at all their values (n, k).
-
-    The values may be complex.
-    """
+    """X (n, 4, 4) over several joints in turn, at their values (n, k), which may be complex."""
     X: NDArray[Any] = np.broadcast_to(np.eye(4), (len(values), 4, 4))
     start = 0
     for step in steps:

@@ -39,10 +39,9 @@ class JointOffset(NamedTuple):
 
 
 def joint_offsets(tree: PoseTree) -> tuple[JointOffset, ...]:
-    """Each joint's offset from the origin of the rigid part that carries it.
+    """Each joint's offset from the joint (or the world) that places the part that carries it.
 
-    That origin is where the part's own joint stands, or the world's. Joints without an offset are
-    left out.
+    Joints without an offset are left out.
     """
     model, plant, kinematics = tree.model, tree.model.plant, PlantKinematics(tree.model)
 

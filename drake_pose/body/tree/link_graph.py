@@ -17,12 +17,10 @@ from drake_pose.errors import ModelError
 
 @dataclass(frozen=True)
 class LinkGroup:
-    """Links welded to each other.
+    """Links welded to each other, the one nearest to the world first.
 
     Attributes:
-        name: the link whose frame is the group's frame.
-        links: names of all its links, the one nearest to the world first.
-        body: index of the plant's body whose frame is the group's frame.
+        name, body: the link and the index of the plant's body whose frame is the group's frame.
         mesh: the geometry of all its links in the group's frame.
     """
 
@@ -34,11 +32,9 @@ class LinkGroup:
 
 @dataclass(frozen=True)
 class JointEdge:
-    """A joint between two groups; the inner one is nearer to the world.
+    """A joint (its index in the plant) between two groups; the inner one is nearer to the world.
 
     Attributes:
-        joint: index of the joint in the plant.
-        inner, outer: group indices.
         positions: indices into q.
         joint_map: X_inner_outer(values); None for a floating joint.
     """
@@ -91,13 +87,9 @@ class PlantKinematics:
 
 
 def build_link_graph(model: ParsedModel, preferred_frame: str | None) -> LinkGraph:
-    """Walk the plant outwards from the world.
+    """Walk the plant outwards from the world; ModelError where the joints form a loop.
 
-    Args:
-        preferred_frame: a link whose frame its group shall have; None for the first with geometry.
-
-    Raises:
-        ModelError: the joints form a loop.
+    ``preferred_frame``: a link whose frame its group shall have; None: the first with geometry.
     """
     plant = model.plant
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]

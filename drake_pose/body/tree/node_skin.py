@@ -34,8 +34,7 @@ class NodeSkin:
         weights: (v,) float64 read-only in 0..1: how far each vertex goes with the link that is
             farther from the plant's world: the node, or its parent where ``turned``.
         colour: (r, g, b) in 0..1.
-        turned: whether the tree is turned over here, so that the node is the one nearer to the
-            plant's world. The band is the same.
+        turned: whether the tree is turned over here: the node is nearer to the plant's world.
         steps: the joints from the node's parent to the node.
     """
 
@@ -95,12 +94,7 @@ def find_skin(
     group: int,
     steps: tuple[ChainStep, ...],
 ) -> NodeSkin | None:
-    """The band between two groups that are a node's parent and the node; None where there is none.
-
-    Args:
-        parent, group: the two groups.
-        steps: the joints from the one to the other.
-    """
+    """The band between the groups of a node's parent and the node (``steps`` between), or None."""
     for band in model.skin:
         ends = (graph.group_of(band.parent), graph.group_of(band.child))
         if ends not in ((parent, group), (group, parent)):
@@ -116,14 +110,7 @@ def find_skin(
 def require_placed(
     model: ParsedModel, graph: LinkGraph, pairs: Collection[tuple[int, int]]
 ) -> None:
-    """Refuse a model with a band that no node of the tree carries.
-
-    Args:
-        pairs: the groups of each node's parent and the node.
-
-    Raises:
-        ModelError: names the band.
-    """
+    """Raise ModelError for a band that no (parent, node) pair of groups carries."""
     for band in model.skin:
         ends = (graph.group_of(band.parent), graph.group_of(band.child))
         if ends not in pairs and ends[::-1] not in pairs:
@@ -142,13 +129,9 @@ def _pose_in_group(model: ParsedModel, graph: LinkGraph, link: str) -> NDArray[n
 
 
 class ModelSkin:
-    """The bands of a model in the frame of the plant's world, as Drake and Meshcat want them.
+    """A model's bands in the frame of the plant's world, as Drake and Meshcat want them.
 
-    Attributes:
-        bands: the bands, as the model declares them.
-
-    Raises:
-        ModelError: a band does not join two neighbours.
+    Raises ModelError where a band does not join two neighbours.
     """
 
     def __init__(self, model: ParsedModel) -> None:

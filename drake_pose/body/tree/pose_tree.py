@@ -1,9 +1,7 @@
 """The pose tree: the rigid parts of an object, each placed by its own few joint values.
 
-This is the tree of Kameda, Minoh, Ikeda (section 2): a node has a rigid surface, a band of skin
-that bends with its joint (where the model has one), a parent, and up to three rotations (here any
-number of positions of any joints) inside limits. The tree may start at
-any link; its nodes' transforms come from Drake's plant.
+After Kameda, Minoh, Ikeda (section 2), with any number of positions of any joints to a node; the
+tree may start at any link, and its nodes' transforms come from Drake's plant.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -33,18 +31,15 @@ class PoseTreeNode:
 
     Attributes:
         name: the link that carries the geometry; its frame is the node's frame N.
-        parent: index in ``PoseTree.nodes``; -1: the world.
+        parent, children: indices in ``PoseTree.nodes``; a parent of -1 is the world.
         depth: steps to the root; a root has 0.
-        children: indices in ``PoseTree.nodes``.
         positions: indices into the plant's q, in order of rotation from the parent to the node; ()
             for a fixed node and for a root that is turned by a RootRotation.
-        position_names: the names of these positions.
         value_names: the names of the node's values: its position names, or those of the
             RootRotation.
         mesh: the rigid part in frame N, welded links included; empty where several parts hang on
             a link that is not seen.
-        skin: the band of skin between the parent and the node, which bends with the node's values;
-            None where the model declares none.
+        skin: the band between the parent and the node; None where the model declares none.
     """
 
     name: str
@@ -72,9 +67,7 @@ class PoseTreeNode:
 class NodePlacement:
     """How a node's values place it: X_PN = X_PA R(rotation values) step(values) step(values) ...
 
-    Attributes:
-        X_PA: (4, 4) constant part: the identity but for roots.
-        rotation: the RootRotation of a root that is turned by one, else None.
+    X_PA is (4, 4), the identity but for roots; ``rotation`` turns a root that has a RootRotation.
     """
 
     X_PA: NDArray[np.float64]
@@ -92,7 +85,6 @@ class PoseTree:
         held: values of positions that are not searched, by index into q.
         unobserved_positions: names of positions that move nothing that is seen, or that the root's
             pose replaces; they keep their default values.
-        placements: how the values of each node place it.
         root: name of the root node; "world" where the plant's own roots are kept.
     """
 
@@ -119,20 +111,14 @@ class PoseTree:
     def with_root_position(self, root_position: NDArray[np.float64]) -> "PoseTree":
         """The same tree with the root's origin at another known position (3,) [m].
 
-        Raises:
-            SettingsError: not three finite numbers, or a tree without a single root.
-            ModelError: the base joints cannot hold the root there.
+        Raises SettingsError where there is no single root, ModelError where base joints forbid it.
         """
         if self._rebuild is None:
             raise SettingsError("only a tree made by ArticulatedModel.pose_tree can be moved")
         return self._rebuild(root_position)
 
     def node_index(self, name: str) -> int:
-        """The node of a link.
-
-        Raises:
-            UnknownNameError: no node has that name.
-        """
+        """The node of a link; UnknownNameError where no node has that name."""
         names = [node.name for node in self.nodes]
         if name not in names:
             raise UnknownNameError("node", name, names, str(self.model.path))
@@ -147,12 +133,10 @@ class PoseTree:
     ) -> NDArray[np.float64]:
         """The node's sampling grid (n, k): every combination of its positions' samples.
 
-        A position is sampled at the multiples of its interval inside its limits, by size, the
-        negative of two equals first; at the middle of the limits where no multiple lies inside;
-        at its one value where it is held. The last position changes fastest.
+        A position is sampled as in ``axis_samples``, at its one value where it is held; the last
+        position changes fastest.
 
         Args:
-            node: index of the node.
             interval: for angles [rad].
             intervals: intervals of single positions or root values, by name [rad or m].
             length_interval: for lengths [m].
@@ -183,20 +167,14 @@ class PoseTree:
         return product_grid(axes, self.nodes[node].name)
 
     def value_bounds(self, node: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Between which values (k,) a node is searched [rad or m]; equal where held.
-
-        The limits, or of wider ones the one turn that is nearest to the default position.
-        """
+        """Limits (k,) for the search [rad or m], or one turn about the default position."""
         lower, upper = self._limits(node)
         around = self.turns_around(node)
         low, high = one_turn(lower, upper, self._default_values(node))
         return np.where(around, low, lower), np.where(around, high, upper)
 
     def value_limits(self, node: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Limits (k,) of a node's values [rad or m]; equal where held, infinite where it is free.
-
-        Free are joints that turn freely.
-        """
+        """Limits (k,) of a node's values [rad or m]; equal where held, infinite where free."""
         lower, upper = self._limits(node)
         if self.nodes[node].positions:
             free = self.model.turns_freely[list(self.nodes[node].positions)] & (lower < upper)
@@ -204,10 +182,7 @@ class PoseTree:
         return lower, upper
 
     def turns_around(self, node: int) -> NDArray[np.bool_]:
-        """Which of a node's values (k,) are angles that can take every direction.
-
-        No limit stands in their way, and they are the same after a full turn.
-        """
+        """Which of a node's values (k,) are periodic angles whose limits leave every direction."""
         return turns_around(*self._limits(node), self._periodic(node))
 
     def _limits(self, node: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -230,11 +205,7 @@ class PoseTree:
         return self.model.periodic[list(self.nodes[node].positions)]
 
     def relative_transforms(self, node: int, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """X_PN (n, 4, 4) of a node in its parent (the world W for a root) at values (n, k).
-
-        Raises:
-            SettingsError: values of the wrong width.
-        """
+        """X_PN (n, 4, 4) in the parent (or W) at values (n, k); SettingsError for a wrong width."""
         values = np.asarray(values, dtype=np.float64)
         width = len(self.nodes[node].value_names)
         if values.ndim != 2 or values.shape[1] != width:
@@ -255,11 +226,7 @@ class PoseTree:
         return self.node_poses_batch([np.asarray(v, dtype=np.float64)[None] for v in values])[0]
 
     def node_poses_batch(self, values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """X_WN (n, n_nodes, 4, 4), given each node's values (n, k_i).
-
-        Raises:
-            SettingsError: not one array a node, or values of the wrong width.
-        """
+        """X_WN (n, n_nodes, 4, 4) at each node's (n, k_i); SettingsError for a wrong width."""
         if len(values) != len(self.nodes):
             raise SettingsError(f"{len(self.nodes)} arrays of values expected, got {len(values)}")
         X_WN = np.empty((len(values[0]), len(self.nodes), 4, 4))
@@ -282,10 +249,7 @@ class PoseTree:
     def positions_from(
         self, values: Sequence[NDArray[np.float64]]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The plant's own positions that put every link where the tree does.
-
-        Args:
-            values: each node's values (k_i,).
+        """The plant's own positions that put every link where the tree does at each node's (k_i,).
 
         Returns:
             q (nq,) and X_WB (4, 4), the pose of the plant's world frame B in the world W; X_WB is
@@ -301,12 +265,7 @@ class PoseTree:
         values: Sequence[NDArray[np.float64]],
         root_position: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """As positions_from of the tree whose root's origin is at (3,) [m], which is not built.
-
-        Raises:
-            SettingsError: a tree that cannot be moved.
-            ModelError: the base joints cannot be solved for.
-        """
+        """As with_root_position at (3,) [m] and positions_from, but no tree is built."""
         if self._base.kind == "constant":
             return self.with_root_position(root_position).positions_from(values)
         X_WN = self.node_poses(values)
@@ -332,12 +291,9 @@ class PoseTree:
     def values_from_positions(
         self, q: NDArray[np.float64], X_WB: NDArray[np.float64] | None = None
     ) -> list[NDArray[np.float64]]:
-        """Each node's values (k_i,) at the plant's positions: the inverse of positions_from.
+        """Each node's values (k_i,) at the plant's q (nq,): the inverse of positions_from.
 
-        Args:
-            q: (nq,) the plant's positions.
-            X_WB: (4, 4) pose of the plant's world frame in the world; None for the identity. Only
-                the rotation of a root with a RootRotation depends on it.
+        X_WB (4, 4), the pose of the plant's world frame, moves a root with a RootRotation alone.
         """
         q = np.asarray(q, dtype=np.float64)
         values = []

@@ -19,14 +19,12 @@ Axis = Literal["x", "y", "z"]
 class RootRotation:
     """The rotation R_WR of the root link R in the world W: fixed, limited, or free.
 
-    Make one with ``fixed``, ``free`` or ``limited``. The rotation's values are an array (k,):
-    nothing when fixed; a rotation vector [rad] relative to R_W0 when free; one angle [rad] for each
-    axis, in order of rotation, when limited: R_WR = R_W0 R(axis 1) R(axis 2) ...
+    The rotation's values are an array (k,): nothing when fixed; a rotation vector [rad] relative to
+    R_W0 when free; one angle [rad] for each axis, in order of rotation, when limited:
+    R_WR = R_W0 R(axis 1) R(axis 2) ...
 
     Attributes:
-        kind: "fixed", "free" or "limited".
         R_W0: (3, 3) the rotation at values of zero, read-only.
-        axes: the letters of the axes when limited.
         lower, upper: (k,) limits [rad], read-only.
         interval: sampling interval [rad]; None for the search's general one.
     """
@@ -40,11 +38,7 @@ class RootRotation:
 
     @staticmethod
     def fixed(rotation: ArrayLike | None = None) -> "RootRotation":
-        """Always R_W0 (3, 3); None for the identity.
-
-        Raises:
-            SettingsError: not a rotation matrix.
-        """
+        """Always R_W0 (3, 3), by default the identity; SettingsError where that is no rotation."""
         return RootRotation("fixed", _rotation_matrix(rotation), (), *_limits([]), None)
 
     @staticmethod
@@ -53,8 +47,7 @@ class RootRotation:
     ) -> "RootRotation":
         """Any rotation, sampled evenly; R_W0 (3, 3) is one of the samples.
 
-        Raises:
-            SettingsError: not a rotation matrix, or an interval that is not positive.
+        Raises SettingsError for no rotation matrix, or an interval that is not positive.
         """
         limits = _limits([(-math.pi, math.pi)] * 3)
         return RootRotation(
@@ -75,7 +68,7 @@ class RootRotation:
                 ``[("y", -180, 180), ("z", -10, 10)]``; each axis is the one already turned by
                 those before it.
             rotation: R_W0 (3, 3); None for the identity.
-            interval_deg: sampled at the multiples of this; None for the search's general one.
+            interval_deg: None for the search's general one.
 
         Raises:
             SettingsError: repeated or unknown axes, crossed limits, or not a rotation matrix.
@@ -112,10 +105,7 @@ class RootRotation:
         return self.R_W0 @ Rotation.from_euler("".join(self.axes).upper(), values).as_matrix()
 
     def values_from(self, R_WR: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The values (k,) [rad] of a rotation (3, 3), the nearest there are where it is limited.
-
-        Those of axes are in the turn nearest to the middle of their limits.
-        """
+        """The values (k,) [rad] of a rotation (3, 3), the nearest there are where it is limited."""
         rotation = Rotation.from_matrix(self.R_W0.T @ R_WR)
         if self.kind == "fixed":
             return np.zeros(0)
@@ -129,14 +119,10 @@ class RootRotation:
 
 
 def even_rotations(interval: float) -> NDArray[np.float64]:
-    """Rotation vectors (n, 3) [rad] spread evenly over all rotations, nearest to none first.
+    """Rotation vectors (n, 3) [rad] about ``interval`` [rad] apart, nearest to none first.
 
-    Directions lie on circles of latitude ``interval`` apart, about ``interval`` apart on each;
-    every direction is taken with turns about itself that are multiples of the interval. The
-    rotation is Rz(azimuth) Ry(polar) Rz(turn - azimuth), so that the samples hold the identity.
-
-    Args:
-        interval: angle between neighbours [rad].
+    Rz(azimuth) Ry(polar) Rz(turn - azimuth), with directions on circles of latitude and turns that
+    are multiples of the interval; the samples hold the identity.
     """
     angles = []
     turns = _full_turn(interval)

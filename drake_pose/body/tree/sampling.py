@@ -17,15 +17,8 @@ _ROUNDING = 1e-9
 def axis_samples(lower: float, upper: float, interval: float, *, is_angle: bool) -> list[float]:
     """The multiples of the interval inside the limits, by size, the negative of two equals first.
 
-    The middle of the limits where no multiple lies inside. A full turn gives each direction once.
-
-    Args:
-        lower, upper: finite limits [rad or m].
-        interval: spacing [rad or m].
-        is_angle: whether values a full turn apart mean the same.
-
-    Raises:
-        SettingsError: more samples than memory should hold.
+    The middle of the finite limits [rad or m] where no multiple lies inside. A full turn of an
+    angle gives each direction once. Raises SettingsError where memory would not hold the samples.
     """
     first = math.ceil(lower / interval - _ROUNDING)
     last = math.floor(upper / interval + _ROUNDING)
@@ -45,8 +38,7 @@ def axis_samples(lower: float, upper: float, interval: float, *, is_angle: bool)
 def product_grid(axes: Sequence[Sequence[float]], node: str) -> NDArray[np.float64]:
     """All combinations (n, k) of the axes' samples, the last axis changing fastest.
 
-    Raises:
-        SettingsError: more combinations than memory should hold; the message names the node.
+    Raises SettingsError, which names the node, where memory would not hold them.
     """
     size = math.prod(len(axis) for axis in axes)
     if size > MAXIMUM_GRID_SIZE:

@@ -65,12 +65,9 @@ def build_pose_tree(
 
 @dataclass(frozen=True)
 class RootPlan:
-    """Where the tree starts.
+    """The group where the tree starts (0: the world's), and whether a RootRotation places it.
 
-    Attributes:
-        start: the group to start from; 0 is the world's.
-        turned: whether that group is placed by a RootRotation.
-        own: whether the group is the plant's own root, so that its position has a default.
+    ``own``: whether the group is the plant's own root, so that its position has a default.
     """
 
     start: int

@@ -43,12 +43,8 @@ class Motions:
 
     The parameters are the tree's values and, after them, what ``TreeKinematics.motions`` was asked
     to add. A point of node i at p_W moves with parameter j by ``omega x p_W + v + sigma p_W`` where
-    ``moves[i, j]``, else not at all.
-
-    Attributes:
-        X_WN: (nodes, 4, 4).
-        twists: (m, 7) omega, v, sigma, in the world and about its origin.
-        moves: (nodes, m) bool.
+    ``moves[i, j]`` (nodes, m), else not at all. X_WN: (nodes, 4, 4); twists: (m, 7) omega, v,
+    sigma, in the world and about its origin.
     """
 
     X_WN: np.ndarray
@@ -57,15 +53,13 @@ class Motions:
 
 
 class TreeKinematics:
-    """A pose tree's kinematics, compiled.
+    """A pose tree's kinematics, compiled; arrays are (m,), value after value, node after node.
 
     Attributes:
-        names: the names of the m values, node after node.
-        value_nodes: (m,) the node of each value.
-        lower, upper: (m,) limits [rad or m]; equal where a value is held, infinite where it is an
-            angle that can take every direction.
-        is_angle: (m,) whether a value is an angle [rad], else a length [m].
-        turns_around: (m,) whether it is an angle that can take every direction.
+        lower, upper: limits [rad or m]; equal where a value is held, infinite where it is an angle
+            that can take every direction.
+        is_angle: whether a value is an angle [rad], else a length [m].
+        turns_around: whether it is an angle that can take every direction.
         packed: the tree as ``find_motions`` takes it.
     """
 
@@ -102,11 +96,7 @@ class TreeKinematics:
         return moves
 
     def flatten(self, node_values: Sequence[np.ndarray]) -> np.ndarray:
-        """All values (m,) of each node's values (k_i,).
-
-        Raises:
-            SettingsError: values of the wrong number.
-        """
+        """All values (m,) of each node's values (k_i,); SettingsError for a wrong number."""
         parts = [np.asarray(values, dtype=np.float64).reshape(-1) for values in node_values]
         wanted = [len(node.value_names) for node in self.tree.nodes]
         if [len(part) for part in parts] != wanted:
@@ -118,19 +108,14 @@ class TreeKinematics:
         return tuple(np.split(np.asarray(values), self.packed.value_starts[1:-1]))
 
     def nearest_turns(self, values: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
-        """The same pose's values (m,), angles that turn around in the turn nearest to others.
+        """The same pose's values (m,), angles that turn around in the turn nearest to ``near``.
 
-        Args:
-            values: all values [rad or m].
-            near: (m,); None: where answers are given, about the default positions.
+        ``near`` is (m,); None: about the default positions, where answers are given.
         """
         return nearest_turn(values, self._middle if near is None else near, self.turns_around)
 
     def within_limits(self, values: np.ndarray) -> np.ndarray:
-        """The same pose's values (m,), angles that turn around less the turns beyond their limits.
-
-        One that turns freely stays what it is.
-        """
+        """The same pose's values (m,), limited periodic angles less the turns beyond limits."""
         limits = [self.tree.value_limits(i) for i in range(len(self.tree.nodes))]
         lower, upper = np.hstack([np.zeros((2, 0)), *limits])
         full = 2.0 * math.pi
@@ -139,10 +124,7 @@ class TreeKinematics:
         return np.where(self.turns_around, values - full * (above - below), values)
 
     def reach(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper ends (m,) of what values may be about those of a pose (m,).
-
-        The limits, or half a turn either side of an angle that turns around.
-        """
+        """The limits (m,), or half a turn either side of a pose's angles that turn around."""
         lower = np.where(self.turns_around, values - math.pi, self.lower)
         return lower, np.where(self.turns_around, values + math.pi, self.upper)
 
@@ -153,10 +135,9 @@ class TreeKinematics:
     def motions(
         self, values: np.ndarray, *, translation: bool = False, scale: bool = False
     ) -> Motions:
-        """Poses and motions at values (m,).
+        """Poses and motions at all values (m,) [rad or m].
 
         Args:
-            values: all values [rad or m].
             translation: add a shift of the first root and all behind it along the world's x, y, z.
             scale: add a uniform growth of these about the first root's origin (per unit).
         """

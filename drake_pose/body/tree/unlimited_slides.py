@@ -16,9 +16,7 @@ def placing_slides(
     They say where the object stands, as the position of a floating joint does (planar robots in
     MJCF have two of them): they are not searched, and root_position moves the object.
 
-    Args:
-        objects: for each object that hangs on the world, the positions between the two.
-        held: positions that are held already, with their values.
+    ``objects`` are the positions between the world and each object that hangs on it.
 
     Raises:
         ModelError: several objects stand on such slides, so where they are to each other is open.
@@ -40,11 +38,7 @@ def placing_slides(
 def refuse_unlimited_slides(
     model: ParsedModel, positions: Sequence[int], held: Mapping[int, float]
 ) -> None:
-    """All that is searched must have limits.
-
-    Raises:
-        ModelError: a slide is neither held nor limited.
-    """
+    """Raise ModelError where a position that is searched is a slide without limits."""
     free = [position for position in _unlimited(model, positions) if position not in held]
     if free:
         raise ModelError(_faults(model, free))

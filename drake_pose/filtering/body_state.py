@@ -209,13 +209,7 @@ class BodyState:
         return self.tree.positions_from(values)
 
     def state(self, q: Array, X_WB: Array | None = None, scale: float = 1.0) -> Array:
-        """(n,) a state at rest.
-
-        Args:
-            q: (nq,) the plant's positions.
-            X_WB: (4, 4) where the plant's world is; None: where the world is.
-            scale: so many times the pixels a metre that it was given with the camera has.
-        """
+        """(n,) a state at rest of positions (nq,), the plant's world at X_WB (4, 4) and a scale."""
         values = self._kinematics.flatten(self.tree.values_from_positions(q, X_WB))
         root = np.append(np.zeros(3), math.log(scale))
         if self._moves:

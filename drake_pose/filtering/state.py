@@ -66,13 +66,7 @@ def factor_and_kind(covariance: Array) -> tuple[Array, bool]:
 
 
 def covariance_from(factor: Array, definite: bool = True) -> Array:
-    """(n, n) L L^T, exactly symmetric.
-
-    Args:
-        factor: (n, k) L.
-        definite: whether the product shall be positive definite also after rounding; then the
-            variances may grow by a few units of the last place.
-    """
+    """(n, n) L L^T, exactly symmetric, of (n, k) L; positive definite after rounding if asked."""
     product = factor @ factor.T
     product = 0.5 * (product + product.T)
     growth = 1e-15
@@ -147,11 +141,7 @@ class StateLayout:
         return np.array([self.index(name) for name in names], dtype=np.intp)
 
     def transition(self, fading: float = 1.0) -> Array:
-        """(n, n) A of (8): one step at constant velocity.
-
-        Args:
-            fading: what is left of a rate after a step; 1 in (8).
-        """
+        """(n, n) A of (8): a step at constant velocity; ``fading`` is left of a rate, 1 in (8)."""
         m = len(self.moving)
         A = np.eye(len(self))
         A[:m, m : 2 * m] = fading * np.eye(m)
@@ -186,12 +176,7 @@ class StateLayout:
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """A normal distribution over a state.
-
-    Attributes:
-        mean: (n,).
-        covariance: (n, n).
-    """
+    """A normal distribution over a state: mean (n,) and covariance (n, n)."""
 
     mean: Array
     covariance: Array
@@ -209,12 +194,7 @@ class Belief:
 def make_belief(
     mean: ArrayLike, covariance: ArrayLike, layout: StateLayout | None = None
 ) -> Belief:
-    """A belief from arrays that are checked.
-
-    Args:
-        mean: (n,).
-        covariance: (n, n).
-        layout: names the elements in messages.
+    """A belief from a mean (n,) and covariance (n, n) that are checked.
 
     Raises:
         SettingsError: sizes that do not fit, NaN, or a covariance that is indefinite.

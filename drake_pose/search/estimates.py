@@ -1,9 +1,4 @@
-"""What a search is given and what every search and tracker answers.
-
-A silhouette seldom has one explanation: a forearm may point towards the camera or away from it, a
-hand may be anywhere behind the trunk. The answer is therefore a set of poses in families: members
-of one family differ by small steps, those of two families do not.
-"""
+"""What a search is given, and the poses in families that searches and trackers answer."""
 
 from __future__ import annotations
 
@@ -27,13 +22,10 @@ TRACKED = "tracked"
 
 @dataclass(frozen=True)
 class View:
-    """What one calibrated camera sees of the body.
-
-    Args:
-        mask: the silhouette S, (height, width) bool.
+    """What one calibrated camera sees of the body: the silhouette S, (height, width) bool.
 
     Raises:
-        MaskError: if the mask is not of the camera's size, or is empty.
+        MaskError: the mask is not of the camera's size, or is empty.
     """
 
     camera: Camera
@@ -60,13 +52,11 @@ class JointEstimate:
 
     Args:
         name: of the position (or of the root's angle).
-        node: the node that the value belongs to.
         determined: True: it lies between low and high; False: it is free, and low and high are
             the ends of what was seen.
         low, high: the interval or the range [rad or m]; of an angle that turns around it may go
             beyond its limits, as the same directions a full turn before or after.
         values: (n,) the different values seen, smallest first [rad or m].
-        turns_around: whether it is an angle that can take every direction.
     """
 
     name: str
@@ -91,7 +81,6 @@ class PoseFamily:
     Args:
         q: (nq,) the representative's positions in the plant's order [rad, m].
         X_WB: (4, 4) pose of the plant's world frame B in the world W.
-        node_values: its values for each node of the pose tree.
         J: its objective (1) [pixel].
         joints: each value of the pose tree, node after node, as far as this family goes.
         size: how many poses were found in it.
@@ -131,10 +120,7 @@ class PoseSet:
         return tuple(joint.determined for joint in self.joints)
 
     def within_intervals(self, node_values: Sequence[np.ndarray]) -> bool:
-        """Whether every value of a pose lies in some one family's intervals and ranges.
-
-        Necessary for a member, not sufficient: values of a family may depend on each other.
-        """
+        """Whether a pose lies in some one family's intervals, as every member does."""
         values = np.concatenate([np.ravel(value) for value in node_values])
         return any(
             all(joint.holds(float(v)) for joint, v in zip(family.joints, values, strict=True))
@@ -142,10 +128,7 @@ class PoseSet:
         )
 
     def position_intervals(self, names: Sequence[str]) -> np.ndarray:
-        """``determined``, ``low`` and ``high``, (3, nq), of a plant's positions by their names.
-
-        NaN where the pose tree has no such value.
-        """
+        """``determined``, ``low`` and ``high``, (3, nq), of positions; NaN: not in the tree."""
         known = {joint.name: (joint.determined, joint.low, joint.high) for joint in self.joints}
         return np.array([known.get(name, (np.nan,) * 3) for name in names], dtype=float).T
 
@@ -194,12 +177,10 @@ class PoseEstimate:
         q: (nq,), the positions in the plant's order [rad, m].
         X_WB: (4, 4), pose of the plant's world frame B in the scene's world W; the identity
             unless the plant's own joints cannot place the body.
-        node_values: the values of each node of the pose tree.
         J: area of the exclusive or of body and silhouette, summed over the views (1) [pixel].
         area: the silhouettes' area [pixel].
         stopped_by: "end" if a search ran to its end, "exact" if J = 0 ended it, or the limit that
             stopped it; TRACKED for a pose that no search found.
-        seconds: wall time [s].
         root_position: (3,) the root's origin in the world [m] where it was estimated; of a parallel
             camera's single picture the part along its axis is arbitrary.
         scale: a parallel camera has so many times the pixels a metre that it was given with, and
@@ -264,12 +245,7 @@ class PoseEstimate:
         return bool(self.found and self.lower_bound >= self.J)
 
     def turned(self, tree: PoseTree, turns: Sequence[np.ndarray]) -> PoseEstimate:
-        """The same pose with angles in other turns.
-
-        Args:
-            tree: the pose tree that was searched.
-            turns: (k_i,) for each node what is added to its values, full turns [rad].
-        """
+        """The same pose with full turns (k_i,) [rad] added to each node's values."""
         pose_set = self.pose_set
         if pose_set is not None:
             families = [

@@ -45,13 +45,10 @@ class SampledTree:
         self._bent_outline = lru_cache(maxsize=_BENT_OUTLINES)(self._bend)
 
     def outlines_at(self, nodes: Sequence[int], samples: np.ndarray | None) -> list[Outline]:
-        """The whole surfaces of nodes at their samples, each in its node's frame.
-
-        Args:
-            samples: (len(nodes),) indices into their samples; may be None where no node bends.
+        """The whole surfaces of nodes at their samples (len(nodes),), each in its node's frame.
 
         Raises:
-            ValueError: a node bends, and no samples are given.
+            ValueError: a node bends, and samples is None.
         """
         if samples is None:
             self._require_rigid(nodes)
@@ -82,18 +79,15 @@ class SampledTree:
         camera: Camera,
         prefixes: np.ndarray,
     ) -> np.ndarray:
-        """Areas of the union of nodes at many poses.
+        """Areas of the union of nodes at many poses: (n, 1 + k) int64, as score_bodies.
 
         Args:
             samples: (n, len(nodes)) the samples they take; may be None where no node bends.
             X_CN: (n, len(nodes), 4, 4) their poses there, in the camera.
             prefixes: (k, H, W + 1) int32 prefix sums of sets.
 
-        Returns:
-            (n, 1 + k) int64, as score_bodies.
-
         Raises:
-            ValueError: a node bends, and no samples are given.
+            ValueError: a node bends, and samples is None.
         """
         bands = [(column, self.bands[node]) for column, node in enumerate(nodes)]
         bent = [(column, band) for column, band in bands if band is not None]
@@ -134,11 +128,7 @@ class SampledTree:
 
 
 class Scoring:
-    """Scores poses of a sampled tree against the silhouettes of one instant.
-
-    Args:
-        views: the silhouettes, at least one.
-    """
+    """Scores poses of a sampled tree against the silhouettes of one instant, one or more."""
 
     def __init__(self, sampled: SampledTree, views: Sequence[View]) -> None:
         self.sampled = sampled
@@ -154,11 +144,7 @@ class Scoring:
     def candidate_areas(
         self, node: int, samples: np.ndarray, X_WN: np.ndarray, regions: "Regions"
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Areas of a node outside the silhouette and in a region of it.
-
-        Args:
-            samples: (n,) the samples it takes.
-            X_WN: (n, 4, 4) its poses there.
+        """Areas of a node at samples (n,) and their poses X_WN (n, 4, 4).
 
         Returns:
             area(P_i minus S) in each view, (views, n) (4), and area(region and P_i) summed over
@@ -173,23 +159,16 @@ class Scoring:
         return np.array(outside), covered
 
     def uncovered(self, nodes: Sequence[int], samples: np.ndarray, X_WN: np.ndarray) -> "Regions":
-        """S minus the projections of some nodes (3), (6).
-
-        Args:
-            samples: (all nodes,) the samples the nodes take.
-            X_WN: (all nodes, 4, 4) their poses there.
-        """
+        """S minus the projections of some nodes (3), (6); samples and X_WN are of all nodes."""
         regions = Regions(self)
         if nodes:
             regions.subtract(nodes, samples[list(nodes)], X_WN[list(nodes)])
         return regions
 
     def J(self, X_WN: np.ndarray, samples: np.ndarray | None = None) -> np.ndarray:
-        """The objective (1) of whole poses, (n,) [pixel].
+        """The objective (1) [pixel] (n,) of poses X_WN (n, nodes, 4, 4) at samples (n, nodes).
 
-        Args:
-            X_WN: (n, nodes, 4, 4) the poses.
-            samples: (n, nodes) the samples the nodes take; may be left out where no node bends.
+        The samples may be left out where no node bends.
         """
         total = np.full(len(X_WN), self.silhouette_area)
         everything = range(len(self.sampled.outlines))
@@ -203,22 +182,12 @@ class Scoring:
     def draw(
         self, nodes: Sequence[int], samples: np.ndarray, X_WN: np.ndarray, view: int
     ) -> np.ndarray:
-        """The union of some nodes' projections in one view, bool.
-
-        Args:
-            samples: (len(nodes),) the samples they take.
-            X_WN: (len(nodes), 4, 4) their poses there.
-            view: index of the view.
-        """
+        """The union of nodes' projections, (H, W) bool, in the view of an index."""
         outlines = self.sampled.outlines_at(nodes, samples)
         return draw_mask(outlines, self.X_CW[view] @ X_WN, self.views[view].camera)
 
     def mean_node_areas(self, X_WN: np.ndarray) -> list[float]:
-        """Mean projected area of a node with geometry in each view [pixel], at the first samples.
-
-        Args:
-            X_WN: (nodes, 4, 4) the nodes' poses there.
-        """
+        """Mean area of a node with geometry in each view [pixel], at the first samples' poses."""
         first = np.zeros((1, 1), dtype=np.int64)
         solid = [i for i, node in enumerate(self.sampled.tree.nodes) if len(node.mesh.triangles)]
         means = []
@@ -249,12 +218,7 @@ class Regions:
         self.prefixes = [np.repeat(sums, 2, axis=0) for sums in scoring.silhouette_prefixes]
 
     def subtract(self, nodes: Sequence[int], samples: np.ndarray, X_WN: np.ndarray) -> None:
-        """Take the projections of nodes out of the region.
-
-        Args:
-            samples: (len(nodes),) the samples they take.
-            X_WN: (len(nodes), 4, 4) their poses there.
-        """
+        """Take the projections of nodes at samples (k,), poses (k, 4, 4), out of the region."""
         scoring = self._scoring
         outlines = scoring.sampled.outlines_at(nodes, samples)
         for view, X_CW, mask, prefixes in zip(
@@ -275,10 +239,8 @@ class PoseSearch(Protocol):
         """The pose tree with its sampling grids."""
 
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
-        """Estimate the pose that the views of one instant show.
+        """Estimate the pose in views of one instant.
 
         Args:
-            views: one or several silhouettes of the same instant.
-            root_position: (3,), the root's known position in the world [m], where it is not the
-                pose tree's own.
+            root_position: (3,) of the root in the world [m], where it is not the pose tree's own.
         """

@@ -48,12 +48,10 @@ class PaperSearchSettings(GridSettings):
             segment (what the paper's 200 pixels are for its body) and double until a pose is found.
         outside_weight: what a pixel outside the silhouette costs where candidates are put in order:
             by e - outside_weight * (area outside). 0 is the paper's order, by e alone.
-        candidate_limit: K, how many of a node's candidates are kept; the paper's is 5.
-        run_limit: the search stops after this many runs of step 3 and answers with the best pose
-            that it has; the paper knows no such limit.
-        leaf_combination_limit: up to this many combinations of the leaves' candidates are tried one
-            by one (section 5.2.1); beyond, each leaf's candidates are tried in turn until no
-            change of one leaf is an improvement.
+        candidate_limit: K, how many of a node's candidates are kept.
+        run_limit: of runs of step 3; the answer is then the best pose so far.
+        leaf_combination_limit: up to so many combinations of the leaves' candidates are all tried
+            (section 5.2.1); beyond, each leaf's in turn.
 
     Raises:
         SettingsError: if a value is out of its range.
@@ -81,11 +79,8 @@ class Stage:
         hypotheses: how many are kept after each node.
         outside_share: the share of a node's mean projected area, both summed over the views, that
             may lie outside the silhouette; infinite: any.
-        outside_weight: what a pixel outside counts in the ranking; a silhouette pixel newly
-            covered counts one. J itself counts both alike, but what is outside stays outside,
-            while what is not covered yet may be covered by a later node.
-        limb_by_limb: place one limb after another, else the ends of all limbs last. What one order
-            cannot find with few hypotheses, the other often can.
+        outside_weight: what a pixel outside counts in the ranking; one newly covered counts one.
+        limb_by_limb: place one limb after another, else the ends of all limbs last.
     """
 
     hypotheses: int
@@ -127,8 +122,7 @@ class BeamSearchSettings(GridSettings):
             [pixel].
         coarse_pixels: stages that let something lie outside see the silhouettes no finer than with
             about this many pixels; the best pose is then judged in full.
-        research_hypotheses: how many hypotheses are kept when single limbs and pairs of limbs of
-            the winner are searched again; 0: they are not.
+        research_hypotheses: kept while limbs of the winner are searched again; 0: they are not.
         time_limit: the search returns its best pose so far after this time [s]; None: no limit.
         hypothesis_limit: the same after this many hypotheses; None: no limit.
 

@@ -46,8 +46,7 @@ class HandObservation:
     Args:
         pixels_per_metre: of the image, for scale 1.
         point_deviation: noise of a joint, a fingertip or the wrist [pixel].
-        angle_deviation: noise of a line's angle alpha [rad].
-        distance_deviation: noise of a line's distance rho [pixel].
+        angle_deviation, distance_deviation: noise of a line's alpha [rad] and rho [pixel].
         scale_deviation: of the scale, where it is known.
         shortest: a segment shorter than this in the image shows no axis [pixel].
         mirror_slope: (30) holds where a joint's turn moves its segment's end by less than this
@@ -92,14 +91,7 @@ class HandObservation:
         return np.array([name.startswith("alpha") for name in MEASURED])
 
     def predict(self, x: Array) -> tuple[Array, Array]:
-        """Features and their Jacobian (13), and the scale ``|q|^2``.
-
-        Args:
-            x: (n,) a state as in ``HAND_STATE``.
-
-        Returns:
-            (37,) with NaN for segments too short to show an axis, and (37, n).
-        """
+        """Features (37,) of (13) and the scale ``|q|^2``, NaN for short axes; Jacobian (37, n)."""
         h, seen, _ = kernel.project_hand(x[_SEEN], self.pixels_per_metre, self.shortest)
         H = np.zeros((kernel.MEASUREMENTS, len(HAND_STATE)))
         H[:, _SEEN] = seen
@@ -110,14 +102,10 @@ class HandObservation:
         return kernel.project_hand(x[_SEEN], self.pixels_per_metre, self.shortest)[2]
 
     def mirrors(self, belief: Belief) -> list[Array]:
-        """Predictions mirrored at the image plane in one joint, where (30) holds.
+        """Predictions (n,) mirrored at the image plane in one joint, where (30) holds.
 
         A segment that points a little towards the camera looks like one that points as much away
         from it. Only the angle at its root is changed.
-
-        Returns:
-            States (n,), one for each joint where the mirrored angle is another one, and not
-            excluded by the prediction.
         """
         x = belief.mean
         reach = self.mirror_reach * np.sqrt(np.diag(belief.covariance)[_FLEXIONS])
@@ -132,14 +120,9 @@ class HandObservation:
 
 
 def plant_positions(x: Array, names: tuple[str, ...], pixels_per_metre: float) -> Array:
-    """(nq,) positions of ``urdf/two_finger_hand`` for a state.
+    """(nq,) positions of ``urdf/two_finger_hand`` for a state (n,) as in ``HAND_STATE``.
 
-    The palm's quaternion is normalised; its position in the camera's plane is the wrist's pixel
-    at scale 1, its depth 0.
-
-    Args:
-        x: (n,) a state as in ``HAND_STATE``.
-        pixels_per_metre: of the image, for scale 1.
+    The palm's quaternion is normalised; its position is the wrist's pixel at scale 1, its depth 0.
     """
     value = dict(zip(HAND_STATE.names, x, strict=True))
     quaternion = np.array([value[name] for name in QUATERNION])

@@ -215,7 +215,6 @@ def mirror_changes(x: Array, reach: Array, slope: float) -> Array:
     """What to add to each flexion so that its segment looks the same, mirrored in depth.
 
     Args:
-        x: (23,) as for ``project_hand``.
         reach: (6,) larger changes are not wanted [rad].
         slope: nor segments whose end a turn moves by more than this, as a fraction of its length.
 

@@ -52,7 +52,6 @@ class Rejection:
     """A hypothesis that was given up.
 
     Attributes:
-        step: when.
         hypothesis: as it was then; for a constraint its belief is that without the limits.
         reason: "constraint", "weight", "twin" or "cap".
         row: the violated inequality's name, for a constraint.
@@ -80,12 +79,7 @@ def normalise(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
 def merge_twins(
     hypotheses: Sequence[Hypothesis], distance: float, step: int
 ) -> tuple[list[Hypothesis], list[Rejection]]:
-    """Keep the heavier of any two that say the same, with the weight of both.
-
-    Args:
-        distance: means closer than this in every element are the same [standard deviations].
-        step: for the record.
-    """
+    """Keep the heavier of any two nearer than so many deviations, with the weight of both."""
     kept: list[Hypothesis] = []
     rejected = []
     for candidate in hypotheses:

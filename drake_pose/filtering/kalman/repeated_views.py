@@ -1,15 +1,9 @@
 """The same view for long teaches nothing new: what one view may tell in all, and no more.
 
-A filter that linearises anew in every frame of a static view intersects tangents at ever other
-points of one curved set, and believes itself ever surer: the flaw that Shimada et al. state in
-their section 7. Here a view keeps the tangent of its first frame, and what that tangent leaves out
-is an offset of each measurement: unknown, the same in all frames of the view, and estimated beside
-the state. A thousand frames then tell the sum of state and offset exactly, and the state no better
-than the offset's own variance allows.
-
-A view is over when the measurement differs from the view's first one by more than noise explains.
-The offsets are independent from measurement to measurement, of the size of the curvature at the
-view's first frame, and forgotten when the view ends.
+A filter linearised anew in every frame of a static view becomes ever surer: the flaw that Shimada
+et al. state in section 7. Here a view keeps the tangent of its first frame; what that leaves out is
+an offset of each measurement, unknown, the same in all frames of the view, of the size of the
+curvature at its first frame, estimated beside the state and forgotten when the view ends.
 """
 
 from dataclasses import dataclass
@@ -30,12 +24,7 @@ _FOURTH_MOMENT = 3.0
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Frames that show the same.
-
-    Attributes:
-        reference: (m,) the measurement of its first frame.
-        count: how many frames it has had.
-    """
+    """Frames that show the same: the measurement (m,) of the first, and how many."""
 
     reference: Array
     count: int
@@ -45,7 +34,6 @@ def next_view(view: View | None, y: Array, model: ObservationModel, significance
     """The view a measurement belongs to: the one so far, or one that begins with it.
 
     Args:
-        y: (m,) measured, NaN where occluded.
         significance: a view is new when noise alone would make it differ so much from the reference
             with no more than this probability; 0: every one is new.
     """

@@ -119,13 +119,10 @@ class FilterState:
 class TruncatedFilter:
     """An extended Kalman filter whose belief stays inside linear inequalities.
 
-    After Shimada, Shirai, Kuno and Miura, sections 4 and 5: prediction at constant velocity,
-    update linearised at the prediction and at its mirrored twins (30), truncation. Differences,
-    each of which can be set back: all rows are truncated at once; the update iterates, linearised
-    where the truncated belief lies; and with "joint" the truncated belief is given out and
-    linearised at, but the next step is predicted from the belief without its limits. Truncated
-    again in every step, a belief would be pushed away from its limits ever further, and would
-    become ever surer, though the limits say the same each time.
+    Shimada, Shirai, Kuno and Miura, sections 4 and 5, with differences, each of which can be set
+    back: all rows are truncated at once; the update iterates, linearised where the truncated belief
+    lies; and with "joint" the next step is predicted from the belief without its limits, which
+    would else count again in every step and make it ever surer.
 
     Args:
         inequalities: the rows, over any elements of the state.
@@ -186,11 +183,7 @@ class TruncatedFilter:
     def update(
         self, state: FilterState, y: Array, observation: ObservationModel | None = None
     ) -> FilterState:
-        """Use a measurement of the predicted moment: section 5, steps 2 to 6.
-
-        Args:
-            y: (m,) NaN where occluded.
-            observation: what is measured this time, if not what the filter was made with.
+        """Use a measurement y (m,), NaN where occluded: section 5, steps 2 to 6.
 
         Raises:
             SettingsError: the measurement does not fit.

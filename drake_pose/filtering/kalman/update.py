@@ -81,13 +81,10 @@ class Updated:
     """A belief after a measurement.
 
     Attributes:
-        belief: mean and covariance.
         log_likelihood: logarithm of the measurement's probability density, from the normal
             distribution fitted at the mean.
         distance: the squared distance of mean and measurement from the prediction: chi-squared
             with ``count`` degrees of freedom if all is as modelled.
-        count: how many numbers were measured.
-        iterations: linearisations made.
     """
 
     belief: Belief
@@ -131,8 +128,7 @@ def with_variances(model: ObservationModel, y: Array, variances: Array) -> Obser
     """The same model for one measurement whose noise is its own.
 
     Args:
-        y: (m,) the measurement, NaN where occluded.
-        variances: (m,) of its noise; those of what is occluded do not matter.
+        y, variances: (m,), NaN where occluded.
 
     Raises:
         SettingsError: wrong sizes, or a variance of something measured that is not positive.
@@ -256,8 +252,6 @@ def update(
 
     Args:
         y: (m,) measured, NaN where occluded.
-        model: says what was to be expected.
-        iterations: linearisations at most.
         start: (n,) where to linearise first; the predicted mean if not given.
         tempered: whether a far start is approached with more noise than there is.
 
@@ -314,7 +308,6 @@ def limited_update(
     Args:
         prediction, y, model, iterations, start: as of ``update``.
         truncate: a belief, and sites (S, 2) to begin with, to a result.
-        sites: for the first truncation.
         tempered: as of ``update``; a mirrored start would be drawn back to the prediction by it.
 
     Raises:

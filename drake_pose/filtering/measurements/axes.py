@@ -93,14 +93,10 @@ class AxisObserver:
         self._settings = settings or AxisSettings()
 
     def measure_labels(self, labels: Labels, q: Array) -> dict[str, Axis]:
-        """Axes in a label image (H, W): the link at each pixel, -1 where none is.
+        """Axes of segments seen well enough in a label image (H, W) of links, -1 for none.
 
         Args:
-            labels: see ``LabelRenderer.segments``.
-            q: (nq,) the rough pose, within some degrees.
-
-        Returns:
-            The axis of each segment that is seen well enough.
+            q: (nq,) a rough pose, within some degrees.
 
         Raises:
             MaskError: an image that is not of the camera's size.
@@ -199,10 +195,8 @@ class AxisObservation:
         axes: start and end of each segment's axis (3,), (3,) in its link's frame, by name [m].
         origin: (2,) where the image's origin is for rho [pixel]; the nearer to the segments, the
             more rho tells.
-        settings: how axes are measured, and how well.
 
     Attributes:
-        observer: measures the axes in a label image.
         names: (m) ``alpha_<link>`` and ``rho_<link>`` of each segment.
         variances: (m,) of the noise, where a frame does not say its own.
         wraps: (m,) true for alpha.
@@ -242,10 +236,7 @@ class AxisObservation:
         return self._links
 
     def predict(self, x: Array) -> tuple[Array, Array]:
-        """Axes (m,) at a state (n,), NaN for a segment too short in the image; and their Jacobian.
-
-        The Jacobian (m, n) is by central differences.
-        """
+        """Axes (m,) at a state (n,), NaN where too short; Jacobian by central differences."""
         h = self._axes_at(x)
         H = np.zeros((len(h), len(x)))
         layout = self.body.layout

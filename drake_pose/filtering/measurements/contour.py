@@ -226,7 +226,6 @@ class ContourObservation(BodyState):
         """Compare the model's contour at a state with a frame.
 
         Args:
-            x: (n,) the state.
             distance: about how far they are apart [pixel], of the measurement before; None: as far
                 as is looked.
             number: how many measurements of the frame were made before: lines in pictures are

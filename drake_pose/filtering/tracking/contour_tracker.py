@@ -94,9 +94,6 @@ class ContourTracker:
         observation: the body and its cameras.
         period: time between two frames [s].
 
-    Attributes:
-        filter: the filter; its layout is the observation's.
-
     Raises:
         SettingsError: a period that is not positive.
     """

@@ -43,11 +43,7 @@ class Followed:
 def make_tracker(
     tree: PoseTree, cameras: Sequence[Camera], period: float, settings: TrackingSettings
 ) -> ContourTracker:
-    """The tracker of a pose tree's contour.
-
-    Args:
-        period: time between two frames [s].
-        settings: how the body may move, and what is unknown.
+    """The tracker of a pose tree's contour, with a period between two frames [s].
 
     Raises:
         SettingsError: no camera, a period that is not positive, or a tree without free values.
@@ -75,10 +71,6 @@ class MatchAndTrack:
     Args:
         search: asked in the first frame, and when the track is lost.
         period: time between two frames [s].
-        settings: how the body may move, and when its track is lost.
-
-    Attributes:
-        tracker: follows the contour.
 
     Raises:
         SettingsError: no camera, a period that is not positive, or a tree without free values.
@@ -106,7 +98,6 @@ class MatchAndTrack:
         """The next frame.
 
         Args:
-            last: what was known after the frame before.
             views: the cameras' masks; there may be none where there are pictures.
             root_position: (3,) where the root is known to be now [m].
             pictures: (H, W, 3 or 4) by camera; the colours along the contour stand in where a

@@ -1,10 +1,8 @@
 """A recorded sequence fitted as a whole: proportions and all poses at once, with how sure they are.
 
-A filter knows of each frame what came before. Of a recording all frames are at hand: poses that
-follow one another smoothly, the proportions that they share and what is usual are fitted together
-by Levenberg and Marquardt's method (a smoother, linearised anew until it stands still). Several
-starts are fitted, as one parallel view cannot tell them apart, and those that explain the sequence
-about as well as the best are all kept.
+Poses that follow one another smoothly, the proportions that they share and what is usual are fitted
+together by Levenberg and Marquardt's method (a smoother). Of several starts, those that explain the
+sequence about as well as the best are kept: one parallel view cannot tell them apart.
 """
 
 from __future__ import annotations
@@ -67,11 +65,7 @@ class SequenceFitSettings:
 
 @dataclass(frozen=True, eq=False)
 class FittedSequence:
-    """One explanation of a sequence.
-
-    Args:
-        fitted: its proportions, and its pose in every frame.
-    """
+    """One explanation of a sequence: its proportions, and its pose in every frame."""
 
     body: ProportionedBody
     fitted: FittedProportions
@@ -103,7 +97,6 @@ def fit_sequence(
     """The explanations of a sequence of one camera's masks, best first.
 
     Args:
-        tracker: says what is unknown, how it moves, its limits, and what is usual.
         masks: of the frames, three or more.
         starts: for each start the states (n,) in all frames.
         period: time between two frames [s].

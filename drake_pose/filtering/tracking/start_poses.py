@@ -1,8 +1,7 @@
 """Several poses from which a track may begin, and which of them a sequence bears out.
 
-One parallel silhouette looks the same from the front as mirrored in depth, and a hand that is
-tilted towards the viewer much like one tilted away. What moves tells them apart: so poses that
-explain the first frame are followed for some frames, and the one that explains these best is kept.
+One parallel silhouette looks the same mirrored in depth. Poses that explain the first frame are
+followed for some frames, and the one that explains these best is kept.
 """
 
 from __future__ import annotations
@@ -91,13 +90,7 @@ def find_start(
     masks: Sequence[Sequence[Mask | None]],
     settings: StartSettings | None = None,
 ) -> list[FollowedStart]:
-    """The poses of the first frame that could be followed, best first.
-
-    Args:
-        tracker: follows.
-        x: (n,) a state that explains the first frame.
-        masks: of the first frames, of all cameras.
-    """
+    """The poses to be followed in frames of all cameras' masks, best first, from a state (n,)."""
     settings = settings or StartSettings()
     observation = tracker.observation
     steps = (0.0, settings.tilt, -settings.tilt)

@@ -51,7 +51,6 @@ class GeneralRow:
     """lower <= sum of factor x joint <= upper.
 
     Attributes:
-        name: for messages and logs.
         terms: a factor for each joint.
         lower, upper: bounds in ``unit``; what is not given does not bound.
         unit: as in ``Difference``.
@@ -69,7 +68,6 @@ class UsualRow:
     """The sum of factor x joint is usually about mean.
 
     Attributes:
-        name: for messages.
         terms: a factor for each joint.
         mean, deviation: its mean and standard deviation in ``unit``.
         unit: as in ``Difference``.
@@ -93,13 +91,7 @@ class Couplings:
 
 @dataclass(frozen=True, eq=False)
 class UsualPose:
-    """How a body is usually held, as independent normal distributions.
-
-    Attributes:
-        phi: (k, n) the factors of the elements of a state x.
-        mean: (k,) of phi x.
-        deviation: (k,) its standard deviation.
-    """
+    """How a body is usually held: phi (k, n) times a state x is normal, mean and deviation (k,)."""
 
     phi: NDArray[np.float64]
     mean: NDArray[np.float64]
@@ -116,9 +108,6 @@ def load_couplings(path: Path | str, columns: Sequence[str]) -> Inequalities:
           - {first: flexion_12, second: flexion_13, within: 10, unit: deg}
         rows:
           - {name: curl, terms: {flexion_11: 1, flexion_12: 1}, upper: 150, unit: deg}
-
-    Args:
-        columns: (n) the names of the elements of the state.
 
     Raises:
         ModelError: the file cannot be read; the message names it and what is wrong.
@@ -153,8 +142,7 @@ def load_usual_pose(path: Path | str, columns: Sequence[str]) -> UsualPose:
         usual:
           - {name: knuckle, terms: {flexion_11: 1}, mean: 30, deviation: 25, unit: deg}
 
-    Args:
-        columns: (n) the names of the elements of the state. Rows about others are left out.
+    Rows about other elements than ``columns`` are left out.
 
     Raises:
         ModelError: the file cannot be read; the message names it and what is wrong.

@@ -70,13 +70,7 @@ class Inequalities:
 def make_inequalities(
     columns: Sequence[str], rows: Sequence[str], phi: ArrayLike, b: ArrayLike
 ) -> Inequalities:
-    """Inequalities from plain arrays.
-
-    Args:
-        columns: (n) the names of the elements of x.
-        rows: (K) a name for each row.
-        phi: (K, n) the rows.
-        b: (K,) the bounds.
+    """Inequalities from columns (n), names of rows (K), phi (K, n) and bounds (K,).
 
     Raises:
         SettingsError: sizes that do not fit, a number that is not finite, or a row of zeros.
@@ -105,11 +99,6 @@ def two_sided(
     upper: float,
 ) -> Inequalities:
     """Bounds lower <= phi^T x <= upper as two rows, or as one where the other bound is infinite.
-
-    Args:
-        columns: (n) the names of the elements of x.
-        phi: (n,) its factors.
-        lower, upper: the bounds; -inf and inf mean none.
 
     Raises:
         SettingsError: the bounds are crossed or NaN, or phi is zero.
@@ -154,11 +143,6 @@ def from_bounds(
     names: Sequence[str], lower: ArrayLike, upper: ArrayLike, columns: Sequence[str] | None = None
 ) -> Inequalities:
     """Bounds lower <= x <= upper, element by element; infinite bounds make no row.
-
-    Args:
-        names: (n) the names of the bounded elements.
-        lower, upper: (n,) their bounds.
-        columns: the names of all elements of x; the bounded ones if not given.
 
     Raises:
         SettingsError: bounds are crossed.

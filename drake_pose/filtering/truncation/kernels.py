@@ -131,10 +131,8 @@ def propagate(
     sites have settled.
 
     Args:
-        base_mean: (n,) of the belief without any of the bounds.
-        base_factor: (n, n) of its covariance.
-        directions: (S, n).
-        lower, upper: (S,) bounds, infinite for none.
+        base_mean, base_factor: (n,) and (n, n) of the belief without any of the bounds.
+        directions, lower, upper: (S, n), (S,) and (S,), infinite for none.
         sites: (S, 2) tau and nu to start from, changed in place.
         tolerance: of the change of a marginal's mean and variance in a sweep, in standard
             deviations and relative.
@@ -209,8 +207,7 @@ def cut_one_by_one(
     """Truncate by (21) to (29), in place.
 
     Args:
-        mean: (n,) changed in place.
-        factor: (n, k) L of the covariance L L^T, changed in place.
+        mean, factor: (n,) and (n, k) L of the covariance L L^T, changed in place.
         phi, b: (K, n) and (K,) the rows.
         skip_above: rows with a larger c_k are left out.
         c: (K,) receives (24) at each row's turn, infinite for rows without variance.

@@ -145,11 +145,6 @@ def truncate_sequential(
 
     The result depends on the order of the rows.
 
-    Args:
-        mean: (n,) q_0.
-        covariance: (n, n) Q_0.
-        inequalities: K rows over the same n elements.
-
     Raises:
         SettingsError: sizes that do not fit, NaN, an indefinite covariance, or a row without
             variance that is not satisfied.
@@ -177,8 +172,6 @@ def truncate_joint(
     the covariance (the sequential form: 1.6 and 4.8).
 
     Args:
-        mean: (n,).
-        covariance: (n, n).
         rows: the inequalities, prepared by ``join_rows`` or not.
         tolerance: of the marginals' change from sweep to sweep.
         start: (S, 2) sites of a similar problem to begin with, which saves sweeps.

@@ -56,8 +56,6 @@ class Pictures:
     """The silhouettes of one instant as bits: parts of one long mask, silhouettes before bands.
 
     Attributes:
-        body, views: what it was made of.
-        bit_views: one for each view.
         has_bands: whether pixels outside the silhouettes have bits, too.
         coarse: whether surfaces of many triangles may be simplified.
         part_starts: (parts + 1,) where each part begins, and the mask's length [word].
@@ -91,16 +89,10 @@ class Pictures:
     def draw_node(
         self, node: int, samples: np.ndarray, X_WN: np.ndarray, masks: np.ndarray
     ) -> np.ndarray:
-        """Add a node's pictures to masks; there must be bands.
-
-        Args:
-            samples: (n,) the samples it takes.
-            X_WN: (n, 4, 4) its poses there.
-            masks: (n, W) uint64, changed in place.
+        """Add a node's pictures at samples (n,), poses X_WN (n, 4, 4), to masks (n, W) uint64.
 
         Returns:
-            (n, 3) int64 the areas in the silhouettes, in the bands and beyond, summed over the
-            views.
+            (n, 3) int64 areas in the silhouettes, the bands, which there must be, and beyond.
         """
         starts, views = self.part_starts, len(self.views)
         total = np.zeros((len(X_WN), 3), dtype=np.int64)
@@ -146,11 +138,7 @@ class _Poses:
 
 
 class PoseStore:
-    """All poses of all nodes that stay inside a limit, by the pose of their parent.
-
-    Args:
-        outside_share: the share of a node's mean projected area that may lie outside.
-    """
+    """All poses of nodes with so large a share of their area outside at most, by parent."""
 
     def __init__(self, body: SampledBody, pictures: Pictures, outside_share: float) -> None:
         self.body = body
@@ -249,12 +237,7 @@ class PoseStore:
         return np.asarray(poses[:, parent])
 
     def reaches(self, poses: np.ndarray, node: int, taken: np.ndarray) -> Reaches:
-        """What can be reached by the nodes that come after ``node``, which takes poses (p,).
-
-        Args:
-            poses: (B, nodes) of the nodes placed before; -1: not placed.
-            taken: (p,).
-        """
+        """What later nodes can reach where ``node`` takes poses (p,); -1 in poses: not placed."""
         placed = _placed(poses, node)
         waiting = [
             i

@@ -39,9 +39,6 @@ class SampledBody:
         reach_balls: (nodes, 4) centre in the parent's frame and radius [m] of a ball that holds the
             node and its descendants at all samples.
 
-    Args:
-        settings: intervals and order.
-
     Raises:
         SettingsError: if the order does not name every node once, parents before children.
     """

@@ -25,20 +25,15 @@ def best_leaf_combination(
 ) -> tuple[tuple[int, ...], float]:
     """Find the combination of the leaves' candidates with the smallest J.
 
-    A leaf changes the picture only where no inner node covers it. Each such pixel has a pattern:
-    which candidates of which leaves cover it. Pixels of one pattern are counted together, so that
-    a combination costs one look at the few patterns, not at the picture.
+    Pixels that no inner node covers are counted by their pattern: which candidates cover them.
 
     Args:
-        inner: the nodes that are not leaves.
         inner_poses: their samples (len(inner),) and poses (len(inner), 4, 4).
-        candidates: for each leaf the samples (n,) and poses (n, 4, 4) of its candidates.
-        adopted: for each leaf the candidate in use.
-        limit: up to this many combinations are all tried; beyond, one leaf after another.
+        candidates: for each leaf the samples (n,) and poses (n, 4, 4).
+        limit: up to so many combinations are all tried; beyond, one leaf after another.
 
     Returns:
-        The candidate of each leaf, and by how much its J is below that of ``adopted`` [pixel].
-        ``adopted`` itself where nothing is better.
+        The candidate of each leaf, and by how much J is below that of ``adopted`` [pixel].
     """
     counts = [len(samples) for samples, _ in candidates]
     patterns, gains = _patterns(scoring, inner, inner_poses, leaves, candidates)

@@ -1,8 +1,6 @@
 """Kameda's search: one silhouette to joint angles, node by node (sections 5.1 and 5.2).
 
-The steps keep the paper's numbers and letters: F (``done``), S' (``uncovered``), JAC_i(t)
-(``_NodeList.samples[t]``), u_i (``_NodeList.adopted``). With several views every area is summed
-over the views, and (4) holds in each view.
+With several views every area is summed over the views, and (4) holds in each view.
 """
 
 import time
@@ -51,13 +49,7 @@ class _Best:
 
 
 class PaperSearch:
-    """Matches silhouettes with a pose tree by the paper's search.
-
-    The sampling grids are made once; :meth:`match` may then be called for any number of pictures.
-
-    Args:
-        settings: the parameters; the paper's where not given.
-    """
+    """Matches silhouettes with a pose tree by the paper's search; grids are made once."""
 
     def __init__(self, tree: PoseTree, settings: PaperSearchSettings | None = None) -> None:
         self.tree = tree
@@ -67,11 +59,8 @@ class PaperSearch:
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
         """Estimate the pose that the views show; see ``PoseSearch``.
 
-        Returns:
-            The best pose found; ``found`` is False where none was.
-
         Raises:
-            SettingsError: if there is no view.
+            SettingsError: there is no view.
         """
         if not views:
             raise SettingsError("a match needs at least one view, but none was given")

@@ -21,10 +21,9 @@ class GridPoses:
 
     Args:
         samples: (m, nodes) int, the index of each node's sample in its grid.
-        node_values: of each pose the values of each node of the pose tree.
-        X_WN: (m, nodes, 4, 4) the nodes' poses in the world.
+        X_WN: (m, nodes, 4, 4).
         J: (m,) the objective (1) [pixel].
-        area: the silhouettes' area [pixel]: J / area is E_total.
+        area: the silhouettes' area [pixel].
     """
 
     samples: np.ndarray
@@ -53,23 +52,12 @@ class Gathering:
         self._errors: list[np.ndarray] = []
 
     def add(self, samples: np.ndarray, errors: np.ndarray) -> None:
-        """Take in poses.
-
-        Args:
-            samples: (n, nodes) the sample of each node.
-            errors: (n,) about what J over the silhouettes' area is.
-        """
+        """Take in the samples (n, nodes) of poses, and about their E_total (n,)."""
         self._samples.append(np.asarray(samples))
         self._errors.append(np.asarray(errors, dtype=np.float64))
 
     def choose(self, scoring: Scoring, pictures: Pictures, count: int, alike: float) -> GridPoses:
-        """The best poses that do not look alike.
-
-        Args:
-            pictures: with bands; in them poses are compared.
-            count: at most this many.
-            alike: as in BeamSearch.best_poses.
-        """
+        """The best poses that do not look alike in pictures with bands, ``count`` at most."""
         nodes = len(scoring.sampled.values)
         samples = self._different_samples(nodes)
         chosen = np.empty((0, nodes), dtype=samples.dtype)

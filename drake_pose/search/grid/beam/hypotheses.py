@@ -67,12 +67,7 @@ class Beam:
         )
 
     def without(self, poses: np.ndarray, nodes: Sequence[int]) -> Hypotheses:
-        """One hypothesis that has poses (nodes,) but for some nodes.
-
-        Args:
-            poses: in the PoseStore, of all nodes.
-            nodes: those taken out; with a node all its descendants must be.
-        """
+        """A hypothesis with poses (nodes,) but of some nodes, given with all their descendants."""
         start = self.start()
         far = 0
         start.poses[0] = poses
@@ -94,7 +89,6 @@ class Beam:
         """Place one more node in every hypothesis and keep the best.
 
         Args:
-            hypotheses: they have placed the node's parent.
             outside_weight: what a pixel outside counts; one newly covered counts one.
             exact: drop what cannot cover the whole silhouettes any more.
 
@@ -172,9 +166,6 @@ class Beam:
         """Place nodes one after another.
 
         Args:
-            start: the hypotheses to begin with.
-            width: how many are kept after each.
-            outside_weight, exact: as in grow.
             proceed: asked after each node, with the number of hypotheses made, whether to go on.
 
         Returns:
@@ -211,11 +202,7 @@ def search_limbs_again(
     """Search limbs again, one or two at a time, until that improves nothing any more.
 
     Args:
-        order: the nodes in the order in which they are placed.
         poses: (nodes,) the pose of each node in the PoseStore.
-        J: its objective as the beam counts it [pixel].
-        width: how many hypotheses are kept.
-        proceed: as in Beam.run.
         found: told of the last hypotheses of every search.
 
     Returns:
@@ -268,13 +255,11 @@ def turn_single_nodes(
     """Try all samples of one node after another, all that hangs on it moving along.
 
     Args:
-        pictures: with bands; in them the samples are compared.
-        samples: (nodes,) the sample of each node.
+        pictures: with bands.
         proceed: asked before each node whether to go on.
 
     Returns:
-        (nodes,) samples no single one of which can be changed for the better, as far as the
-        pictures show it, or as far as it got.
+        Samples (nodes,) that no single change improves in the pictures, as far as it got.
     """
     current = samples.copy()
     J = float(scoring.J(scoring.sampled.poses(current[None]), current[None])[0])

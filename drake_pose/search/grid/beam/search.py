@@ -1,9 +1,7 @@
 """The beam search: many hypotheses at once, ranked by what the whole objective will be.
 
-Like Kameda's search it places one node after another, each at the samples of its grid, and scores
-what a node covers newly (5). Unlike it, it keeps many hypotheses instead of one with K
-alternatives, and needs no threshold r: its first stages let nothing lie outside the silhouette and
-end at J = 0, which certifies itself; later ones let more and more, weighed against what is covered.
+Its first stages let nothing lie outside the silhouette and end at J = 0, which certifies itself;
+later ones let more and more, weighed against what is covered newly (5).
 """
 
 import math
@@ -35,13 +33,10 @@ _MOST_BYTES = 1_000_000_000
 
 
 class BeamSearch:
-    """Matches silhouettes with a pose tree by the beam search.
-
-    Grids and tables are made once; :meth:`match` may then be called for any number of pictures.
+    """Matches silhouettes with a pose tree by the beam search; tables are made once.
 
     Args:
-        examination: how every answer is examined: whether it is proved best, and which other poses
-            look the same; None: it is not.
+        examination: how every answer is examined; None: it is not.
     """
 
     def __init__(
@@ -60,9 +55,8 @@ class BeamSearch:
         """Estimate the pose that the views show; see ``PoseSearch``.
 
         Returns:
-            The best pose found. ``stopped_by`` is "exact" if J = 0, "end" if all stages were run,
-            or the limit that stopped the search: "time_limit" or "hypothesis_limit". ``runs``
-            counts how often a node was placed.
+            The best pose found; ``stopped_by`` is "exact" (J = 0), "end", "time_limit" or
+            "hypothesis_limit".
 
         Raises:
             SettingsError: if there is no view.
@@ -79,13 +73,9 @@ class BeamSearch:
     def match_exactly(
         self, views: Sequence[View], root_position: np.ndarray | None = None
     ) -> PoseEstimate | None:
-        """Run the stages that let nothing lie outside; they end at once where nothing fits.
+        """Run the stages that let nothing lie outside: a pose whose J is 0, or None.
 
-        Where so much fits roughly that its poses fill a gigabyte, as in a picture of another body
-        that may be turned anyhow, they end, too.
-
-        Returns:
-            A pose whose J is 0, or None.
+        They end, too, where what fits roughly fills a gigabyte.
         """
         start = time.perf_counter()
         exact = tuple(stage for stage in self.settings.stages if stage.outside_share == 0.0)
@@ -110,7 +100,6 @@ class BeamSearch:
         poses that leave the silhouette a little.
 
         Args:
-            views, root_position: as in match.
             count: at most this many.
             alike: two poses look alike if each node's pictures in both have so much of their union
                 in common in all views, or it is hidden in both, covering nothing that other nodes

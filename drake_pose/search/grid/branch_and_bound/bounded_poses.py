@@ -134,11 +134,7 @@ class SubtreeReaches:
         self._rows = [np.full(0, -1, dtype=np.int64) for _ in self._nodes]
 
     def rows(self, node: int, parents: np.ndarray) -> np.ndarray:
-        """For all poses of the node's parent the row of ``table``; -1 where not asked for yet.
-
-        Args:
-            parents: (n,) the poses asked for; 0 for a root.
-        """
+        """For all poses of the node's parent the row of ``table``; -1 where never asked for."""
         size = int(parents.max(initial=0)) + 1
         known = self._rows[node]
         if len(known) < size:

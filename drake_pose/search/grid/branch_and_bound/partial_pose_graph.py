@@ -1,9 +1,7 @@
 """Very many poses in little room: a graph of partial poses.
 
-The nodes are placed one after another, layer by layer. A state of a layer stands for all partial
-poses that are equal in all that matters later; an edge places the next node at one of its samples.
-Every path from the one first state to a last one is a pose. From one state a sample leads to one
-state at most, so whether a pose is in the graph takes one look a node.
+A state stands for all partial poses that are equal in all that matters later; an edge places the
+next node at one of its samples. Every path from the first state to a last one is a pose.
 """
 
 from collections.abc import Sequence
@@ -102,11 +100,7 @@ class PartialPoseGraph:
         return seen
 
     def restricted(self, allowed: Sequence[np.ndarray | None]) -> "PartialPoseGraph":
-        """Those poses that take allowed samples alone.
-
-        Args:
-            allowed: for each node (samples,) bool, or None where all are.
-        """
+        """The poses that take allowed samples alone, (samples,) bool of each node; None: all."""
         layers = []
         for layer in self.layers:
             rule = allowed[layer.node]

@@ -50,7 +50,6 @@ class PosesWithin:
         complete: whether it holds all poses within the limit.
         limited: whether a limit of the search left some out.
         lower_bound: no pose of the grid that is not in the graph has a smaller objective [pixel].
-        states: how many partial poses were looked at.
     """
 
     graph: PartialPoseGraph
@@ -95,11 +94,8 @@ def branch_and_bound(
     """Find all poses of the grid whose objective is no greater than a limit.
 
     Args:
-        J_limit: the limit, 0 or more [pixel].
-        limits: how much it may look at.
-        kept_samples: (nodes,) samples of a pose that is never dropped for want of room.
-        deadline: the value of time.perf_counter() at which it stops, where several searches share
-            a time limit [s].
+        kept_samples: (nodes,) of a pose that is never dropped for want of room.
+        deadline: the value of time.perf_counter() at which it stops [s].
 
     Returns:
         The poses; not all if a limit was reached, or if an area beyond the bands around the

@@ -1,9 +1,7 @@
 """What an answer on a grid is worth: whether it is proved best, and what else looks the same.
 
-A search is quick because it drops poses by guess. Branch and bound drops a partial pose only if no
-completion can be within a limit: a complete search without a find proves that the objective is
-greater than the limit everywhere. The limit is raised step by step from 0 to just below the best
-objective known, so that a bound is proved even where time does not suffice for the whole.
+A complete branch and bound without a find proves that J is greater than its limit everywhere. The
+limit is raised from 0 to just below the best J known: a bound is proved whenever time ends.
 """
 
 from collections.abc import Sequence
@@ -30,9 +28,8 @@ class ExaminationSettings:
             is not tried. An answer with J = 0 needs none.
         family_time_limit: the same of the search for all poses as good; it then answers with those
             it has, and no joint is called determined.
-        proof_poses: each step of the proof ends after this many poses of nodes are drawn, which
-            takes nearly all its time: about a second by default. Unlike a limit on time, it gives
-            the same result on every machine.
+        proof_poses: each step of the proof ends after so many poses of nodes are drawn: unlike a
+            limit on time, with the same result on every machine.
         family_poses: the same of the search for all poses as good: about two seconds.
         memory: of each of the two, for what it keeps; it ends as if its time were over [byte].
         families: how many families are described at most.
@@ -79,11 +76,6 @@ def examine(
 ) -> PoseEstimate:
     """Examine what a search on a body's grid found.
 
-    Args:
-        body: the body whose grid was searched.
-        result: what was found in them.
-        root_position: (3,) as the search was given it [m].
-
     Returns:
         The result with ``lower_bound``, ``budget_spent`` and ``pose_set``; a
         better pose in place of the one found if the proof met one. Nothing found stays as it is.
@@ -128,10 +120,8 @@ class Proof:
     Attributes:
         proved: whether no pose of the grid has a smaller objective than J.
         budget_spent: whether a limit on time or room ended the proof before that was settled.
-        J: the smallest objective known [pixel].
         samples: (nodes,) the samples of a pose that has it.
         lower_bound: no pose of the grid has a smaller objective than this [pixel].
-        states: how many partial poses were looked at.
     """
 
     proved: bool

@@ -1,9 +1,7 @@
 """Edges inside the silhouette choose among poses that the silhouette cannot tell apart.
 
-Where one limb passes in front of another, a label image shows an edge that the silhouette
-does not (Kameda, Minoh, Ikeda, section 7, name this as future work). How likely the edges are if a
-pose is the true one follows from how often edges are missed, displaced or wrong; poses under which
-they are far too unlikely are ruled out, so that the true one seldom is (``choose_by_edges``).
+Poses under which the edges of a label image are far too unlikely, as edges are missed, displaced or
+wrong, are ruled out (Kameda, Minoh, Ikeda, section 7, name this as future work).
 """
 
 import itertools
@@ -74,12 +72,7 @@ class EdgeErrors:
         return table
 
     def log_patch(self, seen: int, patches: float) -> np.ndarray:
-        """The log probability (4,) of what a patch holds, as in ``log_pixel``.
-
-        Args:
-            seen: how many pixels of the picture are edges.
-            patches: how many patches there are.
-        """
+        """The log probability (4,) of what a patch holds, of ``seen`` pixels in ``patches``."""
         # A line as long as a patch is wide lies in two of them, mostly.
         wrong = np.clip(2.0 * self.wrong * seen / (self.patch * patches), _WRONG_PIXEL, 0.5)
         missing = self.missing
@@ -95,7 +88,6 @@ class InnerEdges:
         window: first row, row after the last, first column and column after the last of the
             silhouette's surroundings.
         mask: (H, W) bool, the silhouette.
-        errors: how they may be wrong.
     """
 
     edges: np.ndarray
@@ -127,9 +119,6 @@ class InnerEdges:
 
         That the edges are without any error counts as likely beforehand as that they have the
         errors which ``errors`` describes.
-
-        Args:
-            segments: the segment seen at each pixel, -1 where none is.
         """
         top, bottom, left, right = self.window
         window = (slice(top, bottom), slice(left, right))
@@ -150,11 +139,7 @@ class InnerEdges:
 
 
 def edges_of_labels(labels: np.ndarray, mask: np.ndarray) -> InnerEdges:
-    """The borders between the labels inside a silhouette.
-
-    Args:
-        labels: (H, W) int, a label for each segment; negative: none.
-        mask: (H, W) bool, the silhouette.
+    """The borders between labels (H, W) int, negative for none, inside a silhouette.
 
     Raises:
         SettingsError: if the shapes differ or the silhouette is empty.
@@ -200,10 +185,7 @@ class EdgeChoice:
         return self.left == 1 and self.exhaustive
 
     def rules_out(self, samples: np.ndarray) -> bool:
-        """Whether a pose of the set, samples (nodes,), was judged and is ruled out.
-
-        Of a large set not all poses are judged: one that was not is not ruled out.
-        """
+        """Whether a pose of the set, samples (nodes,), was judged and is ruled out."""
         return bool((self.samples[self.left :] == samples).all(axis=1).any())
 
 
@@ -222,7 +204,6 @@ def choose_by_edges(
     look like, as long as the edges are no worse than their ``errors`` say.
 
     Args:
-        renders: one for each camera.
         most: a set of more poses is judged by this many random ones; from the best of them, one
             node and all that hangs on it is then turned in a tenth as many ways while that helps.
         risk: the probability that the true pose may be ruled out with.

@@ -47,7 +47,7 @@ def estimate_joints(
     *,
     complete: bool = True,
 ) -> tuple[JointEstimate, ...]:
-    """Report each value of a tree.
+    """Report each value of a tree, node after node.
 
     A value is determined if it spans no more than one step of its grid; half a step is then
     added on both sides, because the truth may lie between the grid's values.
@@ -57,9 +57,6 @@ def estimate_joints(
         about: for each node the values (k,) of the answer; angles that turn around are given in
             the turn nearest to them.
         complete: whether these are all; else nothing is determined but what cannot move.
-
-    Returns:
-        One report for each value, node after node.
     """
     reports = []
     for i, node in enumerate(sampled.tree.nodes):
@@ -101,13 +98,7 @@ _MOST_PAIRS = 200_000
 
 @dataclass(frozen=True)
 class GraphFamily:
-    """One family of a graph.
-
-    Attributes:
-        clusters: (nodes,) int64 the cluster of each node.
-        size: how many poses it has.
-        J: the smallest objective of these [pixel].
-    """
+    """A family of a graph: clusters (nodes,) int64, count of poses, smallest J [pixel]."""
 
     clusters: np.ndarray
     size: float
@@ -141,11 +132,7 @@ def cluster_samples(sampled: SampledTree, node: int, samples: np.ndarray) -> np.
 
 
 def split_into_families(graph: PartialPoseGraph, labels: list[np.ndarray]) -> list[GraphFamily]:
-    """The families of a graph, best first, of equals the larger first.
-
-    Args:
-        labels: for each node the clusters of its samples, as of cluster_samples.
-    """
+    """The families of a graph by clusters of samples, best first, of equals the larger first."""
     states, families = np.zeros(1, dtype=np.int64), np.zeros(1, dtype=np.int64)
     sizes: np.ndarray = np.ones(1)
     clusters = np.zeros((1, len(labels)), dtype=np.int64)
@@ -200,11 +187,7 @@ _CONTOUR_SHARE = 0.05
 
 @dataclass(frozen=True)
 class GridPoseSet(PoseSet):
-    """A set of poses of the grid that tells of any pose whether it is in it.
-
-    Args:
-        budget_spent: whether a limit on time or room left poses out.
-    """
+    """A set of poses of the grid that tells of any pose whether it is in it."""
 
     graph: PartialPoseGraph
     sampled: SampledTree
@@ -244,7 +227,6 @@ def find_families(
             this [pixel]; None: not at all where the best is exact, else 5 % of the length of the
             silhouettes' contours.
         most: how many families are described at most.
-        limits: how much may be looked at; a limit leaves those found.
 
     Returns:
         The set. It holds the best pose known, and if a better one turns up, that one and those

@@ -15,11 +15,7 @@ _EXACT_ROTATION = 1e-13
 
 
 def check_side(value: Any, field: str, where: str) -> int:
-    """Returns a width or height [pixel] as an int.
-
-    Raises:
-        CameraError: when it is not a whole number from 1 to LARGEST_SIDE.
-    """
+    """A width or height [pixel], a whole number from 1 to LARGEST_SIDE, or CameraError."""
     number = check_number(value, field, where)
     if number != math.floor(number) or not 1 <= number <= LARGEST_SIDE:
         raise CameraError(
@@ -30,12 +26,9 @@ def check_side(value: Any, field: str, where: str) -> int:
 
 
 def check_number(value: Any, field: str, where: str, *, positive: bool = False) -> float:
-    """Returns a finite (and on request positive) number as a float.
+    """A finite (and on request positive) number as a float, or CameraError.
 
     YAML 1.1 reads ``1e-3`` as text, so text that spells a number is accepted.
-
-    Raises:
-        CameraError: when it is none.
     """
     try:
         if isinstance(value, bool) or not isinstance(
@@ -52,14 +45,12 @@ def check_number(value: Any, field: str, where: str, *, positive: bool = False) 
 
 
 def check_pose(value: Any, field: str, where: str) -> np.ndarray:
-    """Returns a rigid transform as a read-only (4, 4) float64 array.
+    """A rigid transform as a read-only (4, 4) float64 array.
 
-    A rotation that was rounded when it was written is replaced by the nearest exact one, so that
-    the kernel and Drake (which insists on an exact one) look through the same camera.
+    A rounded rotation is replaced by the nearest exact one, on which Drake insists.
 
     Raises:
-        CameraError: when it is not a finite 4 x 4 matrix, its last row is not 0 0 0 1, or its
-            upper left 3 x 3 block is not a rotation.
+        CameraError: not a finite 4 x 4 matrix, a last row that is not 0 0 0 1, or no rotation.
     """
     matrix = _read_matrix(value, field, where)
     if not np.all(np.isfinite(matrix)):

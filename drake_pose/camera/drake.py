@@ -43,21 +43,19 @@ _TELE_DISTANCE = 3.0e4
 def camera_to_drake(
     camera: Camera, *, renderer_name: str, depth_range: tuple[float, float] | None = None
 ) -> tuple[ColorRenderCamera, DepthRenderCamera, RigidTransform]:
-    """Returns Drake's render cameras and the pose X_WC that the sensor must have.
+    """Drake's render cameras, and the pose X_WC that the sensor must have.
 
     Drake knows pinholes only: a parallel camera becomes a tele camera 30 km behind the middle of
     the depth range.
 
     Args:
-        camera: the camera.
-        renderer_name: the render engine's name in the scene graph.
         depth_range: nearest and farthest visible depth [m]; left out, `near` to 1 km. Of a parallel
-            camera: nearest and farthest depth of the body in its frame (may be negative); keep it
-            tight, since the render engine's depth buffer has few bits; left out, -2 to 2 m.
+            camera: depths of the body in its frame (may be negative), tight, since the depth buffer
+            has few bits; left out, -2 to 2 m.
 
     Raises:
-        CameraError: when the principal point of a pinhole lies outside the picture (Drake refuses
-            it), or the depth range is not finite, positive and increasing.
+        CameraError: the principal point of a pinhole lies outside the picture (Drake refuses it),
+            or the depth range is not finite, positive and increasing.
     """
     X_CT = RigidTransform()
     if isinstance(camera, PinholeCamera):
@@ -95,12 +93,10 @@ def camera_to_drake(
 def camera_from_drake(
     name: str, source: CameraInfo | RenderCameraCore, X_WC: np.ndarray | RigidTransform
 ) -> PinholeCamera:
-    """Returns the camera of a Drake CameraInfo or RenderCameraCore.
+    """The camera of a Drake CameraInfo or RenderCameraCore.
 
     Args:
-        name: the camera's name.
-        source: the intrinsics; a RenderCameraCore brings its near clipping plane and its sensor
-            offset X_BS too.
+        source: a RenderCameraCore brings its near clipping plane and its sensor offset X_BS too.
         X_WC: the pose of the camera (with a RenderCameraCore: of its body B) in the world.
     """
     pose = X_WC.GetAsMatrix4() if isinstance(X_WC, RigidTransform) else np.asarray(X_WC)
@@ -123,10 +119,7 @@ def camera_from_drake(
 
 
 def camera_from_config(config: CameraConfig) -> PinholeCamera:
-    """Returns the camera whose pictures the colour and label sensor of a CameraConfig takes.
-
-    Its pose is X_PB X_BC. What says nothing of where a pixel looks (far plane, rates, renderer,
-    depth sensor) is left out.
+    """The camera of a CameraConfig's colour and label sensor, at X_PB X_BC.
 
     Raises:
         CameraError: the camera hangs on a frame other than the world, a pose is drawn by lot, or a
@@ -160,11 +153,10 @@ def camera_from_config(config: CameraConfig) -> PinholeCamera:
 
 
 def camera_to_config(camera: Camera) -> CameraConfig:
-    """Returns a CameraConfig with label images on; everything else is Drake's default.
+    """A CameraConfig with label images on; everything else is Drake's default.
 
     Raises:
-        CameraError: a parallel camera, which Drake does not know, or one whose principal point lies
-            outside its picture.
+        CameraError: a parallel camera, or one whose principal point lies outside its picture.
     """
     if not isinstance(camera, PinholeCamera):
         raise CameraError(f"camera '{camera.name}': a CameraConfig is a pinhole, not parallel")
@@ -194,7 +186,7 @@ def camera_to_config(camera: Camera) -> CameraConfig:
 
 
 def read_configs(entries: Mapping[str, Any], path: Path) -> dict[str, PinholeCamera]:
-    """Returns the cameras of CameraConfig entries as ``read_yaml`` gives them with their tags.
+    """The cameras of CameraConfig entries as ``read_yaml`` gives them with their tags.
 
     An entry's key is the camera's name unless its ``name`` says another.
 
@@ -226,9 +218,7 @@ def read_configs(entries: Mapping[str, Any], path: Path) -> dict[str, PinholeCam
 
 
 def dump_scenario(cameras: Mapping[str, Camera] | Iterable[Camera]) -> str:
-    """The text of a Scenario with these cameras, which Drake's ``LoadScenario`` and we read.
-
-    Label images are on, which an estimator needs, and Drake's default is that they are not.
+    """The text of a Scenario with these cameras and label images on, for ``LoadScenario``.
 
     Raises:
         CameraError: a parallel camera, or one whose principal point lies outside its picture.

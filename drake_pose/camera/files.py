@@ -35,17 +35,14 @@ _DRAKES_NAME = "preview_camera"
 
 
 def load_cameras(path: str | Path) -> dict[str, Camera]:
-    """Reads the cameras of a YAML file, in its order.
+    """Reads the cameras of a YAML file, in its order; CameraError names file, camera and field.
 
     A pinhole camera has `width height focal_x focal_y center_x center_y` [pixel, pixel centres at
-    integers] and `X_WC` (4 x 4) [m], and may have `projection: pinhole` and `clipping_near` [m].
-    A parallel camera has `projection: parallel` and `pixels_per_metre` instead of focal lengths.
+    integers] and `X_WC` (4 x 4) [m], and may have `projection: pinhole` and `clipping_near` [m]. A
+    parallel camera has `projection: parallel` and `pixels_per_metre` instead of focal lengths.
 
     A file of Drake's is known by its fields: a Scenario (``cameras:``, also below one name), a
     mapping of CameraConfigs, or a single one. Their principal points count from half a pixel less.
-
-    Raises:
-        CameraError: names the file, the camera and the field.
     """
     found = load_camera_file(path)
     for name, link in found.links.items():
@@ -71,8 +68,7 @@ class CameraFile:
     Args:
         cameras: by name, in the file's order; those without X_WC at the world's origin.
         unplaced: the names of these, but for those that ride on a link.
-        links: the links on which cameras ride, by camera; X_WC of these holds X_LC, their pose in
-            the link's frame.
+        links: by camera that rides on a link, the link; its X_WC holds X_LC, its pose in that.
     """
 
     cameras: dict[str, Camera]
@@ -81,11 +77,7 @@ class CameraFile:
 
 
 def load_camera_file(path: str | Path) -> CameraFile:
-    """Reads a camera file as load_cameras does, in which X_WC may be missing.
-
-    Raises:
-        CameraError: names the file, the camera and the field.
-    """
+    """Reads a camera file as load_cameras does, in which X_WC may be missing."""
     path = Path(path)
     content = read_yaml(path, CameraError, tags=True)
     if not isinstance(content, dict) or not content:
@@ -109,11 +101,7 @@ def load_camera_file(path: str | Path) -> CameraFile:
 
 
 def save_cameras(path: str | Path, cameras: Mapping[str, Camera] | Iterable[Camera]) -> None:
-    """Writes cameras to a YAML file that load_cameras reads back to the last digit.
-
-    Raises:
-        CameraError: when the file cannot be written.
-    """
+    """Writes cameras to a YAML file for load_cameras, to the last digit; or raises CameraError."""
     text = dump_cameras(cameras)
     try:
         Path(path).write_text(text, encoding="utf-8")

@@ -53,16 +53,13 @@ class PinholeCamera(_PosedCamera):
     """A pinhole camera without distortion.
 
     Args:
-        name: the camera's name.
-        width, height: the picture's size [pixel].
-        focal_x, focal_y: focal lengths [pixel].
+        width, height, focal_x, focal_y: [pixel].
         center_x, center_y: the principal point [pixel], pixel centres at integers.
         X_WC: (4, 4) the camera's pose in the world, x right, y down, z forward [m]; read-only.
         near: the nearest visible depth [m].
 
     Raises:
-        CameraError: when a parameter is not finite, has the wrong sign or size, or X_WC is not a
-            rigid transform.
+        CameraError: a parameter is not finite or out of its range, or X_WC is no rigid transform.
     """
 
     name: str
@@ -76,10 +73,7 @@ class PinholeCamera(_PosedCamera):
     near: float = 0.01
 
     def project(self, p_W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Projects points (n, 3) [m] of the world to (n, 2) pixels and (n,) depths [m].
-
-        A point whose depth is not positive has no picture: its pixel is NaN.
-        """
+        """World points (n, 3) [m] to (n, 2) pixels, NaN where depth <= 0, and (n,) depths [m]."""
         p_C = self._in_camera(p_W)
         depth = p_C[:, 2]
         visible = np.where(depth > 0.0, depth, np.nan)

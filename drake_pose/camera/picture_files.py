@@ -26,23 +26,16 @@ _HALF = 128
 
 
 def read_picture(path: Path, error_type: type[DrakePoseError]) -> Picture:
-    """Reads a PNG or JPEG picture (H, W, 3) red, green, blue.
-
-    Raises:
-        error_type: names the file; when it is no whole picture.
-    """
+    """Reads a PNG or JPEG picture (H, W, 3) red, green, blue; the error names the file."""
     data = read_picture_file(path, error_type)
     picture = decode_picture(data, cv2.IMREAD_COLOR, path, error_type)
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
 def read_person_mask(path: Path, error_type: type[DrakePoseError]) -> Mask:
-    """Reads a PNG or JPEG picture of a mask (H, W); it may be empty, where nobody is seen.
+    """Reads a PNG or JPEG picture of a mask (H, W), which may be empty; the error names the file.
 
     A PNG is black and one other colour; a JPEG, whose values its compression blurs, dark and light.
-
-    Raises:
-        error_type: names the file; when it is no whole picture, or no mask.
     """
     data = read_picture_file(path, error_type)
     picture = decode_picture(data, cv2.IMREAD_UNCHANGED, path, error_type)
@@ -63,11 +56,7 @@ def read_person_mask(path: Path, error_type: type[DrakePoseError]) -> Mask:
 
 
 def list_pictures(folder: Path, error_type: type[DrakePoseError]) -> dict[str, Path]:
-    """The picture files of a folder, by frame, in the order of the names; there may be none.
-
-    Raises:
-        error_type: a frame is there twice.
-    """
+    """A folder's picture files by frame, in the order of the names; the error: a frame twice."""
     files: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() in SUFFIXES:
@@ -93,11 +82,7 @@ def mask_of_picture(picture: Picture) -> Mask:
 
 
 def read_picture_file(path: Path, error_type: type[DrakePoseError]) -> bytes:
-    """The content of a file that is a whole PNG or JPEG picture as far as its frame tells.
-
-    Raises:
-        error_type: names the file.
-    """
+    """A whole PNG or JPEG file's content, as far as its frame tells; the error names the file."""
     try:
         data = read_regular(path)
     except OSError as error:
@@ -112,12 +97,9 @@ def read_picture_file(path: Path, error_type: type[DrakePoseError]) -> bytes:
 
 
 def check_png(data: bytes, path: Path, error_type: type[DrakePoseError]) -> tuple[int, int]:
-    """A PNG picture's width and height; one that is cut short or damaged is refused.
+    """A PNG picture's width and height; the error names a file that is cut short or damaged.
 
     OpenCV's decoders differ from version to version in what they make of half a picture.
-
-    Raises:
-        error_type: names the file.
     """
     if not data.startswith(_PNG):
         raise error_type(f"{path}: not a PNG picture")
@@ -138,11 +120,7 @@ def check_png(data: bytes, path: Path, error_type: type[DrakePoseError]) -> tupl
 
 
 def decode_picture(data: bytes, how: int, path: Path, error_type: type[DrakePoseError]) -> Picture:
-    """A picture as OpenCV gives it.
-
-    Raises:
-        error_type: names the file; when it is no picture, or too large.
-    """
+    """A picture as OpenCV gives it; the error names a file that is no picture, or too large."""
     try:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), how)
     except cv2.error:

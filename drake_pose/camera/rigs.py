@@ -36,13 +36,12 @@ def circle_of_cameras(
     face. The world's z is up; a person in the middle who faces +x looks into the face camera.
 
     Args:
-        count: cameras on the circle, camera_0, camera_1 ... counterclockwise from above; the x
-            axis, where the face camera stands, lies half-way between the last and the first.
+        count: cameras on the circle, camera_0, camera_1 ... counterclockwise from above; the x axis
+            lies half-way between the last and the first.
         radius, height: where the cameras of the circle are [m].
         target: (3,) the point they look at [m].
         field_of_view: of a camera on the circle, upright [rad].
         size: width and height of the pictures [pixel].
-        face_camera: whether there is a face camera; it has the same picture size.
 
     Raises:
         CameraError: when there is no camera, or a number is out of its range.

@@ -48,13 +48,11 @@ class Board:
     """A flat calibration board.
 
     Args:
-        kind: checkerboard or charuco.
         columns, rows: number of squares across and down the upright board.
-        square_length: a square's side [m].
-        marker_length: a ChArUco marker's side [m].
+        square_length, marker_length: sides of a square, and of a ChArUco marker [m].
         dictionary: a ChArUco board's dictionary, for example 4X4_50.
-        legacy_pattern: whether the ChArUco board was drawn by OpenCV before 4.6, which began boards
-            of an even number of rows with a white square.
+        legacy_pattern: drawn by OpenCV before 4.6: an even number of rows begins with a white
+            square.
 
     Raises:
         CameraError: when a value is out of its range.
@@ -100,8 +98,8 @@ class Board:
         """Finds the board in a picture: grey (H, W), or (H, W, 3) blue, green, red.
 
         Returns:
-            The corners; None where the board is not found (a checkerboard must be seen whole, of a
-            ChArUco board enough corners in more than one row and column).
+            None where too little of it is seen: a checkerboard must be seen whole, of a ChArUco
+                board enough corners in more than one row and column.
         """
         grey = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
         grey = np.ascontiguousarray(grey, dtype=np.uint8)
@@ -171,13 +169,10 @@ def _top_left_is_white(grey: NDArray[np.uint8], grid: Array) -> bool:
 
 
 def load_board(path: str | Path) -> Board:
-    """Reads a board from a YAML file.
+    """Reads a board from a YAML file; CameraError names the file and the field.
 
     `kind: checkerboard|charuco`, `squares: [across, down]`, `square_length` [m]; a ChArUco board
     has `marker_length` [m] and `dictionary` (4X4_50 ...) too, and may have `legacy_pattern: true`.
-
-    Raises:
-        CameraError: names the file and the field.
     """
     path = Path(path)
     content = read_yaml(path, CameraError)
@@ -208,11 +203,9 @@ class BoardDetections:
     """What a set of calibration pictures shows.
 
     Args:
-        board: the board.
         sizes: width and height of each camera's pictures [pixel].
         detections: by camera, then by frame: where the board's corners are.
-        not_found: pictures in which the board was not found.
-        unreadable: pictures that could not be read, with the reason.
+        not_found, unreadable: pictures without the board; pictures that could not be read, and why.
         mirrored: cameras in whose pictures the board is found when they are turned left to right.
     """
 
@@ -251,7 +244,6 @@ def find_boards(
 
     Args:
         files: by camera, then by frame.
-        board: what to look for.
         on_picture: called with camera and frame before each picture.
 
     Raises:
@@ -291,11 +283,7 @@ def find_boards(
 
 
 def read_board_picture(path: Path, how: int = cv2.IMREAD_COLOR) -> NDArray[np.uint8]:
-    """Reads a picture (H, W, 3) blue, green, red, or as OpenCV's flag says.
-
-    Raises:
-        CameraError: names the file; when it cannot be read or is no picture.
-    """
+    """A picture (H, W, 3) blue, green, red, or as a flag of OpenCV says; CameraError names it."""
     try:
         return decode_picture(read_regular(path), how, path, CameraError)
     except OSError as error:

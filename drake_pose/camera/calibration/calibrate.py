@@ -36,18 +36,15 @@ _BETTER = 0.25
 
 @dataclass(frozen=True)
 class CalibrationSettings:
-    """How to calibrate.
+    """How to calibrate; CameraError when a setting is out of its range.
 
     Args:
-        world: "board:FRAME", the world is the board's frame at that instant (lay it on the floor:
-            z is up); "camera:NAME", that camera's frame; "" for the first camera's.
+        world: "board:FRAME", the board's frame at that instant (on the floor: z is up);
+            "camera:NAME", that camera's frame; "" for the first camera's.
         lens: "none" (no distortion), "standard" (k1, k2, p1, p2) or "full" (k3 too).
         drop_spoilt: go on without the pictures that spoil the calibration instead of refusing.
         leave_out: cameras ("left"), or pictures ("left/0007"), not to be used.
         largest_error: a calibration whose camera has a larger error is refused [pixel].
-
-    Raises:
-        CameraError: when a setting is out of its range.
     """
 
     world: str = ""
@@ -74,12 +71,11 @@ class Calibration:
 
     Args:
         cameras: free of distortion, in the shared world; of pictures that `lenses` undistorted.
-        lenses: how each camera's pictures are distorted.
         X_WB: (4, 4) by frame: where the board was [m].
         errors: by (camera, frame): root mean square distance of the corners [pixel].
         camera_errors: the same over all of a camera's corners.
         left_out: pictures left out, with the reason.
-        world: what the world is: board:FRAME or camera:NAME.
+        world: board:FRAME or camera:NAME.
     """
 
     cameras: Mapping[str, PinholeCamera]
@@ -93,10 +89,6 @@ class Calibration:
 
 def calibrate(seen: BoardDetections, settings: CalibrationSettings | None = None) -> Calibration:
     """Calibrates the cameras that saw a board.
-
-    Args:
-        seen: where the board's corners are, from find_boards.
-        settings: how; the defaults where not given.
 
     Raises:
         CameraError: names the camera, and the picture that spoils the calibration: too few
@@ -232,11 +224,7 @@ def _adjusted_rig(
 
 
 def _disagreeing(errors: Mapping[Picture, float]) -> dict[Picture, str]:
-    """At each instant the picture that contradicts the other cameras' most, if one does.
-
-    One at a time: it has drawn the board away from where the others saw it. Of two cameras that
-    disagree both pictures are in doubt.
-    """
+    """At each instant the picture (of two cameras: both) that contradicts the others most."""
     limit = _limit(errors.values())
     spoilt: dict[Picture, str] = {}
     for frame in {frame for _, frame in errors}:
@@ -283,10 +271,7 @@ def _require_true_cameras(spoilt: Collection[Picture], lenses: Mapping[str, Lens
 
 
 def _is_mirrored(lenses: Mapping[str, LensEstimate], name: str) -> bool:
-    """Whether a camera agrees with the others once its pictures are turned left to right.
-
-    A checkerboard looks like a board in a mirror too, but moves the wrong way.
-    """
+    """Whether a camera agrees with the others once its pictures are turned left to right."""
     own = lenses[name]
     size = own.lens.width, own.lens.height
     # The colours of a board of an even number of columns fit only where rows are exchanged, with

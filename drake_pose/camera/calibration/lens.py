@@ -1,8 +1,6 @@
 """Lenses: a pinhole with distortion, and pictures freed from it.
 
-drake_pose's cameras have no distortion. A calibrated lens therefore gives a second pinhole, whose
-camera matrix is chosen so that every pixel of the undistorted picture was seen by the lens: no
-black rim that would pass for background.
+An undistorted picture's pinhole is chosen so that the lens saw every pixel: no black rim.
 """
 
 from __future__ import annotations
@@ -30,11 +28,10 @@ NUMBERS = ("focal_x", "focal_y", "center_x", "center_y", "k1", "k2", "p1", "p2",
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """A pinhole with radial (k1, k2, k3) and tangential (p1, p2) distortion, as OpenCV has it.
+    """A pinhole with radial and tangential distortion, as OpenCV has it.
 
     Args:
-        width, height: the picture's size [pixel].
-        focal_x, focal_y: [pixel].
+        width, height, focal_x, focal_y: [pixel].
         center_x, center_y: the principal point [pixel], pixel centres at integers.
         distortion: (5,) k1, k2, p1, p2, k3.
     """
@@ -86,11 +83,7 @@ class Lens:
         return np.asarray(uv, dtype=np.float64).reshape(-1, 2)
 
     def undistort(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Frees a picture (H, W) or (H, W, 3) from distortion.
-
-        Raises:
-            CameraError: when it is not of the lens's size.
-        """
+        """Frees a picture (H, W) or (H, W, 3) from distortion; CameraError: another size."""
         if picture.shape[:2] != (self.height, self.width):
             raise CameraError(
                 f"a picture of {picture.shape[1]} x {picture.shape[0]} pixels (width x height) is "
@@ -109,11 +102,7 @@ class Lens:
 
 
 def save_lenses(path: str | Path, lenses: Mapping[str, Lens]) -> None:
-    """Writes lenses to a YAML file that load_lenses reads back to the last digit.
-
-    Raises:
-        CameraError: when the file cannot be written.
-    """
+    """Writes lenses to a YAML file for load_lenses, to the last digit; or raises CameraError."""
     content = {
         name: {"width": lens.width, "height": lens.height, **lens.numbers()}
         for name, lens in lenses.items()
@@ -125,11 +114,7 @@ def save_lenses(path: str | Path, lenses: Mapping[str, Lens]) -> None:
 
 
 def load_lenses(path: str | Path) -> dict[str, Lens]:
-    """Reads lenses from a YAML file: the fields of Lens, and k1, k2, p1, p2, k3.
-
-    Raises:
-        CameraError: names the file, the camera and the field.
-    """
+    """Reads lenses from a YAML file; CameraError names the file, the camera and the field."""
     content = read_yaml(Path(path), CameraError)
     if not isinstance(content, dict) or not content:
         raise CameraError(f"{path}: expected a mapping from camera names to their lenses")

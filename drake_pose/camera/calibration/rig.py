@@ -43,7 +43,6 @@ class Rig:
     """Lenses and poses of cameras, and where the board was.
 
     Args:
-        lenses: by camera.
         X_RC: (4, 4) by camera: its pose in the rig's frame, that of the first camera [m].
         X_RB: (4, 4) by frame: the board's pose in the rig's frame [m].
     """
@@ -69,7 +68,6 @@ class LensEstimate:
     Args:
         points: (n, 3) the board's corners in its frame B [m].
         detections: the board in the camera's pictures, by frame.
-        lens: the lens.
         X_CB: (4, 4) by frame: the board's pose in the camera [m].
         errors: by frame: root mean square distance of the corners [pixel].
         focal_deviation: standard deviation of the focal length over the focal length.
@@ -97,7 +95,6 @@ def estimate_lens(
     """Estimates a camera's lens from the board in its pictures.
 
     Args:
-        name: the camera's name, for messages.
         points: (n, 3) the board's corners in its frame B [m].
         detections: by frame.
         size: the pictures' width and height [pixel].
@@ -139,11 +136,7 @@ def estimate_lens(
 
 
 def require_shared_pictures(detections: Detections) -> None:
-    """Checks that instants which several cameras saw tie all cameras together.
-
-    Raises:
-        CameraError: when the cameras fall into groups that share no picture.
-    """
+    """CameraError when the cameras fall into groups that share no picture."""
     shared = [[len(set(a) & set(b)) for b in detections.values()] for a in detections.values()]
     count, groups = connected_components(csr_array(shared), directed=False)
     if count == 1:
@@ -197,8 +190,7 @@ def chain_rig(estimates: Mapping[str, LensEstimate]) -> Rig:
 def pair_pose(a: LensEstimate, b: LensEstimate) -> tuple[Array, float]:
     """The pose X_AB (4, 4) of two cameras that saw the board at the same instants, and its error.
 
-    Every shared instant proposes a pose; the one wins that explains the other instants best by
-    its median [pixel], so that a minority of spoilt pictures does no harm.
+    Each shared instant proposes a pose; the one with the least median error [pixel] over all wins.
     """
     shared = [frame for frame in a.X_CB if frame in b.X_CB]
     proposals = []
@@ -218,8 +210,6 @@ def adjust_rig(
 
     Args:
         points: (n, 3) the board's corners in its frame [m].
-        detections: by camera, then by frame.
-        start: where to start.
         model: a key of FREE_COEFFICIENTS.
         robust: corners far off count little, so that a spoilt picture stands out instead of
             spoiling the others. The start must be good for most.
@@ -272,11 +262,7 @@ def adjust_rig(
 
 
 def _whitening(J: csr_array) -> LinearOperator:
-    """Units of the unknowns in which the normal matrix J^T J is 1.
-
-    Lenses and poses are nearly exchangeable: in pixels and metres an iterative solver does not
-    converge.
-    """
+    """Units of the unknowns in which the normal matrix J^T J is 1, so that the solver converges."""
     normal = (J.T @ J).toarray()
     units = 1.0 / np.sqrt(np.maximum(np.diag(normal), np.finfo(np.float64).tiny))
     normal *= np.outer(units, units)

@@ -37,7 +37,7 @@ _FIELDS = ("kind", "location", "rate_hz", "masks", "background", "offset")
 def load_sources(
     path: str | Path, cameras: Mapping[str, Camera] | None = None
 ) -> dict[str, SourceSpecification]:
-    """Reads where the pictures of all cameras come from.
+    """Reads where the pictures of all cameras come from, in the order of the calibration.
 
     A camera's entry has `kind` (folder, video, device) and `location` (relative to the file; a
     device's number or address), and either `masks: true`, where the source delivers masks, or
@@ -46,9 +46,6 @@ def load_sources(
     Args:
         path: a `sources.yaml`, or the folder that holds it.
         cameras: the calibrated cameras; those of the `cameras.yaml` beside it where not given.
-
-    Returns:
-        A specification for each camera, in the order of the calibration.
 
     Raises:
         SceneError: names the file, the camera and the field.
@@ -78,11 +75,7 @@ def load_sources(
 
 
 def open_source(specification: SourceSpecification, clock: Clock = time.monotonic) -> FrameSource:
-    """Opens a source.
-
-    Args:
-        specification: where the pictures come from.
-        clock: gives the time stamps of a live camera's pictures [s].
+    """Opens a source; the clock gives the time stamps of a live camera's pictures [s].
 
     Raises:
         SceneError: a folder or video that cannot be read, is empty, or whose pictures are not of

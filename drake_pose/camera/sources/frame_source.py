@@ -23,7 +23,6 @@ class SourceSpecification:
     """Where a camera's pictures come from; plain values, so that another machine may open it.
 
     Args:
-        camera: the camera's name.
         kind: folder: of pictures `<frame>.png` or `.jpg`, perhaps with a `timestamps.csv` (frame,
             time [s]); video: a file that OpenCV reads; device: a live camera.
         location: the folder's or file's path; a device's number or address.
@@ -70,13 +69,7 @@ class SourceSpecification:
 
 @dataclass(frozen=True, eq=False)
 class TimedPicture:
-    """A picture or a mask, and when it was taken.
-
-    Args:
-        time: its time stamp [s].
-        frame: its name.
-        picture: (H, W, 3) red, green, blue; or a mask (H, W), True on the person.
-    """
+    """A picture (H, W, 3) red, green, blue, or a mask (H, W), and its time stamp [s]."""
 
     time: float
     frame: str
@@ -87,7 +80,6 @@ class FrameSource(abc.ABC):
     """One camera's pictures, in the order of their time stamps.
 
     Attributes:
-        specification: where they come from.
         problems: what was wrong so far, each with the camera's name; a reader may empty the list.
         dropped: how many pictures were lost for that.
     """
@@ -117,12 +109,9 @@ class FrameSource(abc.ABC):
         """The next picture, whatever its time stamp."""
 
     def read(self) -> TimedPicture | None:
-        """The next picture; a live camera's newest.
+        """The next picture, a live camera's newest; None: none now, or none any more (`ended`).
 
         A picture whose time stamp does not lie after the last one's is dropped.
-
-        Returns:
-            None where there is none now, or none any more (`ended`).
         """
         while (one := self._read()) is not None:
             if self._last is None or one.time > self._last.time:

@@ -27,12 +27,10 @@ _PATIENCE = 2.0
 
 
 class DeviceSource(FrameSource):
-    """A live camera: its newest picture, with the time at which it came.
+    """A live camera: its newest picture, with the time at which it came by the clock [s].
 
     A slow reader never sees old pictures: those that were not read in time are gone. A camera that
     cannot be opened or fails is reported once and opened again, after growing pauses.
-
-    Its location is a number or an address; the clock gives the time stamps [s].
     """
 
     def __init__(self, specification: SourceSpecification, clock: Clock) -> None:

@@ -123,7 +123,7 @@ class FolderSource(FrameSource):
 
 
 class VideoSource(FrameSource):
-    """The pictures of a video file; those of masks are white on the person.
+    """A video file's pictures, or masks, white on the person.
 
     Raises:
         SceneError: names the file; when it is no video, or of another size.
@@ -202,11 +202,7 @@ def find_picture_files(folder: Path, camera: str) -> dict[str, Path]:
 
 
 def read_time_stamps(path: Path) -> dict[str, float]:
-    """The times [s] by frame of a `timestamps.csv`, in its order.
-
-    Raises:
-        SceneError: names the file and the line.
-    """
+    """The times [s] by frame of a `timestamps.csv`; SceneError names the file and the line."""
     header, rows = read_csv(path, SceneError)
     if not {"frame", "time"} <= set(header):
         raise SceneError(f"{path}: needs the columns frame and time [s] in its first line")

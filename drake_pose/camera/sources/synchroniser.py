@@ -29,7 +29,6 @@ class CameraChange:
     """A camera that is waited for no more, or again.
 
     Args:
-        camera: its name.
         time: its last, or its first, time stamp [s]; nan where it never gave a picture.
         stopped: whether it stopped; else it returned.
     """
@@ -45,13 +44,12 @@ class Synchroniser(Generic[Item]):
     A moment begins with the earliest picture not used yet; every other camera gives its earliest
     one, if that is at most the tolerance later. A moment is complete when every camera has given
     its picture or a later one. A camera that gives none is waited for a while; then it is left out
-    of this moment and waited for no more until it gives a picture again. A picture that comes
-    after its moment is dropped, and counted in `late` by camera.
+    of this moment and waited for no more until it gives a picture again. A picture that comes after
+    its moment is dropped, and counted in `late` by camera.
 
     Args:
-        cameras: their names.
-        tolerance: how far apart the pictures of one moment may be [s]; half of the time between
-            two frames where the cameras are triggered together.
+        tolerance: how far apart the pictures of one moment may be [s]; half of the time between two
+            frames where the cameras are triggered together.
         patience: how long a moment waits for a camera [s], at least the tolerance.
 
     Raises:
@@ -89,10 +87,7 @@ class Synchroniser(Generic[Item]):
         return len(self._queues[camera])
 
     def add(self, camera: str, time: float, item: Item) -> bool:
-        """Takes a camera's next picture with its time stamp [s].
-
-        Returns:
-            Whether it can still be part of a moment.
+        """Takes a camera's next picture, of a time stamp [s]; whether it can be part of a moment.
 
         Raises:
             UnknownNameError: there is no such camera.

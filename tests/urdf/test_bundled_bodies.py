@@ -127,7 +127,8 @@ def silhouette_area_changed(mesh: trimesh.Trimesh, first: float, second: float) 
 
 @pytest.mark.parametrize("name", [*BODIES, "hand", "person"])
 def test_script_writes_the_committed_files(name: str, tmp_path: Path) -> None:
-    assert written_again(name, tmp_path) == committed(name)
+    by_hand = {Path("landmarks.yaml")} if name in BODIES else set()
+    assert set(written_again(name, tmp_path)) == set(committed(name)) - by_hand
     assert_same_files(tmp_path, URDF / name)
 
 
@@ -152,7 +153,7 @@ def test_surfaces_are_closed_small_and_mirrored(path: Path) -> None:
     mesh = read_obj(path)
     assert_closed(mesh)
     if path.parts[-3] != "person":
-        assert 200 <= len(mesh.faces) <= 1500
+        assert (100 if path.stem.endswith("_skin") else 200) <= len(mesh.faces) <= 1500
         if path.stem.startswith("left_"):
             right = read_obj(path.with_name(path.name.replace("left_", "right_")))
             np.testing.assert_array_equal(right.vertices, mesh.vertices * [-1.0, 1.0, 1.0])

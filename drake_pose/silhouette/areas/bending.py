@@ -24,16 +24,9 @@ if TYPE_CHECKING:
 
 
 class BendingOutline:
-    """A rigid surface and a band, whose triangles are always the same and whose vertices are not.
+    """A rigid surface and a band in its frame N, whose vertices move and whose triangles do not.
 
-    Attributes:
-        rigid: the rigid part.
-        rest: both, the band as the mesh has it. Its first vertices and triangles are the rigid
-            part's.
-
-    Args:
-        rigid: the rigid part, in its frame N.
-        band: the band at rest, in the same frame.
+    ``rest``: both, the band at rest; its first vertices and triangles are the rigid part's.
     """
 
     def __init__(self, rigid: Outline, band: TriangleMesh) -> None:
@@ -69,12 +62,9 @@ class BendingOutline:
 
 
 class TreeSurfaces:
-    """The surfaces of a pose tree's nodes at any values.
+    """The surfaces of a pose tree's nodes at any values, each in its node's frame.
 
-    Attributes:
-        rigid: the rigid part of each node, in the node's frame.
-        bending: for each node its rigid part and its band; None for a node without one.
-        skins: for each node its band's motion; None for a node without one.
+    ``bending`` and ``skins``: rigid part and band, and the band's motion; None without a band.
     """
 
     def __init__(self, tree: PoseTree) -> None:
@@ -118,11 +108,7 @@ class TreeSurfaces:
 
 
 class PackedSurfaces:
-    """A pose tree's surfaces as the kernels take them, at any values, at little cost.
-
-    Args:
-        surfaces: the surfaces; their rigid parts may have fewer triangles than the tree's.
-    """
+    """A tree's surfaces as kernels take them; rigid parts may have fewer triangles than its own."""
 
     def __init__(self, surfaces: TreeSurfaces) -> None:
         outlines = [surfaces.whole(node) for node in range(len(surfaces.rigid))]

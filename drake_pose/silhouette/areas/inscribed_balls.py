@@ -1,8 +1,7 @@
 """Balls that a surface's picture covers, whatever the direction it is seen from.
 
-A ball belongs to the visual hull of a surface if every line that meets the ball meets the surface.
-The hull is measured from many sides: in each, a point's distance to the edge of the surface's
-picture bounds the ball around it. This asks nothing of the mesh: it may have holes and inner parts.
+A ball is in the visual hull if every line that meets it meets the surface; a point's distance to
+the edges of pictures from many sides bounds it. The mesh may have holes and inner parts.
 """
 
 from __future__ import annotations
@@ -24,11 +23,7 @@ _ROUNDING = 0.75 + 0.5
 
 
 class VisualHull:
-    """A surface's distances to the edges of its pictures from many sides.
-
-    Args:
-        outline: the surface; one without triangles has an empty hull.
-    """
+    """A surface's distances to the edges of its pictures from many sides; may be empty."""
 
     def __init__(self, outline: Outline) -> None:
         self._center = outline.ball[:3]

@@ -1,8 +1,7 @@
 """The span kernel for label images: which of several surfaces each pixel shows.
 
-The surfaces' spans are painted one after the other. Only pixels that two surfaces of different
-labels cover need depths: there the triangles are drawn with a depth buffer. Both see the same
-pixels, as a triangle's rows begin and end where the span kernel's crossings do.
+The surfaces' spans are painted one after the other; triangles are drawn with a depth buffer only
+where two labels contend. Both see the same pixels, as they begin and end a row alike.
 """
 
 from __future__ import annotations
@@ -45,16 +44,14 @@ def paint_labels(
     empty: int,
     image: np.ndarray,
 ) -> None:
-    """Draws which surface is nearest at each pixel centre.
+    """Draws which surface is nearest at each pixel centre into image (H, W) int16.
 
     Args:
         labels: (nodes,) int16 their labels, not negative, none of them the empty one.
         closed: (nodes,) bool which of them are closed and have their triangles run around
             counter-clockwise seen from outside: only what is turned to the camera is drawn.
         X_CN: (nodes, 3, 4) their poses in the camera.
-        camera: (8,) kernel parameters of the camera.
         empty: the label of pixels that show none.
-        image: (H, W) int16, written.
     """
     height, width = image.shape
     for row in range(height):

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 class Outline:
     """A triangle surface and its edges, each with the one or two triangles it bounds.
 
-    Any set of triangles will do: holes, inner parts and edges of three triangles included. An
-    edge of more than two triangles has several records.
+    Any set of triangles will do: holes, inner parts and edges of three triangles (of which there
+    are several records) included.
 
     Args:
         vertices: (n, 3) float64 points in the surface's own frame N [m].
@@ -28,8 +28,7 @@ class Outline:
         edges: (e, 6) int32 records v0, v1, t0, s0, t1, s1: s is +1 where the triangle t runs from
             v0 to v1 and -1 where it runs back; t1 = -1 and s1 = 0 where there is no second
             triangle.
-        rest: where this is another surface with some of its vertices moved, that surface: what
-            does not depend on the places of vertices is packed once for both.
+        rest: the surface that this is with some vertices moved; what they share is packed once.
     """
 
     vertices: np.ndarray
@@ -47,10 +46,7 @@ class Outline:
 
     @cached_property
     def is_closed(self) -> bool:
-        """Whether all parts are closed, and run around counter-clockwise seen from outside.
-
-        What is turned away from a camera is hidden then.
-        """
+        """Whether all parts are closed, and run around counter-clockwise seen from outside."""
         neighbours = self.edges[:, [2, 4]]
         if not np.all(self.edges[:, 3] * self.edges[:, 5] == -1):
             return False
@@ -93,11 +89,7 @@ class PackedOutlines(NamedTuple):
 
 
 def outline_from_mesh(mesh: TriangleMesh) -> Outline:
-    """Returns the outline of a mesh; vertices at equal places are merged, null triangles left out.
-
-    Args:
-        mesh: vertices (n, 3) [m] and triangles (m, 3).
-    """
+    """The outline of a mesh; vertices at equal places are merged, null triangles left out."""
     places = np.asarray(mesh.vertices, dtype=np.float64).reshape(-1, 3) + 0.0  # -0.0 becomes 0.0
     vertices, renumbered = np.unique(places, axis=0, return_inverse=True)
     triangles = renumbered.reshape(-1)[np.asarray(mesh.triangles, dtype=np.int64).reshape(-1, 3)]

@@ -1,7 +1,4 @@
-"""Packed surfaces seen by a camera: the arithmetic that all kernels share.
-
-Arrays are passed whole with an index where a slice would read better: numba pays for every slice.
-"""
+"""Packed surfaces seen by a camera: the arithmetic that all kernels share."""
 
 from __future__ import annotations
 
@@ -17,9 +14,7 @@ from drake_pose.silhouette.areas.outline import PackedOutlines
 def viewpoint_in_node(X: np.ndarray, camera: np.ndarray) -> tuple[float, float, float, float]:
     """Where a camera stands, or the way it looks, in a node's frame, times a last number.
 
-    That is 0 where it is the way that a parallel camera looks. A pinhole stands there: opposite
-    signs, which only turn the winding number's sign. The last number is 1 but where the pose X has
-    grown.
+    That is 0 for a parallel camera's way; else 1, where the pose X has not grown.
     """
     if camera[0] != 0.0:
         return X[2, 0], X[2, 1], X[2, 2], 0.0
@@ -88,14 +83,9 @@ def clip_triangle(
 ) -> int:
     """Writes u, v and 1 / depth of the corners of a triangle's part beyond a pinhole's near plane.
 
-    Args:
-        t: the triangle among its own.
-        X_CN: (nodes, 3 or 4, 4) the poses.
-        camera: (8,) kernel parameters.
-        corners: (4, 3) written.
+    ``t`` is the triangle among its own; ``X_CN`` (nodes, 3 or 4, 4); ``corners`` (4, 3).
 
-    Returns:
-        How many corners there are: 0, 3 or 4.
+    Returns how many corners there are: 0, 3 or 4.
     """
     X, near, size = X_CN[node], camera[5], 0
     begin, first = packed.starts[node, 0], packed.starts[node, 1]
@@ -143,11 +133,9 @@ def own_copy(packed: PackedOutlines) -> PackedOutlines:
 
 @compiled
 def bend(own: PackedOutlines, part: np.ndarray, band: np.ndarray) -> None:
-    """Puts the vertices of one surface's band at other places.
+    """Puts the vertices of one surface's band at other places; the surface's ball only grows.
 
     Args:
-        own: the surfaces, changed: the band's points, their planes, and the surface's ball, which
-            only grows.
         part: (4,) int64 the surface, its first vertex of the band and its first triangle of the
             band, both counted from the surface's own first; the band's first row in ``band``.
         band: (v, 3) places of the vertices of all bands [m].

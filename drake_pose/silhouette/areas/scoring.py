@@ -31,8 +31,7 @@ def score_bodies(
     """Areas of a body at many poses, its surfaces united exactly, and of intersections with sets.
 
     Args:
-        surfaces: the body's surfaces.
-        X_CN: (n, nodes, 4, 4) their poses in the camera.
+        X_CN: (n, nodes, 4, 4) the surfaces' poses in the camera.
         prefixes: (k, H, W + 1) int32 prefix sums of the sets; k may be 0.
         bands: for each of the bending surfaces (n, v, 3) its band's vertices in its frame N at each
             pose [m].
@@ -87,12 +86,9 @@ def draw_labels(
     camera: Camera,
     empty: int = 0,
 ) -> np.ndarray:
-    """Returns (H, W) int16 the label of the surface that is seen in each pixel, the nearest one.
+    """The label (H, W) int16 of the nearest surface in each pixel, or ``empty``.
 
-    Args:
-        labels: (nodes,) the label of each.
-        X_CN: (nodes, 4, 4) their poses in the camera.
-        empty: the label of pixels that show none.
+    ``labels``: (nodes,); ``X_CN``: (nodes, 4, 4) the surfaces' poses in the camera.
     """
     packed, poses = _check_body(outlines, np.asarray(X_CN)[None])
     image = np.empty((camera.height, camera.width), dtype=np.int16)
@@ -114,8 +110,7 @@ def subtract_body(
     Args:
         mask: (H, W) bool or uint8, C-contiguous; changed in place.
         prefix: (H, W + 1) int32 its prefix sums, C-contiguous; changed in place.
-        outlines: the body's surfaces, or its only one.
-        X_CN: (nodes, 4, 4) their poses in the camera (one surface: (4, 4) will do).
+        X_CN: (nodes, 4, 4) the surfaces' poses in the camera (one surface: (4, 4) will do).
 
     Raises:
         ValueError: when an array has the wrong shape or type, or cannot be changed in place.

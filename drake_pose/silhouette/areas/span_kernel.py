@@ -6,12 +6,10 @@ triangles. Along an edge the runs of its triangles cancel except on the contour,
 edges are walked: each leaves, in every row of pixel centres it crosses (half-open: a row on the
 upper end counts, on the lower end does not), the first pixel to the right of the crossing and a
 weight. Where the sum of weights along a row is not zero lies a span of covered pixels; the area of
-a set under the span [a, b) is P[row, b] - P[row, a] with P the row's prefix sums.
+a set under the span [a, b) is P[row, b] - P[row, a] with P the row's prefix sums. The crossings of
+all surfaces in the same rows give the exact union.
 
-A whole body is the crossings of all its surfaces in the same rows: an exact union.
-
-Arrays are passed whole with an index where a slice would read better, and the innermost functions
-take the few arrays they use or are inlined: numba pays for every slice and every array passed.
+Numba pays for every slice and every array passed: arrays are passed whole, with an index.
 """
 
 from __future__ import annotations
@@ -58,10 +56,7 @@ class Rows(NamedTuple):
 
 @compiled
 def make_rows(packed: PackedOutlines, camera: np.ndarray) -> tuple[Rows, np.ndarray]:
-    """Room for the greatest of some surfaces, and for crossings (height, capacity) int32.
-
-    Crossings stand beside the rest because they are replaced when a row needs more room.
-    """
+    """Room for the greatest of some surfaces, and for crossings (height, capacity)."""
     width, height = int(camera[6]), int(camera[7])
     points, triangles = 0, 0
     for node in range(packed.starts.shape[0] - 1):
@@ -207,8 +202,7 @@ def fill_rows(
 ) -> np.ndarray:
     """Leaves the crossings of surfaces first to end at poses X_CN (nodes, 3, 4) in empty rows.
 
-    Returns:
-        The crossings, made wider until every row had room.
+    Returns the crossings, made wider until every row had room.
     """
     counts, reach = rows.counts, rows.reach
     while True:
@@ -291,11 +285,9 @@ def score(
     """Areas of whole bodies, and of their intersections with sets.
 
     Args:
-        packed: the body's surfaces at rest.
         parts: (b, 4) int64 the bands of skin, as in ``bend``; b may be 0.
         bands: (n, v, 3) the vertices of all bands, one band after the other, at each pose [m].
         X_CN: (n, nodes, 3, 4) the surfaces' poses in the camera.
-        camera: (8,) kernel parameters of the camera.
         prefixes: (k, H, W + 1) int32 prefix sums of the sets.
 
     Returns:
@@ -324,8 +316,7 @@ def paint(
 ) -> np.ndarray:
     """Sets the pixels of a body at poses X_CN (nodes, 3, 4) in mask (H, W) uint8 to value.
 
-    Returns:
-        (2,) int64 first row touched, and the row after the last.
+    Returns (2,) int64 the first row touched, and the row after the last.
     """
     rows, crossings = make_rows(packed, camera)
     crossings = fill_rows(packed, 0, X_CN.shape[0], X_CN, camera, crossings, rows)

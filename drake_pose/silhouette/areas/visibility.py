@@ -17,16 +17,11 @@ _LARGER = 10.0
 
 
 def require_visible(outlines: Sequence[Outline], X_CN: np.ndarray, camera: Camera) -> None:
-    """Refuses a camera that cannot show a body.
-
-    Args:
-        outlines: the body's surfaces.
-        X_CN: (nodes, 4, 4) their poses in the camera.
+    """Refuses a camera that cannot show a body whose surfaces are at X_CN (nodes, 4, 4).
 
     Raises:
         CameraError: names the camera; when the body is wholly behind it, when the camera is inside
-            one of the surfaces, when the body is far larger than the picture, or lies wholly
-            outside of it.
+            one of the surfaces, when the body is far larger than the picture, or wholly outside.
     """
     solid = [
         (outline, np.asarray(X))

@@ -1,7 +1,6 @@
-"""Bit masks of one surface at many poses.
+"""Bit masks of one surface at many poses: the span kernel's pixels, decided by its arithmetic.
 
-The pixels are those of the span kernel, decided by the same arithmetic; only the contour edges are
-looked for among the few that can be on the contour (direction_cells).
+Contour edges are looked for among the few that can be on the contour (direction_cells).
 """
 
 from __future__ import annotations
@@ -29,11 +28,10 @@ _FULL = np.uint64(0xFFFFFFFFFFFFFFFF)
 
 
 class _Scratch(NamedTuple):
-    """What one surface at one pose needs for a moment.
+    """Scratch arrays of one surface at one pose.
 
-    contour: (e,) int32 contour edges; weights: (e,) int32 of the edges; lines: (e, 4) upper and
-    lower end u, v [pixel] of those that cross a row; firsts, lasts: (e,) int32 first row crossed
-    and the row after the last.
+    contour: (e,) contour edges; weights: (e,); lines: (e, 4) upper and lower end u, v [pixel] of
+    those that cross a row; firsts, lasts: (e,) first row crossed and the row after the last.
     """
 
     contour: np.ndarray

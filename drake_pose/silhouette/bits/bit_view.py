@@ -1,8 +1,7 @@
-"""A silhouette made ready for bit masks: its pixels numbered, row after row.
+"""A silhouette made ready for bit masks: its pixels, and a band's, numbered row after row.
 
-Only the silhouette's pixels, and those in a band around it, get a bit. The pixels of a span of a
-row that are in the silhouette have consecutive numbers, so that the prefix sums of the mask tell
-which run of bits a span sets, and a mask of a body of 20,000 pixels is 300 words.
+The silhouette's pixels of a span have consecutive numbers, so the mask's prefix sums tell which run
+of bits a span sets, and a mask of a body of 20,000 pixels is 300 words.
 """
 
 from __future__ import annotations
@@ -23,9 +22,8 @@ class BitView(NamedTuple):
     camera: (8,) kernel parameters; X_CW: (4, 4); window: (4,) int64 first row, first column,
     height h and width w; inside: (h, w + 1) int32 the number of silhouette pixels before each
     pixel, row after row; band: the same of the band's pixels, (0, 0) where there is no band;
-    nearest: (h, w) int32 row * NEAREST_STRIDE + column [picture] of a pixel near each silhouette
-    pixel, the nearest or nearly so, that is in the picture and not in the silhouette, -1 where
-    there is none; sums:
+    nearest: (h, w) int32 row * NEAREST_STRIDE + column [picture] of about the nearest pixel of the
+    picture outside the silhouette for each silhouette pixel, -1 where there is none; sums:
     (h + 1, w + 1) int32 the number of silhouette pixels above and left of each corner.
     """
 
@@ -41,14 +39,10 @@ class BitView(NamedTuple):
 def make_bit_view(
     mask: np.ndarray, camera_parameters: np.ndarray, X_CW: np.ndarray, band: int
 ) -> BitView:
-    """Returns the silhouette's bits.
+    """The bits of a silhouette (H, W) bool that is not empty; X_CW (4, 4).
 
-    Args:
-        mask: (H, W) bool, not empty.
-        camera_parameters: (8,) the camera's kernel parameters.
-        X_CW: (4, 4) the world's pose in the camera.
-        band: the width of the band [pixel]; 0: none, and only bodies that stay inside the
-            silhouette can be told apart by their bits.
+    ``band`` is the band's width [pixel]; 0: none, and only bodies that stay inside the silhouette
+    can be told apart by their bits.
     """
     rows = np.flatnonzero(mask.any(axis=1))
     columns = np.flatnonzero(mask[rows[0] : rows[-1] + 1].any(axis=0))

@@ -20,18 +20,14 @@ def prune_by_balls(
     pairs: np.ndarray,
     limit: float,
 ) -> np.ndarray:
-    """Leaves out poses at which a ball inside the surface shows that too much lies outside.
+    """Which pairs (m,) bool no ball inside the surface shows to lie outside by more than the limit.
 
     Args:
         X_WP: (g, 4, 4) poses of the parent.
         p_PB: (n, k, 3) places of k balls in the parent's frame at each sample of the node [m].
         radii: (k,) of the balls [m].
         pairs: (m, 2) int32 parent pose and sample.
-        limit: the area that may lie outside the silhouette [pixel].
-
-    Returns:
-        (m,) bool: the pairs that are left. None is lost whose surface lies outside by the limit or
-        less.
+        limit: the area that may lie outside the silhouette [pixel]; no pair within it is lost.
     """
     camera, window, X_CW = view.camera, view.window, view.X_CW
     left = np.ones(pairs.shape[0], dtype=np.bool_)
@@ -95,12 +91,9 @@ def _square_outside(
 def draw_discs(
     view: BitView, X_WP: np.ndarray, p_PB: np.ndarray, radius: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draws discs that hold the picture of a ball as bits of the silhouette.
+    """Draws discs that hold the picture of a ball (p_PB (3,), radius [m]) as the silhouette's bits.
 
-    Args:
-        X_WP: (g, 4, 4) poses of the frame that the ball is fixed in.
-        p_PB: (3,) its centre [m].
-        radius: its radius [m].
+    ``X_WP``: (g, 4, 4) poses of the frame that the ball is fixed in.
 
     Returns:
         runs (g, 3) int64 first word, number of words, where they begin in words; words (n,) uint64.

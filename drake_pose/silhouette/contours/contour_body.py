@@ -48,7 +48,7 @@ def contour_body(
     camera: Camera,
     rigid: int | None = None,
 ) -> ContourBody:
-    """Returns a body made ready for a camera.
+    """A body made ready for a camera.
 
     Args:
         X_CN: (nodes, 4, 4) about where they are in the camera: a pinhole sees near surfaces from
@@ -120,12 +120,9 @@ def _stack(parts: Sequence[np.ndarray], columns: int, dtype: type) -> np.ndarray
 def move_surface(
     points: np.ndarray, planes: np.ndarray, triangles: np.ndarray, vertices: np.ndarray
 ) -> None:
-    """Gives one surface of a ContourBody other vertices.
+    """Gives one surface of a ContourBody other vertices (v, 3) [m] in the surface's frame.
 
-    Args:
-        points, planes: the body's, from the surface's first on; written.
-        triangles: (t, 3) the surface's.
-        vertices: (v, 3) [m], in the surface's frame.
+    ``points`` and ``planes`` are the body's from the surface's first on, and written.
     """
     copy_into(points, vertices)
     for t in range(triangles.shape[0]):
@@ -169,14 +166,9 @@ def _find_viewpoint(X: np.ndarray, camera: np.ndarray, viewpoint: np.ndarray) ->
 def find_body_segments(
     body: ContourBody, X_CN: np.ndarray, camera: np.ndarray, wanted: np.ndarray
 ) -> Segments:
-    """Returns the projected contour edges of some surfaces; ``vertices`` index ``body.points``.
+    """The projected contour edges of wanted surfaces; ``vertices`` index ``body.points``.
 
-    Edges with an end nearer than a pinhole's near plane are left out.
-
-    Args:
-        X_CN: (surfaces, 4, 4) the surfaces' poses in the camera.
-        camera: (8,) kernel parameters of the camera.
-        wanted: (surfaces,) bool.
+    Edges with an end nearer than a pinhole's near plane are left out. X_CN: (surfaces, 4, 4).
     """
     capacity, count = 2048, 0
     ends, depths = np.empty((capacity, 4)), np.empty((capacity, 2))

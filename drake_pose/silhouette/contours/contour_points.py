@@ -1,10 +1,9 @@
 """The visible contour of a body's silhouette as points, exact where a row or column crosses it.
 
-The contour edges of all surfaces (see ``kernel``) cross the rows of a raster; where the winding
-number along a row rises from zero or falls back to it, the row enters or leaves the union of all
-surfaces. What these rows say of steep contours, columns say of flat ones: a stretch of contour
-whose normal is nearer to a row is sampled by rows, else by columns. So nothing is drawn, points lie
-on the contour to rounding, and sums over the points times their lengths are sums along the contour.
+Where the winding number along a row of a raster rises from zero or falls back to it, the row enters
+or leaves the union of all surfaces. A stretch of contour whose normal is nearer to a row is sampled
+by rows, else by columns. Points lie on the contour to rounding; sums over them times their lengths
+are sums along the contour.
 """
 
 from __future__ import annotations
@@ -51,7 +50,6 @@ def sample_contour(
     """Points of the visible contour of the union of surfaces.
 
     Args:
-        packed: the surfaces.
         X_CN: (nodes, 4, 4) their poses in the camera; for a parallel camera their rotations may be
             scaled uniformly.
         camera: (8,) kernel parameters. Triangles nearer than its near plane are left out.

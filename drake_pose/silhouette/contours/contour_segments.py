@@ -32,10 +32,7 @@ class Segments(NamedTuple):
 
 @compiled
 def find_segments(packed: PackedOutlines, X_CN: np.ndarray, camera: np.ndarray) -> Segments:
-    """Returns the projected contour edges of all surfaces at poses X_CN (nodes, 4, 4).
-
-    Triangles that reach nearer than a pinhole's near plane are left out.
-    """
+    """The projected contour edges of all surfaces at X_CN (nodes, 4, 4), beyond the near plane."""
     rows, _ = make_rows(packed, camera)
     capacity, count = 1024, 0
     ends, depths = np.empty((capacity, 4)), np.empty((capacity, 2))
@@ -82,16 +79,11 @@ def find_segments(packed: PackedOutlines, X_CN: np.ndarray, camera: np.ndarray) 
 def find_crossings(
     segments: Segments, across: int, first: float, spacing: float, lines: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where the contour edges cross lines of a raster, sorted along each line.
-
-    An edge crosses the lines from its lower end, included, to its upper, excluded.
+    """Where contour edges cross lines of a raster, sorted along each line; upper ends excluded.
 
     Args:
-        segments: the projected contour edges.
         across: 0: the lines are rows, along u; 1: columns, along v.
-        first: where the first line is, on the other axis [pixel].
-        spacing: from line to line [pixel].
-        lines: their number.
+        first, spacing: the first line on the other axis, and from line to line [pixel].
 
     Returns:
         starts (lines + 1,) of the lines' crossings, their places (n,) [pixel] and segments (n,).

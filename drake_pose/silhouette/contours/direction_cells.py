@@ -1,10 +1,8 @@
 """Which edges of a surface can be on its contour, by the direction it is seen from.
 
-All directions are divided into cells of a few degrees: squares on the faces of a cube. An edge is
-on the contour where the camera sees its two triangles from different sides, so an edge both of
-whose triangles turn clearly to one side at the middle of a cell is never on the contour for any
-direction in the cell. What is left is some tenth of the edges. A direction and its opposite have
-the same contour, so three faces of the cube are enough.
+Directions are divided into cells: squares on three faces of a cube, as a direction and its opposite
+have the same contour. An edge both of whose triangles turn clearly to one side at the middle of a
+cell is on the contour for no direction in it; some tenth of the edges is left.
 """
 
 from __future__ import annotations
@@ -57,7 +55,7 @@ def divide_outline(
     band: TriangleMesh | None = None,
     bands: np.ndarray | None = None,
 ) -> CelledOutline:
-    """Returns the surface with its cells.
+    """The surface with its cells.
 
     Args:
         spread: how far the directions in which a camera sees the surface's points may differ from

@@ -1,7 +1,6 @@
 """A model's skin in Drake's SceneGraph: deformable geometry that its VTK renderer draws.
 
-Drake wants a deformable body to be made of tetrahedra. Here each triangle of a band carries a flat
-tetrahedron of its own, whose apex lies just inside the band; what is drawn is the band.
+Drake wants tetrahedra: each triangle of a band carries a flat one, its apex just inside the band.
 """
 
 from __future__ import annotations
@@ -33,15 +32,9 @@ _DEPTH = 0.05
 
 
 class DeformableSkin:
-    """A model's bands in a SceneGraph, as a source of their own.
+    """A model's bands in a SceneGraph: a source whose configuration port is to be connected.
 
-    Attributes:
-        source: the source; connect or fix its configuration port.
-
-    Args:
-        scene_graph: where they go.
-        labels: the render label of each band's child link, by name; 0 for those left out.
-        name: of the source.
+    ``labels``: the render label of each band's child link, by name; 0 for those left out.
     """
 
     def __init__(

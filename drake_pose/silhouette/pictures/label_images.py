@@ -1,7 +1,4 @@
-"""Masks to and from Drake's label images.
-
-Drake's value type ImageLabel16I lives in pydrake.systems.sensors; it alone is taken from there.
-"""
+"""Masks to and from Drake's label images, whose value type alone is from pydrake.systems."""
 
 from __future__ import annotations
 
@@ -39,11 +36,9 @@ def fill_label_image(image: ImageLabel16I, mask: np.ndarray) -> None:
 def label_image_to_mask(
     image: ImageLabel16I | np.ndarray, labels: Collection[int] | None = None
 ) -> np.ndarray:
-    """Returns the mask (H, W) bool of a label image.
+    """The mask (H, W) of a label image or of its data (H, W) or (H, W, 1).
 
-    Args:
-        image: a label image, or its data (H, W) or (H, W, 1).
-        labels: the labels that count as the object; left out, all but EMPTY.
+    ``labels``: those that count as the object; None: all but EMPTY.
     """
     data = label_data(image)
     if labels is None:

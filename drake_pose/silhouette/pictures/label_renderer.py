@@ -38,8 +38,7 @@ class LabelRenderer:
 
     Raises:
         CameraError: on rendering, when Drake cannot draw for the camera.
-        RuntimeError: on rendering in another thread than the one that made the renderer: the
-            engine would give wrong images.
+        RuntimeError: on rendering in another thread than made it: images would be wrong.
     """
 
     def __init__(self, model: ParsedModel, camera: Camera) -> None:
@@ -64,15 +63,9 @@ class LabelRenderer:
         return dict(enumerate(link_names(self._plant)))
 
     def label_image(self, q: np.ndarray, X_WB: np.ndarray | None = None) -> np.ndarray:
-        """Renders the model.
+        """Labels (H, W) int16 of the model at q (nq,); EMPTY where there is no body.
 
-        Args:
-            q: (nq,) the plant's positions.
-            X_WB: (4, 4) pose in the world of the frame B that the plant takes for its world;
-                left out, the world itself.
-
-        Returns:
-            (H, W) int16 labels; EMPTY where there is no body.
+        ``X_WB``: (4, 4) pose of the plant's world frame B in the world; None: the identity.
         """
         if threading.get_ident() != self._thread:
             raise RuntimeError("a LabelRenderer must be used in the thread that made it")

@@ -14,11 +14,9 @@ _CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 
 @dataclass(frozen=True)
 class MaskAgreement:
-    """How a frame's silhouettes and body agree.
+    """How a frame's silhouettes and body agree: intersection over union by camera, and E_total.
 
-    Args:
-        E_total: the area where they differ over the silhouettes' area; NaN without a silhouette.
-        ious: by camera, intersection over union.
+    E_total: the area where they differ over the silhouettes' area; NaN without a silhouette.
     """
 
     E_total: float
@@ -53,7 +51,7 @@ def edge_area(mask: np.ndarray) -> int:
 def signed_distances(mask: np.ndarray) -> np.ndarray:
     """(H, W) float32 distance from the edge of a mask, half way between pixels; positive outside.
 
-    Beyond the picture's edge nothing is known: it is no edge of the mask.
+    The picture's edge is no edge of the mask.
     """
     inside = np.asarray(mask, dtype=np.uint8)
     if inside.all():

@@ -20,18 +20,13 @@ def read_mask(
     *,
     may_be_empty: bool = False,
 ) -> np.ndarray:
-    """Reads a mask: a PNG picture of black (0) and one other value or colour, the object.
+    """Reads a mask (H, W): a PNG picture of black (0) and one other value or colour, the object.
 
-    Args:
-        width, height: the size the mask must have [pixel], where known.
-        may_be_empty: whether a picture that shows nothing is as good as any.
-
-    Returns:
-        (H, W) bool, True on the object.
+    ``may_be_empty``: whether a picture that shows nothing is as good as any.
 
     Raises:
-        MaskError: names the file; when it cannot be read, is no whole PNG picture, has another
-            size, is empty or full, or has more than two values.
+        MaskError: names the file; when it cannot be read, is no whole PNG picture, is not of
+            ``width`` and ``height`` [pixel], is empty or full, or has more than two values.
     """
     path = Path(path)
     try:
@@ -54,11 +49,7 @@ def read_mask(
 
 
 def write_mask(path: str | Path, mask: np.ndarray) -> None:
-    """Writes a mask (H, W) bool as a grey PNG picture, 255 on the object.
-
-    Raises:
-        MaskError: names the file; when it cannot be written.
-    """
+    """Writes a mask (H, W) as a grey PNG, 255 on the object; MaskError names an unwritable file."""
     path = Path(path)
     done, data = cv2.imencode(".png", np.where(mask, 255, 0).astype(np.uint8))
     if not done:

@@ -21,10 +21,8 @@ _NUMBER = re.compile("([0-9]+)")
 class Leftovers:
     """What lies in a scene's folder and is not used.
 
-    Args:
-        uncalibrated: folders of masks that belong to no camera, with how many masks each has.
-        doubled: masks of (camera, frame) beside the one that is used: the same number again.
-        foreign: by camera, files that are no masks; "" for those that lie in no camera's folder.
+    ``uncalibrated`` counts masks in folders of no camera; ``doubled``: further masks of the same
+    (camera, frame); ``foreign``: files that are no masks, "" for those in no camera's folder.
     """
 
     uncalibrated: Mapping[str, int] = field(default_factory=dict)
@@ -34,13 +32,7 @@ class Leftovers:
 
 @dataclass(frozen=True)
 class SceneFiles:
-    """A scene's masks.
-
-    Args:
-        masks: the mask file of (camera, frame).
-        frames: the frames' names in their natural order: 2 before 10.
-        leftovers: what is not used.
-    """
+    """A scene's mask files by (camera, frame), its frames in natural order, and what is left."""
 
     masks: Mapping[tuple[str, str], Path]
     frames: tuple[str, ...]
@@ -67,8 +59,7 @@ def find_masks(folder: Path, cameras: Iterable[str]) -> SceneFiles:
     the same frames.
 
     Raises:
-        SceneError: names the folder; no masks, masks that lie in no camera's folder, or a folder
-            that cannot be read.
+        SceneError: names a folder that cannot be read or holds no masks of a camera.
     """
     names = list(cameras)
     root = folder / "masks"
@@ -102,12 +93,7 @@ def find_images(
     """Finds images/<camera>/<frame>.png or .jpg by (camera, frame); none where there is no folder.
 
     Of a camera without such a folder the video videos/<camera>.mp4 is each of its frames, which are
-    named 000000, 000001 and so on, or as frames of these numbers are named already.
-
-    Args:
-        folder: the scene's.
-        cameras: the cameras.
-        frames: names of frames that are known.
+    named 000000, 000001 and so on, or as known ``frames`` of these numbers are named already.
 
     Raises:
         SceneError: a folder or video that cannot be read.

@@ -41,11 +41,10 @@ class Scene:
     """A folder of masks, and the cameras that took them.
 
     Args:
-        cameras: the cameras by name, in the camera file's order.
-        frames: the frames' names in natural order, 2 before 10; a frame may lack some cameras.
+        cameras: in the camera file's order.
+        frames: in natural order, 2 before 10; a frame may lack some cameras.
         masks: the mask file of (camera, frame).
         sequence: whether the frames follow each other in time.
-        frame_rate_hz: frames a second, where the scene says.
         scale_unknown: whether the cameras are uncalibrated: each is a parallel camera that looks
             along the world's -x, and its pixels_per_metre and what it looks at are to be found.
         leftovers: what lies in the folder and is not used.
@@ -66,22 +65,14 @@ class Scene:
     _videos: dict[Path, VideoPictures] = field(default_factory=dict, repr=False, compare=False)
 
     def cameras_of(self, frame: str) -> tuple[str, ...]:
-        """Returns the names of the cameras that have a mask of a frame.
-
-        Raises:
-            UnknownNameError: when there is no such frame.
-        """
+        """The names of the cameras with a mask of a frame; UnknownNameError for no such frame."""
         names = tuple(camera for camera in self.cameras if (camera, frame) in self.masks)
         if not names and frame not in self.frames:
             raise UnknownNameError("frame", frame, self.frames, str(self.path))
         return names
 
     def mask_path(self, camera: str, frame: str) -> Path:
-        """Returns the mask file of a camera's frame.
-
-        Raises:
-            UnknownNameError: when there is no such camera, or it has no such frame.
-        """
+        """The mask file of a camera's frame; UnknownNameError where there is none."""
         if camera not in self.cameras:
             raise UnknownNameError("camera", camera, self.cameras, str(self.path))
         if (camera, frame) not in self.masks:
@@ -90,12 +81,7 @@ class Scene:
         return self.masks[camera, frame]
 
     def read(self, camera: str, frame: str, *, may_be_empty: bool = False) -> np.ndarray:
-        """Returns the mask (H, W) bool of a camera's frame.
-
-        Args:
-            camera: the camera's name.
-            frame: the frame's name.
-            may_be_empty: whether a picture that shows nobody is as good as any.
+        """The mask (H, W) of a camera's frame, which may be asked to show somebody.
 
         Raises:
             UnknownNameError: when there is no such camera, or it has no such frame.
@@ -106,7 +92,7 @@ class Scene:
         return read_mask(path, size.width, size.height, may_be_empty=may_be_empty)
 
     def read_image(self, camera: str, frame: str) -> np.ndarray:
-        """Returns the picture (H, W, 3), red, green, blue, of a camera's frame.
+        """The picture (H, W, 3), red, green, blue, of a camera's frame.
 
         Raises:
             UnknownNameError: when there is no such camera, or it has no such picture.
@@ -145,16 +131,13 @@ def _read_picture(file: Path) -> np.ndarray:
 def load_scene(path: str | Path, cameras: Mapping[str, Camera] | None = None) -> Scene:
     """Reads what a scene's folder holds; masks are read when they are asked for.
 
-    The folder has `cameras.yaml`, `masks/<camera>/<frame>.png` and perhaps `scene.yaml`
-    (`sequence: true|false`, `frame_rate_hz`). A sequence may have pictures
-    `images/<camera>/<frame>.png` or `.jpg`, or a video `videos/<camera>.mp4`, where it has no
-    masks. With a single camera the masks
-    may lie in `masks/<frame>.png`. Such masks need no camera file: without one they were taken by
-    an uncalibrated camera, or by several where the pictures' sizes differ. Masks of cameras
-    that are not in the camera file are left over, see `Scene.leftovers`.
-
-    Args:
-        cameras: the cameras, where the folder has no `cameras.yaml`, or to be used instead of it.
+    The folder has ``cameras.yaml``, ``masks/<camera>/<frame>.png`` and perhaps ``scene.yaml``
+    (``sequence: true|false``, ``frame_rate_hz``). A sequence may have pictures
+    ``images/<camera>/<frame>.png`` or ``.jpg``, or a video ``videos/<camera>.mp4``, where it has no
+    masks. A single camera's masks may lie in ``masks/<frame>.png``; without a camera file they were
+    taken by an uncalibrated camera, or by several where the pictures' sizes differ. Masks of
+    cameras that are not in the camera file are left over, see ``Scene.leftovers``. Given
+    ``cameras`` are used instead of the folder's.
 
     Raises:
         SceneError: names the folder and what is missing or wrong in it.

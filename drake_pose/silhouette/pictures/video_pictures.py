@@ -15,11 +15,7 @@ VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg")
 
 
 class VideoPictures:
-    """The pictures of a video, counted from 0.
-
-    Raises:
-        SceneError: it is not a video that OpenCV can read.
-    """
+    """The pictures of a video, counted from 0; SceneError where OpenCV cannot read it."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._capture, self._next = path, cv2.VideoCapture(str(path)), 0
@@ -38,11 +34,7 @@ class VideoPictures:
         return rate if rate > 0.0 else None
 
     def read(self, number: int) -> NDArray[np.uint8]:
-        """A picture (H, W, 3), red, green, blue.
-
-        Raises:
-            SceneError: the video ends before it.
-        """
+        """A picture (H, W, 3), red, green, blue; SceneError where the video ends before it."""
         if number < self._next:
             self._capture.release()
             self._capture, self._next = cv2.VideoCapture(str(self._path)), 0

@@ -39,22 +39,16 @@ _PARENT = 3
 
 @dataclass(frozen=True, eq=False)
 class Background:
-    """What a camera sees when nobody is there.
-
-    Args:
-        mean: (H, W, 3) mean colour.
-        deviation: (H, W) standard deviation of a channel: noise and flicker [grey levels].
-    """
+    """An empty scene's mean colour (H, W, 3) and its standard deviation (H, W) [grey levels]."""
 
     mean: Picture
     deviation: Array
 
 
 def learn_background(pictures: Sequence[Picture]) -> Background:
-    """The background from one or more pictures (H, W, 3) of the empty scene.
+    """The background from pictures (H, W, 3) of the empty scene, all of one size.
 
-    Raises:
-        SettingsError: no picture, or pictures of different sizes.
+    Raises SettingsError for no picture, or pictures of different sizes.
     """
     _require_one_size(pictures, 1, "a background needs one or more pictures of the same size")
     stack = np.stack([picture.astype(np.float32) for picture in pictures])
@@ -64,15 +58,10 @@ def learn_background(pictures: Sequence[Picture]) -> Background:
 
 
 def background_of_recording(pictures: Sequence[Picture]) -> Background:
-    """The background from pictures in which something moves: each pixel's median.
+    """The background from three or more pictures (H, W, 3) of a recording: each pixel's median.
 
-    What covers a pixel in half of the pictures, or never moves, is taken for background.
-
-    Args:
-        pictures: (H, W, 3), three or more, spread over the recording.
-
-    Raises:
-        SettingsError: too few pictures, or pictures of different sizes.
+    What covers a pixel in half of the pictures, or never moves, is taken for background. Raises
+    SettingsError for too few pictures, or pictures of different sizes.
     """
     message = "the median of a recording needs three or more pictures of one size"
     _require_one_size(pictures, 3, message)
@@ -105,11 +94,8 @@ def background_support(pictures: Sequence[Picture], background: Background) -> A
 def person_region(picture: Picture, background: Background) -> Mask:
     """Where a picture (H, W, 3) differs from its camera's background: the person, (H, W).
 
-    Patches much smaller than the largest one are dropped as noise; what is left may be in several
-    parts (a hand before a background of its own colour), or empty.
-
-    Raises:
-        SettingsError: when the picture's size is not the background's.
+    Patches much smaller than the largest are dropped as noise; the rest may be several parts, or
+    nothing. Raises SettingsError for a picture of another size than the background.
     """
     if picture.shape != background.mean.shape:
         raise SettingsError(
@@ -137,10 +123,7 @@ def person_region(picture: Picture, background: Background) -> Mask:
 def _where_squares_may_be(
     picture: Picture, mean: Picture, tolerance: Picture
 ) -> tuple[range, range] | None:
-    """Rows and columns of the middles of all squares that are off throughout; None: there are none.
-
-    A third of the rows tells: each square, even if the picture's border cuts it, has one of them.
-    """
+    """Rows and columns of the middles of all squares off throughout, told by every third row."""
     rows = slice(int(picture.shape[0] % _STEP == 0), None, _STEP)
     told = cv2.erode(_off(picture[rows], mean[rows], tolerance[rows]), _SQUARE[:1])
     left, top, width, height = cv2.boundingRect(told)

@@ -1,7 +1,4 @@
-"""What one camera's pictures say of the background beside a body that is about known.
-
-Where the body is about known in each picture, the other pictures show what is behind it.
-"""
+"""The background beside a body that is about known: other pictures show what is behind it."""
 
 from __future__ import annotations
 
@@ -33,15 +30,11 @@ def tell_from_background(
 ) -> list[Array]:
     """How much more likely each pixel's colour is the body's than the background's.
 
-    Pictures may differ in exposure and in the light's colour: each is brought to the others'.
-
-    Args:
-        pictures: (H, W, 3) of one camera that stands still.
-        probabilities: (H, W) of each, how likely the body is at each pixel.
+    Pictures (H, W, 3) of one camera that stands still are brought to each other's exposure and
+    light; ``probabilities`` (H, W) say how likely the body is at each pixel.
 
     Returns:
-        The logarithm of the ratio of likelihoods (H, W), of each picture; 0 where no other pictures
-        show the background.
+        The log likelihood ratio (H, W) of each picture; 0 where no other shows the background.
     """
     even = _match_exposure(pictures, probabilities)
     step = -(-len(even) // _MOST)

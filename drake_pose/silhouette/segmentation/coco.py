@@ -1,8 +1,7 @@
 """Masks in COCO files: polygons, and run lengths, which COCO's own library decodes.
 
-Polygons have their corners between pixels: pixel (0, 0) reaches from 0 to 1, and belongs to what
-its centre lies in. OpenCV's ``fillPoly`` takes every pixel that the border touches, which widens an
-object by half a pixel.
+Corners lie between pixels (pixel 0 is 0..1), and a pixel belongs to what its centre lies in;
+OpenCV's ``fillPoly`` takes every pixel that the border touches, half a pixel too many.
 """
 
 from __future__ import annotations
@@ -35,11 +34,7 @@ class AnnotatedPicture:
     annotations: Sequence[tuple[str, Mapping[str, Any]]] = ()
 
     def draw(self, classes: Container[str]) -> Mask:
-        """The areas of some classes together (H, W), which may be none.
-
-        Raises:
-            ValueError: names an annotation that cannot be drawn.
-        """
+        """The areas of some classes together (H, W); ValueError names what cannot be drawn."""
         mask = np.zeros((self.height, self.width), dtype=np.bool_)
         for name, entry in self.annotations:
             if name not in classes:
@@ -55,14 +50,7 @@ class AnnotatedPicture:
 
 @dataclass(frozen=True)
 class Annotations:
-    """What a COCO file holds.
-
-    Args:
-        path: the file.
-        pictures: in the file's order.
-        names: the classes' names by their numbers' text.
-        warnings: what was left out.
-    """
+    """A COCO file's pictures in its order, classes' names by number, and what was left out."""
 
     path: Path
     pictures: tuple[AnnotatedPicture, ...]
@@ -78,11 +66,7 @@ class Annotations:
 
 
 def read_coco(path: Path) -> Annotations:
-    """Reads a COCO file.
-
-    Raises:
-        MaskError: names the file, and the annotation at fault.
-    """
+    """Reads a COCO file; MaskError names the file, and the annotation at fault."""
     try:
         content = json.loads(read_regular(path, _LARGEST_FILE))
     except OSError as error:
@@ -156,8 +140,7 @@ def _draw(segmentation: Any, height: int, width: int) -> Mask:
 def fill_polygon(corners: NDArray[np.float64], height: int, width: int) -> Mask:
     """The pixels (H, W) whose centres lie in a polygon (n, 2) by the even-odd rule.
 
-    Raises:
-        ValueError: fewer than three corners, or one that is no finite number.
+    Raises ValueError for fewer than three corners, or one that is no finite number.
     """
     if len(corners) < 3 or not np.isfinite(corners).all():
         raise ValueError("a polygon needs three corners (x, y) or more, finite numbers")
@@ -175,9 +158,7 @@ def fill_polygon(corners: NDArray[np.float64], height: int, width: int) -> Mask:
 def decode_run_lengths(counts: Sequence[int] | str, height: int, width: int) -> Mask:
     """The area (H, W) of run lengths, or of the text that they are compressed to.
 
-    Raises:
-        ValueError: run lengths that are none, or do not fill the picture.
-        MaskError: pycocotools is not installed.
+    Raises ValueError where they do not fill the picture, MaskError without pycocotools.
     """
     try:
         from pycocotools import mask as coco

@@ -18,14 +18,9 @@ _SEED = 1
 
 
 def cut_box(picture: Picture, box: Sequence[float]) -> Mask:
-    """The object (H, W) in a box of a picture (H, W, 3).
+    """The object (H, W) in a picture (H, W, 3) and a box x, y, width, height [pixel] around it.
 
-    Args:
-        picture: the picture.
-        box: x, y, width and height [pixel] of a box around the whole object.
-
-    Raises:
-        SettingsError: the box lies outside the picture, or is all of it.
+    Raises SettingsError where the box lies outside the picture, or is all of it.
     """
     height, width = picture.shape[:2]
     x, y, w, h = box

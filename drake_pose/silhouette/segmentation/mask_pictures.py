@@ -45,8 +45,6 @@ def read_mask_picture(
       other colour; a grey picture of many values has probabilities. What may be either is refused.
 
     Args:
-        path: the file.
-        meaning: what its pixels mean.
         classes: the numbers of the classes that are the object; ``all``: each but 0. Where none is
             given, the only class that there is.
 
@@ -77,8 +75,7 @@ def read_mask_picture(
 def mask_of_video_picture(picture: NDArray[np.uint8], where: str) -> Mask:
     """The mask (H, W) in a video's picture (H, W, 3): what is light.
 
-    Raises:
-        MaskError: names the picture by `where`: much of it is neither dark nor light.
+    Raises MaskError, which names the picture by ``where``: much is neither dark nor light.
     """
     grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     between = float(((grey > 64) & (grey < 192)).mean())

@@ -18,13 +18,12 @@ Array = NDArray[np.float32]
 
 
 class SegmentationNetwork:
-    """A network that says for each pixel which class it is of.
+    """A network (an ONNX file) that says for each pixel which class it is of.
 
     Its first output is (1, classes, h, w), scores or probabilities of classes; (1, 1, h, w) or
     (1, h, w), the object's probability or its logit; or (1, h, w) of whole numbers, classes.
 
     Args:
-        file: an ONNX file.
         classes: the numbers of the classes that are the object; ``all``: each but 0. None are
             needed where there are two classes at most.
         size: width and height that pictures are brought to [pixel]; None: they stay as they are.
@@ -64,9 +63,7 @@ class SegmentationNetwork:
     def find(self, picture: Picture) -> Mask:
         """The object (H, W) in a picture (H, W, 3) red, green, blue.
 
-        Raises:
-            SettingsError: the network does not take such pictures, or its output is of another
-                form, or has no such class.
+        Raises SettingsError: the network does not take such pictures, or gives another output.
         """
         values = (picture.astype(np.float32) / 255.0 - np.asarray(self._mean)) / self._std
         if self._size is not None:

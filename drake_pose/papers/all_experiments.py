@@ -68,10 +68,7 @@ class Outcome(NamedTuple):
 
 
 class Experiment(NamedTuple):
-    """One of all: its folder, its title on the page, what runs it alone, and what makes it.
-
-    The last is given whether it is short, its folder for pictures, and what counts.
-    """
+    """An experiment: folder, title, command for it alone, and `run(short, pictures, count)`."""
 
     name: str
     title: str

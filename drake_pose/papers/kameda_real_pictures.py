@@ -22,10 +22,7 @@ METHODS: Mapping[Method, str] = {"paper": "the paper's method", "beam": "multi-s
 
 
 class RealPictures(NamedTuple):
-    """What one of the experiments is made of: names of the stored scene and the bundled model.
-
-    The model is of another person. The settings are root and sampling, given the scene's folder.
-    """
+    """One of the experiments: stored scene, another person's bundled model, settings by folder."""
 
     title: str
     scene: str

@@ -37,13 +37,7 @@ ACCELERATIONS = {
 
 @dataclass(frozen=True, eq=False)
 class SyntheticSequence:
-    """One synthetic sequence.
-
-    Attributes:
-        states: (55, n) true states.
-        measurements: (55, m) with noise, NaN where hidden.
-        guess: table 2's start.
-    """
+    """True states (55, n), measurements (55, m) with noise, NaN: hidden, and table 2's guess."""
 
     states: Array
     measurements: Array

@@ -41,10 +41,7 @@ _ROTATIONS = ("Zrotation", "Xrotation", "Yrotation")
 
 @dataclass(frozen=True, eq=False)
 class SkeletonJoint:
-    """A joint of the file: the link whose origin it is ("world": where several parts stand).
-
-    parent: index of the joint before it; -1 for the root.
-    """
+    """A joint: its link ("world": where several parts stand), its parent's index (-1: root)."""
 
     link: str
     parent: int

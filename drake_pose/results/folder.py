@@ -125,10 +125,7 @@ class ResultFolder:
             raise _cannot_write(self.path / POSES, error) from error
 
     def sort(self, frames: Sequence[str]) -> None:
-        """Close poses.csv and put its rows in the order of ``frames``.
-
-        A job that was resumed for other frames has written them behind the earlier ones.
-        """
+        """Close poses.csv and put its rows, also of a resumed job, in the order of ``frames``."""
         self.close()
         place = {frame: index for index, frame in enumerate(frames)}
         in_order = sorted(self.rows, key=lambda row: place[row.frame])

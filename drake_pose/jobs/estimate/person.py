@@ -38,14 +38,7 @@ FOLLOWED = "followed"
 
 @dataclass(frozen=True, eq=False)
 class _Followed:
-    """A person who was followed through all frames.
-
-    Args:
-        captured: poses and shape.
-        read: gives the masks that were used.
-        faults: what the user should know.
-        distances: (frames,) as of `ColourCapture`; None: there are masks of all frames.
-    """
+    """A person's poses and shape, masks, warnings, and distances (frames,) [pixel] by colour."""
 
     captured: PersonCapture
     read: ReadFrame

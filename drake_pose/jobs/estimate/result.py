@@ -154,13 +154,7 @@ class ResultWriter:
         return [frame for frame in self.inputs.frames if frame not in self.rows]
 
     def _drop_replaced(self) -> None:
-        """Forget finished frames whose masks are not those any more that they were made from.
-
-        A frame whose masks nobody recorded, as the job was killed, is one of them.
-
-        Raises:
-            OutputError: such a frame is not among those that are to be estimated.
-        """
+        """Forget finished frames whose masks are not known to be those they were made from."""
         gone = [f for f, record in self.records.items() if self._digests(f) != record.masks]
         if not gone:
             return

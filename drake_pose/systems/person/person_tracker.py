@@ -351,13 +351,7 @@ def _without(seen: FrameViews, names: Collection[str]) -> FrameViews:
 
 
 class _Moment(NamedTuple):
-    """What cameras see at a moment.
-
-    Attributes:
-        seen: by those that have a picture.
-        others: whether other persons were cut out, or cameras left out because of them.
-        merged: the names of the cameras in which the person and another are one figure.
-    """
+    """What cameras see; whether others were cut out, and who merges person and others."""
 
     seen: FrameViews
     others: bool = False

@@ -26,7 +26,7 @@ def written_again(name: str, folder: Path, *options: str) -> list[Path]:
 def committed(name: str) -> list[Path]:
     """The model's files that its script writes, relative to the model's folder."""
     folder = URDF / name
-    kinds = (".obj", ".urdf", ".yaml")
+    kinds = (".obj", ".mtl", ".urdf", ".yaml")
     return sorted(p.relative_to(folder) for p in folder.rglob("*") if p.suffix in kinds)
 
 

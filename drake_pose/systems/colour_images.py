@@ -14,10 +14,7 @@ Picture = NDArray[np.uint8]
 
 
 def picture_to_colour_image(picture: Picture | None) -> ImageRgba8U:
-    """Returns a picture (H, W, 3) in red, green, blue as a colour image.
-
-    None, where a camera has nothing to show, becomes an image of no pixels.
-    """
+    """A picture (H, W, 3) in red, green, blue as a colour image; None becomes one of no pixels."""
     if picture is None:
         return ImageRgba8U()
     image = ImageRgba8U()

@@ -17,11 +17,7 @@ class SharedValue:
 
 
 def require_time_forward(system: LeafSystem, context: Context, last: float) -> None:
-    """Refuse an update that is earlier than the last one, after which a filter knows the future.
-
-    Raises:
-        SettingsError: time ran backwards.
-    """
+    """Refuse (SettingsError) an update before the last one, whose filter knows the future."""
     now = context.get_time()
     if now < last:
         raise SettingsError(

@@ -21,10 +21,6 @@ class StagedDiagram:
     stages: Mapping[str, tuple[OutputPort, ...]]
 
     def evaluate(self, context: Context, stage: str) -> None:
-        """Have a stage compute what it has not computed yet.
-
-        Args:
-            stage: one of stages.
-        """
+        """Have a stage, one of stages, compute what it has not computed yet."""
         for port in self.stages[stage]:
             port.Eval(port.get_system().GetMyContextFromRoot(context))

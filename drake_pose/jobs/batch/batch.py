@@ -46,16 +46,13 @@ def run_batch(
     resume: bool = False,
     on_progress: OnProgress = lambda *_: None,
 ) -> BatchResult:
-    """Estimates many scenes; each gets a result folder in ``out``.
+    """Estimates many scenes; each gets a result folder in ``out``, which is empty or not there.
 
     A scene that fails does not stop the others. Interrupted, finished chunks are in ``out``.
 
     Args:
-        jobs: the scenes.
-        out: the batch's folder, empty or not there.
         pool: who works; this process where None.
         resume: go on with what is in ``out``, and try failed scenes again.
-        on_progress: called with how far it is.
 
     Raises:
         OutputError: the folder cannot be used, or holds another job.

@@ -34,8 +34,7 @@ class SceneJob:
         name: of the result's folder.
         truth: measured joint positions to compare with.
         chunk: frames in a chunk; a person's recording, and a scene that is audited, is never cut.
-        audit: the table of joint positions that the scene is audited against; None: the scene is
-            estimated.
+        audit: joint positions that the scene is audited against; None: the scene is estimated.
         camera_file: for an audit, in place of the scene's cameras.yaml.
     """
 
@@ -65,15 +64,12 @@ class SceneJob:
 
 
 def read_job(path: Path, chunk: int | None = None) -> tuple[SceneJob, ...]:
-    """Reads a job file. Paths in it are relative to its folder.
+    """Reads a job file's scenes, in its order. Paths in it are relative to its folder.
 
     Args:
-        path: the YAML file: ``scenes`` (name: settings), perhaps ``defaults`` for all of them, and
+        path: the YAML file: ``scenes`` (name: settings), perhaps ``defaults`` for all, and
             ``chunk``.
         chunk: frames in a chunk, in place of the file's.
-
-    Returns:
-        The scenes, in the file's order.
 
     Raises:
         SettingsError: names the file, the scene and the setting at fault.

@@ -26,7 +26,6 @@ class SceneState:
     """How far a scene is.
 
     Args:
-        job: what is to be done.
         described: the job and its files as they were at the start.
         state: WAITING, FINISHED or FAILED.
         tasks: its chunks, or the one task of a scene that is not cut.
@@ -99,11 +98,7 @@ class BatchResult:
         }
 
     def write(self) -> None:
-        """Writes batch.json all at once, and of audits contradictions.csv.
-
-        Raises:
-            OutputError: it cannot be written.
-        """
+        """Writes batch.json at once, and of audits contradictions.csv; or raises OutputError."""
         text = json.dumps(without_nan(self.as_json()), indent=2, ensure_ascii=False)
         self._write(BATCH, text + "\n")
         if any(state.job.audit is not None for state in self.scenes.values()):

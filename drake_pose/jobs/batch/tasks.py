@@ -1,8 +1,7 @@
 """What the workers of `drake-pose batch` do: a chunk of frames, a capture, a scene put together.
 
-A task finds its input and leaves its result on the disk that all machines share. Whatever it makes
-lies beside its place until it is whole, and is then moved there in one step: a task that is done
-twice does no harm, and one that was done is not done again.
+A result is made beside its place on the shared disk and moved there in one step when it is whole: a
+task done twice does no harm, and one that was done is not done again.
 """
 
 from __future__ import annotations
@@ -58,8 +57,6 @@ class Task:
     """A piece of work.
 
     Args:
-        job: the scene it is a piece of.
-        out: the batch's folder.
         index: of the chunk; None: the whole scene, put together from its chunks if it has any.
         frames: the chunk's frames; all of the scene's where index is None.
         chunks: where the chunks lie of which a scene is put together.
@@ -107,11 +104,7 @@ def work_folder(out: Path, job: SceneJob) -> Path:
 
 
 def plan_scene(job: SceneJob, out: Path) -> tuple[Task, ...]:
-    """Cuts a scene into tasks, which depend on nothing but the job.
-
-    Returns:
-        The chunks in order, or one task where a person is followed or the scene is audited, which
-        is not cut.
+    """Cuts a scene into tasks: chunks in order, or one where a person is followed or it is audited.
 
     Raises:
         DrakePoseError: the scene cannot be read.

@@ -38,12 +38,9 @@ class WorkerPool:
 
 
 class ClusterPool(WorkerPool):
-    """The workers of a cluster.
+    """The workers of a cluster; ``work`` does a task.
 
     At most one task a thread is under way, so that none waits at a worker that may die.
-
-    Args:
-        work: what does a task.
     """
 
     def __init__(self, client: Client, work: Callable[[Task], Outcome] = perform) -> None:

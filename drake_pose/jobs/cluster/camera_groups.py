@@ -96,7 +96,6 @@ class Watchers:
         overdue: says up to which time stamp a camera's pictures come too late [s].
 
     Args:
-        specifications: of the cameras' sources.
         spacings: from edge point to edge point, by camera [pixel].
         waits: whether a worker that does not answer is waited for, as a recording can.
 

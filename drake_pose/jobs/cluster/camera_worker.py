@@ -1,7 +1,6 @@
 """What a worker does for live capture: it opens some cameras' sources and says what they see.
 
-Sources stay open from one poll to the next. Pictures do not leave the machine; what leaves it is a
-few kilobytes a camera, and sums over its cameras where the fit asks for them.
+Sources stay open between polls. Of pictures, which stay here, a few kilobytes and sums are sent.
 """
 
 from __future__ import annotations
@@ -71,7 +70,6 @@ class WatchReply:
     Args:
         views: by camera, time stamps [s], names of frames, and views as of pack_view.
         ended: the cameras that will give nothing any more.
-        problems: what was wrong.
         dropped: by camera, pictures that could not be used since the sources were opened.
         rates: by camera, pictures a second, where known.
         seconds: of its processor's time, for views and sums [s].

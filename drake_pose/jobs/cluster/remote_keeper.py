@@ -25,10 +25,7 @@ _RETRY, _LONGEST_RETRY = 3.0, 60.0
 
 
 class RemoteKeeper:
-    """Asks a worker for sums over its cameras; see EdgeKeeper.
-
-    answers: how many sums came.
-    """
+    """Asks a worker for sums over its cameras; see EdgeKeeper. answers: how many came."""
 
     def __init__(self, cameras: Iterable[str], report: Callable[[str], None]) -> None:
         self._numbers = {name: k for k, name in enumerate(cameras)}

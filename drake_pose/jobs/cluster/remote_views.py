@@ -27,9 +27,9 @@ def opener(client: Client, tolerance: float | None = None) -> Callable[[LiveScen
 class ClusterSensors(LocalSensors):
     """Sensors on the workers of a cluster, one worker for each group of cameras; see LiveSensors.
 
-    Pictures stay where they are: a worker says in a few kilobytes what its cameras see, and adds up
-    what they say of a pose, as often as a fit asks. A worker that dies costs the others nothing;
-    another one, or itself when it was started again, goes on with its cameras.
+    A worker says in a few kilobytes what its cameras see, and adds up what they say of a pose, as
+    often as a fit asks. A worker that dies costs the others nothing; another one, or itself when it
+    was started again, goes on with its cameras.
 
     Args:
         live: whether the computer's clock decides; where not given, if a camera is live.

@@ -42,7 +42,7 @@ def open_cluster(workers: int | None = None, scheduler: str | None = None) -> It
     """Workers, for as long as the context lasts.
 
     Args:
-        workers: how many processes on this machine, of one thread each, that talk over its loopback
+        workers: how many processes of one thread on this machine, which talk over its loopback
             address alone; None: one for each core.
         scheduler: address of a Dask scheduler whose workers are used instead.
 
@@ -141,11 +141,7 @@ async def _shake_hands(address: str) -> None:
 
 
 class WorkerFacts(NamedTuple):
-    """What must be the same here and there.
-
-    version: of drake_pose; code: a digest of its source files, as development versions differ in
-    nothing else; sees: whether a file is there.
-    """
+    """What must be the same here and there: version, the source's digest, a file that is seen."""
 
     version: str
     code: str
@@ -163,10 +159,7 @@ def worker_facts(file: Path | None = None) -> WorkerFacts:
 
 
 def require_fit_workers(client: Client, out: Path | None = None) -> None:
-    """Looks whether the workers have this drake_pose, and see the folder of the result.
-
-    Args:
-        out: the result's folder, which all machines must share; None: there is none.
+    """Looks whether the workers have this drake_pose, and see the result's folder, if there is one.
 
     Raises:
         ClusterError: there is no worker, or one is not fit.

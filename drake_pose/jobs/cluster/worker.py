@@ -1,12 +1,10 @@
 """A worker's child: a process that does heavy work in its main thread, as no worker's thread can.
 
-A worker's tasks run in a thread beside the one that talks to the scheduler. Drake's renderer and
-Meshcat belong to the thread that made them, and Python's garbage collector takes them apart in
-whichever thread it happens to run; so a worker has a child, and whatever crashes the child (a
-broken model, too little memory) leaves the worker alive.
+Drake's renderer and Meshcat belong to the thread that made them, and Python's garbage collector
+takes them apart in any thread of a worker; and what crashes the child leaves the worker alive.
 
 Run as ``python -m drake_pose.jobs.cluster.worker MEMORY_LIMIT``: reads pickled pairs of a function
-and its argument, and writes the pickled results. When its parent ends, so does it.
+and its argument, writes the pickled results, and ends with its parent.
 """
 
 from __future__ import annotations
@@ -38,14 +36,11 @@ def worker_resources(dask_worker: Worker) -> tuple[str, ...]:
 
 
 def call_in_child(payload: bytes, tries: int) -> bytes:
-    """Calls a function in the main thread of this worker's child.
+    """Calls a function in the main thread of this worker's child; the pickled result.
 
     Args:
         payload: the pickled pair of a function and its argument.
         tries: how many children may die of it, before ClusterError.
-
-    Returns:
-        The pickled result.
     """
     reason = ""
     for _ in range(tries):

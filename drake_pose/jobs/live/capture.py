@@ -29,17 +29,13 @@ _FRAMES, _PATIENCE = 40, 60.0
 
 @dataclass(frozen=True)
 class LiveSettings:
-    """How a live capture is made.
+    """How a live capture is made; SettingsError: a time that cannot be.
 
     Args:
         seconds: how long; None: until the recordings end, or Ctrl-C.
         shape: a result of capture with the same person, whose lengths and girths are taken.
         fit_shape: whether otherwise the first frames give them; else they are the model's.
-        replay: whether replay.html is written.
         packages: folders of packages that the model's ``package://`` names mean, by name.
-
-    Raises:
-        SettingsError: a time that cannot be.
     """
 
     seconds: float | None = None
@@ -111,15 +107,7 @@ def record_frames(
     result: LiveWriter,
     settings: LiveSettings,
 ) -> LiveResult:
-    """Runs the diagram of a capture, and writes what comes out.
-
-    Args:
-        method: what summary.json calls it.
-        diagram: of the capture, with the sensors.
-        watch: hands frames to ``result``.
-        result: under way.
-        settings: how long, and whether with a replay.
-    """
+    """Runs the diagram of a capture, ``method`` in summary.json, and writes what comes out."""
     result.writer.more["method"] = method
     result.writer.open()
     try:
@@ -155,10 +143,7 @@ def _fit_first_frames(
     tree: PoseTree,
     on_report: Callable[[str], None],
 ) -> KnownShape | None:
-    """A person's lengths and girths by the first frames in which two cameras see the person.
-
-    The sensors are used up. None: the model has no shape joints.
-    """
+    """Lengths and girths by the first frames that two cameras see; None without shape joints."""
     frames: list[dict[str, Mask]] = []
     builder = DiagramBuilder()
     ports = sensors.add(builder)

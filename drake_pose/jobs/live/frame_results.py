@@ -32,12 +32,7 @@ from drake_pose.systems.pictures.picture_capture import CameraCount
 
 @dataclass(frozen=True, eq=False)
 class LiveResult:
-    """What came out of a live capture.
-
-    Args:
-        interrupted: whether Ctrl-C ended it.
-        troubles: what the user should know and was not told while it ran.
-    """
+    """What came out of a live capture; troubles: what the user was not told while it ran."""
 
     estimate: SceneEstimate
     interrupted: bool
@@ -47,15 +42,11 @@ class LiveResult:
 class LiveWriter:
     """The result of a capture under way.
 
-    Attributes:
-        writer: of the folder.
-
     Args:
         tracker: made for the person's pose tree; gives its surfaces.
         out: the result's folder, empty or not there.
         period: time between two frames [s].
         packages: folders of packages that the model's ``package://`` names mean, by name.
-        on_report: called with what the user is told.
         on_frame: called with each frame: how many there are, and whether a person was found.
 
     Raises:

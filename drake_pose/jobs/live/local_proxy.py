@@ -1,8 +1,8 @@
 """A reverse proxy (aiohttp) that lets only a page's own requests through to Drake's Meshcat.
 
-Meshcat answers whoever reaches its port, and any web page that a browser shows may open a WebSocket
-to this machine. Browsers send the name that a page asked for as ``Host``, and with each WebSocket
-the page's own origin as ``Origin``; a page of another origin cannot change either.
+Meshcat answers whoever reaches its port, as any web page in a browser here can. Browsers send the
+name that a page asked for as ``Host``, and with each WebSocket the page's ``Origin``; a page of
+another origin cannot change either.
 """
 
 from __future__ import annotations
@@ -40,10 +40,7 @@ _PASSED = ("Content-Type", "Content-Encoding", "Content-Disposition", "Cache-Con
 
 
 def listen(port: int | None = None) -> socket.socket:
-    """A socket on the loopback address alone.
-
-    Args:
-        port: where it listens; the first free one of ``PORTS`` where not given.
+    """A socket on the loopback address alone, at the port or else the first free one of ``PORTS``.
 
     Raises:
         OSError: the port is taken, or no port is free.
@@ -69,11 +66,7 @@ def open_page(port: int | None = None) -> Meshcat:
     """A Meshcat page for this machine's browsers, without Drake's own message.
 
     Meshcat listens behind the proxy at one of 2^24 loopback addresses, which no web page can find
-    by trying; where the system has but one of them (macOS), at a port that one could find among
-    2^16.
-
-    Args:
-        port: where the page is; a free one where not given.
+    by trying; where the system has but one of them (macOS), at a port among 2^16.
 
     Raises:
         SettingsError: no page can be opened at the port.

@@ -62,7 +62,7 @@ def capture_paper(
         out: the result's folder, empty or not there.
         model_path: a person of the same build as the bundled one, which is taken where not given;
             its measures are taken as they are.
-        settings: how; no shape can be given or fitted.
+        settings: no shape can be given or fitted.
         face: how the face's direction is found; None: by inverse kinematics alone.
         open_sensors: opens the sensors; where not given the scene's. Called twice.
         on_report: called at once when cameras stop and return, and with bad pictures.

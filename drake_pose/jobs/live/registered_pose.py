@@ -79,11 +79,7 @@ class RegisteredPoseSearch:
         self._since = 0
 
     def run(self, sensors: LocalSensors, on_report: Callable[[str], None]) -> CaptureSetup:
-        """What the capture needs, from the pictures of the registered pose.
-
-        Args:
-            sensors: are used up.
-            on_report: called when cameras stop, and with bad pictures.
+        """What the capture needs, from the pictures of the registered pose; uses the sensors up.
 
         Raises:
             SettingsError: nobody showed the registered pose.

@@ -34,19 +34,15 @@ def run_live(
     monitor: Callable[[Context], None] | None = None,
     speed: float = 0.0,
 ) -> bool:
-    """Runs a diagram until its recordings end, its time is up, or Ctrl-C.
+    """Runs a diagram until its recordings end or its time is up; True: until Ctrl-C instead.
 
     Args:
-        diagram: with the sensors in it.
-        sensors: its sensors; None: it has none.
+        sensors: those in the diagram; None: it has none.
         seconds: how long; None: without end.
         on_report: called with what the user should know of cameras and pictures.
         until: asked after every period whether it is enough.
         monitor: called with the diagram's context after every step.
         speed: simulated seconds a second where no camera is live; 0: as fast as it can.
-
-    Returns:
-        Whether it was ended by Ctrl-C.
     """
     simulator = Simulator(diagram)
     if monitor is not None:
@@ -87,8 +83,7 @@ class LiveFrame:
         share: of the contours, what fits; nan where the diagram does not say.
         views: by camera that gave a picture, what it says.
         has_others: whether other persons are in the views, whom the tracker has cut out.
-        deviations: (nq,) standard deviations of q [rad or m]; nan where nobody was found, or where
-            the diagram does not give them.
+        deviations: (nq,) standard deviations of q [rad or m]; nan where not known.
         seconds: the work since the frame before [s].
     """
 
@@ -105,8 +100,6 @@ class FrameWatch:
     """A monitor that notes each new moment of a diagram of build_live_capture or the paper's.
 
     Args:
-        cameras: the names of its cameras.
-        on_frame: called with each frame.
         view: before a camera's name, the output with what the camera's picture says.
     """
 

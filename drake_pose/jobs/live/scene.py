@@ -108,14 +108,11 @@ def load_live_scene(path: Path) -> LiveScene:
 
 
 def take_empty_room(folder: Path, count: int, patience: float = _PATIENCE) -> dict[str, Path]:
-    """Writes the first pictures of every camera that has a background folder into that folder.
+    """Writes each camera's first pictures to its background folder; by camera, where that is.
 
     Args:
         folder: has cameras.yaml and sources.yaml.
         patience: how long it is waited for pictures [s].
-
-    Returns:
-        By camera, where they are.
 
     Raises:
         SceneError: a camera gives too few pictures, or none needs a background.

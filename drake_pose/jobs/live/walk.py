@@ -57,7 +57,6 @@ class Player:
 
     Args:
         q: (n, nq) positions [rad or m], nan where the person was not found; None: keys alone.
-        rate_hz: frames a second.
     """
 
     model: ArticulatedModel
@@ -74,8 +73,7 @@ def recorded_player(
     """Plays the poses of a result folder, as `drake-pose capture` writes it.
 
     Args:
-        model_path: the model it was captured with; the bundled one that its summary names where
-            not given.
+        model_path: the model it was captured with; the bundled one of its summary where not given.
         rate_hz: its frames a second; those in its summary where not given.
         packages: folders of packages that the model's ``package://`` names mean, by name.
 
@@ -148,16 +146,14 @@ def walk(
     """Lets the avatar walk until its recording, the given time, or the user (Ctrl-C) ends it.
 
     Args:
-        player: what moves it.
         seconds: how long; the recording's length where not given, without end for keys alone.
         speed: seconds walked a second; 0: as fast as the machine can.
         on_command: called when the command changes, with its words, "" for none.
         again: asked at the end whether to walk once more from the start.
-        settings: what is a command.
 
     Returns:
         Of the last walk: seconds walked; x, y [m] and heading_deg where it ended; and by command
-        how many seconds it was followed.
+            how many seconds it was followed.
 
     Raises:
         SettingsError: a time or a speed that cannot be.
@@ -305,11 +301,7 @@ class _PersonLog(_WalkLog):
 
 
 def show(page: Meshcat, patience: float = 10.0) -> bool:
-    """Opens a page in the user's browser, and waits until it is there, for this long at most [s].
-
-    Returns:
-        Whether a browser shows it.
-    """
+    """Opens a page in the user's browser; whether one shows it in time (``patience`` [s])."""
     if webbrowser.open(page.web_url()):
         wait_for_browser(page, patience)
     return page.GetNumActiveConnections() > 0

@@ -31,12 +31,7 @@ _FAR = 3.0
 
 
 def find_by_model(source: Source, model: Path, settings: MaskSettings) -> Iterator[FoundMask]:
-    """The masks of a body whose pose is about known in each frame.
-
-    Args:
-        source: pictures or videos, with cameras that have an X_WC.
-        model: the body's file.
-        settings: ``start`` is a table of rough joint positions.
+    """The masks of a body whose pose is about known in each frame (``settings.start``).
 
     Raises:
         CameraError: a camera has no X_WC.

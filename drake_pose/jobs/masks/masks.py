@@ -78,8 +78,6 @@ def make_masks(
     Args:
         source: see ``open_source``.
         out: the scene's folder; new or empty.
-        settings: how masks are found.
-        overlay: whether overlays are written, where there are pictures.
         on_mask: called after each picture with the number of those done.
 
     Raises:
@@ -153,12 +151,7 @@ class _Writer:
             self._write(self._place(OVERLAY, found, ".jpg"), data)
 
     def finish(self) -> SceneMasks:
-        """Writes what else belongs to the scene.
-
-        Raises:
-            MaskError: no picture has a good mask.
-            OutputError: it cannot be written.
-        """
+        """Writes what else belongs to the scene; MaskError: no picture has a good mask."""
         if not self._count:
             more = len(self._refused) - 1
             first = self._refused[0] if self._refused else f"{self._source.path}: has no picture"

@@ -31,7 +31,6 @@ class FoundMask:
     """A mask of one picture, or why there is none.
 
     Args:
-        camera, frame: whose it is.
         where: names the picture in messages.
         mask: (H, W).
         picture: (H, W, 3) red, green, blue; None where only the mask is known.
@@ -53,11 +52,8 @@ class Source:
     """Where the pictures of all cameras are, or what other tools say of them.
 
     Args:
-        path: what was given.
-        camera_file: the cameras' file, None where there is none.
-        cameras: what it says; None where there is none.
+        cameras: what the camera file says; None where there is none.
         pictures: by camera and frame, the files; none where there are videos.
-        videos: by camera.
         annotated: COCO files, each with the camera whose folder it lies in.
     """
 
@@ -96,11 +92,7 @@ class Source:
                 yield f"{number:06d}", f"{self.videos[camera]}: frame {number:06d}", picture
 
     def check_size(self, camera: str, shape: tuple[int, ...], where: str) -> None:
-        """Refuses what has another (height, width) than a camera is calibrated for.
-
-        Raises:
-            SceneError: names what it is.
-        """
+        """SceneError where a camera is calibrated for another (height, width)."""
         own = None if self.cameras is None else self.cameras.cameras[camera]
         if own is not None and shape[:2] != (own.height, own.width):
             raise SceneError(
@@ -150,11 +142,8 @@ def open_source(path: Path, camera_file: Path | None = None) -> Source:
 
     A folder has ``images/<camera>/<frame>.png`` or ``.jpg``, ``videos/<camera>.mp4``, or the same
     without ``images`` and ``videos``, or in ``masks`` where there is neither; with a single camera
-    the pictures may lie in it. A file is a picture, a video, or of COCO.
-
-    Args:
-        path: the folder or file.
-        camera_file: the cameras; the folder's ``cameras.yaml`` where not given, if it has one.
+    the pictures may lie in it. A file is a picture, a video, or of COCO. Its cameras are those of
+    ``camera_file``, or of the folder's ``cameras.yaml``.
 
     Raises:
         SceneError: names what is missing, or in doubt.

@@ -22,10 +22,8 @@ class KnownPositions(LeafSystem):
     .. pydrake_system::
 
         name: KnownPositions
-        input_ports:
-        - positions
-        output_ports:
-        - known_positions
+        input_ports: [positions]
+        output_ports: [known_positions]
 
     A plant refuses positions that are nan, which is what estimators say before they found a body.
 
@@ -51,12 +49,11 @@ def pose_plant(
     positions: OutputPort,
     name: str,
 ) -> None:
-    """Finalize a plant, and let positions in its own order pose its geometry.
+    """Finalize a plant, and let positions (nq,) in its own order pose its geometry.
 
     Args:
         scene_graph: where the plant is registered as a source.
-        plant: the plant, not finalized yet.
-        positions: (nq,) its positions.
+        plant: not finalized yet.
         name: of the system in between.
     """
     plant.Finalize()
@@ -81,7 +78,6 @@ def add_avatar(
 
     Args:
         positions: (nq,) in its plant's order; while they are nan it stands at its model's default.
-        meshcat: where it is drawn.
         prefix: the path below which it is drawn.
         period: time between two drawings [s].
     """

@@ -22,19 +22,13 @@ MESHCAT_PERIOD = 1.0 / 64.0
 
 
 class SkinPoser(LeafSystem):
-    """Bends a skin in a SceneGraph, where sensors see it.
+    """Bends a skin that is registered with a SceneGraph, where sensors see it.
 
     .. pydrake_system::
 
         name: SkinPoser
-        input_ports:
-        - positions
-        output_ports:
-        - geometry_configuration
-
-    Args:
-        deformable: the skin, registered with the SceneGraph.
-        position_count: how many positions its model has.
+        input_ports: [positions]
+        output_ports: [geometry_configuration]
     """
 
     def __init__(self, deformable: DeformableSkin, position_count: int) -> None:
@@ -59,11 +53,9 @@ class MeshcatSkin(LeafSystem):
     .. pydrake_system::
 
         name: MeshcatSkin
-        input_ports:
-        - positions
+        input_ports: [positions]
 
     Args:
-        position_count: how many positions its model has.
         path: where in Meshcat's tree.
         colour: in place of the bands' own colours.
         recorded: Meshcat records the motion of objects, not of their vertices: draw each new shape
@@ -165,9 +157,8 @@ def add_meshcat_skin(
     Args:
         positions: the body's positions (nq,) in its model's order.
         name: of the skin in Meshcat's tree and, with ``_meshcat_skin``, of the new system.
-        colour: in place of the bands' own colours.
         prefix: what it lies under in Meshcat's tree: that of the MeshcatVisualizer.
-        recorded: as in MeshcatSkin.
+        colour, recorded: as in MeshcatSkin.
     """
     if not model.skin:
         return

@@ -29,14 +29,8 @@ class CameraRegistration(LeafSystem):
     .. pydrake_system::
 
         name: CameraRegistration
-        input_ports:
-        - label_image
-        - measured_positions
-        output_ports:
-        - X_WC
-        - covariance
-        - status
-        - registration
+        input_ports: [label_image, measured_positions]
+        output_ports: [X_WC, covariance, status, registration]
 
     No guess of the pose is needed. A periodic update keeps frames in which the body stands
     differently, and searches when there are enough of them; from then on the pose is fitted anew
@@ -56,13 +50,10 @@ class CameraRegistration(LeafSystem):
       contradict the pose; how often the camera was found elsewhere; and intersection over union of
       body and mask, the mean over the kept frames, nan until the camera is found.
 
-    All that is known is state of the context, so that a simulation can be reset, copied and
-    replayed; copies share it.
+    All that is known is state of the context; copies share it.
 
     Args:
-        registration: the body, the camera's intrinsics, and settings.
-        period: time between two updates [s].
-        offset: time of the first update [s].
+        period, offset: time between two updates, and of the first one [s].
         labels: the labels that belong to the body; None: all that are not reserved.
 
     Raises:

@@ -50,8 +50,7 @@ class MatchingDiagram:
     """A diagram that matches silhouettes, and the parts of it that one asks afterwards.
 
     Args:
-        positions_log: logs ``estimated_positions`` once a period.
-        error_log: logs ``error`` once a period.
+        positions_log, error_log: log ``estimated_positions`` and ``error`` once a period.
         player: what plays the masks; None where a camera is simulated.
     """
 
@@ -85,7 +84,7 @@ def build_recorded_matching(
         frames: the frames to play; all where not given.
         root_positions: the root's position (3,) in the world for each frame [m]; the pose tree's
             own where not given.
-        meshcat: where to show the estimated body; nowhere where not given.
+        meshcat: where to show the estimated body.
         tracking: how the body moves from frame to frame: it is matched in the first one, tracked
             from there, and matched again after a loss. Every frame is matched where not given.
         starts: (nq,) by frame where the body is known to be: a track begins there, also after a
@@ -143,11 +142,8 @@ def build_simulated_matching(
     Args:
         true_positions: the true body's positions (nq,), constant or over time.
         period: time between two images, and two matches [s].
-        meshcat: where to show both bodies; nowhere where not given.
+        meshcat: where to show both bodies.
         tracking: as for ``build_recorded_matching``.
-
-    Returns:
-        The diagram.
     """
     builder = DiagramBuilder()
     model = search.tree.model
@@ -174,10 +170,7 @@ def add_simulated_cameras(
     cameras: Sequence[Camera],
     true_positions: Trajectory | np.ndarray,
 ) -> tuple[OutputPort, list[OutputPort]]:
-    """Add a body that moves on a given trajectory, and RgbdSensors that see it.
-
-    Args:
-        true_positions: the body's positions (nq,), constant or over time.
+    """Add a body at positions (nq,), constant or over time, and RgbdSensors that see it.
 
     Returns:
         The port of the positions, and that of each camera's label image.
@@ -249,15 +242,12 @@ def add_posed_body(
     name: str,
     colour: Rgba | None = None,
 ) -> MultibodyPlant:
-    """Add a body that stands as is estimated, for the eye only: no sensor sees it.
+    """Add a body that stands as is estimated, for the eye only; its plant, finalized.
 
     Args:
         estimator: its output ``estimated_positions`` poses the body.
         name: prefix of the body's name in the SceneGraph.
         colour: in place of the body's own colours.
-
-    Returns:
-        The body's plant, finalized.
     """
     plant = MultibodyPlant(0.0)
     plant.RegisterAsSourceForSceneGraph(scene_graph)
@@ -298,7 +288,6 @@ class RegistrationDiagram:
     """A diagram that registers a simulated camera, and the parts of it that one asks afterwards.
 
     Args:
-        registration: the system in it that finds the camera.
         sensor: the simulated camera; ``sensor.SetX_PB(context, X_WC)`` moves it.
         status_log: logs ``status`` once a period.
     """
@@ -319,14 +308,10 @@ def build_simulated_registration(
     """Wire a simulated body and camera to the registration, which is not told the camera's pose.
 
     Args:
-        registration: the body, the camera's intrinsics, and settings.
-        true_positions: the body's positions (nq,), constant or over time; they are measured without
-            an error.
+        true_positions: the body's positions (nq,), constant or over time, measured without an
+            error.
         period: time between two images, and two updates [s].
-        meshcat: where to show the body; nowhere where not given.
-
-    Returns:
-        The diagram.
+        meshcat: where to show the body.
     """
     builder = DiagramBuilder()
     scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())

@@ -58,15 +58,8 @@ class AxisSensor(LeafSystem):
     .. pydrake_system::
 
         name: AxisSensor
-        input_ports:
-        - label_image
-        - estimated_state
-        - statistics
-        - matched_state (optional)
-        output_ports:
-        - measurement
-        - measurement_variances
-        - restart
+        input_ports: [label_image, estimated_state, statistics, matched_state (optional)]
+        output_ports: [measurement, measurement_variances, restart]
 
     ``estimated_state`` and ``statistics`` come from the ``TruncatedEkf`` that takes the outputs,
     whose ports have the same names; ``restart`` goes there, too. The label image's labels are the
@@ -80,7 +73,6 @@ class AxisSensor(LeafSystem):
     start instead, and asks when that proves wrong; a gap later is bridged by the prediction.
 
     Args:
-        observation: what is measured.
         transition: (n, n) one step of the filter's prediction.
 
     Raises:
@@ -145,20 +137,14 @@ class StateMatcher(LeafSystem):
     .. pydrake_system::
 
         name: StateMatcher
-        input_ports:
-        - label_image
-        output_ports:
-        - matched_state
+        input_ports: [label_image]
+        output_ports: [matched_state]
 
     ``SilhouetteMatcher`` matches once a period; this one costs nothing while a filter tracks.
     ``matched_state`` (n) is a state at rest; NaN where no pose is found.
 
-    Args:
-        search: the search, made for the pose tree of the observation's body.
-        observation: says what a state is.
-
     Raises:
-        SettingsError: the search is made for another tree.
+        SettingsError: the search is made for another tree than that of the observation's body.
     """
 
     def __init__(self, search: PoseSearch, observation: AxisObservation, camera: Camera) -> None:
@@ -188,17 +174,10 @@ class BodyBelief(LeafSystem):
     .. pydrake_system::
 
         name: BodyBelief
-        input_ports:
-        - estimated_state
-        - covariance
-        output_ports:
-        - estimated_positions
-        - position_deviations
+        input_ports: [estimated_state, covariance]
+        output_ports: [estimated_positions, position_deviations]
 
     ``position_deviations`` (nq) are NaN where a position is held.
-
-    Args:
-        observation: says what a state is.
     """
 
     def __init__(self, observation: AxisObservation) -> None:
@@ -271,7 +250,6 @@ def add_hand_tracking(
         label_image: the images, labelled by the links' indices.
         period: time between two frames [s].
         tracking: how the body may move; its ``root_moves`` and what is about contours is not used.
-        settings: how axes are measured.
 
     Raises:
         SettingsError: a period that is not positive, no axes, or a tree without free values.
@@ -345,20 +323,11 @@ def build_hand_tracking(
 ) -> tuple[Diagram, HandTracking]:
     """A simulated hand, or any body, and its camera, tracked by ``add_hand_tracking``.
 
+    Arguments and errors are those of that function, and:
+
     Args:
-        search: as there, with ``camera``, ``axes``, ``period``, ``tracking`` and ``settings``.
-        axes: of the segments.
         true_positions: the true body's positions (nq,), constant or over time.
-        period: time between two images [s].
-        meshcat: where to show the true and the estimated body; nowhere where not given.
-        tracking: how the body may move.
-        settings: how axes are measured.
-
-    Returns:
-        The diagram, and its parts.
-
-    Raises:
-        SettingsError, UnknownNameError: as ``add_hand_tracking``.
+        meshcat: where to show the true and the estimated body.
     """
     builder, model = DiagramBuilder(), search.tree.model
     scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())

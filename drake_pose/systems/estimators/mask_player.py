@@ -24,11 +24,8 @@ class MaskPlayer(LeafSystem):
     .. pydrake_system::
 
         name: MaskPlayer
-        output_ports:
-        - label_image
-        - color_image (of cameras with pictures)
-        - measured_positions (where they are given)
-        - frame_index
+        output_ports: [label_image, color_image (of cameras with pictures), measured_positions
+          (where they are given), frame_index]
 
     With several cameras the output ports are ``label_image_<camera>``. Frame k is shown from k
     periods on for one period; before the first and after the last, the nearest one. Where a camera

@@ -13,10 +13,8 @@ class RobotStateMessage(LeafSystem):
     .. pydrake_system::
 
         name: RobotStateMessage
-        input_ports:
-        - positions
-        output_ports:
-        - lcmt_robot_state
+        input_ports: [positions]
+        output_ports: [lcmt_robot_state]
 
     A message holds 32 bit floats, and the context's time in microseconds.
 

@@ -36,8 +36,7 @@ class Matched(SharedValue):
     """What is known after an update.
 
     Args:
-        q: (nq,) the last pose that was found.
-        X_WB: (4, 4) its base.
+        q, X_WB: (nq,) the last pose that was found, and (4, 4) its base.
         estimate: this update's; None: there was nothing to see.
         memory: what a tracker hands to its next update.
     """
@@ -54,21 +53,9 @@ class SilhouetteMatcher(LeafSystem):
     .. pydrake_system::
 
         name: SilhouetteMatcher
-        input_ports:
-        - label_image
-        - root_position (optional)
-        output_ports:
-        - estimated_positions
-        - error
-        - base_pose
-        - body_poses
-        - statistics
-        - proved_optimal
-        - determined
-        - lower
-        - upper
-        - family_positions
-        - pose_estimate
+        input_ports: [label_image, root_position (optional)]
+        output_ports: [estimated_positions, error, base_pose, body_poses, statistics,
+          proved_optimal, determined, lower, upper, family_positions, pose_estimate]
 
     With several cameras the input ports are ``label_image_<camera>``; an unconnected one, or an
     image without any pixel of the body, is left out of the match. All pixels with a label other
@@ -88,8 +75,7 @@ class SilhouetteMatcher(LeafSystem):
 
     Args:
         cameras: the calibrated cameras, in the order of the input ports.
-        period: time between two matches [s].
-        offset: time of the first match [s].
+        period, offset: time between two matches, and of the first one [s].
         labels: the labels that belong to the body; None: all that are not reserved.
         family_limit: how many families are given out at most.
 

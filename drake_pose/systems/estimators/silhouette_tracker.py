@@ -39,37 +39,22 @@ class SilhouetteTracker(SilhouetteMatcher):
     .. pydrake_system::
 
         name: SilhouetteTracker
-        input_ports:
-        - label_image
-        - root_position (optional)
-        - measured_positions (optional)
-        - color_image (where asked for)
-        output_ports:
-        - estimated_positions
-        - error
-        - base_pose
-        - body_poses
-        - statistics
-        - proved_optimal
-        - determined
-        - lower
-        - upper
-        - family_positions
-        - pose_estimate
-        - position_deviations
-        - estimated_state
-        - track
+        input_ports: [label_image, root_position (optional), measured_positions (optional),
+          color_image (where asked for)]
+        output_ports: [estimated_positions, error, base_pose, body_poses, statistics,
+          proved_optimal, determined, lower, upper, family_positions, pose_estimate,
+          position_deviations, estimated_state, track]
 
     The ports are those of ``SilhouetteMatcher``, which it can replace in any diagram, and:
 
     - ``color_image`` (``color_image_<camera>`` where there are several cameras) of each camera
       named in ``color_cameras``: an ``ImageRgba8U``. The colours along the body's contour stand in
-      where there is no label image, or one without any pixel of the body. So a label image of
-      the first frame will do; or none, where measured positions say where the body is at first.
+      where there is no label image, or one without any pixel of the body. So a label image of the
+      first frame will do; or none, where measured positions say where the body is at first.
     - ``measured_positions`` (nq): about where the body is, of encoders for example. The track
       begins there, and again after a loss; the search is not asked. NaN: it is not known now.
-    - ``position_deviations`` (nq): the standard deviation of each position [rad or m]; NaN where
-      a position is no part of what is tracked (held, or solved from the root's pose).
+    - ``position_deviations`` (nq): the standard deviation of each position [rad or m]; NaN where a
+      position is no part of what is tracked (held, or solved from the root's pose).
     - ``estimated_state`` (nq + nv): the estimated positions, then the plant's velocities [rad/s or
       m/s]; these are NaN where there is no track, and where ``position_deviations`` are. They are
       what the filter believes: rates fade within ``tracking.memory``, so in steady motion they are
@@ -78,15 +63,9 @@ class SilhouetteTracker(SilhouetteMatcher):
       search found it; ``matches`` counts how often the search was asked; ``distance`` is between
       the body's contour and the masks' edge (root mean square, robust) [pixel].
 
-    All that is known is state of the context, so that a simulation can be reset, copied and
-    replayed.
+    All that is known is state of the context. Arguments are those of ``SilhouetteMatcher``, and:
 
     Args:
-        search: asked in the first frame and when the track is lost.
-        cameras: the calibrated cameras, in the order of the input ports.
-        period: time between two frames [s].
-        offset: time of the first one [s].
-        labels: the labels that belong to the body; None: all that are not reserved.
         tracking: how the body may move, and when its track is lost.
         color_cameras: names of the cameras that have a port for a colour image.
 

@@ -25,15 +25,7 @@ _LOSS_PROBABILITY = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class _Known(SharedValue):
-    """What is known after an update.
-
-    Args:
-        state: the filter's.
-        step: how many updates there were.
-        unlikely: how many unlikely measurements there were in a row.
-        lost: whether they are too many.
-        time: of the last update [s].
-    """
+    """What is known after an update: how many there were, and unlikely ones in a row; time [s]."""
 
     state: FilterState
     step: int = 0
@@ -48,18 +40,10 @@ class TruncatedEkf(LeafSystem):
     .. pydrake_system::
 
         name: TruncatedEkf
-        input_ports:
-        - measurement (optional)
-        - measurement_variances (optional)
-        - reset_state (optional)
-        - restart (optional)
-        output_ports:
-        - estimated_state
-        - covariance
-        - hypothesis_weights
-        - hypothesis_states
-        - active_limits
-        - statistics
+        input_ports: [measurement (optional), measurement_variances (optional), reset_state
+          (optional), restart (optional)]
+        output_ports: [estimated_state, covariance, hypothesis_weights, hypothesis_states,
+          active_limits, statistics]
 
     A periodic update predicts and uses the measurement: NaN where something is occluded; all NaN,
     or an unconnected port, where a camera is late or missing, which leaves the prediction.
@@ -67,26 +51,24 @@ class TruncatedEkf(LeafSystem):
     model's own where the port is not connected.
 
     - ``estimated_state`` (n), ``covariance`` (n x n, row by row): of the heaviest hypothesis.
-    - ``hypothesis_weights`` (cap), ``hypothesis_states`` (cap x n, row by row): the heaviest
-      first, weights 0 and states NaN where there are fewer.
+    - ``hypothesis_weights`` (cap), ``hypothesis_states`` (cap x n, row by row): the heaviest first,
+      weights 0 and states NaN where there are fewer.
     - ``active_limits`` (K): 1 where that row of ``filter.inequalities`` cut the best belief.
-    - ``statistics``: see ``STATISTICS``. ``lost`` is 1 while measurements have been as unlikely
-      as one in a million for several steps.
+    - ``statistics``: see ``STATISTICS``. ``lost`` is 1 while measurements have been as unlikely as
+      one in a million for several steps.
 
     At the first update, while the track is lost, and whenever ``restart`` (1) is not 0, the filter
     starts again from ``reset_state`` (n), for example from a matcher, if all its elements are
     finite; with the covariance of the belief given here.
 
     Args:
-        belief_filter: says what is estimated, from what, and inside which limits.
         start: the belief before the first measurement.
-        period: time between two updates [s]; one step of the filter's prediction.
-        offset: time of the first update [s].
+        period, offset: time between two updates, one step of the prediction; of the first one [s].
         patience: how many unlikely measurements in a row make a loss.
 
     Raises:
-        SettingsError: a start that does not fit, a period or patience that is not positive; and,
-            in a simulation, time that runs backwards.
+        SettingsError: a start that does not fit, a period or patience that is not positive; and, in
+            a simulation, time that runs backwards.
     """
 
     def __init__(

@@ -33,12 +33,8 @@ class CameraRig:
 
     The diagram's input ``positions`` (nq) poses the body, or a trajectory does. Its outputs are
     ``color_image_<camera>``, ``label_image_<camera>`` and ``depth_image_<camera>``; an image is
-    rendered when it is asked for. Render in one thread only: an engine first used in
-    another thread gives wrong images.
-
-    Args:
-        cameras: by name, in the order of the ports.
-        sensors: the RgbdSensor of each camera.
+    rendered when it is asked for. Render in one thread only: an engine first used in another thread
+    gives wrong images.
     """
 
     diagram: Diagram
@@ -46,27 +42,15 @@ class CameraRig:
     sensors: Mapping[str, RgbdSensor]
 
     def set_positions(self, context: Context, q: NDArray[np.float64]) -> None:
-        """Pose the body.
-
-        Args:
-            q: (nq,) the plant's positions [rad or m].
-        """
+        """Pose the body: (nq,) the plant's positions [rad or m]."""
         self.diagram.GetInputPort("positions").FixValue(context, q)
 
     def picture(self, context: Context, camera: str) -> NDArray[np.uint8]:
-        """What a camera sees: (H, W, 3) red, green, blue.
-
-        Raises:
-            UnknownNameError: there is no such camera.
-        """
+        """What a camera sees: (H, W, 3) red, green, blue; UnknownNameError: there is none such."""
         return colour_image_to_picture(self._port("color_image", camera).Eval(context))
 
     def mask(self, context: Context, camera: str) -> NDArray[np.bool_]:
-        """Where a camera sees the body: (H, W).
-
-        Raises:
-            UnknownNameError: there is no such camera.
-        """
+        """Where a camera sees the body: (H, W); UnknownNameError: there is none such."""
         return label_image_to_mask(self._port("label_image", camera).Eval(context))
 
     def _port(self, kind: str, camera: str) -> OutputPort:
@@ -118,15 +102,7 @@ def add_cameras(
     """Add a renderer and a sensor for each camera, whose images the diagram exports.
 
     Call it after every model has been added: Drake's renderer refuses an OBJ file without normals
-    at the moment it is parsed.
-
-    Args:
-        scene_graph: what the cameras see.
-        cameras: pinhole cameras by name.
-        background: red, green, blue of the empty picture, 0 to 1.
-
-    Raises:
-        CameraError: there is no camera, or one of parallel rays.
+    at the moment it is parsed. Arguments and errors are those of ``build_camera_rig``.
     """
     if not cameras:
         raise CameraError("a rig needs at least one camera")

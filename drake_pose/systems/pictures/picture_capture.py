@@ -63,25 +63,20 @@ class PictureCapture(LeafSystem):
     .. pydrake_system::
 
         name: PictureCapture
-        output_ports:
-        - color_image_<camera>
-        - label_image_<camera>
-        - time
-        - fresh
+        output_ports: [color_image_<camera>, label_image_<camera>, time, fresh]
 
     A camera whose source delivers masks has the port ``label_image_<camera>``, any other
     ``color_image_<camera>``. An image without pixels says that the camera gave no picture at that
     moment. ``time`` is the moment's time stamp [s], counted from the first one, nan before it;
     ``fresh`` is 1 where the moment is new in this period, else 0.
 
-    Recorded sources are read as the simulation's time goes on, each moment is shown, and after
-    the last one the simulation is told to end. Where `live`, the computer's clock decides, and
-    only the newest moment is shown; at first it is waited some seconds for every camera to open.
-    What comes from outside cannot be in a Context: one simulator runs one such system.
+    Recorded sources are read as the simulation's time goes on, each moment is shown, and after the
+    last one the simulation is told to end. Where `live`, the computer's clock decides, and only the
+    newest moment is shown; at first it is waited some seconds for every camera to open. What comes
+    from outside cannot be in a Context: one simulator runs one such system.
 
     Args:
         sources: where each camera's pictures come from, opened.
-        cameras: the calibrated cameras.
         period: time between two looks at the sources [s]; the sources' own where not given.
         live: whether the pictures come by the computer's clock; true where a source is live.
         tolerance: how far apart the pictures of one moment may be [s]; half a period where not

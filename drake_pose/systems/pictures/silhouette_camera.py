@@ -25,12 +25,8 @@ class SilhouetteCamera(LeafSystem):
     .. pydrake_system::
 
         name: SilhouetteCamera
-        input_ports:
-        - body_poses
-        output_ports:
-        - label_image
-        - body_pose_in_world
-        - image_time
+        input_ports: [body_poses]
+        output_ports: [label_image, body_pose_in_world, image_time]
 
     - ``body_poses``: the plant's output port of that name.
     - ``label_image``: in each pixel the render label of the body that is nearest at the pixel's
@@ -44,9 +40,8 @@ class SilhouetteCamera(LeafSystem):
     is not finite is an error: an image without that link would look like a right one.
 
     Args:
-        plant: the bodies; finalized.
-        scene_graph: the SceneGraph that the plant is registered with.
-        camera: the camera; its X_WC is the pose in the parent's frame.
+        plant: the bodies; finalized, and registered with the SceneGraph.
+        camera: its X_WC is the pose in the parent's frame.
         parent: the body that carries the camera; None: the world.
 
     Raises:

@@ -38,10 +38,9 @@ _FOUNTAIN = (-6.0, 3.0)
 
 
 class GardenObject(NamedTuple):
-    """An object of the place.
+    """An object of the place: its path in Meshcat's tree, and its middle's position [m].
 
-    name: its path in Meshcat's tree; position: of its middle [m]; radius: one does not come nearer
-    to its axis than this [m]; 0: one walks over or under it.
+    Nobody comes nearer to its axis than the radius [m]; 0: one walks over or under it.
     """
 
     name: str

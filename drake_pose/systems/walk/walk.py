@@ -64,22 +64,16 @@ class Walker(LeafSystem):
     .. pydrake_system::
 
         name: Walker
-        input_ports:
-        - positions
-        - keys
-        output_ports:
-        - walker_pose
-        - command
-        - rest
-        - avatar_positions
+        input_ports: [positions, keys]
+        output_ports: [walker_pose, command, rest, avatar_positions]
 
     The first pose in which the person stands still is the rest: where and which way the person
     stands without a command. Until then, and while ``positions`` are not finite, nobody is there
     who could command. Whoever turns around from one frame to the next was taken for facing the
-    wrong way, at rest too: the rest turns around with the person. ``keys`` (turn,
-    walk) may stay unconnected; where not 0 it goes before the gestures. Outputs: the walker's x, y
-    [m] and heading [rad] in the place; the command (turn, walk); the rest (5), nan until somebody
-    was seen; and the last known positions (nq).
+    wrong way, at rest too: the rest turns around with the person. ``keys`` (turn, walk) may stay
+    unconnected; where not 0 it goes before the gestures. Outputs: the walker's x, y [m] and heading
+    [rad] in the place; the command (turn, walk); the rest (5), nan until somebody was seen; and the
+    last known positions (nq).
 
     Args:
         model: the person, with the links head, left_foot and right_foot.
@@ -190,15 +184,12 @@ class WalkKeys(LeafSystem):
     .. pydrake_system::
 
         name: WalkKeys
-        output_ports:
-        - keys
-        - positions
+        output_ports: [keys, positions]
 
-    ``keys`` is turn (1 left, -1 right) and walk (1 ahead, -1 behind); ``positions`` is a person
-    who strides while a key is held, and stands otherwise.
+    ``keys`` is turn (1 left, -1 right) and walk (1 ahead, -1 behind); ``positions`` is a person who
+    strides while a key is held, and stands otherwise.
 
     Args:
-        meshcat: gets the buttons.
         stride: (n, nq) positions of one stride that ends standing [rad or m].
         period: time between two looks at the buttons, and between two of these [s].
     """
@@ -246,9 +237,7 @@ class WalkView(LeafSystem):
     .. pydrake_system::
 
         name: WalkView
-        input_ports:
-        - walker_pose
-        - rest
+        input_ports: [walker_pose, rest]
 
     Args:
         meshcat: where the avatar is drawn, below the path ``walker``.
@@ -289,12 +278,10 @@ def build_walk(
     The diagram's outputs are ``walker_pose`` and ``command``.
 
     Args:
-        meshcat: where all is drawn.
         positions: the person's positions (nq,) over time, in a room with z upward, nan where not
             found; or what adds the systems that give them; None: the keys alone.
         stride: (n, nq) one stride on the spot that ends standing, for the keys.
-        period: time between two frames [s].
-        settle: how long the person must stand still at first [s]; 0: the first pose is the rest.
+        period, settle: as of Walker [s].
     """
     draw_garden(meshcat)
     builder = DiagramBuilder()

@@ -5,16 +5,16 @@ import logging
 import re
 import tempfile
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+import yaml
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
-from drake_pose.body.files.directives import cure_directives
 from drake_pose.body.files.mjcf import cure_mjcf
 from drake_pose.body.files.packages import FileFinder
 from drake_pose.body.files.sdf import Limits, cure_sdf
@@ -40,6 +40,8 @@ _VARIABLE = re.compile(r"'[^']*'|-?\d[\d.e+-]*")
 _ABOUT_INERTIA = ("invalid inertia", "parsing inertia matrix", "as central inertia")
 # Some of Drake's messages hold whole files.
 _LONGEST_REASON = 1000
+# Directives that name a file.
+_NAMES_A_FILE = ("add_model", "add_directives")
 
 
 class ModelSource:
@@ -128,7 +130,7 @@ class ModelSource:
                 if len(self._under_way) == 1:
                     self.limits = limits
             else:
-                text = cure_directives(path, self._finder, self._stand_in)
+                text = _cure_directives(path, self._finder, self._stand_in)
             return text, kind
         except ModelError as error:
             reason = str(error)
@@ -208,3 +210,60 @@ def captured_warnings() -> Iterator[list[str]]:
         yield texts
     finally:
         logger.handlers, logger.propagate = handlers, propagate
+
+
+def _cure_directives(path: Path, finder: FileFinder, cure_file: Callable[[Path], Path]) -> str:
+    """The text of model directives, tags and aliases kept, that name the files' stand-ins."""
+    try:
+        node = yaml.compose(path.read_bytes(), Loader=yaml.SafeLoader)
+    except OSError as error:
+        raise ModelError(f"it cannot be read: {error.strerror}") from error
+    except (yaml.YAMLError, ValueError) as error:
+        raise ModelError(f"it is no YAML: {' '.join(str(error).split())}") from error
+    except RecursionError:
+        raise ModelError("it is nested too deeply") from None
+    if node is None:
+        raise ModelError("it is empty; expected 'directives:'")
+    for what, file in list(_files(node)):
+        found = finder.resolve(file.value, path, what)
+        file.value = f"file://{cure_file(found)}"
+    return yaml.serialize(node, Dumper=yaml.SafeDumper, allow_unicode=True)
+
+
+def _files(node: yaml.Node) -> Iterator[tuple[str, yaml.ScalarNode]]:
+    """The scalars that name a file, each once, and the directive they belong to."""
+    waiting, seen = [node], set()
+    while waiting:
+        node = waiting.pop()
+        if id(node) in seen:
+            continue
+        seen.add(id(node))
+        if isinstance(node, yaml.SequenceNode):
+            waiting += reversed(node.value)
+        if not isinstance(node, yaml.MappingNode):
+            continue
+        for key, value in node.value:
+            waiting.append(value)
+            if key.value in _NAMES_A_FILE:
+                for scalar in _values_of_file(value):
+                    if id(scalar) not in seen:
+                        seen.add(id(scalar))
+                        yield key.value, scalar
+
+
+def _values_of_file(node: yaml.Node) -> Iterator[yaml.ScalarNode]:
+    """The values of the key ``file`` in a mapping, those it merges (<<) among them."""
+    waiting, seen = [node], set()
+    while waiting:
+        node = waiting.pop()
+        if id(node) in seen or isinstance(node, yaml.ScalarNode):
+            continue
+        seen.add(id(node))
+        if isinstance(node, yaml.SequenceNode):
+            waiting += node.value
+            continue
+        for key, value in node.value:
+            if key.value == "file" and isinstance(value, yaml.ScalarNode):
+                yield value
+            elif key.value == "<<":
+                waiting.append(value)

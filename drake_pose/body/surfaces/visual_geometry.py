@@ -1,4 +1,9 @@
-"""What Drake draws, read back from SceneGraph (perception role): visual geometry as triangles."""
+"""What Drake draws, read back from SceneGraph (perception role): visual geometry as triangles.
+
+Primitive shapes have the vertices of Drake's VTK renderer. Sources: RobotLocomotion/drake
+``geometry/render_vtk/internal_render_engine_vtk_base.cc`` (resolutions), Kitware/VTK
+``vtkTexturedSphereSource`` and ``vtkCylinderSource`` (vertices).
+"""
 
 import itertools
 from collections.abc import Iterable
@@ -6,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.geometry import (
     Box,
     Capsule,
@@ -25,28 +31,23 @@ from pydrake.multibody.tree import ModelInstanceIndex, RigidBody
 
 from drake_pose.body.surfaces.mesh import TriangleMesh, join_meshes, merge_duplicate_vertices
 from drake_pose.body.surfaces.mesh_files import drawable_file, is_drawn_by_drake, read_mesh_file
-from drake_pose.body.surfaces.primitive_shapes import (
-    box_mesh,
-    capsule_mesh,
-    cylinder_mesh,
-    ellipsoid_mesh,
-    sphere_mesh,
-)
 from drake_pose.errors import ModelError
+
+_VTK_RESOLUTION = 50
 
 
 def shape_mesh(shape: Shape) -> TriangleMesh:
     """A Drake shape as triangles in its own frame; ModelError where it has no surface here."""
     if isinstance(shape, Box):
-        return box_mesh(shape.width(), shape.depth(), shape.height())
+        return _box_mesh(shape.width(), shape.depth(), shape.height())
     if isinstance(shape, Sphere):
-        return sphere_mesh(shape.radius())
+        return _ellipsoid_mesh(*[shape.radius()] * 3)
     if isinstance(shape, Cylinder):
-        return cylinder_mesh(shape.radius(), shape.length())
+        return _cylinder_mesh(shape.radius(), shape.length())
     if isinstance(shape, Capsule):
-        return capsule_mesh(shape.radius(), shape.length())
+        return _capsule_mesh(shape.radius(), shape.length())
     if isinstance(shape, Ellipsoid):
-        return ellipsoid_mesh(shape.a(), shape.b(), shape.c())
+        return _ellipsoid_mesh(shape.a(), shape.b(), shape.c())
     if isinstance(shape, (Mesh, Convex)) and not shape.source().is_path():
         raise ModelError("a mesh that lies in memory cannot be read; write it to a file")
     if isinstance(shape, Mesh):
@@ -146,3 +147,63 @@ def _drawable_shape(shape: Mesh | Convex) -> Mesh | Convex | None:
         return None
     scale: Any = shape.scale3()  # Drake's type stubs name no array type that numpy has.
     return type(shape)(drawable_file(path), scale)
+
+
+def _box_mesh(width: float, depth: float, height: float) -> TriangleMesh:
+    """A box centred at the origin, with edges [m] along x, y and z."""
+    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+    faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    triangles = [(a, b, c) for a, b, c, _ in faces] + [(a, c, d) for a, _, c, d in faces]
+    return TriangleMesh(corners * (width, depth, height), np.array(triangles, dtype=np.int32))
+
+
+def _ellipsoid_mesh(a: float, b: float, c: float) -> TriangleMesh:
+    """An ellipsoid with half axes a, b, c [m] along x, y and z."""
+    polar = np.linspace(0.0, np.pi, _VTK_RESOLUTION + 1)
+    azimuth = np.arange(_VTK_RESOLUTION) * (2.0 * np.pi / _VTK_RESOLUTION)
+    return _closed_rings(_sphere_points(polar, azimuth) * (a, b, c))
+
+
+def _cylinder_mesh(radius: float, length: float) -> TriangleMesh:
+    """A cylinder along z, centred at the origin, of the given radius and length [m]."""
+    # Drake turns VTK's cylinder a quarter about its axis, so the first vertex lies on y.
+    angle = np.pi / 2.0 + np.arange(_VTK_RESOLUTION) * (2.0 * np.pi / _VTK_RESOLUTION)
+    rim = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros_like(angle)], axis=-1)
+    half = np.array([0.0, 0.0, length / 2.0])
+    top, bottom = rim + half, rim - half
+    # A ring that is one single vertex of the rim turns the quads next to it into the cap's fan.
+    fans = (np.broadcast_to(top[0], top.shape), np.broadcast_to(bottom[0], bottom.shape))
+    return _closed_rings(np.stack([fans[0], top, bottom, fans[1]]))
+
+
+def _capsule_mesh(radius: float, length: float) -> TriangleMesh:
+    """A capsule along z, centred at the origin; length [m] is that of its cylindrical part."""
+    quarter = np.linspace(0.0, np.pi / 2.0, _VTK_RESOLUTION - 1)
+    azimuth = np.pi / 2.0 + np.arange(_VTK_RESOLUTION) * (2.0 * np.pi / _VTK_RESOLUTION)
+    upper = radius * _sphere_points(quarter, azimuth) + (0.0, 0.0, length / 2.0)
+    lower = (upper * (1.0, 1.0, -1.0))[::-1]
+    return _closed_rings(np.concatenate([upper, lower]))
+
+
+def _sphere_points(
+    polar: NDArray[np.float64], azimuth: NDArray[np.floating]
+) -> NDArray[np.float64]:
+    """Points (polar, azimuth, 3) of the unit sphere; both poles are exact."""
+    sine = np.where(np.isin(polar, (0.0, np.pi)), 0.0, np.sin(polar))
+    height = np.broadcast_to(np.cos(polar)[:, None], (len(polar), len(azimuth)))
+    return np.stack([np.outer(sine, np.cos(azimuth)), np.outer(sine, np.sin(azimuth)), height], -1)
+
+
+def _closed_rings(points: NDArray[np.float64]) -> TriangleMesh:
+    """Triangles between rings of points (rings, points of a ring, 3); each ring is closed."""
+    rings, count, _ = points.shape
+    index = np.arange(rings * count).reshape(rings, count)
+    above, below = index[:-1], index[1:]
+    above_next, below_next = np.roll(above, -1, axis=1), np.roll(below, -1, axis=1)
+    triangles = np.concatenate(
+        [
+            np.stack([above, below, below_next], axis=-1).reshape(-1, 3),
+            np.stack([above, below_next, above_next], axis=-1).reshape(-1, 3),
+        ]
+    )
+    return merge_duplicate_vertices(TriangleMesh(points.reshape(-1, 3), triangles.astype(np.int32)))

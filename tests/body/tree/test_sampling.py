@@ -4,8 +4,8 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import load_model
+from drake_pose.body.tree.pose_tree import axis_samples, product_grid
 from drake_pose.body.tree.root import RootRotation, even_rotations
-from drake_pose.body.tree.sampling import axis_samples, product_grid
 from drake_pose.errors import SettingsError
 
 TWENTY = np.radians(20.0)

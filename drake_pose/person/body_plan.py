@@ -40,13 +40,11 @@ class PlannedLimb:
     """An arm or leg of a pose tree.
 
     Args:
-        nodes: the nodes that only it has.
-        values: (k,) which of the tree's values move it alone.
+        nodes, values: those that move it alone; k values.
         joints: (3,) its root, middle joint and end among the landmarks.
         poses: (n, k) values all over its limits; the first is at rest.
         stretched: (s,) in which of them the limb is stretched out.
-        samples_T: (n, m, 3) points along it in the trunk's frame at these [m].
-        weights: (n, m) of the points, see crowding.
+        samples_T, weights: (n, m, 3) points along it in the trunk's frame [m], and theirs (n, m).
         length: from its root to its end, stretched out [m].
     """
 
@@ -64,7 +62,6 @@ class BodyPlan:
     """A person's limbs and trunk in a pose tree.
 
     Attributes:
-        landmarks: the anatomical joint centres.
         trunk: the node that the limbs hang on.
         heading: the value that turns all of the body freely, about the vertical; None: no such.
 

@@ -1,7 +1,6 @@
 """What cameras' pictures say of a person where there is no silhouette: colours along lines.
 
-The lines are as wide as the fit's scale: a model that is only like the person is off by
-centimetres, and colours are counted on both sides of the edge that is seen, not of the contour.
+Lines are as wide as the fit's scale; colours count on both sides of the edge that is seen.
 """
 
 from __future__ import annotations
@@ -46,15 +45,10 @@ _LEAST_WIDTHS, _LEAST_AGREEING = (6.0, 12.0), 2.5
 
 
 class ColourViews:
-    """Pictures of a moment, to be compared with a person of whom some colours are known.
-
-    Attributes:
-        cameras: those that have a picture.
-        pictures: (H, W, 3 or 4) of each, red, green, blue.
-        known: of the colours on the body's parts and beside them.
+    """Pictures (H, W, 3 or 4) of a moment, to be compared with a person of whom colours are known.
 
     Args:
-        cameras, pictures: as above.
+        cameras, pictures: by name; only cameras that have a picture are kept.
         known: a camera that is not in it says nothing.
 
     Raises:
@@ -101,11 +95,9 @@ class ColourViews:
     def learned(
         self, fit: ContourFit, values: Array, regions: Mapping[str, Mask] | None = None
     ) -> KnownColours:
-        """What is known of the colours after this moment.
+        """What is known of the colours after this moment, of the pose tree's values (m,).
 
         Args:
-            fit: of the person.
-            values: (m,) of the pose tree.
             regions: (H, W) the person by camera, where known; other cameras of which nothing is
                 known yet learn on both sides of the contour.
         """

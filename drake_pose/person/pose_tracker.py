@@ -1,8 +1,7 @@
 """A person followed by all silhouettes at once; a lost limb or track is searched again.
 
-Every frame is fitted from where the last ones point to. Where too little of the contours fits, the
-limbs that do not fit are placed anew where the regions are unexplained; where all is lost, the
-whole person is, turned to all sides in turn.
+Every frame is fitted from where the last ones point to. Limbs that do not fit are placed anew
+where regions are unexplained; if all is lost, the whole person, turned to all sides in turn.
 """
 
 from __future__ import annotations
@@ -48,10 +47,8 @@ class TrackState:
     """What the next frame is told of this one.
 
     Args:
-        values: (m,) of the pose tree [rad or m].
-        step: (m,) how they changed from the frame before.
-        share: of the contours, what fits.
-        usual: the share that can be expected.
+        values, step: (m,) of the pose tree, and their change from the last frame [rad or m].
+        share, usual: of the contours, what fits, and what can be expected to.
         troubled: for how many frames too little has fitted; below 0: the person was found anew, and
             in this many frames all directions will have been tried.
         worst: of the contour of the part that fits worst, what fits, where colours say so.
@@ -72,11 +69,6 @@ class TrackState:
 
 class PersonPoseTracker:
     """Follows a person.
-
-    Attributes:
-        fit: what compares a pose with the regions.
-        plan: the person's limbs.
-        schedule: the steps of the fits.
 
     Args:
         fit: made for the person's pose tree.
@@ -113,10 +105,7 @@ class PersonPoseTracker:
         return TrackState(np.array(values, dtype=np.float64), np.zeros(len(values)), 1.0, _USUAL)
 
     def positions(self, values: Array) -> Array:
-        """The plant's positions q (nq,) of values (m,), angles that turn freely within half a turn.
-
-        The pose tree's root must hang on joints, as that of urdf/person does.
-        """
+        """The plant's q (nq,) of values (m,), free angles within half a turn; the root needs joints."""
         free = np.isinf(self.fit.upper)
         turned = np.where(free, np.remainder(values + np.pi, 2.0 * np.pi) - np.pi, values)
         q = np.array(self.fit.tree.model.default_positions)
@@ -139,10 +128,8 @@ class PersonPoseTracker:
     ) -> Array:
         """(nq,) standard deviations of the plant's positions [rad or m] by the pictures alone.
 
-        Positions that are no values of the pose tree have none: 0.
-
         Args:
-            values: (m,) of a frame's state.
+            values: (m,) of a frame's state; positions that are none of them deviate by 0.
             seen: the silhouettes or colours that the frame was followed by.
             held_covariance: (h, h) of the held values; None: they are exact.
         """
@@ -158,12 +145,7 @@ class PersonPoseTracker:
         return deviations
 
     def follow(self, last: TrackState | None, frame: FrameViews) -> TrackState | None:
-        """The next frame's state; None where nothing is known yet and not two cameras see a person.
-
-        Args:
-            last: the last frame's state; None where nothing is known yet.
-            frame: what the cameras see.
-        """
+        """The next state; None where nothing is known yet and not two cameras see a person."""
         if last is None:
             found = self._search.found(frame, range(HEADINGS))
             still = np.zeros(len(self._held))
@@ -199,21 +181,14 @@ class PersonPoseTracker:
         return TrackState(fitted.values, step, fitted.inlier_ratio, last.usual, worst=float(worst))
 
     def distance_by_colour(self, values: Array, colours: ColourViews) -> float:
-        """Root mean square distance of the contour at values (m,) to that of the colours [pixel].
-
-        nan where colours show none.
-        """
+        """RMS distance [pixel] of the contour at values (m,) to the colours'; nan: none is seen."""
         placement = self.fit.body.place(values)
         sums = colours.compare(self.fit, placement, self.schedule.follow[-1]).sums
         squares, weight = sums[:, :, [SQUARES, WEIGHT]].sum(axis=(0, 1))
         return float(np.sqrt(squares / weight)) if weight > 0.0 else float("nan")
 
     def _restarted(self, state: TrackState, last: TrackState, frame: FrameViews) -> TrackState:
-        """A state, or the person found anew with some headings, where that fits better.
-
-        The first heading that fits need not be the right one: people look alike from behind. So the
-        search goes on until all have been tried.
-        """
+        """A state, or the person found anew where that fits better, all headings in turn."""
         headings = headings_of(last.troubled)
         found = self._search.found(frame, headings, last.values, last.usual)
         if found is None or found.inlier_ratio <= state.share:

@@ -1,12 +1,8 @@
 """How sure a pose is that was fitted to silhouettes.
 
-Contours of body and regions differ by the pictures' noise and because the person's surface is not
-the model's; both are estimated from what is left of the contours' distances in the frame itself.
-Surface: each part's may be shifted, turned and stretched by as much as makes the distances, common
-to all cameras, likeliest (variance components by restricted maximum likelihood, Patterson and
-Thompson 1971). Noise: what the distances of one part in one camera amount to; a part errs together
-in a camera, so no length of correlation has to be known. What the silhouettes do not tell is as
-unsure as anything inside the limits.
+Distances of the frame's contours give the noise, of one part in one camera together, and how far
+each part's surface is off the model's: variance components by restricted maximum likelihood
+(Patterson and Thompson 1971). What silhouettes do not tell is as unsure as the limits let it.
 """
 
 from __future__ import annotations
@@ -54,12 +50,9 @@ def pose_uncertainty(
     held: Mask | None = None,
     held_covariance: Array | None = None,
 ) -> PoseUncertainty:
-    """The uncertainty of a fitted pose, as far as the pictures and the limits tell.
-
-    What is expected from the last frame does not count: nothing gets sure by being looked at long.
+    """The uncertainty of a fitted pose by the pictures and the limits, without the last frame.
 
     Args:
-        fit: what fitted it.
         compared: what the cameras say of the pose at the scale of the last step.
         held: (m,) values that were held, such as lengths.
         held_covariance: (h, h) of these; None: they are exact.

@@ -32,11 +32,9 @@ def viewing_rays(camera: Camera, uv: Array) -> tuple[Array, Array]:
 def nearest_points(
     origins_a: Array, directions_a: Array, origins_b: Array, directions_b: Array
 ) -> tuple[Array, Array, Mask]:
-    """Where pairs of rays come nearest to each other.
+    """Middles (n, 3) where pairs of rays come nearest, distances (n,) [m], and whether they meet.
 
-    Returns:
-        Middles (n, 3) of the nearest points, their distances (n,) [m], and whether (n,) both points
-        lie in front of their origins and the rays are not parallel.
+    Rays (n,) meet where both points lie in front of their origins and they are not parallel.
     """
     across = origins_b - origins_a
     cosine = np.einsum("ij,ij->i", directions_a, directions_b)
@@ -62,9 +60,7 @@ def meeting_points(
     """The points (m, 3) [m] where rays of two views pass each other by less than a threshold [m].
 
     Args:
-        cameras: one for each view.
-        pixels: (n_k, 2) in each view; all pairs of pixels of all pairs of views are tried.
-        threshold: of the rays' distance.
+        pixels: (n_k, 2) in each camera's view; all pairs of pixels of all pairs are tried.
         free: (n_k,) pairs of which neither pixel is free are left out; None: all are.
     """
     rays = [viewing_rays(camera, uv) for camera, uv in zip(cameras, pixels, strict=True)]
@@ -99,14 +95,7 @@ def triangulate(cameras: Sequence[Camera], pixels: Sequence[Array]) -> Array:
 def sum_at_points(
     camera: Camera, picture: NDArray[np.int8], points: Array, weights: Array
 ) -> tuple[Array, Array]:
-    """(n,) weighted sums of a picture (H, W) at n sets of m points, and of the weights in it.
-
-    Args:
-        camera: took the picture.
-        picture: (H, W).
-        points: (n, m, 3) in the world [m]; those out of the picture add nothing.
-        weights: (n, m).
-    """
+    """(n,) sums of a picture (H, W) at points (n, m, 3) [m], weighted (n, m), and weights in it."""
     X_CW = np.ascontiguousarray(camera.X_CW)
     total: tuple[Array, Array] = _sum_at_points(
         camera.kernel_parameters(), X_CW, picture, points, weights

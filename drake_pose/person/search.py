@@ -76,10 +76,7 @@ LENIENT = AnnealingSchedule(
 
 
 def headings_of(frame: int) -> list[int]:
-    """The headings tried in a frame since the trouble began: all around first, then between.
-
-    Together CYCLE frames try all HEADINGS.
-    """
+    """The headings tried in a frame of trouble, all around first; CYCLE frames try all HEADINGS."""
     # Bits in reverse order make neighbours late.
     order = sorted(range(CYCLE), key=lambda k: f"{k:032b}"[::-1])
     return list(range(order[frame % CYCLE], HEADINGS, CYCLE))
@@ -89,8 +86,6 @@ class PersonSearch:
     """Searches limbs and persons.
 
     Args:
-        fit: what compares a pose with the regions.
-        plan: the person's limbs.
         rounds: the steps of a fit from a coarse guess.
         information: (m,) what is known of values near a guess.
         held: (m,) values that stay.
@@ -121,8 +116,6 @@ class PersonSearch:
         """A fit whose doubtful limbs were searched again, where that is better.
 
         Args:
-            fitted: the fit.
-            frame: what the cameras see.
             enough: where this much of the contours fits, the search ends.
             first: the doubtful limb to begin with; the worst is 0.
             limbs: how many limbs are searched; None: all that are doubtful.
@@ -160,7 +153,6 @@ class PersonSearch:
         """The best of fresh starts with some headings; None where not two cameras see a person.
 
         Args:
-            frame: what the cameras see.
             headings: where not all, only the best start's limbs are searched.
             known: (m,) where held values are taken from; None: the person at rest.
             enough: where this much of the contours fits, no more limbs are searched.
@@ -207,10 +199,7 @@ class PersonSearch:
         return self._fit.fit_sums(add_up, values, self._rounds, prior, self._held)
 
     def _doubtful(self, fitted: PoseFit, frame: FrameViews) -> list[PlannedLimb]:
-        """The limbs that fit badly, hardly show, or would fill much more of the regions elsewhere.
-
-        The worst one is always among them: somewhere something does not fit.
-        """
+        """The limbs that fit badly, hardly show, or would fill more elsewhere; always the worst."""
         lengths, fitting = fitted.sums[:, [COMPARED, FITTING]].T
         shares = np.where(lengths > 0.0, fitting / np.maximum(lengths, 1e-9), 1.0)
         found = []
@@ -267,10 +256,7 @@ class PersonSearch:
         return found
 
     def _stretched(self, values: Array, limb: PlannedLimb) -> list[Array]:
-        """A nearly stretched limb's values, quite stretched: one slightly bent the wrong way is.
-
-        Of the poses about there it is the most relaxed one, as such a limb hardly shows its twist.
-        """
+        """A nearly stretched limb's most relaxed stretched values: it may be bent the wrong way."""
         X_WN = self._fit.kinematics.poses(values)
         root, _, end = self._plan.landmarks.positions(X_WN)[limb.joints]
         if np.linalg.norm(end - root) < _NEARLY * limb.length:

@@ -1,7 +1,6 @@
-"""A person's own lengths and girths, from the silhouettes of several frames at once.
+"""A person's lengths (shape joints) and girths (how wide parts are across their y axis).
 
-Lengths are the model's shape joints, girths how wide its parts are across their y axis. All frames
-share them, each frame has its own pose.
+All frames share them, each has its own pose; silhouettes of several frames tell.
 """
 
 from __future__ import annotations
@@ -60,7 +59,6 @@ class PersonShape:
     """A person's fitted shape.
 
     Args:
-        known: lengths and girths.
         values: (m,) of the pose tree; the shape joints' are the person's, others 0.
         covariance: (h, h) of the shape joints' [m].
         poses: (frames, m) values in the frames that it was fitted to.
@@ -125,15 +123,9 @@ def tracker_of_person(tree: PoseTree, shape: KnownShape | None) -> PersonPoseTra
 
 
 def fit_shape(fit: ContourFit, frames: Frames, poses: Array) -> PersonShape:
-    """Fits lengths, girths and all frames' poses.
+    """Fits lengths, girths and all frames' poses, from values poses (frames, m).
 
-    Args:
-        fit: made for a model with shape joints, such as urdf/person/person_shape.urdf.
-        frames: what is seen in each.
-        poses: (frames, m) values to start from.
-
-    Raises:
-        ModelError: the model has no shape joints.
+    Raises ModelError where the model has no shape joints, as urdf/person/person_shape.urdf has.
     """
     is_shape = shape_values(fit.tree)
     if not is_shape.any():
@@ -203,10 +195,7 @@ def _sides_information(names: Sequence[str], girths: int) -> Array:
 
 
 def _frame_information(fit: ContourFit, frames: Frames, poses: Array, is_shape: Mask) -> Array:
-    """(h, h) information about the lengths, that of a frame, the mean.
-
-    Where a person's surface is not the model's it is so in all frames: more of them do not help.
-    """
+    """(h, h) mean information of a frame about lengths: a surface's error is the same in all."""
     own = np.flatnonzero(~is_shape)
     prior = np.eye(len(own)) / _POSE**2
     total = np.zeros((int(is_shape.sum()), int(is_shape.sum())))

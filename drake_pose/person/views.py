@@ -59,11 +59,9 @@ class KeptEdge:
 
 @dataclass(frozen=True, eq=False)
 class SilhouetteView:
-    """What one camera sees of the person.
+    """What one camera sees of the person: region (H, W) and points of its edge.
 
     Args:
-        region: (H, W) the person.
-        edge: points of the region's edge.
         kept: who else has the edge and can compare contours with it.
     """
 
@@ -160,11 +158,7 @@ class FrameViews:
     _packed: dict[tuple[int, ...], Views] = field(default_factory=dict, init=False, repr=False)
 
     def add_up(self, fit: ContourFit) -> AddUp:
-        """What compares a body's contours with all cameras, weighed as `fit` does, and adds up.
-
-        Edges that are kept elsewhere are compared there; what does not come from there is compared
-        here: the answer is the same, but for the order of the sum.
-        """
+        """What compares a body's contours with all cameras, as `fit` weighs them, and adds up."""
         here = tuple(k for k, view in enumerate(self.views) if view.kept is None)
 
         def total(placement: Placement, step: AnnealingStage) -> CameraSum:

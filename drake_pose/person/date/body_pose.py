@@ -29,8 +29,8 @@ class Waist:
     Args:
         head_share: the head's share in the waist's height.
         ahead: how far the waist of a person standing upright is ahead of the head's middle [m].
-        in_reach: whether the waist is lowered until both feet are in the legs' reach. The formula
-            raises it with every foot that is lifted; then no circle is left to search on.
+        in_reach: whether the waist, which lifting a foot raises, is lowered until both feet are in
+            the legs' reach; else no circle may be left to search on.
     """
 
     head_share: float = 0.55
@@ -38,12 +38,7 @@ class Waist:
     in_reach: bool = False
 
     def place(self, features: Array, heading: float) -> Array:
-        """The waist (3,): at the head's place, at a height between head and feet (z upwards).
-
-        Args:
-            features: (5, 3) in the order of FEATURES [m].
-            heading: where the head looks, from the world's x axis [rad].
-        """
+        """The waist (3,) [m] below the head, of features (5, 3) [m] and the heading [rad]."""
         head, _, _, left_foot, right_foot = features
         feet = 0.5 * (right_foot[2] + left_foot[2])
         height = self.head_share * head[2] + (1.0 - self.head_share) * feet
@@ -52,10 +47,7 @@ class Waist:
 
 
 def waist_of(skeleton: Skeleton) -> Waist:
-    """The constants that are right for this person standing upright, both feet in reach.
-
-    A centimetre of error here makes the knees of a standing person bend by ten.
-    """
+    """The constants for this person standing upright, both feet in reach; centimetres matter."""
     q = np.zeros(len(skeleton.lower))
     head, _, _, left_foot, right_foot = skeleton.features(q)
     hips = np.mean([skeleton.limb_points(q, name)[0] for name in LIMBS[2:]], axis=0)
@@ -68,8 +60,7 @@ class PaperPose:
     """A pose estimated the paper's way.
 
     Args:
-        q: (nq,) positions inside their limits: the model's trunk points from the neck's base to the
-            waist, its limbs go from there to the middle joints and ends below.
+        q: (nq,) positions inside their limits.
         limbs: by name, (3, 3) shoulder, elbow and hand, or hip, knee and foot, as found [m].
         waist: (3,) half-way between the hips, by the waist formula [m].
     """
@@ -93,17 +84,13 @@ def estimate_pose(
     """Estimates a frame's pose.
 
     Args:
-        skeleton: the person.
         last: (nq,) the last frame's positions.
         features: (5, 3) head, hands and feet in the order of FEATURES [m].
-        head_angles: (2,) the head's angles [rad] where the face was seen; None: the last frame's,
-            which inverse kinematics may then move.
-        cameras: the cameras on the circle.
-        regions: (H, W) the person in each of their pictures.
+        head_angles: (2,) [rad] where the face was seen; None: the last frame's, free to move.
+        cameras, regions: those on the circle, and (H, W) the person in each of their pictures.
         search: how elbows and knees are searched: "surfaces" by points of the limbs' surfaces, on
             the circles of all ends within what hands and feet are measured off; "rectangles" as in
             the paper, on one circle; "none": they stay where inverse kinematics puts them.
-        waist: the constants of the waist formula.
     """
     q = _head_and_arms(skeleton, last, features, head_angles)
     R_WT, neck = skeleton.trunk_pose(q)
@@ -141,10 +128,7 @@ def estimate_pose(
 
 
 def _lowered(skeleton: Skeleton, R_WT: Array, place: Array, feet: Array) -> Array:
-    """The waist (3,) at its place or so far below it that both legs reach their feet (2, 3) [m].
-
-    A stretched leg seems out of reach by what features are off: that alone lowers nothing.
-    """
+    """The waist (3,), lowered until both legs reach their feet (2, 3) [m], within tolerance."""
     beyond = 0.0
     for name, foot in zip(LIMBS[2:], feet, strict=True):
         limb = skeleton.limbs[name]

@@ -28,11 +28,8 @@ class CaptureSettings:
     """How the paper's system captures.
 
     Args:
-        skin: which colours are skin.
-        features: how 3-D points become features.
         search: how elbows and knees are searched on their circles; see estimate_pose.
         recognition: similarity from which the registered pose overwrites the state.
-        waist: the constants of the waist formula.
         farthest_face: how far from the eigenspace a face may be [grey levels].
     """
 
@@ -58,13 +55,8 @@ class CaptureSetup:
     """What stays the same from frame to frame.
 
     Args:
-        skeleton: the person.
         cameras: on the circle, by name.
-        face_camera: where there is one.
-        faces: the templates of the face's direction, where there are some.
-        registered: the registered pose, where it is to be recognised.
         backgrounds: by camera, the face camera's among them; a camera without one needs masks.
-        settings: how to capture.
 
     Raises:
         SettingsError: fewer than two cameras, or the face camera has the name of another.
@@ -91,8 +83,7 @@ class CaptureSetup:
 def see_person(picture: Picture, region: Mask, skin: SkinColour) -> PersonView:
     """One camera's share: skin in the person's region (H, W) of a picture (H, W, 3), and contour.
 
-    Raises:
-        SettingsError: a region of another size than the picture's.
+    Raises SettingsError for a region of another size than the picture's.
     """
     if region.shape != picture.shape[:2]:
         raise SettingsError(f"the region is {region.shape}, but the picture {picture.shape}")

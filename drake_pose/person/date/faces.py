@@ -1,7 +1,6 @@
 """Where the face looks: eigenspace templates (Date et al., 3.2; Murase and Nayar 1995).
 
-Pictures of the face, 80 x 130 x 3, are projected to the 60 leading eigenvectors of 300 templates of
-known directions; the nearest template's direction is the answer.
+The nearest of 300 templates, in the space of their 60 leading eigenvectors, is the answer.
 """
 
 from __future__ import annotations
@@ -48,8 +47,7 @@ class FaceTemplates:
         mean: (d,) the mean face, d = 80 x 130 x 3.
         basis: (k, d) the leading eigenvectors, orthonormal.
         coordinates: (n, k) the templates in the eigenspace.
-        directions: (n, 2) turn to the person's left and nod downwards, away from facing the camera
-            [rad].
+        directions: (n, 2) turn to the person's left and nod down from facing the camera [rad].
     """
 
     mean: NDArray[np.float32]
@@ -60,10 +58,9 @@ class FaceTemplates:
 
 @dataclass(frozen=True, eq=False)
 class FaceDirection:
-    """The direction of a face.
+    """The direction (2,) of a face, as of FaceTemplates [rad].
 
     Args:
-        direction: (2,) as of FaceTemplates [rad].
         template: which template is nearest.
         distance: in the eigenspace, over the square root of the pixels' number [grey levels].
         outside: how far the picture is from the eigenspace [grey levels]; large: it is no face.
@@ -76,10 +73,7 @@ class FaceDirection:
 
 
 def cut_face(picture: Picture, blobs: Blobs) -> Picture | None:
-    """The largest skin-coloured blob of a picture (H, W, 3), scaled to (130, 80, 3).
-
-    None where there is no skin, or it touches the picture's edge.
-    """
+    """The largest skin blob of a picture (H, W, 3), scaled to (130, 80, 3); None: none is whole."""
     if not len(blobs.areas):
         return None
     left, top, width, height = (int(side) for side in blobs.boxes[0])
@@ -99,8 +93,7 @@ def learn_faces(
 ) -> FaceTemplates:
     """The eigenspace of faces (130, 80, 3) of known directions (n, 2) [rad], see FaceTemplates.
 
-    Raises:
-        SettingsError: fewer than three faces, or not one direction for each.
+    Raises SettingsError for fewer than three faces, or not one direction for each.
     """
     known = np.asarray(directions, dtype=np.float64).reshape(-1, 2)
     if len(faces) < 3 or len(known) != len(faces):
@@ -120,14 +113,9 @@ def learn_faces(
 
 
 def head_angles(direction: Array, head: Array, camera: Camera) -> Array:
-    """The head's turn and nod in the world (2,) [rad] of a face seen by a camera.
+    """The head's turn and nod in the world (2,) [rad] of a face's direction (2,) seen by a camera.
 
-    Turn about the vertical is 0 where the face looks along the world's x; nod is downwards.
-
-    Args:
-        direction: (2,) turn and nod away from facing the camera, from face_direction [rad].
-        head: (3,) where the head is [m].
-        camera: the face camera.
+    Turn is 0 where the face of a head at (3,) [m] looks along the world's x; nod is downwards.
     """
     towards = camera.X_WC[:3, 3] - head
     level = math.hypot(towards[0], towards[1])
@@ -161,11 +149,7 @@ def face_direction(face: Picture, templates: FaceTemplates) -> FaceDirection:
 def find_face(picture: Picture, blobs: Blobs, templates: FaceTemplates, farthest: float) -> Array:
     """The direction (2,) of the face in a picture (H, W, 3) [rad]; nan where no face is seen.
 
-    Args:
-        picture: red, green, blue.
-        blobs: its skin.
-        templates: what faces look like.
-        farthest: how far from the eigenspace a face may be [grey levels].
+    No face is farther from the eigenspace than `farthest` [grey levels].
     """
     face = cut_face(picture, blobs)
     if face is not None:
@@ -180,9 +164,9 @@ def learn_recorded_faces(folder: Path, skin: SkinColour | None = None) -> FaceTe
 
     The folder holds `directions.csv`, whose first line is `picture,turn,nod`: a picture's file
     beside it (.png or .jpg), and where the face looks in it, away from facing the camera [deg]:
-    the turn to the person's left and the nod downwards. Pictures are whole ones as the face camera
-    takes them, from any distance. Of each the largest skin-coloured patch is the face. A
-    folder `empty` of pictures without the person is needed where other things have skin's colour.
+    the turn to the person's left and the nod downwards. Of each whole picture the largest
+    skin-coloured patch is the face. A folder `empty` of pictures without the person is needed where
+    other things have skin's colour.
 
     Raises:
         SceneError: names the file, line or picture at fault.

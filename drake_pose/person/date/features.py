@@ -24,8 +24,7 @@ class FeatureSettings:
 
     Args:
         threshold: largest distance of two rays that show the same skin [m].
-        reach: points farther than this from where every feature is expected belong to none [m];
-            infinite in the paper.
+        reach: points farther than this from all expected features are dropped [m].
         dense: radius of the dense part of a feature's points [m].
         margin: how far outside a silhouette a point may be seen [pixel].
     """
@@ -43,8 +42,7 @@ class Features:
     Args:
         places: (k, 3) [m]; the last frame's where nothing was measured.
         support: (k,) how many 3-D points the place was taken from; 0: not measured.
-        points: (m, 3) all points inside every silhouette [m].
-        owners: (m,) which feature each was given to; -1: none.
+        points, owners: (m, 3) all inside every silhouette [m], and each's feature (m,); -1: none.
     """
 
     places: Array
@@ -56,7 +54,7 @@ class Features:
 def inside_silhouettes(
     points: Array, cameras: Sequence[Camera], regions: Sequence[Mask], margin: int = 0
 ) -> Mask:
-    """Which points (m, 3) [m] every camera sees in its silhouette, or so many pixels beside it.
+    """Which points (m, 3) [m] every camera sees in its silhouette, or `margin` pixels beside it.
 
     A camera has no say about points outside its picture, nor where it sees nobody at all.
     """
@@ -92,9 +90,7 @@ def expect_features(
 ) -> Array:
     """Where FEATURES are expected in the next frame (5, 3) [m]: feet a step on, the others here.
 
-    In a frame a walker's feet may move by more than they are apart when they pass each other; then
-    the nearest of the last frame's is the wrong one. Hands that meet stop: a step on they would be
-    taken for each other.
+    Else passing feet would be exchanged; hands that meet stop, and a step on would be exchanged.
 
     Args:
         places, last: (5, 3) the features in this frame and in the one before [m].
@@ -117,11 +113,7 @@ def assign(points: Array, expected: Array, reach: float) -> NDArray[np.int64]:
 
 
 def dense_mean(points: Array, radius: float) -> tuple[Array, int]:
-    """The mean of the dense part of points (m, 3), and how many points it has.
-
-    The dense part is what lies within `radius` of the point that has most others there; of equals,
-    the one whose others are nearest.
-    """
+    """The mean of those points (m, 3) within `radius` of the one with most others; their count."""
     distances = np.linalg.norm(points[:, None] - points[None], axis=2)
     near = distances <= radius
     spread = np.where(near, distances, 0.0).sum(axis=1)
@@ -142,13 +134,10 @@ def find_features(
     """The features' places in a frame.
 
     Args:
-        cameras: the cameras.
         centroids: (n_k, 2) the skin blobs' centroids in each camera [pixel].
         regions: (H, W) the person in each camera's picture.
         last: (k, 3) the last frame's features [m].
-        settings: how.
-        expected: (k, 3) where they are expected in this frame [m]; None: as in the paper, the last
-            frame's places.
+        expected: (k, 3) where they are expected in this frame [m]; None, as in the paper: `last`.
     """
     settings = settings or FeatureSettings()
     points = meeting_points(cameras, centroids, settings.threshold)

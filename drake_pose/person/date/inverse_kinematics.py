@@ -22,19 +22,10 @@ _STEPS_A_ROUND = 4
 
 
 def upper_body(skeleton: Skeleton, q: Array, features: Array, *, face_known: bool) -> Array:
-    """Moves neck base and arms until both hands are where they were measured.
+    """Moves neck base and arms from q (nq,), in place at the head, to hands of features (5, 3) [m].
 
     Each side's chain is head 2, neck base 2, shoulder 3, elbow 1. Both sides share head and neck
-    base, so they take turns, a few small steps each.
-
-    Args:
-        skeleton: the person.
-        q: (nq,) the last frame's positions, the head's place and, where known, its angles set.
-        features: (5, 3) head, hands and feet in the world [m].
-        face_known: whether the face's direction was measured: then the head's angles stay.
-
-    Returns:
-        (nq,) positions; legs are unchanged.
+    base, so they take turns, a few small steps each. A known face's head angles stay; legs, too.
     """
     q = np.array(q)
     shared = np.concatenate([skeleton.head_angles, skeleton.neck_angles])
@@ -121,10 +112,7 @@ def aim_trunk(skeleton: Skeleton, q: Array, waist: Array) -> Array:
 
 
 def unlocked(limb: Limb, angles: Array) -> Array:
-    """A limb's angles (4,), its middle joint bent by three degrees at least.
-
-    A stretched limb whose end is to come nearer does not know where to: no small step helps.
-    """
+    """A limb's angles (4,), its middle joint bent by three degrees, lest no small step can help."""
     bend = angles[3]
     if abs(bend) < _LEAST_BEND:
         bend = _LEAST_BEND if limb.upper[3] > -limb.lower[3] else -_LEAST_BEND
@@ -145,7 +133,7 @@ def reach(
     target: Array,
     steps: int,
 ) -> tuple[Array, float]:
-    """Moves a chain's angles in small steps until its end is at the target.
+    """Moves a chain's angles in small steps until its end is at the target (3,) [m].
 
     A step is Levenberg and Marquardt's, J (J^T J + damping)^-1 gap, damped so that all joints take
     part, none by more than two degrees; then limits hold.
@@ -155,10 +143,7 @@ def reach(
         axes: (n,) 0, 1, 2: the joints' axes.
         offsets: (n, 3) each joint's place in the frame of the one before [m].
         end: (3,) the end's place in the last joint's frame [m].
-        angles: (n,) where to start [rad].
-        lower, upper: (n,) limits.
-        free: (n,) which angles may change.
-        target: (3,) [m].
+        angles, lower, upper, free: (n,) the start and limits [rad], and which may change.
         steps: how many at most.
 
     Returns:

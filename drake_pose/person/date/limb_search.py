@@ -49,10 +49,9 @@ _STRETCHED = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Circle:
-    """Where a middle joint can be: center + radius (sin(theta) i + cos(theta) j).
+    """Where a middle joint can be: center + radius (sin(theta) i + cos(theta) j) [m].
 
-    i and j are orthogonal, of length 1: outwards; and behind (arm) or in front (leg). The radius is
-    0 where the limb is stretched out [m].
+    i and j are orthonormal: outwards; and behind (arm) or in front (leg).
     """
 
     center: Array
@@ -69,16 +68,11 @@ class Circle:
 
 
 def joint_circle(limb: Limb, root: Array, end: Array, outward: Array) -> Circle:
-    """The circle of an elbow or knee.
+    """The circle of an elbow or knee between root and end (3,) [m].
 
-    i is the direction in the circle's plane that agrees best with the horizontal part of `outward`;
-    j = i x z for the left arm, z from shoulder to hand (for the right arm and for legs mirrored, so
-    that it points behind the arm and in front of the leg).
-
-    Args:
-        limb: the limb.
-        root, end: (3,) shoulder and hand, or hip and foot [m].
-        outward: (3,) from the neck's base to the shoulder, or from the waist to the hip.
+    i is the direction in the circle's plane that agrees best with the horizontal part of `outward`
+    (3,), from neck base to shoulder or waist to hip; j = i x z for the left arm, z from shoulder to
+    hand (for the right arm and for legs mirrored, to point behind the arm and in front of the leg).
     """
     a, b = limb.lengths
     across = end - root
@@ -109,15 +103,12 @@ def search_limb(
     """The places (3,) of an elbow or knee, and of the end, that agree best with the silhouettes.
 
     Args:
-        limb: the limb.
         R_WT: (3, 3) the trunk's axes in the world: a knee is only where the hip can turn it.
         root, end: (3,) shoulder and hand, or hip and foot [m].
         outward: (3,) from the neck's base to the shoulder, or from the waist to the hip.
         near: (3,) of equally good places, the one nearest to this is taken: inverse kinematics's.
         last: (4,) the limb's angles in the last frame [rad].
-        cameras: the cameras.
         regions: (H, W) the person in each camera's picture.
-        search: "surfaces" or "rectangles".
     """
     ends = [end] if search == "rectangles" else _possible_ends(limb, root, end)
     found = [_places(limb, R_WT, root, one, outward, last) for one in ends]
@@ -177,15 +168,9 @@ def _points_of_segments(
 
 
 def rectangles(root: Array, middles: Array, end: Array, half_widths: Array) -> Array:
-    """Points (n, m, 3) all over the two rectangles of a limb, for n places of its middle joint [m].
+    """Points (n, m, 3) [m] of a limb's rectangles, from root (3,) over n middles (n, 3) to end.
 
-    They lie in the plane of root, middle joint and end, one from the root to the middle joint, one
-    from there to the end.
-
-    Args:
-        root, end: (3,) [m].
-        middles: (n, 3) [m].
-        half_widths: (2,) of the rectangles [m].
+    They lie in the plane of the three joints and are so wide as half_widths (2,) says [m].
     """
     normal = np.cross(middles - root, end - root)
     along = ((np.arange(_SAMPLES_ALONG) + 0.5) / _SAMPLES_ALONG)[:, None, None]
@@ -203,10 +188,7 @@ def rectangles(root: Array, middles: Array, end: Array, half_widths: Array) -> A
 
 
 def correlation(samples: Array, cameras: Sequence[Camera], regions: Sequence[Mask]) -> Array:
-    """C (n,): the share of samples (n, m, 3) in the picture that lie inside the silhouette (H, W).
-
-    The mean over those cameras that see somebody.
-    """
+    """C (n,): the share of samples (n, m, 3) inside silhouettes, where cameras see somebody."""
     total, seers, weights = np.zeros(len(samples)), 0, np.ones(samples.shape[:2])
     for camera, region in zip(cameras, regions, strict=True):
         if region.any():
@@ -219,10 +201,7 @@ def correlation(samples: Array, cameras: Sequence[Camera], regions: Sequence[Mas
 def limb_angles(
     limb: Limb, R_WT: Array, root: Array, middle: Array, end: Array, last: Array
 ) -> Array:
-    """The angles (4,) that put a limb's joints (3,) [m] where they were found, inside its limits.
-
-    Where the limits do not allow it, what is clipped goes at the end's expense.
-    """
+    """The angles (4,) inside limits that put a limb's joints (3,) [m] in place, or near it."""
     angles, _ = place_limb(limb, R_WT, root, middle[None], end, last)
     return np.clip(angles[0], limb.lower, limb.upper)
 
@@ -232,14 +211,11 @@ def place_limb(
 ) -> tuple[Array, Array]:
     """The joint angles that put a limb's joints where they are, for several places of the middle.
 
-    A limb that is nearly straight is as long when it is bent a little: of both the one that the
-    limits allow is taken.
+    A nearly straight limb may be as long when bent a little: limits decide.
 
     Args:
-        limb: the limb.
         R_WT: (3, 3) the trunk's axes in the world.
-        root, end: (3,) [m].
-        middles: (n, 3) [m].
+        root, middles, end: (3,), (n, 3), (3,) [m].
         last: (4,) angles to stay near where several sets do the same [rad].
 
     Returns:

@@ -1,7 +1,6 @@
 """Recognition of the registered pose, which mends a lost track (Date et al., section 5).
 
-Every camera compares its contour with templates of the registered pose as seen from all sides. The
-person may face anywhere, but the cameras must agree on where: their templates are of one heading.
+Each camera's contour is compared with templates from all sides; all must be of one heading.
 """
 
 from __future__ import annotations
@@ -31,8 +30,7 @@ class Contour:
 
     Args:
         shape: (DIRECTIONS,) distance of the farthest contour point in each direction from the
-            region's middle, counterclockwise in the picture from its right, over the square root of
-            the area: neither place nor size matters.
+            region's middle, counterclockwise from the right, over the square root of the area.
         middle: (2,) of the bounding box [pixel].
     """
 
@@ -84,8 +82,8 @@ class RegisteredPose:
         q: (nq,) positions of the registered pose where the person was for the templates.
         heading_position: where the head's turn about the vertical stands in q.
         headings: (n,) the headings of the templates [rad].
-        shapes: by camera: (n, DIRECTIONS) contour shapes; nan where the camera saw none whole.
-        middles: by camera: (n, 2) middle of the person's bounding box [pixel]; nan likewise.
+        shapes, middles: by camera: (n, DIRECTIONS) contour shapes, and (n, 2) middles of the
+            bounding box [pixel]; nan where the camera saw none whole.
     """
 
     q: Array
@@ -115,13 +113,7 @@ def registered_positions(skeleton: Skeleton, spread_deg: float = 80.0) -> Array:
 def stand_registered(
     skeleton: Skeleton, cameras: Sequence[Camera], middles: Sequence[Array]
 ) -> Array:
-    """Positions (nq,) of the registered pose, about where two cameras or more see somebody.
-
-    Args:
-        skeleton: the person.
-        cameras: the cameras.
-        middles: (2,) middle of the person's bounding box in each camera's picture [pixel].
-    """
+    """Positions (nq,) of the registered pose, below boxes' middles (2,) [pixel] in cameras."""
     q = registered_positions(skeleton)
     head, _, _, left_foot, right_foot = skeleton.features(q)
     middle = 0.5 * head + 0.25 * (left_foot + right_foot)
@@ -139,11 +131,8 @@ def register_pose(
     """Makes the templates of a pose.
 
     Args:
-        skeleton: the person.
         q: (nq,) the pose, standing where it will be shown (roughly: only shapes are compared).
-        cameras: the cameras.
         draw: the mask (H, W) that a camera sees at given positions.
-        heading_count: how many headings there are templates of.
     """
     index = int(skeleton.head_angles[0])
     headings = np.arange(heading_count) * 2.0 * np.pi / heading_count
@@ -169,17 +158,12 @@ def recognise(
     contours: Sequence[Contour | None],
     threshold: float = 0.9,
 ) -> Recognition | None:
-    """Whether the person stands in the registered pose now, and where.
+    """Whether the person stands in the registered pose now, and where; None: not so.
 
     Args:
-        skeleton: the person.
         registered: from register_pose, for these cameras.
-        cameras: the cameras.
-        contours: the person's in each camera's picture; None where it is not seen whole.
+        contours: in each camera's picture; None where it is not seen whole; two are needed.
         threshold: mean similarity that is needed.
-
-    Returns:
-        None where the contours differ too much or fewer than two cameras see the person whole.
     """
     scores, seers, middles = [], [], []
     for camera, contour in zip(cameras, contours, strict=True):

@@ -1,7 +1,6 @@
 """The person of figure 5 as a skeleton: joint offsets, axes and limits, read from a model once.
 
-The chain is head - neck base - trunk, and from the trunk two arms and two legs, each with three
-rotations at its root and one at its middle joint: 23 degrees of freedom with the head's position.
+Head - neck base - trunk, and two arms and legs of 3 + 1 rotations: 23 degrees of freedom.
 """
 
 from __future__ import annotations
@@ -35,18 +34,15 @@ _AXES = {"x": 0, "y": 1, "z": 2}
 
 @dataclass(frozen=True, eq=False)
 class Limb:
-    """An arm or a leg.
+    """An arm or a leg, named as one of LIMBS.
 
     Args:
-        name: one of LIMBS.
         root_T: (3,) shoulder or hip in the trunk's frame [m].
         middle_U: (3,) elbow or knee in the upper segment's frame [m].
         end_L: (3,) the hand's or foot's middle in the lower segment's frame [m].
         axes: (4,) 0, 1, 2 for x, y, z: three at the root in the order of rotation, then the middle.
-        positions: (4,) where their angles stand in q.
-        lower, upper: (4,) their limits [rad].
-        half_widths: (2,) mean distance of the upper and the lower segment's surface from the line
-            through its joints [m].
+        positions, lower, upper: (4,) where their angles stand in q, and their limits [rad].
+        half_widths: (2,) mean distance of either segment's surface from its joints' line [m].
         surfaces: (m, 3) points all over either segment's surface, in its frame [m].
     """
 
@@ -77,14 +73,11 @@ class Skeleton:
     """Joint offsets, axes and limits of the person.
 
     Args:
-        model: the model it was read from.
         R_WA: (3, 3) the head's axes when its angles are 0.
-        face_H: (3,) the middle of the head's skin in the head's frame [m].
-        neck_H: (3,) the neck's base in the head's frame [m].
+        face_H, neck_H: (3,) middle of the head's skin, and neck's base, in the head's frame [m].
         head_positions: (3,) where the head's place stands in q.
         head_axes, neck_axes: (2,) axes 0, 1, 2 in the order of rotation.
         head_angles, neck_angles: (2,) where they stand in q.
-        limbs: by name.
         lower, upper: (nq,) limits [rad or m].
     """
 
@@ -134,8 +127,7 @@ class Skeleton:
     def with_features(self, q: Array, places: Array) -> Skeleton:
         """The same person whose features are at places (5, 3) measured in a known pose q (nq,) [m].
 
-        What is seen of the skin has another middle than the whole hand or head. nan: not measured;
-        each is moved by five centimetres at most.
+        Features of seen skin move by five centimetres at most; nan: not measured.
         """
         off = np.nan_to_num(np.asarray(places) - self.features(q))
         length = np.linalg.norm(off, axis=1, keepdims=True)
@@ -157,9 +149,7 @@ class Skeleton:
 def load_skeleton(model: ArticulatedModel) -> Skeleton:
     """Reads the skeleton of a model made like the bundled person.
 
-    Raises:
-        ModelError: the model's segments do not hang together like the person's; the message names
-            the segment.
+    Raises ModelError where its segments do not hang together so, naming the segment.
     """
     tree = model.pose_tree()
     nodes = {node.name: index for index, node in enumerate(tree.nodes)}

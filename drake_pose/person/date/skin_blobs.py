@@ -20,8 +20,7 @@ class SkinColour:
     The defaults are those of Chai and Ngan (1999), found on faces of many origins.
 
     Args:
-        red: lowest and highest red chroma Cr (0 to 255, 128 is grey).
-        blue: lowest and highest blue chroma Cb.
+        red, blue: lowest and highest chroma Cr and Cb (0 to 255, 128 is grey).
         darkest: lowest brightness Y: chroma means nothing in the dark.
     """
 
@@ -35,8 +34,7 @@ class Blobs:
     """Patches of skin in one picture, the largest first.
 
     Args:
-        centroids: (n, 2) [pixel].
-        areas: (n,) [pixel].
+        centroids, areas: (n, 2) and (n,) [pixel].
         boxes: (n, 4) left, top, width, height [pixel].
         mask: (H, W) all of them.
     """
@@ -58,14 +56,9 @@ def skin_mask(picture: Picture, region: Mask, colour: SkinColour) -> Mask:
 def skin_blobs(
     picture: Picture, region: Mask, colour: SkinColour, smallest: int = 12, most: int = 12
 ) -> Blobs:
-    """The skin-coloured blobs of a picture (H, W, 3) in the person's region (H, W).
+    """The largest `most` skin blobs of a picture (H, W, 3) in the person's region (H, W).
 
-    Args:
-        picture: red, green, blue.
-        region: skin is looked for there only.
-        colour: which colours are skin.
-        smallest: area of the smallest blob [pixel].
-        most: how many are kept.
+    None has an area of less than `smallest` pixels.
     """
     top, bottom, left, right = _bounds(region)
     inner = skin_mask(picture[top:bottom, left:right], region[top:bottom, left:right], colour)

@@ -1,8 +1,6 @@
 """Walking through a place by gestures: commands from a stance, and the way walked (Date, table 1).
 
-The room where a person is captured is small, the place large. So where the person stands in the
-room is a command, not a place: facing right or left turns the view, standing ahead of or behind the
-rest place walks forward or backward.
+Facing right or left turns the view, standing ahead of or behind the rest place walks.
 """
 
 from __future__ import annotations
@@ -24,14 +22,12 @@ NO_COMMAND = (0, 0)
 class WalkSettings:
     """When a stance is a command, and how fast it is followed.
 
-    A command begins at one threshold and ends at a lower one, so that a person near it, or noise of
-    the capture, does not switch it on and off.
+    A command begins at one threshold and ends at a lower one, so that noise does not toggle it.
 
     Args:
         turn_begin, turn_end: how far the face is turned away from the rest direction [rad].
         step_begin, step_end: how far the person stands from the rest place [m].
-        turn_rate: how fast the view turns [rad/s].
-        speed: how fast one walks [m/s].
+        turn_rate, speed: how fast the view turns [rad/s] and one walks [m/s].
         body_radius: how near one comes to walls and objects [m].
         on_spot: whether standing ahead or behind is a command only while the person also walks on
             the spot, as in the paper.
@@ -67,13 +63,9 @@ class WalkSettings:
 def stance_of(left_W: Array, head_W: Array, feet_W: Array) -> Array:
     """How a person stands: (5,) the face's heading [rad], head's and feet's x and y [m].
 
-    The heading is about the upward z axis, 0 along x; of the feet it is midway between them.
-
     Args:
-        left_W: (3,) the direction to the left of the face. The face's own direction would be
-            undefined where the person looks at the floor; this one stays level.
-        head_W: (3,) where the head is [m].
-        feet_W: (2, 3) where the feet are [m].
+        left_W: (3,) the direction to the face's left, level also where the person looks down.
+        head_W, feet_W: (3,) and (2, 3) where they are [m]; midway between the feet counts.
     """
     heading = math.atan2(-left_W[0], left_W[1])
     return np.array([heading, *head_W[:2], *np.asarray(feet_W)[:, :2].mean(axis=0)])
@@ -82,8 +74,7 @@ def stance_of(left_W: Array, head_W: Array, feet_W: Array) -> Array:
 def offsets_from_rest(stance: Array, rest: Array) -> tuple[float, float]:
     """How far a stance (5,) is from the one at rest: turned to the left [rad], and ahead [m].
 
-    Ahead, in the rest's direction, is the lesser of the head's and the feet's way, 0 where they go
-    different ways. Leaning and reaching a foot out are thus no steps.
+    Ahead is the lesser of the head's and the feet's way, 0 if they differ: leaning is no step.
     """
     turned = stance[0] - rest[0]
     turned = math.atan2(math.sin(turned), math.cos(turned))
@@ -101,7 +92,6 @@ def recognise_command(
     Args:
         stance, rest: (5,) from stance_of.
         last: the command before; see WalkSettings.
-        settings: the thresholds.
 
     Returns:
         Turning: 1 left, -1 right, 0 not; walking: 1 forward, -1 backward, 0 not.
@@ -126,7 +116,6 @@ def follow_steps(lift: float, steps: Array, seconds: float, settings: WalkSettin
         steps: (3,) the foot lifted last (1 left, -1 right, 0 none), since when it was [s], and how
             many steps, each with the other foot, were taken without a pause.
         seconds: since the last frame.
-        settings: what is a step.
     """
     foot, since, count = steps[0], steps[1] + seconds, steps[2]
     if since > settings.pause:
@@ -151,14 +140,11 @@ def follow_command(
 ) -> Array:
     """The walker's pose (3,), its heading in -pi..pi, after a command was followed for a while.
 
-    Turning and walking at once is an exact arc of a circle. At a wall or an obstacle the walker
-    slides along.
+    Turning and walking at once is an exact arc; the walker slides along walls and obstacles.
 
     Args:
         pose: (3,) x, y [m] and heading [rad].
         command: from recognise_command.
-        seconds: how long.
-        settings: how fast.
         half_size: the place is a square about the origin; half its side [m].
         obstacles: (n, 3) x, y and radius of round obstacles [m].
     """

@@ -97,14 +97,12 @@ class Motion:
 
 
 def make_motion(skeleton: Skeleton, frames: int, seed: int) -> Motion:
-    """A person who shows the registered pose, goes through all motions, and shows it again.
+    """The registered pose, then all motions of a person whose lower foot stands, then it again.
 
-    All of it takes 120 frames or more; of fewer the first ones are given. The lower foot always
-    stands on the floor. Every run draws how far each motion goes (85 to 115 per cent) and where on
-    the floor the person stands; another seed draws others.
+    All takes 120 frames or more; of fewer the first are given. The seed draws how far motions go
+    (85 to 115 per cent) and where the person stands.
 
-    Raises:
-        SettingsError: fewer than FEWEST_FRAMES frames.
+    Raises SettingsError below FEWEST_FRAMES frames.
     """
     if frames < FEWEST_FRAMES:
         raise SettingsError(f"Date's experiment needs {FEWEST_FRAMES} frames or more, not {frames}")

@@ -1,8 +1,7 @@
 """Cameras that have moved since they were calibrated, found by their residual.
 
-Each camera in turn is left out: the others' silhouettes give the pose, and the pose predicts this
-camera's silhouette. Where the prediction is off in the same way in many frames, so that one rigid
-motion of the camera explains it, the camera has moved; poor masks are off in another way each time.
+Each camera in turn is predicted by the others' pose. It has moved where one rigid motion of it
+explains many frames; poor masks are off in another way each time.
 """
 
 from __future__ import annotations
@@ -65,8 +64,7 @@ class CameraMotion:
         pixels: how far the person's joints are off in its pictures, root mean square [pixel].
         metres: the same at the person's place [m].
         turn: by how much the pictures are turned, clockwise [rad].
-        share_before, share_after: of the contours' lengths, what fits with the calibration, and
-            with the motion.
+        share_before, share_after: of the contours, what fits as calibrated and as moved.
     """
 
     X_WC: Array
@@ -83,7 +81,6 @@ class CameraFault:
     """A camera that contradicts the others.
 
     Args:
-        name: the camera.
         motion: how it has moved; it may also have turned further than can be told.
         is_explained: whether its having moved explains all: else its masks may be poor, mirrored,
             or another camera's.
@@ -130,8 +127,6 @@ def camera_motion(
     """The motion of a camera that explains its silhouettes of given poses best.
 
     Args:
-        fit: compares poses with regions.
-        camera: as calibrated.
         edges: of its region in each frame.
         poses: (m,) of the pose tree, for each frame; found without this camera.
     """
@@ -165,10 +160,7 @@ def _moved_camera(
     middle: Array,
     start: Array,
 ) -> Camera:
-    """A camera moved so that its regions fit the poses.
-
-    Seen from the camera, the bodies (about middle (3,)) move, at first by a shift start (3,) [m].
-    """
+    """A camera moved to fit bodies about middle (3,) to regions, first by a shift start (3,) [m]."""
     reach = float(np.linalg.norm(camera.X_WC[:3, 3] - middle))
     names = [f"{camera.name}.{name}" for name in CAMERA_NAMES]
     # What the pictures see of a turn about the camera is the person's way about it.
@@ -228,8 +220,6 @@ def find_fault(
     """The camera that contradicts the others most, if one does.
 
     Args:
-        fit: compares poses with regions.
-        cameras: by name.
         frames: some frames, of which those count that three cameras see or more.
         held: (m,) which values of the pose tree stay, such as lengths.
     """
@@ -278,12 +268,7 @@ def find_fault(
 
 
 def moved_since(before: Sequence[float], after: Sequence[float]) -> int:
-    """From which of some frames on a camera has moved; their count where in none.
-
-    Args:
-        before: in each frame, what share of the contours fits where the camera was calibrated.
-        after: and where it has moved to.
-    """
+    """The frame of a camera's motion, by shares that fit before and after it; or their count."""
     gain = np.asarray(after) - np.asarray(before)
     # What speaks for the motion from each frame on, less what speaks for it before that.
     later = np.concatenate([np.cumsum(gain[::-1])[::-1], [0.0]])

@@ -1,8 +1,7 @@
 """A recording captured in spite of its faults: others in view, nobody in view, a moved camera.
 
-All masks are looked at once before the capture: where fewer than two cameras see anybody, no pose
-can be had, and others in view are cut out of the masks. After the capture each camera is compared
-with what the others say. One that contradicts them is left out, and all is captured once more.
+Others are cut out of the masks first. After the capture a camera that contradicts the rest is
+left out, and all is captured once more.
 """
 
 from __future__ import annotations
@@ -51,11 +50,9 @@ _LEAST_LEFT = 3
 
 @dataclass(frozen=True, eq=False)
 class MovedCamera:
-    """A camera that contradicts the others.
+    """A camera that contradicts the others, from frame `first` (counted from 0) on.
 
     Args:
-        fault: what is wrong with it.
-        first: the frame, counted from 0, from which on it is so.
         is_left_out: whether it was left out from there on.
     """
 
@@ -70,7 +67,6 @@ class CheckedCapture:
 
     Args:
         captured: the capture of all frames; nan where fewer than two cameras see the person.
-        views: what was in view or was not.
         cameras: those that contradict the others.
         rig: what the silhouettes say against the calibration as a whole, if no single camera
             explains it; undone where it can be.

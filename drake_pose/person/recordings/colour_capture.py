@@ -1,7 +1,6 @@
 """A recording of one person of whom only a few frames have masks: pictures say the rest.
 
-From masks, best of the first frame, come the person's shape, pose and colours; the next frames are
-followed by these colours. After a loss the next masks, or positions that are given, go on.
+Masks or given positions start it, also after a loss; the person's colours are followed.
 """
 
 from __future__ import annotations
@@ -39,8 +38,8 @@ class ColourCapture:
         captured: all frames; nan where the person is lost.
         checked: what the frames with masks say, counted among themselves; None: there are none.
         masked: the frames with masks of two cameras or more, counted from 0.
-        distances: (frames,) between the person's contour and the one that colours show, as a root
-            mean square over all cameras [pixel]; nan in frames that were not followed by colour.
+        distances: (frames,) root mean square between the person's contour and the colours' over
+            all cameras [pixel]; nan in frames that were not followed by colour.
     """
 
     captured: PersonCapture
@@ -64,11 +63,8 @@ def capture_by_colour(
     Args:
         tree: of a model with the landmarks of a person. Its shape joints are fitted to the frames
             with masks; without any they stay where the first start has them.
-        cameras: by name.
-        count: how many frames there are.
-        masked: the frames that have masks.
-        masks: gives the masks of a frame; none in most.
-        pictures: gives the pictures (H, W, 3) of a frame by camera.
+        count: how many frames there are; `masked` have masks.
+        masks, pictures: give a frame's, by camera; pictures are (H, W, 3).
         starts: the plant's positions (nq,) by frame, where they are about known.
         on_frame: called after each frame.
 

@@ -1,8 +1,6 @@
 """A whole recording of one person, whose proportions need not be known: masks in, poses out.
 
-The person is found afresh in a few frames; from the one that fits best the others are followed,
-forwards and backwards. Where the model has shape joints, the first frames give the person's own
-lengths and girths, and everything is followed once more with these.
+Found in a few frames, followed both ways from the best; shape joints are fitted, then all again.
 """
 
 from __future__ import annotations
@@ -42,9 +40,7 @@ class PersonCapture:
         shares: (frames,) of the contours' lengths, what fits; 0 where nobody was seen.
         shape: the person's; None where the model has no shape joints.
         outlines: the simplified surfaces of the tree's nodes, as wide as the person.
-        tree: the pose tree.
-        deviations: (frames, nq) standard deviations of the positions [rad or m], as far as the
-            pictures and the limits tell; nan where nobody was seen in time.
+        deviations: (frames, nq) standard deviations of q [rad or m] by pictures and limits; nan.
     """
 
     q: Array
@@ -69,9 +65,7 @@ def capture_person(
     Args:
         tree: of a model with the landmarks of a person, best with shape joints:
             urdf/person/person_shape.urdf.
-        cameras: by name.
-        read: gives the masks of a frame.
-        count: how many frames there are.
+        read: gives the masks of a frame, of `count` frames.
         is_sequence: whether frames follow each other; else each is found afresh.
         on_frame: called after each frame.
         pauses: the frames before which the person was out of sight, and may have gone anywhere.

@@ -61,9 +61,7 @@ class PersonRecording:
         covering: in what share of the masks the largest figure reaches all four sides.
 
     Args:
-        cameras: by name.
-        read: gives the masks of a frame.
-        count: how many frames there are; all are read once.
+        read: gives the masks of a frame; all `count` are read once.
         is_sequence: whether they follow each other.
     """
 
@@ -170,11 +168,10 @@ def _covering(
 
 @dataclass(frozen=True, eq=False)
 class KeptPerson:
-    """A frame's masks without other persons.
+    """A frame's masks (H, W) without other persons, by camera.
 
     Args:
-        masks: (H, W) by camera.
-        person: the person; None where fewer than two cameras see anybody.
+        person: None where fewer than two cameras see anybody.
         cut: the cameras whose masks had others in them, who were cut out.
         merged: the cameras in which the person and another are one figure, which is left whole.
     """
@@ -191,8 +188,6 @@ def keep_person(
     """A frame's masks of one person only.
 
     Args:
-        cameras: by name.
-        masks: of some of the cameras.
         place: (3,) where the person was in the last frame [m]; None: the one whose figures are the
             largest is taken, of two alike the one nearer to where the cameras look.
     """
@@ -216,12 +211,7 @@ def keep_person(
 
 
 def keep_views(frame: FrameViews, place: Array | None = None) -> tuple[FrameViews, KeptPerson]:
-    """What cameras see of one person only, for a tracker that sees frame after frame.
-
-    Args:
-        frame: what they see of all.
-        place: (3,) where the person was in the last frame [m], as in keep_person.
-    """
+    """What cameras see of one person only, who was at a place (3,) [m], as in keep_person."""
     pairs = list(zip(frame.cameras, frame.views, strict=True))
     kept = keep_person(
         {camera.name: camera for camera in frame.cameras},
@@ -249,10 +239,8 @@ def sort_figures(
     """For each camera the figures of others, and whether the person and another are one figure.
 
     Args:
-        cameras: the cameras.
         figures: of each camera's mask.
         person: who is followed; None where he is away.
-        others: who else is there.
     """
     if person is None:
         return [(tuple(own), False) for own in figures]

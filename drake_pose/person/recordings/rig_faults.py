@@ -1,8 +1,7 @@
 """A calibration that the silhouettes contradict before anybody is fitted: mirrored or exchanged.
 
-Where a rig is consistent, every silhouette is filled by the body that all silhouettes together
-allow, their visual hull (silhouette coherence, Hernandez, Schmitt and Cipolla 2007). Where only
-mirroring or exchanging pictures lets a body fill them all, that is what happened to the rig.
+Silhouettes of a consistent rig are filled by their visual hull (silhouette coherence, Hernandez,
+Schmitt and Cipolla 2007); a rig that only a mirrored or exchanged picture mends is faulty.
 """
 
 from __future__ import annotations
@@ -67,12 +66,7 @@ class RigFault:
 def find_rig_fault(
     cameras: Mapping[str, Camera], frames: Sequence[Mapping[str, Mask]]
 ) -> RigFault | None:
-    """What is wrong with a rig as a whole; None where nothing is.
-
-    Args:
-        cameras: by name.
-        frames: the masks (H, W) of one person in some frames, by camera.
-    """
+    """What is wrong with a rig as a whole, by one person's masks in some frames; None: nothing."""
     frames = [masks for masks in frames if len(masks) >= 2]
     if not frames:
         return None

@@ -237,18 +237,14 @@ EXPERIMENTS = (
 
 
 def reproduce_all(out: Path, short: bool, count: Count, say: Callable[[str], None]) -> Path:
-    """Runs all experiments that are not finished yet, and writes the page after each.
+    """Runs all experiments that are not finished yet, writes the page after each, and returns it.
 
     An experiment's folder gets its name when it is finished, so that nothing half done looks whole.
 
     Args:
-        out: the folder.
         short: a few images, runs and frames of each, to see that all of it works.
         count: counts images, sequences and frames.
         say: called with what happens.
-
-    Returns:
-        The page.
 
     Raises:
         OutputError: the folder cannot be written, or holds a run with other settings.

@@ -51,9 +51,7 @@ class Moment(NamedTuple):
     Attributes:
         compared: (H, n W, 3) the input and all estimates, side by side.
         picture: (H, W, 3) of SHOWN_CAMERA.
-        seen: what the paper's stages saw.
-        faces: (130, 80, 3) the face, the nearest template, and the model's head as estimated; none
-            where no face was seen.
+        faces: (130, 80, 3) seen face, nearest template, and the model's head; or none.
     """
 
     compared: Picture
@@ -80,8 +78,7 @@ class DateResult:
             stiff trunk is laid through them, in each frame (4,) in the order of LIMBS [mm]; nan
             where the registered pose was recognised instead.
         face_errors: angle between true and estimated direction of the head in each frame [deg].
-        destroyed: tracks on their way back, by the motion during which they were destroyed;
-            REGISTERED: the registered pose was shown.
+        destroyed: tracks on their way back, by the motion at their destruction, or REGISTERED.
         moments: by motion, what pictures show.
     """
 
@@ -270,11 +267,9 @@ def run_experiment(
 
     Args:
         cameras: how many, the face camera included.
-        frames: how many.
         seed: another one draws other motions.
         method: "silhouette" for all silhouettes at once, "paper" for the paper's way alone; its
             figures lead.
-        count: counts the frames.
         size: width and height of the pictures [pixel].
         waist: of the paper's formula: "person" with this person's constants, "paper" with 0.55,
             0.225, 0.225; "reach" as "person", then lowered until both feet are in reach.
@@ -352,10 +347,7 @@ def _table_of_motions(
 
 
 def frames_of_destruction(motion: Motion) -> dict[int, str]:
-    """Where tracks are destroyed: amid each motion, and when the registered pose is shown again.
-
-    Not in the last frames of a motion cut short, where recovery could not be seen.
-    """
+    """Where tracks are destroyed: amid each whole motion, and at the registered pose's return."""
     count = len(motion.names)
     found = {k: motion.names[k] for k in range(count - _FEWEST_WATCHED) if _is_middle(motion, k)}
     again = 1 + max(k for k, name in enumerate(motion.names) if name != REGISTERED)

@@ -124,8 +124,7 @@ class Seen(NamedTuple):
     Attributes:
         views: the person by camera on the circle.
         found: 3-D points of skin, and the features made of them.
-        faces: (130, 80, 3) the face as cut from the face camera's picture, and the nearest template
-            as far as the eigenspace holds it; none where the face camera saw no face.
+        faces: (130, 80, 3) the face as cut from the picture, and the nearest template; or none.
     """
 
     views: Mapping[str, PersonView]
@@ -134,11 +133,7 @@ class Seen(NamedTuple):
 
 
 class _StagedRun:
-    """A ready diagram that is run frame by frame, each stage by the clock.
-
-    Attributes:
-        milliseconds: processor time of each frame's stages.
-    """
+    """A diagram that is run frame by frame, with the processor time of each frame's stages [ms]."""
 
     def __init__(self, staged: StagedDiagram) -> None:
         self.milliseconds: list[Mapping[str, float]] = []
@@ -176,10 +171,7 @@ class _StagedRun:
 
 
 class PaperTrack(_StagedRun):
-    """The paper's way, with its search for elbows and knees or without.
-
-    A frame whose pose was recognised adds no milliseconds.
-    """
+    """The paper's way, with its limb search or without; recognised frames add no milliseconds."""
 
     def __init__(self, capture: PaperCapture) -> None:
         super().__init__(capture)
@@ -193,8 +185,7 @@ class PaperTrack(_StagedRun):
     def step(self, images: Images) -> Array:
         """The positions (nq,) of one more frame.
 
-        Raises:
-            SettingsError: the registered pose was not recognised in the first frame.
+        Raises SettingsError where the registered pose was not recognised in the first frame.
         """
         self._begin_frame()
         self._fix(images)
@@ -211,10 +202,7 @@ class PaperTrack(_StagedRun):
         return q
 
     def middle_joints(self) -> Array:
-        """(4, 3) elbows and knees of the last frame as found, in the order of LIMBS [m].
-
-        nan in a frame whose pose was recognised instead.
-        """
+        """(4, 3) elbows and knees of the last frame by LIMBS [m]; nan where it was recognised."""
         port = self._capture.diagram.GetOutputPort("limb_points")
         return np.array(port.Eval(self.context)).reshape(len(LIMBS), 3, 3)[:, 1]
 
@@ -283,8 +271,7 @@ class SilhouetteTrack(_StagedRun):
     def step(self, images: Images) -> Array:
         """The positions (nq,) of one more frame, even where the person is lost.
 
-        Raises:
-            SettingsError: nobody was seen in the first frame.
+        Raises SettingsError where nobody was seen in the first frame.
         """
         self._begin_frame()
         if self._shared is None:

@@ -19,11 +19,7 @@ _SKIN = (255, 0, 160)
 
 
 def save_pictures(result: DateResult, folder: Path) -> list[Path]:
-    """Draw a moment of each motion, and the errors over time; returns the PNG files written.
-
-    Of each moment: the input and all estimates side by side (figure 7), skin in a picture, its
-    points in space, and the faces (figures 2 to 4).
-    """
+    """Draw a moment of each motion (figures 7, 2 to 4), and errors over time; returns PNG files."""
     files = []
     for motion, moment in result.moments.items():
         files.append(save_picture(moment.compared, folder / f"figure_07_{motion}.png"))

@@ -64,7 +64,6 @@ class Trial:
     Args:
         true_values: the values drawn, one array for each node [rad or m].
         inside: whether the whole body is inside the picture.
-        result: what the search found.
         seconds: of the processor for the search.
         more_seconds: of the processor for proof and families, or for intervals.
         causes: on the grid, why angles are wrong though the silhouette is matched exactly.
@@ -111,10 +110,9 @@ class ExperimentResult:
 
 
 def experiment_camera(angle: float = 0.0) -> ParallelCamera:
-    """The paper's camera: 700 x 700, parallel, 2.26 pixels a centimetre.
+    """The paper's camera: 700 x 700, parallel, 2.26 pixels a centimetre, the head right above.
 
-    The world's origin, where the head's joint is, lies right above the picture's middle. The angle
-    [rad] turns the camera about the body's upright axis, to the body's left.
+    The angle [rad] turns the camera about the body's upright axis, to the body's left.
     """
     turn, X_WC = np.eye(4), np.eye(4)
     turn[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
@@ -160,13 +158,7 @@ def _tree() -> PoseTree:
 def draw_values(
     search: PoseSearch, angles: str, generator: np.random.Generator
 ) -> list[np.ndarray]:
-    """Draw every node's values [rad or m] at random.
-
-    Args:
-        search: gives the pose tree and its sampling grid.
-        angles: "grid": from the grid, as the paper; "continuous": anywhere inside the limits.
-        generator: draws.
-    """
+    """Draw every node's values [rad or m]: on the search's "grid" or "continuous" in its limits."""
     values = []
     tree = search.tree
     lower, upper = tree.model.lower, tree.model.upper
@@ -197,7 +189,6 @@ def run_experiment(
         search: of ``experiment_search``, ``beam_experiment_search`` or ``continuous_search``.
         images: how many poses.
         seed: of the random angles; with a mismatch, too, the angles are those of this seed.
-        count: counts the poses.
         views: how many cameras see each pose, 180 degrees / views apart: a silhouette from behind
             is the mirror image of that from before and says nothing new.
         mismatch: whether the body in the pictures has other widths and joints than the model.
@@ -284,8 +275,7 @@ def change_body(
 ) -> tuple[np.ndarray, list[Outline]]:
     """The poses (nodes, 4, 4) and surfaces of a body of other measures in the same pose X_WN.
 
-    Every segment is wider or narrower by WIDTH_MISMATCH at most, across its longest axis, and every
-    joint's offset from the joint before it longer or shorter by OFFSET_MISMATCH at most.
+    Widths across the longest axis vary by WIDTH_MISMATCH, joints' offsets by OFFSET_MISMATCH.
     """
     moved = X_WN.copy()
     surfaces = []

@@ -1,7 +1,6 @@
-"""What edges inside the silhouette settle of experiment A's ambiguous silhouettes.
+"""What edges inside the silhouette, the paper's future work, settle of A's ambiguous silhouettes.
 
-The paper names the edges as its future work. Here they are those of Drake's label image: where one
-segment lies before another.
+They are those of Drake's label image: where one segment lies before another.
 """
 
 from dataclasses import replace
@@ -64,8 +63,8 @@ def settle_by_edges(
 def noisy_edges(edges: InnerEdges, share: float, generator: np.random.Generator) -> InnerEdges:
     """Edges as a picture's may be: this share is missing, the others are a pixel off, some wrong.
 
-    Wrong ones are short strokes anywhere inside the silhouette, a quarter as long as what is lost.
-    The edges that are returned are judged by the rates of these errors.
+    Wrong ones are short strokes inside the silhouette, a quarter as long as what is lost; the
+    edges that are returned are judged by the rates of these errors.
     """
     shape = edges.edges.shape
     squares = tuple(-(-side // _SQUARE) for side in shape)

@@ -47,10 +47,7 @@ _KINDS: dict[str, tuple[str, Callable[[Trial], bool]]] = {
 
 
 def save_pictures(result: ExperimentResult, folder: Path) -> list[Path]:
-    """Draw examples of each kind of outcome, a histogram of the effort, and poses as good.
-
-    Returns the PNG files written.
-    """
+    """Draw examples of outcomes, the effort's histogram, poses as good; returns the PNG files."""
     figures = {}
     for name, (title, belongs) in _KINDS.items():
         trials = [trial for trial in result.trials if belongs(trial)][:_EXAMPLES]
@@ -156,9 +153,7 @@ def _draw_chest_ranks(result: ExperimentResult, limit: int) -> Figure:
 def chest_ranks(result: ExperimentResult) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """By image the true chest's rank in its list of candidates, from 1, and the lists' lengths.
 
-    The head is where it truly is; r and the order are the search's, but there is no K, which the
-    paper says is why silhouettes are not matched (6.1, figure 12). 0: the true chest leaves the
-    silhouette by more than r.
+    The head is true; there is no K (6.1, figure 12). 0: the chest leaves the silhouette by over r.
     """
     search = result.search
     assert isinstance(search, PaperSearch)
@@ -204,9 +199,8 @@ def save_families(
 ) -> Path:
     """Draw the best families as columns of a PNG file: what the silhouettes leave open.
 
-    For every camera the first row shows the segments of the family's representative in colours,
-    the second where its body and the silhouette agree. Below stand the joints that are free in
-    the family.
+    Rows for every camera: the representative's segments, and where body and silhouette agree;
+    below, the joints that are free in the family.
     """
     families = answer.families[:most]
     renderers = [LabelRenderer(model, view.camera) for view in views]

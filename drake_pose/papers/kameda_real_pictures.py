@@ -62,7 +62,6 @@ def run_real_experiment(
         experiment: "B" or "C".
         images: how many, the first ones; None: all.
         out: folder for the poses and overlays of each method; None writes nothing.
-        count: counts the pictures.
 
     Returns:
         The figures by method; mean E_total is over the pictures in which a pose was found.

@@ -64,12 +64,10 @@ class Trial(NamedTuple):
     """One sequence, filtered.
 
     Attributes:
-        sequence: truth, measurements and first guess.
         means, deviations: (55, n) of the best hypothesis after each frame.
         covariance: (n, n) of the last.
         milliseconds: (55,) of the processor for prediction and update; nan once it broke down.
-        bound: (n,) what a filter would believe at the end that is linearised at the truth, without
-            limits: what the measurements hold.
+        bound: (n,) deviations at the end of a filter linearised at the truth, without limits.
     """
 
     sequence: SyntheticSequence
@@ -129,17 +127,15 @@ def run_experiment(
 ) -> ExperimentResult:
     """Run the synthetic experiment of section 6 for r_13 = 35 and r_13 = 40.
 
-    The paper gives neither the motion nor the noise: here every run draws both (0.5 pixel for
-    points, 1 pixel and 1 degree for lines).
+    Motion and noise, which the paper does not give, are drawn: 0.5 pixel for points, 1 pixel and
+    1 degree for lines.
 
     Args:
         runs: of each case.
         seed: another one draws other motions, noise and first guesses.
         truncation: "joint", "sequential" (the paper's), "clip" or "none".
         observed: "lines": knuckles hidden, as in the paper; or "full".
-        count: counts the sequences.
-        iterations: linearisations of an update at most; 1 is the paper's filter, None the library's
-            own default.
+        iterations: linearisations of an update at most; 1 is the paper's filter, None the default.
 
     Raises:
         SettingsError: if an argument is not one of these.
@@ -165,11 +161,7 @@ def run_experiment(
 
 
 def experiment_settings(truncation: str, iterations: int | None = None) -> FilterSettings:
-    """The library's own settings, but for these.
-
-    Raises:
-        SettingsError: there is no such truncation, or there are no iterations.
-    """
+    """The library's own settings, but for these; SettingsError where they are impossible."""
     settings = FilterSettings(truncation=cast(Truncation, truncation))
     return settings if iterations is None else replace(settings, iterations=iterations)
 

@@ -90,10 +90,7 @@ class Fate:
 
 @dataclass(frozen=True, eq=False)
 class HypothesesResult:
-    """What became of all hypotheses, mirrored ones and first ones, and how they were made.
-
-    final_errors: (runs,) of the heaviest hypothesis' joint angles in the last frame [deg].
-    """
+    """All hypotheses' fates, and final errors (runs,) of the heaviest one's joint angles [deg]."""
 
     fates: tuple[Fate, ...]
     sequences: tuple[SyntheticSequence, ...]
@@ -104,9 +101,8 @@ class HypothesesResult:
     def shown(self) -> tuple[Fate, Fate] | None:
         """A wrong one that an inequality rejected, as in figure 9, and its survivor; None: none.
 
-        Of those believed in several frames it is the one with the largest weight before its end,
-        where possible rejected by the paper's inequality: two joints of a finger bend about
-        alike. The survivor is the nearest to the truth of those beside it that live on.
+        It had the largest weight of those that lived several frames, by the paper's inequality if
+        possible; its survivor is the nearest to the truth.
         """
         rejected = [
             one
@@ -167,16 +163,11 @@ def run_hypotheses_experiment(
     count: Count = uncounted,
     iterations: int = 1,
 ) -> HypothesesResult:
-    """Follow every hypothesis while fingers bend through the image plane.
+    """Follow every hypothesis while fingers bend through the image plane, as in figure 9.
 
-    The paper's figure 9 shows the third segment ambiguous in depth in frame 18, and the wrong
-    hypothesis rejected in frame 20, as two joints bend about alike. The motion is that of
-    ``run_experiment``, the hand turned so that its fingers point out of the image plane. Weights,
-    which the paper does not have, reject nothing. Arguments as of ``run_experiment``; the defaults
-    are the paper's.
-
-    Raises:
-        SettingsError: if an argument is not one of these.
+    There frame 18's third segment is ambiguous in depth, the wrong hypothesis rejected in frame 20.
+    The motion is that of ``run_experiment`` with fingers out of the image plane; weights, which the
+    paper does not have, reject nothing. Arguments and errors as of ``run_experiment``.
     """
     require_counts(runs=runs)
     require_choice("observed", observed, OBSERVED)

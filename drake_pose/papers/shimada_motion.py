@@ -95,11 +95,7 @@ def make_sequence(
 ) -> SyntheticSequence:
     """Draw a sequence: its motion's phases, its noise, and table 2's first guess.
 
-    Args:
-        r_13, yaw_middle: as for ``true_states``.
-        observed: "full", or "lines": the knuckles are hidden.
-        observation: gives h and the noise.
-        generator: draws.
+    `observed` is "full", or "lines": the knuckles are hidden; the rest as for ``true_states``.
     """
     states = true_states(r_13, generator.uniform(-0.6, 0.6, 6), yaw_middle)
     deviations = np.sqrt(observation.variances)
@@ -117,9 +113,7 @@ def make_sequence(
 def first_guess(x: Array, generator: np.random.Generator) -> Belief:
     """Table 2 around a true state: errors up to the values given there, its variances.
 
-    The palm's rotation is an angle like the others. The scale, 1 with variance 0, is not put into
-    the covariance of the quaternion, whose errors leave the tangent plane; it is observed in the
-    first frame.
+    The palm's rotation is an angle; the scale, 1 with variance 0, is no part of the covariance.
     """
     mean = x.copy()
     moving = len(HAND_STATE.moving)

@@ -53,10 +53,9 @@ def save_pictures(result: ExperimentResult, folder: Path) -> list[Path]:
 
 
 def save_hypotheses(result: HypothesesResult, folder: Path) -> list[Path]:
-    """Draw the hypothesis that an inequality rejected, and the one that it left, if there are any.
+    """Draw the hypothesis that an inequality rejected and the one that it left, if there are any.
 
-    Above both and the truth: when both are there, before the end, and in the end. Below the
-    joint in which they differ most, what the inequality is about, and their weights.
+    They stand above with the truth; below are the joint that differs most, the inequality, weights.
     """
     shown = result.shown()
     if shown is None:

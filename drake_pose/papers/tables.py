@@ -48,10 +48,7 @@ def require_choice(name: str, value: str, choices: Sequence[str]) -> None:
 def spread_over_seeds(
     runs: Sequence[Figures], without: Sequence[str] = ()
 ) -> dict[str, dict[str, float]]:
-    """Mean, smallest and largest of every number over runs that differ in the seed alone.
-
-    Keys that are no outcome are left out.
-    """
+    """Mean, smallest and largest of every outcome over runs that differ in the seed alone."""
     spread = {}
     for key, first in runs[0].items():
         if key not in without and isinstance(first, int | float):
@@ -73,7 +70,6 @@ def figure_table(
     """Figures side by side: a row each, as far as a column has it.
 
     Args:
-        title: of the table.
         rows: by key, what the row is called and the format of its figures.
         columns: by heading, the figures; or those of several seeds, of which the mean is shown, and
             the smallest and largest.

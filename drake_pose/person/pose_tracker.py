@@ -105,7 +105,7 @@ class PersonPoseTracker:
         return TrackState(np.array(values, dtype=np.float64), np.zeros(len(values)), 1.0, _USUAL)
 
     def positions(self, values: Array) -> Array:
-        """The plant's q (nq,) of values (m,), free angles within half a turn; the root needs joints."""
+        """The plant's q (nq,) of values (m,), free angles within half a turn."""
         free = np.isinf(self.fit.upper)
         turned = np.where(free, np.remainder(values + np.pi, 2.0 * np.pi) - np.pi, values)
         q = np.array(self.fit.tree.model.default_positions)

@@ -1,14 +1,9 @@
 """BVH files: a skeleton and its motion, for animation programs.
 
-A joint of the file is a link of the model that is seen, or on which several such links hang; links
-between them that only pass a motion on are left out, and so is the far half of a limb whose length
-is a joint of the model and stays the same all the time. At rest, with all rotations zero, the
-skeleton stands as the model does at its default positions, with the lengths that were captured.
-
-Offsets are in centimetres and rotations in degrees, Z, X, Y in this order; y is up, as the
-format's readers expect: x forward, y left, z up becomes x forward, y up, z right, as in the TRC
-file. The root has position channels. So has a part whose place in the part before it changes in
-time: its offset is zero then, so that readers that add the offset and those that replace it agree.
+Joints are the links that are seen or carry several such; a limb's far half whose length stays is
+left out. Rotations zero is the default pose with the captured lengths. Offsets are in centimetres,
+rotations in degrees, Z, X, Y; x forward, y up, z right, as in TRC. The root has position channels,
+and so has a part whose place changes: its offset is zero, so that all readers agree.
 """
 
 from __future__ import annotations
@@ -92,9 +87,8 @@ def motion_as_bvh(
     """The text of a BVH file of a motion, and how many of its frames were filled.
 
     Args:
-        model: the model.
-        q: (frames, nq) positions [rad or m]; a frame of nan has no pose, and is filled by the last
-            one known before it, or by the first one known.
+        q: (frames, nq) positions [rad or m]; a frame of nan is filled by the last one known before
+            it, or by the first one known.
         X_WB: (frames, 4, 4) poses of the plant's world in the scene's; None: the same world.
         rate_hz: frames a second.
 

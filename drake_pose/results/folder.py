@@ -1,7 +1,6 @@
 """The result folder: tables of poses and joints, files of motion, pages, overlays, a summary.
 
-Every finished frame is on the disk before the next one begins, and every other file is written
-beside its place and then moved there, so that an interruption never leaves half a file.
+Frames are written one by one, other files moved into place: none is ever half there.
 """
 
 from __future__ import annotations
@@ -47,7 +46,6 @@ class PoseRow:
     """One row of poses.csv.
 
     Args:
-        frame: the frame's name.
         q: (nq,) positions [rad or m]; NaN where no pose was found.
         base: (7,) BASE_COLUMNS; None where the model's own joints place it in the world.
         error: E_total; NaN where no pose was found.
@@ -85,7 +83,6 @@ class ResultFolder:
     """Writes a result, frame by frame.
 
     Args:
-        path: the folder.
         position_names: the plant's positions, in its order.
         with_base: whether the base's pose is written too.
         resume: go on with a folder that holds a part of the result.

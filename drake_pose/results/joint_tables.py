@@ -24,11 +24,9 @@ _NORMAL_95 = 1.96
 def record_pose_set(
     pose_set: PoseSet | None, kinds: Mapping[str, str]
 ) -> tuple[dict[str, JointRecord], tuple[dict[str, JointRecord], ...]]:
-    """What is known of each joint over all families, and in each of them.
+    """What is known of each joint over all families, and in each; None: nothing.
 
-    Args:
-        pose_set: the answer as a set; nothing is known without one.
-        kinds: "length" for each position that is one, by name; all others are angles.
+    `kinds` is "length" for each position that is one, by name; all others are angles.
     """
     if pose_set is None:
         return {}, ()
@@ -42,12 +40,9 @@ def record_pose_set(
 def record_deviations(
     model: ArticulatedModel, q: np.ndarray, deviations: np.ndarray
 ) -> dict[str, JointRecord]:
-    """What standard deviations say of each position: 95 % within its limits.
-
-    A position is determined where that is less than half its range.
+    """Each position within 95 % and its limits, determined where that is less than half its range.
 
     Args:
-        model: the model.
         q: (nq,) positions [rad or m]; nothing is known where they are nan.
         deviations: (nq,) their standard deviations [rad or m]; nan where nobody knows.
     """

@@ -39,20 +39,10 @@ def write_motion(
     rows: Sequence[PoseRow],
     rate_hz: float,
 ) -> list[str]:
-    """Writes joint_centres.csv; of a sequence TRC, MOT and BVH files too.
+    """Writes joint_centres.csv; of a sequence TRC, MOT and BVH files too; returns warnings.
 
     Joint centres need a landmarks.yaml beside the model. The files of a sequence hold every frame
-    of the scene from the first to the last of the rows.
-
-    Args:
-        folder: the result's folder.
-        model: the model.
-        scene: the scene.
-        rows: the finished frames, in the scene's order.
-        rate_hz: frames a second.
-
-    Returns:
-        What the user should know.
+    of the scene from the first to the last of the rows, `rate_hz` frames a second.
 
     Raises:
         ModelError: the landmarks cannot be read.
@@ -119,7 +109,6 @@ def centres_as_trc(names: Sequence[str], places: Array, rate_hz: float, name: st
     """A TRC file of joint centres: millimetres, y up as its readers expect (our z), 1-based frames.
 
     Args:
-        names: the joints'.
         places: (frames, joints, 3) in the world, z up [m]; nan is written as an empty field.
         rate_hz: frames a second.
         name: the file's own name, which the format repeats.
@@ -151,7 +140,6 @@ def positions_as_mot(
     """A MOT file of a model's positions: degrees and metres; frames without a pose are left out.
 
     Args:
-        model: the model.
         q: (frames, nq) positions [rad or m].
         rate_hz: frames a second.
         X_WB: (frames, 4, 4) poses of the plant's world in the scene's, written as the columns

@@ -1,7 +1,4 @@
-"""Texts of options and of job files to plain values: `NAME=VALUE`, `X,Y,Z`, frame ranges, ...
-
-All raise a SettingsError where a text has another form.
-"""
+"""Texts of options and of job files to plain values; other forms raise a SettingsError."""
 
 from __future__ import annotations
 
@@ -24,12 +21,7 @@ Corner = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class FromText:
-    """Reads a setting from the texts given with its option; its converter.
-
-    Args:
-        parse: of one text, or where the option may be repeated of all of them.
-        repeated: whether it may be.
-    """
+    """A setting's converter: parses one text, or where the option may be repeated all of them."""
 
     parse: Callable[[Any], Any]
     repeated: bool = False
@@ -141,9 +133,9 @@ def parse_root_position(text: str) -> Corner | tuple[Path, str] | Literal["unkno
 
 
 def parse_root_rotation(text: str) -> Literal["fixed", "free"] | RotationLimits:
-    """Returns ``fixed``, ``free``, or limits of the angles about the root's axes [deg].
+    """Returns ``fixed``, ``free``, or limits about the root's axes [deg], in order of rotation.
 
-    The limits' text is like ``y=-180:180,z=-10:10``; the order is the order of rotation.
+    The limits' text is like ``y=-180:180,z=-10:10``.
     """
     if text == "fixed":
         return "fixed"
@@ -170,7 +162,6 @@ def select_frames(known: Sequence[str], wanted: Sequence[str], where: str) -> tu
     """Returns the frames that were asked for, in the scene's order.
 
     Args:
-        known: the frames' names, in order.
         wanted: names, or ranges ``FIRST:LAST`` that include both ends; all frames where empty.
             A number stands for the frame whose name is that number, with or without zeros before.
         where: the scene, for messages.

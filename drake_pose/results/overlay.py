@@ -27,8 +27,7 @@ def paint_agreement(
 ) -> np.ndarray:
     """Colours (H, W, 3) every pixel by whether silhouette and body agree there.
 
-    AGREEMENT_RGB where both are, MISSING_RGB where the silhouette alone is, EXCESS_RGB where the
-    body alone is. Borders between two segments (H, W) are drawn.
+    Either is alone in MISSING_RGB or EXCESS_RGB. Borders between segments (H, W) are drawn.
     """
     picture = np.full((*mask.shape, 3), BACKGROUND_RGB, dtype=np.uint8)
     picture[mask & body] = AGREEMENT_RGB
@@ -45,14 +44,12 @@ def draw_overlay(
     """Draws the overlay of one camera and frame, with a legend.
 
     Args:
-        mask: (H, W) bool, the silhouette.
-        body: (H, W) bool, where the estimated body is seen; all False where no pose was found.
+        mask, body: (H, W) bool, silhouette and estimated body; all False where no pose was found.
         segments: (H, W) int, which segment is seen, or None.
         title: lines of text above the picture.
 
     Returns:
-        (h, w, 3) uint8, red, green, blue: the surroundings of silhouette and body, enlarged by a
-        whole number where they are small, and the legend below.
+        (h, w, 3) uint8: the surroundings, enlarged by a whole number where small, and the legend.
     """
     rows, columns = _surroundings(mask | body)
     window = (slice(*rows), slice(*columns))
@@ -75,8 +72,7 @@ def draw_over_picture(
 ) -> np.ndarray:
     """Draws the body's contour, and the borders between its parts, over a picture (H, W, 3).
 
-    The other arguments and the result are those of draw_overlay; the whole picture where no pose
-    was found.
+    Otherwise as draw_overlay; the whole picture where no pose was found.
     """
     painted = picture.copy()
     contours, _ = cv2.findContours(body.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
@@ -91,10 +87,7 @@ def draw_over_picture(
 def draw_shapes(
     mask: np.ndarray, shapes: Sequence[np.ndarray], names: Sequence[str], title: Sequence[str]
 ) -> np.ndarray:
-    """Draws the contours of one or two bodies (H, W) over a silhouette, one over the other.
-
-    names: of the shapes, for the legend; title and result as of draw_overlay.
-    """
+    """Draws the contours of one or two named bodies (H, W) over a silhouette; see draw_overlay."""
     colours = (MISSING_RGB, EXCESS_RGB)[: len(shapes)]
     rows, columns = _surroundings(np.logical_or.reduce([mask, *shapes]))
     window = (slice(*rows), slice(*columns))

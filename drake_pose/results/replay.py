@@ -31,15 +31,12 @@ def make_replay(
     cameras: Sequence[Camera],
     period: float,
 ) -> str:
-    """The page that Meshcat records of poses of a body.
+    """The page that Meshcat records of poses of a body, and where the cameras are.
 
     Args:
-        model: the body.
         positions: (frames, nq) its positions [rad or m].
         X_WB: (frames) poses of the plant's world in the scene's world.
-        cameras: drawn where they are.
-        period: time between two frames [s]. Frames a second or more apart stand still, others
-            are played as a motion.
+        period: time between two frames [s]; those a second or more apart stand still.
     """
     # Port 0: any free one. The server lives for a moment only, and listens on this machine alone.
     logger = logging.getLogger("drake")

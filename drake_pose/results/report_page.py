@@ -57,12 +57,8 @@ class ReportContent:
 
     Args:
         folder: the result's folder, whose files are linked.
-        model: the body.
-        cameras: the names of those that were used.
         seen: (camera, frame) of every picture that there is.
-        rows: the finished frames in order.
-        records: what is known of each, by name.
-        summary: the content of summary.json.
+        rows, records: the finished frames in order, and what is known of each, by name.
         joined: whether frames follow each other in time.
     """
 

@@ -37,7 +37,6 @@ class Plot:
     """A plot over frames, in a picture of WIDTH by HEIGHT.
 
     Args:
-        curves: what is plotted.
         bands: paths of areas: what is known, and what is not determined.
         limits: heights of limits in the picture.
         x_ticks, y_ticks: places and texts.
@@ -85,7 +84,6 @@ def plot_curves(
     """Plots curves over frames; nan leaves a gap.
 
     Args:
-        frames: the frames' names.
         values: label and (frames,) values of each curve.
         joined: whether neighbouring frames are joined by a line.
         limits: lower and upper, in the picture where they are near.

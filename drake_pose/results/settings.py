@@ -1,7 +1,6 @@
-"""What an estimate of a scene is made with: the command's options, a job file's keys, in Python.
+"""What an estimate is made with: options (cyclopts), a job file's keys, arguments in Python.
 
-A settings class is written once. Its fields are the options of the command (cyclopts; the text
-below a field is the option's help), the keys of a job file, and the arguments in Python.
+A class's fields are all three; the text below a field is the option's help.
 """
 
 from collections.abc import Mapping
@@ -162,11 +161,7 @@ def changed(settings: Any) -> tuple[str, ...]:
 
 
 def require_choices(settings: Any) -> None:
-    """Refuses what is none of a setting's choices.
-
-    Raises:
-        SettingsError: names those that there are.
-    """
+    """Refuses what is none of a setting's choices, by a SettingsError that names those."""
     for name, hint in get_type_hints(type(settings)).items():
         value = getattr(settings, name)
         if get_origin(hint) is Literal and value not in get_args(hint):

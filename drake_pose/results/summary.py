@@ -30,8 +30,7 @@ _PACKAGES = ("drake", "numpy", "numba", "opencv-python-headless")
 class JointRecord:
     """What is known of one value of the pose tree, as JointEstimate [deg or m].
 
-    low and high are the ends of its interval, or of what was seen where it is not determined; value
-    is that of the pose that stands for a family, None over all families.
+    From low to high it may be, or was seen; value is that of a family, None over all families.
     """
 
     determined: bool
@@ -45,7 +44,6 @@ class FrameRecord:
     """What the search said about one frame.
 
     Args:
-        found: whether a pose was found.
         E_total: J over the silhouettes' area; None where no pose was found.
         seconds: the search's wall time [s].
         first_E_total: before the re-estimation.
@@ -57,7 +55,7 @@ class FrameRecord:
         camera_scale: pixels a metre of a parallel camera whose scale was found.
         explained: whether the pose explains the silhouettes at least roughly.
         joints: what is known of each value of the pose tree, by name.
-        families: by name too, in each family of poses that look the same; the first of them.
+        families: the same in the first families of poses that look the same.
         family_count: how many families there are; None where the search does not say.
         ious: by camera that was used, intersection over union of silhouette and body.
         masks: by camera, what tells the mask's file from another (``mask_digests``).
@@ -105,10 +103,7 @@ def _joint_records(values: Mapping[str, Any]) -> dict[str, JointRecord]:
 
 
 def describe_job(scene: Path, model: Path, settings: EstimateSettings) -> dict[str, Any]:
-    """What is estimated from what and how, as plain JSON values.
-
-    The files' SHA-256 tell whether a job that is resumed is still the same.
-    """
+    """What is estimated from what and how, as plain JSON values, with the files' SHA-256."""
     return {
         "scene": str(scene),
         "model": str(model),
@@ -196,10 +191,7 @@ def describe_cameras(records: Mapping[str, FrameRecord]) -> dict[str, dict[str, 
 def camera_warnings(
     records: Mapping[str, FrameRecord], known: Sequence[str] = ()
 ) -> tuple[str, ...]:
-    """Which cameras agree much less than the others, where there are three or more.
-
-    A camera that earlier warnings (known) name is not named again.
-    """
+    """Which of three cameras or more, `known` ones aside, agree much less than the others."""
     means = {name: float(one["mean_iou"]) for name, one in describe_cameras(records).items()}
     if len(means) < 3:
         return ()

@@ -1,10 +1,7 @@
 """The body in a sequence of one unknown camera: which of its parts, how long, how tilted.
 
-Nobody has measured such a body, and one parallel silhouette tells neither which way it is tilted
-nor whether a part that should be there is hidden or cut off. The sequence tells: parts without
-which the first frame is explained better are left out, poses of the first frame that look alike are
-followed through the sequence, and lengths, widths and all poses are fitted to it together. What
-comes out is a model as others are, its poses, and where it is tracked from if the sequence goes on.
+The first frame leaves out parts that explain it no better; its poses that look alike are
+followed; lengths, widths and all poses are fitted together, to a model, its poses and a start.
 """
 
 from __future__ import annotations
@@ -54,8 +51,8 @@ class FittedBody(NamedTuple):
     Attributes:
         inputs: with the fitted model, and a search that knows the first frame's pose.
         summary: what the summary says of it.
-        shapes: (h, w, 3) uint8, red, green, blue: the corrected shape drawn over the file's in the
-            first frame (Shimada's figure 18); None where the shape was left as it is.
+        shapes: (h, w, 3) uint8, the corrected shape drawn over the file's in the first frame
+            (Shimada's figure 18); None where the shape was left as it is.
     """
 
     inputs: Inputs
@@ -87,8 +84,7 @@ class _StartedSearch(RootPlacementSearch):
 def fit_body(inputs: Inputs, settings: EstimateSettings, on_stage: OnStage | None) -> FittedBody:
     """Find out about the body, where it is followed through a sequence of an uncalibrated camera.
 
-    Raises:
-        DrakePoseError: as for an estimate.
+    Raises DrakePoseError as for an estimate.
     """
     scene, search = inputs.scene, inputs.search
     tracking = None if search is None else sequence_tracking(scene, search, settings.track)

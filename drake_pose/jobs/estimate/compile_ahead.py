@@ -1,7 +1,6 @@
-"""A second process that compiles a search's last kernels while the first compiles the others.
+"""A second process that compiles a search's last kernels: on two cores a third less waiting.
 
-On two cores the first search of an installation waits about a third less. The processes share what
-they compile (``drake_pose.compiled``). Run as ``python -m drake_pose.jobs.estimate.compile_ahead``.
+``python -m drake_pose.jobs.estimate.compile_ahead``; what is compiled is shared.
 """
 
 from __future__ import annotations

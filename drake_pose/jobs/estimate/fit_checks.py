@@ -37,10 +37,9 @@ Match = Callable[[str, Sequence[View]], float]
 
 @dataclass(frozen=True)
 class Contradiction:
-    """Cameras that one pose does not explain together.
+    """Cameras that one pose does not explain together; all compared ones, where nobody can tell.
 
     Args:
-        cameras: those at fault; all that are compared, where nobody can tell.
         exchanged: whether it is explained once their pictures are exchanged.
         together, alone, after: E_total by all cameras, by each alone, and with pictures exchanged.
     """
@@ -80,14 +79,7 @@ def poor_fit_warnings(
     model: ArticulatedModel,
     held: Iterable[str],
 ) -> tuple[str, ...]:
-    """One warning where poses explain their pictures badly, with what to look at.
-
-    Args:
-        rows: the poses of the frames.
-        records: by frame.
-        model: the body.
-        held: names of positions that were not searched.
-    """
+    """One warning where poses explain their pictures badly; `held` positions were not searched."""
     # A followed person is judged by the contours (describe_fit): others in view are in the masks.
     judged = {frame: one for frame, one in records.items() if one.share is None}
     errors = {frame: one.E_total for frame, one in judged.items() if one.E_total is not None}
@@ -134,7 +126,6 @@ def find_contradiction(
         cameras: those that were matched together.
         read: the mask (H, W) of a camera's frame.
         seen: (camera, frame) of the masks that there are.
-        records: by frame.
     """
     known = {f: one.E_total for f, one in records.items() if one.E_total is not None}
     limit = _DOUBTFUL if len(cameras) == 2 else BADLY_EXPLAINED

@@ -54,14 +54,10 @@ class Inputs:
     """What is estimated, from what, and how.
 
     Args:
-        scene: the recorded scene.
-        model: the body.
-        cameras: the cameras that are matched together.
-        frames: the frames' names.
+        cameras: those that are matched together.
         search: made for the body's pose tree; None where a person is followed by all silhouettes.
         root_positions: the root's position (3,) by frame [m], where it differs.
         truth: measured joint positions, where there are some.
-        warnings: what the user should know of the input.
         starts: the plant's positions (nq,) by frame where it is known where the body is.
         known: answers of the first frames that are known before the search is asked, by frame.
     """
@@ -81,16 +77,9 @@ class Inputs:
 def read_inputs(
     scene_path: Path, model_path: Path, settings: EstimateSettings, truth_path: Path | None
 ) -> Inputs:
-    """Read and check everything.
+    """Read and check everything; without a truth path the scene's own joint_angles.csv is taken.
 
-    Args:
-        scene_path: the scene's folder.
-        model_path: the model file.
-        settings: the settings.
-        truth_path: measured joint positions; None: the scene's own joint_angles.csv, if any.
-
-    Raises:
-        DrakePoseError: names the file, camera, frame, link or joint at fault.
+    Raises DrakePoseError naming the file, camera, frame, link or joint at fault.
     """
     scene = load_scene(scene_path, _named_cameras(scene_path, settings.cameras))
     # Of pictures with few masks it is no fault that masks are missing.
@@ -215,8 +204,7 @@ def make_tree(
 ) -> PoseTree:
     """The pose tree, its root placed as the settings say.
 
-    A model that no joint holds in the world stays as its file has it, unless a root or a rotation
-    is asked for.
+    A model without a joint in the world stays in place unless a root or rotation is asked for.
     """
     held = _in_plant_units(model, settings.hold)
     root, turns = settings.root, settings.root_rotation
@@ -290,8 +278,7 @@ def make_placement_search(
 ) -> RootPlacementSearch:
     """The search for a root that can be anywhere.
 
-    Where the model's own joints turn its root in all ways, the tree begins at the node with the
-    most neighbours, which a silhouette shows best; its rotations are tried more coarsely then.
+    Where joints turn the root freely, the tree begins at the node of most neighbours, coarsely.
 
     Raises:
         SettingsError: if the method is the paper's, or angles on the grid are wanted.

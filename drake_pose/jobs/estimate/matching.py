@@ -38,8 +38,7 @@ def sequence_tracking(
 ) -> TrackingSettings | None:
     """How the body of a scene is tracked; None where every frame is matched on its own.
 
-    A sequence without a frame rate is taken as a video of 30 frames a second. Where the search
-    finds the root's position or the camera's scale in the first frame, the track does, too.
+    No frame rate means 30 frames a second; a searched root position or scale is tracked, too.
     """
     if not track or not scene.sequence:
         return None

@@ -23,11 +23,9 @@ _CENTRE_COLUMNS = ("frame", "joint", "x", "y", "z")
 
 @dataclass(frozen=True)
 class TrueAngles:
-    """Joint positions that were measured by other means.
+    """Joint positions of a file that were measured by other means.
 
     Args:
-        path: the file they are from.
-        names: the positions that were measured.
         values: (len(names),) [rad or m] by frame: its number, or its name if that is none.
         bases: (7,) BASE_COLUMNS by frame, of an estimate whose base moved.
         is_estimate: whether they are the poses.csv of an estimate.
@@ -81,8 +79,7 @@ def read_true_angles(path: Path, position_names: Sequence[str]) -> TrueAngles:
     """Measured joint positions [rad or m] of a file with columns `frame` and positions' names.
 
     Frames are compared as numbers where they are numbers: the row of frame 3 is that of
-    ``0003.png``. The file may be the poses.csv of an estimate, of which rows without a pose are
-    left out.
+    ``0003.png``. Of an estimate's poses.csv rows without a pose are left out.
 
     Raises:
         SceneError: if the file cannot be read, or gives a column or a frame twice.
@@ -144,9 +141,7 @@ def read_starts(
     model: ArticulatedModel,
     settings: EstimateSettings,
 ) -> dict[str, np.ndarray]:
-    """The plant's positions (nq,) by frame, of ``settings.start``.
-
-    Every picture is read once: a bad one is better met now than in the middle.
+    """The plant's positions (nq,) by frame, of ``settings.start``; all pictures are read once.
 
     Raises:
         SceneError: nothing says where the body is in the first frame, or a picture cannot be read.

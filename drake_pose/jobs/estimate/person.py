@@ -51,14 +51,11 @@ def follow_person(
 ) -> Iterator[FinishedFrame]:
     """Follows the person through all frames; then gives them, compared with their masks and drawn.
 
-    A recording is followed as a whole: when it is resumed, frames that were finished before are
-    followed once more with those that are missing.
+    A resumed recording is followed as a whole again.
 
     Args:
-        result: what is estimated, and where the frames go to.
         track: whether the frames of a sequence follow each other.
         overlay: whether overlays are written.
-        on_stage: called with what is done before the first frame is finished.
 
     Raises:
         ModelError: the model has no landmarks of a person.

@@ -71,13 +71,10 @@ class FinishedFrame(NamedTuple):
 
 @dataclass(frozen=True)
 class SceneEstimate:
-    """The estimate of a scene.
+    """The estimate of a scene: the pose of each frame, and the search's record of it by name.
 
     Args:
-        position_names: the plant's positions, in its order.
-        position_kinds: "angle" [rad], "length" [m] or "quaternion" for each position.
-        rows: the pose of each frame.
-        records: what the search said about each frame, by name.
+        position_kinds: "angle" [rad], "length" [m] or "quaternion" for each position of the plant.
         summary: what summary.json holds.
         folder: the result folder, if one was written.
         warnings: what the user should know.
@@ -101,12 +98,10 @@ class ResultWriter:
     """A result under way.
 
     Attributes:
-        inputs: what is estimated.
         rows, records: of the finished frames, by name, those of an earlier job among them.
         more: what the method adds to summary.json.
 
     Args:
-        inputs: what is estimated.
         job: from describe_job.
         path: the result's folder; None writes nothing.
         recorded: the summary of the job that is resumed, if one is.

@@ -39,11 +39,9 @@ def estimate_scene(
     Args:
         scene: the scene's folder: cameras.yaml, masks/<camera>/<frame>.png; or masks/<frame>.png
             alone, of an uncalibrated camera.
-        model: the body's model file.
         out: folder for the result; None writes nothing.
         settings: which cameras and frames, the root, the sampling.
-        truth: measured joint positions to compare with; the scene's own joint_angles.csv, if it
-            has one, where None.
+        truth: measured joint positions to compare with; None: the scene's own joint_angles.csv.
         resume: go on with an interrupted result in ``out``.
         replay, overlay: whether replay.html is made, and overlays are written.
         on_frame: called after each frame.

@@ -33,10 +33,7 @@ class CheckedScene:
 
 
 def check_scene(scene: Scene) -> CheckedScene:
-    """Finds the faults of a scene's files; few pictures are read.
-
-    Masks of a camera that stood still while the others went on are left out of the scene.
-    """
+    """The faults of a scene's files, and it without masks of cameras that stood still alone."""
     if scene.scale_unknown:
         return CheckedScene(scene, ())
     warnings = _check_leftovers(scene)
@@ -129,8 +126,7 @@ def frame_ranges(frames: Iterable[str], known: Sequence[str]) -> str:
 def find_repeats(scene: Scene) -> set[tuple[str, str]]:
     """The masks, (camera, frame), whose file is that of the frame before again, byte for byte.
 
-    A recording has a hundred thousand of them: each is looked at once, and read only where it is as
-    large as a neighbour; what cannot be read is like none.
+    Files are read only where sizes are equal; what cannot be read is like none.
     """
     found = set()
     for name in scene.cameras:

@@ -160,7 +160,7 @@ def _moved_camera(
     middle: Array,
     start: Array,
 ) -> Camera:
-    """A camera moved to fit bodies about middle (3,) to regions, first by a shift start (3,) [m]."""
+    """A camera moved to fit its regions to bodies about middle (3,), first by a shift (3,) [m]."""
     reach = float(np.linalg.norm(camera.X_WC[:3, 3] - middle))
     names = [f"{camera.name}.{name}" for name in CAMERA_NAMES]
     # What the pictures see of a turn about the camera is the person's way about it.

@@ -29,11 +29,7 @@ from drake_pose.systems.staged_diagram import StagedDiagram
 
 @dataclass(frozen=True, eq=False)
 class PaperCapture(StagedDiagram):
-    """A diagram of the paper's capture, and the part of it that one asks afterwards.
-
-    Args:
-        estimator: keeps what one frame hands to the next.
-    """
+    """A diagram of the paper's capture; its estimator keeps what one frame hands to the next."""
 
     estimator: PaperPoseEstimator
 
@@ -48,18 +44,16 @@ def build_paper_capture(
 
     The diagram's outputs are those of ``PaperPoseEstimator``, ``person_view_<camera>``, where
     the setup has what they need ``face_direction``, ``recognised_positions`` and ``similarity``,
-    and where the source has it ``time``.
-    The source's inputs are the diagram's, by their names.
+    and where the source has it ``time``. The source's inputs are the diagram's, by their names.
 
     Args:
-        setup: the person, the cameras, and how to capture. Without a registered pose nobody is
-            found by itself: see ``PaperPoseEstimator.set_person``.
+        setup: without a registered pose nobody is found by itself: see
+            ``PaperPoseEstimator.set_person``.
         source: what has the output ``color_image_<camera>`` of each camera: a rig's diagram
             (``build_camera_rig``), recorded pictures, live cameras. A camera without a background
             in the setup needs ``label_image_<camera>``, too. A source that is not new in every
             period has the output ``fresh``. None: the images are the diagram's inputs.
         period: time between two frames [s].
-        meshcat: where the avatar is shown; None: nowhere.
 
     Raises:
         SettingsError: the source lacks an output, or the period is not positive.

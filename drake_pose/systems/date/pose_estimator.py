@@ -42,21 +42,17 @@ class PaperPoseEstimator(LeafSystem):
         - limb_points
         - expected_features
 
-    Stepwise inverse kinematics of the upper body, the search for elbows and knees on their circles,
-    waist and legs; where ``recognised_positions`` are not nan they overwrite all that was known,
-    without a reset. A camera that is unconnected or gives None is left out. While ``fresh`` is 0
-    the images are still the last frame's, and nothing is done.
+    Stepwise inverse kinematics of the upper body, waist and legs, and the search for elbows and
+    knees. ``recognised_positions`` that are not nan overwrite all without a reset. A camera that is
+    unconnected or gives None is left out. While ``fresh`` is 0 nothing is done.
 
     Outputs, all of them state, nan until the person is known: ``estimated_positions`` (nq) [rad or
     m]; ``last_features`` (15), where head, hands and feet were [m], and ``last_support`` (5), from
     how many 3-D points (``FeatureFinder`` needs them in the next frame); and ``limb_points`` (36),
     root, middle joint and end of left arm, right arm, left leg and right leg as found [m], nan
     where the pose was recognised: no limb was searched then; ``expected_features`` (15), where
-    head, hands and feet are expected in the next frame [m], for ``FeatureFinder``, too.
-
-    Args:
-        setup: the person, the cameras, and how to capture.
-        period: time between two frames [s].
+    head, hands and feet are expected in the next frame [m], for ``FeatureFinder``, too. The time
+    between two frames is ``period`` [s].
 
     Raises:
         SettingsError: a period that is not positive.
@@ -97,7 +93,6 @@ class PaperPoseEstimator(LeafSystem):
         """Say where the person is.
 
         Args:
-            context: this system's.
             q: (nq,) positions [rad or m].
             features: (5, 3) head, hands and feet [m]; those at q where not given.
 

@@ -46,11 +46,9 @@ def prepare_paper_capture(
 ) -> CaptureSetup:
     """Makes the setup of a capture while the person shows the registered pose.
 
-    The pictures say where in its parts the person's skin is seen; the registered pose's
-    templates are rendered.
+    The pictures say where the person's skin is seen; the pose's templates are rendered.
 
     Args:
-        model: the person.
         cameras: all of them, by name.
         face_camera: which of them is the face camera; None: there is none.
         q: (nq,) where the person stands, in the registered pose [rad or m].
@@ -117,14 +115,7 @@ def _features_of(
 def learn_rendered_faces(
     model: ArticulatedModel, skeleton: Skeleton, q: Array, skin: SkinColour
 ) -> FaceTemplates:
-    """Templates of a model's face: 300 rendered pictures, 20 turns times 15 nods.
-
-    Args:
-        model: the person.
-        skeleton: the person's.
-        q: (nq,) positions of the rest of the body.
-        skin: which colours are skin.
-    """
+    """Templates of a model's face: 300 rendered pictures, 20 turns times 15 nods, at q (nq,)."""
     head = skeleton.features(q)[0]
     camera = circle_of_cameras(
         1, height=float(head[2]), target=head, field_of_view=_FACE_VIEW, size=_FACE_SIZE

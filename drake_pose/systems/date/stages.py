@@ -30,8 +30,7 @@ def _allocate() -> AbstractValue:
 class ViewPorts:
     """The input ports ``person_view_<camera>`` of a system; tickets: of all of them.
 
-    Raises:
-        SettingsError: fewer than two cameras, or two of one name.
+    Raises SettingsError for fewer than two cameras, or two of one name.
     """
 
     def __init__(self, system: LeafSystem, cameras: Sequence[Camera]) -> None:
@@ -69,15 +68,13 @@ class HorizontalImage(LeafSystem):
         - region
         - person_view
 
-    The paper's horizontal image processing module (3.1.1). Where ``label_image`` is connected it
-    gives the person's region; otherwise the background model does. Outputs: ``region``, a mask
-    (H, W), and ``person_view``, a ``person.date.capture.PersonView``; both are None while the
-    camera is lost: ``color_image`` is unconnected, or an image of no pixels.
+    The paper's horizontal image processing module (3.1.1). The region is that of ``label_image``,
+    where not connected that of the background model. Outputs: ``region``, a mask (H, W), and
+    ``person_view``, a ``person.date.capture.PersonView``; both are None while the camera is lost:
+    ``color_image`` is unconnected, or an image of no pixels.
 
     Args:
-        camera: the camera.
         background: what it sees when nobody is there; None where ``label_image`` is connected.
-        skin: which colours are skin.
 
     Raises:
         SettingsError: the background's size is not the camera's. When evaluated: there is neither a
@@ -173,11 +170,7 @@ class FeatureFinder(LeafSystem):
     are expected in this frame [m]; the last frame's places where unconnected. Outputs: ``features``
     (15), the last frame's where nothing was measured [m]; ``support`` (5), from how many 3-D points
     each was taken, 0: not measured; and both with all 3-D points as ``found``, a
-    ``person.date.features.Features`` or None.
-
-    Args:
-        cameras: the cameras on the circle, in the order of the input ports.
-        settings: how features are found.
+    ``person.date.features.Features`` or None. Cameras are in the order of the input ports.
 
     Raises:
         SettingsError: fewer than two cameras, or two of one name.
@@ -230,12 +223,8 @@ class FaceDirectionFinder(LeafSystem):
 
     The paper's face processing module (3.2). ``person_view`` is ``HorizontalImage``'s of the same
     picture. ``face_direction`` (2) is turn to the person's left and nod downwards, away from facing
-    the camera [rad]; nan where no face is seen, or the camera has stopped.
-
-    Args:
-        camera: the face camera.
-        templates: faces of known directions.
-        farthest: how far from the eigenspace a face may be [grey levels].
+    the camera [rad]; nan where no face is seen, or the camera has stopped. No face is farther from
+    the eigenspace than ``farthest`` [grey levels].
     """
 
     def __init__(self, camera: Camera, templates: FaceTemplates, farthest: float = 30.0) -> None:
@@ -275,13 +264,8 @@ class PoseRecogniser(LeafSystem):
     A camera that is unconnected or gives None is left out. Outputs: ``recognised_positions`` (nq)
     of the person in the registered pose [rad or m], nan where it is not recognised;
     ``similarity`` of the contours, 0 where not recognised; and both as ``recognition``, a
-    ``person.date.recognition.Recognition`` or None.
-
-    Args:
-        skeleton: the person.
-        registered: the registered pose, made for these cameras.
-        cameras: the cameras on the circle, in the order of the input ports.
-        threshold: similarity from which it is recognised.
+    ``person.date.recognition.Recognition`` or None. It is recognised from a similarity of
+    ``threshold`` on. Cameras are in the order of the input ports, as of the registered pose.
     """
 
     def __init__(

@@ -33,10 +33,9 @@ class SensorPorts(NamedTuple):
 
 
 class LiveSensors(Protocol):
-    """The sensors of all cameras: here, as LocalSensors, or on other machines.
+    """The sensors of all cameras, here (LocalSensors) or elsewhere, looked at each period [s].
 
     Attributes:
-        period: time between two looks at the cameras [s].
         live: whether the pictures come by the computer's clock; else by the simulation's time.
     """
 
@@ -64,8 +63,6 @@ class LocalSensors:
     """Sensors in this process: a PictureCapture, and a SilhouetteSensor each; see LiveSensors.
 
     Args:
-        capture: gives the pictures.
-        cameras: the calibrated cameras.
         backgrounds: of the cameras whose sources do not deliver masks.
     """
 
@@ -134,13 +131,9 @@ def add_person_tracker(
     """Add what follows a person with sensors.
 
     Args:
-        builder: the diagram under construction.
-        tracker: made for the person's pose tree.
         cameras: two calibrated cameras or more.
-        silhouettes: by camera.
         period: time between two looks at the sensors [s].
         time: the pictures' time stamp; None: every period brings new pictures.
-        meshcat: where the avatar is shown; None: nowhere.
         with_deviations: whether the positions' standard deviations are an output.
 
     Raises:
@@ -173,11 +166,8 @@ def build_live_capture(
 ) -> Diagram:
     """Cameras' pictures, or what workers elsewhere make of them, to a person's poses.
 
-    The diagram's outputs are those of PersonTracker, and ``silhouette_<camera>``, its inputs.
-
-    Args:
-        tracker, cameras, meshcat, with_deviations: as of add_person_tracker.
-        sensors: those of the cameras, here or elsewhere.
+    The diagram's outputs are those of PersonTracker, and ``silhouette_<camera>``, its inputs; the
+    arguments but the sensors are those of add_person_tracker.
 
     Raises:
         SettingsError: fewer than two cameras, or a period that is not positive.
@@ -220,9 +210,7 @@ def build_silhouette_capture(
     stages ``region`` and ``edge``.
 
     Args:
-        tracker: made for the person's pose tree.
-        cameras: two calibrated cameras or more.
-        backgrounds: of all cameras.
+        backgrounds: of all cameras, two or more.
         period: time between two frames [s].
         edge_points: a picture's height over the spacing of the edge points.
 
@@ -263,7 +251,6 @@ def build_person_capture(
         cameras: two or more.
         true_positions: the person's positions (nq,) over time.
         period: time between two frames [s].
-        meshcat: where the avatar is shown; None: nowhere.
 
     Raises:
         SettingsError: fewer than two cameras, or a period that is not positive.

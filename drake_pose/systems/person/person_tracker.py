@@ -74,11 +74,10 @@ class PersonTracker(LeafSystem):
     default, and ``body_poses`` those of all bodies there, in the plant's order. ``share`` is that
     of the contours that fits, 0 where nobody was seen; ``time`` the stamp of the last pictures
     used; ``seen`` for each camera whether it saw the person in them, 1 or 0; ``others`` 1 where
-    other persons were in them. Others are looked for at the start, while too little of the contours
-    fits, and for a while after they were seen; they are cut out, and a camera in which the person
-    and another are one figure is left out where three others see the person alone, else not judged
-    by. ``deviations``, where asked for, are the positions' standard deviations [rad or m] by the
-    pictures and the limits alone.
+    other persons were in them. Others are cut out; a camera in which the person and another are one
+    figure is left out where three others see the person alone, else not judged by. ``deviations``,
+    where asked for, are standard deviations [rad or m] by the pictures and the limits
+    alone.
 
     Where fewer than two cameras give a silhouette that shows somebody, a person who is known is
     followed by colour in ``color_image_<camera>``, an ``ImageRgba8U``; the colours are learned from
@@ -86,8 +85,7 @@ class PersonTracker(LeafSystem):
     colour is searched in the next silhouettes.
 
     Args:
-        tracker: made for the person's pose tree.
-        cameras: the calibrated cameras, in the order of the input ports.
+        cameras: calibrated, in the order of the input ports.
         period: time between two looks at the inputs [s].
         with_deviations: whether the deviations are an output.
         color_cameras: names of the cameras that have a port for a colour image.

@@ -43,7 +43,6 @@ class SilhouetteSensor(LeafSystem):
     image has no pixels: then the camera gave no picture at that moment.
 
     Args:
-        camera: the camera.
         background: what it sees of the empty room; None: the input is a label image.
         edge_points: the picture's height over the spacing of the edge points.
     """
@@ -99,7 +98,6 @@ class RemoteSensors(PictureCapture):
 
     Args:
         sources: where each camera's packed views come from, opened.
-        cameras: the calibrated cameras.
         keepers: by camera, who has the edges of its pictures and compares contours with them; the
             process itself does where nobody has.
         others: the further arguments of PictureCapture.

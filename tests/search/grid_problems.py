@@ -42,12 +42,7 @@ class GridProblem:
 
 
 class ProblemMaker:
-    """Draws problems of one body.
-
-    Args:
-        tree: the pose tree.
-        interval: of its grid [rad].
-    """
+    """Draws problems of one body, on a grid of an interval [rad]."""
 
     def __init__(self, tree: PoseTree, interval: float) -> None:
         self.tree = tree
@@ -77,15 +72,16 @@ class ProblemMaker:
         for camera in cameras(views, side):
             mask = draw_mask(self._outlines(), camera.X_CW @ X_WN, camera)
             shown.append(View(camera, mask ^ (generator.random(mask.shape) < noise)))
-        return self._problem(shown)
+        return self.problem(shown)
 
     def show(self, values: list[np.ndarray]) -> GridProblem:
         """The problem of one view of a pose, given by each node's values."""
         camera = cameras(1, 70)[0]
         X_CN = camera.X_CW @ self.tree.node_poses(values)
-        return self._problem([View(camera, draw_mask(self._outlines(), X_CN, camera))])
+        return self.problem([View(camera, draw_mask(self._outlines(), X_CN, camera))])
 
-    def _problem(self, shown: list[View]) -> GridProblem:
+    def problem(self, shown: list[View]) -> GridProblem:
+        """The problem of given views."""
         Js = Scoring(self.body.sampled, shown).J(self.X_WN, self.choices)
         return GridProblem(self.body, shown, self.choices, Js)
 

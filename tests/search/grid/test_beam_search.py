@@ -1,7 +1,5 @@
 """The beam search against brute force over whole grids, and what it promises of its answers."""
 
-import itertools
-import math
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +9,9 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import SettingsError
-from drake_pose.search.estimates import View
 from drake_pose.search.grid.beam.search import BeamSearch
-from drake_pose.search.scoring import SampledTree, Scoring
-from drake_pose.search.settings import BeamSearchSettings, PaperSearchSettings, Stage
-from drake_pose.silhouette.areas.bending import TreeSurfaces
-from drake_pose.silhouette.areas.scoring import draw_mask
+from drake_pose.search.scoring import Scoring
+from drake_pose.search.settings import BeamSearchSettings, Stage
 from tests.search.bodies import (
     box_link,
     forked_body,
@@ -25,74 +20,32 @@ from tests.search.bodies import (
     load_body,
     swinging_chain,
 )
+from tests.search.grid_problems import ProblemMaker, show_pose
 
-INTERVAL = 0.35
-
-
-def all_Js(tree: PoseTree, views: list[View], interval: float = INTERVAL) -> np.ndarray:
-    """J of every pose of the grid: nothing but the definition."""
-    sampled = SampledTree(tree, PaperSearchSettings(interval=interval))
-    scoring = Scoring(sampled, views)
-    choices = itertools.product(*(range(len(values)) for values in sampled.values))
-    X_WN = np.array(
-        [
-            tree.node_poses([sampled.values[i][t] for i, t in enumerate(choice)])
-            for choice in choices
-        ]
-    )
-    return scoring.J(X_WN)
-
-
-def picture(tree: PoseTree, camera: ParallelCamera, values: list[np.ndarray]) -> View:
-    outlines = TreeSurfaces(tree).at(values)
-    return View(camera, draw_mask(outlines, camera.X_CW @ tree.node_poses(values), camera))
-
-
-def random_values(tree: PoseTree, generator: np.random.Generator) -> list[np.ndarray]:
-    bounds = [tree.value_bounds(i) for i in range(len(tree.nodes))]
-    return [generator.uniform(lower, upper) for lower, upper in bounds]
+INTERVAL = 0.4
 
 
 def search(tree: PoseTree, **settings: object) -> BeamSearch:
     return BeamSearch(tree, BeamSearchSettings(interval=INTERVAL, **settings))
 
 
-def cameras(count: int) -> list[ParallelCamera]:
-    """Cameras at 0 and 60 degrees about the vertical."""
-    front = front_camera(80, shift=0.137)
-    X_WC = np.array(front.X_WC)
-    turn = np.eye(4)
-    c, s = math.cos(math.radians(60)), math.sin(math.radians(60))
-    turn[:2, :2] = [[c, -s], [s, c]]
-    return [front, front.with_pose(turn @ X_WC)][:count]
-
-
-@pytest.mark.parametrize("make", ["chain", "fork"])
 @pytest.mark.parametrize("count", [1, 2])
-def test_finds_the_minimum_that_brute_force_finds(tmp_path: Path, make: str, count: int) -> None:
-    model = swinging_chain(tmp_path, 3) if make == "chain" else forked_body(tmp_path)
-    tree = model.pose_tree()
-    matcher = search(tree)
+def test_finds_the_minimum_that_brute_force_finds(maker: ProblemMaker, count: int) -> None:
+    matcher = search(maker.tree)
     generator = np.random.default_rng(3)
     for _ in range(2):
-        values = random_values(tree, generator)
-        views = [picture(tree, camera, values) for camera in cameras(count)]
-        result = matcher.match(views)
+        problem = maker.make(generator, views=count, noise=0.0, on_grid=False)
+        result = matcher.match(problem.views)
         assert result.found
-        assert result.J == all_Js(tree, views).min()
+        assert result.J == problem.best[1]
 
 
-def test_finds_the_minimum_for_a_mask_that_no_pose_explains(tmp_path: Path) -> None:
-    tree = forked_body(tmp_path).pose_tree()
-    camera = front_camera(60, shift=0.137)
-    generator = np.random.default_rng(4)
-    view = picture(tree, camera, random_values(tree, generator))
-    mask = view.mask ^ (generator.random(view.mask.shape) < 0.1)
-    mask[40:50, 5:15] = True
-    view = View(camera, mask)
-    result = search(tree).match([view])
+def test_finds_the_minimum_for_a_mask_that_no_pose_explains(maker: ProblemMaker) -> None:
+    problem = maker.make(np.random.default_rng(4), views=1, noise=0.1, on_grid=False)
+    problem.views[0].mask[40:50, 5:15] = True
+    result = search(maker.tree).match(problem.views)
     assert result.stopped_by == "end"
-    assert result.J == all_Js(tree, [view]).min()
+    assert result.J == maker.problem(problem.views).best[1]
 
 
 def test_ends_at_an_exact_pose_and_reports_the_objective_of_its_own_answer(tmp_path: Path) -> None:
@@ -102,11 +55,11 @@ def test_ends_at_an_exact_pose_and_reports_the_objective_of_its_own_answer(tmp_p
     generator = np.random.default_rng(5)
     for _ in range(5):
         values = [grid[generator.integers(len(grid))] for grid in matcher.sampled.values]
-        view = picture(tree, camera, values)
+        view = show_pose(matcher.sampled, values, camera)
         result = matcher.match([view])
         assert result.stopped_by == "exact"
         assert result.J == 0.0 == result.E_total
-        shown = picture(tree, camera, list(result.node_values))
+        shown = show_pose(matcher.sampled, list(result.node_values), camera)
         assert np.array_equal(shown.mask, view.mask)
 
 
@@ -116,7 +69,7 @@ def test_exact_stages_end_where_their_poses_take_too_much_memory(
     tree = swinging_chain(tmp_path, 4).pose_tree()
     matcher = search(tree)
     values = [grid[len(grid) // 2] for grid in matcher.sampled.values]
-    view = picture(tree, front_camera(100, shift=0.137), values)
+    view = show_pose(matcher.sampled, values, front_camera(100, shift=0.137))
     found = matcher.match_exactly([view])
     assert found is not None
     assert found.J == 0.0
@@ -137,7 +90,7 @@ def test_a_sliding_joint_and_a_fixed_one(tmp_path: Path) -> None:
     tree = model.pose_tree()
     matcher = BeamSearch(tree, BeamSearchSettings(interval=0.25, length_interval=0.05))
     camera = front_camera(90, shift=0.137)
-    view = picture(tree, camera, [np.array([0.15]), np.array([-0.5])])
+    view = show_pose(matcher.sampled, [np.array([0.15]), np.array([-0.5])], camera)
     result = matcher.match([view])
     assert result.J == 0.0
     np.testing.assert_allclose(result.q, [0.15, -0.5], atol=1e-9)
@@ -148,8 +101,8 @@ def test_what_lies_outside_the_picture_costs_nothing(tmp_path: Path) -> None:
     matcher = search(tree)
     camera = ParallelCamera("cut", 40, 25, 100.0, 19.637, 19.637, front_camera().X_WC)
     values = [grid[2] for grid in matcher.sampled.values]
-    view = picture(tree, camera, values)
-    whole = picture(tree, front_camera(100, shift=0.137), values)
+    view = show_pose(matcher.sampled, values, camera)
+    whole = show_pose(matcher.sampled, values, front_camera(100, shift=0.137))
     assert view.mask.sum() < whole.mask.sum()
     assert matcher.match([view]).stopped_by == "exact"
 
@@ -157,11 +110,11 @@ def test_what_lies_outside_the_picture_costs_nothing(tmp_path: Path) -> None:
 def test_a_root_at_another_position(tmp_path: Path) -> None:
     model = swinging_chain(tmp_path, 3)
     still = model.pose_tree()
-    values = [np.array([0.35])] * 3
+    values = [np.array([INTERVAL])] * 3
     X_WE = still.node_poses(values)[0]
     rotation = RootRotation.limited([("x", -60, 60)])
     tree = model.pose_tree(root="segment_0", root_position=np.zeros(3), root_rotation=rotation)
-    view = picture(still, front_camera(100, shift=0.137), values)
+    view = show_pose(search(still).sampled, values, front_camera(100, shift=0.137))
     result = search(tree).match([view], root_position=X_WE[:3, 3])
     assert result.J <= 2.0
 
@@ -171,17 +124,15 @@ def test_a_root_at_another_position(tmp_path: Path) -> None:
     [({"time_limit": 0.0}, "time_limit"), ({"hypothesis_limit": 1}, "hypothesis_limit")],
 )
 def test_a_limit_still_answers_and_says_so(
-    tmp_path: Path, limits: dict[str, float], reason: str
+    maker: ProblemMaker, limits: dict[str, float], reason: str
 ) -> None:
-    tree = forked_body(tmp_path).pose_tree()
-    view = picture(tree, cameras(1)[0], random_values(tree, np.random.default_rng(9)))
-    result = search(tree, **limits).match([view])
+    problem = maker.make(np.random.default_rng(9), views=1, noise=0.0, on_grid=False)
+    result = search(maker.tree, **limits).match(problem.views)
     assert result.found
     assert np.isfinite(result.q).all()
     assert result.stopped_by == reason
-    assert result.J == Scoring(SampledTree(tree, PaperSearchSettings()), [view]).J(
-        tree.node_poses(result.node_values)[None]
-    )
+    X_WN = maker.tree.node_poses(result.node_values)
+    assert result.J == Scoring(maker.body.sampled, problem.views).J(X_WN[None])
 
 
 def test_the_order_of_nodes_can_be_given_and_is_checked(tmp_path: Path) -> None:

@@ -1,7 +1,6 @@
 """The branch and bound against the definition over whole grids."""
 
 import math
-import time
 from pathlib import Path
 
 import numpy as np
@@ -10,19 +9,12 @@ import pytest
 from drake_pose.search.grid.branch_and_bound.bounded_poses import BoundLimits
 from drake_pose.search.grid.branch_and_bound.partial_pose_graph import PartialPoseGraph
 from drake_pose.search.grid.branch_and_bound.search import branch_and_bound
-from tests.search.bodies import box_link, forked_body, joint, load_body, swinging_chain
+from tests.search.bodies import box_link, joint, load_body, swinging_chain
 from tests.search.grid_problems import GridProblem, ProblemMaker
 
 
 def members(graph: PartialPoseGraph, problem: GridProblem) -> set[tuple[int, ...]]:
     return {tuple(row) for row in problem.choices.tolist() if graph.contains(np.array(row))}
-
-
-@pytest.fixture(scope="module", params=["chain", "fork"])
-def maker(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> ProblemMaker:
-    folder = tmp_path_factory.mktemp("body")
-    model = swinging_chain(folder, 3) if request.param == "chain" else forked_body(folder)
-    return ProblemMaker(model.pose_tree(), 0.35)
 
 
 @pytest.mark.parametrize("views", [1, 2])
@@ -68,15 +60,6 @@ def test_what_was_left_out_is_no_better_than_the_bound(maker: ProblemMaker) -> N
         assert min(left_out) >= found.lower_bound
         if math.isinf(limits.deadline):
             assert found.graph.contains(samples)
-
-
-def test_time_is_kept(maker: ProblemMaker) -> None:
-    problem = maker.make(np.random.default_rng(4), views=1, noise=0.0, on_grid=False)
-    branch_and_bound(maker.body, problem.views, 1.0)
-    start = time.perf_counter()
-    found = branch_and_bound(maker.body, problem.views, 500.0, BoundLimits(time_limit=0.0))
-    assert time.perf_counter() - start < 1.0
-    assert not found.complete
 
 
 def test_hidden_limbs_multiply_and_are_counted(tmp_path: Path) -> None:
@@ -140,7 +123,7 @@ def test_the_central_pose_is_a_best_one(maker: ProblemMaker) -> None:
 
 
 def test_a_picture_that_cuts_the_body_off(tmp_path: Path) -> None:
-    maker = ProblemMaker(swinging_chain(tmp_path, 3).pose_tree(), 0.35)
+    maker = ProblemMaker(swinging_chain(tmp_path, 3).pose_tree(), 0.4)
     generator = np.random.default_rng(9)
     problem = maker.make(generator, views=1, noise=0.0, on_grid=True, side=26)
     mask = problem.views[0].mask

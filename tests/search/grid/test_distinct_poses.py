@@ -1,8 +1,6 @@
 """The list of the best poses against brute force, and that no two of it look alike."""
 
 import itertools
-import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,35 +10,24 @@ from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import View
 from drake_pose.search.grid.beam.distinct_poses import GridPoses
 from drake_pose.search.grid.beam.search import BeamSearch
-from drake_pose.search.scoring import SampledTree, Scoring
-from drake_pose.search.settings import BeamSearchSettings, PaperSearchSettings
+from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask
-from tests.search.bodies import forked_body, front_camera
+from tests.search.bodies import forked_body
+from tests.search.grid_problems import GridProblem, ProblemMaker
 
 INTERVAL = 0.2
 ALIKE = 0.7
 
 
+@pytest.fixture(scope="module")
+def maker(tmp_path_factory: pytest.TempPathFactory) -> ProblemMaker:
+    return ProblemMaker(forked_body(tmp_path_factory.mktemp("fork")).pose_tree(), INTERVAL)
+
+
 @pytest.fixture
-def tree(tmp_path: Path) -> PoseTree:
-    return forked_body(tmp_path).pose_tree()
-
-
-def picture(tree: PoseTree, values: list[np.ndarray], angle: float = 0.0) -> View:
-    camera = front_camera(100, shift=0.137)
-    X_TW = np.eye(4)
-    c, s = math.cos(angle), math.sin(angle)
-    X_TW[:2, :2] = [[c, -s], [s, c]]
-    camera = camera.with_pose(X_TW @ camera.X_WC)
-    outlines = [outline_from_mesh(node.mesh) for node in tree.nodes]
-    return View(camera, draw_mask(outlines, camera.X_CW @ tree.node_poses(values), camera))
-
-
-def random_values(tree: PoseTree, seed: int) -> list[np.ndarray]:
-    generator = np.random.default_rng(seed)
-    bounds = [tree.value_bounds(i) for i in range(len(tree.nodes))]
-    return [generator.uniform(lower, upper) for lower, upper in bounds]
+def problem(maker: ProblemMaker) -> GridProblem:
+    return maker.make(np.random.default_rng(2), views=1, noise=0.0, on_grid=False)
 
 
 def settings(**more: object) -> BeamSearchSettings:
@@ -69,65 +56,58 @@ def look_alike(tree: PoseTree, views: list[View], poses: GridPoses, i: int, j: i
     return True
 
 
-@pytest.mark.parametrize("angles", [[0.0], [0.0, 1.0]])
+@pytest.mark.parametrize("count", [1, 2])
 def test_the_list_begins_with_the_best_and_no_two_look_alike(
-    tree: PoseTree, angles: list[float]
+    maker: ProblemMaker, count: int
 ) -> None:
-    views = [picture(tree, random_values(tree, 1), angle) for angle in angles]
-    search = BeamSearch(tree, settings())
-    poses = search.best_poses(views, count=12, alike=ALIKE)
-    assert len(poses) == 12
+    views = maker.make(np.random.default_rng(1), views=count, noise=0.0, on_grid=False).views
+    search = BeamSearch(maker.tree, settings())
+    poses = search.best_poses(views, count=8, alike=ALIKE)
+    assert len(poses) == 8
     assert poses.J[0] == search.match(views).J
     assert (np.diff(poses.J) >= 0).all()
     for i, j in itertools.combinations(range(len(poses)), 2):
-        assert not look_alike(tree, views, poses, i, j)
+        assert not look_alike(maker.tree, views, poses, i, j)
 
 
-def test_what_is_told_of_a_pose_belongs_together(tree: PoseTree) -> None:
-    views = [picture(tree, random_values(tree, 2))]
-    search = BeamSearch(tree, settings())
-    poses = search.best_poses(views, count=5)
-    scoring = Scoring(SampledTree(tree, PaperSearchSettings()), views)
+def test_what_is_told_of_a_pose_belongs_together(maker: ProblemMaker, problem: GridProblem) -> None:
+    search = BeamSearch(maker.tree, settings())
+    poses = search.best_poses(problem.views, count=5)
     for i in range(len(poses)):
-        X_WN = tree.node_poses(poses.node_values[i])
+        X_WN = maker.tree.node_poses(poses.node_values[i])
         np.testing.assert_allclose(poses.X_WN[i], X_WN, atol=1e-12)
-        assert scoring.J(X_WN[None])[0] == poses.J[i]
+        known = (problem.choices == poses.samples[i]).all(axis=1)
+        assert problem.Js[known] == poses.J[i]
         for node, values in enumerate(poses.node_values[i]):
             grid = search.sampled.values[node]
             np.testing.assert_array_equal(grid[poses.samples[i, node]], values)
-    assert poses.area == views[0].mask.sum()
+    assert poses.area == problem.views[0].mask.sum()
 
 
-def test_all_poses_of_the_grid_differ_if_that_is_wanted(tree: PoseTree) -> None:
-    views = [picture(tree, random_values(tree, 3))]
-    search = BeamSearch(tree, settings())
-    choices = list(itertools.product(*(range(len(grid)) for grid in search.sampled.values)))
-    X_WN = [
-        tree.node_poses([grid[t] for grid, t in zip(search.sampled.values, choice, strict=True)])
-        for choice in choices
-    ]
-    Js = np.sort(Scoring(search.sampled, views).J(np.array(X_WN)))
-    poses = search.best_poses(views, count=10, alike=2.0)
+def test_all_poses_of_the_grid_differ_if_that_is_wanted(
+    maker: ProblemMaker, problem: GridProblem
+) -> None:
+    poses = BeamSearch(maker.tree, settings()).best_poses(problem.views, count=10, alike=2.0)
     assert len(np.unique(poses.samples, axis=0)) == 10
-    np.testing.assert_array_equal(poses.J, Js[:10])
+    np.testing.assert_array_equal(poses.J, np.sort(problem.Js)[:10])
 
 
-def test_alternatives_to_an_exact_pose_are_listed_too(tree: PoseTree) -> None:
-    search = BeamSearch(tree, settings())
-    view = picture(tree, [grid[1] for grid in search.sampled.values])
-    poses = search.best_poses([view], count=6)
+def test_alternatives_to_an_exact_pose_are_listed_too(maker: ProblemMaker) -> None:
+    search = BeamSearch(maker.tree, settings())
+    problem = maker.show([grid[1] for grid in search.sampled.values])
+    poses = search.best_poses(problem.views, count=6)
     assert poses.J[0] == 0.0
     assert len(poses) == 6
 
 
-def test_a_limit_leaves_a_list_that_may_be_short(tree: PoseTree) -> None:
-    view = picture(tree, random_values(tree, 4))
-    poses = BeamSearch(tree, settings(time_limit=0.0)).best_poses([view])
+def test_a_limit_leaves_a_list_that_may_be_short(maker: ProblemMaker, problem: GridProblem) -> None:
+    poses = BeamSearch(maker.tree, settings(time_limit=0.0)).best_poses(problem.views)
     assert len(poses) == len(poses.node_values) >= 1
 
 
 @pytest.mark.parametrize(("count", "alike"), [(0, 0.5), (1, 0.0)])
-def test_settings_out_of_range_are_refused(tree: PoseTree, count: int, alike: float) -> None:
-    view = picture(tree, random_values(tree, 4))
+def test_settings_out_of_range_are_refused(
+    maker: ProblemMaker, problem: GridProblem, count: int, alike: float
+) -> None:
     with pytest.raises(SettingsError):
-        BeamSearch(tree, settings()).best_poses([view], count=count, alike=alike)
+        BeamSearch(maker.tree, settings()).best_poses(problem.views, count=count, alike=alike)

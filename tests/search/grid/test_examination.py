@@ -1,5 +1,6 @@
 """Answers with their proof and their set, against the definition over whole grids."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -7,18 +8,17 @@ import pytest
 
 from drake_pose.errors import SettingsError
 from drake_pose.search.grid.beam.search import BeamSearch
-from drake_pose.search.grid.families.examination import ExaminationSettings, examine
+from drake_pose.search.grid.branch_and_bound.bounded_poses import BoundLimits
+from drake_pose.search.grid.families.examination import (
+    ExaminationSettings,
+    examine,
+    prove_optimal,
+)
 from drake_pose.search.grid.families.search import samples_at
 from drake_pose.search.settings import BeamSearchSettings
-from tests.search.bodies import swinging_chain
 from tests.search.grid_problems import ProblemMaker
 
-INTERVAL = 0.5
-
-
-@pytest.fixture(scope="module")
-def maker(tmp_path_factory: pytest.TempPathFactory) -> ProblemMaker:
-    return ProblemMaker(swinging_chain(tmp_path_factory.mktemp("chain"), 3).pose_tree(), INTERVAL)
+INTERVAL = 0.4
 
 
 def search_of(maker: ProblemMaker, examination: ExaminationSettings | None) -> BeamSearch:
@@ -28,8 +28,8 @@ def search_of(maker: ProblemMaker, examination: ExaminationSettings | None) -> B
 def test_what_is_proved_is_the_best_of_the_grid(maker: ProblemMaker) -> None:
     examined = search_of(maker, ExaminationSettings(proof_poses=10**6, family_poses=10**6))
     generator = np.random.default_rng(5)
-    for noise in (0.0, 0.003, 0.01, 0.03) * 2:
-        problem = maker.make(generator, views=1, noise=noise, on_grid=noise == 0.0)
+    for noise, views in itertools.product((0.0, 0.003, 0.01, 0.03), (1, 2)):
+        problem = maker.make(generator, views=views, noise=noise, on_grid=noise == 0.0)
         result = examined.match(problem.views)
         best = problem.best[1]
         assert result.proved_optimal
@@ -95,8 +95,46 @@ def test_a_pose_between_the_samples_is_refused(maker: ProblemMaker) -> None:
         examine(search.body, problem.views, moved, ExaminationSettings())
 
 
-@pytest.mark.parametrize("name", ["proof_time_limit", "family_time_limit"])
-@pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf")])
-def test_times_are_checked(name: str, value: float) -> None:
-    with pytest.raises(SettingsError, match="time_limit"):
-        ExaminationSettings(**{name: value})
+@pytest.mark.parametrize(
+    "limit", [{"states": 2}, {"pairs": 8}, {"poses": 1}, {"time_limit": 0}, {"memory": 8_000}]
+)
+def test_a_limit_leaves_a_true_bound_and_no_false_proof(
+    maker: ProblemMaker, limit: dict[str, int]
+) -> None:
+    generator = np.random.default_rng(12)
+    proved = 0
+    for number in range(12):
+        problem = maker.make(generator, views=1, noise=0.01, on_grid=False)
+        start = int(np.argsort(problem.Js)[number])
+        proof = prove_optimal(
+            problem.body,
+            problem.views,
+            problem.choices[start],
+            float(problem.Js[start]),
+            BoundLimits(**limit),
+        )
+        best = float(problem.Js.min())
+        assert proof.lower_bound <= best <= proof.J <= problem.Js[start]
+        assert tuple(proof.samples.tolist()) in problem.within(proof.J)
+        assert proof.budget_spent != proof.proved
+        if proof.proved:
+            proved += 1
+            assert proof.J == best
+    assert proved < 12
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"tolerance": -1.0},
+        {"families": 0},
+        {"proof_poses": 0},
+        {"memory": 0},
+        {"proof_time_limit": -1.0},
+        {"family_time_limit": float("nan")},
+        {"proof_time_limit": float("inf")},
+    ],
+)
+def test_settings_out_of_range_are_refused(settings: dict[str, float]) -> None:
+    with pytest.raises(SettingsError, match=r"time_limit|positive|or more"):
+        ExaminationSettings(**settings)

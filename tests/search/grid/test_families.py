@@ -6,10 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import JointEstimate, View
 from drake_pose.search.grid.branch_and_bound.bounded_poses import BoundLimits
-from drake_pose.search.grid.families.examination import ExaminationSettings
 from drake_pose.search.grid.families.search import (
     GridPoseSet,
     cluster_samples,
@@ -175,20 +173,6 @@ def test_two_neighbouring_values_are_still_determined(tmp_path: Path) -> None:
     assert one.determined
     assert (one.low, one.high) == pytest.approx((-0.25, 0.75))
     assert not other.determined or len(three) <= 2
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"tolerance": -1.0},
-        {"families": 0},
-        {"proof_poses": 0},
-        {"memory": 0},
-    ],
-)
-def test_settings_out_of_range_are_refused(settings: dict[str, float]) -> None:
-    with pytest.raises(SettingsError):
-        ExaminationSettings(**settings)
 
 
 def test_a_pose_off_the_grid_has_no_samples(tmp_path: Path) -> None:

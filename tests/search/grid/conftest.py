@@ -1,0 +1,13 @@
+"""Two bodies whose whole grids can be looked at."""
+
+import pytest
+
+from tests.search.bodies import forked_body, swinging_chain
+from tests.search.grid_problems import ProblemMaker
+
+
+@pytest.fixture(scope="session", params=["chain", "fork"])
+def maker(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> ProblemMaker:
+    folder = tmp_path_factory.mktemp("body")
+    model = swinging_chain(folder, 3) if request.param == "chain" else forked_body(folder)
+    return ProblemMaker(model.pose_tree(), 0.4)

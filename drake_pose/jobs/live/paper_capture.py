@@ -5,34 +5,54 @@ The registered pose, upright with both arms spread, begins it and sets it right.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from pydrake.systems.framework import Context, Diagram
+from numpy.typing import NDArray
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
 from drake_pose.body.files.packages import bundled_model
-from drake_pose.body.model import load_model
-from drake_pose.errors import SettingsError
+from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.camera.models import Camera, PinholeCamera
+from drake_pose.errors import CameraError, SceneError, SettingsError, UnknownNameError
 from drake_pose.jobs.estimate.scene_checks import frame_ranges
 from drake_pose.jobs.live.capture import LiveSettings, record_frames
 from drake_pose.jobs.live.frame_results import LiveResult, LiveWriter
-from drake_pose.jobs.live.registered_pose import RegisteredPoseSearch
-from drake_pose.jobs.live.run import FrameWatch, LiveFrame
+from drake_pose.jobs.live.run import FrameWatch, LiveFrame, run_live
 from drake_pose.jobs.live.scene import LiveScene
-from drake_pose.person.date.faces import learn_recorded_faces
-from drake_pose.person.date.skeleton import FEATURES
+from drake_pose.person.date.capture import CaptureSettings, CaptureSetup, PersonView
+from drake_pose.person.date.faces import FaceTemplates, learn_recorded_faces
+from drake_pose.person.date.recognition import (
+    Recognition,
+    RegisteredPose,
+    recognise,
+    register_pose,
+    stand_registered,
+)
+from drake_pose.person.date.skeleton import FEATURES, load_skeleton
 from drake_pose.person.shape import tracker_of_person
 from drake_pose.results.folder import require_empty
+from drake_pose.systems.colour_images import colour_image_to_picture
 from drake_pose.systems.date.capture import build_paper_capture
+from drake_pose.systems.date.preparation import prepare_paper_capture
+from drake_pose.systems.date.stages import HorizontalImage
 from drake_pose.systems.person.live_capture import LocalSensors
+from drake_pose.systems.pictures.camera_rig import build_camera_rig
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
 
 METHOD = "paper_capture"
 """What summary.json calls it."""
 
 # A choice: of simulated persons who are followed the mean IoU is about 0.8 and more.
 _LEAST_IOU = 0.6
+# How long it is waited for the registered pose before live cameras [s].
+_PATIENCE = 60.0
+# The arms may still be on their way up: so many more moments are looked at for a better one.
+_MORE_MOMENTS = 10
 
 
 @dataclass(frozen=True)
@@ -92,6 +112,166 @@ def capture_paper(
         return record_frames(METHOD, diagram, sensors, watch, writer, settings)
     finally:
         sensors.close()
+
+
+class RegisteredPoseSearch:
+    """Looks for the registered pose in a scene's pictures: upright, both arms spread.
+
+    Args:
+        face_camera: which camera sees the face; None: there is none.
+        faces: templates of the person's face; needed where there is a face camera.
+
+    Raises:
+        SceneError: a camera delivers masks.
+        CameraError: a camera of parallel rays.
+        UnknownNameError: there is no such face camera.
+        SettingsError: fewer than two other cameras, or a face camera without templates.
+        ModelError: the model is not made like the bundled person.
+    """
+
+    def __init__(
+        self,
+        scene: LiveScene,
+        model: ArticulatedModel,
+        face_camera: str | None = None,
+        faces: FaceTemplates | None = None,
+    ) -> None:
+        self._cameras = require_colour(scene)
+        if face_camera is not None and face_camera not in scene.cameras:
+            raise UnknownNameError("camera", face_camera, scene.cameras, str(scene.path))
+        if (face_camera is None) != (faces is None):
+            raise SettingsError("a face camera needs templates of the face, and these a camera")
+        self._scene, self._model = scene, model
+        self._face_camera, self._faces = face_camera, faces
+        ring = {name: one for name, one in self._cameras.items() if name != face_camera}
+        self._settings = CaptureSettings()
+        self._setup = CaptureSetup(load_skeleton(model), ring, settings=self._settings)
+        self._rig = build_camera_rig(model, ring)
+        self._context = self._rig.diagram.CreateDefaultContext()
+        self._registered: RegisteredPose | None = None
+        self._best: Recognition | None = None
+        self._shown: dict[str, Picture] = {}
+        self._since = 0
+
+    def run(self, sensors: LocalSensors, on_report: Callable[[str], None]) -> CaptureSetup:
+        """What the capture needs, from the pictures of the registered pose; uses the sensors up.
+
+        Raises:
+            SettingsError: nobody showed the registered pose.
+            KeyboardInterrupt: the user gave up.
+        """
+        builder = DiagramBuilder()
+        capture = builder.AddNamedSystem("picture_capture", sensors.capture)
+        for name, camera in self._setup.cameras.items():
+            image = HorizontalImage(camera, self._scene.backgrounds[name], self._settings.skin)
+            builder.AddNamedSystem(f"horizontal_image_{name}", image)
+            port = capture.GetOutputPort(f"color_image_{name}")
+            builder.Connect(port, image.GetInputPort("color_image"))
+            builder.ExportOutput(port, f"color_image_{name}")
+            builder.ExportOutput(image.GetOutputPort("person_view"), f"person_view_{name}")
+        builder.ExportOutput(capture.GetOutputPort("fresh"), "fresh")
+        diagram = builder.Build()
+
+        def look(context: Context) -> None:
+            if diagram.GetOutputPort("fresh").Eval(context)[0]:
+                views = {
+                    name: diagram.GetOutputPort(f"person_view_{name}").Eval(context)
+                    for name in self._setup.cameras
+                }
+                seen = {name: view for name, view in views.items() if view is not None}
+                if self._is_best(seen):
+                    images = {n: diagram.GetOutputPort(f"color_image_{n}") for n in seen}
+                    self._shown = {
+                        name: colour_image_to_picture(port.Eval(context)).copy()
+                        for name, port in images.items()
+                    }
+
+        def is_done() -> bool:
+            return self._similarity >= self._settings.recognition and self._since >= _MORE_MOMENTS
+
+        # What is wrong with recorded pictures is said when they are captured.
+        report = on_report if sensors.live else lambda _: None
+        waited = _PATIENCE if sensors.live else None
+        try:
+            if run_live(diagram, sensors, waited, report, is_done, look):
+                raise KeyboardInterrupt
+        finally:
+            sensors.close()
+        return self._prepared(on_report)
+
+    @property
+    def _similarity(self) -> float:
+        return -1.0 if self._best is None else self._best.similarity
+
+    def _is_best(self, views: Mapping[str, PersonView]) -> bool:
+        """Whether a moment's views are the most like the registered pose."""
+        contours = {name: view.contour for name, view in views.items() if view.contour is not None}
+        skeleton, cameras = self._setup.skeleton, [self._setup.cameras[name] for name in contours]
+        self._since += 1
+        if len(contours) < 2:
+            return False
+        if self._registered is None:
+            q = stand_registered(skeleton, cameras, [one.middle for one in contours.values()])
+            ring = list(self._setup.cameras.values())
+            self._registered = register_pose(skeleton, q, ring, self._draw)
+        seen = list(contours.values())
+        found = recognise(skeleton, self._registered, cameras, seen, threshold=0.0)
+        if found is None or found.similarity <= self._similarity:
+            return False
+        self._best, self._since = found, 0
+        return True
+
+    def _draw(self, camera: Camera, q: Array) -> NDArray[np.bool_]:
+        self._rig.set_positions(self._context, q)
+        return self._rig.mask(self._context, camera.name)
+
+    def _prepared(self, on_report: Callable[[str], None]) -> CaptureSetup:
+        path, needed = self._scene.path, self._settings.recognition
+        if self._best is None:
+            raise SettingsError(
+                f"{path}: two cameras never saw a person whole at the same time: compare the "
+                "pictures with those of the empty room"
+            )
+        if self._similarity < needed:
+            raise SettingsError(
+                f"{path}: nobody showed the registered pose, upright with both arms spread: the "
+                f"likest silhouettes agree with it by {self._similarity:.2f}, "
+                f"{needed:.2f} are needed; show it once, give a model of the person's measures "
+                "(urdf/person/make_person.py makes one), or capture by all silhouettes "
+                "(--method person)"
+            )
+        known = {
+            name: one
+            for name, one in self._cameras.items()
+            if name == self._face_camera or name in self._shown
+        }
+        for name in self._cameras:
+            if name not in known:
+                on_report(f"camera '{name}' gave no picture of the registered pose: left out")
+        return prepare_paper_capture(
+            self._model, known, self._face_camera, self._best.q, self._shown,
+            self._scene.backgrounds, self._settings, self._faces,
+        )  # fmt: skip
+
+
+def require_colour(scene: LiveScene) -> dict[str, PinholeCamera]:
+    """The cameras of a scene whose colour pictures show skin.
+
+    Raises:
+        SceneError: a camera delivers masks.
+        CameraError: a camera of parallel rays.
+    """
+    cameras = {}
+    for name, camera in scene.cameras.items():
+        if scene.specifications[name].gives_masks:
+            raise SceneError(
+                f"{scene.path}: camera '{name}' delivers masks; the paper's method looks for skin "
+                "in colour pictures: give these, and a background of the empty room"
+            )
+        if not isinstance(camera, PinholeCamera):
+            raise CameraError(f"camera '{name}': the paper's method needs a pinhole camera")
+        cameras[name] = camera
+    return cameras
 
 
 class _PaperWatch(FrameWatch):

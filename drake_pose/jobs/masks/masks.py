@@ -15,10 +15,10 @@ import yaml
 
 from drake_pose.camera.picture_files import Picture
 from drake_pose.errors import DrakePoseError, MaskError, OutputError, SceneError
-from drake_pose.jobs.masks.by_model import find_by_model
 from drake_pose.jobs.masks.finding import (
     compare_with_empty_room,
     cut_boxes,
+    find_by_model,
     read_given_masks,
     segment_by_network,
 )

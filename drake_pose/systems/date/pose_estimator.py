@@ -28,19 +28,10 @@ class PaperPoseEstimator(LeafSystem):
     .. pydrake_system::
 
         name: PaperPoseEstimator
-        input_ports:
-        - person_view_<camera>
-        - features
-        - support
-        - face_direction (optional)
-        - recognised_positions (optional)
-        - fresh (optional)
-        output_ports:
-        - estimated_positions
-        - last_features
-        - last_support
-        - limb_points
-        - expected_features
+        input_ports: [person_view_<camera>, features, support, face_direction (optional),
+          recognised_positions (optional), fresh (optional)]
+        output_ports: [estimated_positions, last_features, last_support, limb_points,
+          expected_features]
 
     Stepwise inverse kinematics of the upper body, waist and legs, and the search for elbows and
     knees. ``recognised_positions`` that are not nan overwrite all without a reset. A camera that is

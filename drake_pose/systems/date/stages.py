@@ -61,12 +61,8 @@ class HorizontalImage(LeafSystem):
     .. pydrake_system::
 
         name: HorizontalImage
-        input_ports:
-        - color_image
-        - label_image (optional)
-        output_ports:
-        - region
-        - person_view
+        input_ports: [color_image, label_image (optional)]
+        output_ports: [region, person_view]
 
     The paper's horizontal image processing module (3.1.1). The region is that of ``label_image``,
     where not connected that of the background model. Outputs: ``region``, a mask (H, W), and
@@ -155,14 +151,8 @@ class FeatureFinder(LeafSystem):
     .. pydrake_system::
 
         name: FeatureFinder
-        input_ports:
-        - person_view_<camera>
-        - last_features
-        - expected_features (optional)
-        output_ports:
-        - found
-        - features
-        - support
+        input_ports: [person_view_<camera>, last_features, expected_features (optional)]
+        output_ports: [found, features, support]
 
     The first part of the paper's 3-D module (3.1.2). A camera that is unconnected or gives None is
     left out. ``last_features`` (15) are the last frame's: head, left hand, right hand, left foot,
@@ -215,11 +205,8 @@ class FaceDirectionFinder(LeafSystem):
     .. pydrake_system::
 
         name: FaceDirectionFinder
-        input_ports:
-        - color_image
-        - person_view
-        output_ports:
-        - face_direction
+        input_ports: [color_image, person_view]
+        output_ports: [face_direction]
 
     The paper's face processing module (3.2). ``person_view`` is ``HorizontalImage``'s of the same
     picture. ``face_direction`` (2) is turn to the person's left and nod downwards, away from facing
@@ -254,12 +241,8 @@ class PoseRecogniser(LeafSystem):
     .. pydrake_system::
 
         name: PoseRecogniser
-        input_ports:
-        - person_view_<camera>
-        output_ports:
-        - recognition
-        - recognised_positions
-        - similarity
+        input_ports: [person_view_<camera>]
+        output_ports: [recognition, recognised_positions, similarity]
 
     A camera that is unconnected or gives None is left out. Outputs: ``recognised_positions`` (nq)
     of the person in the registered pose [rad or m], nan where it is not recognised;

@@ -50,19 +50,9 @@ class PersonTracker(LeafSystem):
     .. pydrake_system::
 
         name: PersonTracker
-        input_ports:
-        - silhouette_<camera>
-        - color_image_<camera> (of color_cameras)
-        - time
-        output_ports:
-        - estimated_positions
-        - last_positions
-        - body_poses
-        - share
-        - time
-        - seen
-        - others
-        - deviations
+        input_ports: [silhouette_<camera>, color_image_<camera> (of color_cameras), time]
+        output_ports: [estimated_positions, last_positions, body_poses, share, time, seen, others,
+          deviations]
 
     ``silhouette_<camera>`` is a SilhouetteView, as SilhouetteSensor gives it; where it is None or
     not connected the others go on without the camera. ``time`` is the pictures' time stamp [s]:

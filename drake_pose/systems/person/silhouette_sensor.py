@@ -32,11 +32,8 @@ class SilhouetteSensor(LeafSystem):
     .. pydrake_system::
 
         name: SilhouetteSensor
-        input_ports:
-        - label_image
-        output_ports:
-        - region
-        - silhouette
+        input_ports: [label_image]
+        output_ports: [region, silhouette]
 
     With a background the input port is ``color_image`` instead. The outputs are abstract: the
     person's region (H, W), and a SilhouetteView of it; None where the port is not connected or the
@@ -87,10 +84,7 @@ class RemoteSensors(PictureCapture):
     .. pydrake_system::
 
         name: RemoteSensors
-        output_ports:
-        - silhouette_<camera>
-        - time
-        - fresh
+        output_ports: [silhouette_<camera>, time, fresh]
 
     As PictureCapture, but its sources deliver packed views (bytes (n,) of pack_view) in place of
     pictures, and its outputs are what SilhouetteSensor gives: a SilhouetteView, or None where the

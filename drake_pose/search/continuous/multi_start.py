@@ -294,8 +294,9 @@ class _MultiStartRun:
             J,
             area,
             stopped_by=self.stopped_by,
-            pose_set=self._pose_set(scoring),
+            # Before the families, whose evaluations are not the search's.
             statistics=SearchStatistics(self.fit.evaluations, first),
+            pose_set=self._pose_set(scoring),
         )
 
 

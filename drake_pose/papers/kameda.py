@@ -17,7 +17,7 @@ from drake_pose.search.continuous.search import ContinuousSearch
 from drake_pose.search.estimates import PoseEstimate, View
 from drake_pose.search.grid.beam.search import BeamSearch
 from drake_pose.search.grid.families.examination import ExaminationSettings, examine
-from drake_pose.search.kameda.search import PaperSearch
+from drake_pose.search.kameda import PaperSearch
 from drake_pose.search.scoring import PoseSearch, SampledTree
 from drake_pose.search.settings import BeamSearchSettings, PaperSearchSettings
 from drake_pose.silhouette.areas.outline import Outline

@@ -14,7 +14,7 @@ from scipy.special import chdtri
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.hand.observation import (
+from drake_pose.filtering.hand import (
     FLEXIONS,
     HAND_STATE,
     LENGTHS,

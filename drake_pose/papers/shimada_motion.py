@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.filtering.hand.observation import (
+from drake_pose.filtering.hand import (
     FLEXIONS,
     HAND_STATE,
     LENGTHS,

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from drake_pose.filtering.hand.observation import (
+from drake_pose.filtering.hand import (
     FLEXIONS,
     HAND_STATE,
     LENGTHS,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.hand.observation import HAND_STATE, LENGTHS, MEASURED, HandObservation
+from drake_pose.filtering.hand import HAND_STATE, LENGTHS, MEASURED, HandObservation
 from drake_pose.filtering.kalman.truncated_filter import TRUNCATIONS, FilterSettings
 from drake_pose.papers.shimada import (
     CASES,

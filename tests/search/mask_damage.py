@@ -55,12 +55,7 @@ def damage_views(
     """Damage silhouettes of one instant.
 
     What is missing or in front of the body is at the same place of it in all views.
-
-    Args:
-        views: the clean silhouettes.
-        p_W: (n, 3) points of the body in the world [m]; what is missing is about one of them.
-        damage: how much.
-        generator: random numbers.
+    ``p_W``: (n, 3) points of the body in the world [m]; what is missing is about one of them.
     """
     sizes = [math.sqrt(np.count_nonzero(view.mask)) for view in views]
     masks = [view.mask.astype(np.uint8) for view in views]
@@ -94,10 +89,7 @@ def damage_views(
 def nudge_camera(camera: Camera, pixels: float, generator: np.random.Generator) -> Camera:
     """The camera turned a little (a parallel one: moved), as by an error of its calibration.
 
-    Args:
-        camera: the camera.
-        pixels: standard deviation of how far its picture moves along rows and columns [pixel].
-        generator: random numbers.
+    ``pixels``: standard deviation of how far its picture moves along rows and columns [pixel].
     """
     shift = generator.normal(0.0, pixels, 2)
     roll = generator.normal(0.0, pixels / (0.25 * camera.width))

@@ -19,7 +19,7 @@ from drake_pose.camera.models import PinholeCamera
 from drake_pose.jobs.demo import run_demo
 from drake_pose.results.overlay import paint_agreement
 from drake_pose.search.estimates import View
-from drake_pose.search.kameda.search import PaperSearch
+from drake_pose.search.kameda import PaperSearch
 from drake_pose.search.settings import PaperSearchSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 

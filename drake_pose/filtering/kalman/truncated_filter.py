@@ -200,7 +200,10 @@ class TruncatedFilter:
                 b for h in state.hypotheses for b in self._branches(h, y, model, step, places)
             ]
         alive, rejected = self._reject(branches, step)
-        finished = [self._weigh(h, result) for h, result in alive]
+        finished = [
+            self._finish(h, done.updated.belief, done.truncated, done.updated.log_likelihood)
+            for h, done in alive
+        ]
         leader = max(range(len(finished)), key=lambda i: finished[i].log_weight)
         merged, twins = merge_twins(normalise(finished), self.settings.twin_distance, step)
         kept, pruned = prune(
@@ -283,18 +286,14 @@ class TruncatedFilter:
             return [branches[keep]], rejected[:keep] + rejected[keep + 1 :]
         return alive, rejected
 
-    def _weigh(self, hypothesis: Hypothesis, result: LimitedUpdate) -> Hypothesis:
+    def _finish(
+        self, hypothesis: Hypothesis, free: Belief, result: Truncated, log_likelihood: float = 0.0
+    ) -> Hypothesis:
         """The hypothesis after its update, weighed by the measurement and by the limits."""
-        updated = result.updated
-        evidence = hypothesis.log_evidence + updated.log_likelihood
-        weighed = replace(hypothesis, log_evidence=evidence)
-        return self._finish(weighed, updated.belief, result.truncated)
-
-    def _finish(self, hypothesis: Hypothesis, free: Belief, result: Truncated) -> Hypothesis:
         active = tuple(self.inequalities.rows[k] for k in np.flatnonzero(result.active))
         belief = Belief(result.mean, result.covariance)
-        weight = hypothesis.log_evidence + result.log_probability
-        evidence = hypothesis.log_evidence
+        evidence = hypothesis.log_evidence + log_likelihood
+        weight = evidence + result.log_probability
         if self.settings.truncation != "joint":
             # The paper's: the next step is predicted from the truncated belief.
             free, evidence = belief, weight

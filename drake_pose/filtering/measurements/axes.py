@@ -101,19 +101,13 @@ class AxisObserver:
         Raises:
             MaskError: an image that is not of the camera's size.
         """
-        self._check_size(labels)
-        return self._measure(labels, self._renderer.segments(q), q)
-
-    def _check_size(self, image: NDArray[np.generic]) -> None:
-        expected = (self._camera.height, self._camera.width)
-        if image.shape != expected:
+        size = (self._camera.height, self._camera.width)
+        if labels.shape != size:
             raise MaskError(
-                f"camera '{self._camera.name}': an image of {image.shape[::-1]} pixels, "
-                f"{expected[::-1]} expected"
+                f"camera '{self._camera.name}': an image of {labels.shape[::-1]} pixels, "
+                f"{size[::-1]} expected"
             )
-
-    def _measure(self, labels: Labels, rough: Labels, q: Array) -> dict[str, Axis]:
-        poses = self._renderer.link_poses(q)
+        rough, poses = self._renderer.segments(q), self._renderer.link_poses(q)
         found = {}
         for name, link in self._links.items():
             X, ends = poses[link], np.array(self._axes[name])

@@ -41,26 +41,13 @@ _SAME = 0.1
 _TRIANGLES, _SPACING = 160, 2.0
 # The parts of a fit [pixel].
 _ROUNDS = (AnnealingStage(15.0, 3.0, 6), AnnealingStage(6.0, 3.0, 8), AnnealingStage(3.0, 3.0, 20))
-
-
-@dataclass(frozen=True)
-class SequenceFitSettings:
-    """How a sequence is fitted.
-
-    Args:
-        memory: pictures closer in time than this say the same: they are worth one together [s].
-        deviation: how far the body's contour is from a mask's edge, where its proportions are
-            fitted and its flesh is still not that of who is seen [pixel].
-        correlation: so much of a contour errs together [pixel]: that of a finger's bone.
-        starts: so many starts are fitted at most.
-        worse: fits whose cost is so many times the best one's are given up.
-    """
-
-    memory: float = 0.15
-    deviation: float = 2.0
-    correlation: float = 75.0
-    starts: int = 3
-    worse: float = 1.1
+# Pictures closer in time than this say the same: they are worth one together [s].
+_MEMORY = 0.15
+# How far the body's contour is from a mask's edge, where its proportions are fitted and its flesh
+# is still not that of who is seen, and how much of it errs together: that of a finger's bone [px].
+_DEVIATION, _CORRELATION = 2.0, 75.0
+# So many starts are fitted at most, and fits whose cost is so many times the best one's given up.
+_STARTS, _WORSE = 3, 1.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +79,6 @@ def fit_sequence(
     masks: Sequence[Mask],
     starts: Sequence[Sequence[Array]],
     period: float,
-    settings: SequenceFitSettings | None = None,
 ) -> list[FittedSequence]:
     """The explanations of a sequence of one camera's masks, best first.
 
@@ -101,19 +87,18 @@ def fit_sequence(
         starts: for each start the states (n,) in all frames.
         period: time between two frames [s].
     """
-    settings = settings or SequenceFitSettings()
     observation = tracker.observation
     surfaces = few_rigid_triangles(TreeSurfaces(observation.tree), _TRIANGLES)
     body = ProportionedBody(TreeKinematics(observation.tree), surfaces)
     edges = [find_edge_points(mask, _SPACING) for mask in masks]
-    step = max(1, min(int(settings.memory / period + 1e-9), (len(masks) - 1) // 2))
+    step = max(1, min(int(_MEMORY / period + 1e-9), (len(masks) - 1) // 2))
     picked = np.arange(0, len(masks), step, dtype=np.intp)
     camera = observation.cameras[0]
 
     def fit(frames: Indices, begin: Array, last: bool) -> FittedProportions:
         apart = period * float(frames[1] - frames[0])
-        worth = min(1.0, apart / settings.memory)
-        noise = Noise(settings.deviation, settings.correlation / worth)
+        worth = min(1.0, apart / _MEMORY)
+        noise = Noise(_DEVIATION, _CORRELATION / worth)
         plan = ProportionSettings(noise=noise, rounds=_ROUNDS[-1:] if last else _ROUNDS)
         prior = _sequence_prior(tracker, apart)
         return fit_proportions(
@@ -121,13 +106,13 @@ def fit_sequence(
         )
 
     coarse = []
-    for states in starts[: settings.starts]:
+    for states in starts[:_STARTS]:
         begin = np.array([observation.parameters(states[k]) for k in picked.tolist()])
         coarse.append(fit(picked, begin, False))
     coarse.sort(key=lambda one: one.cost)
     kept: list[FittedProportions] = []
     for one in coarse:
-        near = one.cost <= settings.worse * coarse[0].cost
+        near = one.cost <= _WORSE * coarse[0].cost
         if near and not any(_are_same(body, one, other) for other in kept):
             kept.append(one)
     if step == 1:

@@ -37,7 +37,7 @@ from drake_pose.results.settings import EstimateSettings, RootTurns
 from drake_pose.search.continuous.multi_start import MultiStartSearch, MultiStartSettings
 from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
 from drake_pose.search.estimates import PoseEstimate
-from drake_pose.search.kameda.search import PaperSearch
+from drake_pose.search.kameda import PaperSearch
 from drake_pose.search.scoring import PoseSearch
 from drake_pose.search.settings import BeamSearchSettings, PaperSearchSettings
 from drake_pose.search.starts.root_placement import hub, turns_freely

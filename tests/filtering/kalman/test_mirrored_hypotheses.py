@@ -5,7 +5,7 @@ import pytest
 
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import load_model
-from drake_pose.filtering.hand.observation import (
+from drake_pose.filtering.hand import (
     FLEXIONS,
     HAND_STATE,
     LENGTHS,

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.hand.observation import HAND_STATE
+from drake_pose.filtering.hand import HAND_STATE
 from drake_pose.filtering.kalman.repeated_views import (
     RepeatedView,
     anchored,

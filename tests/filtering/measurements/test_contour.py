@@ -24,12 +24,11 @@ def pinhole(name, turn_deg, side=260, focal=330.0, distance=2.9, height=0.9):
     return PinholeCamera(name, side, side, focal, focal, middle, middle, X_WC)
 
 
-def descend(observation, masks, x, steps=8):
+def descend(observation, seen, x, steps=5):
     """Gauss and Newton's steps from a state."""
-    moving, seen = len(observation.layout.moving), observation.look(masks)
-    distance = None
-    for _ in range(steps):
-        measured = observation.measure(seen, x, distance)
+    moving, distance = len(observation.layout.moving), None
+    for k in range(steps):
+        measured = observation.measure(seen, x, distance, k)
         distance = measured.distance
         H = measured.H[:, :moving]
         step = np.linalg.solve(H.T @ H + 1e-3 * np.eye(moving), H.T @ measured.y)
@@ -45,7 +44,9 @@ def test_it_leads_back_to_the_truth_that_drake_rendered(tmp_path):
     truth = np.array([0.2, 0.9, -0.6])
     x_true = observation.state(truth)
     masks = [LabelRenderer(model, camera).mask(truth)]
-    x, measured = descend(observation, masks, x_true + np.r_[0.12, -0.15, 0.1, np.zeros(3)])
+    x, measured = descend(
+        observation, observation.look(masks), x_true + np.r_[0.12, -0.15, 0.1, np.zeros(3)]
+    )
     q, X_WB = observation.positions(x)
     # Segments of 12 to 24 pixels: a quarter of a pixel is a degree.
     np.testing.assert_allclose(q, truth, atol=np.radians(2.5))
@@ -66,7 +67,7 @@ def test_an_occluder_pulls_little(tmp_path):
     at = int(np.argmax(columns))
     # A blob beside the outermost arm.
     mask[rows[at] - 5 : rows[at] + 6, columns[at] : columns[at] + 8] = True
-    x, _ = descend(observation, [mask], observation.state(truth))
+    x, _ = descend(observation, observation.look([mask]), observation.state(truth))
     np.testing.assert_allclose(observation.positions(x)[0], truth, atol=np.radians(2.5))
 
 
@@ -90,7 +91,7 @@ def test_a_body_with_skin():
     start = x_true.copy()
     start[:moving] += generator.uniform(-0.04, 0.04, moving)
     before = observation.measure(observation.look(masks), start)
-    x, after = descend(observation, masks, start, steps=5)
+    x, after = descend(observation, observation.look(masks), start)
     assert after.distance < 0.7 < before.distance
     assert np.median(np.abs(x - x_true)[:moving]) < np.median(np.abs(start - x_true)[:moving])
 
@@ -107,8 +108,7 @@ def test_a_root_that_is_known_elsewhere_and_one_that_is_estimated_there(tmp_path
     seen = held.with_root_position(there).draw(held.state(q), camera)
     assert not np.array_equal(seen, at_home)
     np.testing.assert_array_equal(moves.draw(x, camera), seen)
-    start = moves.state(q)
-    found, _ = descend(moves, [seen], start)
+    found, _ = descend(moves, moves.look([seen]), moves.state(q), steps=8)
     np.testing.assert_allclose(found[moves.layout.indices(ROOT_SHIFT)][1:], there[1:], atol=0.004)
 
 

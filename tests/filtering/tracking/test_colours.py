@@ -11,6 +11,7 @@ from drake_pose.fit.colours import ColourSettings, part_distances, weigh_parts
 from drake_pose.fit.contour_fit import Comparison
 from drake_pose.fit.kernel import COMPARED, SQUARES, WEIGHT
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from tests.filtering.measurements.test_contour import descend
 from tests.filtering.tracking.test_match_and_track import PERIOD
 from tests.search.bodies import forked_body, near_camera
 
@@ -52,26 +53,14 @@ def painted(mask, background, generator, noise=6.0, colour=ORANGE):
     return np.clip(picture, 0, 255).astype(np.uint8)
 
 
-def descend(observation, picture, colours, x, steps=6):
-    """Gauss and Newton's steps from a state."""
-    moving, seen = len(observation.layout.moving), observation.look([None], [picture], colours)
-    distance = None
-    for k in range(steps):
-        measured = observation.measure(seen, x, distance, k)
-        distance = measured.distance
-        H = measured.H[:, :moving]
-        x = x.copy()
-        x[:moving] += np.linalg.solve(H.T @ H + 1e-3 * np.eye(moving), H.T @ measured.y)
-    return x, measured
-
-
 def test_colours_lead_back_to_the_truth(observation, renderer):
     generator = np.random.default_rng(3)
     background, truth = room(generator), np.array([0.2, 0.9, -0.6])
     picture = painted(renderer.mask(truth), background, generator)
     x = observation.state(truth)
     colours = observation.learn([picture], x, observation.no_colours(), True)
-    found, measured = descend(observation, picture, colours, x + np.r_[0.12, -0.15, 0.1, 0, 0, 0])
+    seen = observation.look([None], [picture], colours)
+    found, measured = descend(observation, seen, x + np.r_[0.12, -0.15, 0.1, 0, 0, 0], steps=6)
     # Segments of 12 to 24 pixels: a quarter of a pixel is a degree.
     np.testing.assert_allclose(observation.positions(found)[0], truth, atol=np.radians(2.5))
     assert measured.distance < 0.8
@@ -92,7 +81,8 @@ def test_what_covers_the_body_pulls_little(observation, renderer):
     covered = background.copy()
     covered[:, columns[at] - 10 : columns[at] + 25] = GREEN
     shown = mask & ~np.all(covered == GREEN, axis=-1)
-    found, _ = descend(observation, painted(shown, covered, generator), colours, x)
+    seen = observation.look([None], [painted(shown, covered, generator)], colours)
+    found, _ = descend(observation, seen, x, steps=6)
     np.testing.assert_allclose(observation.positions(found)[0], truth, atol=np.radians(4.0))
 
 

@@ -10,7 +10,7 @@ from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.tracking.contour_tracker import ContourTracker, TrackingSettings
 from drake_pose.filtering.tracking.match_and_track import Followed, MatchAndTrack
 from drake_pose.search.estimates import TRACKED, View
-from drake_pose.search.kameda.search import PaperSearch
+from drake_pose.search.kameda import PaperSearch
 from drake_pose.search.settings import PaperSearchSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.filtering.measurements.test_contour import pinhole

@@ -9,7 +9,7 @@ from drake_pose.body.model import ArticulatedModel
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.search.estimates import View
 from drake_pose.search.grid.beam.search import BeamSearch
-from drake_pose.search.kameda.search import PaperSearch
+from drake_pose.search.kameda import PaperSearch
 from drake_pose.search.scoring import SampledTree, Scoring
 from drake_pose.search.settings import BeamSearchSettings, PaperSearchSettings
 from drake_pose.silhouette.areas.bending import TreeSurfaces
@@ -76,31 +76,15 @@ def test_the_papers_search_is_that_of_plain_pictures(limb: ArticulatedModel, see
         assert result.J == naive.best[0]
 
 
-@pytest.mark.parametrize("seed", range(1))
-def test_the_wide_search_finds_the_minimum(limb: ArticulatedModel, seed: int) -> None:
+def test_the_beam_search_finds_the_minimum(limb: ArticulatedModel) -> None:
     tree = limb.pose_tree()
     search = BeamSearch(tree, BeamSearchSettings(interval=INTERVAL))
     sampled = search.sampled
-    rng = np.random.default_rng(10 + seed)
+    rng = np.random.default_rng(10)
     target = [v[t] for v, t in zip(sampled.values, random_samples(sampled, rng), strict=True)]
-    exact = search.match([view_of(tree, target)])
-    assert exact.J == 0
+    assert search.match([view_of(tree, target)]).J == 0
     values = [rng.uniform(*tree.value_bounds(i)) for i in range(3)]
     view = view_of(tree, values)
     scoring = Scoring(sampled, [view])
-    everything = itertools.product(*(range(len(v)) for v in sampled.values))
-    samples = np.array(list(everything))
+    samples = np.array(list(itertools.product(*(range(len(v)) for v in sampled.values))))
     assert search.match([view]).J == scoring.J(scoring.sampled.poses(samples), samples).min()
-
-
-def test_grid_poses_are_judged_with_their_skin(limb: ArticulatedModel) -> None:
-    tree = limb.pose_tree()
-    search = BeamSearch(tree, BeamSearchSettings(interval=INTERVAL))
-    rng = np.random.default_rng(4)
-    target = random_samples(search.sampled, rng)
-    view = view_of(tree, [v[t] for v, t in zip(search.sampled.values, target, strict=True)])
-    poses = search.best_poses([view], count=5)
-    assert poses.J[0] == 0
-    for samples, J in zip(poses.samples, poses.J, strict=True):
-        values = [v[t] for v, t in zip(search.sampled.values, samples, strict=True)]
-        assert np.count_nonzero(view_of(tree, values).mask ^ view.mask) == J

@@ -11,7 +11,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.lcm import LcmInterfaceSystem, LcmPublisherSystem, LcmSubscriberSystem
 from pydrake.systems.sensors import ImageToLcmImageArrayT, LcmImageArrayToImages, PixelType
 
-from drake_pose.search.kameda.search import PaperSearch
+from drake_pose.search.kameda import PaperSearch
 from drake_pose.search.settings import PaperSearchSettings
 from drake_pose.silhouette.pictures.label_images import mask_to_label_image
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer

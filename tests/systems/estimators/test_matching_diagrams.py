@@ -12,7 +12,7 @@ from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import SettingsError
 from drake_pose.search.grid.beam.search import BeamSearch
 from drake_pose.search.grid.families.examination import ExaminationSettings
-from drake_pose.search.kameda.search import PaperSearch
+from drake_pose.search.kameda import PaperSearch
 from drake_pose.search.settings import BeamSearchSettings, PaperSearchSettings
 from drake_pose.silhouette.pictures.label_images import mask_to_label_image
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer

@@ -13,7 +13,7 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.filtering.tracking.contour_tracker import TrackingSettings
-from drake_pose.search.kameda.search import PaperSearch
+from drake_pose.search.kameda import PaperSearch
 from drake_pose.search.settings import PaperSearchSettings
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask, mask_to_label_image
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer

@@ -5,7 +5,7 @@ from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import VectorLogSink
 
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.hand.observation import HAND_STATE
+from drake_pose.filtering.hand import HAND_STATE
 from drake_pose.filtering.state import Belief
 from drake_pose.papers.shimada import experiment_filter
 from drake_pose.papers.shimada_motion import make_sequence

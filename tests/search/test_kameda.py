@@ -5,7 +5,7 @@ import pytest
 
 from drake_pose.errors import MaskError, SettingsError
 from drake_pose.search.estimates import View
-from drake_pose.search.kameda.search import PaperSearch
+from drake_pose.search.kameda import PaperSearch
 from drake_pose.search.scoring import Scoring
 from drake_pose.search.settings import PaperSearchSettings
 from drake_pose.silhouette.areas.scoring import draw_mask
@@ -129,29 +129,6 @@ def test_automatic_threshold_doubles_until_a_pose_is_found(sliders):
     assert result.found
     assert result.statistics.outside_limit[0] == pytest.approx(0.126 * 124 * 4)
     assert result.statistics.runs == 1 + 1 + 2
-
-
-def test_leaf_combination_helps_where_leaves_overlap(tmp_path):
-    """Each leaf alone wants the larger blot; together they must share two blots (5.2.1)."""
-    model = load_body(
-        tmp_path,
-        box_link("trunk", 4, 10),
-        joint("fixed_here", "prismatic", "world", "trunk", (0.0, 0.0), axis="0 1 0"),
-        box_link("near", 8, 8, z=-9.0),
-        joint("near_slide", "prismatic", "trunk", "near", (-0.1, 0.1), axis="0 1 0"),
-        box_link("far", 8, 7, z=-9.0),
-        joint("far_slide", "prismatic", "trunk", "far", (-0.1, 0.1), axis="0 1 0"),
-    )
-    settings = PaperSearchSettings(length_interval=0.1, outside_limit=30.0)
-    search = PaperSearch(model.pose_tree(), settings)
-    camera = front_camera()
-    values = [np.array([0.0]), np.array([0.1]), np.array([-0.1])]
-    mask = silhouette(search, camera, values)
-    # The true place of "near" loses a column: its other place scores 56 of its 64 pixels too.
-    mask[:, 63] = False
-    expected = 8
-    result = search.match([View(camera, mask)])
-    assert result.J == expected
 
 
 @pytest.mark.parametrize("K", [1, 5])

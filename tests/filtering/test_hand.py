@@ -6,8 +6,7 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.hand.observation import HAND_STATE, HandObservation, plant_positions
-from drake_pose.filtering.hand.projection import scaled_rotation
+from drake_pose.filtering.hand import HAND_STATE, HandObservation, plant_positions, scaled_rotation
 from drake_pose.filtering.state import Belief
 
 OBSERVATION = HandObservation()

@@ -1,1 +1,0 @@
-"""Shimada's two-finger hand: its projection, and its observation."""

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drake_pose.jobs.estimate.capture_warnings import (
+from drake_pose.jobs.estimate.person import (
     describe_cameras,
     describe_fit,
     describe_rig,
@@ -53,6 +53,6 @@ def test_a_camera_that_moved_or_contradicts():
 
 
 def test_who_fits_badly():
-    assert describe_fit([0.0, 0.9, 0.7], FRAMES) == ()
-    (warning,) = describe_fit([0.0, 0.5, 0.7, 0.3], FRAMES)
+    assert describe_fit([0.0, 0.9, 0.7]) == ()
+    (warning,) = describe_fit([0.0, 0.5, 0.7, 0.3])
     assert "only 50 % of the contours fit" in warning

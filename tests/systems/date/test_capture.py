@@ -19,8 +19,7 @@ from drake_pose.person.date.recognition import recognise
 from drake_pose.person.date.skeleton import LIMBS
 from drake_pose.silhouette.segmentation.background import person_region
 from drake_pose.systems.colour_images import picture_to_colour_image
-from drake_pose.systems.date.capture import build_paper_capture
-from drake_pose.systems.date.pose_estimator import PaperPoseEstimator
+from drake_pose.systems.date.capture import PaperPoseEstimator, build_paper_capture
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
 from tests.person.studio import shared_studio
 

@@ -11,14 +11,16 @@ from drake_pose.camera.models import Camera
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
 
-def stepping(person: ArticulatedModel, phase: float, x: float, y: float) -> np.ndarray:
-    """Positions (nq,) of a person at a phase of a step, standing at (x, y)."""
+def stepping(
+    person: ArticulatedModel, phase: float, x: float = 0.0, y: float = 0.0, knees: float = 30.0
+) -> np.ndarray:
+    """Positions (nq,) of a person at a phase of a step, standing at (x, y), knees bent [deg]."""
     swing = np.sin(phase)
     degrees = {
         "left_thigh_x": -35 * swing,
         "right_thigh_x": 35 * swing,
-        "left_shin_x": 30 + 20 * swing,
-        "right_shin_x": 30 - 20 * swing,
+        "left_shin_x": knees + 20 * swing,
+        "right_shin_x": knees - 20 * swing,
         "left_upper_arm_z": 40,
         "right_upper_arm_z": -40,
         "left_upper_arm_x": 30 * swing,

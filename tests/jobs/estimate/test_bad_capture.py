@@ -86,6 +86,14 @@ def capture(runner: CliRunner, walk: Walk, scene: Path, out: Path) -> list[str]:
     return warnings
 
 
+def assert_refused(runner: CliRunner, walk: Walk, scene: Path, *parts: str) -> None:
+    given = ["--model", str(walk.person.path), "--out", str(scene.parent / "out")]
+    result = runner.invoke(app, ["capture", str(scene), *given])
+    assert result.exit_code == 1
+    for part in parts:
+        assert part in result.stderr
+
+
 def spoil(scene: Path) -> None:
     """All faults at once that cost a camera no more than some frames."""
     masks = scene / "masks"
@@ -151,20 +159,14 @@ def test_nobody_in_view_and_back_elsewhere(walk: Walk, runner: CliRunner, tmp_pa
 def test_too_few_cameras_are_calibrated(walk: Walk, runner: CliRunner, tmp_path: Path) -> None:
     scene = write(tmp_path / "scene", walk, {n: own[:1] for n, own in walk.masks.items()})
     save_cameras(scene / "cameras.yaml", {"camera_1": walk.cameras["camera_1"]})
-    given = ["--model", str(walk.person.path), "--out", str(tmp_path / "out")]
-    result = runner.invoke(app, ["capture", str(scene), *given])
-    assert result.exit_code == 1
-    assert "masks are there of camera_1 alone" in result.stderr
-    assert "cameras.yaml lacks camera_0, camera_2, camera_3" in result.stderr
+    lacks = "cameras.yaml lacks camera_0, camera_2, camera_3"
+    assert_refused(runner, walk, scene, "masks are there of camera_1 alone", lacks)
 
 
 def test_nobody_at_all(walk: Walk, runner: CliRunner, tmp_path: Path) -> None:
     masks = {name: [np.zeros((120, 160), dtype=bool)] * 2 for name in walk.masks}
     scene = write(tmp_path / "scene", walk, masks)
-    given = ["--model", str(walk.person.path), "--out", str(tmp_path / "out")]
-    result = runner.invoke(app, ["capture", str(scene), *given])
-    assert result.exit_code == 1
-    assert "in none of 2 frames two cameras see a person" in result.stderr
+    assert_refused(runner, walk, scene, "in none of 2 frames two cameras see a person")
 
 
 @pytest.mark.slow
@@ -231,11 +233,7 @@ def test_calibration_that_cannot_be_right_is_refused(
     cameras = yaml.safe_load((scene / "cameras.yaml").read_text())
     spoiled(cameras)
     (scene / "cameras.yaml").write_text(yaml.safe_dump(cameras))
-    given = ["--model", str(walk.person.path), "--out", str(tmp_path / "out")]
-    result = runner.invoke(app, ["capture", str(scene), *given])
-    assert result.exit_code == 1
-    for part in parts:
-        assert part in result.stderr
+    assert_refused(runner, walk, scene, *parts)
 
 
 def test_pictures_that_are_no_masks_are_refused(
@@ -246,18 +244,11 @@ def test_pictures_that_are_no_masks_are_refused(
         picture = np.zeros((120, 160, 3), np.uint8)
         picture[:, :, 0] = np.arange(160)
         cv2.imwrite(str(file), picture)
-    given = ["--model", str(walk.person.path), "--out", str(tmp_path / "out")]
-    result = runner.invoke(app, ["capture", str(scene), *given])
-    assert result.exit_code == 1
-    assert "none of 8 masks" in result.stderr
-    assert "two" in result.stderr
+    assert_refused(runner, walk, scene, "none of 8 masks", "two")
 
 
 def test_masks_of_the_background_are_refused(walk: Walk, runner: CliRunner, tmp_path: Path) -> None:
     scene = write(
         tmp_path / "scene", walk, {n: [~m for m in own[:2]] for n, own in walk.masks.items()}
     )
-    given = ["--model", str(walk.person.path), "--out", str(tmp_path / "out")]
-    result = runner.invoke(app, ["capture", str(scene), *given])
-    assert result.exit_code == 1
-    assert "white before a black background" in result.stderr
+    assert_refused(runner, walk, scene, "white before a black background")

@@ -14,7 +14,7 @@ from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.recordings.colour_capture import capture_by_colour
 from drake_pose.person.shape import NOISE
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
-from tests.person.recordings.test_person_capture import stepping
+from tests.person.persons_in_view import stepping
 
 FRAMES = 8
 CLOTHES = np.array([[230, 130, 40], [200, 40, 60], [240, 210, 60], [120, 20, 30], [250, 160, 150]])
@@ -41,7 +41,7 @@ def recording(person, cameras):
         * np.array([0.4, 0.9, 1.0])
         for name in cameras
     }
-    q = np.array([stepping(person, 0.12 * k) for k in range(FRAMES)])
+    q = np.array([stepping(person, 0.12 * k, knees=45.0) for k in range(FRAMES)])
     pictures, masks = [], []
     for pose in q:
         segments = {name: one.segments(pose) for name, one in renderers.items()}

@@ -16,6 +16,7 @@ from drake_pose.person.shape import NOISE, fit_shape, shape_values
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import load_scene
+from tests.person.persons_in_view import stepping
 
 LENGTHS = {
     "trunk_stretch": 0.03,
@@ -40,26 +41,6 @@ def cameras():
     return circle_of_cameras(5, size=(320, 240), face_camera=False)
 
 
-def stepping(person, phase):
-    q = np.zeros(len(person.position_names))
-    degrees = {
-        "left_thigh_x": -35 * np.sin(phase),
-        "right_thigh_x": 35 * np.sin(phase),
-        "left_shin_x": 45 + 20 * np.sin(phase),
-        "right_shin_x": 45 - 20 * np.sin(phase),
-        "left_upper_arm_z": 40,
-        "right_upper_arm_z": -40,
-        "left_upper_arm_x": 30 * np.sin(phase),
-        "right_upper_arm_x": -30 * np.sin(phase),
-        "left_forearm_x": -60 + 30 * np.sin(phase),
-        "right_forearm_x": -60 - 30 * np.sin(phase),
-    }
-    for name, angle in degrees.items():
-        q[person.position_index(name)] = np.radians(angle)
-    q[person.position_index("position_z")] = 1.5
-    return q
-
-
 class TestShape:
     def test_lengths_are_found(self, person, cameras):
         fit = ContourFit(person.pose_tree(), noise=NOISE)
@@ -67,7 +48,7 @@ class TestShape:
         renderers = [LabelRenderer(person, camera) for camera in cameras.values()]
         frames, starts = [], []
         for phase in np.linspace(0.0, 2 * np.pi, 6, endpoint=False):
-            q = stepping(person, phase)
+            q = stepping(person, phase, knees=45.0)
             starts.append(q[order])
             worn = q.copy()
             for name, stretch in LENGTHS.items():
@@ -96,7 +77,7 @@ class TestShape:
         outlines = with_girths(fit.outlines, girths)
         frames, starts = [], []
         for phase in np.linspace(0.0, 2 * np.pi, 4, endpoint=False):
-            values = stepping(person, phase)[order]
+            values = stepping(person, phase, knees=45.0)[order]
             X_WN = fit.kinematics.poses(values)
             starts.append(values)
             masks = [draw_mask(outlines, c.X_CW @ X_WN, c) for c in cameras.values()]

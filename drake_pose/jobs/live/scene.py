@@ -107,12 +107,8 @@ def load_live_scene(path: Path) -> LiveScene:
     return LiveScene(path, cameras, specifications, backgrounds)
 
 
-def take_empty_room(folder: Path, count: int, patience: float = _PATIENCE) -> dict[str, Path]:
+def take_empty_room(folder: Path, count: int) -> dict[str, Path]:
     """Writes each camera's first pictures to its background folder; by camera, where that is.
-
-    Args:
-        folder: has cameras.yaml and sources.yaml.
-        patience: how long it is waited for pictures [s].
 
     Raises:
         SceneError: a camera gives too few pictures, or none needs a background.
@@ -130,7 +126,7 @@ def take_empty_room(folder: Path, count: int, patience: float = _PATIENCE) -> di
                 f"{place}: the background of camera '{name}' exists already; move it away first"
             )
     with ExitStack() as opened:
-        pictures = _take(_open(specifications, opened), count, patience)
+        pictures = _take(_open(specifications, opened), count)
     for name, place in places.items():
         try:
             place.mkdir(parents=True, exist_ok=True)
@@ -142,12 +138,10 @@ def take_empty_room(folder: Path, count: int, patience: float = _PATIENCE) -> di
     return places
 
 
-def _take(
-    sources: Mapping[str, FrameSource], count: int, patience: float
-) -> dict[str, list[Picture]]:
+def _take(sources: Mapping[str, FrameSource], count: int) -> dict[str, list[Picture]]:
     """This many pictures of each camera."""
     pictures: dict[str, list[Picture]] = {name: [] for name in sources}
-    end = time.monotonic() + patience
+    end = time.monotonic() + _PATIENCE
     while slow := [name for name, some in pictures.items() if len(some) < count]:
         for name in slow:
             if (taken := sources[name].read()) is not None:

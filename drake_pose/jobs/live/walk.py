@@ -110,10 +110,10 @@ def recorded_player(
     return Player(model, q, rate_hz)
 
 
-def simulated_player(seed: int = 0) -> Player:
+def simulated_player() -> Player:
     """Plays the known motion of Date's experiment."""
     model = load_model(bundled_model("person"), check=False)
-    return Player(model, make_motion(load_skeleton(model), _SIMULATED_FRAMES, seed).q)
+    return Player(model, make_motion(load_skeleton(model), _SIMULATED_FRAMES, seed=0).q)
 
 
 def key_player() -> Player:

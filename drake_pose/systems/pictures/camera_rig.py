@@ -81,7 +81,8 @@ def build_camera_rig(
     plant = MultibodyPlant(0.0)
     plant.RegisterAsSourceForSceneGraph(scene_graph)
     model.add_to(plant, scene_graph)
-    sensors = add_cameras(builder, scene_graph, cameras, background)
+    # After the model: Drake's renderer refuses an OBJ file without normals when it is parsed.
+    sensors = _add_cameras(builder, scene_graph, cameras, background)
     if true_positions is None:
         entrance = builder.AddNamedSystem("positions", PassThrough(model.plant.num_positions()))
         builder.ExportInput(entrance.get_input_port(), "positions")
@@ -93,17 +94,13 @@ def build_camera_rig(
     return CameraRig(builder.Build(), dict(cameras), sensors)
 
 
-def add_cameras(
+def _add_cameras(
     builder: DiagramBuilder,
     scene_graph: SceneGraph,
     cameras: Mapping[str, PinholeCamera],
-    background: tuple[float, float, float] = (0.55, 0.58, 0.62),
+    background: tuple[float, float, float],
 ) -> dict[str, RgbdSensor]:
-    """Add a renderer and a sensor for each camera, whose images the diagram exports.
-
-    Call it after every model has been added: Drake's renderer refuses an OBJ file without normals
-    at the moment it is parsed. Arguments and errors are those of ``build_camera_rig``.
-    """
+    """Add a renderer and a sensor for each camera, whose images the diagram exports."""
     if not cameras:
         raise CameraError("a rig needs at least one camera")
     parameters = RenderEngineVtkParams(default_clear_color=np.array(background))

@@ -85,10 +85,10 @@ def garden_obstacles() -> NDArray[np.float64]:
     return np.array([(*one.position[:2], one.radius) for one in garden_objects() if one.radius])
 
 
-def draw_garden(meshcat: Meshcat, path: str = "place") -> None:
-    """Draw the place, under a path of Meshcat's tree, below a sky."""
+def draw_garden(meshcat: Meshcat) -> None:
+    """Draw the place, under ``place`` of Meshcat's tree, below a sky."""
     for one in garden_objects():
-        here = f"{path}/{one.name}"
+        here = f"place/{one.name}"
         meshcat.SetObject(here, one.shape, Rgba(*one.colour))
         meshcat.SetTransform(here, RigidTransform(one.position))
     meshcat.SetProperty("/Grid", "visible", False)

@@ -21,6 +21,7 @@ from drake_pose.silhouette.pictures.scenes import load_scene
 from drake_pose.systems.estimators.diagrams import build_recorded_matching, build_simulated_matching
 from drake_pose.systems.estimators.mask_player import MaskPlayer
 from drake_pose.systems.estimators.silhouette_matcher import STATISTICS, SilhouetteMatcher
+from drake_pose.systems.estimators.silhouette_tracker import SilhouetteTracker
 from tests.search.bodies import box_link, front_camera, joint, load_body, swinging_chain
 
 PERIOD = 0.1
@@ -172,14 +173,15 @@ def test_mask_player_plays_frame_by_frame(tmp_path, chain):
         np.testing.assert_array_equal(image == 1, scene.read("front", f"{frame:04d}"))
 
 
-def test_a_matcher_refuses_bad_settings(chain):
+@pytest.mark.parametrize("system", [SilhouetteMatcher, SilhouetteTracker])
+def test_bad_settings_are_refused(chain, system):
     search = search_for(chain)
     with pytest.raises(SettingsError, match="period"):
-        SilhouetteMatcher(search, [front_camera()], 0.0)
+        system(search, [front_camera()], 0.0)
     with pytest.raises(SettingsError, match="cameras"):
-        SilhouetteMatcher(search, [], PERIOD)
+        system(search, [], PERIOD)
     with pytest.raises(SettingsError, match=r"front.*front"):
-        SilhouetteMatcher(search, [front_camera(), front_camera()], PERIOD)
+        system(search, [front_camera(), front_camera()], PERIOD)
 
 
 def test_what_the_answer_is_worth_comes_out(tmp_path):

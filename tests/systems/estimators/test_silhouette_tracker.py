@@ -11,14 +11,13 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import ImageRgba8U
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_pose.errors import SettingsError, UnknownNameError
+from drake_pose.errors import UnknownNameError
 from drake_pose.filtering.tracking.contour_tracker import TrackingSettings
 from drake_pose.search.kameda import PaperSearch
 from drake_pose.search.settings import PaperSearchSettings
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask, mask_to_label_image
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.systems.estimators.diagrams import add_simulated_cameras, build_simulated_matching
-from drake_pose.systems.estimators.silhouette_matcher import SilhouetteMatcher
 from drake_pose.systems.estimators.silhouette_tracker import TRACK, SilhouetteTracker
 from drake_pose.systems.pictures.silhouette_camera import SilhouetteCamera
 from tests.filtering.measurements.test_contour import pinhole
@@ -214,11 +213,3 @@ def test_without_pictures_nothing_is_estimated(body, search):
     tracker.ExecuteForcedEvents(context)
     np.testing.assert_array_equal(tracker.GetOutputPort("track").Eval(context), 0.0)
     assert tracker.GetOutputPort("pose_estimate").Eval(context) is None
-
-
-def test_it_is_a_matcher_and_checks_what_a_matcher_checks(search):
-    assert issubclass(SilhouetteTracker, SilhouetteMatcher)
-    with pytest.raises(SettingsError, match="period"):
-        SilhouetteTracker(search, [front_camera()], 0.0)
-    with pytest.raises(SettingsError, match="cameras"):
-        SilhouetteTracker(search, [], PERIOD)

@@ -46,12 +46,9 @@ _WATCHED, _FEWEST_WATCHED = 30, 10
 
 
 class Moment(NamedTuple):
-    """The middle frame of a motion, for pictures.
+    """The middle frame of a motion: pictures (H, W, 3), `compared` side by side with all estimates.
 
-    Attributes:
-        compared: (H, n W, 3) the input and all estimates, side by side.
-        picture: (H, W, 3) of SHOWN_CAMERA.
-        faces: (130, 80, 3) seen face, nearest template, and the model's head; or none.
+    `faces` (130, 80, 3) are the seen face, nearest template, and the model's head, or none.
     """
 
     compared: Picture

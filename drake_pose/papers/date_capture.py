@@ -119,12 +119,9 @@ def noisy(picture: Picture, generator: np.random.Generator) -> Picture:
 
 
 class Seen(NamedTuple):
-    """What the paper's stages saw in a frame.
+    """What the paper's stages saw in a frame: the person by camera, and features in space.
 
-    Attributes:
-        views: the person by camera on the circle.
-        found: 3-D points of skin, and the features made of them.
-        faces: (130, 80, 3) the face as cut from the picture, and the nearest template; or none.
+    `faces` (130, 80, 3) are the face as cut from the picture, and the nearest template, or none.
     """
 
     views: Mapping[str, PersonView]

@@ -47,10 +47,8 @@ class SyntheticSequence:
 def true_states(r_13: float, phase: Array, yaw_middle: float = 0.0) -> Array:
     """(55, n) a hand that moves, turns, flexes and comes closer and goes away.
 
-    Args:
-        r_13: the length of finger 1's last segment [mm].
-        phase: (6,) shifts of the swings [rad].
-        yaw_middle: about what the fingers swing away from the camera [rad]; negative: towards it.
+    `r_13` is finger 1's last segment [mm], `phase` (6,) shifts of the swings [rad], `yaw_middle`
+    about what fingers swing away from the camera [rad]; negative: towards it.
     """
     frames = np.arange(FRAMES)
     turn = 2 * np.pi * frames / FRAMES

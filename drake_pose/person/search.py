@@ -83,13 +83,10 @@ def headings_of(frame: int) -> list[int]:
 
 
 class PersonSearch:
-    """Searches limbs and persons.
+    """Searches limbs and persons by fits of some rounds from coarse guesses.
 
-    Args:
-        rounds: the steps of a fit from a coarse guess.
-        information: (m,) what is known of values near a guess.
-        held: (m,) values that stay.
-        rest: (m,) values of a person at rest, with the held ones.
+    `information`, `held` and `rest` (m,) are what is known of values near a guess, which of them
+    stay, and those of a person at rest.
     """
 
     def __init__(

@@ -43,12 +43,7 @@ NOISE = Noise(deviation=0.02, correlation=0.15)
 
 @dataclass(frozen=True, eq=False)
 class KnownShape:
-    """A person's lengths and girths.
-
-    Args:
-        lengths: by shape joint [m]; those that are missing are the model's.
-        girths: by part, sides alike: how wide, 1 as the model.
-    """
+    """A person's lengths by shape joint [m], else the model's, and girths by part, else 1."""
 
     lengths: Mapping[str, float]
     girths: Mapping[str, float]

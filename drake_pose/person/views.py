@@ -59,11 +59,7 @@ class KeptEdge:
 
 @dataclass(frozen=True, eq=False)
 class SilhouetteView:
-    """What one camera sees of the person: region (H, W) and points of its edge.
-
-    Args:
-        kept: who else has the edge and can compare contours with it.
-    """
+    """A camera's region (H, W), points of its edge, and who else can compare contours with it."""
 
     region: Mask
     edge: EdgePoints

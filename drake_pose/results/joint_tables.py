@@ -42,9 +42,7 @@ def record_deviations(
 ) -> dict[str, JointRecord]:
     """Each position within 95 % and its limits, determined where that is less than half its range.
 
-    Args:
-        q: (nq,) positions [rad or m]; nothing is known where they are nan.
-        deviations: (nq,) their standard deviations [rad or m]; nan where nobody knows.
+    Positions q (nq,) and deviations (nq,) are in rad or m; nan: nothing is known.
     """
     if not np.isfinite(q).all():
         return {}

@@ -34,12 +34,9 @@ class Curve:
 
 @dataclass(frozen=True)
 class Plot:
-    """A plot over frames, in a picture of WIDTH by HEIGHT.
+    """A plot over frames of WIDTH by HEIGHT: curves, heights of limits, ticks' places and texts.
 
-    Args:
-        bands: paths of areas: what is known, and what is not determined.
-        limits: heights of limits in the picture.
-        x_ticks, y_ticks: places and texts.
+    `bands` are paths of areas: what is known, and what is not determined.
     """
 
     curves: tuple[Curve, ...]

@@ -149,14 +149,7 @@ def summarize(
     complete: bool,
     more: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """The content of summary.json.
-
-    Args:
-        job: from describe_job.
-        records: of the finished frames.
-        complete: whether all is done, all files written.
-        more: what the method and the checks have to say.
-    """
+    """The content of summary.json: a job of describe_job, finished frames, more of the method."""
     ious = [iou for record in records.values() for iou in record.ious.values()]
     errors = [record.E_total for record in records.values() if record.E_total is not None]
     seconds = [record.seconds for record in records.values()]

@@ -46,13 +46,11 @@ _FEWEST = 3
 
 
 class FittedBody(NamedTuple):
-    """What is found out about a body.
+    """What is found out about a body, with what the summary says of it.
 
     Attributes:
         inputs: with the fitted model, and a search that knows the first frame's pose.
-        summary: what the summary says of it.
-        shapes: (h, w, 3) uint8, the corrected shape drawn over the file's in the first frame
-            (Shimada's figure 18); None where the shape was left as it is.
+        shapes: (h, w, 3) uint8, the corrected shape over the file's (Shimada's figure 18), or None.
     """
 
     inputs: Inputs

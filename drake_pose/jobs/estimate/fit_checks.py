@@ -121,11 +121,7 @@ def find_contradiction(
 ) -> Contradiction | None:
     """Cameras that contradict each other; nothing is matched where the poses fit.
 
-    Args:
-        match: finds the best pose of a frame in some views.
-        cameras: those that were matched together.
-        read: the mask (H, W) of a camera's frame.
-        seen: (camera, frame) of the masks that there are.
+    `read` gives the mask (H, W) of a camera's frame, `seen` is (camera, frame) of those there are.
     """
     known = {f: one.E_total for f, one in records.items() if one.E_total is not None}
     limit = _DOUBTFUL if len(cameras) == 2 else BADLY_EXPLAINED

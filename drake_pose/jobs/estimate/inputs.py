@@ -152,8 +152,7 @@ def leave_out_links(
 def select_cameras(scene: Scene, wanted: Sequence[str]) -> tuple[Camera, ...]:
     """The wanted cameras in the scene's order; all that have masks where none is named.
 
-    Raises:
-        UnknownNameError: if there is no such camera.
+    Raises UnknownNameError where there is no such camera.
     """
     for name in wanted:
         if name not in scene.cameras:

@@ -66,8 +66,7 @@ def estimate_frames(
 ) -> Iterator[tuple[str, PoseEstimate]]:
     """The missing frames' poses: those that are known, then those of the matching diagram.
 
-    Raises:
-        SettingsError: a frame has no picture.
+    Raises SettingsError where a frame has no picture.
     """
     yield from ((frame, pose) for frame, pose in inputs.known.items() if frame in missing)
     left = [frame for frame in missing if frame not in inputs.known]

@@ -71,13 +71,9 @@ class FinishedFrame(NamedTuple):
 
 @dataclass(frozen=True)
 class SceneEstimate:
-    """The estimate of a scene: the pose of each frame, and the search's record of it by name.
+    """The estimate of a scene: poses, the search's records, summary.json, folder and warnings.
 
-    Args:
-        position_kinds: "angle" [rad], "length" [m] or "quaternion" for each position of the plant.
-        summary: what summary.json holds.
-        folder: the result folder, if one was written.
-        warnings: what the user should know.
+    Position kinds are "angle" [rad], "length" [m] or "quaternion", in the plant's order.
     """
 
     position_names: tuple[str, ...]

@@ -128,12 +128,7 @@ def register_pose(
     draw: Callable[[Camera, Array], Mask],
     heading_count: int = 36,
 ) -> RegisteredPose:
-    """Makes the templates of a pose.
-
-    Args:
-        q: (nq,) the pose, standing where it will be shown (roughly: only shapes are compared).
-        draw: the mask (H, W) that a camera sees at given positions.
-    """
+    """Makes the templates of a pose q (nq,), about where it is shown; `draw` gives masks."""
     index = int(skeleton.head_angles[0])
     headings = np.arange(heading_count) * 2.0 * np.pi / heading_count
     headings = np.array([math.remainder(heading, 2.0 * math.pi) for heading in headings])

@@ -33,10 +33,7 @@ class SkinColour:
 class Blobs:
     """Patches of skin in one picture, the largest first.
 
-    Args:
-        centroids, areas: (n, 2) and (n,) [pixel].
-        boxes: (n, 4) left, top, width, height [pixel].
-        mask: (H, W) all of them.
+    Centroids (n, 2), areas (n,), boxes (n, 4) of left, top, width, height [pixel]; mask (H, W).
     """
 
     centroids: Array

@@ -124,12 +124,7 @@ def fit_without(
 def camera_motion(
     fit: ContourFit, camera: Camera, edges: Sequence[EdgePoints], poses: Sequence[Array]
 ) -> CameraMotion:
-    """The motion of a camera that explains its silhouettes of given poses best.
-
-    Args:
-        edges: of its region in each frame.
-        poses: (m,) of the pose tree, for each frame; found without this camera.
-    """
+    """The motion of a camera that explains its edges best, by poses (m,) found without it."""
     places = np.array([fit.kinematics.poses(values)[:, :3, 3] for values in poses])
     pairs = list(zip(edges, poses, strict=True))
     found = []
@@ -217,11 +212,9 @@ def find_fault(
     frames: Sequence[FrameView],
     held: Mask | None = None,
 ) -> CameraFault | None:
-    """The camera that contradicts the others most, if one does.
+    """The camera that contradicts the others most, if one does; `held` (m,) values stay.
 
-    Args:
-        frames: some frames, of which those count that three cameras see or more.
-        held: (m,) which values of the pose tree stay, such as lengths.
+    Of the frames those count that three cameras see or more.
     """
     frames = [frame for frame in frames if len(frame.edges) >= 3]
     names = [name for name in cameras if any(name in frame.edges for frame in frames)]

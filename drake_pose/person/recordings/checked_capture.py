@@ -50,11 +50,7 @@ _LEAST_LEFT = 3
 
 @dataclass(frozen=True, eq=False)
 class MovedCamera:
-    """A camera that contradicts the others, from frame `first` (counted from 0) on.
-
-    Args:
-        is_left_out: whether it was left out from there on.
-    """
+    """A camera that contradicts the others from frame `first` (from 0) on; maybe left out."""
 
     fault: CameraFault
     first: int

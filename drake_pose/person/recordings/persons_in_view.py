@@ -185,11 +185,9 @@ class KeptPerson:
 def keep_person(
     cameras: Mapping[str, Camera], masks: Mapping[str, Mask], place: Array | None = None
 ) -> KeptPerson:
-    """A frame's masks of one person only.
+    """A frame's masks of one person only, who was at a place (3,) [m] in the last frame.
 
-    Args:
-        place: (3,) where the person was in the last frame [m]; None: the one whose figures are the
-            largest is taken, of two alike the one nearer to where the cameras look.
+    None: the one whose figures are the largest, of two alike nearer to where the cameras look.
     """
     used = [cameras[name] for name in masks]
     figures = [find_figures(mask) for mask in masks.values()]
@@ -238,9 +236,7 @@ def sort_figures(
 ) -> list[tuple[tuple[Figure, ...], bool]]:
     """For each camera the figures of others, and whether the person and another are one figure.
 
-    Args:
-        figures: of each camera's mask.
-        person: who is followed; None where he is away.
+    The person is None where he is away.
     """
     if person is None:
         return [(tuple(own), False) for own in figures]

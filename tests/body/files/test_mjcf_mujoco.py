@@ -6,6 +6,7 @@ Every case also names one place computed by hand.
 import numpy as np
 import pytest
 import trimesh
+from pydrake.geometry import Role
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_pose.body.model import load_model
@@ -60,33 +61,22 @@ def assert_as_mujoco(path, model):
             np.testing.assert_allclose(rotation, data.xmat[body].reshape(3, 3), atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    "spoil",
-    [
-        lambda text: ("\n \n<?xml version='1.0'?>" + text).encode(),
-        lambda text: text.replace("<worldbody>", "<worldbody><!-- a -- b --->").encode(),
-        lambda text: text.replace('"m"', '"m\xe9"').encode("latin-1"),
-        lambda text: text.replace("model=", 'xsi:schema="s" model=').encode(),
-        lambda text: text.replace('"m"', '"m&nbsp;n & o"').encode(),
-        lambda text: ('<?xml version="1.0" encoding="nonsense"?>' + text).encode(),
-        lambda text: ("\ufeff" + text).encode(),
-        lambda text: ('<?xml version="1.0" encoding="utf-16"?>' + text).encode("utf-16"),
-        lambda text: text.replace("<mujoco ", '<mujoco xmlns="http://example.org" ').encode(),
-        lambda text: text.replace('model="m"', "").encode(),
-    ],
-    ids=[
-        "newline",
-        "comment",
-        "latin1",
-        "prefix",
-        "entity",
-        "encoding",
-        "bom",
-        "utf16",
-        "xmlns",
-        "nameless",
-    ],
-)
+# What a strict reader refuses in a file, or reads otherwise.
+SPOILT = {
+    "newline": lambda text: ("\n \n<?xml version='1.0'?>" + text).encode(),
+    "comment": lambda text: text.replace("<worldbody>", "<worldbody><!-- a -- b --->").encode(),
+    "latin1": lambda text: text.replace('"m"', '"m\xe9"').encode("latin-1"),
+    "prefix": lambda text: text.replace("model=", 'xsi:schema="s" model=').encode(),
+    "entity": lambda text: text.replace('"m"', '"m&nbsp;n & o"').encode(),
+    "encoding": lambda text: ('<?xml version="1.0" encoding="nonsense"?>' + text).encode(),
+    "bom": lambda text: ("\ufeff" + text).encode(),
+    "utf16": lambda text: ('<?xml version="1.0" encoding="utf-16"?>' + text).encode("utf-16"),
+    "xmlns": lambda text: text.replace("<mujoco ", '<mujoco xmlns="http://example.org" ').encode(),
+    "nameless": lambda text: text.replace('model="m"', "").encode(),
+}
+
+
+@pytest.mark.parametrize("spoil", SPOILT.values(), ids=SPOILT)
 def test_what_a_strict_reader_refuses_is_cured_all_the_same(tmp_path, spoil):
     path = file_of(tmp_path)
     path.write_bytes(spoil(path.read_text()))
@@ -177,15 +167,9 @@ def test_geoms_that_are_not_drawn_or_that_collide_do_not_matter(tmp_path):
     assert len(mesh.triangles) == 12 + 1
     np.testing.assert_allclose(np.max(mesh.vertices, axis=0), (1.0, 1.0, 0.1))
     np.testing.assert_allclose(np.min(mesh.vertices, axis=0), (-0.2, -0.1, -0.1))
-    assert model.scene_graph.model_inspector().NumGeometriesWithRole(_proximity()) == 0
+    assert model.scene_graph.model_inspector().NumGeometriesWithRole(Role.kProximity) == 0
     # A body without <inertial> keeps the mass of the geom that is not drawn.
     assert model.plant.GetBodyByName("b").default_mass() == pytest.approx(8.0)
-
-
-def _proximity():
-    from pydrake.geometry import Role
-
-    return Role.kProximity
 
 
 @pytest.mark.parametrize(

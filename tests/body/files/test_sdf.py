@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 import trimesh
+from pydrake.multibody.plant import MultibodyPlant
 
 from drake_pose.body.model import load_model
 from drake_pose.errors import ModelError
-from tests.body.models import BOX, JOINTS_SDF, WELDED_URDF, write
+from tests.body.models import BOX, WELDED_URDF, write
 from tests.body.models import link as urdf_link
 from tests.body.models import urdf as urdf_file
 
@@ -52,12 +53,6 @@ def test_collision_and_what_simulators_add_are_left_out(tmp_path):
     assert model.warnings == ()
     bare = sdf(link("a", "", collision("c.stl")))
     assert "no visual geometry" in refusal(tmp_path, bare, "bare.sdf")
-
-
-def test_limits_that_drake_passes_over(tmp_path):
-    model = load_model(write(tmp_path, JOINTS_SDF, "thing.sdf"), check=False)
-    screw = model.position_index("screw")
-    assert (model.lower[screw], model.upper[screw]) == (-3.0, 3.0)
 
 
 def test_joints_that_couple_others_are_named(tmp_path):
@@ -164,6 +159,8 @@ def test_models_named_by_directives_are_cured_as_if_they_were_read_alone(tmp_pat
     model = load_model(path, package_paths={"mine": tmp_path}, check=False)
     alone = load_model(tmp_path / "joints.xml", check=False)
     assert {"left::upper", "right::upper", "box", "hand"} <= set(model.link_names)
+    assert {"left_a1", "left_a2", "right_a1", "right_a2"} <= set(model.position_names)
+    assert len(model.add_to(MultibodyPlant(0.0))) == 4
     plant, random = model.plant, np.random.default_rng(5)
     q = random.uniform(alone.lower, alone.upper)
     contexts = plant.CreateDefaultContext(), alone.plant.CreateDefaultContext()

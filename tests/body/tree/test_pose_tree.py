@@ -141,6 +141,7 @@ def test_limits_that_drake_does_not_read_are_kept(all_joints):
     names = ("u_qx", "u_qy", "ball_qx", "screw", "back", "turn")
     index = [all_joints.position_index(name) for name in names]
     np.testing.assert_allclose(all_joints.upper[index], [1, 1, np.pi, 3, 2, np.pi])
+    np.testing.assert_allclose(all_joints.lower[index], [-1, -1, -np.pi, -3, -1, -np.pi])
 
 
 def planar_robot(more: str = "") -> str:
@@ -300,18 +301,6 @@ def test_real_arm_agrees_with_drake(shared_data):
     assert largest_difference_from_drake(model, fixed) < 1e-9
     turned = model.pose_tree("link_5", root_position=[0, 0, 0])
     assert largest_difference_from_drake(model, turned) < 1e-9
-
-
-def test_model_directives_are_read(tmp_path):
-    write(tmp_path, WELDED_URDF, "arm.urdf")
-    text = "directives:\n- add_model:\n    name: left\n    file: package://mine/arm.urdf\n"
-    text += "- add_model:\n    name: right\n    file: package://mine/arm.urdf\n"
-    path = write(tmp_path, text, "two.dmd.yaml")
-    model = load_model(path, package_paths={"mine": tmp_path}, check=False)
-    assert model.position_names == ("left_a1", "left_a2", "right_a1", "right_a2")
-    assert "left::upper" in model.link_names
-    plant = MultibodyPlant(0.0)
-    assert len(model.add_to(plant)) == 2
 
 
 def test_bad_arguments_name_what_exists(floating, jointed):

@@ -97,8 +97,10 @@ def test_every_shape_looks_as_drake_draws_it(tmp_path: Path, shape: str) -> None
     model = model_of(tmp_path, [shape, shape])
     for seed in range(3):
         for camera in cameras(np.random.default_rng(seed)):
-            share, _, _ = measure_agreement(model, camera, 8, seed)
+            share, whole, _ = measure_agreement(model, camera, 8, seed)
             assert share <= LARGEST_SHARE, (shape, camera.name, share)
+            # Primitives of 45 or 60 sides instead of VTK's 50 differ in 0.0016 and more.
+            assert shape == "open mesh" or whole <= 3e-4, (shape, camera.name, whole)
 
 
 def test_a_body_of_all_shapes(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from drake_pose.body.surfaces.mesh import TriangleMesh
-from drake_pose.camera.models import Camera, PinholeCamera
+from drake_pose.camera.models import Camera
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_labels, draw_mask
 from tests.silhouette.areas.test_span_kernel import CAMERAS, name_of
@@ -71,33 +71,15 @@ def test_surfaces_that_are_not_closed_hide_nothing_behind_them() -> None:
     assert not outline_from_mesh(TriangleMesh(cube.vertices, turned)).is_closed
 
 
-def test_the_nearer_part_covers_the_other() -> None:
-    camera = PinholeCamera("front", 100, 80, 100.0, 100.0, 49.5, 39.5, np.eye(4))
-    sizes = np.array([[0.2, 0.6, 0.1], [0.6, 0.2, 0.1]])
-    cube = box(1.0)
-    meshes = [TriangleMesh(cube.vertices * size, cube.triangles) for size in sizes]
-    outlines = [outline_from_mesh(mesh) for mesh in meshes]
-    for far, near in ((0, 1), (1, 0)):
-        X_CN = np.tile(np.eye(4), (2, 1, 1))
-        X_CN[far, 2, 3], X_CN[near, 2, 3] = 2.0, 1.5
-        labels = draw_labels(outlines, [7, 9], X_CN, camera)
-        # Where the axis of both goes through the picture, and the nearer part is seen whole.
-        whole = draw_mask([outlines[near]], X_CN[[near]], camera)
-        assert whole[40, 50]
-        assert (labels[whole] == (7, 9)[near]).all()
-        np.testing.assert_array_equal(labels > 0, draw_mask(outlines, X_CN, camera))
-        assert set(np.unique(labels)) == {0, 7, 9}
-
-
 def test_parts_of_one_label_are_one() -> None:
     camera = CAMERAS[1]
     X_CN = np.tile(np.eye(4), (3, 1, 1))
     X_CN[:, :3, :3] = Rotation.random(3, random_state=6).as_matrix()
     X_CN[:, 2, 3] = 2.0, 2.1, 2.2
     outlines = [outline_from_mesh(box(0.6))] * 3
-    labels = draw_labels(outlines, [5, 5, 5], X_CN, camera, EMPTY)
+    labels = draw_labels(outlines, [5, 5, 5], X_CN, camera)
     np.testing.assert_array_equal(labels == 5, draw_mask(outlines, X_CN, camera))
-    assert set(np.unique(labels)) == {5, EMPTY}
+    assert set(np.unique(labels)) == {0, 5}
 
 
 def test_nothing_to_draw() -> None:

@@ -13,7 +13,6 @@ from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
 from drake_pose.silhouette.areas.bending import BendingOutline, TreeSurfaces
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask, prefix_sums, score_bodies, subtract_body
-from drake_pose.silhouette.areas.visibility import require_visible
 from drake_pose.silhouette.bits.bit_kernel import draw_bits
 from drake_pose.silhouette.bits.bit_view import make_bit_view
 from drake_pose.silhouette.contours.direction_cells import divide_outline
@@ -178,12 +177,6 @@ def test_without_a_band_nothing_is_new(tmp_path: Path) -> None:
     assert not surfaces.bends
     values = [np.zeros(1), np.zeros(1), np.zeros(3)]
     assert all(a is b for a, b in zip(surfaces.at(values), surfaces.rigid, strict=True))
-    camera = cameras(np.random.default_rng(3))[0]
-    values, X_CN = pose(model, np.zeros(5), camera)
-    prefixes = np.zeros((0, SIDE, SIDE + 1), dtype=np.int32)
-    found = score_bodies(surfaces.rigid, X_CN[None], camera, prefixes)
-    np.testing.assert_array_equal(found, score_bodies(surfaces.rigid, X_CN[None], camera, prefixes))
-    require_visible(surfaces.at(values), X_CN, camera)
 
 
 def test_wrong_bands_are_refused() -> None:

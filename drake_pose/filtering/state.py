@@ -43,11 +43,7 @@ def factor_of(covariance: Array) -> Array:
 
 
 def factor_and_kind(covariance: Array) -> tuple[Array, bool]:
-    """``factor_of``, and whether the covariance is positive definite.
-
-    Raises:
-        SettingsError: the covariance is indefinite.
-    """
+    """``factor_of``, whose errors it raises, and whether the covariance is positive definite."""
     try:
         return np.asarray(np.linalg.cholesky(covariance), dtype=np.float64), True
     except np.linalg.LinAlgError:

@@ -91,15 +91,10 @@ def test_table_1(hand):
             assert not satisfied({first: base + bound + outward * 1e-6, second: base})
 
 
-def test_a_joint_that_turns_freely_has_no_row(tmp_path):
+def test_a_joint_that_turns_freely_has_no_row_and_a_model_without_any_is_told_of(tmp_path):
     file = tmp_path / "r.urdf"
     file.write_text(FREE_AND_LIMITED)
-    rows = from_model(load_model(file))
-    assert rows.rows == ("bends >= -1", "bends <= 2")
-
-
-def test_a_model_without_limits_is_allowed_and_it_is_said(tmp_path):
-    file = tmp_path / "r.urdf"
+    assert from_model(load_model(file)).rows == ("bends >= -1", "bends <= 2")
     limit = '<limit lower="-1" upper="2" effort="1" velocity="1"/>'
     file.write_text(FREE_AND_LIMITED.replace("revolute", "continuous").replace(limit, ""))
     with pytest.warns(UserWarning, match="no joint has a limit"):
@@ -125,12 +120,9 @@ def test_the_rows_that_clash_are_named_and_no_others():
     assert ">= 0" not in message
 
 
-def test_rows_without_room_are_refused():
+def test_the_inner_point_is_inside_and_no_rows_are_allowed_but_none_without_room():
     with pytest.raises(SettingsError, match="leave no room"):
         inner_point(from_bounds(["a", "b"], [0, 1], [1, 1]))
-
-
-def test_the_inner_point_is_inside_and_no_rows_are_allowed():
     rows = from_bounds(["a", "b"], [0, -np.inf], [1, -5])
     assert (rows.margins(inner_point(rows)) > 0).all()
     np.testing.assert_array_equal(inner_point(from_bounds(["a"], [-np.inf], [np.inf])), [0.0])

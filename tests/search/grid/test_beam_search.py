@@ -162,12 +162,9 @@ def test_settings_out_of_range_are_refused(settings: dict[str, object]) -> None:
         BeamSearchSettings(**settings)
 
 
-def test_a_stage_out_of_range_is_refused() -> None:
+def test_a_stage_out_of_range_and_no_view_are_refused(tmp_path: Path) -> None:
     for arguments in ((0,), (1, -0.1), (1, 0.0, 0)):
         with pytest.raises(SettingsError):
             Stage(*arguments)
-
-
-def test_no_view_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match="at least one view"):
         search(forked_body(tmp_path).pose_tree()).match([])

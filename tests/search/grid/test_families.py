@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drake_pose.search.estimates import JointEstimate, View
+from drake_pose.search.estimates import View
 from drake_pose.search.grid.branch_and_bound.bounded_poses import BoundLimits
 from drake_pose.search.grid.families.search import (
     GridPoseSet,
@@ -173,15 +173,11 @@ def test_two_neighbouring_values_are_still_determined(tmp_path: Path) -> None:
     assert one.determined
     assert (one.low, one.high) == pytest.approx((-0.25, 0.75))
     assert not other.determined or len(three) <= 2
+    assert one.holds(0.75)
+    assert not one.holds(0.76)
 
 
 def test_a_pose_off_the_grid_has_no_samples(tmp_path: Path) -> None:
     sampled = ProblemMaker(swinging_chain(tmp_path, 2).pose_tree(), 0.5).body.sampled
     assert samples_at(sampled, [np.array([0.5]), np.array([-1.0])]) is not None
     assert samples_at(sampled, [np.array([0.5]), np.array([-0.9])]) is None
-
-
-def test_a_report_holds_what_lies_between() -> None:
-    report = JointEstimate("elbow", 0, True, -0.5, 0.5, np.array([0.0]))
-    assert report.holds(0.5)
-    assert not report.holds(0.51)

@@ -61,12 +61,9 @@ def test_what_may_be_seen_sums_to_one() -> None:
     assert np.exp(errors.log_patch(50, 100.0)).sum() == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [({"missing": 0.0}, "missing"), ({"wrong": -1.0}, "wrong"), ({"patch": 0}, "patch")],
-)
-def test_errors_out_of_range_are_refused(values: dict[str, float], message: str) -> None:
-    with pytest.raises(SettingsError, match=message):
+@pytest.mark.parametrize("values", [{"missing": 0.0}, {"wrong": -1.0}, {"patch": 0}])
+def test_errors_out_of_range_are_refused(values: dict[str, float]) -> None:
+    with pytest.raises(SettingsError, match=next(iter(values))):
         EdgeErrors(**values)
 
 

@@ -55,6 +55,7 @@ python_maximum_signature_line_length = 80
 nitpick_ignore_regex = [
     ("py:.*", r"(np|numpy|pydrake|rich|distributed|pathlib|collections|enum|jinja2|numba)\..*"),
     ("py:.*", r"(cv2|scipy|trimesh|asyncio|http|socketserver|PIL|xml|types|typing|aiohttp)\..*"),
+    ("py:.*", r"(functools|matplotlib|socket)\..*"),
     ("py:.*", r"cyclopts\..*"),
     # An argument that is raised; names of types, and what is imported for type checkers alone.
     ("py:exc", "error_type"),

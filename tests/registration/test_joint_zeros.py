@@ -48,7 +48,7 @@ class TestCalibrateJoints:
         camera = looking_at(np.array([1.6, 0.4, 0.5]), MIDDLE, 0.1)
         frames = see(model, body, camera, 8, 4)
         wrong = type(camera)("eye", 640, 480, 612.0, 612.0, 319.5, 239.5, np.eye(4))
-        registered = CameraSearch(body).refine(wrong, frames)
+        registered = CameraSearch(body).register(wrong, frames)
         found = calibrate_joints(body, [registered], [frames], [], focal=True)
         assert found.cameras[0].focal_x == pytest.approx(600.0, rel=0.004)
         assert abs(found.cameras[0].focal_x - 600.0) < 4.0 * 600.0 * found.focal_deviations[0]

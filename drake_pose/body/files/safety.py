@@ -1,5 +1,6 @@
 """Reading a model that nobody has vouched for, first in a child process that may die instead."""
 
+import atexit
 import functools
 import hashlib
 import json
@@ -9,6 +10,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +67,7 @@ class _Checker:
         self._lock = threading.Lock()
         self._process: subprocess.Popen[str] | None = None
         self._owner = 0
+        atexit.register(self._close)
 
     def ask(self, question: dict[str, str]) -> dict[str, Any]:
         """How the child ended: status (None: out of time), its answer or its last remark."""
@@ -79,20 +82,28 @@ class _Checker:
         process = self._running()
         assert process.stdin is not None
         assert process.stdout is not None
+        answer = ""
         try:
             process.stdin.write(line + "\n")
             process.stdin.flush()
             answer = process.stdout.readline()
         except BrokenPipeError:
-            answer = ""
-        if answer:
-            return dict(json.loads(answer))
+            pass
+        finally:
+            if not answer:  # Interrupted, too: the answer must not be taken for the next one.
+                self._close()
+        return dict(json.loads(answer)) if answer else None
+
+    def _close(self) -> None:
+        """Let the process end, which it does when nobody can ask it any more."""
+        if self._process is not None and self._owner == os.getpid():
+            with suppress(BrokenPipeError), self._process:
+                pass
         self._process = None
-        return None
 
     def _running(self) -> subprocess.Popen[str]:
         # A process that was forked must not read its parent's answers.
-        if self._process is None or self._process.poll() is not None or self._owner != os.getpid():
+        if self._process is None or self._owner != os.getpid():
             library_folder = str(Path(__file__).resolve().parents[3])
             paths = [library_folder, os.environ.get("PYTHONPATH", "")]
             search_path = os.pathsep.join(part for part in paths if part)

@@ -1,5 +1,6 @@
 """README, CONTRIBUTING and the pages under tutorials: links, examples, commands, formats."""
 
+import pkgutil
 import re
 import shlex
 from collections.abc import Iterator
@@ -46,6 +47,12 @@ PYTHON = [(name, code) for name, text in SHOWN.items() for code in blocks(text, 
 COMMANDS = [
     words[1:] for text in SHOWN.values() for words in shell_lines(text) if words[0] == "drake-pose"
 ]
+
+
+@each_page
+def test_python_names_in_the_text_exist(page: str) -> None:
+    for name in set(re.findall(r"drake_pose(?:\.[a-z]\w*)+(?:\.[A-Z]\w*)?", TEXTS[page])):
+        assert pkgutil.resolve_name(name) is not None
 
 
 @pytest.mark.slow

@@ -97,11 +97,12 @@ class Coupling:
     mean: Array
     information: Array
 
-    def slope_and_cost(self, own: Array) -> tuple[Array, float]:
-        """(frames, p) half the slope at own unknowns (frames, p), and the cost."""
+    def added_to(self, equations: Equations, own: Array) -> Equations:
+        """Equations with the slope and cost at own unknowns; the curvature is no frame's own."""
         off = self.rows @ own.ravel() - self.mean
-        slope = self.rows.T @ (self.information * off)
-        return slope.reshape(own.shape), float(self.information @ off**2)
+        g = equations.g.copy()
+        g[:, : own.shape[1]] += (self.rows.T @ (self.information * off)).reshape(own.shape)
+        return Equations(equations.H, g, equations.cost + float(self.information @ off**2))
 
     def curvature(self) -> csc_array:
         """(frames p, frames p)."""
@@ -146,22 +147,25 @@ def minimise(
         coupling: what is known of the own unknowns of several frames together.
     """
     settings = settings or StepSettings()
-    if coupling is not None:
-        evaluate = _coupled(evaluate, coupling)
     curvature = None if coupling is None else coupling.curvature()
+
+    def evaluated(own: Array, shared: Array, part: AnnealingStage) -> Equations:
+        found = evaluate(own, shared, part)
+        return found if coupling is None else coupling.added_to(found, own)
+
     lower, upper = limits
     p = own.shape[1]
     own, shared = np.clip(own, lower[:p], upper[:p]), np.clip(shared, lower[p:], upper[p:])
     damping, evaluations, cost = settings.damping, 0, np.inf
     for part in rounds:
-        equations = evaluate(own, shared, part)
+        equations = evaluated(own, shared, part)
         evaluations, cost = evaluations + 1, equations.cost
         for _ in range(part.iterations):
             trial = _stepped(equations, own, shared, limits, damping, settings, curvature)
             if part.iterations == 1:
                 own, shared = trial
                 break
-            tried = evaluate(*trial, part)
+            tried = evaluated(*trial, part)
             evaluations += 1
             if tried.cost < cost:
                 gain = 1.0 - tried.cost / cost
@@ -175,21 +179,6 @@ def minimise(
                     break
         damping = min(damping, _NEXT_DAMPING)
     return Minimum(own, shared, float(cost), evaluations)
-
-
-def _coupled(
-    evaluate: Callable[[Array, Array, AnnealingStage], Equations], coupling: Coupling
-) -> Callable[[Array, Array, AnnealingStage], Equations]:
-    """The same equations with a coupling's slope and cost; its curvature is no frame's own."""
-
-    def evaluate_coupled(own: Array, shared: Array, step: AnnealingStage) -> Equations:
-        found = evaluate(own, shared, step)
-        slope, cost = coupling.slope_and_cost(own)
-        g = found.g.copy()
-        g[:, : own.shape[1]] += slope
-        return Equations(found.H, g, found.cost + cost)
-
-    return evaluate_coupled
 
 
 def _stepped(
@@ -233,20 +222,25 @@ def _solved_together(
     whole = csc_array(block_diag(list(H[:, :p, :p])) + curvature)
     diagonal = whole.diagonal()
     damped = shares[0] * diagonal + shares[1] * diagonal.mean() + 1e-9
-    ends = np.tile(lower[:p], frames), np.tile(upper[:p], frames)
-    free = _free(own.ravel(), g[:, :p].ravel(), *ends)
-    loose = _free(shared, g[:, p:].sum(axis=0), lower[p:], upper[p:])
+    slopes = g[:, :p].ravel(), g[:, p:].sum(axis=0)
+    free = _is_free(own, slopes[0].reshape(frames, p), lower[:p], upper[:p]).ravel()
+    loose = _is_free(shared, slopes[1], lower[p:], upper[p:])
     mixed = H[:, :p, p:].reshape(frames * p, -1)[np.ix_(free, loose)]
     factors = splu(csc_array((whole + diags_array(damped))[free][:, free]))
-    solved = factors.solve(np.column_stack([-g[:, :p].ravel()[free], mixed]))
+    solved = factors.solve(np.column_stack([-slopes[0][free], mixed]))
     S = H[:, p:, p:].sum(axis=0)[np.ix_(loose, loose)]
-    if len(loose):
-        S[np.diag_indices(len(loose))] += shares[0] * np.diag(S) + shares[1] * np.diag(S).mean()
+    if len(S):
+        S[np.diag_indices(len(S))] += shares[0] * np.diag(S) + shares[1] * np.diag(S).mean()
     change, steps = np.zeros(len(shared)), np.zeros(frames * p)
-    slope = g[:, p:].sum(axis=0)[loose] + mixed.T @ solved[:, 0]
+    slope = slopes[1][loose] + mixed.T @ solved[:, 0]
     change[loose] = np.linalg.solve(S - mixed.T @ solved[:, 1:], -slope)
     steps[free] = solved[:, 0] - solved[:, 1:] @ change[loose]
     return steps.reshape(frames, p), change
+
+
+def _is_free(x: Array, g: Array, lower: Array, upper: Array) -> NDArray[np.bool_]:
+    """Whether unknowns do not stand at a limit that they would leave."""
+    return np.asarray(~((x <= lower) & (g > 0.0) | (x >= upper) & (g < 0.0)))
 
 
 @compiled
@@ -262,97 +256,75 @@ def _solved(
     """Damped steps of own (frames, p) and shared unknowns (q,), none of them out of a limit."""
     frames, p = own.shape
     q = len(shared)
-    S, s = np.zeros((q, q)), np.zeros(q)
+    S = np.zeros((q, q + 1))
     for frame in range(frames):
         for k in range(q):
-            s[k] += g[frame, p + k]
+            S[k, q] -= g[frame, p + k]
             for column in range(q):
                 S[k, column] += H[frame, p + k, p + column]
-    loose = _free(shared, s, lower[p:], upper[p:])
-    _damp(S, shares)
-    steps = np.zeros((frames, p))
-    gains = np.zeros((frames, p, q))
-    for frame in range(frames):
-        free = _free(own[frame], g[frame, :p], lower[:p], upper[:p])
-        block, right = np.empty((len(free), len(free))), np.empty((len(free), q + 1))
-        for row in range(len(free)):
-            right[row, 0] = -g[frame, free[row]]
-            for column in range(q):
-                right[row, column + 1] = H[frame, free[row], p + column]
-            for column in range(len(free)):
-                block[row, column] = H[frame, free[row], free[column]]
-        _damp(block, shares)
-        solve_in_place(block, right)
-        for row in range(len(free)):
-            steps[frame, free[row]] = right[row, 0]
-            for k in range(q):
-                gains[frame, free[row], k] = right[row, k + 1]
-                s[k] += H[frame, p + k, free[row]] * right[row, 0]
-                for column in range(q):
-                    S[k, column] -= H[frame, p + k, free[row]] * right[row, column + 1]
-    block, right = np.empty((len(loose), len(loose))), np.empty((len(loose), 1))
-    for row in range(len(loose)):
-        right[row, 0] = -s[loose[row]]
-        for column in range(len(loose)):
-            block[row, column] = S[loose[row], loose[column]]
-    solve_in_place(block, right)
-    change = np.zeros(q)
-    for k in range(len(loose)):
-        change[loose[k]] = right[k, 0]
+    is_held = _damp(S, shared, lower[p:], upper[p:], shares)
+    # Of each frame its own unknowns' equations, those of the shared ones beside them: [A C -g].
+    M = np.empty((frames, p, p + q + 1))
     for frame in range(frames):
         for row in range(p):
+            for column in range(p + q):
+                M[frame, row, column] = H[frame, row, column]
+            M[frame, row, p + q] = -g[frame, row]
+        _damp(M[frame], own[frame], lower[:p], upper[:p], shares)
+        eliminate(M[frame])
+        for k in range(q):
+            for row in range(p):
+                for column in range(0 if is_held[k] else q + 1):
+                    S[k, column] -= H[frame, p + k, row] * M[frame, row, p + column]
+    eliminate(S)
+    steps = np.empty((frames, p))
+    for frame in range(frames):
+        for row in range(p):
+            steps[frame, row] = M[frame, row, p + q]
             for k in range(q):
-                steps[frame, row] -= gains[frame, row, k] * change[k]
-    return steps, change
+                steps[frame, row] -= M[frame, row, p + k] * S[k, q]
+    return steps, S[:, q].copy()
 
 
 @compiled
-def solve_in_place(A: Array, B: Array) -> None:
-    """Puts A^-1 B (n, m) in place of B, by elimination with pivots; A (n, n) is lost.
+def _damp(
+    M: Array, x: Array, lower: Array, upper: Array, shares: tuple[float, float]
+) -> NDArray[np.bool_]:
+    """Adds to the diagonal of [H ... -g] shares of each element and of the mean, in place.
+
+    Returns which unknowns stand at a limit that they would leave: they are to be 0 instead.
+    """
+    n, last = len(x), M.shape[1] - 1
+    is_held = np.empty(n, dtype=np.bool_)
+    total, free = 0.0, 0
+    for k in range(n):
+        leaves_below, leaves_above = M[k, last] < 0.0, M[k, last] > 0.0
+        is_held[k] = (x[k] <= lower[k] and leaves_below) or (x[k] >= upper[k] and leaves_above)
+        if not is_held[k]:
+            total += M[k, k]
+            free += 1
+    for k in range(n):
+        if is_held[k]:
+            M[k] = 0.0
+            M[k, k] = 1.0
+        else:
+            M[k, k] += shares[0] * M[k, k] + shares[1] * total / free + 1e-9
+    return is_held
+
+
+@compiled
+def eliminate(M: Array) -> None:
+    """Makes [A B] (n, n + k) into [1 A^-1 B], A positive definite: Gauss and Jordan's elimination.
 
     LAPACK gains nothing on matrices this small, and takes long to be compiled in.
     """
-    n = len(A)
+    n, columns = M.shape
     for k in range(n):
-        pivot = k
-        for row in range(k + 1, n):
-            if abs(A[row, k]) > abs(A[pivot, k]):
-                pivot = row
-        if pivot != k:
-            for column in range(n):
-                A[k, column], A[pivot, column] = A[pivot, column], A[k, column]
-            for column in range(B.shape[1]):
-                B[k, column], B[pivot, column] = B[pivot, column], B[k, column]
-        for row in range(k + 1, n):
-            share = A[row, k] / A[k, k]
-            for column in range(k + 1, n):
-                A[row, column] -= share * A[k, column]
-            for column in range(B.shape[1]):
-                B[row, column] -= share * B[k, column]
-    for k in range(n - 1, -1, -1):
-        for column in range(B.shape[1]):
-            for row in range(k + 1, n):
-                B[k, column] -= A[k, row] * B[row, column]
-            B[k, column] /= A[k, k]
-
-
-@compiled
-def _free(x: Array, g: Array, lower: Array, upper: Array) -> NDArray[np.int64]:
-    """The unknowns but those that stand at a limit and would leave it."""
-    indices, count = np.empty(len(x), np.int64), 0
-    for k in range(len(x)):
-        if not ((x[k] <= lower[k] and g[k] > 0.0) or (x[k] >= upper[k] and g[k] < 0.0)):
-            indices[count] = k
-            count += 1
-    return indices[:count]
-
-
-@compiled
-def _damp(H: Array, shares: tuple[float, float]) -> None:
-    """Adds a share of each element of the diagonal, and a share of its mean, to the diagonal."""
-    if len(H):
-        even = 0.0
-        for k in range(len(H)):
-            even += shares[1] * H[k, k] / len(H)
-        for k in range(len(H)):
-            H[k, k] += shares[0] * H[k, k] + even + 1e-9
+        share = 1.0 / M[k, k]
+        for column in range(k, columns):
+            M[k, column] *= share
+        for row in range(n):
+            share = M[row, k]
+            if row != k and share != 0.0:
+                for column in range(k, columns):
+                    M[row, column] -= share * M[k, column]

@@ -15,7 +15,7 @@ import numpy as np
 
 from drake_pose.compiled import compiled
 from drake_pose.errors import SettingsError
-from drake_pose.fit.levenberg_marquardt import solve_in_place
+from drake_pose.fit.levenberg_marquardt import eliminate
 from drake_pose.search.estimates import View
 from drake_pose.search.raster_fit.body import Freedom, RefinementBody, place_surfaces
 from drake_pose.search.raster_fit.kernel import (
@@ -321,14 +321,14 @@ def limited_step(
     active = np.arange(count)
     while len(active) > 0:
         step[:] = 0.0
-        block, right = np.empty((len(active), len(active))), np.empty((len(active), 1))
+        block = np.empty((len(active), len(active) + 1))
         for i in range(len(active)):
-            right[i, 0] = -g[active[i]]
+            block[i, -1] = -g[active[i]]
             for j in range(len(active)):
                 block[i, j] = H[active[i], active[j]]
             block[i, i] += damping + _RELATIVE_DAMPING * block[i, i]
-        solve_in_place(block, right)
-        step[active] = right[:, 0]
+        eliminate(block)
+        step[active] = block[:, -1]
         step *= min(1.0, longest / max(np.abs(step).max(), 1e-300))
         leaving = (step < 0.0) & (current <= lower + _AT_LIMIT)
         leaving |= (step > 0.0) & (current >= upper - _AT_LIMIT)

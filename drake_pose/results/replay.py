@@ -15,7 +15,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.camera.models import Camera, PinholeCamera
-from drake_pose.systems.bodies.posed_geometry import pose_plant
+from drake_pose.systems.bodies.posed_geometry import add_posed_plant
 from drake_pose.systems.bodies.skin import add_meshcat_skin
 
 _BODY_PATH = "visualizer"
@@ -48,11 +48,8 @@ def make_replay(
         logger.setLevel(level)
     builder = DiagramBuilder()
     scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
-    plant = MultibodyPlant(0.0)
-    plant.RegisterAsSourceForSceneGraph(scene_graph)
-    model.add_to(plant, scene_graph)
     source = builder.AddNamedSystem("positions", ConstantVectorSource(positions[0]))
-    pose_plant(builder, scene_graph, plant, source.get_output_port(), "geometry_pose")
+    plant = add_posed_plant(builder, scene_graph, model, source.get_output_port(), "geometry_pose")
     MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
     add_meshcat_skin(
         builder, meshcat, model, source.get_output_port(), "body", prefix=_BODY_PATH, recorded=True

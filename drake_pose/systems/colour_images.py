@@ -5,10 +5,17 @@ A camera that has nothing to show gives an image of no pixels: a port of images 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection, Sequence
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.systems.framework import Context
 from pydrake.systems.sensors import ImageRgba8U
+
+from drake_pose.camera.models import Camera
+from drake_pose.errors import UnknownNameError
+from drake_pose.systems.ports import PortedSystem
 
 Picture = NDArray[np.uint8]
 
@@ -33,3 +40,42 @@ def colour_image_to_picture(image: ImageRgba8U) -> Picture:
     if not image.size():
         return np.empty((0, 0, 3), dtype=np.uint8)
     return np.asarray(cv2.cvtColor(image.data, cv2.COLOR_RGBA2RGB))
+
+
+class ColourPorts:
+    """The input ports for colour images of some of a system's cameras.
+
+    Args:
+        wanted: the names of these cameras; UnknownNameError: one is no camera's.
+        port: the name of a camera's port.
+    """
+
+    def __init__(
+        self,
+        system: PortedSystem,
+        cameras: Sequence[Camera],
+        wanted: Collection[str],
+        port: Callable[[Camera], str],
+    ) -> None:
+        known = {camera.name: camera for camera in cameras}
+        for name in wanted:
+            if name not in known:
+                raise UnknownNameError("camera", name, known, "color_cameras")
+        self._system = system
+        self._ports = {name: port(one) for name, one in known.items() if name in wanted}
+        for name, own in self._ports.items():
+            system.add_input(own, ImageRgba8U(known[name].width, known[name].height))
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The names of the cameras that have a port."""
+        return tuple(self._ports)
+
+    def pictures(self, context: Context) -> dict[str, Picture]:
+        """The pictures (H, W, 4) that are there, by camera."""
+        images = {name: self._system.given(context, port) for name, port in self._ports.items()}
+        return {
+            name: np.array(image.data)
+            for name, image in images.items()
+            if image is not None and image.size()
+        }

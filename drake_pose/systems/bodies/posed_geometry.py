@@ -4,19 +4,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DiagramBuilder,
-    LeafSystem,
-    OutputPort,
-)
+from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from drake_pose.body.parsed_model import ParsedModel
+from drake_pose.systems.ports import PortedSystem
 
 
-class KnownPositions(LeafSystem):
+class KnownPositions(PortedSystem):
     """Passes positions on, and others instead while they are not known.
 
     .. pydrake_system::
@@ -33,29 +28,32 @@ class KnownPositions(LeafSystem):
 
     def __init__(self, otherwise: NDArray[np.float64]) -> None:
         super().__init__()
-        self._otherwise = otherwise
-        self._input = self.DeclareVectorInputPort("positions", len(otherwise))
-        self.DeclareVectorOutputPort("known_positions", len(otherwise), self._calc)
+        given = self.add_input("positions", len(otherwise))
 
-    def _calc(self, context: Context, output: BasicVector) -> None:
-        q = self._input.Eval(context)
-        output.SetFromVector(q if np.isfinite(q).all() else self._otherwise)
+        def known(context: Context) -> NDArray[np.float64]:
+            q = given.Eval(context)
+            return q if np.isfinite(q).all() else otherwise
+
+        self.add_output("known_positions", len(otherwise), known)
 
 
-def pose_plant(
+def add_posed_plant(
     builder: DiagramBuilder,
     scene_graph: SceneGraph,
-    plant: MultibodyPlant,
+    model: ParsedModel,
     positions: OutputPort,
     name: str,
-) -> None:
-    """Finalize a plant, and let positions (nq,) in its own order pose its geometry.
+    prefix: str = "",
+) -> MultibodyPlant:
+    """Add a body that stands as positions (nq,) in its own order say; its plant, finalized.
 
     Args:
-        scene_graph: where the plant is registered as a source.
-        plant: not finalized yet.
-        name: of the system in between.
+        name: of the system between positions and SceneGraph.
+        prefix: of the body's name in the SceneGraph.
     """
+    plant = MultibodyPlant(0.0)
+    plant.RegisterAsSourceForSceneGraph(scene_graph)
+    model.add_to(plant, scene_graph, prefix=prefix)
     plant.Finalize()
     poser = builder.AddNamedSystem(
         name, MultibodyPositionToGeometryPose(plant, input_multibody_state=False)
@@ -64,6 +62,7 @@ def pose_plant(
     builder.Connect(
         poser.get_output_port(), scene_graph.get_source_pose_port(plant.get_source_id())
     )
+    return plant
 
 
 def add_avatar(
@@ -82,11 +81,8 @@ def add_avatar(
         period: time between two drawings [s].
     """
     scene_graph = builder.AddNamedSystem("avatar_scene_graph", SceneGraph())
-    plant = MultibodyPlant(0.0)
-    plant.RegisterAsSourceForSceneGraph(scene_graph)
-    model.add_to(plant, scene_graph)
     known = builder.AddNamedSystem("avatar_positions", KnownPositions(model.default_positions))
     builder.Connect(positions, known.get_input_port())
-    pose_plant(builder, scene_graph, plant, known.get_output_port(), "avatar_pose")
+    add_posed_plant(builder, scene_graph, model, known.get_output_port(), "avatar_pose")
     parameters = MeshcatVisualizerParams(prefix=prefix, publish_period=period)
     MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, parameters)

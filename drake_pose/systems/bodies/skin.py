@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 
 import numpy as np
-from pydrake.common.value import AbstractValue
 from pydrake.geometry import GeometryConfigurationVector, Meshcat, Rgba, SceneGraph
 from pydrake.systems.framework import (
     Context,
@@ -16,12 +15,13 @@ from pydrake.systems.framework import (
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.body.tree.node_skin import ModelSkin
 from drake_pose.silhouette.pictures.drake_skin import DeformableSkin
+from drake_pose.systems.ports import PortedSystem
 
 MESHCAT_PERIOD = 1.0 / 64.0
 """Time between two drawings [s]: that of Drake's MeshcatVisualizer."""
 
 
-class SkinPoser(LeafSystem):
+class SkinPoser(PortedSystem):
     """Bends a skin that is registered with a SceneGraph, where sensors see it.
 
     .. pydrake_system::
@@ -33,18 +33,12 @@ class SkinPoser(LeafSystem):
 
     def __init__(self, deformable: DeformableSkin, position_count: int) -> None:
         super().__init__()
-        self._deformable = deformable
-        self._positions = self.DeclareVectorInputPort("positions", position_count)
-        self.DeclareAbstractOutputPort(
-            "geometry_configuration",
-            lambda: AbstractValue.Make(GeometryConfigurationVector()),
-            self._calc_configuration,
-            {self._positions.ticket()},
-        )
+        positions = self.add_input("positions", position_count)
 
-    def _calc_configuration(self, context: Context, output: AbstractValue) -> None:
-        vertices = self._deformable.skin.vertices(self._positions.Eval(context))
-        output.set_value(self._deformable.configuration(vertices))
+        def configure(context: Context) -> GeometryConfigurationVector:
+            return deformable.configuration(deformable.skin.vertices(positions.Eval(context)))
+
+        self.add_output("geometry_configuration", GeometryConfigurationVector(), configure)
 
 
 class MeshcatSkin(LeafSystem):

@@ -3,13 +3,12 @@
 from collections.abc import Collection
 
 import numpy as np
-from pydrake.common.value import AbstractValue
+from numpy.typing import NDArray
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
+from pydrake.systems.framework import Context
 from pydrake.systems.sensors import ImageLabel16I
 
 from drake_pose.camera.models import PinholeCamera
-from drake_pose.errors import SettingsError
 from drake_pose.registration.online_registration import (
     CameraStatus,
     OnlineRegistration,
@@ -18,12 +17,15 @@ from drake_pose.registration.online_registration import (
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import RegisteredCamera
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
+from drake_pose.systems.ports import BeliefSystem, require_period
+
+Array = NDArray[np.float64]
 
 REGISTRATION = ("keyframes", "contradictions", "moves", "mean_iou")
 """What the elements of the output ``registration`` of CameraRegistration are."""
 
 
-class CameraRegistration(LeafSystem):
+class CameraRegistration(BeliefSystem[OnlineState]):
     """Finds where a camera stands from a body at measured positions, and whether it was moved.
 
     .. pydrake_system::
@@ -68,77 +70,60 @@ class CameraRegistration(LeafSystem):
         labels: Collection[int] | None = None,
     ) -> None:
         super().__init__()
-        if not period > 0:
-            raise SettingsError(f"the registration's period must be positive, not {period}")
+        require_period("registration", period)
         self._registration = registration
         self._tree, camera = registration.body.tree, registration.camera
         self._labels = None if labels is None else frozenset(labels)
-        image = ImageLabel16I(camera.width, camera.height)
-        self._image = self.DeclareAbstractInputPort("label_image", AbstractValue.Make(image))
-        self._positions = self.DeclareVectorInputPort(
-            "measured_positions", len(self._tree.model.position_names)
-        )
-        self._state = self.DeclareAbstractState(AbstractValue.Make(OnlineState()))
-        ticket = {self.abstract_state_ticket(self._state)}
-        self.DeclareAbstractOutputPort(
-            "X_WC", lambda: AbstractValue.Make(RigidTransform()), self._calc_X_WC, ticket
-        )
-        self.DeclareVectorOutputPort("covariance", 36, self._calc_covariance, ticket)
-        self.DeclareVectorOutputPort("status", 1, self._calc_status, ticket)
-        self.DeclareVectorOutputPort(
-            "registration", len(REGISTRATION), self._calc_registration, ticket
-        )
-        self.DeclarePeriodicUnrestrictedUpdateEvent(period, offset, self._update)
+        self.add_input("label_image", ImageLabel16I(camera.width, camera.height))
+        self.add_input("measured_positions", len(self._tree.model.position_names))
+        self.keep_belief(OnlineState(), period, offset)
+        self.show("X_WC", RigidTransform(), _X_WC)
+        self.show("covariance", 36, self._covariance)
+        self.show("status", 1, lambda known: [float(registration.status(known))])
+        self.show("registration", len(REGISTRATION), _numbers)
 
     def online_state(self, context: Context) -> OnlineState:
         """What is known in a context."""
-        state: OnlineState = context.get_abstract_state(int(self._state)).get_value()
-        return state
+        return self.belief(context)
 
     def registered_camera(self, context: Context) -> PinholeCamera | None:
         """The camera with its pose, for searches and estimators; None unless the status is 1."""
-        believed = self._believed(context)
+        believed = self._believed(self.belief(context))
         return None if believed is None else believed.camera
 
-    def _believed(self, context: Context) -> RegisteredCamera | None:
-        """The camera as it was found; None unless the status is 1."""
-        state = self.online_state(context)
-        is_believed = self._registration.status(state) is CameraStatus.REGISTERED
-        return state.registered if is_believed else None
-
-    def _update(self, context: Context, state: State) -> EventStatus:
-        if not self._image.HasValue(context):
-            return EventStatus.DidNothing()
-        q = np.array(self._positions.Eval(context))
+    def next_belief(self, context: Context, last: OnlineState) -> OnlineState:
+        """What is known with one frame more."""
+        image = self.given(context, "label_image")
+        if image is None:
+            return last
+        q = np.array(self.GetInputPort("measured_positions").Eval(context))
         if not np.isfinite(q).all():
-            return EventStatus.DidNothing()
+            return last
         values = np.concatenate(self._tree.values_from_positions(q))
-        mask = label_image_to_mask(self._image.Eval(context), self._labels)
-        frame = PosedFrame(f"{context.get_time():g} s", values, mask)
-        known = self._registration.next(self.online_state(context), frame)
-        state.get_mutable_abstract_state(int(self._state)).set_value(known)
-        return EventStatus.Succeeded()
+        mask = label_image_to_mask(image, self._labels)
+        return self._registration.next(last, PosedFrame(f"{context.get_time():g} s", values, mask))
 
-    def _calc_X_WC(self, context: Context, output: AbstractValue) -> None:
-        registered = self.online_state(context).registered
-        if registered is None:
-            output.set_value(RigidTransform(np.full(3, np.nan)))
-        else:
-            output.set_value(RigidTransform(registered.camera.X_WC))
+    def _believed(self, known: OnlineState) -> RegisteredCamera | None:
+        """The camera as it was found; None unless the status is 1."""
+        is_believed = self._registration.status(known) is CameraStatus.REGISTERED
+        return known.registered if is_believed else None
 
-    def _calc_covariance(self, context: Context, output: BasicVector) -> None:
-        believed = self._believed(context)
+    def _covariance(self, known: OnlineState) -> Array:
+        believed = self._believed(known)
         covariance = np.diag(np.full(6, np.inf)) if believed is None else believed.covariance
-        output.SetFromVector(covariance.ravel())
+        return covariance.ravel()
 
-    def _calc_status(self, context: Context, output: BasicVector) -> None:
-        status = self._registration.status(self.online_state(context))
-        output.SetFromVector(np.array([float(status)]))
 
-    def _calc_registration(self, context: Context, output: BasicVector) -> None:
-        state = self.online_state(context)
-        iou = np.nan
-        if state.registered is not None:
-            iou = float(np.mean([frame.iou for frame in state.registered.frames]))
-        counts = [len(state.keyframes), state.contradictions, state.moves]
-        output.SetFromVector(np.array([*counts, iou], dtype=float))
+def _X_WC(known: OnlineState) -> RigidTransform:
+    """The camera's pose as it was last found."""
+    if known.registered is None:
+        return RigidTransform(np.full(3, np.nan))
+    return RigidTransform(known.registered.camera.X_WC)
+
+
+def _numbers(known: OnlineState) -> list[float]:
+    """REGISTRATION."""
+    iou = np.nan
+    if known.registered is not None:
+        iou = float(np.mean([frame.iou for frame in known.registered.frames]))
+    return [len(known.keyframes), known.contradictions, known.moves, iou]

@@ -1,14 +1,11 @@
 """Ready diagrams: a simulated camera or recorded masks, the matcher, the estimated body, logs."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from pydrake.geometry import (
-    ColorRenderCamera,
-    DepthRenderCamera,
     IllustrationProperties,
-    MakeRenderEngineVtk,
     Meshcat,
     MeshcatVisualizer,
     RenderEngineVtkParams,
@@ -17,32 +14,29 @@ from pydrake.geometry import (
     RoleAssign,
     SceneGraph,
 )
-from pydrake.math import RigidTransform
-from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, LeafSystem, OutputPort
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import LogVectorOutput, TrajectorySource, VectorLogSink
 from pydrake.systems.sensors import RgbdSensor
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.body.tree.tree_builder import build_pose_tree
-from drake_pose.camera.drake import camera_to_drake
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.filtering.tracking.contour_tracker import TrackingSettings
 from drake_pose.registration.online_registration import OnlineRegistration
 from drake_pose.search.estimates import PoseEstimate
 from drake_pose.search.scoring import PoseSearch
 from drake_pose.silhouette.pictures.scenes import Scene
-from drake_pose.systems.bodies.posed_geometry import pose_plant
+from drake_pose.systems.bodies.posed_geometry import add_posed_plant
 from drake_pose.systems.bodies.skin import add_meshcat_skin, add_skin
 from drake_pose.systems.estimators.camera_registration import CameraRegistration
 from drake_pose.systems.estimators.mask_player import MaskPlayer
 from drake_pose.systems.estimators.silhouette_matcher import SilhouetteMatcher, camera_port
 from drake_pose.systems.estimators.silhouette_tracker import SilhouetteTracker
+from drake_pose.systems.pictures.camera_rig import add_sensors
 
 ESTIMATE_COLOUR = Rgba(0.0, 0.45, 0.70, 0.6)
-_RENDERER = "label_renderer"
 
 
 @dataclass(frozen=True)
@@ -93,36 +87,19 @@ def build_recorded_matching(
     Returns:
         The diagram; frame k is matched at time k times the player's period.
     """
+    player = MaskPlayer(scene, cameras, frames, positions=starts, root_positions=root_positions)
+    matcher = _matcher(search, cameras, player.period, tracking, player.color_cameras)
     builder = DiagramBuilder()
-    played = MaskPlayer(scene, cameras, frames, positions=starts)
-    player = builder.AddNamedSystem("mask_player", played)
-    matcher = builder.AddNamedSystem(
-        "silhouette_matcher",
-        _make_matcher(search, cameras, player.period, tracking, player.color_cameras),
-    )
-    ports = [camera_port("label_image", camera, cameras) for camera in cameras]
-    if tracking is not None:
-        seen = [camera for camera in cameras if camera.name in player.color_cameras]
-        ports += [camera_port("color_image", camera, cameras) for camera in seen]
-        ports += ["measured_positions"] if starts else []
-    for port in ports:
-        builder.Connect(player.GetOutputPort(port), matcher.GetInputPort(port))
-    if root_positions is not None:
-        values = np.array([root_positions[frame] for frame in player.frames], dtype=float)
-        # A hold needs two breaks; the last position is held on behind the last frame.
-        values = np.vstack([values, values[-1:]])
-        # A frame's position must stand just before its match is computed, in spite of rounding.
-        breaks = player.period * (np.arange(len(values)) - 1e-6)
-        breaks[0] = 0.0
-        positions = PiecewisePolynomial.ZeroOrderHold(breaks, values.T)
-        source = builder.AddNamedSystem("root_position", TrajectorySource(positions))
-        builder.Connect(source.get_output_port(), matcher.GetInputPort("root_position"))
+    builder.AddNamedSystem("mask_player", player)
+    builder.AddNamedSystem("silhouette_matcher", matcher)
+    for index in range(player.num_output_ports()):
+        name = player.get_output_port(index).get_name()
+        if matcher.HasInputPort(name):
+            builder.Connect(player.get_output_port(index), matcher.GetInputPort(name))
     if meshcat is not None:
         scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
-        model, estimate = search.tree.model, matcher.GetOutputPort("estimated_positions")
-        add_posed_body(builder, scene_graph, model, matcher, "estimated")
-        MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
-        add_meshcat_skin(builder, meshcat, model, estimate, "estimated")
+        estimate = matcher.GetOutputPort("estimated_positions")
+        show_estimate(builder, scene_graph, search.tree.model, estimate, meshcat)
     return _finish(builder, matcher, player.period, player)
 
 
@@ -148,18 +125,16 @@ def build_simulated_matching(
     builder = DiagramBuilder()
     model = search.tree.model
     scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
-    matcher = builder.AddNamedSystem(
-        "silhouette_matcher", _make_matcher(search, cameras, period, tracking)
-    )
+    matcher = _matcher(search, cameras, period, tracking)
+    builder.AddNamedSystem("silhouette_matcher", matcher)
     truth, images = add_simulated_cameras(builder, scene_graph, model, cameras, true_positions)
     for camera, image in zip(cameras, images, strict=True):
         builder.Connect(image, matcher.GetInputPort(camera_port("label_image", camera, cameras)))
     if meshcat is not None:
-        add_posed_body(builder, scene_graph, model, matcher, "estimated", ESTIMATE_COLOUR)
-        MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
         estimate = matcher.GetOutputPort("estimated_positions")
+        show_estimate(builder, scene_graph, model, estimate, meshcat, ESTIMATE_COLOUR)
+        # The visualizer begins by clearing its part of Meshcat's tree.
         add_meshcat_skin(builder, meshcat, model, truth, "true")
-        add_meshcat_skin(builder, meshcat, model, estimate, "estimated", ESTIMATE_COLOUR)
     return _finish(builder, matcher, period, None)
 
 
@@ -177,46 +152,26 @@ def add_simulated_cameras(
     """
     if isinstance(true_positions, np.ndarray):
         true_positions = PiecewisePolynomial(true_positions.reshape(-1, 1))
-    truth = builder.AddNamedSystem("true_positions", TrajectorySource(true_positions))
-    plant = MultibodyPlant(0.0)
-    plant.RegisterAsSourceForSceneGraph(scene_graph)
-    model.add_to(plant, scene_graph, prefix="true")
-    scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(RenderEngineVtkParams()))
-    pose_plant(builder, scene_graph, plant, truth.get_output_port(), "true_geometry_pose")
+    source = builder.AddNamedSystem("true_positions", TrajectorySource(true_positions))
+    truth = source.get_output_port()
+    add_posed_plant(builder, scene_graph, model, truth, "true_geometry_pose", "true")
     labels = {name: label for label, name in enumerate(model.link_names)}
-    add_skin(builder, scene_graph, model, truth.get_output_port(), "true", labels)
-    images = []
-    for camera in cameras:
-        colour_camera, depth_camera, X_WC = _drake_camera(camera, model, true_positions)
-        sensor = builder.AddNamedSystem(
-            f"camera_{camera.name}",
-            RgbdSensor(scene_graph.world_frame_id(), X_WC, colour_camera, depth_camera),
-        )
-        builder.Connect(scene_graph.get_query_output_port(), sensor.query_object_input_port())
-        images.append(sensor.label_image_output_port())
-    return truth.get_output_port(), images
-
-
-def _make_matcher(
-    search: PoseSearch,
-    cameras: Sequence[Camera],
-    period: float,
-    tracking: TrackingSettings | None,
-    color_cameras: Collection[str] = (),
-) -> SilhouetteMatcher:
-    if tracking is None:
-        return SilhouetteMatcher(search, cameras, period)
-    return SilhouetteTracker(
-        search, cameras, period, tracking=tracking, color_cameras=color_cameras
+    add_skin(builder, scene_graph, model, truth, "true", labels)
+    ranges = {
+        camera.name: _depth_range(camera, model, true_positions)
+        for camera in cameras
+        if not isinstance(camera, PinholeCamera)
+    }
+    sensors = add_sensors(
+        builder, scene_graph, {one.name: one for one in cameras}, ranges, RenderEngineVtkParams()
     )
+    return truth, [sensor.label_image_output_port() for sensor in sensors.values()]
 
 
-def _drake_camera(
+def _depth_range(
     camera: Camera, model: ParsedModel, true_positions: Trajectory
-) -> tuple[ColorRenderCamera, DepthRenderCamera, RigidTransform]:
-    """Drake's cameras; a parallel one becomes a tele camera that is clipped about the body."""
-    if isinstance(camera, PinholeCamera):
-        return camera_to_drake(camera, renderer_name=_RENDERER)
+) -> tuple[float, float]:
+    """The depths about a moving body [m]: a parallel camera is drawn as a tele camera, clipped."""
     start, end = true_positions.start_time(), true_positions.end_time()
     # A constant has no end.
     times = np.linspace(start, end, 100) if np.isfinite([start, end]).all() else np.zeros(1)
@@ -230,32 +185,40 @@ def _drake_camera(
     everything = np.concatenate(depths)
     # A body that moves fast may reach further between the times looked at.
     margin = 0.5 + 0.1 * float(np.ptp(everything))
-    depth_range = (float(everything.min()) - margin, float(everything.max()) + margin)
-    return camera_to_drake(camera, renderer_name=_RENDERER, depth_range=depth_range)
+    return float(everything.min()) - margin, float(everything.max()) + margin
 
 
-def add_posed_body(
+def _matcher(
+    search: PoseSearch,
+    cameras: Sequence[Camera],
+    period: float,
+    tracking: TrackingSettings | None,
+    color_cameras: Sequence[str] = (),
+) -> SilhouetteMatcher:
+    if tracking is None:
+        return SilhouetteMatcher(search, cameras, period)
+    return SilhouetteTracker(
+        search, cameras, period, tracking=tracking, color_cameras=color_cameras
+    )
+
+
+def show_estimate(
     builder: DiagramBuilder,
     scene_graph: SceneGraph,
     model: ParsedModel,
-    estimator: LeafSystem,
-    name: str,
+    positions: OutputPort,
+    meshcat: Meshcat,
     colour: Rgba | None = None,
-) -> MultibodyPlant:
-    """Add a body that stands as is estimated, for the eye only; its plant, finalized.
+) -> None:
+    """Show a SceneGraph in Meshcat, with a body at estimated positions that no sensor sees.
 
     Args:
-        estimator: its output ``estimated_positions`` poses the body.
-        name: prefix of the body's name in the SceneGraph.
         colour: in place of the body's own colours.
     """
-    plant = MultibodyPlant(0.0)
-    plant.RegisterAsSourceForSceneGraph(scene_graph)
-    model.add_to(plant, scene_graph, prefix=name)
-    estimate = estimator.GetOutputPort("estimated_positions")
-    pose_plant(builder, scene_graph, plant, estimate, f"{name}_geometry_pose")
-    source = plant.get_source_id()
-    inspector = scene_graph.model_inspector()
+    plant = add_posed_plant(
+        builder, scene_graph, model, positions, "estimated_geometry_pose", "estimated"
+    )
+    source, inspector = plant.get_source_id(), scene_graph.model_inspector()
     for index in range(plant.num_bodies()):
         frame = plant.GetBodyFrameIdOrThrow(BodyIndex(index))
         for geometry in inspector.GetGeometries(frame):
@@ -268,7 +231,8 @@ def add_posed_body(
                 properties = IllustrationProperties()
                 properties.AddProperty("phong", "diffuse", colour)
                 scene_graph.AssignRole(source, geometry, properties, RoleAssign.kReplace)
-    return plant
+    MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
+    add_meshcat_skin(builder, meshcat, model, positions, "estimated", colour)
 
 
 def _finish(

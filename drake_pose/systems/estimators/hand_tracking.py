@@ -13,14 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
-from pydrake.geometry import Meshcat, MeshcatVisualizer, SceneGraph
+from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.systems.framework import (
-    BasicVector,
     Context,
     Diagram,
     DiagramBuilder,
-    InputPort,
-    LeafSystem,
     OutputPort,
     ValueProducer,
 )
@@ -41,10 +38,11 @@ from drake_pose.search.scoring import PoseSearch
 from drake_pose.silhouette.pictures.label_images import EMPTY, label_data, label_image_to_mask
 from drake_pose.systems.estimators.diagrams import (
     ESTIMATE_COLOUR,
-    add_posed_body,
     add_simulated_cameras,
+    show_estimate,
 )
 from drake_pose.systems.estimators.truncated_ekf import STATISTICS, TruncatedEkf
+from drake_pose.systems.ports import PortedSystem
 
 Array = NDArray[np.float64]
 
@@ -52,7 +50,7 @@ Array = NDArray[np.float64]
 _FEWEST_PIXELS = 30
 
 
-class AxisSensor(LeafSystem):
+class AxisSensor(PortedSystem):
     """Measures segments' axes in a label image, beside the filter's prediction.
 
     .. pydrake_system::
@@ -87,10 +85,10 @@ class AxisSensor(LeafSystem):
         self._observation, self._transition = observation, transition
         model = observation.body.tree.model
         self._labels = [model.link_index(link) for link in observation.links]
-        self._image = _declare_image(self, camera)
-        self._estimate = self.DeclareVectorInputPort("estimated_state", n)
-        self._statistics = self.DeclareVectorInputPort("statistics", len(STATISTICS))
-        self._matched = self.DeclareVectorInputPort("matched_state", n)
+        self.add_input("label_image", ImageLabel16I(camera.width, camera.height))
+        self.add_input("estimated_state", n)
+        self.add_input("statistics", len(STATISTICS))
+        self.add_input("matched_state", n)
         measured = self.DeclareCacheEntry(
             "measured", ValueProducer(lambda: AbstractValue.Make([]), self._calc)
         )
@@ -98,10 +96,11 @@ class AxisSensor(LeafSystem):
             (("measurement", m), ("measurement_variances", m), ("restart", 1))
         ):
 
-            def calculate(context: Context, output: BasicVector, row: int = row) -> None:
-                output.SetFromVector(measured.Eval(context)[row])
+            def read(context: Context, row: int = row) -> Array:
+                found: Array = measured.Eval(context)[row]
+                return found
 
-            self.DeclareVectorOutputPort(name, size, calculate, {measured.ticket()})
+            self.add_output(name, size, read, {measured.ticket()})
 
     def _calc(self, context: Context, output: AbstractValue) -> None:
         nothing = np.full(len(self._observation.names), np.nan)
@@ -109,29 +108,27 @@ class AxisSensor(LeafSystem):
         if labels is None:
             output.set_value([nothing, nothing, np.zeros(1)])
             return
-        statistics = dict(zip(STATISTICS, self._statistics.Eval(context), strict=True))
-        x = self._transition @ self._estimate.Eval(context)
+        statistics = dict(zip(STATISTICS, self.given(context, "statistics"), strict=True))
+        x = self._transition @ self.given(context, "estimated_state")
         y, variances = self._observation.measure(labels, x)
         visible = sum(np.count_nonzero(labels == k) >= _FEWEST_PIXELS for k in self._labels)
         astray = 2 * np.count_nonzero(np.isfinite(y[::2])) < visible
         restart = statistics["step"] == 0 or statistics["lost"] > 0 or astray
-        if restart and self._matched.HasValue(context):
-            matched = np.array(self._matched.Eval(context))
-            if np.isfinite(matched).all():
-                y, variances = self._observation.measure(labels, matched)
+        matched = self.given(context, "matched_state") if restart else None
+        if matched is not None and np.isfinite(matched).all():
+            y, variances = self._observation.measure(labels, matched)
         output.set_value([y, variances, np.array([float(restart)])])
 
     def _see(self, context: Context) -> NDArray[np.int16] | None:
         """(H, W) the label image; None where there is none, or none of the body."""
-        if not self._image.HasValue(context):
-            return None
-        labels = label_data(self._image.Eval(context))
-        if not np.isin(labels, self._labels).any():
+        image = self.given(context, "label_image")
+        labels = None if image is None else label_data(image)
+        if labels is None or not np.isin(labels, self._labels).any():
             return None
         return np.where(labels == EMPTY, np.int16(-1), labels)
 
 
-class StateMatcher(LeafSystem):
+class StateMatcher(PortedSystem):
     """Matches a body's silhouette whenever its output is asked for, and never else.
 
     .. pydrake_system::
@@ -152,23 +149,20 @@ class StateMatcher(LeafSystem):
         if search.tree is not observation.body.tree:
             raise SettingsError("the search and the observation must share one pose tree")
         self._search, self._body, self._camera = search, observation.body, camera
-        self._image = _declare_image(self, camera)
-        self.DeclareVectorOutputPort(
-            "matched_state", len(self._body.layout), self._match, {self._image.ticket()}
-        )
+        self.add_input("label_image", ImageLabel16I(camera.width, camera.height))
+        self.add_output("matched_state", len(self._body.layout), self._match)
 
-    def _match(self, context: Context, output: BasicVector) -> None:
-        state = np.full(len(self._body.layout), np.nan)
-        if self._image.HasValue(context):
-            mask = label_image_to_mask(self._image.Eval(context))
-            if mask.any():
-                result = self._search.match([View(self._camera, mask)])
-                if result.found:
-                    state = self._body.state(result.q, result.X_WB)
-        output.SetFromVector(state)
+    def _match(self, context: Context) -> Array:
+        image = self.given(context, "label_image")
+        mask = None if image is None else label_image_to_mask(image)
+        if mask is not None and mask.any():
+            result = self._search.match([View(self._camera, mask)])
+            if result.found:
+                return self._body.state(result.q, result.X_WB)
+        return np.full(len(self._body.layout), np.nan)
 
 
-class BodyBelief(LeafSystem):
+class BodyBelief(PortedSystem):
     """A filter's belief as positions of the plant, with their standard deviations.
 
     .. pydrake_system::
@@ -182,35 +176,24 @@ class BodyBelief(LeafSystem):
 
     def __init__(self, observation: AxisObservation) -> None:
         super().__init__()
-        self._body = observation.body
-        layout, model = self._body.layout, self._body.tree.model
-        seen = [*layout.moving, *layout.constant]
-        self._from = layout.indices(seen)
-        self._to = [model.position_index(name) for name in seen]
-        n, self._count = len(layout), len(model.position_names)
-        self._state = self.DeclareVectorInputPort("estimated_state", n)
-        self._covariance = self.DeclareVectorInputPort("covariance", n * n)
-        self.DeclareVectorOutputPort(
-            "estimated_positions", self._count, self._calc_positions, {self._state.ticket()}
-        )
-        self.DeclareVectorOutputPort(
-            "position_deviations", self._count, self._calc_deviations, {self._covariance.ticket()}
+        body = observation.body
+        model, seen = body.tree.model, [*body.layout.moving, *body.layout.constant]
+        n, nq = len(body.layout), len(model.position_names)
+        state, covariance = (
+            self.add_input("estimated_state", n),
+            self.add_input("covariance", n * n),
         )
 
-    def _calc_positions(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._body.positions(np.array(self._state.Eval(context)))[0])
+        def deviate(context: Context) -> Array:
+            deviations, P = np.full(nq, np.nan), covariance.Eval(context).reshape(n, n)
+            own = [model.position_index(name) for name in seen]
+            deviations[own] = np.sqrt(np.diag(P)[body.layout.indices(seen)])
+            return deviations
 
-    def _calc_deviations(self, context: Context, output: BasicVector) -> None:
-        deviations = np.full(self._count, np.nan)
-        n = len(self._body.layout)
-        P = np.array(self._covariance.Eval(context)).reshape(n, n)
-        deviations[self._to] = np.sqrt(np.diag(P)[self._from])
-        output.SetFromVector(deviations)
-
-
-def _declare_image(system: LeafSystem, camera: Camera) -> InputPort:
-    image = ImageLabel16I(camera.width, camera.height)
-    return system.DeclareAbstractInputPort("label_image", AbstractValue.Make(image))
+        self.add_output(
+            "estimated_positions", nq, lambda context: body.positions(state.Eval(context))[0]
+        )
+        self.add_output("position_deviations", nq, deviate)
 
 
 @dataclass(frozen=True)
@@ -265,17 +248,17 @@ def add_hand_tracking(
     sensor = builder.AddNamedSystem("axis_sensor", AxisSensor(observation, transition, camera))
     matcher = builder.AddNamedSystem("matcher", StateMatcher(search, observation, camera))
     belief = builder.AddNamedSystem("belief", BodyBelief(observation))
-    matched = matcher.GetOutputPort("matched_state")
-    builder.Connect(label_image, sensor.GetInputPort("label_image"))
-    builder.Connect(label_image, matcher.GetInputPort("label_image"))
-    builder.Connect(matched, sensor.GetInputPort("matched_state"))
-    builder.Connect(matched, ekf.GetInputPort("reset_state"))
-    for name in ("measurement", "measurement_variances", "restart"):
-        builder.Connect(sensor.GetOutputPort(name), ekf.GetInputPort(name))
-    for name in ("estimated_state", "statistics"):
-        builder.Connect(ekf.GetOutputPort(name), sensor.GetInputPort(name))
-    for name in ("estimated_state", "covariance"):
-        builder.Connect(ekf.GetOutputPort(name), belief.GetInputPort(name))
+    for system in (sensor, matcher):
+        builder.Connect(label_image, system.GetInputPort("label_image"))
+    builder.Connect(matcher.GetOutputPort("matched_state"), ekf.GetInputPort("reset_state"))
+    for giver, taker, names in (
+        (matcher, sensor, ("matched_state",)),
+        (sensor, ekf, ("measurement", "measurement_variances", "restart")),
+        (ekf, sensor, ("estimated_state", "statistics")),
+        (ekf, belief, ("estimated_state", "covariance")),
+    ):
+        for name in names:
+            builder.Connect(giver.GetOutputPort(name), taker.GetInputPort(name))
 
     def log(port: OutputPort) -> VectorLogSink:
         return LogVectorOutput(port, builder, publish_period=period)
@@ -334,6 +317,6 @@ def build_hand_tracking(
     _, images = add_simulated_cameras(builder, scene_graph, model, [camera], true_positions)
     parts = add_hand_tracking(builder, search, camera, axes, images[0], period, tracking, settings)
     if meshcat is not None:
-        add_posed_body(builder, scene_graph, model, parts.belief, "estimated", ESTIMATE_COLOUR)
-        MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
+        estimate = parts.belief.GetOutputPort("estimated_positions")
+        show_estimate(builder, scene_graph, model, estimate, meshcat, ESTIMATE_COLOUR)
     return builder.Build(), parts

@@ -1,11 +1,11 @@
 """Recorded masks as a Drake system."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 
 from drake_pose.camera.models import Camera
@@ -13,19 +13,22 @@ from drake_pose.silhouette.pictures.label_images import mask_to_label_image
 from drake_pose.silhouette.pictures.scenes import Scene
 from drake_pose.systems.colour_images import picture_to_colour_image
 from drake_pose.systems.estimators.silhouette_matcher import camera_port
+from drake_pose.systems.ports import PortedSystem
+
+Array = NDArray[np.float64]
 
 DEFAULT_FRAME_RATE_HZ = 1.0
 """Where a scene says nothing, as stills do."""
 
 
-class MaskPlayer(LeafSystem):
+class MaskPlayer(PortedSystem):
     """Plays the masks of a recorded scene as label images.
 
     .. pydrake_system::
 
         name: MaskPlayer
         output_ports: [label_image, color_image (of cameras with pictures), measured_positions
-          (where they are given), frame_index]
+          (where they are given), root_position (where it is given), frame_index]
 
     With several cameras the output ports are ``label_image_<camera>``. Frame k is shown from k
     periods on for one period; before the first and after the last, the nearest one. Where a camera
@@ -36,6 +39,7 @@ class MaskPlayer(LeafSystem):
         frames: the frames to play; all of the scene's where not given.
         period: time between two frames [s]; by the scene's frame rate where not given.
         positions: (nq,) by frame, given out as ``measured_positions``; NaN in other frames.
+        root_positions: (3,) by frame [m], given out as ``root_position``; NaN in other frames.
 
     Attributes:
         color_cameras: the names of the cameras that have pictures (``Scene.images``) and so a port
@@ -49,37 +53,43 @@ class MaskPlayer(LeafSystem):
         cameras: Sequence[Camera],
         frames: Sequence[str] | None = None,
         period: float | None = None,
-        positions: Mapping[str, NDArray[np.float64]] | None = None,
+        positions: Mapping[str, Array] | None = None,
+        root_positions: Mapping[str, Array] | None = None,
     ) -> None:
         super().__init__()
         self._scene = scene
         self.frames = tuple(scene.frames if frames is None else frames)
         rate = scene.frame_rate_hz or DEFAULT_FRAME_RATE_HZ
         self.period = 1.0 / rate if period is None else period
-        for camera in cameras:
-            image = ImageLabel16I(camera.width, camera.height)
-            self.DeclareAbstractOutputPort(
-                camera_port("label_image", camera, cameras),
-                lambda image=image: AbstractValue.Make(image),
-                self._calc_label_image(camera),
-                {self.time_ticket()},
-            )
         self.color_cameras = tuple(
             camera.name
             for camera in cameras
             if any((camera.name, frame) in scene.images for frame in self.frames)
         )
-        for camera in cameras:
-            if camera.name in self.color_cameras:
-                self.DeclareAbstractOutputPort(
-                    camera_port("color_image", camera, cameras),
-                    lambda: AbstractValue.Make(ImageRgba8U()),
-                    self._calc_color_image(camera),
-                    {self.time_ticket()},
-                )
-        if positions:
-            self._declare_positions(positions)
-        self.DeclareVectorOutputPort("frame_index", 1, self._calc_frame_index, {self.time_ticket()})
+        kinds = (
+            (
+                "label_image",
+                ImageLabel16I(),
+                self._label_image,
+                [camera.name for camera in cameras],
+            ),
+            ("color_image", ImageRgba8U(), self._color_image, self.color_cameras),
+        )
+        for kind, image, read, names in kinds:
+            for camera in cameras:
+                if camera.name in names:
+                    self._play(camera_port(kind, camera, cameras), image, partial(read, camera))
+        given = {"measured_positions": positions, "root_position": root_positions}
+        for name, values in given.items():
+            if values:
+                size = len(next(iter(values.values())))
+                self._play(name, size, partial(_known_or_nan, values, size))
+        self.add_output(
+            "frame_index",
+            1,
+            lambda context: [self.frame_index(context.get_time())],
+            {self.time_ticket()},
+        )
 
     def frame_index(self, time: float) -> int:
         """Which of ``frames`` is shown at a time [s]."""
@@ -87,36 +97,25 @@ class MaskPlayer(LeafSystem):
         index = int(np.floor(time / self.period + 5e-7))
         return min(max(index, 0), len(self.frames) - 1)
 
-    def _calc_label_image(self, camera: Camera) -> Callable[[Context, AbstractValue], None]:
-        def calc(context: Context, output: AbstractValue) -> None:
-            frame = self.frames[self.frame_index(context.get_time())]
-            if (camera.name, frame) in self._scene.masks:
-                mask = self._scene.read(camera.name, frame)
-            else:
-                mask = np.zeros((camera.height, camera.width), dtype=bool)
-            output.set_value(mask_to_label_image(mask))
+    def _play(self, port: str, like: Any, read: Callable[[str], Any]) -> None:
+        """An output of what a function says of the frame that is shown."""
+        self.add_output(
+            port,
+            like,
+            lambda context: read(self.frames[self.frame_index(context.get_time())]),
+            {self.time_ticket()},
+        )
 
-        return calc
+    def _label_image(self, camera: Camera, frame: str) -> ImageLabel16I:
+        if (camera.name, frame) in self._scene.masks:
+            return mask_to_label_image(self._scene.read(camera.name, frame))
+        return mask_to_label_image(np.zeros((camera.height, camera.width), dtype=bool))
 
-    def _calc_color_image(self, camera: Camera) -> Callable[[Context, AbstractValue], None]:
-        def calc(context: Context, output: AbstractValue) -> None:
-            frame = self.frames[self.frame_index(context.get_time())]
-            picture = None
-            if (camera.name, frame) in self._scene.images:
-                picture = self._scene.read_image(camera.name, frame)
-            output.set_value(picture_to_colour_image(picture))
+    def _color_image(self, camera: Camera, frame: str) -> ImageRgba8U:
+        if (camera.name, frame) in self._scene.images:
+            return picture_to_colour_image(self._scene.read_image(camera.name, frame))
+        return picture_to_colour_image(None)
 
-        return calc
 
-    def _declare_positions(self, positions: Mapping[str, NDArray[np.float64]]) -> None:
-        """The port of positions that are known in some frames."""
-        unknown = np.full(len(next(iter(positions.values()))), np.nan)
-
-        def calc(context: Context, output: BasicVector) -> None:
-            frame = self.frames[self.frame_index(context.get_time())]
-            output.SetFromVector(positions.get(frame, unknown))
-
-        self.DeclareVectorOutputPort("measured_positions", len(unknown), calc, {self.time_ticket()})
-
-    def _calc_frame_index(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector([self.frame_index(context.get_time())])
+def _known_or_nan(values: Mapping[str, Array], size: int, frame: str) -> Array:
+    return values.get(frame, np.full(size, np.nan))

@@ -3,11 +3,12 @@
 from collections.abc import Sequence
 
 from drake import lcmt_robot_state
-from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import Context, LeafSystem
+from pydrake.systems.framework import Context
+
+from drake_pose.systems.ports import PortedSystem
 
 
-class RobotStateMessage(LeafSystem):
+class RobotStateMessage(PortedSystem):
     """Names positions in an lcmt_robot_state, for an LcmPublisherSystem.
 
     .. pydrake_system::
@@ -25,15 +26,15 @@ class RobotStateMessage(LeafSystem):
     def __init__(self, names: Sequence[str]) -> None:
         super().__init__()
         self._names = list(names)
-        self._positions = self.DeclareVectorInputPort("positions", len(names))
-        self.DeclareAbstractOutputPort(
-            "lcmt_robot_state", lambda: AbstractValue.Make(lcmt_robot_state()), self._calc
+        self.add_input("positions", len(names))
+        self.add_output(
+            "lcmt_robot_state", lcmt_robot_state(), self._calc, {self.all_sources_ticket()}
         )
 
-    def _calc(self, context: Context, output: AbstractValue) -> None:
+    def _calc(self, context: Context) -> lcmt_robot_state:
         message = lcmt_robot_state()
         message.utime = round(1e6 * context.get_time())
         message.num_joints = len(self._names)
         message.joint_name = self._names
-        message.joint_position = self._positions.Eval(context).tolist()
-        output.set_value(message)
+        message.joint_position = self.GetInputPort("positions").Eval(context).tolist()
+        return message

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.framework import Context
 from pydrake.systems.sensors import ImageLabel16I
 
 from drake_pose.camera.models import Camera
@@ -18,7 +18,7 @@ from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import PoseEstimate, View
 from drake_pose.search.scoring import PoseSearch
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
-from drake_pose.systems.shared_value import SharedValue
+from drake_pose.systems.ports import BeliefSystem, SharedValue, require_period
 
 Array = NDArray[np.float64]
 
@@ -29,6 +29,14 @@ STATISTICS = ("found", "J", "E_total", "first_E_total", "runs", "outside_limit",
 def camera_port(kind: str, camera: Camera, cameras: Sequence[Camera]) -> str:
     """Name of the port that carries a camera's image of a kind, where there are ``cameras``."""
     return kind if len(cameras) == 1 else f"{kind}_{camera.name}"
+
+
+def body_poses(plant: MultibodyPlant, q: Array, X_WB: Array) -> list[RigidTransform]:
+    """The poses of all bodies at positions (nq,), in the plant's order; X_WB: of its world."""
+    context = plant.CreateDefaultContext()
+    plant.SetPositions(context, q)
+    base = RigidTransform(X_WB)
+    return [base @ pose for pose in plant.get_body_poses_output_port().Eval(context)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +55,7 @@ class Matched(SharedValue):
     memory: Any
 
 
-class SilhouetteMatcher(LeafSystem):
+class SilhouetteMatcher(BeliefSystem[Matched]):
     """Estimates the positions of an articulated body from label images.
 
     .. pydrake_system::
@@ -97,138 +105,87 @@ class SilhouetteMatcher(LeafSystem):
         names = [camera.name for camera in cameras]
         if not cameras or len(set(names)) != len(names):
             raise SettingsError(f"a matcher needs one or more cameras of different names: {names}")
-        if not period > 0:
-            raise SettingsError(f"the matcher's period must be positive, not {period}")
+        require_period("matcher", period)
         if family_limit < 1:
             raise SettingsError(f"the family limit must be 1 or more, not {family_limit}")
         self._search, self._cameras, self._family_limit = search, tuple(cameras), family_limit
         self._labels = None if labels is None else frozenset(labels)
         for camera in cameras:
-            image = AbstractValue.Make(ImageLabel16I(camera.width, camera.height))
-            self.DeclareAbstractInputPort(camera_port("label_image", camera, cameras), image)
-        self._root_position = self.DeclareVectorInputPort("root_position", 3)
-        first = Matched(search.tree.model.default_positions, np.eye(4), None, self._first_memory())
-        self._state = self.DeclareAbstractState(AbstractValue.Make(first))
-        self._declare_outputs(search.tree.model.plant.num_positions())
-        self.DeclarePeriodicUnrestrictedUpdateEvent(period, offset, self._match)
-        self.DeclareForcedUnrestrictedUpdateEvent(self._match)
+            image = ImageLabel16I(camera.width, camera.height)
+            self.add_input(camera_port("label_image", camera, cameras), image)
+        self.add_input("root_position", 3)
+        q = search.tree.model.default_positions
+        self.keep_belief(Matched(q, np.eye(4), None, self._first_memory()), period, offset)
+        self._declare_outputs(search.tree.model.plant)
 
-    def _declare_outputs(self, position_count: int) -> None:
-        ticket = self._ticket = {self.abstract_state_ticket(self._state)}
-        for name, size, calc in (
-            ("estimated_positions", position_count, self._calc_positions),
-            ("error", 1, self._calc_error),
-            ("statistics", len(STATISTICS), self._calc_statistics),
-        ):
-            self.DeclareVectorOutputPort(name, size, calc, ticket)
-        for name, initial, calc_value in (
-            ("base_pose", RigidTransform(), self._calc_base_pose),
-            ("body_poses", [RigidTransform()], self._calc_body_poses),
-            ("pose_estimate", None, self._calc_estimate),
-        ):
-            value = AbstractValue.Make(initial)
-            self.DeclareAbstractOutputPort(name, value.Clone, calc_value, ticket)
-        for row, (name, count) in enumerate(
-            (
-                ("proved_optimal", 1),
-                ("determined", position_count),
-                ("lower", position_count),
-                ("upper", position_count),
-                ("family_positions", self._family_limit * position_count),
-            )
-        ):
+    def _declare_outputs(self, plant: MultibodyPlant) -> None:
+        nq = plant.num_positions()
+        self.show("estimated_positions", nq, lambda known: known.q)
+        self.show("error", 1, lambda known: _statistics(known.estimate)[2:3])
+        self.show("statistics", len(STATISTICS), lambda known: _statistics(known.estimate))
+        self.show("base_pose", RigidTransform(), lambda known: RigidTransform(known.X_WB))
+        self.show(
+            "body_poses", [RigidTransform()], lambda known: body_poses(plant, known.q, known.X_WB)
+        )
+        self.show("pose_estimate", None, lambda known: known.estimate)
+        sizes = {"proved_optimal": 1, "determined": nq, "lower": nq, "upper": nq}
+        for name, size in (sizes | {"family_positions": self._family_limit * nq}).items():
 
-            def calc_worth(context: Context, output: BasicVector, row: int = row) -> None:
-                worth = self._worth(self._matched(context).estimate)
-                output.SetFromVector(
-                    np.full(output.size(), np.nan) if worth is None else worth[row]
-                )
+            def worth(known: Matched, name: str = name, size: int = size) -> Array:
+                return self._worth(known.estimate).get(name, np.full(size, np.nan))
 
-            self.DeclareVectorOutputPort(name, count, calc_worth, ticket)
+            self.show(name, size, worth)
 
-    def _matched(self, context: Context) -> Matched:
-        matched: Matched = context.get_abstract_state(int(self._state)).get_value()
-        return matched
-
-    def _views(self, context: Context) -> list[View]:
+    def next_belief(self, context: Context, last: Matched) -> Matched:
+        """The match of what the cameras see now."""
         views = []
-        for index, camera in enumerate(self._cameras):
-            port = self.get_input_port(index)
-            if port.HasValue(context):
-                mask = label_image_to_mask(port.Eval(context), self._labels)
-                if mask.any():
-                    views.append(View(camera, mask))
-        return views
-
-    def _match(self, context: Context, state: State) -> EventStatus:
-        last, views = self._matched(context), self._views(context)
-        q, X_WB, estimate, memory = last.q, last.X_WB, None, last.memory
-        if self._is_seen(context, views):
-            root_position = None
-            if self._root_position.HasValue(context):
-                root_position = self._root_position.Eval(context)
-            estimate, memory = self._find(context, memory, views, root_position)
-            if estimate.found:
-                q, X_WB = estimate.q, estimate.X_WB
-        known = Matched(q, X_WB, estimate, memory)
-        state.get_mutable_abstract_state(int(self._state)).set_value(known)
-        return EventStatus.Succeeded()
+        for camera in self._cameras:
+            image = self.given(context, camera_port("label_image", camera, self._cameras))
+            mask = None if image is None else label_image_to_mask(image, self._labels)
+            if mask is not None and mask.any():
+                views.append(View(camera, mask))
+        estimate, memory = self._find(context, last.memory, views)
+        if estimate is None or not estimate.found:
+            return Matched(last.q, last.X_WB, estimate, memory)
+        return Matched(estimate.q, estimate.X_WB, estimate, memory)
 
     def _first_memory(self) -> Any:
         """What the first update gets as its memory."""
         return None
 
-    def _is_seen(self, context: Context, views: Sequence[View]) -> bool:
-        """Whether there is anything to find a pose in."""
-        return bool(views)
-
     def _find(
-        self, context: Context, memory: Any, views: Sequence[View], root_position: Array | None
-    ) -> tuple[PoseEstimate, Any]:
-        """The pose that the views show, and what the next update gets as its memory."""
-        return self._search.match(views, root_position), None
+        self, context: Context, memory: Any, views: Sequence[View]
+    ) -> tuple[PoseEstimate | None, Any]:
+        """The pose that the views show, if any, and what the next update gets as its memory."""
+        if not views:
+            return None, memory
+        return self._search.match(views, self.given(context, "root_position")), memory
 
-    def _worth(self, estimate: PoseEstimate | None) -> Sequence[Array] | None:
-        """What an answer is worth, in the order of the ports; None: it is not said."""
+    def _worth(self, estimate: PoseEstimate | None) -> dict[str, Array]:
+        """What an answer is worth, by port; nothing where it is not said."""
         if estimate is None or not estimate.found or estimate.pose_set is None:
-            return None
+            return {}
         names = self._search.tree.model.position_names
         families = np.full((self._family_limit, len(names)), np.nan)
         found = [family.q for family in estimate.pose_set.families[: self._family_limit]]
         families[: len(found)] = found
-        proved = np.array([float(estimate.proved_optimal)])
-        return proved, *estimate.pose_set.position_intervals(names), families.ravel()
+        determined, lower, upper = estimate.pose_set.position_intervals(names)
+        return {
+            "proved_optimal": np.array([float(estimate.proved_optimal)]),
+            "determined": determined,
+            "lower": lower,
+            "upper": upper,
+            "family_positions": families.ravel(),
+        }
 
-    def _calc_positions(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._matched(context).q)
 
-    def _statistics(self, context: Context) -> Array:
-        values, estimate = np.zeros(len(STATISTICS)), self._matched(context).estimate
-        values[1:4] = np.inf
-        if estimate is not None:
-            search = estimate.statistics
-            values[4:] = search.runs, max(search.outside_limit, default=0.0), estimate.seconds
-            if estimate.found:
-                values[:4] = 1.0, estimate.J, estimate.E_total, estimate.first_E_total
-        return values
-
-    def _calc_error(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._statistics(context)[2:3])
-
-    def _calc_statistics(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._statistics(context))
-
-    def _calc_base_pose(self, context: Context, output: AbstractValue) -> None:
-        output.set_value(RigidTransform(self._matched(context).X_WB))
-
-    def _calc_body_poses(self, context: Context, output: AbstractValue) -> None:
-        plant, matched = self._search.tree.model.plant, self._matched(context)
-        plant_context = plant.CreateDefaultContext()
-        plant.SetPositions(plant_context, matched.q)
-        # The pose in the scene's world of the frame that the plant takes for its world.
-        X_WB = RigidTransform(matched.X_WB)
-        poses = plant.get_body_poses_output_port().Eval(plant_context)
-        output.set_value([X_WB @ pose for pose in poses])
-
-    def _calc_estimate(self, context: Context, output: AbstractValue) -> None:
-        output.set_value(self._matched(context).estimate)
+def _statistics(estimate: PoseEstimate | None) -> Array:
+    """An update's STATISTICS."""
+    values = np.zeros(len(STATISTICS))
+    values[1:4] = np.inf
+    if estimate is not None:
+        search = estimate.statistics
+        values[4:] = search.runs, max(search.outside_limit, default=0.0), estimate.seconds
+        if estimate.found:
+            values[:4] = 1.0, estimate.J, estimate.E_total, estimate.first_E_total
+    return values

@@ -5,19 +5,20 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import BasicVector, Context
-from pydrake.systems.sensors import ImageRgba8U
+from pydrake.systems.framework import Context
 
 from drake_pose.camera.models import Camera
-from drake_pose.errors import UnknownNameError
 from drake_pose.filtering.tracking.contour_tracker import TrackingSettings
 from drake_pose.filtering.tracking.match_and_track import Followed, MatchAndTrack
-from drake_pose.fit.colours import Picture
 from drake_pose.search.estimates import TRACKED, PoseEstimate, View
 from drake_pose.search.scoring import PoseSearch
-from drake_pose.systems.estimators.silhouette_matcher import SilhouetteMatcher, camera_port
-from drake_pose.systems.shared_value import require_time_forward
+from drake_pose.systems.colour_images import ColourPorts
+from drake_pose.systems.estimators.silhouette_matcher import (
+    Matched,
+    SilhouetteMatcher,
+    camera_port,
+)
+from drake_pose.systems.ports import require_time_forward
 
 Array = NDArray[np.float64]
 
@@ -86,92 +87,61 @@ class SilhouetteTracker(SilhouetteMatcher):
     ) -> None:
         super().__init__(search, cameras, period, offset, labels)
         self._follower = MatchAndTrack(search, cameras, period, tracking)
-        model, layout = search.tree.model, self._follower.tracker.filter.layout
-        names = model.position_names
-
-        def own(some: Sequence[str]) -> list[str]:
-            return [name for name in some if name in names]
-
-        # Which position each element of the state that is one stands for.
-        self._layout, self._period = layout, period
-        self._moving, self._still = own(layout.moving), own(layout.constant)
-        self._measured = self.DeclareVectorInputPort("measured_positions", len(names))
-        known = {camera.name: camera for camera in cameras}
-        for name in color_cameras:
-            if name not in known:
-                raise UnknownNameError("camera", name, known, "color_cameras")
-        self._color_ports = {
-            camera.name: self.DeclareAbstractInputPort(
-                camera_port("color_image", camera, cameras),
-                AbstractValue.Make(ImageRgba8U(camera.width, camera.height)),
-            )
-            for camera in cameras
-            if camera.name in color_cameras
-        }
-        for port, size, calc in (
-            ("position_deviations", len(names), self._calc_deviations),
-            ("estimated_state", model.plant.num_multibody_states(), self._calc_state),
-            ("track", len(TRACK), self._calc_track),
-        ):
-            self.DeclareVectorOutputPort(port, size, calc, self._ticket)
+        self._period, self._layout = period, self._follower.tracker.filter.layout
+        model = search.tree.model
+        nq = len(model.position_names)
+        # Elements of the state that are positions, and which; the others are the root's.
+        self._moving, self._still = (
+            [name for name in some if name in model.position_names]
+            for some in (self._layout.moving, self._layout.constant)
+        )
+        self.add_input("measured_positions", nq)
+        self._colours = ColourPorts(
+            self, cameras, color_cameras, lambda one: camera_port("color_image", one, cameras)
+        )
+        self.show("position_deviations", nq, self._deviations)
+        self.show("estimated_state", model.plant.num_multibody_states(), self._state)
+        self.show("track", len(TRACK), lambda known: known.memory.track)
 
     def _first_memory(self) -> _Memory:
         return _Memory(Followed(), (0.0, 0.0, 0.0), -np.inf)
 
-    def _pictures(self, context: Context) -> dict[str, Picture]:
-        """The colour images that are there, by camera."""
-        images = {
-            name: port.Eval(context)
-            for name, port in self._color_ports.items()
-            if port.HasValue(context)
-        }
-        # A camera that has nothing to show gives an image of no pixels.
-        return {name: np.array(image.data) for name, image in images.items() if image.size()}
-
-    def _is_seen(self, context: Context, views: Sequence[View]) -> bool:
-        return bool(views) or bool(self._pictures(context))
-
     def _find(
-        self, context: Context, memory: _Memory, views: Sequence[View], root_position: Array | None
-    ) -> tuple[PoseEstimate, _Memory]:
+        self, context: Context, memory: _Memory, views: Sequence[View]
+    ) -> tuple[PoseEstimate | None, _Memory]:
+        pictures = self._colours.pictures(context)
+        if not views and not pictures:
+            return None, memory
         require_time_forward(self, context, memory.time)
-        start = None
-        if self._measured.HasValue(context):
-            q = np.array(self._measured.Eval(context))
-            start = q if np.all(np.isfinite(q)) else None
-        last = memory.followed
-        now, result = self._follower.next(
-            last, views, root_position, self._pictures(context), start
-        )
+        start = self.given(context, "measured_positions")
+        if start is not None and not np.all(np.isfinite(start)):
+            start = None
+        last, root_position = memory.followed, self.given(context, "root_position")
+        now, result = self._follower.next(last, views, root_position, pictures, start)
         is_tracked = result.stopped_by == TRACKED and now.matches == last.matches
         measurement = None if now.track is None else now.track.measurement
         distance = np.nan if measurement is None else measurement.distance
         track = float(result.found and is_tracked), float(now.matches), distance
         return result, _Memory(now, track, context.get_time())
 
-    def _calc_deviations(self, context: Context, output: BasicVector) -> None:
-        deviations = np.full(output.size(), np.nan)
-        track = self._matched(context).memory.followed.track
+    def _deviations(self, known: Matched) -> Array:
+        deviations, track = np.full(len(known.q), np.nan), known.memory.followed.track
         if track is not None:
             seen = [*self._moving, *self._still]
             found = track.state.best.deviations()[self._layout.indices(seen)]
             deviations[self._indices(seen)] = found
-        output.SetFromVector(deviations)
+        return deviations
 
-    def _calc_state(self, context: Context, output: BasicVector) -> None:
-        matched, plant = self._matched(context), self._search.tree.model.plant
-        qdot, track = np.full(len(matched.q), np.nan), matched.memory.followed.track
+    def _state(self, known: Matched) -> Array:
+        plant = self._search.tree.model.plant
+        qdot, track = np.full(len(known.q), np.nan), known.memory.followed.track
         if track is not None:
             rates = self._layout.indices([f"rate_{name}" for name in self._moving])
             qdot[self._indices(self._still)] = 0.0
             qdot[self._indices(self._moving)] = track.state.best.mean[rates] / self._period
         plant_context = plant.CreateDefaultContext()
-        plant.SetPositions(plant_context, matched.q)
-        v = plant.MapQDotToVelocity(plant_context, qdot)
-        output.SetFromVector(np.concatenate([matched.q, v]))
+        plant.SetPositions(plant_context, known.q)
+        return np.concatenate([known.q, plant.MapQDotToVelocity(plant_context, qdot)])
 
     def _indices(self, names: Sequence[str]) -> list[int]:
         return [self._search.tree.model.position_index(name) for name in names]
-
-    def _calc_track(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._matched(context).memory.track)

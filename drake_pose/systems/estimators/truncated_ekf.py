@@ -5,15 +5,19 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
+from pydrake.systems.framework import Context
 from scipy.special import chdtri
 
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.kalman.truncated_filter import FilterState, TruncatedFilter
 from drake_pose.filtering.kalman.update import with_variances
 from drake_pose.filtering.state import Belief, make_belief
-from drake_pose.systems.shared_value import SharedValue, require_time_forward
+from drake_pose.systems.ports import (
+    BeliefSystem,
+    SharedValue,
+    require_period,
+    require_time_forward,
+)
 
 Array = NDArray[np.float64]
 
@@ -33,8 +37,13 @@ class _Known(SharedValue):
     lost: bool = False
     time: float = -math.inf
 
+    def statistics(self) -> list[float]:
+        """STATISTICS."""
+        state = self.state
+        return [self.step, len(state.hypotheses), state.distance, state.count, self.lost]
 
-class TruncatedEkf(LeafSystem):
+
+class TruncatedEkf(BeliefSystem[_Known]):
     """Estimates a state from measurements, inside linear inequalities.
 
     .. pydrake_system::
@@ -80,103 +89,66 @@ class TruncatedEkf(LeafSystem):
         patience: int = 3,
     ) -> None:
         super().__init__()
-        if not 0 < period < math.inf:
-            raise SettingsError(f"the filter's period must be positive, not {period}")
+        require_period("filter", period)
         if patience < 1:
             raise SettingsError(f"patience must be 1 or more, not {patience}")
         self.filter, self._patience = belief_filter, patience
         self._start = make_belief(start.mean, start.covariance)
         n, cap = len(belief_filter.layout), belief_filter.settings.hypothesis_cap
-        measured = len(belief_filter.observation.names)
-        self._measurement, self._variances, self._reset, self._restart = (
-            self.DeclareVectorInputPort(name, size)
-            for name, size in (
-                ("measurement", measured),
-                ("measurement_variances", measured),
-                ("reset_state", n),
-                ("restart", 1),
-            )
-        )
-        first = _Known(belief_filter.start(self._start))
-        self._state = self.DeclareAbstractState(AbstractValue.Make(first))
-        ticket = {self.abstract_state_ticket(self._state)}
-        for name, size, calculate in (
-            ("estimated_state", n, self._calc_state),
-            ("covariance", n * n, self._calc_covariance),
-            ("hypothesis_weights", cap, self._calc_weights),
-            ("hypothesis_states", cap * n, self._calc_states),
-            ("active_limits", max(len(belief_filter.inequalities), 1), self._calc_active),
-            ("statistics", len(STATISTICS), self._calc_statistics),
-        ):
-            self.DeclareVectorOutputPort(name, size, calculate, ticket)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(period, offset, self._update)
-        self.DeclareForcedUnrestrictedUpdateEvent(self._update)
+        self._measured = len(belief_filter.observation.names)
+        self.add_input("measurement", self._measured)
+        self.add_input("measurement_variances", self._measured)
+        self.add_input("reset_state", n)
+        self.add_input("restart", 1)
+        self.keep_belief(_Known(belief_filter.start(self._start)), period, offset)
+        rows = belief_filter.inequalities.rows
+
+        def hypotheses(known: _Known) -> tuple[Array, Array]:
+            weights, states = np.zeros(cap), np.full((cap, n), np.nan)
+            for k, one in enumerate(known.state.hypotheses):
+                weights[k], states[k] = one.weight, one.belief.mean
+            return weights, states.ravel()
+
+        def active(known: _Known) -> Array:
+            cut = np.zeros(max(len(rows), 1))
+            if known.step and rows:
+                cut[:] = np.isin(rows, known.state.hypotheses[0].active)
+            return cut
+
+        self.show("estimated_state", n, lambda known: known.state.best.mean)
+        self.show("covariance", n * n, lambda known: known.state.best.covariance.ravel())
+        self.show("hypothesis_weights", cap, lambda known: hypotheses(known)[0])
+        self.show("hypothesis_states", cap * n, lambda known: hypotheses(known)[1])
+        self.show("active_limits", max(len(rows), 1), active)
+        self.show("statistics", len(STATISTICS), _Known.statistics)
 
     def filter_state(self, context: Context) -> FilterState:
         """The filter's state in a context."""
-        return self._known(context).state
+        return self.belief(context).state
 
-    def _known(self, context: Context) -> _Known:
-        known: _Known = context.get_abstract_state(int(self._state)).get_value()
-        return known
-
-    def _update(self, context: Context, state: State) -> EventStatus:
-        known = self._known(context)
-        require_time_forward(self, context, known.time)
-        now, unlikely, is_fresh = known.state, known.unlikely, known.step == 0
-        is_wanted = is_fresh or known.lost
-        if self._restart.HasValue(context):
-            is_wanted = is_wanted or self._restart.Eval(context)[0] != 0
-        if is_wanted and self._reset.HasValue(context):
-            mean = np.array(self._reset.Eval(context))
-            if np.isfinite(mean).all():
+    def next_belief(self, context: Context, last: _Known) -> _Known:
+        """A step of the filter."""
+        require_time_forward(self, context, last.time)
+        now, unlikely, is_fresh = last.state, last.unlikely, last.step == 0
+        restart = self.given(context, "restart")
+        if is_fresh or last.lost or (restart is not None and restart[0] != 0):
+            mean = self.given(context, "reset_state")
+            if mean is not None and np.isfinite(mean).all():
                 now = self.filter.start(Belief(mean, self._start.covariance))
                 is_fresh, unlikely = True, 0
         if not is_fresh:
             now = self.filter.predict(now)
-        y, model = np.full(self._measurement.size(), np.nan), None
-        if self._measurement.HasValue(context):
-            y = np.array(self._measurement.Eval(context))
-            if self._variances.HasValue(context):
-                variances = np.array(self._variances.Eval(context))
-                model = with_variances(self.filter.observation, y, variances)
+        y, variances = self.given(context, "measurement"), None
+        if y is None:
+            y = np.full(self._measured, np.nan)
+        else:
+            variances = self.given(context, "measurement_variances")
+        model = None
+        if variances is not None:
+            model = with_variances(self.filter.observation, y, variances)
         now = self.filter.update(now, y, model)
         if now.count:
             is_unlikely = now.distance > chdtri(now.count, _LOSS_PROBABILITY)
             unlikely = unlikely + 1 if is_unlikely else 0
         lost = unlikely >= self._patience
-        updated = _Known(now, known.step + 1, unlikely, lost, context.get_time())
-        state.get_mutable_abstract_state(int(self._state)).set_value(updated)
-        return EventStatus.Succeeded()
-
-    def _calc_state(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self.filter_state(context).best.mean)
-
-    def _calc_covariance(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self.filter_state(context).best.covariance.ravel())
-
-    def _calc_weights(self, context: Context, output: BasicVector) -> None:
-        weights = np.zeros(output.size())
-        hypotheses = self.filter_state(context).hypotheses
-        weights[: len(hypotheses)] = [one.weight for one in hypotheses]
-        output.SetFromVector(weights)
-
-    def _calc_states(self, context: Context, output: BasicVector) -> None:
-        states = np.full((self.filter.settings.hypothesis_cap, len(self.filter.layout)), np.nan)
-        hypotheses = self.filter_state(context).hypotheses
-        states[: len(hypotheses)] = [one.belief.mean for one in hypotheses]
-        output.SetFromVector(states.ravel())
-
-    def _calc_active(self, context: Context, output: BasicVector) -> None:
-        names = self.filter.inequalities.rows
-        known = self._known(context)
-        active = np.zeros(output.size())
-        if known.step and names:
-            active[:] = np.isin(names, known.state.hypotheses[0].active)
-        output.SetFromVector(active)
-
-    def _calc_statistics(self, context: Context, output: BasicVector) -> None:
-        known = self._known(context)
-        state = known.state
-        values = known.step, len(state.hypotheses), state.distance, state.count, known.lost
-        output.SetFromVector(np.array(values, dtype=float))
+        return _Known(now, last.step + 1, unlikely, lost, context.get_time())

@@ -8,18 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import MakeRenderEngineVtk, RenderEngineVtkParams, SceneGraph
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, System
 from pydrake.systems.primitives import PassThrough, TrajectorySource
 from pydrake.systems.sensors import RgbdSensor
 from pydrake.trajectories import Trajectory
 
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.camera.drake import camera_to_drake
-from drake_pose.camera.models import PinholeCamera
+from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError, UnknownNameError
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
-from drake_pose.systems.bodies.posed_geometry import pose_plant
+from drake_pose.systems.bodies.posed_geometry import add_posed_plant
 from drake_pose.systems.colour_images import colour_image_to_picture
 
 _RENDERER = "rig_renderer"
@@ -76,48 +75,51 @@ def build_camera_rig(
     Raises:
         CameraError: there is no camera, or one of parallel rays.
     """
-    builder = DiagramBuilder()
-    scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
-    plant = MultibodyPlant(0.0)
-    plant.RegisterAsSourceForSceneGraph(scene_graph)
-    model.add_to(plant, scene_graph)
-    # After the model: Drake's renderer refuses an OBJ file without normals when it is parsed.
-    sensors = _add_cameras(builder, scene_graph, cameras, background)
-    if true_positions is None:
-        entrance = builder.AddNamedSystem("positions", PassThrough(model.plant.num_positions()))
-        builder.ExportInput(entrance.get_input_port(), "positions")
-        positions = entrance.get_output_port()
-    else:
-        source = builder.AddNamedSystem("true_positions", TrajectorySource(true_positions))
-        positions = source.get_output_port()
-    pose_plant(builder, scene_graph, plant, positions, "geometry_pose")
-    return CameraRig(builder.Build(), dict(cameras), sensors)
-
-
-def _add_cameras(
-    builder: DiagramBuilder,
-    scene_graph: SceneGraph,
-    cameras: Mapping[str, PinholeCamera],
-    background: tuple[float, float, float],
-) -> dict[str, RgbdSensor]:
-    """Add a renderer and a sensor for each camera, whose images the diagram exports."""
     if not cameras:
         raise CameraError("a rig needs at least one camera")
-    parameters = RenderEngineVtkParams(default_clear_color=np.array(background))
-    scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(parameters))
-    sensors = {}
     for name, camera in cameras.items():
         if not isinstance(camera, PinholeCamera):
             raise CameraError(f"camera '{name}': a rig's sensors are pinholes, not parallel")
-        color, depth, X_WC = camera_to_drake(
-            camera, renderer_name=_RENDERER, depth_range=(camera.near, _FARTHEST)
-        )
-        sensor = builder.AddNamedSystem(
-            f"camera_{name}", RgbdSensor(scene_graph.world_frame_id(), X_WC, color, depth)
-        )
-        builder.Connect(scene_graph.get_query_output_port(), sensor.query_object_input_port())
+    builder = DiagramBuilder()
+    scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
+    source: System
+    if true_positions is None:
+        source = builder.AddNamedSystem("positions", PassThrough(model.plant.num_positions()))
+        builder.ExportInput(source.get_input_port(), "positions")
+    else:
+        source = builder.AddNamedSystem("true_positions", TrajectorySource(true_positions))
+    add_posed_plant(builder, scene_graph, model, source.get_output_port(), "geometry_pose")
+    ranges = {name: (camera.near, _FARTHEST) for name, camera in cameras.items()}
+    parameters = RenderEngineVtkParams(default_clear_color=np.array(background))
+    sensors = add_sensors(builder, scene_graph, cameras, ranges, parameters)
+    for name, sensor in sensors.items():
         builder.ExportOutput(sensor.color_image_output_port(), f"color_image_{name}")
         builder.ExportOutput(sensor.label_image_output_port(), f"label_image_{name}")
         builder.ExportOutput(sensor.depth_image_32F_output_port(), f"depth_image_{name}")
-        sensors[name] = sensor
+    return CameraRig(builder.Build(), dict(cameras), sensors)
+
+
+def add_sensors(
+    builder: DiagramBuilder,
+    scene_graph: SceneGraph,
+    cameras: Mapping[str, Camera],
+    depth_ranges: Mapping[str, tuple[float, float]],
+    parameters: RenderEngineVtkParams,
+) -> dict[str, RgbdSensor]:
+    """Add a renderer, and an RgbdSensor ``camera_<name>`` for each camera, returned by name.
+
+    Call it after the models are added: the renderer refuses OBJ files without normals when it is.
+
+    Args:
+        depth_ranges: as of camera_to_drake, by camera that has its own [m].
+    """
+    scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(parameters))
+    sensors = {}
+    for name, camera in cameras.items():
+        color, depth, X_WC = camera_to_drake(
+            camera, renderer_name=_RENDERER, depth_range=depth_ranges.get(name)
+        )
+        sensor = RgbdSensor(scene_graph.world_frame_id(), X_WC, color, depth)
+        sensors[name] = builder.AddNamedSystem(f"camera_{name}", sensor)
+        builder.Connect(scene_graph.get_query_output_port(), sensor.query_object_input_port())
     return sensors

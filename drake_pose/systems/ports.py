@@ -1,0 +1,157 @@
+"""What the systems here are made of: ports by name, and what they know, renewed once a period."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import (
+    Context,
+    DependencyTicket,
+    DiscreteValues,
+    EventStatus,
+    InputPort,
+    LeafSystem,
+    OutputPort,
+    State,
+)
+
+from drake_pose.errors import SettingsError
+
+Array = NDArray[np.float64]
+T = TypeVar("T")
+
+
+def require_period(whose: str, period: float) -> None:
+    """Refuse (SettingsError) a time between two updates that is not positive [s]."""
+    if not 0.0 < period < math.inf:
+        raise SettingsError(f"the {whose}'s period must be positive, not {period}")
+
+
+def require_time_forward(system: LeafSystem, context: Context, last: float) -> None:
+    """Refuse (SettingsError) an update before the last one, whose filter knows the future."""
+    now = context.get_time()
+    if now < last:
+        raise SettingsError(
+            f"{system.get_name()}: time ran backwards, from {last:g} s to {now:g} s; to begin "
+            "anew, set the context to its defaults (SetDefaultContext)"
+        )
+
+
+class PortedSystem(LeafSystem):
+    """A system whose ports are declared by what is like their values: an int is a vector's size."""
+
+    def add_input(self, name: str, like: Any) -> InputPort:
+        """An input port."""
+        if isinstance(like, int):
+            return self.DeclareVectorInputPort(name, like)
+        return self.DeclareAbstractInputPort(name, AbstractValue.Make(like))
+
+    def add_output(
+        self,
+        name: str,
+        like: Any,
+        calc: Callable[[Context], Any],
+        tickets: set[DependencyTicket] | None = None,
+    ) -> OutputPort:
+        """An output port that a function of the context gives, and what of; None: all inputs."""
+        of = {self.all_input_ports_ticket()} if tickets is None else tickets
+        if isinstance(like, int):
+            return self.DeclareVectorOutputPort(
+                name, like, lambda context, output: output.SetFromVector(calc(context)), of
+            )
+        return self.DeclareAbstractOutputPort(
+            name,
+            AbstractValue.Make(like).Clone,
+            lambda context, output: output.set_value(calc(context)),
+            of,
+        )
+
+    def given(self, context: Context, name: str) -> Any:
+        """What comes in at a port, a vector as a copy; None: it is not connected."""
+        port = self.GetInputPort(name)
+        value = port.Eval(context) if port.HasValue(context) else None
+        return np.array(value) if isinstance(value, np.ndarray) else value
+
+
+class SharedValue:
+    """A value that nobody changes: Drake would copy abstract state twice in every update."""
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Any:
+        return self
+
+
+class BeliefSystem(PortedSystem, Generic[T]):
+    """Renews a value, its belief, once a period; outputs read it.
+
+    The update is an unrestricted one, as abstract state needs.
+    """
+
+    def keep_belief(self, first: T, period: float, offset: float = 0.0) -> None:
+        """Declares the belief, and when it is renewed [s]."""
+        self._belief = self.DeclareAbstractState(AbstractValue.Make(first))
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period, offset, self._renew)
+        self.DeclareForcedUnrestrictedUpdateEvent(self._renew)
+
+    def show(self, name: str, like: Any, read: Callable[[T], Any]) -> OutputPort:
+        """An output port that reads the belief."""
+        ticket = {self.abstract_state_ticket(self._belief)}
+        return self.add_output(name, like, lambda context: read(self.belief(context)), ticket)
+
+    def belief(self, context: Context) -> T:
+        """What is known in a context."""
+        known: T = context.get_abstract_state(int(self._belief)).get_value()
+        return known
+
+    def next_belief(self, context: Context, last: T) -> T:
+        """What is known after an update."""
+        raise NotImplementedError
+
+    def _renew(self, context: Context, state: State) -> EventStatus:
+        last = self.belief(context)
+        known = self.next_belief(context, last)
+        if known is last:
+            return EventStatus.DidNothing()
+        state.get_mutable_abstract_state(int(self._belief)).set_value(known)
+        return EventStatus.Succeeded()
+
+
+class MemorySystem(PortedSystem):
+    """Renews named vectors once a period.
+
+    The update is a discrete one: it sees what unrestricted ones of the same time have changed.
+    """
+
+    def keep_vectors(
+        self, starts: Mapping[str, Array], shown: Collection[str], period: float
+    ) -> None:
+        """Declares vectors, which of them are outputs, and when they are renewed [s]."""
+        self._vectors = {name: self.DeclareDiscreteState(first) for name, first in starts.items()}
+        for name in shown:
+            self.DeclareStateOutputPort(name, self._vectors[name])
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._renew)
+
+    def vectors(self, context: Context) -> dict[str, Array]:
+        """Copies of what is known in a context."""
+        return {
+            name: np.array(context.get_discrete_state(index).value())
+            for name, index in self._vectors.items()
+        }
+
+    def set_vectors(self, state: DiscreteValues, known: Mapping[str, Array]) -> None:
+        """Writes what is known from now on."""
+        for name, value in known.items():
+            state.set_value(self._vectors[name], np.ravel(value))
+
+    def next_vectors(self, context: Context, known: dict[str, Array]) -> Mapping[str, Array]:
+        """What is known after an update, and was not before; may change ``known``."""
+        raise NotImplementedError
+
+    def _renew(self, context: Context, state: DiscreteValues) -> EventStatus:
+        changed = self.next_vectors(context, self.vectors(context))
+        self.set_vectors(state, changed)
+        return EventStatus.Succeeded() if changed else EventStatus.DidNothing()

@@ -1,6 +1,7 @@
 """Checks of camera parameters; every message names the camera and the field."""
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -52,7 +53,18 @@ def check_pose(value: Any, field: str, where: str) -> np.ndarray:
     Raises:
         CameraError: not a finite 4 x 4 matrix, a last row that is not 0 0 0 1, or no rotation.
     """
-    matrix = _read_matrix(value, field, where)
+    rows = value.tolist() if isinstance(value, np.ndarray) else value
+    if not (
+        isinstance(rows, list | tuple)
+        and [len(row) if isinstance(row, list | tuple) else 0 for row in rows] == [4] * 4
+    ):
+        raise CameraError(
+            f"{where}: {field} must be a 4 x 4 matrix of numbers, not {_short(value)}"
+        )
+    if isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
+        matrix = np.array(value, dtype=np.float64)
+    else:
+        matrix = np.array([[check_number(entry, field, where) for entry in row] for row in rows])
     if not np.all(np.isfinite(matrix)):
         raise CameraError(f"{where}: {field} has entries that are not finite")
     if not np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0], rtol=0.0, atol=1e-12):
@@ -78,19 +90,16 @@ def check_pose(value: Any, field: str, where: str) -> np.ndarray:
     return matrix
 
 
-def _read_matrix(value: Any, field: str, where: str) -> np.ndarray:
-    """Returns the 4 x 4 numbers as a fresh array; lists from a file are checked entry by entry."""
-    rows = value if isinstance(value, list | tuple) else ()
-    if isinstance(value, np.ndarray):
-        if value.shape == (4, 4) and value.dtype.kind in "fiu":
-            return np.array(value, dtype=np.float64)
-    elif len(rows) == 4 and all(isinstance(row, list | tuple) and len(row) == 4 for row in rows):
-        return np.array([[check_number(entry, field, where) for entry in row] for row in rows])
-    raise CameraError(f"{where}: {field} must be a 4 x 4 matrix of numbers, not {_short(value)}")
+def write_file(path: str | Path, text: str, what: str) -> None:
+    """Writes a text; CameraError, which says what it holds, where that cannot be."""
+    try:
+        Path(path).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise CameraError(f"{path}: cannot write {what}: {error.strerror}") from error
 
 
 def _short(value: Any) -> str:
-    """Returns a value as text that cannot flood a message."""
+    """A value as text that cannot flood a message."""
     if isinstance(value, dict | list | tuple | set):
         return f"a {type(value).__name__} of {len(value)}"
     if isinstance(value, np.ndarray):

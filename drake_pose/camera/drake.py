@@ -24,6 +24,7 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraConfig, CameraInfo
 
+from drake_pose.camera.checks import write_file
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError
 
@@ -239,11 +240,7 @@ def save_scenario(path: str | Path, cameras: Mapping[str, Camera] | Iterable[Cam
     Raises:
         CameraError: as ``dump_scenario``; and when the file cannot be written.
     """
-    text = dump_scenario(cameras)
-    try:
-        Path(path).write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise CameraError(f"{path}: cannot write the cameras: {error.strerror}") from error
+    write_file(path, dump_scenario(cameras), "the cameras")
 
 
 def _rigid_transform(X_AB: np.ndarray) -> RigidTransform:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from drake_pose.camera.checks import check_number, check_pose
+from drake_pose.camera.checks import check_number, check_pose, write_file
 from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
 from drake_pose.errors import CameraError
 from drake_pose.yaml_files import read_yaml
@@ -102,11 +102,7 @@ def load_camera_file(path: str | Path) -> CameraFile:
 
 def save_cameras(path: str | Path, cameras: Mapping[str, Camera] | Iterable[Camera]) -> None:
     """Writes cameras to a YAML file for load_cameras, to the last digit; or raises CameraError."""
-    text = dump_cameras(cameras)
-    try:
-        Path(path).write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise CameraError(f"{path}: cannot write the cameras: {error.strerror}") from error
+    write_file(path, dump_cameras(cameras), "the cameras")
 
 
 def dump_cameras(

@@ -30,7 +30,6 @@ _FIELDS = {
     "checkerboard": ("kind", "squares", "square_length"),
     "charuco": ("kind", "squares", "square_length", "marker_length", "dictionary"),
 }
-_LEGACY = "legacy_pattern"
 _MOST_SQUARES = 100
 _FEWEST_CORNERS = 8
 
@@ -75,9 +74,12 @@ class Board:
                     f"board: squares must be two whole numbers from 3 to {_MOST_SQUARES} (across "
                     f"and down), not {count!r}"
                 )
-        check_number(self.square_length, "square_length", "board", positive=True)
+        if not isinstance(self.legacy_pattern, bool):
+            raise CameraError("board: legacy_pattern must be true or false")
+        for name in ("square_length", "marker_length")[: 1 + (self.kind == "charuco")]:
+            length = check_number(getattr(self, name), name, "board", positive=True)
+            object.__setattr__(self, name, length)
         if self.kind == "charuco":
-            length = check_number(self.marker_length, "marker_length", "board", positive=True)
             if length >= self.square_length:
                 raise CameraError("board: marker_length must be less than square_length")
             self.opencv_charuco_board()
@@ -179,7 +181,7 @@ def load_board(path: str | Path) -> Board:
     if not isinstance(content, dict) or content.get("kind") not in _FIELDS:
         raise CameraError(f"{path}: a board needs kind: {' or '.join(_FIELDS)}")
     kind = content["kind"]
-    known = (*_FIELDS[kind], *([_LEGACY] if kind == "charuco" else []))
+    known = (*_FIELDS[kind], *(["legacy_pattern"] if kind == "charuco" else []))
     unknown = [str(name)[:40] for name in content if name not in known]
     missing = [name for name in _FIELDS[kind] if name not in content]
     if unknown or missing:
@@ -188,10 +190,6 @@ def load_board(path: str | Path) -> Board:
     squares = content.pop("squares")
     if not isinstance(squares, list) or len(squares) != 2:
         raise CameraError(f"{path}: squares must be two whole numbers, across and down")
-    if not isinstance(content.get(_LEGACY, False), bool):
-        raise CameraError(f"{path}: legacy_pattern must be true or false")
-    for name in {"square_length", "marker_length"} & set(content):
-        content[name] = check_number(content[name], name, str(path))
     try:
         return Board(columns=squares[0], rows=squares[1], **content)
     except CameraError as error:

@@ -13,12 +13,10 @@ from drake_pose.camera.calibration.board import BoardDetections, Detection, Pict
 from drake_pose.camera.calibration.lens import Lens
 from drake_pose.camera.calibration.rig import (
     FREE_COEFFICIENTS,
-    Detections,
-    LensEstimate,
     Rig,
     adjust_rig,
     chain_rig,
-    estimate_lens,
+    own_rig,
     pair_pose,
     require_shared_pictures,
 )
@@ -97,18 +95,17 @@ def calibrate(seen: BoardDetections, settings: CalibrationSettings | None = None
         UnknownNameError: when the settings name a camera or frame that is not there.
     """
     settings = settings or CalibrationSettings()
-    detections, left_out = _chosen(seen, settings)
-    _check_board(seen, detections)
-    points = seen.board.points
-    lenses = {}
-    for name in detections:
-        lenses[name], spoilt = _own_lens(name, points, detections[name], seen.sizes[name], settings)
+    seen, left_out = _chosen(seen, settings)
+    _check_board(seen)
+    own = {}
+    for name in seen.detections:
+        own[name], seen, spoilt = _own_rig(name, seen, settings)
         left_out |= spoilt
-    rig, spoilt = _adjusted_rig(points, detections, lenses, settings)
+    rig, seen, spoilt = _agreed_rig(seen, own, settings)
     left_out |= spoilt
-    errors = rig.errors(points, detections)
+    errors = rig.errors(seen)
     camera_errors = {}
-    for name, frames in detections.items():
+    for name, frames in seen.detections.items():
         counts = [len(detection.corners) for detection in frames.values()]
         squares = [errors[name, frame] ** 2 for frame in frames]
         camera_errors[name] = float(np.sqrt(np.average(squares, weights=counts)))
@@ -126,44 +123,49 @@ def calibrate(seen: BoardDetections, settings: CalibrationSettings | None = None
         what = "picture of the board" if kind == "board" else "camera"
         raise UnknownNameError(what, name, poses, "the calibration")
     X_WR = inverse_pose(poses[name])
-    cameras = {n: rig.lenses[n].camera(n, X_WR @ rig.X_RC[n]) for n in detections}
+    cameras = {n: rig.lenses[n].camera(n, X_WR @ X_RC) for n, X_RC in rig.X_RC.items()}
     X_WB = {frame: X_WR @ X for frame, X in rig.X_RB.items()}
     return Calibration(cameras, rig.lenses, X_WB, errors, camera_errors, left_out, world)
 
 
 def _chosen(
     seen: BoardDetections, settings: CalibrationSettings
-) -> tuple[dict[str, dict[str, Detection]], dict[Picture, str]]:
-    """The detections to use, in dictionaries of our own, and what was left out on request."""
+) -> tuple[BoardDetections, dict[Picture, str]]:
+    """What is seen in the pictures to use, and what was left out on request."""
     unwanted = set(settings.leave_out)
     pictures = [(camera, frame) for camera, frames in seen.detections.items() for frame in frames]
     known = {*seen.detections, *("/".join(picture) for picture in (*pictures, *seen.not_found))}
     for name in sorted(unwanted - known):
         raise UnknownNameError("camera or picture", name, sorted(known), "the calibration")
-    left_out: dict[Picture, str] = {}
-    detections: dict[str, dict[str, Detection]] = {
-        camera: {} for camera in seen.detections if camera not in unwanted
+    left_out = {
+        (camera, frame): "the camera was left out" if camera in unwanted else "left out on request"
+        for camera, frame in pictures
+        if {camera, f"{camera}/{frame}"} & unwanted
     }
-    for camera, frame in pictures:
-        if camera in unwanted:
-            left_out[camera, frame] = "the camera was left out"
-        elif f"{camera}/{frame}" in unwanted:
-            left_out[camera, frame] = "left out on request"
-        else:
-            detections[camera][frame] = seen.detections[camera][frame]
-    if not detections:
+    kept = {name: dict(seen.detections[name]) for name in seen.detections if name not in unwanted}
+    if not kept:
         raise CameraError("no camera is left to be calibrated")
-    return detections, left_out
+    chosen = replace(seen, detections=kept)
+    return _without(chosen, [(name, frame) for name, frame in left_out if name in kept]), left_out
 
 
-def _check_board(seen: BoardDetections, detections: Detections) -> None:
+def _without(seen: BoardDetections, pictures: Collection[Picture]) -> BoardDetections:
+    """The same without some pictures."""
+    kept = {
+        camera: {frame: one for frame, one in frames.items() if (camera, frame) not in pictures}
+        for camera, frames in seen.detections.items()
+    }
+    return replace(seen, detections=kept)
+
+
+def _check_board(seen: BoardDetections) -> None:
     for camera in seen.mirrored:
-        if camera in detections:
+        if camera in seen.detections:
             raise CameraError(
                 f"camera '{camera}': its pictures are mirrored: the board is found in them only "
                 "when left and right are exchanged; switch mirroring off"
             )
-    if len(detections) > 1 and seen.board.looks_the_same_turned:
+    if len(seen.detections) > 1 and seen.board.looks_the_same_turned:
         raise CameraError(
             f"a checkerboard of {seen.board.columns} x {seen.board.rows} squares looks the same "
             "when it is turned by 180 degrees, so several cameras cannot agree on its corners: "
@@ -171,56 +173,49 @@ def _check_board(seen: BoardDetections, detections: Detections) -> None:
         )
 
 
-def _own_lens(
-    name: str,
-    points: Array,
-    frames: dict[str, Detection],
-    size: tuple[int, int],
-    settings: CalibrationSettings,
-) -> tuple[LensEstimate, dict[Picture, str]]:
-    """A camera's lens; spoilt pictures are taken out of `frames` or refused."""
+def _own_rig(
+    name: str, seen: BoardDetections, settings: CalibrationSettings
+) -> tuple[Rig, BoardDetections, dict[Picture, str]]:
+    """A camera's lens by itself, what is seen without its spoilt pictures, and these."""
     spoilt: dict[Picture, str] = {}
     while True:
-        estimate = estimate_lens(name, points, frames, size, settings.lens)
-        worst = max(estimate.errors, key=lambda frame: estimate.errors[frame])
+        own, focal_deviation = own_rig(name, seen, settings.lens)
+        errors = {frame: own.error(seen, name, frame, X_CB) for frame, X_CB in own.X_RB.items()}
+        worst = max(errors, key=lambda frame: errors[frame])
         # One spoilt picture also harms the others' errors: the worst goes first, then look again.
-        if estimate.errors[worst] <= _limit(estimate.errors.values()):
+        if errors[worst] <= _limit(errors.values()):
             break
-        reason = f"its corners are {estimate.errors[worst]:.2f} pixel off the camera's own lens"
+        reason = f"its corners are {errors[worst]:.2f} pixel off the camera's own lens"
         spoilt[name, worst] = reason
-        del frames[worst]
+        seen = _without(seen, [(name, worst)])
     _refuse(spoilt, settings)
-    if not estimate.focal_deviation < _LARGEST_FOCAL_DEVIATION:
+    if not focal_deviation < _LARGEST_FOCAL_DEVIATION:
         raise CameraError(
             f"camera '{name}': its pictures are too much alike to tell the focal length (known to "
-            f"{100.0 * estimate.focal_deviation:.0f} % only): tilt the board, fill the picture"
+            f"{100.0 * focal_deviation:.0f} % only): tilt the board, fill the picture"
         )
-    return estimate, spoilt
+    return own, seen, spoilt
 
 
-def _adjusted_rig(
-    points: Array,
-    detections: dict[str, dict[str, Detection]],
-    lenses: Mapping[str, LensEstimate],
-    settings: CalibrationSettings,
-) -> tuple[Rig, dict[Picture, str]]:
-    """Everything at once; spoilt pictures are taken out of `detections` or refused."""
-    rig = chain_rig(lenses)
+def _agreed_rig(
+    seen: BoardDetections, own: Mapping[str, Rig], settings: CalibrationSettings
+) -> tuple[Rig, BoardDetections, dict[Picture, str]]:
+    """Everything at once, what is seen without the pictures that contradict others, and these."""
+    rig, every = chain_rig(seen, own), seen
     spoilt: dict[Picture, str] = {}
-    while len(detections) > 1:
-        rig = adjust_rig(points, detections, rig, settings.lens, robust=True)
-        worst = _disagreeing(rig.errors(points, detections))
+    while len(own) > 1:
+        rig = adjust_rig(seen, rig, settings.lens, robust=True)
+        worst = _disagreeing(rig.errors(seen))
         if not worst:
             break
         spoilt |= worst
-        _require_true_cameras(spoilt, lenses)
-        for camera, frame in worst:
-            del detections[camera][frame]
-        left = {frame for frames in detections.values() for frame in frames}
+        _require_true_cameras(every, spoilt, own)
+        seen = _without(seen, worst)
+        left = {frame for frames in seen.detections.values() for frame in frames}
         rig = replace(rig, X_RB={frame: X for frame, X in rig.X_RB.items() if frame in left})
     _refuse(spoilt, settings)
-    require_shared_pictures(detections)
-    return adjust_rig(points, detections, rig, settings.lens, robust=False), spoilt
+    require_shared_pictures(seen.detections)
+    return adjust_rig(seen, rig, settings.lens, robust=False), seen, spoilt
 
 
 def _disagreeing(errors: Mapping[Picture, float]) -> dict[Picture, str]:
@@ -246,19 +241,21 @@ def _disagreeing(errors: Mapping[Picture, float]) -> dict[Picture, str]:
     return dict(sorted(spoilt.items()))
 
 
-def _require_true_cameras(spoilt: Collection[Picture], lenses: Mapping[str, LensEstimate]) -> None:
+def _require_true_cameras(
+    seen: BoardDetections, spoilt: Collection[Picture], own: Mapping[str, Rig]
+) -> None:
     """Refuses a camera most of whose shared pictures contradict the others, and says why."""
     counts = Counter(camera for camera, _ in spoilt)
-    for name, own in lenses.items():
-        others = {frame for other in lenses if other != name for frame in lenses[other].X_CB}
-        shared = [frame for frame in own.X_CB if frame in others]
+    for name in own:
+        others = {frame for other in own if other != name for frame in own[other].X_RB}
+        shared = [frame for frame in own[name].X_RB if frame in others]
         bad = sum((name, frame) in spoilt for frame in shared)
         blamed_more = any(count > bad for other, count in counts.items() if other != name)
         if 2 * bad <= len(shared) or blamed_more:
             continue
         # Of two cameras nobody can say which is wrong.
-        who = " or ".join(f"camera '{n}'" for n in (lenses if len(lenses) == 2 else [name]))
-        if _is_mirrored(lenses, name):
+        who = " or ".join(f"camera '{n}'" for n in (own if len(own) == 2 else [name]))
+        if _is_mirrored(seen, own, name):
             raise CameraError(
                 f"{who}: its pictures are mirrored: they agree with the other cameras only when "
                 "left and right are exchanged; switch mirroring off"
@@ -270,27 +267,25 @@ def _require_true_cameras(spoilt: Collection[Picture], lenses: Mapping[str, Lens
         )
 
 
-def _is_mirrored(lenses: Mapping[str, LensEstimate], name: str) -> bool:
+def _is_mirrored(seen: BoardDetections, own: Mapping[str, Rig], name: str) -> bool:
     """Whether a camera agrees with the others once its pictures are turned left to right."""
-    own = lenses[name]
-    size = own.lens.width, own.lens.height
     # The colours of a board of an even number of columns fit only where rows are exchanged, with
     # an odd number columns; squares are one more than corners.
-    numbers = np.arange(len(own.points)).reshape(len(np.unique(own.points[:, 1])), -1)
+    numbers = np.arange(len(seen.board.points)).reshape(seen.board.rows - 1, -1)
     numbers = numbers[::-1] if len(numbers) % 2 == 0 else numbers[:, ::-1]
     turned = {}
-    for frame, seen in own.detections.items():
-        corners = numbers.ravel()[seen.corners]
+    for frame, one in seen.detections[name].items():
+        corners = numbers.ravel()[one.corners]
         order = np.argsort(corners)
-        uv = [size[0] - 1.0, 0.0] + seen.uv * [-1.0, 1.0]
+        uv = [seen.sizes[name][0] - 1.0, 0.0] + one.uv * [-1.0, 1.0]
         turned[frame] = Detection(corners[order], uv[order])
     try:
-        estimate = estimate_lens(name, own.points, turned, size)
+        other_way, _ = own_rig(name, replace(seen, detections={name: turned}))
     except CameraError:
         return False
-    others = [one for one in lenses.values() if one is not own and set(one.X_CB) & set(own.X_CB)]
-    as_seen = np.median([pair_pose(other, own)[1] for other in others])
-    as_turned = np.median([pair_pose(other, estimate)[1] for other in others])
+    others = [own[n] for n in own if n != name and set(own[n].X_RB) & set(own[name].X_RB)]
+    as_seen = np.median([pair_pose(seen, other, own[name])[1] for other in others])
+    as_turned = np.median([pair_pose(seen, other, other_way)[1] for other in others])
     return bool(as_turned < _BETTER * as_seen)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from drake_pose.camera.checks import check_number, check_side
+from drake_pose.camera.checks import check_number, check_side, write_file
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import CameraError
 from drake_pose.yaml_files import read_yaml
@@ -76,12 +76,6 @@ class Lens:
         (fx, _, cx), (_, fy, cy), _ = self.straight_matrix.tolist()
         return PinholeCamera(name, self.width, self.height, fx, fy, cx, cy, X_WC)
 
-    def project(self, p_C: Array) -> Array:
-        """Projects points (n, 3) of the camera's frame [m] to (n, 2) pixels as taken."""
-        points = np.asarray(p_C, dtype=np.float64).reshape(-1, 1, 3)
-        uv, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), self.matrix, self.distortion)
-        return np.asarray(uv, dtype=np.float64).reshape(-1, 2)
-
     def undistort(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Frees a picture (H, W) or (H, W, 3) from distortion; CameraError: another size."""
         if picture.shape[:2] != (self.height, self.width):
@@ -89,16 +83,8 @@ class Lens:
                 f"a picture of {picture.shape[1]} x {picture.shape[0]} pixels (width x height) is "
                 f"not of the lens of {self.width} x {self.height}"
             )
-        return np.asarray(cv2.remap(picture, *self._maps, cv2.INTER_LINEAR), dtype=np.uint8)
-
-    @cached_property
-    def _maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Where each pixel of the undistorted picture is in the picture as taken."""
-        across, down = cv2.initUndistortRectifyMap(
-            self.matrix, self.distortion, np.eye(3), self.straight_matrix,
-            (self.width, self.height), cv2.CV_32FC1,
-        )  # fmt: skip
-        return np.asarray(across), np.asarray(down)
+        straight = cv2.undistort(picture, self.matrix, self.distortion, None, self.straight_matrix)
+        return np.asarray(straight, dtype=np.uint8)
 
 
 def save_lenses(path: str | Path, lenses: Mapping[str, Lens]) -> None:
@@ -107,10 +93,7 @@ def save_lenses(path: str | Path, lenses: Mapping[str, Lens]) -> None:
         name: {"width": lens.width, "height": lens.height, **lens.numbers()}
         for name, lens in lenses.items()
     }
-    try:
-        Path(path).write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
-    except OSError as error:
-        raise CameraError(f"{path}: cannot write the lenses: {error.strerror}") from error
+    write_file(path, yaml.safe_dump(content, sort_keys=False), "the lenses")
 
 
 def load_lenses(path: str | Path) -> dict[str, Lens]:
@@ -124,7 +107,7 @@ def load_lenses(path: str | Path) -> dict[str, Lens]:
         where = f"{path}: camera '{name}'"
         if not isinstance(entry, dict) or set(entry) != needed:
             raise CameraError(f"{where}: a lens has exactly {', '.join(sorted(needed))}")
-        size = tuple(check_side(entry[side], side, where) for side in ("width", "height"))
+        width, height = (check_side(entry[side], side, where) for side in ("width", "height"))
         numbers = [check_number(entry[field], field, where) for field in NUMBERS]
-        lenses[str(name)] = Lens.from_numbers((size[0], size[1]), numbers)
+        lenses[str(name)] = Lens.from_numbers((width, height), numbers)
     return lenses

@@ -9,7 +9,7 @@ import pytest
 from drake_pose.camera.calibration.board import Board, Detection, load_board
 from drake_pose.camera.calibration.calibrate import CalibrationSettings, calibrate
 from drake_pose.camera.calibration.lens import Lens, load_lenses, save_lenses
-from drake_pose.camera.calibration.rig import _project_corners, _vector
+from drake_pose.camera.calibration.rig import _vector, corner_residuals
 from drake_pose.errors import CameraError, UnknownNameError
 from tests.camera.boards import (
     CHARUCO,
@@ -70,10 +70,9 @@ class TestKnownCameras:
             [np.array([*lens[name].numbers().values()]) for name in cameras]
             + [_vector(X) for X in X_CW + list(poses.values())]
         )
-        places = {frame: k for k, frame in enumerate(poses)}
 
         def residuals(x):
-            return _project_corners(x, seen.board.points, seen.detections, places)
+            return corner_residuals(seen, x, list(poses))
 
         _, J = residuals(x)
         for k, step in enumerate(1e-6 * np.eye(len(x))):

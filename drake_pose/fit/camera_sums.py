@@ -22,9 +22,6 @@ from drake_pose.silhouette.areas.outline import PackedOutlines
 
 Array = NDArray[np.float64]
 
-REACH = 4.0
-"""Distances beyond this many scales do not correspond."""
-
 # Cameras and nodes of a request.
 _HEADER = struct.Struct("<2q")
 _LOWER = np.tril_indices(12)
@@ -85,20 +82,10 @@ class EdgeKeeper(Protocol):
 
 
 def compare_placed(
-    packed: PackedOutlines,
-    X_WN: Array,
-    views: Views,
-    weights: Array,
-    pieces: Array | None = None,
-    side: float = 1.0,
+    packed: PackedOutlines, X_WN: Array, views: Views, weights: Array
 ) -> tuple[Array, Array, Array]:
-    """A, b and sums of each camera, as of `compare_contours`; the other arguments as there."""
-    cameras, nodes = len(weights), len(X_WN)
-    pieces = np.zeros((cameras, 0, 0)) if pieces is None else pieces
-    A, b = np.zeros((cameras, nodes, 12, 12)), np.zeros((cameras, nodes, 12))
-    sums = np.zeros((cameras, nodes + 1, _SUMS))
-    outputs = (A, b, sums, pieces, side)
-    compare_contours(packed, X_WN, views.cameras, views.evidence, weights, REACH, *outputs)
+    """A, b and sums of each camera; arguments as of `compare_contours`."""
+    A, b, sums, _ = compare_contours(packed, X_WN, *views, weights, 0, 1.0)
     return A, b, sums
 
 

@@ -22,16 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.compiled import compiled
-from drake_pose.fit.kernel import (
-    CLOSE,
-    COMPARED,
-    COST,
-    FITTING,
-    SQUARES,
-    WEIGHT,
-    add_residual,
-    seen_from,
-)  # fmt: skip
+from drake_pose.fit.kernel import add_residual, seen_from
 from drake_pose.silhouette.areas.outline import PackedOutlines
 from drake_pose.silhouette.contours.contour_points import sample_contour
 
@@ -93,41 +84,22 @@ def compare_lines(
         A, b, sums: (nodes, 12, 12), (nodes, 12) and (nodes + 1, 6) added to, as of
             `compare_contours`; lengths are of lines that say something, by how much they do.
     """
-    unit, scale, spacing, worth = weights
-    X_CN = seen_from(camera[0], X_WN)
-    uv, normals, lengths, nodes, p_N, clearances = sample_contour(packed, X_CN, camera[1], spacing)
-    noise = (scale / 2.5) ** 2
+    contour = sample_contour(packed, seen_from(camera[0], X_WN), camera[1], weights[2])
+    uv, normals, lengths, nodes, p_N, clearances = contour
+    noise = (weights[1] / 2.5) ** 2
     rows, p, w = np.empty((2, 3)), np.empty(3), np.empty(12)
-    blocks, on, beside = _line_arrays()
+    scratch = np.empty((3, 2 * _BLOCKS + 2))
     for i in range(len(uv)):
         node = nodes[i]
-        r, variance = _find_edge(
-            picture, histograms[node], uv[i], normals[i], clearances[i], step,
-            (blocks, on, beside),
-        )  # fmt: skip
-        if variance <= 0.0:
-            continue
-        length = 2.0 * lengths[i] / (1.0 + variance / noise)
-        t = (r / scale) ** 2
-        sums[node, COMPARED] += length * unit
-        if t < 1.0:
-            sums[node, FITTING] += length * unit
-        sums[node, CLOSE] += length * unit / (1.0 + t)
-        sums[node, COST] += worth * length * r * r / (1.0 + t)
-        weight = worth * length / (1.0 + t) ** 2
-        sums[node, SQUARES] += weight * r * r
-        sums[node, WEIGHT] += weight
-        add_residual(
-            A[node], b[node], X_WN[node], p_N[i], camera, normals[i, 0], normals[i, 1], r, weight,
-            (rows, p, w),
-        )  # fmt: skip
-
-
-@compiled
-def _line_arrays() -> tuple[Array, Array, Array]:
-    """Room for what _find_edge reckons with."""
-    blocks = 2 * _BLOCKS + 1
-    return np.empty(blocks), np.empty(blocks + 1), np.empty(blocks + 1)
+        edge, variance = _find_edge(
+            picture, histograms[node], uv[i], normals[i], clearances[i], step, scratch
+        )
+        if variance > 0.0:
+            add_residual(
+                A[node], b[node], sums[node], X_WN[node], p_N[i], camera, normals[i, 0],
+                normals[i, 1], edge, 2.0 * lengths[i] / (1.0 + variance / noise), weights,
+                (rows, p, w),
+            )  # fmt: skip
 
 
 @compiled
@@ -150,10 +122,10 @@ def _find_edge(
     normal: Array,
     clearance: Array,
     step: int,
-    scratch: tuple[Array, Array, Array],
+    scratch: Array,
 ) -> tuple[float, float]:
     """Where the edge lies on a line, outwards, and the variance [pixel]; -1: nothing is said."""
-    blocks, on, beside = scratch
+    blocks, on, beside = scratch[0], scratch[1], scratch[2]
     # Of a thin part coarse blocks would see little, and too much of what is beyond.
     step = max(1, min(step, int(clearance[0] / _BLOCKS_ACROSS)))
     for k in range(-_BLOCKS, _BLOCKS + 1):
@@ -228,14 +200,13 @@ def learn_colours(
     uv, normals, _, nodes, _, clearances = sample_contour(packed, X_CN, camera[1], spacing)
     counts = np.zeros((len(histograms), 2, COLOURS), dtype=np.float32)
     totals = np.zeros((len(histograms), 2))
-    blocks, on, beside = _line_arrays()
+    scratch = np.empty((3, 2 * _BLOCKS + 2))
     for i in range(len(uv)):
         node, middle = nodes[i], 0.0
         if agreeing < np.inf and not len(region):
             edge, variance = _find_edge(
-                picture, histograms[node], uv[i], normals[i], clearances[i], max(step, 1),
-                (blocks, on, beside),
-            )  # fmt: skip
+                picture, histograms[node], uv[i], normals[i], clearances[i], max(step, 1), scratch
+            )
             if variance > 0.0 and abs(edge) > agreeing:
                 continue
             if variance > 0.0 and step > 0:
@@ -256,23 +227,15 @@ def learn_colours(
                 totals[node, where] += 1.0
     for node in range(len(histograms)):
         for side in range(2):
-            if totals[node, side] >= _FEW:
-                _mix(histograms[node, side], counts[node, side], totals[node, side], rate)
+            shares, total = histograms[node, side], totals[node, side]
+            if total >= _FEW:
+                # Of a side of which nothing is known yet the new colours are all.
+                share = rate if shares.any() else 1.0
+                for colour in range(COLOURS):
+                    shares[colour] += share * (counts[node, side, colour] / total - shares[colour])
         for colour in range(COLOURS):
             on_it, beside_it = histograms[node, ON, colour], histograms[node, BESIDE, colour]
             # Most colours are never seen: a logarithm takes longer than all else here.
             even = on_it == beside_it
             odds = 0.0 if even else math.log((on_it + _RARE) / (beside_it + _RARE))
             histograms[node, ODDS, colour] = odds
-
-
-@compiled
-def _mix(shares: Histograms, counts: Histograms, total: float, rate: float) -> None:
-    """Moves shares (COLOURS,) towards those of counts, by a rate; all the way from nothing."""
-    known = 0.0
-    for colour in range(COLOURS):
-        known += shares[colour]
-    if known == 0.0:
-        rate = 1.0
-    for colour in range(COLOURS):
-        shares[colour] += rate * (counts[colour] / total - shares[colour])

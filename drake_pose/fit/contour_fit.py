@@ -25,7 +25,7 @@ from drake_pose.fit.camera_sums import (
     compare_placed,
 )
 from drake_pose.fit.evidence import EdgePoints, pack_evidence
-from drake_pose.fit.kernel import CLOSE, COMPARED, COST, FITTING, collect
+from drake_pose.fit.kernel import CLOSE, COMPARED, COST, FITTING, collect, compare_contours
 from drake_pose.fit.levenberg_marquardt import (
     AnnealingStage,
     Equations,
@@ -184,8 +184,7 @@ class ContourFit:
 
     def fit(
         self,
-        cameras: Sequence[Camera],
-        edges: Sequence[EdgePoints],
+        views: Views,
         values: Array,
         rounds: Sequence[AnnealingStage],
         prior: Prior | None = None,
@@ -194,27 +193,16 @@ class ContourFit:
         """Fits a pose.
 
         Args:
-            cameras: the cameras.
-            edges: of each camera's silhouette; without points where nothing is seen.
+            views: the cameras, and the edges of each one's silhouette.
             values: (m,) where to start.
             rounds: the parts of the fit.
             prior: what else is known.
             held: (m,) which values stay.
         """
-        return self.fit_views(pack_views(cameras, edges), values, rounds, prior, held)
-
-    def fit_views(
-        self,
-        views: Views,
-        values: Array,
-        rounds: Sequence[AnnealingStage],
-        prior: Prior | None = None,
-        held: Mask | None = None,
-    ) -> PoseFit:
-        """As fit, of views that are packed."""
 
         def add_up(placement: Placement, step: AnnealingStage) -> CameraSum:
-            return add_cameras(*self.compare_placed(views, placement, step))
+            weights = self.weights(views.cameras, placement, step)
+            return add_cameras(*compare_placed(placement.packed, placement.X_WN, views, weights))
 
         return self.fit_sums(add_up, values, rounds, prior, held)
 
@@ -253,34 +241,16 @@ class ContourFit:
         fitted[index] = found.own[0]
         return PoseFit(fitted, sums, found.cost, found.evaluations)
 
-    def compare(
-        self,
-        cameras: Sequence[Camera],
-        edges: Sequence[EdgePoints],
-        theta: Array,
-        step: AnnealingStage,
-    ) -> Comparison:
-        """The contours at values (m,) compared with all cameras' edges; arguments as in fit."""
-        return self.compare_views(pack_views(cameras, edges), theta, step)
-
-    def compare_views(self, views: Views, theta: Array, step: AnnealingStage) -> Comparison:
+    def compare(self, views: Views, theta: Array, step: AnnealingStage) -> Comparison:
         """The contours at values (m,), or at all parameters, compared with all cameras' edges."""
         return compare_views(self.body, views, theta, step, self.noise, self._pixels)
-
-    def compare_placed(
-        self, views: Views, placement: Placement, step: AnnealingStage
-    ) -> tuple[Array, Array, Array]:
-        """A, b and sums of each camera, as of `compare_contours`, where the body stands."""
-        weights = self.weights(views.cameras, placement, step)
-        return compare_placed(placement.packed, placement.X_WN, views, weights)
 
     def piece_costs(self, views: Views, theta: Array, step: AnnealingStage, side: float) -> Array:
         """(cameras, k, k) the cost at values (m,) by squares of the pictures of a side [pixel]."""
         placement = self.body.place(theta)
         weights = self.weights(views.cameras, placement, step)
-        pieces = np.zeros((len(weights), _SQUARES, _SQUARES))
-        compare_placed(placement.packed, placement.X_WN, views, weights, pieces, side)
-        return pieces
+        placed = placement.packed, placement.X_WN
+        return np.asarray(compare_contours(*placed, *views, weights, _SQUARES, side)[3])
 
     def weights(
         self, cameras: tuple[Array, Array], placement: Placement, step: AnnealingStage
@@ -347,25 +317,22 @@ def project(
             body's; None: the cameras stay.
     """
     placement = compared.placement
+    own_H, own_g = normal_equations(compared.total, placement, size)
     if camera_motions is None:
-        return normal_equations(compared.total, placement, size)
+        return own_H, own_g
     cameras, count = camera_motions.shape[:2]
-    nodes, moved = len(placement.X_WN), len(placement.motions)
-    total = size + cameras * count
-    H, g = np.zeros((total, total)), np.zeros(total)
     # A camera moves every node.
-    ends = placement.starts[1:]
-    places = np.repeat(ends, count)
-    more = np.tile(np.arange(count), nodes)
-    owners = np.insert(placement.owners, places, moved + more)
-    starts = placement.starts + count * np.arange(nodes + 1)
-    for c in range(cameras):
-        parameters = np.insert(placement.parameters, places, size + c * count + more)
-        motions = np.vstack([placement.motions, camera_motions[c]])
-        part = collect(compared.A[c], compared.b[c], motions, starts, owners, parameters, total)
-        H += part[0]
-        g += part[1]
-    return H, g
+    pulls = symmetric(compared.A) @ np.swapaxes(camera_motions, 1, 2)[:, None]
+    moved = np.swapaxes(placement.dense(size), 0, 1).reshape(size, -1)
+    H = np.zeros((size + cameras * count,) * 2)
+    H[:size, :size] = own_H
+    H[:size, size:] = moved @ np.moveaxis(pulls, 0, 2).reshape(moved.shape[1], -1)
+    H[size:, :size] = H[:size, size:].T
+    for c, block in enumerate(camera_motions @ pulls.sum(axis=1)):
+        own = slice(size + c * count, size + (c + 1) * count)
+        H[own, own] = block
+    pulled = -camera_motions @ compared.b.sum(axis=1)[..., None]
+    return H, np.concatenate([own_g, pulled.ravel()])
 
 
 def normal_equations(total: CameraSum, placement: Placement, size: int) -> tuple[Array, Array]:
@@ -379,6 +346,11 @@ def normal_equations(total: CameraSum, placement: Placement, size: int) -> tuple
         placement.parameters,
         size,
     )
+
+
+def symmetric(A: Array) -> Array:
+    """The symmetric matrices (..., n, n) of which the lower triangles are given."""
+    return np.asarray(np.tril(A) + np.swapaxes(np.tril(A, -1), -1, -2))
 
 
 def pixels_per_metre(cameras: tuple[Array, Array], place: Array) -> Array:

@@ -20,7 +20,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.fit.contour_fit import Comparison, ContourFit, Views, pixels_per_metre
+from drake_pose.fit.contour_fit import (
+    Comparison,
+    ContourFit,
+    Views,
+    pixels_per_metre,
+    symmetric,
+)
 from drake_pose.silhouette.areas.outline import Outline
 
 Array = NDArray[np.float64]
@@ -138,7 +144,7 @@ def distances_in_pictures(
     found: list[tuple[float, int, int, Array, Array, Array, float]] = []
     mean_size = float(np.mean([picture.size for picture in pictures]))
     for c, (A_lower, b, X_WN, X_CW, moves, size) in enumerate(pictures):
-        A = np.tril(A_lower) + np.swapaxes(np.tril(A_lower, -1), -1, -2)
+        A = symmetric(A_lower)
         shakes = _camera_motions(outlines, X_CW, X_WN, size)
         for n in np.flatnonzero(np.einsum("nii->n", A) > 0.0).tolist():
             D = surface_deformations(outlines[n].vertices, X_WN[n]) * mean_size
@@ -164,8 +170,7 @@ def distances_in_pictures(
     count = pictures[0].moves.shape[1]
     information = np.zeros((count, count))
     for A_lower, _, _, _, moves, _ in pictures:
-        A = np.tril(A_lower) + np.swapaxes(np.tril(A_lower, -1), -1, -2)
-        information += (moves @ A @ np.swapaxes(moves, 1, 2)).sum(axis=0)
+        information += (moves @ symmetric(A_lower) @ np.swapaxes(moves, 1, 2)).sum(axis=0)
     return Distances(
         y=np.array([one[6] for one in found]),
         X=np.array([one[3] for one in found]).reshape(-1, count),

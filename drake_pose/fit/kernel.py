@@ -16,14 +16,16 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.compiled import compiled
+from drake_pose.compiled import compiled, multiply
 from drake_pose.fit.evidence import Evidence
-from drake_pose.fit.point_motion import picture_rows
 from drake_pose.silhouette.areas.outline import PackedOutlines
-from drake_pose.silhouette.contours.contour_points import ContourPoints, sample_contour
+from drake_pose.silhouette.contours.contour_points import sample_contour
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
+
+REACH = 4.0
+"""Distances beyond this many scales do not correspond."""
 
 # Contours correspond only where their normals point alike: at least this cosine.
 _ALIKE = 0.3
@@ -78,14 +80,10 @@ def compare_contours(
     cameras: tuple[Array, Array],
     edges: Evidence,
     weights: Array,
-    reach: float,
-    A: Array,
-    b: Array,
-    sums: Array,
-    pieces: Array,
+    squares: int,
     side: float,
-) -> None:
-    """Adds what each camera says of the nodes' affine motions.
+) -> tuple[Array, Array, Array, Array]:
+    """What each camera says of the nodes' affine motions.
 
     The cost is x^T A x - 2 b^T x and what it is now, for x the rows of a node's affine motion
     (3, 4), which moves a point at p_W by M p_W + v.
@@ -97,76 +95,55 @@ def compare_contours(
         edges: of their silhouettes.
         weights: (c, 4) of each camera: units of length a pixel, the cost's scale and the spacing of
             the body's contour [pixel], and what a pixel of contour is worth.
-        reach: farther points do not correspond [scales].
-        A, b: (c, nodes, 12, 12), lower triangles, and (c, nodes, 12) added to.
-        sums: (c, nodes + 1, 6) added to, of each node's contour, and of all edges in the last row:
-            COMPARED, the length; FITTING, how much of it fits to within the scale; CLOSE, one minus
-            the cost in squares of the scale, summed along it [all in units of length]; COST, and
-            SQUARES of the distances, both as weighted in A and b; WEIGHT, of these.
-        pieces: (c, k, k) the COST by squares of the picture added to; beyond k squares they are
-            counted from 0 again. (c, 0, 0): it is not asked for.
-        side: of the squares [pixel].
+        squares: k, so many squares of each picture's rows and columns are told apart; 0: none.
+        side: of the squares [pixel]; beyond k they are counted from 0 again.
+
+    Returns:
+        A (c, nodes, 12, 12), lower triangles, and b (c, nodes, 12); sums (c, nodes + 1, 6) of each
+        node's contour, and of all edges in the last row: COMPARED, the length; FITTING, how much of
+        it fits to within the scale; CLOSE, one minus the cost in squares of the scale, summed along
+        it [all in units of length]; COST, and SQUARES of the distances, both as weighted in A and
+        b; WEIGHT, of these; and (c, k, k) the COST by squares of the picture.
     """
-    uv, normals, lengths, starts = edges
-    for c in range(len(weights)):
-        begin, end = starts[c], starts[c + 1]
+    count, nodes = len(weights), len(X_WN)
+    A, b = np.zeros((count, nodes, 12, 12)), np.zeros((count, nodes, 12))
+    sums, pieces = np.zeros((count, nodes + 1, 6)), np.zeros((count, squares, squares))
+    rows, p, w = np.empty((2, 3)), np.empty(3), np.empty(12)
+    for c in range(count):
+        begin, end = edges.starts[c], edges.starts[c + 1]
         if begin == end:
             continue
-        X_CN = seen_from(cameras[0][c], X_WN)
-        contour = sample_contour(packed, X_CN, cameras[1][c], weights[c, 2])
-        edge = (uv[begin:end], normals[begin:end], lengths[begin:end])
         camera = (cameras[0][c], cameras[1][c])
-        add = (A[c], b[c], sums[c], pieces[c])
-        _add_camera(contour, edge, X_WN, camera, weights[c], reach, add, side)
-
-
-@compiled
-def _add_camera(
-    contour: ContourPoints,
-    edge: tuple[Array, Array, Array],
-    X_WN: Array,
-    camera: tuple[Array, Array],
-    weights: Array,
-    reach: float,
-    add: tuple[Array, Array, Array, Array],
-    side: float,
-) -> None:
-    """compare_contours for one camera; add: its outputs."""
-    A, b, sums, pieces = add
-    unit, scale, _, worth = weights
-    uv, normals, lengths, nodes, p_N, _ = contour
-    edge_uv, edge_normals, edge_lengths = edge
-    of_point, of_edge = nearest_alike(uv, normals, edge_uv, edge_normals, reach * scale)
-    rows, p, w = np.empty((2, 3)), np.empty(3), np.empty(12)
-    n = len(uv)
-    for pair in range(n + len(edge_uv)):
-        i = pair if pair < n else of_edge[pair - n]
-        j = of_point[pair] if pair < n else pair - n
-        length = lengths[i] if pair < n else edge_lengths[j]
-        counted = nodes[i] if pair < n else len(sums) - 1
-        sums[counted, COMPARED] += length * unit
-        u, v = (uv[i, 0], uv[i, 1]) if pair < n else (edge_uv[j, 0], edge_uv[j, 1])
-        if i < 0 or j < 0:
+        own_A, own_b, own_sums = A[c], b[c], sums[c]
+        unit, scale, spacing, worth = weights[c, 0], weights[c, 1], weights[c, 2], weights[c, 3]
+        contour = sample_contour(packed, seen_from(camera[0], X_WN), camera[1], spacing)
+        uv, normals = contour.uv, contour.normals
+        edge_uv, edge_normals = edges.uv[begin:end], edges.normals[begin:end]
+        of_point, of_edge = nearest_alike(uv, normals, edge_uv, edge_normals, REACH * scale)
+        n = len(uv)
+        for pair in range(n + len(edge_uv)):
+            i = pair if pair < n else of_edge[pair - n]
+            j = of_point[pair] if pair < n else pair - n
+            length = contour.lengths[i] if pair < n else edges.lengths[begin + j]
+            counted = own_sums[contour.nodes[i] if pair < n else nodes]
             cost = worth * length * scale * scale
-            sums[counted, COST] += cost
-            _add_piece(pieces, u / side, v / side, cost)
-            continue
-        n0, n1 = normals[i, 0] + edge_normals[j, 0], normals[i, 1] + edge_normals[j, 1]
-        size = math.sqrt(n0 * n0 + n1 * n1)
-        n0, n1 = n0 / size, n1 / size
-        r = (edge_uv[j, 0] - uv[i, 0]) * n0 + (edge_uv[j, 1] - uv[i, 1]) * n1
-        t = (r / scale) ** 2
-        if t < 1.0:
-            sums[counted, FITTING] += length * unit
-        sums[counted, CLOSE] += length * unit / (1.0 + t)
-        cost = worth * length * r * r / (1.0 + t)
-        sums[counted, COST] += cost
-        _add_piece(pieces, u / side, v / side, cost)
-        weight = worth * length / (1.0 + t) ** 2
-        sums[counted, SQUARES] += weight * r * r
-        sums[counted, WEIGHT] += weight
-        node = nodes[i]
-        add_residual(A[node], b[node], X_WN[node], p_N[i], camera, n0, n1, r, weight, (rows, p, w))
+            if i < 0 or j < 0:
+                counted[COMPARED] += length * unit
+                counted[COST] += cost
+            else:
+                n0, n1 = normals[i, 0] + edge_normals[j, 0], normals[i, 1] + edge_normals[j, 1]
+                size = math.sqrt(n0 * n0 + n1 * n1)
+                n0, n1 = n0 / size, n1 / size
+                r = (edge_uv[j, 0] - uv[i, 0]) * n0 + (edge_uv[j, 1] - uv[i, 1]) * n1
+                node = contour.nodes[i]
+                cost = add_residual(
+                    own_A[node], own_b[node], counted, X_WN[node], contour.p_N[i], camera,
+                    n0, n1, r, length, weights[c], (rows, p, w),
+                )  # fmt: skip
+            if squares > 0:
+                u, v = (uv[i, 0], uv[i, 1]) if pair < n else (edge_uv[j, 0], edge_uv[j, 1])
+                pieces[c, math.floor(v / side) % squares, math.floor(u / side) % squares] += cost
+    return A, b, sums, pieces
 
 
 @compiled
@@ -174,40 +151,71 @@ def seen_from(X_CW: Array, X_WN: Array) -> Array:
     """X_CN (nodes, 4, 4)."""
     X_CN = np.zeros_like(X_WN)
     for node in range(len(X_WN)):
-        for row in range(3):
-            for column in range(4):
-                for k in range(4):
-                    X_CN[node, row, column] += X_CW[row, k] * X_WN[node, k, column]
+        multiply(X_CW, X_WN[node], X_CN[node])
         X_CN[node, 3, 3] = 1.0
     return X_CN
+
+
+@compiled
+def picture_rows(p_W: Array, X_CW: Array, camera: Array, rows: Array) -> None:
+    """Writes du/dp_W and dv/dp_W (2, 3) of a point."""
+    x, y, z = X_CW[0, 3], X_CW[1, 3], X_CW[2, 3]
+    for k in range(3):
+        x += X_CW[0, k] * p_W[k]
+        y += X_CW[1, k] * p_W[k]
+        z += X_CW[2, k] * p_W[k]
+    for k in range(3):
+        if camera[0] == 1.0:
+            rows[0, k] = camera[1] * X_CW[0, k]
+            rows[1, k] = camera[2] * X_CW[1, k]
+        else:
+            rows[0, k] = camera[1] * (X_CW[0, k] - X_CW[2, k] * x / z) / z
+            rows[1, k] = camera[2] * (X_CW[1, k] - X_CW[2, k] * y / z) / z
 
 
 @compiled
 def add_residual(
     A: Array,
     b: Array,
+    sums: Array,
     X_WN: Array,
     p_N: Array,
     camera: tuple[Array, Array],
     n0: float,
     n1: float,
     r: float,
-    weight: float,
+    length: float,
+    weights: Array,
     scratch: tuple[Array, Array, Array],
-) -> None:
+) -> float:
     """Adds one distance in a picture to a node's A (12, 12), lower triangle, and b (12,).
 
     Args:
-        A, b: added to.
+        A, b, sums: added to, as of `compare_contours`.
         X_WN: (4, 4) of the node.
         p_N: (3,) its point.
         camera: X_CW (4, 4) and kernel parameters (8,).
         n0, n1: the direction along which the point is to move.
         r: by how much [pixel].
-        weight: its weight.
+        length: of the contour that the point stands for [pixel].
+        weights: (4,) as of `compare_contours`.
         scratch: (2, 3), (3,) and (12,).
+
+    Returns:
+        The cost.
     """
+    unit, scale, worth = weights[0], weights[1], weights[3]
     rows, p, w = scratch
+    t = (r / scale) ** 2
+    cost = worth * length * r * r / (1.0 + t)
+    weight = worth * length / (1.0 + t) ** 2
+    sums[COMPARED] += length * unit
+    if t < 1.0:
+        sums[FITTING] += length * unit
+    sums[CLOSE] += length * unit / (1.0 + t)
+    sums[COST] += cost
+    sums[SQUARES] += weight * r * r
+    sums[WEIGHT] += weight
     for k in range(3):
         p[k] = X_WN[k, 3]
         for c in range(3):
@@ -222,14 +230,18 @@ def add_residual(
         b[k] += share * r
         for c in range(k + 1):
             A[k, c] += share * w[c]
+    return cost
 
 
 @compiled
-def _add_piece(pieces: Array, column: float, row: float, cost: float) -> None:
-    """Adds a cost to the square of a picture that it arises in."""
-    size = len(pieces)
-    if size > 0:
-        pieces[math.floor(row) % size, math.floor(column) % size] += cost
+def speed_along(row: Array, p: Array, twist: Array) -> float:
+    """The speed of a point (3,) along a row (3,)."""
+    s = twist[6]
+    return (
+        row[0] * (twist[1] * p[2] - twist[2] * p[1] + twist[3] + s * p[0])
+        + row[1] * (twist[2] * p[0] - twist[0] * p[2] + twist[4] + s * p[1])
+        + row[2] * (twist[0] * p[1] - twist[1] * p[0] + twist[5] + s * p[2])
+    )
 
 
 @compiled

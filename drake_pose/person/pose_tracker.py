@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.fit.camera_sums import AddUp
-from drake_pose.fit.contour_fit import ContourFit, PoseFit, Prior
+from drake_pose.fit.contour_fit import ContourFit, PoseFit, Prior, pack_views
 from drake_pose.fit.kernel import COMPARED, FITTING, SQUARES, WEIGHT
 from drake_pose.person.body_plan import BodyPlan
 from drake_pose.person.colour_views import ColourViews
@@ -137,8 +137,8 @@ class PersonPoseTracker:
         if isinstance(seen, ColourViews):
             compared = seen.compare(self.fit, self.fit.body.place(values), last)
         else:
-            edges = [view.edge for view in seen.views]
-            compared = self.fit.compare(seen.cameras, edges, values, last)
+            views = pack_views(seen.cameras, [view.edge for view in seen.views])
+            compared = self.fit.compare(views, values, last)
         sure = pose_uncertainty(self.fit, compared, self._held, held_covariance)
         deviations = np.zeros(len(self.fit.tree.model.position_names))
         deviations[self._order] = np.sqrt(np.diag(sure.covariance))

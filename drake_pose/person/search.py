@@ -187,7 +187,7 @@ class PersonSearch:
     def _judged(self, values: Array, frame: FrameViews) -> PoseFit:
         """A few steps of a fit to a few cameras."""
         prior = Prior(values, 0.1 * self._information)
-        return self._fit.fit(*frame.coarse, values, self._coarse, prior, self._held)
+        return self._fit.fit(frame.coarse, values, self._coarse, prior, self._held)
 
     def _refine(self, values: Array, frame: FrameViews) -> PoseFit:
         """A fit from a coarse guess, which is trusted little."""

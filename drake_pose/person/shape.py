@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import Camera
 from drake_pose.errors import ModelError, UnknownNameError
-from drake_pose.fit.contour_fit import ContourFit, Noise
+from drake_pose.fit.contour_fit import ContourFit, Noise, pack_views
 from drake_pose.fit.evidence import NO_EDGE, EdgePoints, pack_evidence
 from drake_pose.fit.frames_fit import FramesFit
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
@@ -195,7 +195,7 @@ def _frame_information(fit: ContourFit, frames: Frames, poses: Array, is_shape: 
     prior = np.eye(len(own)) / _POSE**2
     total = np.zeros((int(is_shape.sum()), int(is_shape.sum())))
     for (cameras, edges), pose in zip(frames, poses, strict=True):
-        compared = fit.compare(cameras, edges, pose, _ROUNDS[-1])
+        compared = fit.compare(pack_views(cameras, edges), pose, _ROUNDS[-1])
         H = pose_uncertainty(fit, compared).information
         cross = H[np.ix_(own, is_shape)]
         follow = np.linalg.solve(H[np.ix_(own, own)] + prior, cross)

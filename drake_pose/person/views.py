@@ -23,7 +23,7 @@ from drake_pose.fit.camera_sums import (
     add_sums,
     compare_placed,
 )
-from drake_pose.fit.contour_fit import ContourFit, pack_cameras
+from drake_pose.fit.contour_fit import ContourFit, pack_cameras, pack_views
 from drake_pose.fit.evidence import EdgePoints, find_edge_points, pack_evidence
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import Placement
@@ -228,13 +228,16 @@ class FrameViews:
         )
 
     @cached_property
-    def coarse(self) -> tuple[list[Camera], list[EdgePoints]]:
+    def coarse(self) -> Views:
         """The judges' cameras and every other point of their edges."""
         edges = [self.views[k].edge for k in self.judges]
-        return [self.cameras[k] for k in self.judges], [
-            EdgePoints(edge.uv[::2], edge.normals[::2], 2.0 * edge.lengths[::2], edge.middle)
-            for edge in edges
-        ]
+        return pack_views(
+            [self.cameras[k] for k in self.judges],
+            [
+                EdgePoints(edge.uv[::2], edge.normals[::2], 2.0 * edge.lengths[::2], edge.middle)
+                for edge in edges
+            ],
+        )
 
     def middle(self) -> Array | None:
         """(3,) where somebody is [m]; None where fewer than two cameras see one."""

@@ -85,7 +85,7 @@ class CameraFit:
         """
         views = self._views(X_CW, frame, width, log_focal)
         values = self.values[frame] if values is None else values
-        return self.contours.compare_views(views, values, step)
+        return self.contours.compare(views, values, step)
 
     def piece_costs(self, X_CW: Array, widths: Array, step: AnnealingStage, side: float) -> Array:
         """(frames, k, k) costs by squares of the pictures of a side [pixel].

@@ -237,7 +237,7 @@ class PerFrameFit:
         X_CW, kernel, _ = self._parameters.place(theta[size:])
         values = theta[: len(self.contours.kinematics.names)]
         views = Views((X_CW, kernel), evidence)
-        return (contours or self.contours).compare_views(views, values, TOLD_APART)
+        return (contours or self.contours).compare(views, values, TOLD_APART)
 
     def _pictures(
         self, compared: Comparison, theta: Array, change: Array

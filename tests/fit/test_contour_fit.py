@@ -4,7 +4,7 @@ import pytest
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.camera.rigs import circle_of_cameras
-from drake_pose.fit.contour_fit import ContourFit, Prior
+from drake_pose.fit.contour_fit import ContourFit, Prior, pack_views
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.kernel import collect, nearest_alike
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
@@ -141,7 +141,7 @@ class TestFit:
         order = [person.position_index(name) for name in fit.kinematics.names]
         start = true[order] + np.random.default_rng(1).normal(0.0, 0.08, len(order))
         prior = Prior(start, np.full(len(start), 1.0 / 0.3**2))
-        found = fit.fit(cameras, edges, start, (*STEPS, *STEPS), prior)
+        found = fit.fit(pack_views(cameras, edges), start, (*STEPS, *STEPS), prior)
         off = fit.kinematics.poses(found.values) - fit.kinematics.poses(true[order])
         assert 1e3 * np.linalg.norm(off[:, :3, 3], axis=1).max() < 12.0
         assert found.inlier_ratio > 0.9
@@ -152,13 +152,13 @@ class TestFit:
         camera = circle_of_cameras(1, size=(160, 120), face_camera=False)["camera_0"]
         start = np.zeros(len(fit.lower))
         empty = find_edge_points(np.zeros((120, 160), dtype=bool), 4.0)
-        found = fit.fit([camera], [empty], start, STEPS)
+        found = fit.fit(pack_views([camera], [empty]), start, STEPS)
         np.testing.assert_allclose(found.values, start, atol=1e-9)
         edge = find_edge_points(LabelRenderer(person, camera).mask(standing(person)), 4.0)
         order = [person.position_index(name) for name in fit.kinematics.names]
         start = standing(person)[order] + 0.05
         held = np.arange(len(start)) % 2 == 0
-        found = fit.fit([camera], [edge], start, STEPS, None, held)
+        found = fit.fit(pack_views([camera], [edge]), start, STEPS, None, held)
         clipped = np.clip(start, fit.lower, fit.upper)
         np.testing.assert_array_equal(found.values[held], start[held])
         assert np.abs(found.values - clipped)[~held].max() > 1e-3

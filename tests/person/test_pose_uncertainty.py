@@ -7,7 +7,7 @@ from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.camera.rigs import circle_of_cameras
-from drake_pose.fit.contour_fit import ContourFit
+from drake_pose.fit.contour_fit import ContourFit, pack_views
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.person.pose_uncertainty import pose_uncertainty
@@ -41,7 +41,8 @@ class World:
 
     def deviations(self, values, edges, cameras=None, **more):
         cameras = self.cameras if cameras is None else cameras
-        found = pose_uncertainty(self.fit, self.fit.compare(cameras, edges, values, STEP), **more)
+        views = pack_views(cameras, edges)
+        found = pose_uncertainty(self.fit, self.fit.compare(views, values, STEP), **more)
         return dict(zip(self.names, np.sqrt(np.diag(found.covariance)), strict=True))
 
 
@@ -83,9 +84,9 @@ class TestUncertainty:
             pose = {name: angle * generator.uniform(0.7, 1.3) for name, angle in POSE.items()}
             true = world.values(**pose, head_y=generator.uniform(-20, 20))
             edges = world.edges(true, misshapen(world.fit.outlines, generator, size))
-            values = world.fit.fit(world.cameras, edges, true, [STEP] * 6).values
+            values = world.fit.fit(pack_views(world.cameras, edges), true, [STEP] * 6).values
             found = pose_uncertainty(
-                world.fit, world.fit.compare(world.cameras, edges, values, STEP)
+                world.fit, world.fit.compare(pack_views(world.cameras, edges), values, STEP)
             )
             ratios.append((values - true) / np.sqrt(np.diag(found.covariance)))
             surfaces.append(found.surface)
@@ -139,7 +140,9 @@ class TestUncertainty:
         modest = world.deviations(values, edges)
         noise = replace(world.fit.noise, deviation=2.0 * world.fit.noise.deviation)
         other = ContourFit(world.person.pose_tree(), noise=noise)
-        found = pose_uncertainty(other, other.compare(world.cameras, edges, values, STEP))
+        found = pose_uncertainty(
+            other, other.compare(pack_views(world.cameras, edges), values, STEP)
+        )
         bold = dict(zip(world.names, np.sqrt(np.diag(found.covariance)), strict=True))
         for name in world.names:
             assert modest[name] / 1.5 < bold[name] < 1.5 * modest[name], name

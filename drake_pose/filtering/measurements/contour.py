@@ -13,7 +13,7 @@ from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.body_state import BodyState, Mask
 from drake_pose.filtering.kalman.update import LinearObservation
-from drake_pose.fit.camera_sums import REACH, Views
+from drake_pose.fit.camera_sums import Views
 from drake_pose.fit.colours import (
     ColourSettings,
     Histograms,
@@ -33,7 +33,7 @@ from drake_pose.fit.contour_fit import (
     project,
 )
 from drake_pose.fit.evidence import NO_EDGE, find_edge_points
-from drake_pose.fit.kernel import COMPARED, FITTING, SQUARES, WEIGHT
+from drake_pose.fit.kernel import COMPARED, FITTING, REACH, SQUARES, WEIGHT
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 
 Array = NDArray[np.float64]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.camera.models import Camera
-from drake_pose.fit.contour_fit import ContourFit, Prior
+from drake_pose.fit.contour_fit import ContourFit, Prior, pack_views
 from drake_pose.fit.evidence import EdgePoints, pack_evidence
 from drake_pose.fit.frames_fit import FramesFit
 from drake_pose.fit.levenberg_marquardt import AnnealingStage, StepSettings
@@ -111,8 +111,7 @@ def fit_without(
     names = [name for name in frame.edges if name != left_out]
     information = np.where(fit.kinematics.is_angle, 1.0, 4.0) / _ANGLE_DEVIATION**2
     found = fit.fit(
-        [cameras[name] for name in names],
-        [frame.edges[name] for name in names],
+        pack_views([cameras[name] for name in names], [frame.edges[name] for name in names]),
         frame.values,
         _POSE_ROUNDS,
         Prior(frame.values, information),
@@ -178,7 +177,7 @@ def _moved_camera(
 
 def share_of(fit: ContourFit, camera: Camera, edge: EdgePoints, values: Array) -> float:
     """What share of the contours' lengths fits in one picture."""
-    return fit.compare([camera], [edge], values, _JUDGED).inlier_ratio
+    return fit.compare(pack_views([camera], [edge]), values, _JUDGED).inlier_ratio
 
 
 def _describe(

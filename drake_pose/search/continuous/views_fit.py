@@ -85,13 +85,13 @@ class ViewsFit:
     def cost(self, values: np.ndarray, step: AnnealingStage) -> float:
         """What does not fit at values (m,) [pixel]."""
         self.evaluations += 1
-        sums = self._fit.compare_views(self._views, values, step).sums
+        sums = self._fit.compare(self._views, values, step).sums
         return float(sums[..., COST].sum()) / self._scale(step) ** 2
 
     def distances(self, values: np.ndarray, step: AnnealingStage) -> Distances:
         """What is left of the contours' distances at values (m,)."""
         self.evaluations += 1
-        compared = self._fit.compare_views(self._views, values, step)
+        compared = self._fit.compare(self._views, values, step)
         unit = max(1.0, _ERROR_UNIT * self.size)
         return distances(self._fit, self._views, compared, unit)
 
@@ -107,7 +107,7 @@ class ViewsFit:
         """Refine values (m,), but for some that are held, by indices."""
         fixed = self.kinematics.upper <= self.kinematics.lower
         fixed[list(held)] = True
-        found = self._fit.fit_views(self._views, values, rounds, None, fixed)
+        found = self._fit.fit(self._views, values, rounds, None, fixed)
         self.evaluations += found.evaluations
         return FittedPose(found.values, found.cost / self._scale(rounds[-1]) ** 2)
 

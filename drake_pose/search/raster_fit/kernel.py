@@ -12,8 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_pose.compiled import compiled
-from drake_pose.fit.kernel import seen_from
-from drake_pose.fit.point_motion import picture_rows, speed_along
+from drake_pose.fit.kernel import picture_rows, seen_from, speed_along
 from drake_pose.search.raster_fit.lines import Border, compare_line, pixels_apart
 from drake_pose.silhouette.contours.contour_body import ContourBody, find_body_segments
 from drake_pose.silhouette.contours.contour_segments import (

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
-from drake_pose.fit.contour_fit import ContourFit, Prior
+from drake_pose.fit.contour_fit import ContourFit, Prior, pack_views
 from drake_pose.fit.evidence import NO_EDGE, find_edge_points
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import VERY_FEW, few_triangles
@@ -289,7 +289,7 @@ class PoseAndMask:
         known = np.where(self._spread > 0.0, 1.0 / np.maximum(self._spread, 1e-9) ** 2, 0.0)
         prior = Prior(start, known)
         held = self._spread <= 0.0
-        return self._fit.fit(self._cameras, edges, values, rounds, prior, held).values
+        return self._fit.fit(pack_views(self._cameras, edges), values, rounds, prior, held).values
 
     def _agree(self, drawn: Sequence[Mask], masks: Sequence[Mask | None]) -> tuple[float, ...]:
         """IoU of silhouettes and masks; nan where there is no picture."""

@@ -52,11 +52,16 @@ class Noise:
 
     Args:
         deviation: of the distance of the contours [m].
-        correlation: so much of a contour errs together [m].
+        correlation: so much of a contour errs together [m], of all cameras or (cameras,).
     """
 
     deviation: float = 0.006
-    correlation: float = 0.06
+    correlation: float | Array = 0.06
+
+    @classmethod
+    def of_a_pixel(cls, pixels: float | Array) -> Noise:
+        """With which a pixel of contour counts one, where so many are the unit of length."""
+        return cls(deviation=1.0, correlation=0.5 / pixels**3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,8 +163,8 @@ class ContourFit:
         outlines: a surface for each node; few triangles will do. The tree's own where not given.
         noise: what a point of contour is worth.
         steps: how steps are made.
-        pixels: so many pixels are the unit of length of rounds and noise in every camera; None:
-            that unit is the metre, as large as it is seen at the body's root.
+        pixels: so many pixels are the unit of length of rounds and noise, in all cameras or (c,);
+            None: that unit is the metre, as large as it is seen at the body's root.
         body: what else may be unknown of it; None: the tree's values, ROOT_NAMES and no more.
     """
 
@@ -169,7 +174,7 @@ class ContourFit:
         outlines: Sequence[Outline] | None = None,
         noise: Noise | None = None,
         steps: StepSettings | None = None,
-        pixels: float | None = None,
+        pixels: float | Array | None = None,
         body: BodyParameters | None = None,
     ) -> None:
         self.kinematics = tree if isinstance(tree, TreeKinematics) else TreeKinematics(tree)
@@ -265,7 +270,7 @@ def compare_views(
     theta: Array,
     step: AnnealingStage,
     noise: Noise,
-    pixels: float | None = None,
+    pixels: float | Array | None = None,
 ) -> Comparison:
     """A body's contours compared with all cameras' edges.
 
@@ -275,7 +280,7 @@ def compare_views(
         theta: (m,) its tree's values, or all its parameters (n,).
         step: scale and spacing.
         noise: what a point of contour is worth.
-        pixels: of the unit of length; None: the metre's at the root.
+        pixels: of the unit of length, of all cameras or (c,); None: the metre's at the root.
     """
     placement = body.place(theta)
     weights = camera_weights(views.cameras, placement, step, noise, pixels)
@@ -287,13 +292,13 @@ def camera_weights(
     placement: Placement,
     step: AnnealingStage,
     noise: Noise,
-    pixels: float | None = None,
+    pixels: float | Array | None = None,
 ) -> Array:
     """(c, 4) of cameras, as `compare_contours` takes them; arguments as of compare_views."""
     if pixels is None:
         size = pixels_per_metre(cameras, placement.X_WN[0, :3, 3])
     else:
-        size = np.full(len(cameras[0]), pixels)
+        size = np.broadcast_to(pixels, len(cameras[0]))
     return np.column_stack(
         [
             1.0 / size,
@@ -305,38 +310,14 @@ def camera_weights(
     )
 
 
-def project(
-    compared: Comparison, size: int, camera_motions: Array | None = None
-) -> tuple[Array, Array]:
-    """The normal equations H dx = -g of a frame's parameters, by the chain rule.
+def normal_equations(total: CameraSum, placement: Placement, size: int) -> tuple[Array, Array]:
+    """The normal equations H dx = -g of a body's parameters, by the chain rule.
 
     Args:
-        compared: what the cameras say.
-        size: how many parameters the body has.
-        camera_motions: (cameras, k, 12) as of `CameraParameters.place`, whose parameters follow the
-            body's; None: the cameras stay.
+        total: what all cameras say together.
+        placement: of the body.
+        size: how many parameters it has.
     """
-    placement = compared.placement
-    own_H, own_g = normal_equations(compared.total, placement, size)
-    if camera_motions is None:
-        return own_H, own_g
-    cameras, count = camera_motions.shape[:2]
-    # A camera moves every node.
-    pulls = symmetric(compared.A) @ np.swapaxes(camera_motions, 1, 2)[:, None]
-    moved = np.swapaxes(placement.dense(size), 0, 1).reshape(size, -1)
-    H = np.zeros((size + cameras * count,) * 2)
-    H[:size, :size] = own_H
-    H[:size, size:] = moved @ np.moveaxis(pulls, 0, 2).reshape(moved.shape[1], -1)
-    H[size:, :size] = H[:size, size:].T
-    for c, block in enumerate(camera_motions @ pulls.sum(axis=1)):
-        own = slice(size + c * count, size + (c + 1) * count)
-        H[own, own] = block
-    pulled = -camera_motions @ compared.b.sum(axis=1)[..., None]
-    return H, np.concatenate([own_g, pulled.ravel()])
-
-
-def normal_equations(total: CameraSum, placement: Placement, size: int) -> tuple[Array, Array]:
-    """As project, of what cameras that stay say together."""
     return collect(
         total.A,
         total.b,

@@ -102,6 +102,7 @@ class Picture(NamedTuple):
         X_CW: (4, 4) the world's pose in the camera.
         moves: (nodes, m, 12) the affine motions that the m values give to the nodes.
         size: how far the unit of errors is at the body [m].
+        camera: the how manieth.
     """
 
     A: Array
@@ -110,6 +111,7 @@ class Picture(NamedTuple):
     X_CW: Array
     moves: Array
     size: float
+    camera: int = 0
 
 
 def distances(fit: ContourFit, views: Views, compared: Comparison, unit: float) -> Distances:
@@ -132,7 +134,9 @@ def distances(fit: ContourFit, views: Views, compared: Comparison, unit: float) 
 
 
 def distances_in_pictures(
-    outlines: Sequence[Outline], pictures: Sequence[Picture], most: int = _MOST_DISTANCES
+    outlines: Sequence[Outline],
+    pictures: Sequence[Picture],
+    most: int = _MOST_DISTANCES,
 ) -> Distances:
     """The distances in several pictures, each of which errs as a whole, too.
 
@@ -143,7 +147,7 @@ def distances_in_pictures(
     """
     found: list[tuple[float, int, int, Array, Array, Array, float]] = []
     mean_size = float(np.mean([picture.size for picture in pictures]))
-    for c, (A_lower, b, X_WN, X_CW, moves, size) in enumerate(pictures):
+    for c, (A_lower, b, X_WN, X_CW, moves, size, *_) in enumerate(pictures):
         A = symmetric(A_lower)
         shakes = _camera_motions(outlines, X_CW, X_WN, size)
         for n in np.flatnonzero(np.einsum("nii->n", A) > 0.0).tolist():
@@ -169,8 +173,9 @@ def distances_in_pictures(
     of_part = of[:, 1, None] == np.arange(len(outlines))
     count = pictures[0].moves.shape[1]
     information = np.zeros((count, count))
-    for A_lower, _, _, _, moves, _ in pictures:
-        information += (moves @ symmetric(A_lower) @ np.swapaxes(moves, 1, 2)).sum(axis=0)
+    for one in pictures:
+        told = one.moves @ symmetric(one.A) @ np.swapaxes(one.moves, 1, 2)
+        information += told.sum(axis=0)
     return Distances(
         y=np.array([one[6] for one in found]),
         X=np.array([one[3] for one in found]).reshape(-1, count),
@@ -218,9 +223,18 @@ def surface_deformations(vertices: Array, X_WN: Array) -> Array:
     return K
 
 
-def widening(vertices: Array, X_WN: Array) -> Array:
-    """(12,) an affine motion that makes a part's surface about a metre wider on all sides."""
-    return np.asarray(surface_deformations(vertices, X_WN)[:, [3, 7, 11]].sum(axis=1))
+def with_widths(outlines: Sequence[Outline], pictures: Sequence[Picture]) -> list[Picture]:
+    """Pictures whose silhouettes may be too wide on all sides: a further value for each [unit]."""
+    found = []
+    for k, one in enumerate(pictures):
+        wider = np.zeros((len(outlines), len(pictures), 12))
+        for n, (outline, X_WN) in enumerate(zip(outlines, one.X_WN, strict=True)):
+            if len(outline.vertices):
+                # The part's surface is about a metre wider on all sides.
+                by = surface_deformations(outline.vertices, X_WN)[:, [3, 7, 11]].sum(axis=1)
+                wider[n, k] = by * one.size
+        found.append(one._replace(moves=np.concatenate([one.moves, wider], axis=1)))
+    return found
 
 
 def _camera_motions(outlines: Sequence[Outline], X_CW: Array, X_WN: Array, size: float) -> Array:

@@ -11,9 +11,16 @@ from numpy.typing import NDArray
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.fit.camera_sums import Views
-from drake_pose.fit.contour_fit import Noise, compare_views, project
-from drake_pose.fit.evidence import Evidence
-from drake_pose.fit.kernel import COMPARED, COST, FITTING
+from drake_pose.fit.contour_fit import (
+    Comparison,
+    ContourFit,
+    Noise,
+    pixels_per_metre,
+    symmetric,
+)
+from drake_pose.fit.covariance import Picture
+from drake_pose.fit.evidence import Evidence, widened
+from drake_pose.fit.kernel import COMPARED, COST, FITTING, WEIGHT
 from drake_pose.fit.levenberg_marquardt import (
     AnnealingStage,
     Coupling,
@@ -27,8 +34,13 @@ from drake_pose.fit.unknowns import Unknowns
 Array = NDArray[np.float64]
 
 
+WIDTH = "width"
+"""By how much a silhouette is too wide on all sides [pixel]: a parameter of each camera."""
+
 # Of an unknown of which nothing is told: one over the variance.
 _LEAST_INFORMATION = 1e-4
+# What follows a width is told by differences over so much to either side [pixel].
+_WIDTH_STEP = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,20 +103,29 @@ class FittedFrames:
         return np.sqrt(np.maximum(variances, 0.0)).reshape(frames, p)
 
 
+def parameter_names(body: BodyParameters, cameras: Sequence[Camera]) -> tuple[str, ...]:
+    """All parameters of a frame: the body's, the cameras' CAMERA_NAMES, and their WIDTHs."""
+    looks = [f"{camera.name}.{name}" for camera in cameras for name in CAMERA_NAMES]
+    return (*body.names, *looks, *(f"{camera.name}.{WIDTH}" for camera in cameras))
+
+
 class FramesFit:
     """Fits unknowns of several frames that the same cameras see.
 
     Attributes:
-        names: of all parameters of a frame: the body's, then the cameras'.
+        body: the body.
+        names: of all parameters of a frame, parameter_names.
 
     Args:
         body: the body.
         cameras: the cameras.
         unknowns: which parameters are unknown.
-        pivot: (3,) the point in the world about which cameras turn [m]; None: the root's place.
+        pivot: (3,) or (cameras, 3), about which in the world cameras turn [m]; None: the root's
+            place.
         noise: what a point of contour is worth.
         steps: how steps are made.
-        pixels: of the unit of length of rounds and noise; None: the metre's at the root.
+        pixels: of the unit of length of rounds and noise, of all cameras or (cameras,); None: the
+            metre's at the root.
     """
 
     def __init__(
@@ -116,16 +137,21 @@ class FramesFit:
         pivot: Array | None = None,
         noise: Noise | None = None,
         steps: StepSettings | None = None,
-        pixels: float | None = None,
+        pixels: float | Array | None = None,
     ) -> None:
         kinematics = body.kinematics
         values = kinematics.flatten(kinematics.tree.default_values())
         where = kinematics.poses(values)[0, :3, 3] if pivot is None else pivot
-        self._body, self._cameras = body, CameraParameters(cameras, where)
-        self.names = (*body.names, *self._cameras.names)
-        self.unknowns, self._noise = unknowns, noise or Noise()
-        self._steps, self._pixels = steps, pixels
+        self.body, self._cameras = body, CameraParameters(cameras, where)
+        self.names = parameter_names(body, cameras)
+        self.unknowns = unknowns
+        self._contours = ContourFit(kinematics, body.outlines, noise, steps, pixels, body)
+        self._first_width = len(self.names) - len(cameras)
         self._fixed = not np.any(unknowns.entries >= len(body.names))
+        # A body is placed faster that neither grows nor is shifted.
+        self._values = len(kinematics.names)
+        places = (unknowns.entries >= self._values) & (unknowns.entries < len(body.names))
+        self._stays = not places.any()
 
     def fit(
         self,
@@ -169,7 +195,7 @@ class FramesFit:
             return self._equations(frames, base, (own, shared), about, step, shared_information)[0]
 
         limits = self.unknowns.lower, self.unknowns.upper
-        found = minimise(evaluate, own, shared, limits, rounds, self._steps, coupling)
+        found = minimise(evaluate, own, shared, limits, rounds, self._contours.steps, coupling)
         equations, costs, shares = self._equations(
             frames, base, (found.own, found.shared), about, rounds[-1], shared_information
         )
@@ -195,11 +221,13 @@ class FramesFit:
         own: Array,
         shared: Array,
         step: AnnealingStage,
+        expected: tuple[Array, Array] | None = None,
     ) -> Equations:
         """The normal equations at some unknowns; arguments as in fit."""
         base = np.zeros((len(frames), len(self.names)))
         base[:, : held.shape[1]] = held
-        return self._equations(frames, base, (own, shared), (own, shared), step, None)[0]
+        about = (own, shared) if expected is None else expected
+        return self._equations(frames, base, (own, shared), about, step, None)[0]
 
     def _equations(
         self,
@@ -216,9 +244,7 @@ class FramesFit:
         costs, shares = [], []
         for k, evidence in enumerate(frames):
             theta = unknowns.parameters(base[k], at[0][k], at[1])
-            own_H, own_g, sums = self._frame(evidence, theta, step)
-            H[k] = own_H[np.ix_(unknowns.entries, unknowns.entries)]
-            g[k] = own_g[unknowns.entries]
+            H[k], g[k], sums = self._frame(evidence, theta, step)
             cost += float(sums[:, :, COST].sum())
             costs.append(sums[:, :, COST].sum(axis=1))
             lengths = np.maximum(sums[:, :, COMPARED].sum(axis=1), 1e-9)
@@ -244,16 +270,111 @@ class FramesFit:
     def _frame(
         self, evidence: Evidence, theta: Array, step: AnnealingStage
     ) -> tuple[Array, Array, Array]:
-        """A frame's equations of all its parameters, and its sums."""
-        size = len(self._body.names)
-        X_CW, kernel, motions = self._cameras.place(theta[size:])
-        views = Views((X_CW, kernel), evidence)
-        compared = compare_views(self._body, views, theta[:size], step, self._noise, self._pixels)
-        H, g = project(compared, size, None if self._fixed else motions)
+        """A frame's equations of the unknowns, and its sums."""
+        compared, (_, _, motions) = self.compare(evidence, theta, step)
         if self._fixed:
-            more = len(motions) * len(CAMERA_NAMES)
-            H, g = np.pad(H, (0, more)), np.pad(g, (0, more))
+            told = [(self._moves(compared, motions, 0), compared.total.A, compared.total.b)]
+        else:
+            told = [
+                (self._moves(compared, motions, c), A, b)
+                for c, (A, b) in enumerate(zip(compared.A, compared.b, strict=True))
+            ]
+        u = len(self.unknowns.entries)
+        H, g = np.zeros((u, u)), np.zeros(u)
+        for moves, A, b in told:
+            rows, pulled = (
+                np.swapaxes(one, 0, 1).reshape(u, -1) for one in (moves, moves @ symmetric(A))
+            )
+            H += rows @ pulled.T
+            g -= rows @ b.ravel()
+        widths = np.flatnonzero(self.unknowns.entries >= self._first_width)
+        if not len(widths):
+            return H, g, compared.sums
+        less, more = (self._wider(evidence, theta, step, off) for off in (-1.0, 1.0))
+        for k in widths:
+            c = self.unknowns.entries[k] - self._first_width
+            slope = (more.sums[c] - less.sums[c])[:, COST].sum()
+            g[k] = slope / (4.0 * _WIDTH_STEP)
+            pulled = np.einsum("nux,nx->u", told[c][0], less.b[c] - more.b[c])
+            H[k] = H[:, k] = pulled / (2.0 * _WIDTH_STEP)
+            H[k, k] = compared.sums[c][:, WEIGHT].sum()
         return H, g, compared.sums
+
+    def compare(
+        self, evidence: Evidence, theta: Array, step: AnnealingStage
+    ) -> tuple[Comparison, tuple[Array, Array, Array]]:
+        """A frame's contours compared with its silhouettes at all parameters (n,).
+
+        Returns:
+            the comparison, and the cameras as of ``CameraParameters.place``.
+        """
+        places = self.places(theta)
+        views = self._views(evidence, theta, places)
+        return self._contours.compare(views, self._of_body(theta), step), places
+
+    def piece_costs(
+        self, evidence: Evidence, theta: Array, step: AnnealingStage, side: float
+    ) -> Array:
+        """(cameras, k, k) the costs at all parameters (n,) by squares of a side [pixel]."""
+        views = self._views(evidence, theta, self.places(theta))
+        return self._contours.piece_costs(views, self._of_body(theta), step, side)
+
+    def _of_body(self, theta: Array) -> Array:
+        """The body's parameters, the tree's values alone where all others are 0."""
+        own = theta[: len(self.body.names)]
+        return own[: self._values] if self._stays and not own[self._values :].any() else own
+
+    def _views(self, evidence: Evidence, theta: Array, places: tuple[Array, Array, Array]) -> Views:
+        """The cameras, and their silhouettes as wide as they are."""
+        widths = theta[self._first_width :]
+        return Views(places[:2], widened(evidence, -widths) if widths.any() else evidence)
+
+    def places(self, theta: Array) -> tuple[Array, Array, Array]:
+        """The cameras at all parameters (n,), as of ``CameraParameters.place``."""
+        return self._cameras.place(theta[len(self.body.names) : self._first_width])
+
+    def pictures(
+        self, frames: Sequence[Evidence], parameters: Array, step: AnnealingStage
+    ) -> list[Picture]:
+        """What each silhouette says at all parameters (frames, n).
+
+        Its values are the unknowns but widths: each frame's own, then the shared ones.
+        """
+        chosen = self.unknowns.entries < self._first_width
+        p = int(np.count_nonzero(chosen & ~self.unknowns.shared))
+        q = int(np.count_nonzero(chosen & self.unknowns.shared))
+        found = []
+        for k, (evidence, theta) in enumerate(zip(frames, parameters, strict=True)):
+            compared, (X_CW, kernel, motions) = self.compare(evidence, theta, step)
+            X_WN = compared.placement.X_WN
+            sizes = 1.0 / pixels_per_metre((X_CW, kernel), X_WN[:, :3, 3].mean(axis=0))
+            for c in np.flatnonzero(compared.A.any(axis=(1, 2, 3))).tolist():
+                own, shared = np.split(self._moves(compared, motions, c)[:, chosen], [p], axis=1)
+                moves = np.zeros((len(X_WN), len(frames) * p + q, 12))
+                moves[:, k * p : (k + 1) * p], moves[:, len(frames) * p :] = own, shared
+                A = symmetric(compared.A[c])
+                found.append(Picture(A, compared.b[c], X_WN, X_CW[c], moves, float(sizes[c]), c))
+        return found
+
+    def _wider(
+        self, evidence: Evidence, theta: Array, step: AnnealingStage, by: float
+    ) -> Comparison:
+        """As compare, all widths larger by so many steps."""
+        theta = theta.copy()
+        theta[self._first_width :] += by * _WIDTH_STEP
+        return self.compare(evidence, theta, step)[0]
+
+    def _moves(self, compared: Comparison, motions: Array, camera: int) -> Array:
+        """(nodes, u, 12) how the unknowns move the nodes before a camera; widths move none."""
+        entries, placement = self.unknowns.entries, compared.placement
+        moves = np.zeros((len(placement.X_WN), len(entries), 12))
+        own = entries < len(self.body.names)
+        if own.any():
+            moves[:, own] = placement.dense(len(self.body.names))[:, entries[own]]
+        look = entries - len(self.body.names) - camera * len(CAMERA_NAMES)
+        turned = (look >= 0) & (look < len(CAMERA_NAMES)) & (entries < self._first_width)
+        moves[:, turned] = motions[camera, look[turned]]
+        return moves
 
 
 def _reduced(equations: Equations, p: int) -> tuple[Array, list[Array]]:

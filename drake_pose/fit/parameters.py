@@ -160,14 +160,16 @@ class CameraParameters:
 
     Args:
         cameras: the cameras where all parameters are 0.
-        pivot: (3,) the point in the world about which they turn [m].
+        pivot: (3,) the point in the world about which they turn [m], or (cameras, 3).
     """
 
     def __init__(self, cameras: Sequence[Camera], pivot: Array) -> None:
         self.names = tuple(f"{camera.name}.{name}" for camera in cameras for name in CAMERA_NAMES)
         self._X_CW = np.array([camera.X_CW for camera in cameras])
         self._kernel = np.array([camera.kernel_parameters() for camera in cameras])
-        self._pivots = self._X_CW[:, :3, :3] @ pivot + self._X_CW[:, :3, 3]
+        pivots = np.broadcast_to(pivot, (len(cameras), 3))
+        turned = np.einsum("cij,cj->ci", self._X_CW[:, :3, :3], pivots)
+        self._pivots = turned + self._X_CW[:, :3, 3]
 
     def place(self, theta: Array) -> tuple[Array, Array, Array]:
         """The cameras at all parameters (7 c,).

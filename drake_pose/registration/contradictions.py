@@ -23,11 +23,10 @@ from drake_pose.fit.covariance import (
     distances_covariance,
     distances_in_pictures,
     estimate_sizes,
-    widening,
+    with_widths,
 )
-from drake_pose.registration.camera_fit import POSE_NAMES
 from drake_pose.registration.per_frame_fit import FrameFit, PerFrameFit
-from drake_pose.registration.uncertainty import KNOWN_BEFOREHAND
+from drake_pose.registration.shared_fit import KNOWN_BEFOREHAND, POSE_NAMES
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -244,13 +243,8 @@ class _Auditor:
 
     def _distances(self, pictures: Sequence[Picture]) -> Distances:
         """The distances in pictures; their values are what was free, then each picture's width."""
-        outlines, wide = self._fit.contours.outlines, []
-        for c, one in enumerate(pictures):
-            more = np.zeros((len(outlines), len(pictures), 12))
-            for n, (outline, X_WN) in enumerate(zip(outlines, one.X_WN, strict=True)):
-                more[n, c] = widening(outline.vertices, X_WN) * one.size
-            wide.append(one._replace(moves=np.concatenate([one.moves, more], axis=1)))
-        return distances_in_pictures(outlines, wide)
+        outlines = self._fit.outlines
+        return distances_in_pictures(outlines, with_widths(outlines, pictures))
 
     def _tell(self, fitted: FrameFit, sizes: ErrorSizes) -> FrameInformation:
         seen = self._distances(fitted.pictures)
@@ -363,7 +357,7 @@ class _Auditor:
         causes = [Cause("joint", name, eye[:, [k]]) for k, name in enumerate(self._fit.joints)]
         names = self._fit.camera_names
         for c, name in enumerate(names):
-            if fitted is None or name in fitted.cameras:
+            if fitted is None or c in {one.camera for one in fitted.pictures}:
                 first = self._joints + c * len(POSE_NAMES)
                 causes.append(Cause("camera", name, eye[:, first : first + len(POSE_NAMES)]))
         if len(names) > 1:

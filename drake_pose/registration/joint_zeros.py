@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,28 +22,22 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, UnknownNameError
 from drake_pose.fit.lengthened_body import length_name
-from drake_pose.registration.calibration_fit import (
-    CONSTANT_DEVIATION,
-    ROUNDS_WITH_CONSTANTS,
-    Calibration,
-    CalibrationFit,
-    agreeing,
-    inlier_ratios,
-    start_calibration,
-)
-from drake_pose.registration.camera_fit import CameraFit
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import RegisteredCamera, RegistrationBody
-from drake_pose.registration.uncertainty import calibration_covariance, pose_covariance
+from drake_pose.registration.shared_fit import (
+    CONSTANT_DEVIATION,
+    ROUNDS_WITH_CONSTANTS,
+    Shared,
+    SharedFit,
+)
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 # So many standard deviations to either side it is looked whether the cost bends as it should.
 _ASIDE = 2.0
 # Less than this share of what it should be is none.
 _NO_BEND = 1e-3
-_SPACING = 1.0 / 300.0
-_AGAIN = 2
 # What is no better known than this share of what it was beforehand is not determined.
 _DETERMINED = 0.2
 # What a constant goes with is correlated with it by more.
@@ -162,49 +155,49 @@ def calibrate_joints(
             f"{len(names)} joints' zeros and {len(lengths)} links' lengths need as many frames of "
             f"differing poses, and two or more; there are {count}: give more frames, or name fewer"
         )
-    moved = lengthened_joints(body.tree, lengths)
-    fits = [
-        CameraFit(PosedFrames(body.kinematics, body.all, one.camera, own), _SPACING, moved)
+    seen = [
+        PosedFrames(body.kinematics, body.all, one.camera, own)
         for one, own in zip(cameras, frames, strict=True)
     ]
     X_CW = [one.camera.X_CW for one in cameras]
-    asked = [*names, *(length_name(link) for link in lengths)]
+    offsets = lengthened_joints(body.tree, lengths)
+    sought = [*names, *(length_name(link) for link in lengths)]
     standing = [name for name in body.kinematics.names if name in OBJECT_POSITIONS]
     told: dict[str, KinematicParameter] = {}
-    sought = asked
     while True:
-        constants = [fits[0].names.index(name) for name in [*standing, *sought]]
-        fit, found = _fit(fits, X_CW, constants, focal)
-        covariance = _as_the_cost_bends(fit, found, calibration_covariance(fit, found))
-        values = _constants(fit, found, covariance, sought)
+        fit = SharedFit(seen, X_CW, [*standing, *sought], offsets=offsets, focal=focal)
+        found, covariance, pictures = _fitted(fit)
+        values = _constants(fit, found, pictures, covariance, sought)
         told |= values
         # The cameras shall fit what is answered: nothing is added where it cannot be told.
         sought = [name for name in sought if values[name].determined]
         if len(sought) == len(values):
             break
-    return _describe(
-        fit, found, covariance, [told[name] for name in names],
-        [replace(told[length_name(link)], name=link) for link in lengths],
-    )  # fmt: skip
+    deviations = np.sqrt(np.diag(covariance))[: len(seen) * fit.per_camera]
+    first = len(fit.names) - len(fit.constants)
+    stands = slice(first, first + len(standing))
+    return JointCalibration(
+        tuple(told[name] for name in names),
+        tuple(replace(told[length_name(link)], name=link) for link in lengths),
+        tuple(fit.cameras(found)),
+        fit.camera_covariances(found, covariance),
+        deviations[fit.per_camera - 1 :: fit.per_camera] if focal else np.zeros(len(seen)),
+        found.shared[stands],
+        covariance[stands, stands],
+    )
 
 
-def _fit(
-    fits: Sequence[CameraFit], X_CW: Sequence[Array], constants: Sequence[int], focal: bool
-) -> tuple[CalibrationFit, Calibration]:
-    """The last fit, and what it found."""
-    found = start_calibration(fits, X_CW, len(constants))
+def _fitted(fit: SharedFit) -> tuple[Shared, Array, int]:
+    """What was found, its covariance (u, u), and how many pictures counted."""
     # Constants that are off let good frames contradict, so all count at first.
-    fit = CalibrationFit(fits, [np.arange(len(one.values)) for one in fits], constants, focal)
-    for k in range(_AGAIN):
-        if k > 0:
-            ratios = [inlier_ratios(fit, found, c) for c in range(len(fits))]
-            which = [np.flatnonzero(agreeing(one)) for one in ratios]
-            fit = CalibrationFit(fits, which, constants, focal)
-        found = fit.fit(found, ROUNDS_WITH_CONSTANTS)
-    return fit, found
+    found = fit.fit(ROUNDS_WITH_CONSTANTS)
+    which = fit.agreeing(fit.inlier_ratios(found))
+    found = fit.fit(ROUNDS_WITH_CONSTANTS, found, which)
+    covariance = _as_the_cost_bends(fit, found, which, fit.covariance(found, which))
+    return found, covariance, int(np.count_nonzero(which))
 
 
-def _as_the_cost_bends(fit: CalibrationFit, found: Calibration, covariance: Array) -> Array:
+def _as_the_cost_bends(fit: SharedFit, found: Shared, which: Mask, covariance: Array) -> Array:
     """(u, u) the covariance, larger along constants whose cost bends less than it should.
 
     A round base that turns looks as before, but the edges of its mesh's facets seem to move until
@@ -213,61 +206,32 @@ def _as_the_cost_bends(fit: CalibrationFit, found: Calibration, covariance: Arra
     found_covariance = covariance.copy()
     for k in range(len(fit.names) - len(fit.constants), len(fit.names)):
         along = covariance[:, k] / math.sqrt(covariance[k, k])
-        bends, said = fit.bend(found, _ASIDE * along, ROUNDS_WITH_CONSTANTS[-1])
+        bends, said = fit.bend(found, _ASIDE * along, ROUNDS_WITH_CONSTANTS[-1], which)
         share = min(1.0, max(_NO_BEND, bends / said))
         found_covariance += (1.0 / share - 1.0) * np.outer(along, along)
     return found_covariance
 
 
-def _describe(
-    fit: CalibrationFit,
-    found: Calibration,
-    covariance: Array,
-    zeros: Sequence[KinematicParameter],
-    lengths: Sequence[KinematicParameter],
-) -> JointCalibration:
-    """Zeros and lengths, and the cameras as they fit them."""
-    cameras, covariances, focal = [], [], np.zeros(len(fit.fits))
-    for c, own in enumerate(fit.fits):
-        at = slice(c * fit.per_camera, c * fit.per_camera + 6)
-        moved = partial(own.moved, found.X_CW[c])
-        covariances.append(pose_covariance(moved, covariance[at, at]))
-        cameras.append(own.placed(found.X_CW[c], float(found.log_focal[c])))
-        if fit.per_camera > 6:
-            focal[c] = math.sqrt(covariance[c * fit.per_camera + 6, c * fit.per_camera + 6])
-    first = len(fit.names) - len(fit.constants)
-    standing = [k for k, name in enumerate(fit.names[first:]) if name in OBJECT_POSITIONS]
-    places = first + np.array(standing, dtype=np.intp)
-    return JointCalibration(
-        tuple(zeros), tuple(lengths), tuple(cameras), np.array(covariances), focal,
-        found.constants[standing], covariance[np.ix_(places, places)],
-    )  # fmt: skip
-
-
 def _constants(
-    fit: CalibrationFit, found: Calibration, covariance: Array, names: Sequence[str]
+    fit: SharedFit, found: Shared, pictures: int, covariance: Array, names: Sequence[str]
 ) -> dict[str, KinematicParameter]:
     """Some constants by name, each with its interval, or what it goes with where that is all."""
-    pictures = sum(len(which) for which in fit.which)
     freedom = max(1, _PICTURE_MOTIONS * pictures - len(fit.names))
-    first = len(fit.names) - len(fit.constants)
-    lengths = len(fit.fits[0].frames.kinematics.names)
+    deviations = np.sqrt(np.diag(covariance))
     told = {}
-    for k, (index, value) in enumerate(zip(fit.constants, found.constants.tolist(), strict=True)):
-        name, deviation = fit.names[first + k], math.sqrt(covariance[first + k, first + k])
-        if name not in names:
-            continue
+    for name in names:
+        k = fit.names.index(name)
+        value, deviation = float(found.shared[k]), float(deviations[k])
         if deviation > _DETERMINED * CONSTANT_DEVIATION:
-            along = covariance[:, first + k] / np.sqrt(np.diag(covariance)) / deviation
-            others = [j for j in range(len(along)) if j != first + k]
-            gauge = tuple(fit.names[j] for j in others if abs(along[j]) > _GOES_WITH)
+            goes = np.abs(covariance[:, k]) > _GOES_WITH * deviations * deviation
+            gauge = tuple(fit.names[j] for j in np.flatnonzero(goes) if j != k)
             ends = (-math.inf, math.inf)
             told[name] = KinematicParameter(name, 0.0, math.inf, *ends, False, gauge)
             continue
         width = float(stdtrit(freedom, 1.0 - 0.5 * _LEVEL)) * deviation
         p_value = 2.0 * float(stdtr(freedom, -abs(value) / deviation)) * len(names)
         low, middle, high = value - width, value, value + width
-        if index >= lengths:
+        if name not in fit.seen[0].kinematics.names:
             # A length was fitted as a logarithm.
             deviation *= math.exp(value)
             low, middle, high = math.expm1(low), math.expm1(middle), math.expm1(high)

@@ -22,22 +22,13 @@ from drake_pose.body.model import OBJECT_POSITIONS
 from drake_pose.body.tree.joint_map import inverse_transforms
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
-from drake_pose.fit.levenberg_marquardt import AnnealingStage
-from drake_pose.registration.calibration_fit import (
-    ROUNDS_WITH_CONSTANTS,
-    Calibration,
-    CalibrationFit,
-    start_calibration,
-)
-from drake_pose.registration.camera_fit import CameraFit
-from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
+from drake_pose.registration.posed_frames import LAST_SPACING, PosedFrame, PosedFrames
 from drake_pose.registration.register import (
     COARSE,
     COARSE_SPACING,
     FINE,
     FINE_SPACING,
     FIRST_SIDE,
-    LAST_SPACING,
     SECOND_SIDE,
     CameraSearch,
     ObjectPose,
@@ -46,9 +37,9 @@ from drake_pose.registration.register import (
     spread,
     with_widths,
 )
+from drake_pose.registration.shared_fit import ROUNDS_WITH_CONSTANTS, Shared, SharedFit
 from drake_pose.registration.standing_object import StandingObject, require_turns, turns_between
 from drake_pose.registration.start_poses import E_total, areas
-from drake_pose.silhouette.areas.outline import Outline
 
 Array = NDArray[np.float64]
 Look = tuple[Array, Array]
@@ -104,23 +95,33 @@ class ObjectSearch:
         """
         require_turns(camera.name, self._standing, frames)
         looks = self._search(camera, frames)
-        fine = [self._fitted(camera, frames, look, True) for look in looks]
-        last = [self._fitted(camera, frames, look, False) for look in self._distinct(fine, frames)]
-        looks = self._distinct(last, frames)
-        fitted = []
-        for X_LC, X_WT in looks:
-            fit, constants = self._fit(camera, frames, (X_LC, X_WT), LAST_SPACING)
-            now = with_widths(fit, inverse_transforms(X_LC), constants)
+        for rounds, spacing, surfaces in (
+            (FINE, FINE_SPACING, "few"),
+            (ROUNDS_WITH_CONSTANTS, LAST_SPACING, "all"),
+        ):
+            fits = [self._fit(camera, frames, look, spacing, surfaces) for look in looks]
+            fitted = [
+                self._look(fit, fit.fit(rounds), look[1])
+                for fit, look in zip(fits, looks, strict=True)
+            ]
+            looks = self._distinct(fitted, frames)
+        fits, founds = [], []
+        for k, look in enumerate(looks):
+            fit = self._fit(camera, frames, look)
+            now = with_widths(fit)
             # Where it stands now is where a last fit finds it.
-            look = self._look(now, X_WT)
-            fit, constants = self._fit(camera, frames, look, LAST_SPACING)
-            fitted.append((look, fit, replace(now, constants=np.zeros(len(constants)))))
-        found, covariance, as_good = describe_fitted([one[1:] for one in fitted], constants)
-        X_LC, X_WT = fitted[as_good[0]][0]
+            looks[k] = self._look(fit, now, look[1])
+            fits.append(self._fit(camera, frames, looks[k]))
+            founds.append(Shared(0.0 * now.shared, now.widths))
+        found, covariance, as_good = describe_fitted(list(zip(fits, founds, strict=True)))
+        X_LC, X_WT = looks[as_good[0]]
         others = [X_WT @ turn for turn in self._standing.symmetry.told_apart[1:]]
         # Where the camera would be elsewhere, too, that is told with the camera.
-        looks = [fitted[k][0] for k in as_good[1:]]
-        others += [X for camera_too, X in looks if not self._differ(camera_too[None], X_LC[None])]
+        others += [
+            X
+            for camera_too, X in (looks[k] for k in as_good[1:])
+            if not self._differ(camera_too[None], X_LC[None])
+        ]
         seen = ObjectPose(
             X_WT,
             self._standing.pose_covariance(X_WT, covariance[6:, 6:]),
@@ -153,10 +154,13 @@ class ObjectSearch:
         starts = self._distinct(
             [(found.X_LC[k], found.X_WT[k]) for k in order[: 10 * _STARTS]], some
         )
-        fitted = []
-        for look in starts[:_STARTS]:
-            fit, constants = self._fit(camera, some, look, COARSE_SPACING, "very_few")
-            fitted.append(self._look(self._calibrate(fit, look, constants, COARSE), look[1]))
+        fits = [
+            self._fit(camera, some, look, COARSE_SPACING, "very_few") for look in starts[:_STARTS]
+        ]
+        fitted = [
+            self._look(fit, fit.fit(COARSE), look[1])
+            for fit, look in zip(fits, starts, strict=False)
+        ]
         both = HandEye(np.array([one[0] for one in fitted]), np.array([one[1] for one in fitted]))
         off = self._misfits(camera, alone, X_WL, both, SECOND_SIDE)
         limit = _WORSE_BY + _WORSE_TIMES * float(off.min())
@@ -180,40 +184,23 @@ class ObjectSearch:
             off += np.minimum(E_total(areas(posed, X_CT, side))[:, 0], 1.0) / len(alone)
         return off
 
-    def _fitted(
-        self, camera: PinholeCamera, frames: Sequence[PosedFrame], look: Look, few: bool
-    ) -> Look:
-        """A look, fitted to all frames finely."""
-        if few:
-            fit, constants = self._fit(camera, frames, look, FINE_SPACING, "few")
-            return self._look(self._calibrate(fit, look, constants, FINE), look[1])
-        fit, constants = self._fit(camera, frames, look, LAST_SPACING)
-        return self._look(self._calibrate(fit, look, constants, ROUNDS_WITH_CONSTANTS), look[1])
-
     def _fit(
         self,
         camera: PinholeCamera,
         frames: Sequence[PosedFrame],
         look: Look,
-        spacing: float,
+        spacing: float = LAST_SPACING,
         surfaces: str = "all",
-    ) -> tuple[CameraFit, list[int]]:
-        """A fit with the object where a look has it, and which parameters move it."""
+    ) -> SharedFit:
+        """A fit of camera and object that begins where a look has them."""
         body = self._standing.body(look[1])
-        outlines: Sequence[Outline] = getattr(body, surfaces)
-        fit = CameraFit(PosedFrames(body.kinematics, outlines, camera, frames), spacing)
-        return fit, [fit.names.index(name) for name in OBJECT_POSITIONS]
+        seen = PosedFrames(body.kinematics, getattr(body, surfaces), camera, frames, spacing)
+        return SharedFit([seen], [inverse_transforms(look[0])], OBJECT_POSITIONS)
 
-    def _calibrate(
-        self, fit: CameraFit, look: Look, constants: Sequence[int], rounds: Sequence[AnnealingStage]
-    ) -> Calibration:
-        start = start_calibration([fit], [inverse_transforms(look[0])], len(constants))
-        every = np.arange(len(fit.values))
-        return CalibrationFit([fit], [every], constants).fit(start, rounds)
-
-    def _look(self, found: Calibration, X_WT: Array) -> Look:
+    def _look(self, fit: SharedFit, found: Shared, X_WT: Array) -> Look:
         """What was found, from where the object stood before."""
-        return inverse_transforms(found.X_CW[0]), self._standing.moved(X_WT, found.constants)
+        moved = self._standing.moved(X_WT, found.shared[fit.per_camera :])
+        return fit.cameras(found)[0].X_WC, moved
 
     def _distinct(self, looks: Sequence[Look], frames: Sequence[PosedFrame]) -> list[Look]:
         """Those of some looks that see the object otherwise than all before them.

@@ -14,34 +14,19 @@ from numpy.typing import NDArray
 
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
-from drake_pose.errors import MaskError
-from drake_pose.fit.camera_sums import Views
-from drake_pose.fit.contour_fit import (
-    Comparison,
-    ContourFit,
-    Noise,
-    inlier_ratio_of,
-    pixels_per_metre,
-)
+from drake_pose.fit.contour_fit import Comparison, Noise, inlier_ratio_of
 from drake_pose.fit.covariance import Picture
-from drake_pose.fit.evidence import (
-    NO_EDGE,
-    Evidence,
-    find_edge_points,
-    pack_evidence,
-    widened,
-)
-from drake_pose.fit.frames_fit import FramesFit
+from drake_pose.fit.evidence import Evidence
+from drake_pose.fit.frames_fit import FramesFit, parameter_names
 from drake_pose.fit.kernel import COST, WEIGHT
 from drake_pose.fit.levenberg_marquardt import AnnealingStage, StepSettings
-from drake_pose.fit.parameters import CAMERA_NAMES, CameraParameters
+from drake_pose.fit.parameters import BodyParameters
 from drake_pose.fit.unknowns import choose
-from drake_pose.registration.calibration_fit import TOLD_APART
-from drake_pose.registration.camera_fit import POSE_NAMES
+from drake_pose.registration.posed_frames import SeenFrame, common_size, middle_of
+from drake_pose.registration.shared_fit import POSE_NAMES, TOLD_APART
 from drake_pose.silhouette.areas.outline import Outline
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _ROUNDS = tuple(
     AnnealingStage(scale, 0.02) for scale in (0.12, 0.09, 0.07, 0.05, 0.04, 0.03, 0.025)
@@ -61,15 +46,6 @@ _POINT_ERROR, _ERROR_LENGTH = 4.0, 100.0
 
 
 @dataclass(frozen=True, eq=False)
-class SeenFrame:
-    """A frame: values (m,) of the pose tree [rad or m], and the silhouettes (H, W) by camera."""
-
-    name: str
-    values: Array
-    masks: Mapping[str, Mask]
-
-
-@dataclass(frozen=True, eq=False)
 class FrameFit:
     """A frame whose joints and cameras were fitted.
 
@@ -77,14 +53,12 @@ class FrameFit:
         pictures: the contours compared with each camera's silhouette where the fit ended, and told
             as distances from what is given; their values are the joints' and POSE_NAMES of each
             camera.
-        cameras: of the pictures.
         inlier_ratios: before and after, by camera.
         weights: (nodes,) how much of the contours of each node was compared [pixel].
     """
 
     name: str
     pictures: tuple[Picture, ...]
-    cameras: tuple[str, ...]
     inlier_ratios: tuple[Mapping[str, float], Mapping[str, float]]
     weights: Array
 
@@ -93,6 +67,7 @@ class PerFrameFit:
     """Fits frames, each by itself, with all that is given free to move.
 
     Attributes:
+        outlines: all of the surfaces.
         names: of the p values that move: the joints, and POSE_NAMES of each camera.
         deviations: (p,) how far what is given may be off: standard deviations [rad or m].
 
@@ -113,36 +88,30 @@ class PerFrameFit:
         cameras: Sequence[Camera],
         frames: Sequence[SeenFrame],
     ) -> None:
-        self._cameras = tuple(cameras)
+        self._cameras, self.outlines = tuple(cameras), outlines[1]
         self._size = common_size(cameras, frames)
-        noise = Noise(deviation=1.0, correlation=0.5 / self._size**3)
-        self._few, self.contours = (
-            ContourFit(kinematics, one, noise, _STEPS, pixels=self._size) for one in outlines
-        )
-        places = [kinematics.poses(frame.values)[:, :3, 3].mean(axis=0) for frame in frames]
-        pivot = np.mean(places, axis=0)
-        self._parameters = CameraParameters(cameras, pivot)
         joints = np.flatnonzero(kinematics.lower < kinematics.upper)
         self.camera_names = tuple(camera.name for camera in cameras)
         self.joints = tuple(kinematics.names[k] for k in joints)
         looks = tuple(f"{camera.name}.{name}" for camera in cameras for name in POSE_NAMES)
         self.names = (*self.joints, *looks)
-        worth = _POINT_ERROR * np.sqrt(_ERROR_LENGTH)
         of_joints = np.where(kinematics.is_angle[joints], _ANGLE, _SHIFT)
         turns = [name.startswith("turn") for name in POSE_NAMES]
         self.is_angle = np.concatenate([kinematics.is_angle[joints], *([turns] * len(cameras))])
         of_camera = [_CAMERA_TURN] * 3 + [_CAMERA_SHIFT] * 3
         self.deviations = np.concatenate([of_joints, *([of_camera] * len(cameras))])
-        body = self._few.body
-        unknown = choose(
-            [*body.names, *self._parameters.names],
-            self.names,
-            deviation=self.deviations / worth,
+        worth = _POINT_ERROR * np.sqrt(_ERROR_LENGTH)
+        bodies = [BodyParameters(kinematics, one) for one in outlines]
+        unknowns = choose(
+            parameter_names(bodies[0], cameras), self.names, deviation=self.deviations / worth
         )
-        self._entries = unknown.entries
-        self._fit = FramesFit(
-            body, cameras, unknown, pivot=pivot, noise=noise, steps=_STEPS, pixels=self._size
-        )
+        self._few, self._all = (
+            FramesFit(
+                body, cameras, unknowns, pivot=middle_of(kinematics, frames),
+                noise=Noise.of_a_pixel(self._size), steps=_STEPS, pixels=self._size,
+            )
+            for body in bodies
+        )  # fmt: skip
 
     def fit(self, frame: SeenFrame) -> FrameFit:
         """Fits a frame.
@@ -150,57 +119,52 @@ class PerFrameFit:
         Raises:
             MaskError: a mask of another size than its camera's picture.
         """
-        evidence = self._evidence(frame)
-        held, change = self._held(frame), np.zeros((1, len(self.names)))
-        theta, widths = held, np.zeros(len(self._cameras))
+        evidence = frame.edges(self._cameras, _SPACING * self._size)
+        held, change = np.zeros(len(self._all.names)), np.zeros((1, len(self.names)))
+        held[: len(frame.values)] = frame.values
+        base, given = held, (change, np.zeros(0))
         for rounds in (_ROUNDS, _ROUNDS[-2:]):
-            found = self._fit.fit(
-                [widened(evidence, -widths)],
-                frame.values[None],
-                change,
-                np.zeros(0),
-                rounds,
-                expected=(np.zeros_like(change), np.zeros(0)),
+            found = self._few.fit(
+                [evidence], base[None], change, np.zeros(0), rounds, expected=given
             )
-            change, theta = found.own, found.parameters[0]
-            widths = self._widths(evidence, theta)
-        own = self._widths(evidence, held)
-        before = self._compare(widened(evidence, -own), held)
-        after = self._compare(widened(evidence, -widths), theta)
+            change, theta = found.own, self._with_widths(evidence, found.parameters[0])
+            base = np.append(held[: -len(self._cameras)], theta[-len(self._cameras) :])
+        held = self._with_widths(evidence, held)
+        before, after = (self._all.compare(evidence, one, TOLD_APART)[0] for one in (held, theta))
         told = after
         if _cost(before) <= _FITS_ALREADY * _cost(after):
-            theta, told, change, widths = held, before, np.zeros_like(change), own
+            theta, told, change = held, before, given[0]
         return FrameFit(
             frame.name,
-            *self._pictures(told, theta, change[0]),
+            tuple(
+                one._replace(b=one.b + np.einsum("nkl,npl,p->nk", one.A, one.moves, change[0]))
+                for one in self._all.pictures([evidence], theta[None], TOLD_APART)
+            ),
             (self._inlier_ratios(before, frame), self._inlier_ratios(after, frame)),
             _weights(told),
         )
 
     def _inlier_ratios(self, compared: Comparison, frame: SeenFrame) -> dict[str, float]:
         return {
-            camera.name: inlier_ratio_of(compared.sums[c])
-            for c, camera in enumerate(self._cameras)
-            if camera.name in frame.masks
+            name: inlier_ratio_of(sums)
+            for name, sums in zip(self.camera_names, compared.sums, strict=True)
+            if name in frame.masks
         }
 
-    def _widths(self, evidence: Evidence, theta: Array) -> Array:
-        """(c,) by how much the silhouettes are wider on all sides than the body [pixel]."""
-        costs = np.array(
-            [
-                self._compare(
-                    widened(evidence, np.full(len(self._cameras), -one)), theta, self._few
-                )
-                .sums[:, :, COST]
-                .sum(axis=1)
-                for one in _WIDTHS
-            ]
-        )
-        best = np.clip(costs.argmin(axis=0), 1, len(_WIDTHS) - 2)
-        low, middle, high = (np.take_along_axis(costs, (best + k)[None], 0)[0] for k in (-1, 0, 1))
+    def _with_widths(self, evidence: Evidence, theta: Array) -> Array:
+        """All parameters (n,), the silhouettes as much wider on all sides as fits best [pixel]."""
+        found, costs = theta.copy(), []
+        for one in _WIDTHS:
+            found[-len(self._cameras) :] = one
+            compared, _ = self._few.compare(evidence, found, TOLD_APART)
+            costs.append(compared.sums[:, :, COST].sum(axis=1))
+        best = np.clip(np.argmin(costs, axis=0), 1, len(_WIDTHS) - 2)
+        low, middle, high = (np.choose(best + k, costs) for k in (-1, 0, 1))
         bend = low - 2.0 * middle + high
         step = np.where(bend > 0.0, 0.5 * (low - high) / np.where(bend > 0.0, bend, 1.0), 0.0)
-        return _WIDTHS[best] + np.clip(step, -1.0, 1.0) * (_WIDTHS[1] - _WIDTHS[0])
+        by = np.clip(step, -1.0, 1.0) * (_WIDTHS[1] - _WIDTHS[0])
+        found[-len(self._cameras) :] = _WIDTHS[best] + by
+        return found
 
     def base_moves(self) -> Array:
         """(p, 6) how what is free follows a turn [rad] and shift [m] of the base, in deviations.
@@ -214,77 +178,6 @@ class PerFrameFit:
             moves[first : first + 3, :3] = R_CW
             moves[first + 3 : first + 6, 3:] = R_CW
         return np.asarray(moves / self.deviations[:, None])
-
-    def _held(self, frame: SeenFrame) -> Array:
-        theta = np.zeros(len(self._fit.names))
-        theta[: len(frame.values)] = frame.values
-        return theta
-
-    def _evidence(self, frame: SeenFrame) -> Evidence:
-        spacing = max(1.0, round(_SPACING * self._size))
-        edges = []
-        for camera in self._cameras:
-            mask = frame.masks.get(camera.name)
-            if mask is not None:
-                _check_size(camera, frame.name, mask)
-            edges.append(NO_EDGE if mask is None else find_edge_points(mask, spacing))
-        return pack_evidence(edges)
-
-    def _compare(
-        self, evidence: Evidence, theta: Array, contours: ContourFit | None = None
-    ) -> Comparison:
-        size = len(self.contours.body.names)
-        X_CW, kernel, _ = self._parameters.place(theta[size:])
-        values = theta[: len(self.contours.kinematics.names)]
-        views = Views((X_CW, kernel), evidence)
-        return (contours or self.contours).compare(views, values, TOLD_APART)
-
-    def _pictures(
-        self, compared: Comparison, theta: Array, change: Array
-    ) -> tuple[tuple[Picture, ...], tuple[str, ...]]:
-        """The comparison with each camera's silhouette, and the cameras that have one."""
-        size, X_WN = len(self.contours.body.names), compared.placement.X_WN
-        X_CW, kernel, motions = self._parameters.place(theta[size:])
-        values = len(self.contours.kinematics.names)
-        moves = np.zeros((len(X_WN), len(theta), 12))
-        moves[:, :values] = compared.placement.dense(values)
-        metres = 1.0 / pixels_per_metre((X_CW, kernel), X_WN[:, :3, 3].mean(axis=0))
-        pictures, names = [], []
-        for c, camera in enumerate(self._cameras):
-            if not compared.A[c].any():
-                continue
-            own = moves.copy()
-            first = size + c * len(CAMERA_NAMES)
-            own[:, first : first + 6] = motions[c, :6]
-            own = own[:, self._entries]
-            A = compared.A[c]
-            whole = np.tril(A) + np.swapaxes(np.tril(A, -1), -1, -2)
-            moved = np.einsum("npk,p->nk", own, change)
-            b = compared.b[c] + np.einsum("nkl,nl->nk", whole, moved)
-            pictures.append(Picture(whole, b, X_WN, X_CW[c], own, float(metres[c])))
-            names.append(camera.name)
-        return tuple(pictures), tuple(names)
-
-
-def common_size(cameras: Sequence[Camera], frames: Sequence[SeenFrame]) -> float:
-    """The root of the silhouettes' median area [pixel]."""
-    areas = []
-    for frame in frames:
-        for camera in cameras:
-            if camera.name in frame.masks:
-                _check_size(camera, frame.name, frame.masks[camera.name])
-                areas.append(np.count_nonzero(frame.masks[camera.name]))
-    if not any(areas):
-        raise MaskError("no mask shows the body; give masks in which it is white")
-    return float(np.sqrt(np.median([area for area in areas if area])))
-
-
-def _check_size(camera: Camera, frame: str, mask: Mask) -> None:
-    if mask.shape != (camera.height, camera.width):
-        raise MaskError(
-            f"camera '{camera.name}', frame '{frame}': a mask of {camera.width} x {camera.height} "
-            f"pixels is expected, not {mask.shape[1]} x {mask.shape[0]}"
-        )
 
 
 def _cost(compared: Comparison) -> float:

@@ -1,8 +1,8 @@
-"""Frames of one camera in which the joint positions of the body are known."""
+"""Frames in which the joint positions of the body are known: of one camera, or of several."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -12,14 +12,18 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.camera.models import PinholeCamera
+from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import MaskError
-from drake_pose.fit.evidence import Evidence, find_edge_points, pack_evidence
+from drake_pose.fit.evidence import NO_EDGE, EdgePoints, Evidence, find_edge_points, pack_evidence
+from drake_pose.fit.parameters import BodyParameters
 from drake_pose.silhouette.areas.outline import Outline
 from drake_pose.silhouette.areas.scoring import prefix_sums
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+
+LAST_SPACING = 1.0 / 300.0
+"""Of the points of silhouettes' edges in the last parts of a fit [root of the area]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +43,11 @@ class PosedFrame:
 class PosedFrames:
     """All that a camera sees, as a search and a fit take it.
 
-    Attributes:
+    Args:
         camera: the camera; its pose is not used.
+        spacing: from one point of a silhouette's edge to the next [root of the area].
+
+    Attributes:
         X_WN: (frames, nodes, 4, 4) the nodes' poses.
         size: the root of the silhouettes' median area [pixel].
 
@@ -54,6 +61,7 @@ class PosedFrames:
         outlines: Sequence[Outline],
         camera: PinholeCamera,
         frames: Sequence[PosedFrame],
+        spacing: float = LAST_SPACING,
     ) -> None:
         for frame in frames:
             if frame.mask.shape != (camera.height, camera.width) or not frame.mask.any():
@@ -64,7 +72,7 @@ class PosedFrames:
                     f"{np.count_nonzero(frame.mask)} pixels of it"
                 )
         self.kinematics, self.outlines = kinematics, tuple(outlines)
-        self.camera, self.frames = camera, tuple(frames)
+        self.camera, self.frames, self.spacing = camera, tuple(frames), spacing
         self.X_WN = np.array([kinematics.poses(frame.values) for frame in frames])
         areas = [np.count_nonzero(frame.mask) for frame in frames]
         self.size = float(np.sqrt(np.median(areas)))
@@ -94,9 +102,16 @@ class PosedFrames:
             # A flat body has no hull.
             return np.asarray(points)
 
-    def evidence(self, spacing: float) -> list[Evidence]:
-        """The edges of each frame's silhouette, points so far apart [pixel]."""
-        return [pack_evidence([find_edge_points(frame.mask, spacing)]) for frame in self.frames]
+    @cached_property
+    def edges(self) -> list[EdgePoints]:
+        """Of each frame's silhouette."""
+        spacing = max(1.0, round(self.spacing * self.size))
+        return [find_edge_points(frame.mask, spacing) for frame in self.frames]
+
+    @cached_property
+    def body(self) -> BodyParameters:
+        """What of the body may be unknown."""
+        return BodyParameters(self.kinematics, self.outlines)
 
     def smaller(self, side: float) -> tuple[PinholeCamera, Array]:
         """The camera with smaller pictures, and the silhouettes in them.
@@ -118,3 +133,55 @@ class PosedFrames:
             )
             sums.append(prefix_sums(shrunk > 0.5))
         return small, np.array(sums)
+
+
+@dataclass(frozen=True, eq=False)
+class SeenFrame:
+    """A frame: values (m,) of the pose tree [rad or m], and the silhouettes (H, W) by camera."""
+
+    name: str
+    values: Array
+    masks: Mapping[str, Mask]
+
+    def edges(self, cameras: Sequence[Camera], spacing: float) -> Evidence:
+        """Of the silhouettes, points so far apart [pixel].
+
+        Raises:
+            MaskError: a mask of another size than its camera's picture.
+        """
+        self.require_sizes(cameras)
+        masks = [self.masks.get(camera.name) for camera in cameras]
+        spacing = max(1.0, round(spacing))
+        return pack_evidence(
+            [NO_EDGE if mask is None else find_edge_points(mask, spacing) for mask in masks]
+        )
+
+    def require_sizes(self, cameras: Sequence[Camera]) -> None:
+        """Refuses (MaskError) a mask of another size than its camera's picture."""
+        for camera in cameras:
+            mask = self.masks.get(camera.name)
+            if mask is not None and mask.shape != (camera.height, camera.width):
+                raise MaskError(
+                    f"camera '{camera.name}', frame '{self.name}': a mask of {camera.width} x "
+                    f"{camera.height} pixels is expected, not {mask.shape[1]} x {mask.shape[0]}"
+                )
+
+
+def common_size(cameras: Sequence[Camera], frames: Sequence[SeenFrame]) -> float:
+    """The root of the silhouettes' median area [pixel].
+
+    Raises:
+        MaskError: a mask of another size than its camera's picture, or no mask shows the body.
+    """
+    for frame in frames:
+        frame.require_sizes(cameras)
+    areas = [np.count_nonzero(mask) for frame in frames for mask in frame.masks.values()]
+    if not any(areas):
+        raise MaskError("no mask shows the body; give masks in which it is white")
+    return float(np.sqrt(np.median([area for area in areas if area])))
+
+
+def middle_of(kinematics: TreeKinematics, frames: Sequence[SeenFrame]) -> Array:
+    """(3,) of the nodes' places in the world [m]."""
+    places = [kinematics.poses(frame.values)[:, :3, 3].mean(axis=0) for frame in frames]
+    return np.asarray(np.mean(places, axis=0))

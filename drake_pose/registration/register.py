@@ -11,7 +11,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,16 +23,8 @@ from drake_pose.errors import RegistrationError
 from drake_pose.fit.covariance import excess
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import FEW, VERY_FEW, few_triangles, with_girths
-from drake_pose.registration.calibration_fit import (
-    TOLD_APART,
-    Calibration,
-    CalibrationFit,
-    agreeing,
-    inlier_ratios,
-    start_calibration,
-)
-from drake_pose.registration.camera_fit import CameraFit
-from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
+from drake_pose.registration.posed_frames import LAST_SPACING, PosedFrame, PosedFrames
+from drake_pose.registration.shared_fit import Shared, SharedFit, fit_pose
 from drake_pose.registration.start_poses import (
     E_total,
     areas,
@@ -41,9 +32,8 @@ from drake_pose.registration.start_poses import (
     place_by_bounds,
     spread_rotations,
 )
-from drake_pose.registration.uncertainty import calibration_covariance, pose_covariance
 from drake_pose.silhouette.areas.bending import TreeSurfaces
-from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
+from drake_pose.silhouette.areas.outline import outline_from_mesh
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -57,7 +47,7 @@ FINE = (
 )
 LAST = (AnnealingStage(0.02, 0.01), AnnealingStage(0.01, 0.005), AnnealingStage(0.005, 0.005, 6))
 # Spacing of silhouettes' edge points in each of these [root of the silhouettes' area].
-COARSE_SPACING, FINE_SPACING, LAST_SPACING = 1.0 / 40.0, 1.0 / 80.0, 1.0 / 300.0
+COARSE_SPACING, FINE_SPACING = 1.0 / 40.0, 1.0 / 80.0
 # Rotations tried and fitted in a search that is rough.
 _ROUGH = (2000, 15)
 # Sides of silhouettes in the pictures in which poses are compared [pixel].
@@ -224,50 +214,46 @@ class CameraSearch:
         self, camera: PinholeCamera, frames: Sequence[PosedFrame], looks: Sequence[Array]
     ) -> RegisteredCamera:
         """The best of the poses that are fitted from some X_CW (4, 4), and those as good."""
-        fine = CameraFit(self._posed(self._body.few, camera, frames), FINE_SPACING)
-        last = CameraFit(self._posed(self._body.all, camera, frames), LAST_SPACING)
-        fitted = [last.fit(fine.fit(X_CW, FINE), LAST) for X_CW in looks]
-        looks = distinct(last.frames, fitted)
-        return describe_fitted([(last, with_widths(last, X_CW)) for X_CW in looks])[0]
-
-    def _posed(
-        self, outlines: Sequence[Outline], camera: PinholeCamera, frames: Sequence[PosedFrame]
-    ) -> PosedFrames:
-        return PosedFrames(self._body.kinematics, outlines, camera, frames)
+        kinematics = self._body.kinematics
+        fine = PosedFrames(kinematics, self._body.few, camera, frames, FINE_SPACING)
+        last = PosedFrames(kinematics, self._body.all, camera, frames, LAST_SPACING)
+        fitted = [fit_pose(last, fit_pose(fine, X_CW, FINE), LAST) for X_CW in looks]
+        fits = [SharedFit([last], [X_CW]) for X_CW in distinct(last, fitted)]
+        return describe_fitted([(fit, with_widths(fit)) for fit in fits])[0]
 
     def search(
         self, camera: PinholeCamera, frames: Sequence[PosedFrame], kept: int = _KEPT
     ) -> list[Array]:
         """Poses X_CW (4, 4) near which the best one may be, best first, so many at most."""
         some = spread(frames)
-        posed = self._posed(self._body.very_few, camera, some)
+        body = self._body
+        posed = PosedFrames(body.kinematics, body.very_few, camera, some, COARSE_SPACING)
         starts = np.tile(np.eye(4), (len(self._R_CW), 1, 1))
         starts[:, :3, :3] = self._R_CW
         starts[:, :3, 3] = place_by_bounds(posed, self._R_CW)
         order = np.argsort(mean_misfit(posed, starts, FIRST_SIDE), kind="stable")
-        fit = CameraFit(posed, COARSE_SPACING)
-        found = [fit.fit(starts[k], COARSE) for k in order[: self._fitted_count]]
+        found = [fit_pose(posed, starts[k], COARSE) for k in order[: self._fitted_count]]
         off = mean_misfit(posed, np.array(found), SECOND_SIDE)
         return distinct(posed, [found[k] for k in np.argsort(off, kind="stable")])[:kept]
 
 
 def describe_fitted(
-    fitted: Sequence[tuple[CameraFit, Calibration]], constants: Sequence[int] = ()
+    fitted: Sequence[tuple[SharedFit, Shared]],
 ) -> tuple[RegisteredCamera, Array, list[int]]:
-    """The best of some fitted poses of a camera; its covariance; which fit no worse, best first.
+    """The best of some fitted poses of a camera; which fit no worse, best first.
 
-    constants: the body's parameters that were fitted beside the camera in all.
+    Between these, the covariance (u, u) of what is shared in the best one.
     """
-    side = max(1.0, _PIECE * fitted[0][0].frames.size)
-    pieces = [fit.piece_costs(one.X_CW[0], one.widths[0], TOLD_APART, side) for fit, one in fitted]
+    side = max(1.0, _PIECE * fitted[0][0].seen[0].size)
+    pieces = [fit.piece_costs(found, side) for fit, found in fitted]
     order = np.argsort([one.sum() for one in pieces], kind="stable")
     fit, best = fitted[order[0]]
-    X_CW = best.X_CW[0]
-    ratios = inlier_ratios(CalibrationFit([fit], [], constants), best)
-    agree = agreeing(ratios)
-    found = areas(fit.frames, best.X_CW, np.inf)[0]
+    (seen,), (camera,) = fit.seen, fit.cameras(best)
+    ratios = fit.inlier_ratios(best)
+    agree = fit.agreeing(ratios)
+    found = areas(seen, camera.X_CW[None], np.inf)[0]
     iou = intersection_over_union(found)
-    rows = zip(fit.frames.frames, E_total(found), iou, ratios, agree, strict=True)
+    rows = zip(seen.frames, E_total(found), iou, ratios, agree, strict=True)
     misfits = [
         FrameMisfit(frame.name, float(off), float(one), float(ratio), bool(agrees))
         for frame, off, one, ratio, agrees in rows
@@ -276,16 +262,16 @@ def describe_fitted(
     counted = [one[agree] for one in pieces]
     as_good = [int(k) for k in order if excess(counted[k], counted[order[0]]) <= _SIGNIFICANCE]
     # Fits that began apart may have ended in one pose.
-    alike = distinct(fit.frames, [fitted[k][1].X_CW[0] for k in as_good])
-    own = CalibrationFit([fit], [np.flatnonzero(agree)], constants)
-    covariance = calibration_covariance(own, best)
-    camera = RegisteredCamera(
-        fit.frames.camera.with_pose(np.linalg.inv(X_CW)),
-        pose_covariance(partial(fit.moved, X_CW), covariance[:6, :6]),
+    looks = [fitted[k][0].cameras(fitted[k][1])[0].X_CW for k in as_good]
+    alike = distinct(seen, looks)
+    covariance = fit.covariance(best, agree)
+    registered = RegisteredCamera(
+        camera,
+        fit.camera_covariances(best, covariance)[0],
         tuple(misfits),
         np.array([np.linalg.inv(X) for X in alike[1:]]).reshape(-1, 4, 4),
     )
-    return camera, covariance, as_good
+    return registered, covariance, as_good
 
 
 def spread(frames: Sequence[PosedFrame], most: int = 8) -> list[PosedFrame]:
@@ -314,11 +300,9 @@ def distinct(frames: PosedFrames, X_CW: Sequence[Array]) -> list[Array]:
     return kept
 
 
-def with_widths(fit: CameraFit, X_CW: Array, constants: Sequence[int] = ()) -> Calibration:
-    """A pose (4, 4) fitted to the frames that agree, and the widths of their silhouettes."""
-    found = start_calibration([fit], [X_CW], len(constants))
-    every = CalibrationFit([fit], [], constants)
+def with_widths(fit: SharedFit) -> Shared:
+    """What was fitted to the frames that agree, the widths of their silhouettes among it."""
+    found = fit.start
     for _ in range(_AGAIN):
-        which = np.flatnonzero(agreeing(inlier_ratios(every, found)))
-        found = CalibrationFit([fit], [which], constants).fit(found, LAST)
+        found = fit.fit(LAST, found, fit.agreeing(fit.inlier_ratios(found)))
     return found

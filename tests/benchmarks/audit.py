@@ -24,7 +24,8 @@ from drake_pose.body.model import load_model
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.registration.contradictions import Audit, audit_frames
-from drake_pose.registration.per_frame_fit import PerFrameFit, SeenFrame
+from drake_pose.registration.per_frame_fit import PerFrameFit
+from drake_pose.registration.posed_frames import SeenFrame
 from drake_pose.registration.register import RegistrationBody
 from tests.benchmarks.scenes import Array, Mask, damaged, draw_arm, print_table, segments
 

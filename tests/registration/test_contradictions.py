@@ -10,7 +10,8 @@ from drake_pose.body.model import ArticulatedModel
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import MaskError
 from drake_pose.registration.contradictions import Audit, Finding, audit_frames
-from drake_pose.registration.per_frame_fit import PerFrameFit, SeenFrame
+from drake_pose.registration.per_frame_fit import PerFrameFit
+from drake_pose.registration.posed_frames import SeenFrame
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.search.arms import arm_cameras

@@ -6,11 +6,10 @@ import pytest
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.errors import RegistrationError, UnknownNameError
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
-from drake_pose.registration.calibration_fit import CalibrationFit, start_calibration
-from drake_pose.registration.camera_fit import CameraFit
 from drake_pose.registration.joint_zeros import calibrate_joints
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import CameraSearch, RegistrationBody
+from drake_pose.registration.shared_fit import SharedFit
 from tests.registration.arm_pictures import errors, looking_at, see
 
 MIDDLE = np.array([0.0, 0.0, 0.4])
@@ -112,11 +111,9 @@ def test_the_cost_bends_as_the_normal_equations_say(
 ) -> None:
     camera = looking_at(np.array([1.6, 0.4, 0.5]), MIDDLE, 0.1)
     frames = see(model, body, camera, 4, 4)
-    own = CameraFit(PosedFrames(body.kinematics, body.all, camera, frames), 1.0 / 300.0)
-    zero = body.kinematics.names.index("elbow_turn")
-    fit = CalibrationFit([own], [np.arange(len(frames))], [zero])
+    seen = PosedFrames(body.kinematics, body.all, camera, frames)
+    fit = SharedFit([seen], [camera.X_CW], ["elbow_turn"])
     by = np.append(np.zeros(6), np.radians(0.1))
-    found = start_calibration([own], [camera.X_CW], 1)
-    bends, said = fit.bend(found, by, AnnealingStage(0.005, 0.005))
+    bends, said = fit.bend(fit.start, by, AnnealingStage(0.005, 0.005))
     assert said > 0.0
     assert bends == pytest.approx(said, rel=0.5)

@@ -1,8 +1,10 @@
 """Laws of the parts that a registration is made of; each is a matter of milliseconds."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -10,15 +12,14 @@ from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.errors import MaskError
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
-from drake_pose.registration.calibration_fit import (
-    CONSTANT_DEVIATION,
-    FOCAL_DEVIATION,
-    CalibrationFit,
-    start_calibration,
-)
-from drake_pose.registration.camera_fit import CameraFit
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import RegistrationBody
+from drake_pose.registration.shared_fit import (
+    CONSTANT_DEVIATION,
+    FOCAL_DEVIATION,
+    Shared,
+    SharedFit,
+)
 from drake_pose.registration.standing_object import StandingObject
 from drake_pose.registration.start_poses import add_bound_equations, place_by_bounds
 from tests.registration.arm_pictures import looking_at, see
@@ -31,18 +32,21 @@ STEP = AnnealingStage(0.02, 0.02)
 @pytest.fixture(scope="module")
 def posed(model: ArticulatedModel, body: RegistrationBody) -> PosedFrames:
     camera = looking_at(PLACE, MIDDLE, 0.1)
-    return PosedFrames(body.kinematics, body.very_few, camera, see(model, body, camera, 2, 4))
+    frames = see(model, body, camera, 2, 4)
+    return PosedFrames(body.kinematics, body.very_few, camera, frames, 0.02)
+
+
+def with_zero(posed: PosedFrames) -> SharedFit:
+    """A fit of a camera, its focal length and a joint's zero."""
+    return SharedFit([posed], [posed.camera.X_CW], posed.kinematics.names[3:4], focal=True)
 
 
 def test_what_is_known_beforehand_pulls_by_what_it_says(posed: PosedFrames) -> None:
-    fit = CalibrationFit([CameraFit(posed, 0.05)], [np.arange(2)], [3], focal=True)
-    free = CalibrationFit(fit.fits, fit.which, [3], focal=True)
-    free.information = np.zeros_like(free.information)
-    start = start_calibration(fit.fits, [posed.camera.X_CW], 1)
+    fit, free = with_zero(posed), with_zero(posed)
+    nothing = np.zeros_like(free._fit.unknowns.information)
+    free._fit.unknowns = replace(free._fit.unknowns, information=nothing)
     shared = np.array([0.01, 0.0, -0.01, 0.002, 0.003, 0.0, 0.04, -0.03])
-    with_prior, without = (
-        one.equations(start, np.zeros((2, 1)), shared, STEP) for one in (fit, free)
-    )
+    with_prior, without = (one.equations(Shared(shared, np.zeros(2)), STEP) for one in (fit, free))
     known = np.array([0.0] * 6 + [FOCAL_DEVIATION**-2, CONSTANT_DEVIATION**-2])
     H, g = with_prior.H - without.H, with_prior.g - without.g
     np.testing.assert_allclose(H.sum(axis=0)[1:, 1:], np.diag(known), atol=1e-6)
@@ -52,18 +56,44 @@ def test_what_is_known_beforehand_pulls_by_what_it_says(posed: PosedFrames) -> N
 
 def test_slopes_of_the_cost_are_those_of_the_equations(posed: PosedFrames) -> None:
     """g is half the derivative of the cost: of a pose, the focal length, a zero and a width."""
-    fit = CalibrationFit([CameraFit(posed, 0.02)], [np.arange(2)], [3], focal=True)
-    start = start_calibration(fit.fits, [posed.camera.X_CW], 1)
-    own, at = np.zeros((2, 1)), np.array([0.02, -0.01, 0.02, 0.01, 0.01, 0.01, 0.02, 0.03])
+    fit, own = with_zero(posed), np.zeros(2)
+    at = np.array([0.02, -0.01, 0.02, 0.01, 0.01, 0.01, 0.02, 0.03])
     wide = AnnealingStage(0.2, 0.01)
-    g = fit.equations(start, own, at, wide).g.sum(axis=0)[1:]
+    g = fit.equations(Shared(at, own), wide).g.sum(axis=0)[1:]
     for k, slope in enumerate(g):
         by = 2e-3 * np.eye(8)[k]
-        more, less = (fit.equations(start, own, at + s * by, wide).cost for s in (1.0, -1.0))
+        more, less = (fit.equations(Shared(at + s * by, own), wide).cost for s in (1.0, -1.0))
         assert (more - less) / 8e-3 == pytest.approx(slope, abs=0.1 * np.abs(g).max()), k
-    wider, narrower = (fit.equations(start, own + w, at, wide).cost for w in (0.25, -0.25))
-    widths = fit.equations(start, own, at, wide).g[:, 0]
+    wider, narrower = (fit.equations(Shared(at, own + w), wide).cost for w in (0.25, -0.25))
+    widths = fit.equations(Shared(at, own), wide).g[:, 0]
     assert (wider - narrower) / 1.0 == pytest.approx(float(widths.sum()))
+
+
+def test_a_camera_s_covariance_is_that_of_its_moves(posed: PosedFrames) -> None:
+    """J sigma J^T, J the derivative of X_WC by POSE_NAMES."""
+    fit = SharedFit([posed], [posed.camera.X_CW])
+    at = np.array([0.1, -0.2, 0.3, 0.02, 0.03, -0.01])
+    X_WC, J = fit.cameras(Shared(at, np.zeros(2)))[0].X_WC, np.zeros((6, 6))
+    for k in range(6):
+        X = fit.cameras(Shared(at + 1e-6 * np.eye(6)[k], np.zeros(2)))[0].X_WC
+        turn = X[:3, :3] @ X_WC[:3, :3].T
+        J[:, k] = [turn[2, 1], turn[0, 2], turn[1, 0], *(X[:3, 3] - X_WC[:3, 3])]
+    covariance = np.diag([1.0, 4.0, 9.0, 0.1, 0.2, 0.3])
+    found = fit.camera_covariances(Shared(at, np.zeros(2)), covariance)[0]
+    np.testing.assert_allclose(found, (J / 1e-6) @ covariance @ (J / 1e-6).T, atol=1e-4)
+
+
+def test_a_wider_mask_is_told_from_a_nearer_camera(posed: PosedFrames) -> None:
+    """The width that is found is that of the mask, whatever the camera's distance takes of it."""
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
+    frames = [
+        replace(one, mask=cv2.dilate(one.mask.view(np.uint8), disc).view(bool))
+        for one in posed.frames
+    ]
+    wide = PosedFrames(posed.kinematics, posed.outlines, posed.camera, frames, posed.spacing)
+    fits = [SharedFit([one], [posed.camera.X_CW]) for one in (posed, wide)]
+    exact, wider = (fit.fit([AnnealingStage(0.02, 0.01, 6)]).widths for fit in fits)
+    np.testing.assert_allclose(wider - exact, 2.0, atol=0.4)
 
 
 def test_bounds_pull_along_the_derivative_of_how_far_they_are_off(posed: PosedFrames) -> None:

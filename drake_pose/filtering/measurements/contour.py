@@ -29,8 +29,8 @@ from drake_pose.fit.contour_fit import (
     Comparison,
     Noise,
     compare_views,
+    normal_equations,
     pack_views,
-    project,
 )
 from drake_pose.fit.evidence import NO_EDGE, find_edge_points
 from drake_pose.fit.kernel import COMPARED, FITTING, REACH, SQUARES, WEIGHT
@@ -269,7 +269,7 @@ class ContourObservation(BodyState):
     ) -> ContourMeasurement:
         """What the contours say as no more numbers than the state has elements, with noise 1."""
         settings = self.settings
-        H, g = project(compared, len(self._body.names))
+        H, g = normal_equations(compared.total, compared.placement, len(self._body.names))
         index = self._parameter_index
         scale = max(settings.deviation, distance)
         # Both contours say the same: together they count as one.

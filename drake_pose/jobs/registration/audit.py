@@ -21,7 +21,8 @@ from drake_pose.jobs.estimate.scene_checks import check_scene, frame_ranges
 from drake_pose.jobs.registration.positions import KnownPositions, read_known_positions
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.registration.contradictions import Audit, Finding, FrameAudit, audit_frames
-from drake_pose.registration.per_frame_fit import PerFrameFit, SeenFrame
+from drake_pose.registration.per_frame_fit import PerFrameFit
+from drake_pose.registration.posed_frames import SeenFrame
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.results.folder import OVERLAY, ResultFolder, require_empty
 from drake_pose.results.overlay import draw_overlay, encode_png

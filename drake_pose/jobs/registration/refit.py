@@ -27,8 +27,7 @@ from drake_pose.registration.joint_zeros import (
     calibrate_joints,
     lengthened_joints,
 )
-from drake_pose.registration.per_frame_fit import SeenFrame
-from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
+from drake_pose.registration.posed_frames import PosedFrame, PosedFrames, SeenFrame
 from drake_pose.registration.register import FrameMisfit, RegisteredCamera, RegistrationBody
 from drake_pose.registration.start_poses import E_total, areas, intersection_over_union
 

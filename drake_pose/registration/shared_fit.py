@@ -1,0 +1,353 @@
+"""Cameras, and what all frames share beside them, fitted together with the masks' widths.
+
+A mask that is too wide on all sides makes its body seem nearer. Each mask's width is unknown, too:
+thin links and their distances from one another tell the two apart.
+
+How sure what is shared is: contours do not err point by point. There are the noise of points, the
+surface of a part in all frames alike, its edge in one mask, and each frame as a whole
+(``fit.covariance``). How large these are is told by what is left of the distances at the scale of
+the fit; frames' pulls scatter as these say, or by a factor more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.body.model import OBJECT_POSITIONS
+from drake_pose.body.tree.joint_offsets import JointOffset
+from drake_pose.camera.models import PinholeCamera
+from drake_pose.fit.contour_fit import Noise
+from drake_pose.fit.covariance import (
+    Distances,
+    ErrorSizes,
+    distances_covariance,
+    distances_in_pictures,
+    estimate_sizes,
+    values_covariance,
+    with_widths,
+)
+from drake_pose.fit.evidence import NO_EDGE, Evidence, pack_evidence
+from drake_pose.fit.frames_fit import FramesFit, parameter_names
+from drake_pose.fit.lengthened_body import LengthenedBody
+from drake_pose.fit.levenberg_marquardt import AnnealingStage, Equations, StepSettings
+from drake_pose.fit.parameters import CAMERA_NAMES
+from drake_pose.fit.unknowns import choose, join
+from drake_pose.registration.posed_frames import PosedFrames
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+POSE_NAMES = CAMERA_NAMES[:6]
+"""A camera's turn [rad] and shift [m] along its axes about the middle of the bodies."""
+
+ROUNDS_WITH_CONSTANTS = (
+    *(AnnealingStage(scale, 0.02) for scale in (0.12, 0.09, 0.07, 0.05, 0.03, 0.02)),
+    AnnealingStage(0.01, 0.01),
+    # Again and again, for what hardly shows, such as a zero that turns with the camera, gains so
+    # little in a step that a round ends before it is there.
+    *(AnnealingStage(0.005, 0.005, 6) for _ in range(5)),
+)
+"""Parts of a fit that has constants to find beside cameras."""
+
+TOLD_APART = AnnealingStage(0.025, 0.01)
+"""At this scale frames are told apart that agree and that contradict."""
+
+CONSTANT_DEVIATION, FOCAL_DEVIATION = 0.2, 0.1
+"""What is known beforehand of zeros [rad or m] and the logarithms of lengths, and of the logarithms
+of focal lengths: deviations."""
+
+KNOWN_BEFOREHAND = 20
+"""The scale of frames' errors is known beforehand as well as so many distances tell it."""
+
+STEPS = StepSettings(longest=0.3, damping=1e-2, even_damping=1e-6)
+
+# And of where an object stands, once it was found [m, rad].
+_OBJECT_DEVIATION = 1.0
+# A frame agrees whose inlier ratio is this share of that of the two that fit best.
+_AGREES = 0.7
+# Masks are wider or narrower by no more [pixel].
+_WIDEST = 6.0
+# At this scale cameras were fitted in the end.
+_FITTED = AnnealingStage(0.005, 0.005)
+# Sizes of errors are known beforehand to a factor of twenty; frames tell them.
+PRIOR_DEVIATION = 3.0
+# What a picture tells of a direction is nothing below this share of what it tells best.
+_TOLD = 1e-3
+# Where parts err by so much [pixel], a calibration is no better than this [pixel].
+_PARTS_ERR, _NO_BETTER = 0.2, 1.0
+
+
+class Shared(NamedTuple):
+    """What was found.
+
+    shared: (u,) by the names of a fit; widths: (rows,) of masks [pixel], 0 where they do not count.
+    """
+
+    shared: Array
+    widths: Array
+
+
+class SharedFit:
+    """Fits what the frames of several cameras share.
+
+    Attributes:
+        seen: what each camera sees.
+        rows: (rows,) the how manieth camera each mask is of, one camera's after another's.
+        names: of the u shared unknowns: those of each camera, then the constants.
+        per_camera: so many of them each camera has.
+        constants: names of the body's parameters to which an unknown constant is added in all
+            frames: values of the pose tree, and lengths.
+
+    Args:
+        X_CW: (4, 4) for each camera, where a fit begins.
+        offsets: joints whose places on their links are unknown.
+        focal: whether the cameras' focal lengths are unknown.
+        widths: whether the masks' are.
+    """
+
+    def __init__(
+        self,
+        seen: Sequence[PosedFrames],
+        X_CW: Sequence[Array],
+        constants: Sequence[str] = (),
+        *,
+        offsets: Sequence[JointOffset] = (),
+        focal: bool = False,
+        widths: bool = True,
+    ) -> None:
+        self.seen, self.constants = tuple(seen), tuple(constants)
+        first, body = seen[0], seen[0].body
+        if offsets:
+            body = LengthenedBody(first.kinematics, first.outlines, offsets)
+        self.rows = np.repeat(np.arange(len(seen)), [len(one.frames) for one in seen])
+        self._values = np.array([frame.values for one in seen for frame in one.frames])
+        edges = [edge for one in seen for edge in one.edges]
+        self._evidence = [
+            pack_evidence([edge if k == c else NO_EDGE for k in range(len(seen))])
+            for c, edge in zip(self.rows, edges, strict=True)
+        ]
+        cameras = [
+            one.camera.with_pose(np.linalg.inv(X)) for one, X in zip(seen, X_CW, strict=True)
+        ]
+        self.per_camera = len(POSE_NAMES) + focal
+        looks = CAMERA_NAMES[: self.per_camera]
+        names = [f"{camera.name}.{name}" for camera in cameras for name in looks]
+        self.names = (*names, *constants)
+        known = [
+            _OBJECT_DEVIATION if n in OBJECT_POSITIONS else CONSTANT_DEVIATION for n in constants
+        ]
+        deviations = [
+            FOCAL_DEVIATION if n == CAMERA_NAMES[6] else np.inf for _ in cameras for n in looks
+        ]
+        every = parameter_names(body, cameras)
+        unknowns = choose(every, self.names, shared=True, deviation=np.array([*deviations, *known]))
+        if widths:
+            own = choose(every, every[-len(cameras) :], lower=-_WIDEST, upper=_WIDEST)
+            unknowns = join(own, unknowns)
+        sizes = np.array([one.size for one in seen])
+        self._fit = FramesFit(
+            body, cameras, unknowns, pivot=np.array([one.middle for one in seen]),
+            noise=Noise.of_a_pixel(sizes), steps=STEPS, pixels=sizes,
+        )  # fmt: skip
+
+    @property
+    def start(self) -> Shared:
+        """All as it is given."""
+        return Shared(np.zeros(len(self.names)), np.zeros(len(self.rows)))
+
+    def fit(
+        self,
+        rounds: Sequence[AnnealingStage],
+        start: Shared | None = None,
+        which: Mask | None = None,
+    ) -> Shared:
+        """Fits all from where it starts to those of the masks (rows,) that count."""
+        start, which = start or self.start, self._every(which)
+        found = self._fit.fit(*self._at(start, which), rounds, expected=self._known(which))
+        widths = np.zeros(len(self.rows))
+        widths[which] = found.own.sum(axis=1)
+        return Shared(found.shared, widths)
+
+    def equations(self, at: Shared, step: AnnealingStage, which: Mask | None = None) -> Equations:
+        """The normal equations of the masks (rows,) that count, own unknowns first."""
+        which = self._every(which)
+        return self._fit.equations(*self._at(at, which), step, self._known(which))
+
+    def bend(
+        self, found: Shared, by: Array, step: AnnealingStage, which: Mask | None = None
+    ) -> tuple[float, float]:
+        """How much the cost bends upwards as what is shared moves by (u,), by slopes and by H."""
+        p = self._fit.unknowns.own_count
+        less, here, more = (
+            self.equations(Shared(found.shared + sign * by, found.widths), step, which)
+            for sign in (-1.0, 0.0, 1.0)
+        )
+        known = float(self._fit.unknowns.information[p:] @ by**2)
+        slopes = (more.g - less.g).sum(axis=0)[p:]
+        said = float(by @ here.H.sum(axis=0)[p:, p:] @ by)
+        return 0.5 * float(by @ slopes) - known, said - known
+
+    def inlier_ratios(self, found: Shared) -> Array:
+        """(rows,) of both contours' lengths, what fits."""
+        compared = [
+            self._fit.compare(evidence, theta, TOLD_APART)[0]
+            for evidence, theta in zip(self._evidence, self._parameters(found), strict=True)
+        ]
+        return np.array([one.inlier_ratio for one in compared])
+
+    def agreeing(self, ratios: Array) -> Mask:
+        """(rows,) which masks fit nearly as well as the two of their camera that fit best."""
+        own = [ratios[self.rows == c] for c in range(len(self.seen))]
+        return np.concatenate([one >= _AGREES * np.sort(one)[-2:].mean() for one in own])
+
+    def piece_costs(self, found: Shared, side: float) -> Array:
+        """(rows, k, k) costs by squares of the pictures of a side [pixel]."""
+        return np.array(
+            [
+                self._fit.piece_costs(self._evidence[k], theta, TOLD_APART, side)[self.rows[k]]
+                for k, theta in enumerate(self._parameters(found))
+            ]
+        )
+
+    def cameras(self, found: Shared) -> list[PinholeCamera]:
+        """The cameras as they were found."""
+        X_CW, kernel, _ = self._fit.places(self._parameters(found)[0])
+        return [
+            replace(one.camera, X_WC=np.linalg.inv(X), focal_x=float(k[1]), focal_y=float(k[2]))
+            for one, X, k in zip(self.seen, X_CW, kernel, strict=True)
+        ]
+
+    def covariance(self, found: Shared, which: Mask | None = None) -> Array:
+        """(u, u) of the errors of what is shared, told by the masks (rows,) that count."""
+        seen = self._distances(found, _FITTED, which)
+        is_angle = np.zeros(seen.X.shape[1], bool)
+        sizes = estimate_sizes(seen, is_angle, 0.0, PRIOR_DEVIATION)
+        covariance = values_covariance(seen, sizes, np.arange(len(is_angle)), is_angle)
+        covariance *= _scatter(seen, sizes, len(self.names))
+        trusted = _calibration_error(self._distances(found, TOLD_APART, which))
+        for c, camera in enumerate(self.cameras(found)):
+            unseen = _unseen_errors(self.seen[c], camera.X_CW, trusted)[: self.per_camera]
+            at = np.arange(len(unseen)) + c * len(unseen)
+            covariance[at, at] += unseen**2
+        return covariance[: len(self.names), : len(self.names)]
+
+    def camera_covariances(self, found: Shared, covariance: Array) -> Array:
+        """(cameras, 6, 6) of the poses' errors in the world, covariance being of what is shared."""
+        X_CW, _, motions = self._fit.places(self._parameters(found)[0])
+        first = self.per_camera * np.arange(len(X_CW))
+        return np.array(
+            [
+                pose_covariance(X, moves[:6], covariance[k : k + 6, k : k + 6])
+                for k, X, moves in zip(first, X_CW, motions, strict=True)
+            ]
+        )
+
+    def _every(self, which: Mask | None) -> Mask:
+        return np.ones(len(self.rows), bool) if which is None else which
+
+    def _chosen(self, which: Mask) -> list[Evidence]:
+        return [self._evidence[k] for k in np.flatnonzero(which)]
+
+    def _at(self, at: Shared, which: Mask) -> tuple[list[Evidence], Array, Array, Array]:
+        """Masks that count, as ``FramesFit`` takes them: edges, what is held, both unknowns."""
+        return self._chosen(which), self._values[which], self._own(at)[which], at.shared
+
+    def _known(self, which: Mask) -> tuple[Array, Array]:
+        """What own and shared unknowns are expected to be."""
+        own = np.zeros((np.count_nonzero(which), self._fit.unknowns.own_count))
+        return own, np.zeros(len(self.names))
+
+    def _own(self, at: Shared) -> Array:
+        """(rows, own unknowns): of each mask the width of its camera's."""
+        own = np.zeros((len(self.rows), self._fit.unknowns.own_count))
+        if own.size:
+            own[np.arange(len(own)), self.rows] = at.widths
+        return own
+
+    def _parameters(self, at: Shared) -> Array:
+        """(rows, n) all parameters."""
+        held = np.zeros((len(self.rows), len(self._fit.names)))
+        held[:, : self._values.shape[1]] = self._values
+        rows = zip(held, self._own(at), strict=True)
+        return np.array([self._fit.unknowns.parameters(one, own, at.shared) for one, own in rows])
+
+    def _distances(self, found: Shared, step: AnnealingStage, which: Mask | None) -> Distances:
+        """The distances in all masks that count; values are what is shared, then the widths."""
+        which = self._every(which)
+        pictures = self._fit.pictures(self._chosen(which), self._parameters(found)[which], step)
+        outlines = self._fit.body.outlines
+        return distances_in_pictures(outlines, with_widths(outlines, pictures))
+
+
+def fit_pose(seen: PosedFrames, X_CW: Array, rounds: Sequence[AnnealingStage]) -> Array:
+    """X_CW (4, 4) fitted to all frames from where it starts; silhouettes keep their widths."""
+    fit = SharedFit([seen], [X_CW], widths=False)
+    return fit.cameras(fit.fit(rounds))[0].X_CW
+
+
+def pose_covariance(X_CW: Array, motions: Array, covariance: Array) -> Array:
+    """(6, 6) of a camera's error in the world: a rotation vector [rad], a shift [m].
+
+    Args:
+        X_CW: (4, 4) of the camera.
+        motions: (6, 12) of all that it sees, as of ``CameraParameters.place``.
+        covariance: (6, 6) of these.
+    """
+    # Where all that it sees moves one way, it moves the other way.
+    by = -motions.reshape(6, 3, 4)
+    p_WC = -X_CW[:3, :3].T @ X_CW[:3, 3]
+    turns = np.stack([by[:, 2, 1], by[:, 0, 2], by[:, 1, 0]])
+    J = np.vstack([turns, (by[:, :, :3] @ p_WC + by[:, :, 3]).T])
+    return np.asarray(J @ covariance @ J.T)
+
+
+def _scatter(seen: Distances, sizes: ErrorSizes, shared: int) -> float:
+    """By what factor frames disagree more about what they share than errors say: of variances.
+
+    Each frame's distances along what it tells of the shared values, its width put right, are
+    normal with a known covariance about what these values make of them.
+    """
+    V = distances_covariance(seen, sizes)
+    designs, lefts = [], []
+    for picture in np.unique(seen.pictures):
+        rows = np.flatnonzero(seen.pictures == picture)
+        X, widths = np.split(seen.X[rows], [shared], axis=1)
+        X = X - widths @ np.linalg.pinv(widths) @ X
+        U, told, _ = np.linalg.svd(X, full_matrices=False)
+        U = U[:, told > _TOLD * told.max()]
+        L = np.linalg.cholesky(U.T @ V[np.ix_(rows, rows)] @ U)
+        designs.append(np.linalg.solve(L, U.T @ X))
+        lefts.append(np.linalg.solve(L, U.T @ seen.y[rows]))
+    if not designs:
+        return 1.0
+    design, left = np.concatenate(designs), np.concatenate(lefts)
+    by, _, rank, _ = np.linalg.lstsq(design, left)
+    off = left - design @ by
+    scale = (KNOWN_BEFOREHAND + float(off @ off)) / (KNOWN_BEFOREHAND + len(off) - rank)
+    # Frames that agree by chance are no surer.
+    return max(scale, 1.0)
+
+
+def _calibration_error(seen: Distances) -> float:
+    """By how much a calibration may be off that no frame contradicts [pixel].
+
+    Wrong intrinsics err alike in all frames: the pose follows, and nothing is left of it. So where
+    parts are seen to err, a calibration is not trusted beyond a pixel either. What comes again
+    where a part stands still may be the part's surface: none of it counts as noise here.
+    """
+    seen = seen._replace(effects=seen.effects._replace(repeated=seen.effects.noise))
+    sizes = estimate_sizes(seen, np.zeros(seen.X.shape[1], bool), 0.0, PRIOR_DEVIATION)
+    return min(_NO_BETTER, _NO_BETTER * (sizes.surface**2 + sizes.mask**2) / _PARTS_ERR**2)
+
+
+def _unseen_errors(seen: PosedFrames, X_CW: Array, pixels: float) -> Array:
+    """(7,) by how much a camera's turn, shift and focal length are off then: deviations."""
+    depth = float(X_CW[2, :3] @ seen.middle + X_CW[2, 3])
+    size = pixels * depth / seen.camera.focal_x
+    turn = size / seen.extent
+    return np.array([turn, turn, turn, size, size, size * depth / seen.extent, turn])

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from drake_pose.body.tree.joint_map import chain_transforms
 from drake_pose.body.tree.joint_offsets import JointOffset
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.fit.parameters import BodyParameters, Placement, affine_motions
+from drake_pose.fit.parameters import BodyParameters, Placement, affine_motions, owners_of
 from drake_pose.silhouette.areas.outline import Outline
 
 Array = NDArray[np.float64]
@@ -62,7 +62,8 @@ class LengthenedBody(BodyParameters):
                 first = last
             first = turned
         moves = kinematics.motions(kinematics.flatten(kinematics.tree.default_values())).moves
-        self._moves = np.hstack([moves, self._behind])
+        parameters = np.concatenate([np.arange(count), count + self._lengths])
+        self._owners = owners_of(np.hstack([moves, self._behind]), parameters)
 
     def place(self, theta: Array) -> Placement:
         """The body at its tree's values (m,), or at all parameters (n,)."""
@@ -78,12 +79,8 @@ class LengthenedBody(BodyParameters):
         twists[:, 3:6] -= np.cross(twists[:, :3], self._shifted @ shifts)
         moved = np.zeros((len(offsets), 7))
         moved[:, 3:6] = growth * offsets
-        owners = [np.flatnonzero(row) for row in self._moves]
-        starts = np.cumsum([0, *(len(owned) for owned in owners)])
-        flat = np.concatenate(owners)
-        parameters = np.concatenate([np.arange(count), count + self._lengths])[flat]
         motions = affine_motions(np.vstack([twists, moved]))
-        return Placement(self._at(theta[:count]), X_WN, motions, starts, flat, parameters)
+        return Placement(self._at(theta[:count]), X_WN, motions, *self._owners)
 
     def _offsets_in_world(self, values: Array, X_WN: Array) -> Array:
         """(offsets, 3) at the tree's values (m,), nothing lengthened."""

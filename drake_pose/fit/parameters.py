@@ -87,63 +87,49 @@ class BodyParameters:
         bends = surfaces is not None and surfaces.bends
         self._bending = PackedSurfaces(surfaces) if surfaces is not None and bends else None
         self.kinematics, self.outlines = kinematics, tuple(outlines)
-        self.groups = np.full(len(self.outlines), -1) if groups is None else np.array(groups)
-        self.names = (
-            *kinematics.names,
-            *ROOT_NAMES,
-            *(f"{GIRTH_PREFIX}{name}" for name in girth_names),
-        )
-        self._has_girths = bool(np.any(self.groups >= 0))
+        nodes, count = len(self.outlines), len(kinematics.names) + len(ROOT_NAMES)
+        self.groups = np.full(nodes, -1) if groups is None else np.array(groups)
+        girths = tuple(f"{GIRTH_PREFIX}{name}" for name in girth_names)
+        self.names = (*kinematics.names, *ROOT_NAMES, *girths)
         self._packed = pack(self.outlines)
-        tree = kinematics.tree
-        values = kinematics.flatten(tree.default_values())
+        values = kinematics.flatten(kinematics.tree.default_values())
         moves = kinematics.motions(values, translation=True, scale=True).moves
         self._rooted = moves[:, -1]
         self._of_root = kinematics.value_nodes == 0
-        count = len(kinematics.names)
-        self._values_only = _owned([np.flatnonzero(row) for row in moves[:, :count]])
-        girths = [[] if group < 0 else [group] for group in self.groups]
-        first = count + len(ROOT_NAMES)
-        starts, owners, _ = _owned(
-            [
-                [*np.flatnonzero(row), *(first + node for _ in girth)]
-                for node, (row, girth) in enumerate(zip(moves, girths, strict=True))
-            ]
+        self._values_only = owners_of(moves[:, :-4], np.arange(count - 4))
+        self._wide = np.flatnonzero(self.groups >= 0)
+        self._all = owners_of(
+            np.hstack([moves, np.eye(nodes, dtype=np.bool_)[:, self._wide]]),
+            np.concatenate([np.arange(count), count + self.groups[self._wide]]),
         )
-        of = np.concatenate([np.arange(first), first + self.groups])
-        self._all = starts, owners, of[owners]
 
     def place(self, theta: Array) -> Placement:
         """The body at its tree's values (m,), or at all parameters (n,)."""
-        kinematics = self.kinematics
-        count = len(kinematics.names)
-        motions = kinematics.motions(theta[:count])
+        count = len(self.kinematics.names)
+        at = self.kinematics.motions(theta[:count])
+        affine = affine_motions(at.twists)
         if len(theta) == count:
-            affine = affine_motions(motions.twists)
-            return Placement(self._at(theta), motions.X_WN, affine, *self._values_only)
-        shift, growth = theta[count : count + 3], float(np.exp(theta[count + 3]))
-        X_WN, twists = motions.X_WN.copy(), np.zeros((count + 4, 7))
-        twists[:count] = motions.twists
-        root = X_WN[0, :3, 3].copy()
+            return Placement(self._at(theta), at.X_WN, affine, *self._values_only)
+        root, growth = at.X_WN[0, :3, 3], float(np.exp(theta[count + 3]))
+        moved = theta[count : count + 3] + (1.0 - growth) * root
+        X_WN = at.X_WN.copy()
         X_WN[self._rooted, :3, :3] *= growth
-        X_WN[self._rooted, :3, 3] = root + shift + growth * (X_WN[self._rooted, :3, 3] - root)
-        omega, v = motions.twists[:, :3], motions.twists[:, 3:6]
-        turned = omega @ _cross_matrix((1.0 - growth) * root + shift).T
-        twists[:count, 3:6] = growth * v + turned
+        X_WN[self._rooted, :3, 3] = moved + growth * at.X_WN[self._rooted, :3, 3]
+        M, v = affine.reshape(-1, 3, 4)[:, :, :3], affine.reshape(-1, 3, 4)[:, :, 3]
         # What moves the root moves the point about which the body has grown.
-        held = (1.0 - growth) * (omega @ _cross_matrix(root) + v)
-        twists[:count, 3:6] += held * self._of_root[:, None]
-        twists[count : count + 3, 3:6] = np.eye(3)
-        twists[-1, 3:6], twists[-1, 6] = -root - shift, 1.0
+        held = (1.0 - growth) * (M @ root + v) * self._of_root[:, None]
+        twists = np.zeros((4, 7))
+        twists[:3, 3:6] = np.eye(3)
+        twists[3, 3:6], twists[3, 6] = -root - theta[count : count + 3], 1.0
+        motions = [affine_of(M, growth * v - M @ moved + held), affine_motions(twists)]
         packed = self._at(theta[:count])
-        if self._has_girths:
-            girths = np.append(theta[count + 4 :], 0.0)
-            wide = np.where(self.groups >= 0, np.exp(girths[self.groups]), 1.0)
-            packed = _widened(packed, wide)
-        affine = affine_motions(twists)
-        if self._has_girths:
-            affine = np.vstack([affine, [_widening(X) for X in X_WN]])
-        return Placement(packed, X_WN, affine, *self._all)
+        if len(self._wide):
+            scale = np.ones((len(X_WN), 3))
+            girths = np.exp(theta[count + 4 :])[self.groups[self._wide]]
+            scale[self._wide, 0] = scale[self._wide, 2] = girths
+            packed = stretched(packed, scale)
+            motions.append(np.array([_widening(X) for X in X_WN[self._wide]]))
+        return Placement(packed, X_WN, np.vstack(motions), *self._all)
 
     def _at(self, values: Array) -> PackedOutlines:
         """The surfaces at the tree's values (m,)."""
@@ -188,17 +174,14 @@ class CameraParameters:
             p_CW = R @ (X_CW[c, :3, 3] - self._pivots[c]) + pivot
             X_CW[c, :3, :3], X_CW[c, :3, 3] = R_CW, p_CW
             kernel[c, 1:3] *= np.exp(part[6])
-            M, v = np.zeros((7, 3, 3)), np.zeros((7, 3))
-            for k in range(3):
-                M[k] = _cross_matrix(omegas[:, k])
-                v[k] = -M[k] @ pivot
-            v[3:6] = np.eye(3)
-            M[6, 0, 0] = M[6, 1, 1] = 1.0
+            twists = np.zeros((6, 7))
+            twists[:3, :3], twists[3:, 3:6] = omegas.T, np.eye(3)
+            in_camera = np.zeros((7, 3, 4))
+            in_camera[:6] = affine_motions(twists).reshape(6, 3, 4)
+            in_camera[:3, :, 3] = -in_camera[:3, :, :3] @ pivot
+            in_camera[6, 0, 0] = in_camera[6, 1, 1] = 1.0
             # What is affine in the camera's frame is so in the world's.
-            affine = np.zeros((7, 3, 4))
-            affine[:, :, :3] = R_CW.T @ M @ R_CW
-            affine[:, :, 3] = (M @ p_CW + v) @ R_CW
-            motions[c] = affine.reshape(7, 12)
+            motions[c] = (R_CW.T @ in_camera @ X_CW[c]).reshape(7, 12)
         return X_CW, kernel, motions
 
 
@@ -213,10 +196,20 @@ def affine_motions(twists: Array) -> Array:
     return affine.reshape(-1, 12)
 
 
-def _owned(motions: Sequence[Sequence[int] | NDArray[np.intp]]) -> tuple[Indices, Indices, Indices]:
-    """starts, owners and parameters of a Placement whose motions are its parameters."""
-    owners = np.array([one for group in motions for one in group], dtype=np.int64)
-    return np.cumsum([0, *(len(group) for group in motions)]), owners, owners
+def affine_of(M: Array, v: Array) -> Array:
+    """Affine motions (m, 12) of M (m, 3, 3) and v (m, 3)."""
+    return np.concatenate([M, v[:, :, None]], axis=2).reshape(-1, 12)
+
+
+def owners_of(moves: NDArray[np.bool_], parameters: Indices) -> tuple[Indices, Indices, Indices]:
+    """starts, owners and parameters of a Placement.
+
+    Args:
+        moves: (nodes, k) which motions each node has.
+        parameters: (k,) which parameter makes each.
+    """
+    owners = np.nonzero(moves)[1].astype(np.int64)
+    return np.cumsum([0, *moves.sum(axis=1)]), owners, parameters[owners]
 
 
 def _widening(X_WN: Array) -> Array:
@@ -228,25 +221,15 @@ def _widening(X_WN: Array) -> Array:
     return M.reshape(-1)
 
 
-def _widened(packed: PackedOutlines, girths: Array) -> PackedOutlines:
-    """Surfaces, each node's as wide across its y axis as girths (nodes,) say."""
+def stretched(packed: PackedOutlines, scale: Array) -> PackedOutlines:
+    """Surfaces, each node's so many times (nodes, 3) as large along its frame's axes."""
     points, planes = packed.points.copy(), packed.planes.copy()
-    for node, girth in enumerate(girths):
-        vertices = slice(packed.starts[node, 0], packed.starts[node + 1, 0])
-        triangles = slice(packed.starts[node, 1], packed.starts[node + 1, 1])
-        points[0, vertices] *= girth
-        points[2, vertices] *= girth
-        planes[0, triangles] *= girth
-        planes[1:4, triangles] *= np.array([girth**2, girth, girth**2])[:, None]
-    balls = packed.balls.copy()
-    balls[:, [0, 2]] *= girths[:, None]
-    balls[:, 3] *= np.maximum(girths, 1.0)
+    for node, (s, volume) in enumerate(zip(scale, scale.prod(axis=1), strict=True)):
+        points[:, slice(*packed.starts[node : node + 2, 0])] *= s[:, None]
+        factors = np.array([*volume / s, volume])
+        planes[:, slice(*packed.starts[node : node + 2, 1])] *= factors[:, None]
+    balls = packed.balls * np.column_stack([scale, scale.max(axis=1)])
     return packed._replace(points=points, planes=planes, balls=balls)
-
-
-def _cross_matrix(r: Array) -> Array:
-    """The matrix (3, 3) of the cross product with a vector (3,)."""
-    return np.array([[0.0, -r[2], r[1]], [r[2], 0.0, -r[0]], [-r[1], r[0], 0.0]])
 
 
 def _turn(r: Array) -> tuple[Array, Array]:
@@ -257,5 +240,5 @@ def _turn(r: Array) -> tuple[Array, Array]:
         c = (1.0 - a) / angle**2
     else:
         a, b, c = 1.0 - angle**2 / 6.0, 0.5 - angle**2 / 24.0, 1.0 / 6.0 - angle**2 / 120.0
-    K = _cross_matrix(r)
+    K = np.array([[0.0, -r[2], r[1]], [r[2], 0.0, -r[0]], [-r[1], r[0], 0.0]])
     return np.eye(3) + a * K + b * K @ K, np.eye(3) + b * K + c * K @ K

@@ -29,46 +29,20 @@ from drake_pose.fit.parameters import (
     BodyParameters,
     Placement,
     affine_motions,
+    affine_of,
+    owners_of,
+    stretched,
 )
 from drake_pose.fit.unknowns import Unknowns, choose, join
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import PackedOutlines
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 LENGTH_PREFIX, WIDTH_PREFIX, PLACE_PREFIX = "log_length_", "log_width_", "joint_place_"
 """Begin the names of the logarithms of how much longer a part is, and of how much wider a part or
 all parts of a limb are; and of how far along a part its own joint lies, over the part's length."""
-
-
-class _MotionList:
-    """Affine motions of nodes, collected; the whole body has grown about its root and is shifted.
-
-    Args:
-        nodes: how many there are.
-        growth: of the whole.
-        moved: (3,) where the world's origin comes to lie by growth and shift [m].
-    """
-
-    def __init__(self, nodes: int, growth: float, moved: Array) -> None:
-        self._growth, self._moved = growth, moved
-        self._motions: list[Array] = []
-        self._parameters: list[int] = []
-        self._owners: list[list[int]] = [[] for _ in range(nodes)]
-
-    def add(self, parameter: int, nodes: Sequence[int], M: Array, v: Array) -> None:
-        """A parameter moves some nodes by M (3, 3) p + v (3,) before the whole grows."""
-        for node in nodes:
-            self._owners[node].append(len(self._motions))
-        self._parameters.append(parameter)
-        self._motions.append(np.column_stack([M, self._growth * v - M @ self._moved]).reshape(12))
-
-    def placement(self, packed: PackedOutlines, X_WN: Array) -> Placement:
-        """The body with these motions."""
-        starts = np.cumsum([0, *(len(owned) for owned in self._owners)])
-        owners = np.array([one for owned in self._owners for one in owned], dtype=np.int64)
-        parameters = np.array(self._parameters, dtype=np.int64)[owners]
-        return Placement(packed, X_WN, np.array(self._motions), starts, owners, parameters)
 
 
 class ProportionedBody(BodyParameters):
@@ -118,6 +92,28 @@ class ProportionedBody(BodyParameters):
             *self.place_names,
         )
         self.axes, self._along, self._rest = self._find_axes()
+        self._parents = np.array([node.parent for node in nodes])
+        self._owners = self._find_owners()
+
+    def _find_owners(self) -> tuple[Indices, Indices, Indices]:
+        """Which nodes each motion of `place` moves, in its order, and which parameter makes it."""
+        count, nodes = len(self.kinematics.names) + len(ROOT_NAMES), len(self._parents)
+        every = np.arange(nodes)
+        values = self.kinematics.flatten(self.kinematics.tree.default_values())
+        below = np.eye(nodes, dtype=np.bool_)
+        for i, parent in enumerate(self._parents):
+            below[i] |= (parent >= 0) & below[parent]
+        hanging = np.flatnonzero(self._parents >= 0)
+        lengths, widths = count + every, count + nodes + self.limbs
+        by = self._parents[hanging]
+        places = len(self.names) - len(self.placed) + np.arange(len(self.placed))
+        own, hung = every[:, None] == every, below[:, hanging]
+        moves = (
+            self.kinematics.motions(values).moves, np.ones((nodes, 4), np.bool_), own, own,
+            hung, hung, below[:, self.placed],
+        )  # fmt: skip
+        made_by = np.arange(count), lengths, widths, lengths[by], widths[by], places
+        return owners_of(np.hstack(moves), np.concatenate(made_by))
 
     def _find_axes(self) -> tuple[NDArray[np.int64], Array, Array]:
         """(nodes,) axes; (nodes, 3) [m] along them how long, and the same at rest in the parent."""
@@ -176,7 +172,7 @@ class ProportionedBody(BodyParameters):
         """The body at all parameters (n,)."""
         kinematics = self.kinematics
         count = len(kinematics.names)
-        at_rest = kinematics.motions(theta[:count], translation=True, scale=True)
+        at_rest = kinematics.motions(theta[:count])
         scale, shares = self.factors(theta), self.joint_places(theta)
         R = at_rest.X_WN[:, :3, :3]
         # How a node's frame, stretched, maps a vector in the world.
@@ -193,19 +189,47 @@ class ProportionedBody(BodyParameters):
                 places[i] += shares[i] * (R[node.parent] @ self._rest[i])
         shift, growth = theta[count : count + 3], float(np.exp(theta[count + 3]))
         moved = places[0] + shift - growth * places[0]
-        motions = _MotionList(len(places), growth, moved)
-        self._add_values(motions, at_rest, maps, places, growth)
-        everything = list(range(len(places)))
-        for k in range(3):
-            motions.add(count + k, everything, np.zeros((3, 3)), np.eye(3)[k] / growth)
-        motions.add(count + 3, everything, np.eye(3), -places[0])
-        self._add_proportions(motions, R, places + back, carried)
+        M, v = self._moving(at_rest, maps, places, growth)
+        hanging = np.flatnonzero(self._parents >= 0)
+        along = R[np.arange(len(R)), :, self.axes]
+        long = along[:, :, None] * along[:, None]
+        for stretch in (long, np.eye(3) - long):
+            M.append(stretch)
+            v.append(-np.einsum("nij,nj->ni", stretch, places + back))
+        for stretch in (long, np.eye(3) - long):
+            v.append(np.einsum("nij,nj->ni", stretch[self._parents], carried)[hanging])
+        beside = np.einsum("nij,nj->ni", R[self._parents], self._rest)
+        v.append((beside - np.einsum("nij,nj->ni", R, self._along))[self.placed])
+        all_v = np.concatenate(v)
+        all_M = np.zeros((len(all_v), 3, 3))
+        turning = np.concatenate(M)
+        all_M[: len(turning)] = turning
         X_WN = at_rest.X_WN.copy()
         X_WN[:, :3, :3] *= growth
         X_WN[:, :3, 3] = moved + growth * places
-        packed = _stretched(self._at(theta[:count]), scale)
+        packed = stretched(self._at(theta[:count]), scale)
         self._move_flesh(packed, -self._along * shares[:, None])
-        return motions.placement(packed, X_WN)
+        motions = affine_of(all_M, growth * all_v - all_M @ moved)
+        return Placement(packed, X_WN, motions, *self._owners)
+
+    def _moving(
+        self, at_rest: Motions, maps: Array, places: Array, growth: float
+    ) -> tuple[list[Array], list[Array]]:
+        """M (k, 3, 3) and v (k, 3) that values, the root's shift and its growth make.
+
+        What is moved by M p + v has not grown about the root yet, nor is it shifted.
+        """
+        nodes = self.kinematics.value_nodes
+        affine = affine_motions(at_rest.twists).reshape(-1, 3, 4)
+        M = affine[:, :, :3]
+        velocity = np.einsum("kij,kj->ki", M, at_rest.X_WN[nodes, :3, 3]) + affine[:, :, 3]
+        # The first root is what carries nothing stretched.
+        by = np.concatenate([maps, np.eye(3)[None]])[self._parents[nodes]]
+        velocity = np.einsum("kij,kj->ki", by, velocity)
+        v = velocity - np.einsum("kij,kj->ki", M, places[nodes])
+        # What moves the root moves the point about which the body has grown.
+        v += (1.0 / growth - 1.0) * velocity * (nodes == 0)[:, None]
+        return [M, np.zeros((3, 3, 3)), np.eye(3)[None]], [v, np.eye(3) / growth, -places[:1]]
 
     def _move_flesh(self, packed: PackedOutlines, moved: Array) -> None:
         """Moves each node's rigid part in its frame by (nodes, 3) [m]; bands stay at the joints."""
@@ -216,55 +240,6 @@ class ProportionedBody(BodyParameters):
             packed.planes[3, triangles] += moved[i] @ packed.planes[:3, triangles]
             packed.balls[i, :3] += moved[i]
             packed.balls[i, 3] += np.linalg.norm(moved[i])
-
-    def _add_values(
-        self, motions: _MotionList, at_rest: Motions, maps: Array, places: Array, growth: float
-    ) -> None:
-        """The motions that the tree's values make."""
-        X0, twists = at_rest.X_WN, at_rest.twists
-        cross = affine_motions(np.pad(twists[:, :3], ((0, 0), (0, 4)))).reshape(-1, 3, 4)[:, :, :3]
-        for k, i in enumerate(self.kinematics.value_nodes.tolist()):
-            velocity = cross[k] @ X0[i, :3, 3] + twists[k, 3:6]
-            parent = self.kinematics.tree.nodes[i].parent
-            if parent >= 0:
-                velocity = maps[parent] @ velocity
-            v = velocity - cross[k] @ places[i]
-            if i == 0:
-                # What moves the root moves the point about which the body has grown.
-                v = v + (1.0 / growth - 1.0) * velocity
-            motions.add(k, np.flatnonzero(at_rest.moves[:, k]).tolist(), cross[k], v)
-
-    def _add_proportions(
-        self, motions: _MotionList, R: Array, flesh: Array, carried: Array
-    ) -> None:
-        """The motions that lengths, widths and places make: of a node, and of what hangs on it.
-
-        Args:
-            motions: to add to.
-            R: (nodes, 3, 3) how nodes are turned.
-            flesh: (nodes, 3) where the origins of their rigid parts are.
-            carried: (nodes, 3) from those to what they carry, the stretched part of it.
-        """
-        first, nodes = len(self.kinematics.names) + len(ROOT_NAMES), self.kinematics.tree.nodes
-        for i, node in enumerate(nodes):
-            axis = R[i][:, self.axes[i]]
-            long = np.outer(axis, axis)
-            width = first + len(nodes) + int(self.limbs[i])
-            for parameter, M in ((first + i, long), (width, np.eye(3) - long)):
-                motions.add(parameter, [i], M, -M @ flesh[i])
-                for child in node.children:
-                    motions.add(parameter, self._below(child), np.zeros((3, 3)), M @ carried[child])
-        for k, i in enumerate(self.placed.tolist()):
-            moved = R[nodes[i].parent] @ self._rest[i] - R[i] @ self._along[i]
-            parameter = len(self.names) - len(self.placed) + k
-            motions.add(parameter, self._below(i), np.zeros((3, 3)), moved)
-
-    def _below(self, node: int) -> list[int]:
-        """A node and all that hang on it."""
-        found = [node]
-        for one in found:
-            found.extend(self.kinematics.tree.nodes[one].children)
-        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -413,18 +388,3 @@ def _unknowns(
     widths = choose(body.names, body.width_names, shared=True, deviation=settings.width_deviation)
     places = choose(body.names, body.place_names, shared=True, deviation=settings.place_deviation)
     return join(own, lengths, widths, places)
-
-
-def _stretched(packed: PackedOutlines, scale: Array) -> PackedOutlines:
-    """Surfaces, each node's so many times (nodes, 3) as large along its frame's axes."""
-    points, planes, balls = packed.points.copy(), packed.planes.copy(), packed.balls.copy()
-    for node, s in enumerate(scale):
-        vertices = slice(packed.starts[node, 0], packed.starts[node + 1, 0])
-        triangles = slice(packed.starts[node, 1], packed.starts[node + 1, 1])
-        points[:, vertices] *= s[:, None]
-        volume = float(np.prod(s))
-        planes[:3, triangles] *= (volume / s)[:, None]
-        planes[3, triangles] *= volume
-    balls[:, :3] *= scale
-    balls[:, 3] *= scale.max(axis=1)
-    return packed._replace(points=points, planes=planes, balls=balls)

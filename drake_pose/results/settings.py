@@ -95,7 +95,7 @@ class EstimateSettings(CaptureSettings):
     like y=-180:180,z=-10:10; zero is as at the model's default positions. Default: the model's own
     root moves as its joints allow, any other link is free."""
     interval: Annotated[float, Parameter(metavar="DEG")] = 10.0
-    """Sampling interval of all angles [deg]."""
+    """Sampling interval of all angles [deg]: of angles on the grid and of the paper's method."""
     length_interval: Annotated[float, Parameter(metavar="M")] = 0.05
     """Sampling interval of all prismatic joints [m]."""
     joint_intervals: Annotated[Positions, Parameter("--joint-interval")] = field(
@@ -117,8 +117,9 @@ class EstimateSettings(CaptureSettings):
     person: one person, fitted to all cameras' silhouettes at once; auto: person if model, cameras
     and options allow it, else beam."""
     angles: Literal["continuous", "grid"] = "continuous"
-    """continuous: poses are refined between the samples; grid: multiples of the sampling interval
-    only. Method beam only."""
+    """continuous: poses are refined between coarse samples; grid: multiples of the sampling
+    interval only, and the search ends where the silhouettes are matched exactly. Method beam only.
+    """
 
     def __post_init__(self) -> None:
         require_choices(self)

@@ -37,6 +37,8 @@ from drake_pose.results.settings import EstimateSettings, RootTurns
 from drake_pose.search.continuous.multi_start import MultiStartSearch, MultiStartSettings
 from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
 from drake_pose.search.estimates import PoseEstimate
+from drake_pose.search.grid.beam.search import BeamSearch
+from drake_pose.search.grid.families.examination import ExaminationSettings
 from drake_pose.search.kameda import PaperSearch
 from drake_pose.search.scoring import PoseSearch
 from drake_pose.search.settings import BeamSearchSettings, PaperSearchSettings
@@ -257,9 +259,12 @@ def _sampling(model: ArticulatedModel, settings: EstimateSettings) -> dict[str, 
 
 def _make_search(tree: PoseTree, settings: EstimateSettings, model: ArticulatedModel) -> PoseSearch:
     if settings.method != "paper":
-        continuous = settings.angles == "continuous"
         beam = BeamSearchSettings(**_sampling(model, settings), time_limit=settings.time_limit)
-        return MultiStartSearch(tree, MultiStartSettings(beam, continuous))
+        if settings.angles == "grid":
+            return BeamSearch(tree, beam, ExaminationSettings())
+        # It samples as coarsely as it likes; but intervals of joints that are none are refused.
+        tree.grid(0, beam.interval, beam.intervals, beam.length_interval)
+        return MultiStartSearch(tree, MultiStartSettings(beam))
     paper = PaperSearchSettings(
         **_sampling(model, settings),
         outside_limit=settings.outside_limit,

@@ -21,6 +21,7 @@ from drake_pose.results.summary import FrameRecord
 from drake_pose.search.continuous.multi_start import MultiStartSearch
 from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
 from drake_pose.search.estimates import PoseEstimate, View
+from drake_pose.search.grid.beam.search import BeamSearch
 from drake_pose.search.scoring import PoseSearch
 from drake_pose.search.starts.root_placement import scale_camera
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
@@ -172,7 +173,7 @@ def compare_cameras(result: ResultWriter, search: PoseSearch, on_stage: OnStage 
     inputs = result.inputs
     if inputs.scene.images:
         return
-    if isinstance(search, MultiStartSearch):
+    if isinstance(search, (BeamSearch, MultiStartSearch)):
         search = search.without_alternatives()
 
     def match(frame: str, views: Sequence[View]) -> float:

@@ -1,10 +1,8 @@
 """Multi-start search: from silhouettes, also damaged or ill fitting, to continuous positions.
 
-A body that is the object itself, in a pose of the grid, is found by the exact stages of the beam
-search, and J = 0 ends the search. Else poses that are roughly right are found by places
-(``rough_search``), drawn to the silhouettes' edges by saturating costs (``fit``), and about
-the best of them other explanations are sought: a limb searched again, joints that turn against each
-other (``self_motions``).
+Poses that are roughly right are found by places (``coarse_search``), drawn to the silhouettes'
+edges by saturating costs (``fit``), and about the best of them other explanations are sought: a
+limb searched again, joints that turn against each other (``self_motions``).
 """
 
 from __future__ import annotations
@@ -29,8 +27,6 @@ from drake_pose.search.continuous.views_fit import (
     refine_best,
 )
 from drake_pose.search.estimates import PoseEstimate, PoseSet, SearchStatistics, View
-from drake_pose.search.grid.beam.search import BeamSearch
-from drake_pose.search.grid.families.examination import ExaminationSettings, examine
 from drake_pose.search.grid.sampled_body import SampledBody
 from drake_pose.search.scoring import Scoring
 from drake_pose.search.settings import BeamSearchSettings
@@ -70,21 +66,18 @@ class MultiStartSettings:
     """Parameters of the multi-start search.
 
     Args:
-        beam: of the search on the grid. Its time limit is that of the multi-start search.
-        continuous: False: nothing but the search on the grid is run.
+        beam: of the coarse search, but for the sampling intervals, the nodes' order and the time
+            limit.
         rounds: how often other explanations are sought about the best poses.
         families: of the answer as a set; None: only the best pose is wanted.
-        examination: of an answer on the grid.
 
     Raises:
         SettingsError: if a value is out of its range.
     """
 
     beam: BeamSearchSettings = field(default_factory=BeamSearchSettings)
-    continuous: bool = True
     rounds: int = 2
     families: RobustFamilySettings | None = field(default_factory=RobustFamilySettings)
-    examination: ExaminationSettings | None = field(default_factory=ExaminationSettings)
 
     def __post_init__(self) -> None:
         if self.rounds < 0:
@@ -103,24 +96,15 @@ class MultiStartSearch:
         self.tree = tree
         self.settings = settings or MultiStartSettings()
         beam = self.settings.beam
-        self._grid_search = BeamSearch(tree, beam, self.settings.examination)
-        self.sampled = self._grid_search.sampled
-        if self.settings.continuous:
-            self._body = SampledBody(
-                tree,
-                replace(
-                    beam,
-                    interval=INTERVAL,
-                    length_interval=LENGTH_INTERVAL,
-                    intervals={},
-                ),
-            )
-            self._outlines = few_triangles(self.sampled.surfaces)
-            self._kinematics = TreeKinematics(tree)
+        coarse = replace(beam, interval=INTERVAL, length_interval=LENGTH_INTERVAL, intervals={})
+        self._body = SampledBody(tree, coarse)
+        self.sampled = self._body.sampled
+        self._outlines = few_triangles(self.sampled.surfaces)
+        self._kinematics = TreeKinematics(tree)
 
     def without_alternatives(self) -> MultiStartSearch:
         """The same search where only E_total is wanted: one round, and no set of poses."""
-        settings = replace(self.settings, rounds=0, families=None, examination=None)
+        settings = replace(self.settings, rounds=0, families=None)
         return MultiStartSearch(self.tree, settings)
 
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
@@ -132,25 +116,15 @@ class MultiStartSearch:
                 pose tree's own.
 
         Returns:
-            The best pose found. ``stopped_by`` is "exact" if J = 0, "end" if all was tried, or
-            "time_limit".
+            The best pose found. ``stopped_by`` is "end" if all was tried, or "time_limit".
 
         Raises:
             SettingsError: if there is no view.
         """
         if not views:
             raise SettingsError("a match needs at least one view, but none was given")
-        if not self.settings.continuous:
-            return self._grid_search.match(views, root_position)
         start = time.perf_counter()
         clean = [View(view.camera, without_specks(view.mask)) for view in views]
-        if all(np.array_equal(one.mask, view.mask) for one, view in zip(clean, views, strict=True)):
-            exact = self._grid_search.match_exactly(views, root_position)
-            if exact is not None:
-                if self.settings.examination is None:
-                    return exact
-                body, settings = self._grid_search.body, self.settings.examination
-                return examine(body, views, exact, settings, root_position)
         result = self._run(clean, root_position, start).result(views)
         return replace(result, seconds=time.perf_counter() - start)
 

@@ -31,7 +31,7 @@ def paper_arguments(scene: TinyScene, out: Path, *more: str) -> list[str]:
 
 def test_result_folder(tiny_scene: TinyScene, runner: CliRunner, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    result = runner.invoke(app, arguments(tiny_scene, out))
+    result = runner.invoke(app, arguments(tiny_scene, out, "--angles", "grid"))
     assert result.exit_code == 0, result.output
     assert sorted(path.name for path in out.iterdir()) == [
         "families.csv", "joints.csv", "overlay", "poses.csv", "replay.html", "report.html",

@@ -74,25 +74,6 @@ def test_continuous_pose_is_found_and_said_to_be_known(
     assert sum(answer.determined) >= 4
 
 
-def test_a_pose_of_the_grid_ends_the_search_at_once(
-    tree: PoseTree, search: MultiStartSearch
-) -> None:
-    grids = search.sampled.values
-    generator = np.random.default_rng(5)
-    values = np.concatenate([grid[generator.integers(len(grid))] for grid in grids])
-    result = search.match(clean_views(tree, values))
-    assert result.stopped_by == "exact"
-    assert result.J == 0
-    assert result.pose_set is not None
-
-
-def test_grid_alone(tree: PoseTree, pose: np.ndarray) -> None:
-    settings = MultiStartSettings(BeamSearchSettings(interval=GRID), continuous=False)
-    result = MultiStartSearch(tree, settings).match(clean_views(tree, pose))
-    steps = all_values(result) / GRID
-    np.testing.assert_allclose(steps, np.round(steps), atol=1e-6)
-
-
 @pytest.mark.slow
 def test_damaged_and_ill_fitting_arms(tree: PoseTree, search: MultiStartSearch) -> None:
     places, held = [], []

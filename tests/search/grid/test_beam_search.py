@@ -63,22 +63,6 @@ def test_ends_at_an_exact_pose_and_reports_the_objective_of_its_own_answer(tmp_p
         assert np.array_equal(shown.mask, view.mask)
 
 
-def test_exact_stages_end_where_their_poses_take_too_much_memory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    tree = swinging_chain(tmp_path, 4).pose_tree()
-    matcher = search(tree)
-    values = [grid[len(grid) // 2] for grid in matcher.sampled.values]
-    view = show_pose(matcher.sampled, values, front_camera(100, shift=0.137))
-    found = matcher.match_exactly([view])
-    assert found is not None
-    assert found.J == 0.0
-    monkeypatch.setattr("drake_pose.search.grid.beam.search._MOST_BYTES", 100)
-    assert matcher.match_exactly([view]) is None
-    # The search that goes on without them is not cut short.
-    assert matcher.match([view]).stopped_by == "exact"
-
-
 def test_a_sliding_joint_and_a_fixed_one(tmp_path: Path) -> None:
     model = load_body(
         tmp_path,

@@ -4,7 +4,6 @@ Its first stages let nothing lie outside the silhouette and end at J = 0, which 
 later ones let more and more, weighed against what is covered newly (5).
 """
 
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -27,9 +26,6 @@ from drake_pose.search.grid.node_poses import Pictures, PoseStore, coarsen
 from drake_pose.search.grid.sampled_body import SampledBody
 from drake_pose.search.scoring import Scoring
 from drake_pose.search.settings import BeamSearchSettings, Stage
-
-# A body that is the object itself needs far less.
-_MOST_BYTES = 1_000_000_000
 
 
 class BeamSearch:
@@ -70,22 +66,9 @@ class BeamSearch:
             result = replace(result, seconds=time.perf_counter() - start)
         return result
 
-    def match_exactly(
-        self, views: Sequence[View], root_position: np.ndarray | None = None
-    ) -> PoseEstimate | None:
-        """Run the stages that let nothing lie outside: a pose whose J is 0, or None.
-
-        They end, too, where what fits roughly fills a gigabyte.
-        """
-        start = time.perf_counter()
-        exact = tuple(stage for stage in self.settings.stages if stage.outside_share == 0.0)
-        run = self._prepare(views, root_position)
-        run.most_bytes = _MOST_BYTES
-        run.run_stages(exact)
-        if run.J > 0:
-            return None
-        run.stopped_by = "exact"
-        return run.result(time.perf_counter() - start)
+    def without_alternatives(self) -> "BeamSearch":
+        """The same search where only E_total is wanted: no examination."""
+        return BeamSearch(self.tree, self.settings)
 
     def best_poses(
         self,
@@ -155,25 +138,12 @@ class _Run:
         self.runs = 0
         self.hypotheses = 0
         self.stopped_by = ""
-        self.most_bytes = math.inf
         self._stores: dict[float, PoseStore] = {}
 
     def search(self) -> None:
         """Run stage after stage until J = 0 or a limit is reached; then polish the answer."""
-        self.run_stages(self.settings.stages)
-        if self.samples is None:
-            self._answer_somehow()
-        elif self.J > 0 and self.settings.research_hypotheses and not self.stopped_by:
-            turned = turn_single_nodes(
-                self.scoring, self.pictures(exact=False), self.samples, lambda: self.proceed(0)
-            )
-            self._keep_if_better(turned)
-        self.stopped_by = "exact" if self.J == 0 else self.stopped_by or "end"
-
-    def run_stages(self, stages: Sequence[Stage]) -> None:
-        """Run stage after stage until J = 0 or a limit is reached."""
         skip_exact = False
-        for stage in stages:
+        for stage in self.settings.stages:
             exact = stage.outside_share == 0.0
             if exact and skip_exact:
                 continue
@@ -185,6 +155,14 @@ class _Run:
             if self.stopped_by or (self.J == 0 and (self.gathering is None or not exact)):
                 break
             skip_exact = skip_exact or complete or self.J == 0
+        if self.samples is None:
+            self._answer_somehow()
+        elif self.J > 0 and self.settings.research_hypotheses and not self.stopped_by:
+            turned = turn_single_nodes(
+                self.scoring, self.pictures(exact=False), self.samples, lambda: self.proceed(0)
+            )
+            self._keep_if_better(turned)
+        self.stopped_by = "exact" if self.J == 0 else self.stopped_by or "end"
 
     def pictures(self, exact: bool) -> Pictures:
         """The silhouettes as bits: coarse ones with a band for stages that are not exact."""
@@ -205,8 +183,6 @@ class _Run:
             self.stopped_by = "hypothesis_limit"
         elif time.perf_counter() >= self.deadline:
             self.stopped_by = "time_limit"
-        elif sum(store.nbytes for store in self._stores.values()) > self.most_bytes:
-            self.stopped_by = "memory_limit"
         return not self.stopped_by
 
     def _run_stage(self, beam: Beam, stage: Stage) -> bool:

@@ -10,14 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import (
+    CacheEntry,
     Context,
     DependencyTicket,
+    DiagramBuilder,
     DiscreteValues,
     EventStatus,
     InputPort,
     LeafSystem,
     OutputPort,
     State,
+    System,
+    ValueProducer,
 )
 
 from drake_pose.errors import SettingsError
@@ -40,6 +44,21 @@ def require_time_forward(system: LeafSystem, context: Context, last: float) -> N
             f"{system.get_name()}: time ran backwards, from {last:g} s to {now:g} s; to begin "
             "anew, set the context to its defaults (SetDefaultContext)"
         )
+
+
+def connect_same(builder: DiagramBuilder, giver: System, taker: System) -> None:
+    """Connect all outputs of a system to inputs of the same names of another, where there are."""
+    for index in range(giver.num_output_ports()):
+        port = giver.get_output_port(index)
+        if taker.HasInputPort(port.get_name()):
+            builder.Connect(port, taker.GetInputPort(port.get_name()))
+
+
+def export_outputs(builder: DiagramBuilder, system: System) -> None:
+    """Make all outputs of a system the diagram's, under their names."""
+    for index in range(system.num_output_ports()):
+        port = system.get_output_port(index)
+        builder.ExportOutput(port, port.get_name())
 
 
 class PortedSystem(LeafSystem):
@@ -69,6 +88,17 @@ class PortedSystem(LeafSystem):
             AbstractValue.Make(like).Clone,
             lambda context, output: output.set_value(calc(context)),
             of,
+        )
+
+    def add_cache(self, name: str, calc: Callable[[Context], Any]) -> CacheEntry:
+        """What a function makes of the inputs, for several outputs."""
+        return self.DeclareCacheEntry(
+            name,
+            ValueProducer(
+                AbstractValue.Make(None).Clone,
+                lambda context, output: output.set_value(calc(context)),
+            ),
+            {self.all_input_ports_ticket()},
         )
 
     def given(self, context: Context, name: str) -> Any:

@@ -147,9 +147,9 @@ def _fit_first_frames(
     frames: list[dict[str, Mask]] = []
     builder = DiagramBuilder()
     ports = sensors.add(builder)
-    for name, port in ports.silhouettes.items():
+    for name, port in ports.items():
         builder.ExportOutput(port, name)
-    builder.ExportOutput(ports.time, "time")
+    builder.ExportOutput(sensors.GetOutputPort("time"), "time")
     diagram = builder.Build()
     last = np.nan
 
@@ -157,7 +157,7 @@ def _fit_first_frames(
         nonlocal last
         before, last = last, float(diagram.GetOutputPort("time").Eval(context)[0])
         if last != before and not np.isnan(last):
-            views = {name: diagram.GetOutputPort(name).Eval(context) for name in ports.silhouettes}
+            views = {name: diagram.GetOutputPort(name).Eval(context) for name in ports}
             seen = {name: view.region for name, view in views.items() if shows_somebody(view)}
             if len(seen) >= 2:
                 frames.append(seen)

@@ -38,7 +38,7 @@ from drake_pose.systems.colour_images import colour_image_to_picture
 from drake_pose.systems.date.capture import build_paper_capture
 from drake_pose.systems.date.preparation import prepare_paper_capture
 from drake_pose.systems.date.stages import HorizontalImage
-from drake_pose.systems.person.live_capture import LocalSensors
+from drake_pose.systems.person.live_capture import LiveSensors
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
 
 Array = NDArray[np.float64]
@@ -69,7 +69,7 @@ def capture_paper(
     model_path: Path | None = None,
     settings: LiveSettings | None = None,
     face: FaceFolder | None = None,
-    open_sensors: Callable[[], LocalSensors] | None = None,
+    open_sensors: Callable[[], LiveSensors] | None = None,
     on_report: Callable[[str], None] = lambda _: None,
     on_frame: Callable[[int, bool], None] = lambda _, __: None,
 ) -> LiveResult:
@@ -107,7 +107,7 @@ def capture_paper(
         writer = LiveWriter(
             scene, model, tracker, out, sensors.period, settings.packages, on_report, on_frame
         )
-        diagram = build_paper_capture(setup, sensors.capture, sensors.period).diagram
+        diagram = build_paper_capture(setup, sensors, sensors.period).diagram
         watch = _PaperWatch(diagram, setup.cameras, writer)
         return record_frames(METHOD, diagram, sensors, watch, writer, settings)
     finally:
@@ -153,7 +153,7 @@ class RegisteredPoseSearch:
         self._shown: dict[str, Picture] = {}
         self._since = 0
 
-    def run(self, sensors: LocalSensors, on_report: Callable[[str], None]) -> CaptureSetup:
+    def run(self, sensors: LiveSensors, on_report: Callable[[str], None]) -> CaptureSetup:
         """What the capture needs, from the pictures of the registered pose; uses the sensors up.
 
         Raises:
@@ -161,7 +161,7 @@ class RegisteredPoseSearch:
             KeyboardInterrupt: the user gave up.
         """
         builder = DiagramBuilder()
-        capture = builder.AddNamedSystem("picture_capture", sensors.capture)
+        capture = builder.AddNamedSystem("picture_capture", sensors)
         for name, camera in self._setup.cameras.items():
             image = HorizontalImage(camera, self._scene.backgrounds[name], self._settings.skin)
             builder.AddNamedSystem(f"horizontal_image_{name}", image)

@@ -23,8 +23,7 @@ from drake_pose.camera.sources.files import (
 from drake_pose.camera.sources.frame_source import FrameSource, Picture, SourceSpecification
 from drake_pose.errors import OutputError, SceneError
 from drake_pose.silhouette.segmentation.background import Background, learn_background
-from drake_pose.systems.person.live_capture import LocalSensors
-from drake_pose.systems.pictures.picture_capture import PictureCapture
+from drake_pose.systems.person.live_capture import LiveSensors
 
 # How long it is waited for a camera that is to show the empty room [s].
 _PATIENCE = 30.0
@@ -44,9 +43,7 @@ class LiveScene:
     specifications: Mapping[str, SourceSpecification]
     backgrounds: Mapping[str, Background]
 
-    def open_sensors(
-        self, live: bool | None = None, tolerance: float | None = None
-    ) -> LocalSensors:
+    def open_sensors(self, live: bool | None = None, tolerance: float | None = None) -> LiveSensors:
         """Opens the sources, and the sensors that see with them.
 
         Args:
@@ -59,9 +56,11 @@ class LiveScene:
         """
         with ExitStack() as opened:
             sources = _open(self.specifications, opened)
-            capture = PictureCapture(sources, self.cameras, live=live, tolerance=tolerance)
+            sensors = LiveSensors(
+                sources, self.cameras, self.backgrounds, live=live, tolerance=tolerance
+            )
             opened.pop_all()
-        return LocalSensors(capture, self.cameras, self.backgrounds)
+        return sensors
 
 
 def _open(

@@ -221,8 +221,8 @@ def walk_live(
     opened: LiveSensors = scene.open_sensors(live=True) if open_sensors is None else open_sensors()
 
     def add(builder: DiagramBuilder) -> OutputPort:
-        seen, time = opened.add(builder)
-        system = add_person_tracker(builder, tracker, scene.cameras, seen, opened.period, time)
+        seen, period, time = opened.add(builder), opened.period, opened.GetOutputPort("time")
+        system = add_person_tracker(builder, tracker, scene.cameras, seen, period, time)
         return system.GetOutputPort("estimated_positions")
 
     try:

@@ -3,12 +3,15 @@
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, SceneGraph
+from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.systems.ports import PortedSystem
+
+Array = NDArray[np.float64]
 
 
 class KnownPositions(PortedSystem):
@@ -26,15 +29,23 @@ class KnownPositions(PortedSystem):
         otherwise: (nq,) the output while the input is not finite.
     """
 
-    def __init__(self, otherwise: NDArray[np.float64]) -> None:
+    def __init__(self, otherwise: Array) -> None:
         super().__init__()
         given = self.add_input("positions", len(otherwise))
 
-        def known(context: Context) -> NDArray[np.float64]:
+        def known(context: Context) -> Array:
             q = given.Eval(context)
             return q if np.isfinite(q).all() else otherwise
 
         self.add_output("known_positions", len(otherwise), known)
+
+
+def body_poses(plant: MultibodyPlant, q: Array, X_WB: Array | None = None) -> list[RigidTransform]:
+    """The poses of all bodies at positions (nq,), in the plant's order; X_WB: of its world."""
+    context = plant.CreateDefaultContext()
+    plant.SetPositions(context, q)
+    base = RigidTransform() if X_WB is None else RigidTransform(X_WB)
+    return [base @ pose for pose in plant.get_body_poses_output_port().Eval(context)]
 
 
 def add_posed_plant(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,15 +11,12 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import (
     Context,
     DiagramBuilder,
-    DiscreteValues,
-    EventStatus,
+    InputPort,
     InputPortIndex,
-    LeafSystem,
     OutputPort,
     System,
 )
 
-from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.person.date.body_pose import estimate_pose
 from drake_pose.person.date.capture import CaptureSetup
@@ -33,12 +31,13 @@ from drake_pose.systems.date.stages import (
     PoseRecogniser,
     ViewPorts,
 )
+from drake_pose.systems.ports import MemorySystem, connect_same, export_outputs, require_period
 from drake_pose.systems.staged_diagram import StagedDiagram
 
 Array = NDArray[np.float64]
 
 
-class PaperPoseEstimator(LeafSystem):
+class PaperPoseEstimator(MemorySystem):
     """Estimates the person's positions, and keeps all that one frame hands to the next.
 
     .. pydrake_system::
@@ -67,34 +66,22 @@ class PaperPoseEstimator(LeafSystem):
 
     def __init__(self, setup: CaptureSetup, period: float) -> None:
         super().__init__()
-        if not period > 0:
-            raise SettingsError(f"the estimator's period must be positive, not {period}")
+        require_period("estimator", period)
         self.setup = setup
-        positions = len(setup.skeleton.lower)
+        nq, places = len(setup.skeleton.lower), 3 * len(FEATURES)
         self._views = ViewPorts(self, list(setup.cameras.values()))
-        sizes = {
-            "features": 3 * len(FEATURES),
-            "support": len(FEATURES),
-            "face_direction": 2,
-            "recognised_positions": positions,
-            "fresh": 1,
-        }
-        self._ports = {
-            name: self.DeclareVectorInputPort(name, size) for name, size in sizes.items()
-        }
-        unknown = {
-            "estimated_positions": positions,
-            "last_features": 3 * len(FEATURES),
-            "last_support": len(FEATURES),
-            "limb_points": 9 * len(LIMBS),
-            "expected_features": 3 * len(FEATURES),
-        }
-        self._states = {
-            name: self.DeclareDiscreteState(np.full(size, np.nan)) for name, size in unknown.items()
-        }
-        for name, state in self._states.items():
-            self.DeclareStateOutputPort(name, state)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._estimate)
+        inputs = {
+            "features": places, "support": len(FEATURES), "face_direction": 2,
+            "recognised_positions": nq, "fresh": 1,
+        }  # fmt: skip
+        for name, size in inputs.items():
+            self.add_input(name, size)
+        states = {
+            "estimated_positions": nq, "last_features": places, "last_support": len(FEATURES),
+            "limb_points": 9 * len(LIMBS), "expected_features": places,
+        }  # fmt: skip
+        unknown = {name: np.full(size, np.nan) for name, size in states.items()}
+        self.keep_vectors(unknown, unknown, period)
 
     def set_person(self, context: Context, q: Array, features: Array | None = None) -> None:
         """Say where the person is.
@@ -109,40 +96,25 @@ class PaperPoseEstimator(LeafSystem):
         _require_finite(q, (len(self.setup.skeleton.lower),), "positions")
         if features is not None:
             _require_finite(features, (len(FEATURES), 3), "features")
-        self._overwrite(context.get_mutable_discrete_state(), q, features)
+        self.set_vectors(context.get_mutable_discrete_state(), self._anew(q, features))
 
-    def _overwrite(self, state: DiscreteValues, q: Array, features: Array | None) -> None:
-        places = self.setup.skeleton.features(q) if features is None else features
-        limbs = np.full(9 * len(LIMBS), np.nan)
-        self._write(state, q, places, np.zeros(len(FEATURES)), limbs, places)
-
-    def _write(self, state: DiscreteValues, *values: Array) -> None:
-        for index, value in zip(self._states.values(), values, strict=True):
-            state.set_value(index, np.ravel(value))
-
-    def _value(self, context: Context, name: str) -> Array | None:
-        """The value of an input port; None: unconnected, or unknown (nan)."""
-        port = self._ports[name]
-        value = port.Eval(context) if port.HasValue(context) else None
-        return value if value is not None and np.isfinite(value).all() else None
-
-    def _estimate(self, context: Context, state: DiscreteValues) -> EventStatus:
-        fresh = self._value(context, "fresh")
+    def next_vectors(self, context: Context, known: dict[str, Array]) -> Mapping[str, Array]:
+        """The pose in the pictures of one moment more."""
+        fresh = self._known(context, "fresh")
         if fresh is not None and not fresh[0]:
-            return EventStatus.DidNothing()
-        recognised = self._value(context, "recognised_positions")
+            return {}
+        recognised, features = (
+            self._known(context, name) for name in ("recognised_positions", "features")
+        )
         if recognised is not None:
-            self._overwrite(state, recognised, None)
-            return EventStatus.Succeeded()
-        features = self._value(context, "features")
-        last = context.get_discrete_state(self._states["estimated_positions"]).value()
-        if features is None or not np.isfinite(last).all():
-            return EventStatus.DidNothing()
+            return self._anew(recognised, None)
+        if features is None or not np.isfinite(known["estimated_positions"]).all():
+            return {}
         features = features.reshape(-1, 3)
         cameras, views = self._views.evaluate(context)
         pose = estimate_pose(
             self.setup.skeleton,
-            last,
+            known["estimated_positions"],
             features,
             self._head_angles(context, features[0]),
             cameras,
@@ -150,19 +122,35 @@ class PaperPoseEstimator(LeafSystem):
             search=self.setup.settings.search,
             waist=self.setup.settings.waist,
         )
-        support = self._ports["support"].Eval(context)
-        limbs = np.array([pose.limbs[name] for name in LIMBS])
-        before, support_before = (
-            context.get_discrete_state(self._states[name]).value()
-            for name in ("last_features", "last_support")
-        )
-        expected = expect_features(features, support, before.reshape(-1, 3), support_before)
-        self._write(state, pose.q, features, support, limbs, expected)
-        return EventStatus.Succeeded()
+        support = self.GetInputPort("support").Eval(context)
+        before = known["last_features"].reshape(-1, 3)
+        return {
+            "estimated_positions": pose.q,
+            "last_features": features,
+            "last_support": support,
+            "limb_points": np.array([pose.limbs[name] for name in LIMBS]),
+            "expected_features": expect_features(features, support, before, known["last_support"]),
+        }
+
+    def _anew(self, q: Array, features: Array | None) -> dict[str, Array]:
+        """What is known where nothing before counts."""
+        places = self.setup.skeleton.features(q) if features is None else features
+        return {
+            "estimated_positions": q,
+            "last_features": places,
+            "last_support": np.zeros(len(FEATURES)),
+            "limb_points": np.full(9 * len(LIMBS), np.nan),
+            "expected_features": places,
+        }
+
+    def _known(self, context: Context, name: str) -> Array | None:
+        """The value of an input port; None: unconnected, or unknown (nan)."""
+        value: Array | None = self.given(context, name)
+        return value if value is not None and np.isfinite(value).all() else None
 
     def _head_angles(self, context: Context, head: Array) -> Array | None:
         """The head's angles in the world (2,) [rad] where the face is seen."""
-        camera, direction = self.setup.face_camera, self._value(context, "face_direction")
+        camera, direction = self.setup.face_camera, self._known(context, "face_direction")
         if camera is None or direction is None:
             return None
         return head_angles(direction, head, camera)
@@ -204,122 +192,97 @@ def build_paper_capture(
     Raises:
         SettingsError: the source lacks an output, or the period is not positive.
     """
-    wiring = _Wiring(setup, source)
-    estimator = wiring.add("pose", PaperPoseEstimator(setup, period))
-    wiring.add_images()
-    wiring.watch(estimator)
+    builder = DiagramBuilder()
+    if source is not None:
+        builder.AddNamedSystem("source", source)
+        for index in range(source.num_input_ports()):
+            port = source.get_input_port(InputPortIndex(index))
+            builder.ExportInput(port, port.get_name())
+    images, wanted = _add_images(builder, setup)
+    views = {name: image.GetOutputPort("person_view") for name, image in images.items()}
+    regions = tuple(image.GetOutputPort("region") for image in images.values())
+    stages: dict[str, tuple[OutputPort, ...]] = {"region": regions, "skin": tuple(views.values())}
+    estimator = PaperPoseEstimator(setup, period)
+    builder.AddNamedSystem("pose", estimator)
+    _connect_views(builder, views, estimator)
+    for stage, (system, results) in _parts(setup).items():
+        builder.AddNamedSystem(stage, system)
+        stages[stage] = (system.GetOutputPort(results[0]),)
+        if isinstance(system, FaceDirectionFinder):
+            builder.Connect(views[system.camera], system.GetInputPort("person_view"))
+            wanted[f"color_image_{system.camera}"].append(system.GetInputPort("color_image"))
+        _connect_views(builder, views, system)
+        connect_same(builder, system, estimator)
+        connect_same(builder, estimator, system)
+        for name in results if stage != "features" else ():
+            builder.ExportOutput(system.GetOutputPort(name), name)
+    _connect_images(builder, source, wanted)
+    if source is not None and source.HasOutputPort("fresh"):
+        builder.Connect(source.GetOutputPort("fresh"), estimator.GetInputPort("fresh"))
+    if source is not None and source.HasOutputPort("time"):
+        builder.ExportOutput(source.GetOutputPort("time"), "time")
+    export_outputs(builder, estimator)
+    if meshcat is not None:
+        positions = estimator.GetOutputPort("estimated_positions")
+        add_avatar(builder, setup.skeleton.model, positions, meshcat, "avatar", period)
+    return PaperCapture(builder.Build(), stages, estimator)
+
+
+def _parts(setup: CaptureSetup) -> dict[str, tuple[System, tuple[str, ...]]]:
+    """By stage what comes between images and pose, and its outputs, the estimator's first."""
+    parts: dict[str, tuple[System, tuple[str, ...]]] = {}
     cameras, settings = list(setup.cameras.values()), setup.settings
     if setup.registered is not None:
         recogniser = PoseRecogniser(setup.skeleton, setup.registered, cameras, settings.recognition)
-        wiring.watch(wiring.add("recognition", recogniser))
-        wiring.finish("recognition", recogniser, "recognised_positions", estimator)
-        wiring.export(recogniser.GetOutputPort("similarity"))
-    features = FeatureFinder(cameras, settings.features)
-    wiring.watch(wiring.add("features", features))
-    for name in ("last_features", "expected_features"):
-        wiring.connect(estimator, features, name)
-    wiring.finish("features", features, "features", estimator, exported=False)
-    wiring.connect(features, estimator, "support")
+        parts["recognition"] = recogniser, ("recognised_positions", "similarity")
+    parts["features"] = FeatureFinder(cameras, settings.features), ("features",)
     if setup.face_camera is not None and setup.faces is not None:
         face = FaceDirectionFinder(setup.face_camera, setup.faces, settings.farthest_face)
-        wiring.add_face(face, setup.face_camera.name)
-        wiring.finish("face", face, "face_direction", estimator)
-    if source is not None and source.HasOutputPort("fresh"):
-        wiring.connect(source, estimator, "fresh")
-    if source is not None and source.HasOutputPort("time"):
-        wiring.export(source.GetOutputPort("time"))
-    for port in range(estimator.num_output_ports()):
-        wiring.export(estimator.get_output_port(port))
-    if meshcat is not None:
-        positions = estimator.GetOutputPort("estimated_positions")
-        model = setup.skeleton.model
-        add_avatar(wiring.builder, model, positions, meshcat, "avatar", period)
-    return PaperCapture(wiring.builder.Build(), wiring.stages, estimator)
+        parts["face"] = face, ("face_direction",)
+    return parts
 
 
-class _Wiring:
-    """The diagram under construction; see build_paper_capture."""
+def _connect_views(
+    builder: DiagramBuilder, views: Mapping[str, OutputPort], system: System
+) -> None:
+    """Connects what the cameras on the circle saw."""
+    for name, port in views.items():
+        if system.HasInputPort(f"person_view_{name}"):
+            builder.Connect(port, system.GetInputPort(f"person_view_{name}"))
 
-    def __init__(self, setup: CaptureSetup, source: System | None) -> None:
-        self.setup, self.source = setup, source
-        self.builder = DiagramBuilder()
-        self.stages: dict[str, tuple[OutputPort, ...]] = {}
-        self._images: dict[str, HorizontalImage] = {}
-        self._inputs: set[str] = set()
-        if source is not None:
-            self.builder.AddNamedSystem("source", source)
-            for index in range(source.num_input_ports()):
-                port = source.get_input_port(InputPortIndex(index))
-                self.builder.ExportInput(port, port.get_name())
 
-    def add(self, name: str, system: LeafSystem) -> LeafSystem:
-        return self.builder.AddNamedSystem(name, system)
+def _add_images(
+    builder: DiagramBuilder, setup: CaptureSetup
+) -> tuple[dict[str, HorizontalImage], dict[str, list[InputPort]]]:
+    """One HorizontalImage a camera, the face camera's last, and the images that they want."""
+    images, wanted, face = {}, {}, setup.face_camera
+    for camera in [*setup.cameras.values(), *([] if face is None else [face])]:
+        name, background = camera.name, setup.backgrounds.get(camera.name)
+        image = HorizontalImage(camera, background, setup.settings.skin)
+        images[name] = builder.AddNamedSystem(f"horizontal_image_{name}", image)
+        builder.ExportOutput(image.GetOutputPort("person_view"), f"person_view_{name}")
+        for kind in ("color_image",) if background is not None else ("color_image", "label_image"):
+            wanted[f"{kind}_{name}"] = [image.GetInputPort(kind)]
+    return images, wanted
 
-    def export(self, port: OutputPort, name: str | None = None) -> None:
-        self.builder.ExportOutput(port, name or port.get_name())
 
-    def add_images(self) -> None:
-        """One HorizontalImage a camera, the face camera's last."""
-        face = self.setup.face_camera
-        for camera in [*self.setup.cameras.values(), *([] if face is None else [face])]:
-            self._images[camera.name] = self._add_image(camera)
-        for stage, name in (("region", "region"), ("skin", "person_view")):
-            self.stages[stage] = tuple(image.GetOutputPort(name) for image in self._images.values())
-        for name, image in self._images.items():
-            self.export(image.GetOutputPort("person_view"), f"person_view_{name}")
-
-    def _add_image(self, camera: Camera) -> HorizontalImage:
-        name, background = camera.name, self.setup.backgrounds.get(camera.name)
-        image = HorizontalImage(camera, background, self.setup.settings.skin)
-        self.add(f"horizontal_image_{name}", image)
-        self._connect_image("color_image", name, image)
-        if background is None:
-            self._connect_image("label_image", name, image)
-        return image
-
-    def _connect_image(self, kind: str, camera: str, system: LeafSystem) -> None:
-        """Connects a camera's image of a kind to a system's input of that name."""
-        name, port = f"{kind}_{camera}", system.GetInputPort(kind)
-        if self.source is None:
-            if name in self._inputs:
-                self.builder.ConnectInput(name, port)
-            else:
-                self.builder.ExportInput(port, name)
-                self._inputs.add(name)
-            return
-        if not self.source.HasOutputPort(name):
+def _connect_images(
+    builder: DiagramBuilder, source: System | None, wanted: Mapping[str, Sequence[InputPort]]
+) -> None:
+    """Connects images by the names of the source's outputs, or as inputs of the diagram."""
+    for name, (first, *more) in wanted.items():
+        if source is None:
+            builder.ExportInput(first, name)
+            for port in more:
+                builder.ConnectInput(name, port)
+            continue
+        if not source.HasOutputPort(name):
+            kind, camera = name[:11], name[12:]
             background = " (or a background in the setup)" if kind == "label_image" else ""
+            ports = [source.get_output_port(k).get_name() for k in range(source.num_output_ports())]
             raise SettingsError(
                 f"camera '{camera}': the source needs an output port {name}{background}; it has: "
-                + ", ".join(
-                    self.source.get_output_port(k).get_name()
-                    for k in range(self.source.num_output_ports())
-                )
+                + ", ".join(ports)
             )
-        self.builder.Connect(self.source.GetOutputPort(name), port)
-
-    def watch(self, system: LeafSystem) -> None:
-        """Connects what the cameras on the circle saw."""
-        for name in self.setup.cameras:
-            view = self._images[name].GetOutputPort("person_view")
-            self.builder.Connect(view, system.GetInputPort(f"person_view_{name}"))
-
-    def add_face(self, finder: FaceDirectionFinder, camera: str) -> None:
-        """What the face camera sees, to what finds the face's direction."""
-        self.add("face", finder)
-        self._connect_image("color_image", camera, finder)
-        view = self._images[camera].GetOutputPort("person_view")
-        self.builder.Connect(view, finder.GetInputPort("person_view"))
-
-    def connect(self, giver: System, taker: System, name: str) -> None:
-        """Connects ports of one name."""
-        self.builder.Connect(giver.GetOutputPort(name), taker.GetInputPort(name))
-
-    def finish(
-        self, stage: str, system: System, name: str, estimator: System, exported: bool = True
-    ) -> None:
-        """A stage ends in an output that the estimator needs."""
-        self.stages[stage] = (system.GetOutputPort(name),)
-        self.connect(system, estimator, name)
-        if exported:
-            self.export(system.GetOutputPort(name))
+        for port in (first, *more):
+            builder.Connect(source.GetOutputPort(name), port)

@@ -6,56 +6,47 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, ValueProducer
+from pydrake.systems.framework import Context
 from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 
 from drake_pose.camera.models import Camera
 from drake_pose.errors import CameraError, SettingsError
-from drake_pose.person.date.capture import PersonView, see_person
+from drake_pose.person.date.capture import Mask, PersonView, Picture, see_person
 from drake_pose.person.date.faces import FaceTemplates, find_face
-from drake_pose.person.date.features import FeatureSettings, find_features
-from drake_pose.person.date.recognition import RegisteredPose, recognise
+from drake_pose.person.date.features import Features, FeatureSettings, find_features
+from drake_pose.person.date.recognition import Recognition, RegisteredPose, recognise
 from drake_pose.person.date.skeleton import FEATURES, Skeleton
 from drake_pose.person.date.skin_blobs import SkinColour
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 from drake_pose.silhouette.segmentation.background import Background, person_region
 from drake_pose.systems.colour_images import colour_image_to_picture
+from drake_pose.systems.ports import PortedSystem
 
-
-def _allocate() -> AbstractValue:
-    return AbstractValue.Make(None)
+Array = NDArray[np.float64]
 
 
 class ViewPorts:
-    """The input ports ``person_view_<camera>`` of a system; tickets: of all of them.
+    """The input ports ``person_view_<camera>`` of a system.
 
     Raises SettingsError for fewer than two cameras, or two of one name.
     """
 
-    def __init__(self, system: LeafSystem, cameras: Sequence[Camera]) -> None:
+    def __init__(self, system: PortedSystem, cameras: Sequence[Camera]) -> None:
         names = [camera.name for camera in cameras]
         if len(names) < 2 or len(set(names)) != len(names):
             raise SettingsError(f"two or more different cameras are needed, not: {names}")
-        self._cameras = tuple(cameras)
-        self._ports = [
-            system.DeclareAbstractInputPort(f"person_view_{name}", AbstractValue.Make(None))
-            for name in names
-        ]
-        self.tickets = {port.ticket() for port in self._ports}
+        self._system, self._cameras = system, tuple(cameras)
+        for name in names:
+            system.add_input(f"person_view_{name}", None)
 
     def evaluate(self, context: Context) -> tuple[list[Camera], list[PersonView]]:
         """The cameras that go, and what they saw; unconnected ones and None are left out."""
-        pairs = [
-            (camera, port.Eval(context))
-            for camera, port in zip(self._cameras, self._ports, strict=True)
-            if port.HasValue(context)
-        ]
-        seen = [(camera, view) for camera, view in pairs if view is not None]
-        return [camera for camera, _ in seen], [view for _, view in seen]
+        views = [self._system.given(context, f"person_view_{one.name}") for one in self._cameras]
+        cameras = [one for one, view in zip(self._cameras, views, strict=True) if view is not None]
+        return cameras, [view for view in views if view is not None]
 
 
-class HorizontalImage(LeafSystem):
+class HorizontalImage(PortedSystem):
     """Finds the person in one camera's picture: region, skin-coloured blobs in it, contour.
 
     .. pydrake_system::
@@ -89,51 +80,44 @@ class HorizontalImage(LeafSystem):
                 f"camera '{camera.name}' has {size[0]} x {size[1]} pixels (width x height), but "
                 f"its background {width} x {height}"
             )
-        self._camera, self._background, self._skin = camera, background, skin or SkinColour()
-        self._color = self.DeclareAbstractInputPort(
-            "color_image", AbstractValue.Make(ImageRgba8U(*size))
-        )
-        self._label = self.DeclareAbstractInputPort(
-            "label_image", AbstractValue.Make(ImageLabel16I(*size))
-        )
-        color, label = self._color.ticket(), self._label.ticket()
-        self._picture = self.DeclareCacheEntry(
-            "picture", ValueProducer(_allocate, self._calc_picture), {color}
-        )
-        self._region = self.DeclareAbstractOutputPort(
-            "region", _allocate, self._calc_region, {color, label}
-        )
-        self.DeclareAbstractOutputPort("person_view", _allocate, self._calc_view, {color, label})
+        self._camera, self._background, skin = camera, background, skin or SkinColour()
+        self.add_input("color_image", ImageRgba8U(*size))
+        self.add_input("label_image", ImageLabel16I(*size))
+        shown = self.add_cache("picture", self._picture)
 
-    def _calc_picture(self, context: Context, output: AbstractValue) -> None:
+        def see(context: Context) -> PersonView | None:
+            picture, mask = shown.Eval(context), region.Eval(context)
+            return None if picture is None else see_person(picture, mask, skin)
+
+        region = self.add_output(
+            "region", None, lambda context: self._region(context, shown.Eval(context))
+        )
+        self.add_output("person_view", None, see)
+
+    def _picture(self, context: Context) -> Picture | None:
         """The picture (H, W, 3); None while the camera has stopped."""
-        output.set_value(None)
-        if self._color.HasValue(context):
-            picture = colour_image_to_picture(self._color.Eval(context))
-            if picture.size:
-                self._require_size(picture, "color image")
-                output.set_value(picture)
+        image = self.given(context, "color_image")
+        if image is None or not image.size():
+            return None
+        picture = colour_image_to_picture(image)
+        self._require_size(picture, "color image")
+        return picture
 
-    def _calc_region(self, context: Context, output: AbstractValue) -> None:
-        picture = self._picture.Eval(context)
+    def _region(self, context: Context, picture: Picture | None) -> Mask | None:
+        """Where the person is (H, W); None while the camera has stopped."""
         if picture is None:
-            output.set_value(None)
-        elif self._label.HasValue(context):
-            mask = label_image_to_mask(self._label.Eval(context))
+            return None
+        image = self.given(context, "label_image")
+        if image is not None:
+            mask = label_image_to_mask(image)
             self._require_size(mask, "label image")
-            output.set_value(mask)
-        elif self._background is not None:
-            output.set_value(person_region(picture, self._background))
-        else:
-            raise SettingsError(
-                f"camera '{self._camera.name}': nothing tells the person from what is behind; give "
-                "a background model or connect label_image"
-            )
-
-    def _calc_view(self, context: Context, output: AbstractValue) -> None:
-        picture, region = self._picture.Eval(context), self._region.Eval(context)
-        seen = None if picture is None else see_person(picture, region, self._skin)
-        output.set_value(seen)
+            return mask
+        if self._background is not None:
+            return person_region(picture, self._background)
+        raise SettingsError(
+            f"camera '{self._camera.name}': nothing tells the person from what is behind; give "
+            "a background model or connect label_image"
+        )
 
     def _require_size(self, image: NDArray[np.generic], kind: str) -> None:
         camera = self._camera
@@ -145,7 +129,7 @@ class HorizontalImage(LeafSystem):
             )
 
 
-class FeatureFinder(LeafSystem):
+class FeatureFinder(PortedSystem):
     """Finds head, hands and feet in space where the rays of skin-coloured blobs meet.
 
     .. pydrake_system::
@@ -168,38 +152,40 @@ class FeatureFinder(LeafSystem):
 
     def __init__(self, cameras: Sequence[Camera], settings: FeatureSettings | None = None) -> None:
         super().__init__()
-        self._settings = settings or FeatureSettings()
+        self._settings, size = settings or FeatureSettings(), 3 * len(FEATURES)
         self._views = ViewPorts(self, cameras)
-        self._last = self.DeclareVectorInputPort("last_features", 3 * len(FEATURES))
-        self._expected = self.DeclareVectorInputPort("expected_features", 3 * len(FEATURES))
-        tickets = {*self._views.tickets, self._last.ticket(), self._expected.ticket()}
-        self._found = self.DeclareAbstractOutputPort("found", _allocate, self._find, tickets)
-        self.DeclareVectorOutputPort("features", 3 * len(FEATURES), self._calc_features, tickets)
-        self.DeclareVectorOutputPort("support", len(FEATURES), self._calc_support, tickets)
+        self.add_input("last_features", size)
+        self.add_input("expected_features", size)
+        found = self.add_output("found", None, self._find)
 
-    def _find(self, context: Context, output: AbstractValue) -> None:
-        last = self._last.Eval(context).reshape(-1, 3)
+        def places(context: Context) -> Array:
+            what = found.Eval(context)
+            return np.full(size, np.nan) if what is None else what.places.ravel()
+
+        def support(context: Context) -> Array:
+            what = found.Eval(context)
+            return np.zeros(len(FEATURES)) if what is None else what.support
+
+        self.add_output("features", size, places)
+        self.add_output("support", len(FEATURES), support)
+
+    def _find(self, context: Context) -> Features | None:
+        last = self.GetInputPort("last_features").Eval(context).reshape(-1, 3)
         if not np.isfinite(last).all():
-            output.set_value(None)
-            return
+            return None
         cameras, views = self._views.evaluate(context)
-        centroids = [view.blobs.centroids for view in views]
-        regions = [view.region for view in views]
-        is_given = self._expected.HasValue(context)
-        expected = self._expected.Eval(context).reshape(-1, 3) if is_given else None
-        output.set_value(find_features(cameras, centroids, regions, last, self._settings, expected))
-
-    def _calc_features(self, context: Context, output: BasicVector) -> None:
-        found = self._found.Eval(context)
-        places = np.full(output.size(), np.nan) if found is None else found.places.ravel()
-        output.SetFromVector(places)
-
-    def _calc_support(self, context: Context, output: BasicVector) -> None:
-        found = self._found.Eval(context)
-        output.SetFromVector(np.zeros(output.size()) if found is None else found.support)
+        expected = self.given(context, "expected_features")
+        return find_features(
+            cameras,
+            [view.blobs.centroids for view in views],
+            [view.region for view in views],
+            last,
+            self._settings,
+            None if expected is None else expected.reshape(-1, 3),
+        )
 
 
-class FaceDirectionFinder(LeafSystem):
+class FaceDirectionFinder(PortedSystem):
     """Finds the direction of the face in the face camera's picture by eigenspace templates.
 
     .. pydrake_system::
@@ -216,26 +202,20 @@ class FaceDirectionFinder(LeafSystem):
 
     def __init__(self, camera: Camera, templates: FaceTemplates, farthest: float = 30.0) -> None:
         super().__init__()
-        self._templates, self._farthest = templates, farthest
-        self._color = self.DeclareAbstractInputPort(
-            "color_image", AbstractValue.Make(ImageRgba8U(camera.width, camera.height))
-        )
-        self._view = self.DeclareAbstractInputPort("person_view", AbstractValue.Make(None))
-        tickets = {port.ticket() for port in (self._color, self._view)}
-        self.DeclareVectorOutputPort("face_direction", 2, self._calc_direction, tickets)
+        self.camera = camera.name
+        self.add_input("color_image", ImageRgba8U(camera.width, camera.height))
+        self.add_input("person_view", None)
 
-    def _calc_direction(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(np.full(2, np.nan))
-        if not (self._color.HasValue(context) and self._view.HasValue(context)):
-            return
-        picture = colour_image_to_picture(self._color.Eval(context))
-        view = self._view.Eval(context)
-        if picture.size and view is not None:
-            found = find_face(picture, view.blobs, self._templates, self._farthest)
-            output.SetFromVector(found)
+        def find(context: Context) -> Array:
+            image, view = self.given(context, "color_image"), self.given(context, "person_view")
+            if image is None or not image.size() or view is None:
+                return np.full(2, np.nan)
+            return find_face(colour_image_to_picture(image), view.blobs, templates, farthest)
+
+        self.add_output("face_direction", 2, find)
 
 
-class PoseRecogniser(LeafSystem):
+class PoseRecogniser(PortedSystem):
     """Recognises the registered pose in what all cameras see, whatever went before (section 5).
 
     .. pydrake_system::
@@ -259,28 +239,21 @@ class PoseRecogniser(LeafSystem):
         threshold: float = 0.93,
     ) -> None:
         super().__init__()
-        self._skeleton, self._registered, self._threshold = skeleton, registered, threshold
-        self._views = ViewPorts(self, cameras)
-        tickets = self._views.tickets
-        self._recognition = self.DeclareAbstractOutputPort(
-            "recognition", _allocate, self._recognise, tickets
-        )
-        self.DeclareVectorOutputPort(
-            "recognised_positions", len(registered.q), self._calc_positions, tickets
-        )
-        self.DeclareVectorOutputPort("similarity", 1, self._calc_similarity, tickets)
+        views = ViewPorts(self, cameras)
 
-    def _recognise(self, context: Context, output: AbstractValue) -> None:
-        cameras, views = self._views.evaluate(context)
-        contours = [view.contour for view in views]
-        output.set_value(
-            recognise(self._skeleton, self._registered, cameras, contours, self._threshold)
-        )
+        def see(context: Context) -> Recognition | None:
+            going, seen = views.evaluate(context)
+            contours = [view.contour for view in seen]
+            return recognise(skeleton, registered, going, contours, threshold)
 
-    def _calc_positions(self, context: Context, output: BasicVector) -> None:
-        found = self._recognition.Eval(context)
-        output.SetFromVector(np.full(output.size(), np.nan) if found is None else found.q)
+        def positions(context: Context) -> Array:
+            found = recognition.Eval(context)
+            return np.full(len(registered.q), np.nan) if found is None else found.q
 
-    def _calc_similarity(self, context: Context, output: BasicVector) -> None:
-        found = self._recognition.Eval(context)
-        output.SetFromVector([0.0 if found is None else found.similarity])
+        def similarity(context: Context) -> list[float]:
+            found = recognition.Eval(context)
+            return [0.0 if found is None else found.similarity]
+
+        recognition = self.add_output("recognition", None, see)
+        self.add_output("recognised_positions", len(registered.q), positions)
+        self.add_output("similarity", 1, similarity)

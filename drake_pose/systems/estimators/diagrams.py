@@ -35,6 +35,7 @@ from drake_pose.systems.estimators.mask_player import MaskPlayer
 from drake_pose.systems.estimators.silhouette_matcher import SilhouetteMatcher, camera_port
 from drake_pose.systems.estimators.silhouette_tracker import SilhouetteTracker
 from drake_pose.systems.pictures.camera_rig import add_sensors
+from drake_pose.systems.ports import connect_same
 
 ESTIMATE_COLOUR = Rgba(0.0, 0.45, 0.70, 0.6)
 
@@ -92,10 +93,7 @@ def build_recorded_matching(
     builder = DiagramBuilder()
     builder.AddNamedSystem("mask_player", player)
     builder.AddNamedSystem("silhouette_matcher", matcher)
-    for index in range(player.num_output_ports()):
-        name = player.get_output_port(index).get_name()
-        if matcher.HasInputPort(name):
-            builder.Connect(player.get_output_port(index), matcher.GetInputPort(name))
+    connect_same(builder, player, matcher)
     if meshcat is not None:
         scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
         estimate = matcher.GetOutputPort("estimated_positions")

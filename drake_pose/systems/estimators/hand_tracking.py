@@ -12,14 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.common.value import AbstractValue
 from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.systems.framework import (
     Context,
     Diagram,
     DiagramBuilder,
     OutputPort,
-    ValueProducer,
 )
 from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
 from pydrake.systems.sensors import ImageLabel16I
@@ -42,7 +40,7 @@ from drake_pose.systems.estimators.diagrams import (
     show_estimate,
 )
 from drake_pose.systems.estimators.truncated_ekf import STATISTICS, TruncatedEkf
-from drake_pose.systems.ports import PortedSystem
+from drake_pose.systems.ports import PortedSystem, connect_same
 
 Array = NDArray[np.float64]
 
@@ -89,9 +87,7 @@ class AxisSensor(PortedSystem):
         self.add_input("estimated_state", n)
         self.add_input("statistics", len(STATISTICS))
         self.add_input("matched_state", n)
-        measured = self.DeclareCacheEntry(
-            "measured", ValueProducer(lambda: AbstractValue.Make([]), self._calc)
-        )
+        measured = self.add_cache("measured", self._measure)
         for row, (name, size) in enumerate(
             (("measurement", m), ("measurement_variances", m), ("restart", 1))
         ):
@@ -102,12 +98,11 @@ class AxisSensor(PortedSystem):
 
             self.add_output(name, size, read, {measured.ticket()})
 
-    def _calc(self, context: Context, output: AbstractValue) -> None:
+    def _measure(self, context: Context) -> tuple[Array, Array, Array]:
         nothing = np.full(len(self._observation.names), np.nan)
         labels = self._see(context)
         if labels is None:
-            output.set_value([nothing, nothing, np.zeros(1)])
-            return
+            return nothing, nothing, np.zeros(1)
         statistics = dict(zip(STATISTICS, self.given(context, "statistics"), strict=True))
         x = self._transition @ self.given(context, "estimated_state")
         y, variances = self._observation.measure(labels, x)
@@ -117,7 +112,7 @@ class AxisSensor(PortedSystem):
         matched = self.given(context, "matched_state") if restart else None
         if matched is not None and np.isfinite(matched).all():
             y, variances = self._observation.measure(labels, matched)
-        output.set_value([y, variances, np.array([float(restart)])])
+        return y, variances, np.array([float(restart)])
 
     def _see(self, context: Context) -> NDArray[np.int16] | None:
         """(H, W) the label image; None where there is none, or none of the body."""
@@ -251,14 +246,8 @@ def add_hand_tracking(
     for system in (sensor, matcher):
         builder.Connect(label_image, system.GetInputPort("label_image"))
     builder.Connect(matcher.GetOutputPort("matched_state"), ekf.GetInputPort("reset_state"))
-    for giver, taker, names in (
-        (matcher, sensor, ("matched_state",)),
-        (sensor, ekf, ("measurement", "measurement_variances", "restart")),
-        (ekf, sensor, ("estimated_state", "statistics")),
-        (ekf, belief, ("estimated_state", "covariance")),
-    ):
-        for name in names:
-            builder.Connect(giver.GetOutputPort(name), taker.GetInputPort(name))
+    for giver, taker in ((matcher, sensor), (sensor, ekf), (ekf, sensor), (ekf, belief)):
+        connect_same(builder, giver, taker)
 
     def log(port: OutputPort) -> VectorLogSink:
         return LogVectorOutput(port, builder, publish_period=period)

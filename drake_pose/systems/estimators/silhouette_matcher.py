@@ -18,6 +18,7 @@ from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import PoseEstimate, View
 from drake_pose.search.scoring import PoseSearch
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
+from drake_pose.systems.bodies.posed_geometry import body_poses
 from drake_pose.systems.ports import BeliefSystem, SharedValue, require_period
 
 Array = NDArray[np.float64]
@@ -29,14 +30,6 @@ STATISTICS = ("found", "J", "E_total", "first_E_total", "runs", "outside_limit",
 def camera_port(kind: str, camera: Camera, cameras: Sequence[Camera]) -> str:
     """Name of the port that carries a camera's image of a kind, where there are ``cameras``."""
     return kind if len(cameras) == 1 else f"{kind}_{camera.name}"
-
-
-def body_poses(plant: MultibodyPlant, q: Array, X_WB: Array) -> list[RigidTransform]:
-    """The poses of all bodies at positions (nq,), in the plant's order; X_WB: of its world."""
-    context = plant.CreateDefaultContext()
-    plant.SetPositions(context, q)
-    base = RigidTransform(X_WB)
-    return [base @ pose for pose in plant.get_body_poses_output_port().Eval(context)]
 
 
 @dataclass(frozen=True, eq=False)

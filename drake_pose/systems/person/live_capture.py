@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any
 
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
@@ -12,6 +12,7 @@ from pydrake.trajectories import Trajectory
 
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.camera.models import Camera, PinholeCamera
+from drake_pose.camera.sources.frame_source import FrameSource
 from drake_pose.errors import SettingsError
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.pose_tracker import PersonPoseTracker
@@ -21,87 +22,9 @@ from drake_pose.systems.bodies.posed_geometry import add_avatar
 from drake_pose.systems.person.person_tracker import PersonTracker
 from drake_pose.systems.person.silhouette_sensor import SilhouetteSensor
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
-from drake_pose.systems.pictures.picture_capture import CameraCount, PictureCapture
+from drake_pose.systems.pictures.picture_capture import PictureCapture
+from drake_pose.systems.ports import export_outputs
 from drake_pose.systems.staged_diagram import StagedDiagram
-
-
-class SensorPorts(NamedTuple):
-    """By camera the port of a SilhouetteView or None, and that of the pictures' time stamp [s]."""
-
-    silhouettes: Mapping[str, OutputPort]
-    time: OutputPort
-
-
-class LiveSensors(Protocol):
-    """The sensors of all cameras, here (LocalSensors) or elsewhere, looked at each period [s].
-
-    Attributes:
-        live: whether the pictures come by the computer's clock; else by the simulation's time.
-    """
-
-    period: float
-    live: bool
-
-    @property
-    def skipped(self) -> int:
-        """How many moments were not shown, as newer ones had come."""
-
-    def add(self, builder: DiagramBuilder) -> SensorPorts:
-        """Adds the systems that see to a diagram under construction."""
-
-    def take_reports(self) -> list[str]:
-        """What the user should know and was not told yet."""
-
-    def counts(self) -> dict[str, CameraCount]:
-        """How each camera did so far."""
-
-    def close(self) -> None:
-        """Lets go of files, cameras and workers."""
-
-
-class LocalSensors:
-    """Sensors in this process: a PictureCapture, and a SilhouetteSensor each; see LiveSensors.
-
-    Args:
-        backgrounds: of the cameras whose sources do not deliver masks.
-    """
-
-    def __init__(
-        self,
-        capture: PictureCapture,
-        cameras: Mapping[str, Camera],
-        backgrounds: Mapping[str, Background],
-    ) -> None:
-        self.capture = capture
-        self.period, self.live = capture.period, capture.live
-        self._cameras, self._backgrounds = cameras, backgrounds
-
-    @property
-    def skipped(self) -> int:
-        """How many moments were not shown, as newer ones had come."""
-        return self.capture.skipped
-
-    def add(self, builder: DiagramBuilder) -> SensorPorts:
-        """Adds the systems that see to a diagram under construction."""
-        builder.AddNamedSystem("picture_capture", self.capture)
-        sensors = _add_sensors(builder, self._cameras, self._backgrounds)
-        for name, sensor in sensors.items():
-            image = f"{sensor.get_input_port().get_name()}_{name}"
-            builder.Connect(self.capture.GetOutputPort(image), sensor.get_input_port())
-        silhouettes = {k: sensor.GetOutputPort("silhouette") for k, sensor in sensors.items()}
-        return SensorPorts(silhouettes, self.capture.GetOutputPort("time"))
-
-    def take_reports(self) -> list[str]:
-        """What the user should know and was not told yet."""
-        return self.capture.take_reports()
-
-    def counts(self) -> dict[str, CameraCount]:
-        """How each camera did so far."""
-        return self.capture.counts()
-
-    def close(self) -> None:
-        """Lets go of files and cameras."""
-        self.capture.close()
 
 
 def _add_sensors(
@@ -116,6 +39,34 @@ def _add_sensors(
         )
         for name, camera in cameras.items()
     }
+
+
+class LiveSensors(PictureCapture):
+    """A PictureCapture and what sees with it, looked at each period: a SilhouetteSensor a camera.
+
+    Args:
+        backgrounds: of the cameras whose sources do not deliver masks.
+        how: the further arguments of PictureCapture.
+    """
+
+    def __init__(
+        self,
+        sources: Mapping[str, FrameSource],
+        cameras: Mapping[str, Camera],
+        backgrounds: Mapping[str, Background],
+        **how: Any,
+    ) -> None:
+        super().__init__(sources, cameras, **how)
+        self._cameras, self._backgrounds = cameras, backgrounds
+
+    def add(self, builder: DiagramBuilder) -> dict[str, OutputPort]:
+        """Adds itself and the sensors to a diagram; by camera the port of a view or None."""
+        builder.AddNamedSystem("picture_capture", self)
+        sensors = _add_sensors(builder, self._cameras, self._backgrounds)
+        for name, sensor in sensors.items():
+            image = f"{sensor.get_input_port().get_name()}_{name}"
+            builder.Connect(self.GetOutputPort(image), sensor.get_input_port())
+        return {name: sensor.GetOutputPort("silhouette") for name, sensor in sensors.items()}
 
 
 def add_person_tracker(
@@ -151,12 +102,6 @@ def add_person_tracker(
     return system
 
 
-def _export_outputs(builder: DiagramBuilder, system: PersonTracker) -> None:
-    for index in range(system.num_output_ports()):
-        port = system.get_output_port(index)
-        builder.ExportOutput(port, port.get_name())
-
-
 def build_live_capture(
     tracker: PersonPoseTracker,
     cameras: Mapping[str, Camera],
@@ -173,21 +118,20 @@ def build_live_capture(
         SettingsError: fewer than two cameras, or a period that is not positive.
     """
     builder = DiagramBuilder()
-    ports = sensors.add(builder)
-    system = add_person_tracker(
-        builder,
-        tracker,
-        cameras,
-        ports.silhouettes,
-        sensors.period,
-        ports.time,
-        meshcat,
-        with_deviations,
-    )
-    for name, port in ports.silhouettes.items():
+    silhouettes = sensors.add(builder)
+    for name, port in silhouettes.items():
         builder.ExportOutput(port, f"silhouette_{name}")
-    _export_outputs(builder, system)
-    return builder.Build()
+    return _build(
+        builder, tracker, cameras, silhouettes, sensors.period, sensors.GetOutputPort("time"),
+        meshcat, with_deviations,
+    )[0]  # fmt: skip
+
+
+def _build(builder: DiagramBuilder, *of_tracker: Any) -> tuple[Diagram, PersonTracker]:
+    """The diagram with a person tracker, whose outputs are its own."""
+    system = add_person_tracker(builder, *of_tracker)
+    export_outputs(builder, system)
+    return builder.Build(), system
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,11 +172,10 @@ def build_silhouette_capture(
     for name, sensor in sensors.items():
         builder.ExportInput(sensor.get_input_port(), f"color_image_{name}")
     edges = {name: sensor.GetOutputPort("silhouette") for name, sensor in sensors.items()}
-    person = add_person_tracker(builder, tracker, cameras, edges, period)
-    _export_outputs(builder, person)
     regions = tuple(sensor.GetOutputPort("region") for sensor in sensors.values())
+    diagram, person = _build(builder, tracker, cameras, edges, period)
     stages = {"region": regions, "edge": tuple(edges.values())}
-    return SilhouetteCapture(builder.Build(), stages, person)
+    return SilhouetteCapture(diagram, stages, person)
 
 
 def build_person_capture(
@@ -244,7 +187,7 @@ def build_person_capture(
 ) -> Diagram:
     """A simulated person, the cameras around it, what follows it, and the avatar in the browser.
 
-    The diagram's outputs are ``estimated_positions`` and ``share``.
+    The diagram's outputs are those of PersonTracker.
 
     Args:
         model: the person, with landmarks.yaml beside its file.
@@ -257,15 +200,11 @@ def build_person_capture(
         ModelError: the model has no landmarks of trunk, arms and legs.
     """
     builder = DiagramBuilder()
-    rig = builder.AddNamedSystem(
-        "camera_rig", build_camera_rig(model, cameras, true_positions).diagram
-    )
+    rig = build_camera_rig(model, cameras, true_positions).diagram
+    builder.AddNamedSystem("camera_rig", rig)
     sensors = _add_sensors(builder, cameras, {})
     for name, sensor in sensors.items():
         builder.Connect(rig.GetOutputPort(f"label_image_{name}"), sensor.get_input_port())
     edges = {name: sensor.GetOutputPort("silhouette") for name, sensor in sensors.items()}
     tracker = PersonPoseTracker(ContourFit(model.pose_tree()))
-    system = add_person_tracker(builder, tracker, cameras, edges, period, meshcat=meshcat)
-    for name in ("estimated_positions", "share"):
-        builder.ExportOutput(system.GetOutputPort(name), name)
-    return builder.Build()
+    return _build(builder, tracker, cameras, edges, period, None, meshcat)[0]

@@ -2,38 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from pydrake.common.value import AbstractValue
+from numpy.typing import NDArray
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DiscreteStateIndex,
-    DiscreteValues,
-    EventStatus,
-    InputPort,
-    LeafSystem,
-)
-from pydrake.systems.sensors import ImageRgba8U
+from pydrake.systems.framework import Context
 
 from drake_pose.camera.models import Camera
-from drake_pose.errors import SettingsError, UnknownNameError
+from drake_pose.errors import SettingsError
 from drake_pose.fit.colour_lines import COLOURS
 from drake_pose.fit.contour_fit import inlier_ratio_of
 from drake_pose.person.colour_views import ColourViews
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
 from drake_pose.person.recordings.persons_in_view import keep_views
 from drake_pose.person.views import FrameViews, SilhouetteView, shows_somebody
+from drake_pose.systems.bodies.posed_geometry import body_poses
+from drake_pose.systems.colour_images import ColourPorts
+from drake_pose.systems.ports import MemorySystem, require_period
 
-# Before the values in the state: whether the person is known, the share that fits, the usual share,
-# troubled frames, whether lost, in how many more frames others are looked for, the frame's time
-# stamp, and the time since the frame before.
-_SCALARS = 8
-_OTHERS = 5
+Array = NDArray[np.float64]
+
 # Who was seen beside the person is looked for in this many more frames; to look takes long.
 _REMEMBERED = 15
 # Silhouettes of fewer cameras do not say where the person is.
@@ -44,7 +35,7 @@ _ENOUGH = 3
 _LONGEST_PAUSE = 3.0
 
 
-class PersonTracker(LeafSystem):
+class PersonTracker(MemorySystem):
     """Follows a person from what several cameras' pictures say.
 
     .. pydrake_system::
@@ -97,162 +88,144 @@ class PersonTracker(LeafSystem):
         names = [camera.name for camera in cameras]
         if len(names) < 2 or len(set(names)) != len(names):
             raise SettingsError(f"a person is tracked by two or more different cameras: {names}")
-        if not period > 0:
-            raise SettingsError(f"the tracker's period must be positive, not {period}")
+        require_period("tracker", period)
         self._tracker, self._cameras = tracker, tuple(cameras)
-        self._silhouettes = [
-            self.DeclareAbstractInputPort(f"silhouette_{name}", AbstractValue.Make(None))
-            for name in names
-        ]
-        self._time = self.DeclareVectorInputPort("time", 1)
-        default = tracker.fit.tree.model.default_positions
-        size = len(tracker.fit.lower)
-        start = np.concatenate([np.zeros(_SCALARS), tracker.values(default), np.zeros(size)])
-        start[_SCALARS - 2] = np.nan
-        self._state = self.DeclareDiscreteState(start)
-        self._seen = self.DeclareDiscreteState(len(names))
-        self._last = self.DeclareDiscreteState(tracker.positions(tracker.values(default)))
-        ticket = {self.discrete_state_ticket(self._state)}
-        self.DeclareVectorOutputPort(
-            "estimated_positions", len(default), self._calc_positions, ticket
+        self._with_deviations = with_deviations
+        for name in names:
+            self.add_input(f"silhouette_{name}", None)
+        self.add_input("time", 1)
+        self._colours = ColourPorts(
+            self, cameras, color_cameras, lambda one: f"color_image_{one.name}"
         )
-        self.DeclareStateOutputPort("last_positions", self._last)
-        self.DeclareAbstractOutputPort(
-            "body_poses",
-            lambda: AbstractValue.Make([RigidTransform()]),
-            self._calc_body_poses,
-            {self.discrete_state_ticket(self._last)},
-        )
-        self.DeclareVectorOutputPort("share", 1, self._calc_share, ticket)
-        self.DeclareVectorOutputPort("time", 1, self._calc_time, ticket)
-        self.DeclareStateOutputPort("seen", self._seen)
-        self._others = self.DeclareDiscreteState(1)
-        self.DeclareStateOutputPort("others", self._others)
-        self._deviations: DiscreteStateIndex | None = None
-        if with_deviations:
-            self._deviations = self.DeclareDiscreteState(np.full(len(default), np.nan))
-            self.DeclareStateOutputPort("deviations", self._deviations)
-        self._color_ports = self._declare_color_ports(color_cameras)
         # What is known of the person's colours: state, so that a simulation can be replayed.
-        self._colours_shape = (len(color_cameras), len(tracker.fit.outlines), 3, COLOURS)
-        self._colours = self.DeclareDiscreteState(int(np.prod(self._colours_shape)))
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._follow)
-
-    def _declare_color_ports(self, wanted: Collection[str]) -> dict[str, InputPort]:
-        """The ports of colour images by camera."""
-        known = {camera.name: camera for camera in self._cameras}
-        for name in wanted:
-            if name not in known:
-                raise UnknownNameError("camera", name, known, "color_cameras")
-        return {
-            name: self.DeclareAbstractInputPort(
-                f"color_image_{name}",
-                AbstractValue.Make(ImageRgba8U(camera.width, camera.height)),
-            )
-            for name, camera in known.items()
-            if name in wanted
+        self._colours_shape = (len(self._colours.cameras), len(tracker.fit.outlines), 3, COLOURS)
+        model = tracker.fit.tree.model
+        values = tracker.values(model.default_positions)
+        unknown = np.full(len(model.default_positions), np.nan)
+        shown = {
+            "estimated_positions": unknown,
+            "last_positions": tracker.positions(values),
+            "share": np.zeros(1),
+            "time": np.full(1, np.nan),
+            "seen": np.zeros(len(names)),
+            "others": np.zeros(1),
         }
+        if with_deviations:
+            shown["deviations"] = unknown
+        # The usual share is 0 until the person is known; in as many more frames as are watched
+        # others are looked for; elapsed is the time between the last two frames.
+        inner = {
+            "values": values,
+            "step": np.zeros(len(values)),
+            **{name: np.zeros(1) for name in ("usual", "troubled", "watched", "elapsed")},
+            "colours": np.zeros(int(np.prod(self._colours_shape))),
+        }
+        self.keep_vectors(shown | inner, shown, period)
+        last = self.GetOutputPort("last_positions")
+        self.add_output(
+            "body_poses",
+            [RigidTransform()],
+            lambda context: body_poses(model.plant, last.Eval(context)),
+            {self.all_state_ticket()},
+        )
 
     def known_person(self, context: Context) -> TrackState | None:
         """What is known of the person, lost or not; None: nobody was found yet."""
-        return _unpack(context.get_discrete_state(self._state).value(), 0.0)
+        return _person(self.vectors(context), 0.0)
 
     def set_person(self, context: Context, person: TrackState) -> None:
         """Say what is known of the person; the next pictures follow within a period."""
-        state = context.get_mutable_discrete_state(self._state)
-        state.SetFromVector(_pack(person, 0.0, np.nan, 0.0))
+        fresh = {"watched": np.zeros(1), "time": np.full(1, np.nan), "elapsed": np.zeros(1)}
+        state = context.get_mutable_discrete_state()
+        self.set_vectors(state, self._packed(person) | fresh)
 
-    def _follow(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        vector = context.get_discrete_state(self._state).value()
-        before = float(vector[_SCALARS - 2])
-        time = context.get_time()
-        if self._time.HasValue(context):
-            time = float(self._time.Eval(context)[0])
+    def next_vectors(self, context: Context, known: dict[str, Array]) -> Mapping[str, Array]:
+        """What is known with the pictures of one moment more."""
+        before, time = float(known["time"][0]), context.get_time()
+        stamp = self.given(context, "time")
+        if stamp is not None:
+            time = float(stamp[0])
             if np.isnan(time) or time == before:
-                return EventStatus.Succeeded()
+                return {}
         elapsed = 0.0 if np.isnan(before) else time - before
-        last = _unpack(vector, elapsed)
-        moment, colours = self._moment(context), self._colour_views(context)
+        last = _person(known, elapsed)
+        moment, colours = self._moment(context), self._colour_views(context, known["colours"])
         is_blind = sum(shows_somebody(view) for view in moment.seen.views) < _SEERS
         found: TrackState | None
         if is_blind and colours is not None and last is not None:
             found, colours = self._followed_by_colour(last, colours)
             kept, by_colour = _Moment(FrameViews((), ())), colours
         else:
-            found, kept = self._followed(last, moment, vector[_OTHERS] > 0)
+            found, kept = self._followed(last, moment, known["watched"][0] > 0)
             by_colour = None
-        self._set_seen(discrete_state, kept, by_colour)
-        if self._deviations is not None:
-            discrete_state.get_mutable_value(self._deviations)[:] = np.nan
+        changed = {"time": np.array([time]), **self._seen(kept, by_colour)}
+        if self._with_deviations:
+            changed["deviations"] = np.full(len(known["last_positions"]), np.nan)
         if found is None and last is not None:
             found = TrackState(last.values, np.zeros(len(last.step)), 0.0, last.usual)
         if found is None:
-            discrete_state.get_mutable_value(self._state)[_SCALARS - 2] = time
-            return EventStatus.Succeeded()
+            return changed
         found = self._judged(found, kept)
-        watched = _REMEMBERED if kept.others else max(vector[_OTHERS] - 1.0, 0.0)
-        discrete_state.set_value(self._state, _pack(found, watched, time, elapsed))
+        watched = _REMEMBERED if kept.others else max(known["watched"][0] - 1.0, 0.0)
+        changed |= {"watched": np.array([watched]), "elapsed": np.array([elapsed])}
+        changed |= self._packed(found)
         if not found.is_lost:
-            self._note(discrete_state, found.values, kept, colours, by_colour is not None)
-        return EventStatus.Succeeded()
+            changed["last_positions"] = self._tracker.positions(found.values)
+            if self._with_deviations:
+                seen = kept.seen if by_colour is None else by_colour
+                changed["deviations"] = self._tracker.deviations(found.values, seen)
+            if colours is not None:
+                changed["colours"] = self._learned(found.values, kept, colours, known["colours"])
+        return changed
 
-    def _note(
-        self,
-        discrete_state: DiscreteValues,
-        values: np.ndarray,
-        kept: _Moment,
-        colours: ColourViews | None,
-        by_colour: bool,
-    ) -> None:
-        """Keeps what a frame says in which the person is not lost."""
-        tracker = self._tracker
-        discrete_state.set_value(self._last, tracker.positions(values))
-        if self._deviations is not None:
-            seen = colours if by_colour and colours is not None else kept.seen
-            discrete_state.set_value(self._deviations, tracker.deviations(values, seen))
-        if colours is not None:
-            regions = {
-                camera.name: view.region
-                for camera, view in kept.pairs
-                if camera.name not in kept.merged and shows_somebody(view)
-            }
-            known = colours.learned(tracker.fit, values, regions)
-            packed = discrete_state.get_mutable_value(self._colours).reshape(self._colours_shape)
-            for k, name in enumerate(self._color_ports):
-                if name in known:
-                    packed[k] = known[name]
+    def _packed(self, person: TrackState) -> dict[str, Array]:
+        """What is known of the person, as vectors."""
+        q = self._tracker.positions(person.values)
+        return {
+            "estimated_positions": np.full(len(q), np.nan) if person.is_lost else q,
+            "share": np.array([person.share]),
+            "values": person.values,
+            "step": person.step,
+            "usual": np.array([person.usual]),
+            "troubled": np.array([float(person.troubled)]),
+        }
 
-    def _set_seen(
-        self, discrete_state: DiscreteValues, kept: _Moment, by_colour: ColourViews | None
-    ) -> None:
-        """Notes which cameras saw the person, and whether others were there."""
+    def _learned(self, values: Array, kept: _Moment, colours: ColourViews, before: Array) -> Array:
+        """What is known of the colours after a frame in which the person is not lost."""
+        regions = {
+            camera.name: view.region
+            for camera, view in kept.pairs
+            if camera.name not in kept.merged and shows_somebody(view)
+        }
+        known = colours.learned(self._tracker.fit, values, regions)
+        packed = before.reshape(self._colours_shape)
+        for k, name in enumerate(self._colours.cameras):
+            if name in known:
+                packed[k] = known[name]
+        return packed
+
+    def _seen(self, kept: _Moment, by_colour: ColourViews | None) -> dict[str, Array]:
+        """Which cameras saw the person, and whether others were there."""
         seers = {camera.name for camera, view in kept.pairs if shows_somebody(view)}
         seers |= {*kept.merged}
         if by_colour is not None:
             seers = {camera.name for camera in by_colour.cameras}
-        seen = [float(camera.name in seers) for camera in self._cameras]
-        discrete_state.set_value(self._seen, seen)
-        discrete_state.set_value(self._others, [float(kept.others)])
+        seen = np.array([float(camera.name in seers) for camera in self._cameras])
+        return {"seen": seen, "others": np.array([float(kept.others)])}
 
-    def _colour_views(self, context: Context) -> ColourViews | None:
+    def _colour_views(self, context: Context, colours: Array) -> ColourViews | None:
         """The pictures that are there, and what is known of the colours; None: no picture."""
-        cameras, pictures = [], []
-        for camera in self._cameras:
-            port = self._color_ports.get(camera.name)
-            image = port.Eval(context) if port is not None and port.HasValue(context) else None
-            # A camera that has nothing to show gives an image of no pixels.
-            if image is not None and image.size():
-                cameras.append(camera)
-                pictures.append(np.array(image.data))
-        if not cameras:
+        pictures = self._colours.pictures(context)
+        if not pictures:
             return None
-        packed = context.get_discrete_state(self._colours).value().reshape(self._colours_shape)
+        packed = colours.reshape(self._colours_shape)
         known = {
             name: packed[k].astype(np.float32)
-            for k, name in enumerate(self._color_ports)
+            for k, name in enumerate(self._colours.cameras)
             if packed[k].any()
         }
-        return ColourViews(cameras, pictures, known)
+        cameras = [camera for camera in self._cameras if camera.name in pictures]
+        return ColourViews(cameras, [pictures[camera.name] for camera in cameras], known)
 
     def _followed_by_colour(
         self, last: TrackState, colours: ColourViews
@@ -266,12 +239,9 @@ class PersonTracker(LeafSystem):
 
     def _moment(self, context: Context) -> _Moment:
         """What those cameras see that have a picture."""
-        pairs = [
-            (camera, view)
-            for camera, port in zip(self._cameras, self._silhouettes, strict=True)
-            if (view := port.Eval(context) if port.HasValue(context) else None) is not None
-        ]
-        return _Moment(FrameViews([camera for camera, _ in pairs], [view for _, view in pairs]))
+        views = {one.name: self.given(context, f"silhouette_{one.name}") for one in self._cameras}
+        cameras = [camera for camera in self._cameras if views[camera.name] is not None]
+        return _Moment(FrameViews(cameras, [views[camera.name] for camera in cameras]))
 
     def _followed(
         self, last: TrackState | None, moment: _Moment, is_watching: bool
@@ -312,25 +282,6 @@ class PersonTracker(LeafSystem):
         total = clean.add_up(fit)(fit.body.place(found.values), step)
         return replace(found, share=inlier_ratio_of(total.sums))
 
-    def _calc_positions(self, context: Context, output: BasicVector) -> None:
-        vector = context.get_discrete_state(self._state).value()
-        positions = self._tracker.positions(np.split(vector[_SCALARS:], 2)[0])
-        known, lost = vector[0], vector[4]
-        output.SetFromVector(positions if known and not lost else np.full(len(positions), np.nan))
-
-    def _calc_body_poses(self, context: Context, output: AbstractValue) -> None:
-        plant = self._tracker.fit.tree.model.plant
-        plant_context = plant.CreateDefaultContext()
-        plant.SetPositions(plant_context, context.get_discrete_state(self._last).value())
-        output.set_value(plant.get_body_poses_output_port().Eval(plant_context))
-
-    def _calc_share(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state(self._state).value()[1:2])
-
-    def _calc_time(self, context: Context, output: BasicVector) -> None:
-        vector = context.get_discrete_state(self._state).value()
-        output.SetFromVector(vector[_SCALARS - 2 : _SCALARS - 1])
-
 
 def _without(seen: FrameViews, names: Collection[str]) -> FrameViews:
     """What the cameras see that are not named."""
@@ -351,18 +302,13 @@ class _Moment(NamedTuple):
         return list(zip(self.seen.cameras, self.seen.views, strict=True))
 
 
-def _pack(state: TrackState, watched: float, time: float, elapsed: float) -> np.ndarray:
-    lost = state.is_lost
-    scalars = [1.0, state.share, state.usual, state.troubled, lost, watched, time, elapsed]
-    return np.concatenate([scalars, state.values, state.step])
-
-
-def _unpack(vector: np.ndarray, elapsed: float) -> TrackState | None:
+def _person(known: Mapping[str, Array], elapsed: float) -> TrackState | None:
     """The last frame's state after a time [s]; None where the person is not known yet."""
-    known, share, usual, troubled, _, _, _, usually = vector[:_SCALARS]
-    if not known:
+    share, usual, troubled, usually = (
+        float(known[name][0]) for name in ("share", "usual", "troubled", "elapsed")
+    )
+    if not usual:
         return None
-    values, step = np.split(vector[_SCALARS:], 2)
     # Where frames were skipped, the motion has gone on for longer than from frame to frame.
     frames = min(elapsed / usually, _LONGEST_PAUSE) if usually > 0 and elapsed > 0 else 1.0
-    return TrackState(values.copy(), frames * step, float(share), float(usual), int(troubled))
+    return TrackState(known["values"], frames * known["step"], share, usual, int(troubled))

@@ -6,17 +6,12 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import (
-    Context,
-    DependencyTicket,
-    EventStatus,
-    LeafSystem,
-    State,
-)
+from pydrake.systems.framework import Context, DependencyTicket, EventStatus, State
 from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 
 from drake_pose.camera.models import Camera
@@ -25,6 +20,7 @@ from drake_pose.camera.sources.synchroniser import CameraChange, Moment, Synchro
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.silhouette.pictures.label_images import fill_label_image
 from drake_pose.systems.colour_images import fill_colour_image
+from drake_pose.systems.ports import PortedSystem, require_period
 
 USUAL_RATE_HZ = 30.0
 """Pictures a second where no source says."""
@@ -57,7 +53,7 @@ class CameraCount:
     changes: tuple[CameraChange, ...]
 
 
-class PictureCapture(LeafSystem):
+class PictureCapture(PortedSystem):
     """Gives the synchronised pictures of several cameras.
 
     .. pydrake_system::
@@ -109,9 +105,8 @@ class PictureCapture(LeafSystem):
         self.live = devices if live is None else live
         if devices and not self.live:
             raise SettingsError("live cameras cannot be captured by the simulation's time")
-        self.period = usual_period(sources) if period is None else period
-        if not (math.isfinite(self.period) and self.period > 0):
-            raise SettingsError(f"the capture's period must be positive, not {self.period}")
+        self.period = _usual_period(sources) if period is None else period
+        require_period("capture", self.period)
         share = _LIVE_TOLERANCE if devices else 0.5
         tolerance = share * self.period if tolerance is None else tolerance
         patience = _PERIODS_OF_PATIENCE * self.period if patience is None else patience
@@ -124,21 +119,20 @@ class PictureCapture(LeafSystem):
         self._begin: float | None = None
         self._origins: dict[str, float] = {}
         self._pending: dict[str, TimedPicture | None] = dict.fromkeys(self._sources)
-        self._moment: Moment[TimedPicture] | None = None
+        # The one that is shown; its time counts from the first one.
+        self.moment: Moment[TimedPicture] | None = None
         self._used = dict.fromkeys(self._sources, 0)
         self._changes: dict[str, list[CameraChange]] = {name: [] for name in self._sources}
         self._reports: list[str] = []
         self.skipped = 0
         self._time = self.DeclareDiscreteState(np.array([math.nan]))
         self._fresh = self.DeclareDiscreteState(1)
-        self._declare_outputs(cameras, {self.discrete_state_ticket(self._time)})
+        self._declare_outputs(cameras, self.discrete_state_ticket(self._time))
         self.DeclareStateOutputPort("time", self._time)
         self.DeclareStateOutputPort("fresh", self._fresh)
         self.DeclarePeriodicUnrestrictedUpdateEvent(self.period, 0.0, self._look)
 
-    def _declare_outputs(
-        self, cameras: Mapping[str, Camera], ticket: set[DependencyTicket]
-    ) -> None:
+    def _declare_outputs(self, cameras: Mapping[str, Camera], ticket: DependencyTicket) -> None:
         """One output a camera."""
         for name, source in self._sources.items():
             size = cameras[name].width, cameras[name].height
@@ -149,15 +143,10 @@ class PictureCapture(LeafSystem):
                 port, image, fill = "color_image", ImageRgba8U(*size), fill_colour_image
             self.DeclareAbstractOutputPort(
                 f"{port}_{name}",
-                lambda image=image: AbstractValue.Make(image),
-                self._calc_image(name, fill),
-                ticket,
+                AbstractValue.Make(image).Clone,
+                partial(self._calc_image, name, fill),
+                {ticket},
             )
-
-    @property
-    def moment(self) -> Moment[TimedPicture] | None:
-        """The moment that is shown; its time counts from the first one."""
-        return self._moment
 
     def counts(self) -> dict[str, CameraCount]:
         """How each camera did so far."""
@@ -201,7 +190,7 @@ class PictureCapture(LeafSystem):
             if ended and not rest and not any(self._pending.values()):
                 return EventStatus.ReachedTermination(self, "the recording has ended")
             return EventStatus.Succeeded()
-        self._moment = moment
+        self.moment = moment
         for name in moment.items:
             self._used[name] += 1
         state.get_mutable_discrete_state(self._time).SetFromVector([moment.time])
@@ -278,24 +267,18 @@ class PictureCapture(LeafSystem):
                 text = f"stopped at {change.time:.2f} s; the others go on without it"
             self._reports.append(f"camera '{change.camera}' {text}")
 
-    def _picture(self, name: str) -> np.ndarray | None:
-        one = None if self._moment is None else self._moment.items.get(name)
-        return None if one is None else one.picture
-
     def _calc_image(
-        self, name: str, fill: Callable[[Any, np.ndarray], None]
-    ) -> Callable[[Context, AbstractValue], None]:
-        def calc(context: Context, output: AbstractValue) -> None:
-            image, picture = output.get_mutable_value(), self._picture(name)
-            if picture is None:
-                image.resize(0, 0)
-                return
-            fill(image, picture)
-
-        return calc
+        self, name: str, fill: Callable[[Any, np.ndarray], None], _: Context, output: AbstractValue
+    ) -> None:
+        image = output.get_mutable_value()
+        one = None if self.moment is None else self.moment.items.get(name)
+        if one is None:
+            image.resize(0, 0)
+        else:
+            fill(image, one.picture)
 
 
-def usual_period(sources: Mapping[str, FrameSource]) -> float:
+def _usual_period(sources: Mapping[str, FrameSource]) -> float:
     """Time between two pictures of the fastest source [s]; 1/30 where none says."""
     rates = [rate for one in sources.values() if (rate := one.rate_hz) is not None]
     return 1.0 / max(rates, default=USUAL_RATE_HZ)

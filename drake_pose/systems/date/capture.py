@@ -122,7 +122,7 @@ class PaperPoseEstimator(MemorySystem):
             search=self.setup.settings.search,
             waist=self.setup.settings.waist,
         )
-        support = self.GetInputPort("support").Eval(context)
+        support = self.GetInputPort("support").Eval(context).astype(np.int64)
         before = known["last_features"].reshape(-1, 3)
         return {
             "estimated_positions": pose.q,

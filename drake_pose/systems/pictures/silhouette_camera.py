@@ -8,7 +8,7 @@ from pydrake.geometry import Role, SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, RigidBody
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import Context
 from pydrake.systems.sensors import ImageLabel16I
 
 from drake_pose.body.surfaces.visual_geometry import labelled_meshes
@@ -17,9 +17,10 @@ from drake_pose.errors import ModelError
 from drake_pose.silhouette.areas.label_kernel import paint_labels
 from drake_pose.silhouette.areas.outline import outline_from_mesh, pack
 from drake_pose.silhouette.pictures.label_images import EMPTY
+from drake_pose.systems.ports import PortedSystem
 
 
-class SilhouetteCamera(LeafSystem):
+class SilhouetteCamera(PortedSystem):
     """Gives label images of a plant's bodies, as an RgbdSensor does, without VTK, GL or a display.
 
     .. pydrake_system::
@@ -76,24 +77,24 @@ class SilhouetteCamera(LeafSystem):
         self._closed = np.array([outline.is_closed for _, _, outline in found])
         self._packed = pack(tuple(outline for _, _, outline in found))
         self._parameters, self._X_CP = camera.kernel_parameters(), camera.X_CW
-        poses = AbstractValue.Make([RigidTransform()] * len(bodies))
-        self._body_poses = self.DeclareAbstractInputPort("body_poses", poses)
-        tickets = {self._body_poses.ticket()}
-        image = ImageLabel16I(camera.width, camera.height)
+        bodies_posed = self.add_input("body_poses", [RigidTransform()] * len(bodies))
         self.DeclareAbstractOutputPort(
-            "label_image", lambda: AbstractValue.Make(image), self._calc_image, tickets
+            "label_image",
+            AbstractValue.Make(ImageLabel16I(camera.width, camera.height)).Clone,
+            self._calc_image,
+            {bodies_posed.ticket()},
         )
-        self.DeclareAbstractOutputPort(
+        self.add_output(
             "body_pose_in_world",
-            lambda: AbstractValue.Make(RigidTransform()),
-            self._calc_pose,
-            tickets,
+            RigidTransform(),
+            lambda context: bodies_posed.Eval(context)[self._parent] @ RigidTransform(camera.X_WC),
         )
-        self.DeclareVectorOutputPort("image_time", 1, self._calc_time, {self.time_ticket()})
+        time = {self.time_ticket()}
+        self.add_output("image_time", 1, lambda context: [context.get_time()], time)
 
     def _poses(self, context: Context) -> np.ndarray:
         """The poses (n, 4, 4) of all bodies in the world, all of them finite."""
-        listed = self._body_poses.Eval(context)
+        listed = self.GetInputPort("body_poses").Eval(context)
         if len(listed) != len(self._names):
             raise ModelError(
                 f"{self.get_name()}: body_poses holds {len(listed)} poses, but the plant has "
@@ -117,13 +118,6 @@ class SilhouetteCamera(LeafSystem):
         paint_labels(
             self._packed, self._labels, self._closed, X_CB, self._parameters, EMPTY, labels
         )
-
-    def _calc_pose(self, context: Context, output: AbstractValue) -> None:
-        X_WP = self._body_poses.Eval(context)[self._parent]
-        output.set_value(X_WP @ RigidTransform(self.camera.X_WC))
-
-    def _calc_time(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector([context.get_time()])
 
 
 def _require_drawable(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import (
-    BasicVector,
     Context,
     Diagram,
     DiagramBuilder,
-    DiscreteValues,
     EventStatus,
     LeafSystem,
     OutputPort,
@@ -34,6 +32,7 @@ from drake_pose.person.date.walk_commands import (
     walks_on_spot,
 )
 from drake_pose.systems.bodies.posed_geometry import add_avatar
+from drake_pose.systems.ports import MemorySystem, connect_same, require_period
 from drake_pose.systems.walk.garden import (
     HALF_SIZE,
     START,
@@ -58,7 +57,7 @@ _AROUND = math.radians(100.0)
 _HELD = 0.55
 
 
-class Walker(LeafSystem):
+class Walker(MemorySystem):
     """Recognises commands in a person's poses and follows them through a place.
 
     .. pydrake_system::
@@ -95,8 +94,7 @@ class Walker(LeafSystem):
         settle: float = 0.0,
     ) -> None:
         super().__init__()
-        if not period > 0:
-            raise SettingsError(f"the walker's period must be positive, not {period}")
+        require_period("walker", period)
         if not settle >= 0:
             raise SettingsError(f"the time to settle must be 0 s or more, not {settle}")
         for part in _PARTS:
@@ -106,45 +104,39 @@ class Walker(LeafSystem):
         self._plant_context = model.plant.CreateDefaultContext()
         self._settings = settings or WalkSettings()
         self._obstacles = garden_obstacles()
-        self._positions = self.DeclareVectorInputPort("positions", len(standing))
-        self._keys = self.DeclareVectorInputPort("keys", 2)
-        starts = {
+        self.add_input("positions", len(standing))
+        self.add_input("keys", 2)
+        shown = {
             "walker_pose": np.array(START),
             "command": np.zeros(2),
             "rest": np.full(5, np.nan),
             "avatar_positions": standing,
+        }
+        inner = {
             # The stance that the person may be settling in, and since when [s].
             "settling": np.append(np.full(5, np.nan), 0.0),
             "heading": np.full(1, np.nan),
             "steps": np.array(NO_STEPS),
         }
-        self._states = {name: self.DeclareDiscreteState(start) for name, start in starts.items()}
-        for name in ("walker_pose", "command", "rest", "avatar_positions"):
-            self.DeclareStateOutputPort(name, self._states[name])
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._walk)
+        self.keep_vectors(shown | inner, shown, period)
 
-    def _walk(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        known = {
-            name: np.array(context.get_discrete_state(index).value())
-            for name, index in self._states.items()
-        }
-        q = self._positions.Eval(context)
+    def next_vectors(self, context: Context, known: dict[str, Array]) -> Mapping[str, Array]:
+        """The walk's next step."""
+        q = self.GetInputPort("positions").Eval(context)
         turn, walk = NO_COMMAND
         if np.isfinite(q).all():
             turn, walk = self._recognise(q, known, context.get_time())
         else:
             known["heading"], known["steps"] = np.full(1, np.nan), np.array(NO_STEPS)
-        if self._keys.HasValue(context):
-            pressed = self._keys.Eval(context).astype(int)
+        pressed = self.given(context, "keys")
+        if pressed is not None:
             turn, walk = int(pressed[0]) or turn, int(pressed[1]) or walk
         known["command"] = np.array([turn, walk], dtype=float)
         known["walker_pose"] = follow_command(
             known["walker_pose"], (turn, walk), self._period, self._settings, HALF_SIZE,
             self._obstacles,
         )  # fmt: skip
-        for name, index in self._states.items():
-            discrete_state.set_value(index, known[name])
-        return EventStatus.Succeeded()
+        return known
 
     def _recognise(self, q: Array, known: dict[str, Array], time: float) -> tuple[int, int]:
         """The command of a person who is seen; what is known by state's name is brought up."""
@@ -178,7 +170,7 @@ class Walker(LeafSystem):
         return stance_of(X_WH.rotation().col(0), X_WH.translation(), feet), lift
 
 
-class WalkKeys(LeafSystem):
+class WalkKeys(MemorySystem):
     """Reads Meshcat's buttons, or the arrow keys, as commands.
 
     .. pydrake_system::
@@ -200,35 +192,31 @@ class WalkKeys(LeafSystem):
         for name, key in KEYS.items():
             meshcat.AddButton(name, key)
         # By button: how often it was pressed, and how much longer that counts [s].
-        self._pressed = self.DeclareDiscreteState(len(KEYS))
-        self._left = self.DeclareDiscreteState(len(KEYS))
-        self._frame = self.DeclareDiscreteState(1)
-        ticket = {self.discrete_state_ticket(self._left)}
-        self.DeclareVectorOutputPort("keys", 2, self._calc_keys, ticket)
-        ticket = {self.discrete_state_ticket(self._frame)}
-        self.DeclareVectorOutputPort("positions", stride.shape[1], self._calc_positions, ticket)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._look)
+        starts = {name: np.zeros(len(KEYS)) for name in ("pressed", "left")}
+        self.keep_vectors(starts | {"frame": np.zeros(1)}, (), period)
+        tickets = {self.all_state_ticket()}
 
-    def _look(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        before = context.get_discrete_state(self._pressed).value()
-        left = context.get_discrete_state(self._left).value()
+        def command(context: Context) -> list[float]:
+            ahead, behind, left, right = self.vectors(context)["left"] > 0.0
+            return [float(left) - float(right), float(ahead) - float(behind)]
+
+        self.add_output("keys", 2, command, tickets)
+        self.add_output(
+            "positions",
+            stride.shape[1],
+            lambda context: stride[int(self.vectors(context)["frame"][0]) - 1],
+            tickets,
+        )
+
+    def next_vectors(self, context: Context, known: dict[str, Array]) -> Mapping[str, Array]:
+        """What the buttons say, and the stride's next frame."""
         pressed = np.array([float(self._meshcat.GetButtonClicks(name)) for name in KEYS])
-        left = np.where(pressed > before, _HELD, np.maximum(left - self._period, 0.0))
-        frame = int(context.get_discrete_state(self._frame).value()[0])
-        if left.any() or frame:
-            frame = (frame + 1) % len(self._stride)
-        discrete_state.set_value(self._pressed, pressed)
-        discrete_state.set_value(self._left, left)
-        discrete_state.set_value(self._frame, np.array([float(frame)]))
-        return EventStatus.Succeeded()
-
-    def _calc_keys(self, context: Context, output: BasicVector) -> None:
-        ahead, behind, left, right = context.get_discrete_state(self._left).value() > 0.0
-        output.SetFromVector([float(left) - float(right), float(ahead) - float(behind)])
-
-    def _calc_positions(self, context: Context, output: BasicVector) -> None:
-        frame = int(context.get_discrete_state(self._frame).value()[0])
-        output.SetFromVector(self._stride[frame - 1])
+        held = np.maximum(known["left"] - self._period, 0.0)
+        left = np.where(pressed > known["pressed"], _HELD, held)
+        frame = known["frame"]
+        if left.any() or frame[0]:
+            frame = (frame + 1.0) % len(self._stride)
+        return {"pressed": pressed, "left": left, "frame": frame}
 
 
 class WalkView(LeafSystem):
@@ -296,8 +284,7 @@ def build_walk(
     builder.Connect(source, walker.GetInputPort("positions"))
     builder.Connect(keys.GetOutputPort("keys"), walker.GetInputPort("keys"))
     view = builder.AddNamedSystem("view", WalkView(meshcat, period))
-    for name in ("walker_pose", "rest"):
-        builder.Connect(walker.GetOutputPort(name), view.GetInputPort(name))
+    connect_same(builder, walker, view)
     avatar = walker.GetOutputPort("avatar_positions")
     add_avatar(builder, model, avatar, meshcat, f"{_WALKER}/avatar", period)
     for name in ("walker_pose", "command"):

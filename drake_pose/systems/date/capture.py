@@ -124,12 +124,13 @@ class PaperPoseEstimator(MemorySystem):
         )
         support = self.GetInputPort("support").Eval(context).astype(np.int64)
         before = known["last_features"].reshape(-1, 3)
+        support_before = known["last_support"].astype(np.int64)
         return {
             "estimated_positions": pose.q,
             "last_features": features,
             "last_support": support,
             "limb_points": np.array([pose.limbs[name] for name in LIMBS]),
-            "expected_features": expect_features(features, support, before, known["last_support"]),
+            "expected_features": expect_features(features, support, before, support_before),
         }
 
     def _anew(self, q: Array, features: Array | None) -> dict[str, Array]:

@@ -12,12 +12,7 @@ from drake_pose.camera.checks import check_number
 from drake_pose.camera.files import load_cameras
 from drake_pose.camera.models import Camera
 from drake_pose.camera.picture_files import Picture, read_picture
-from drake_pose.camera.sources.frame_source import (
-    KINDS,
-    Clock,
-    FrameSource,
-    SourceSpecification,
-)
+from drake_pose.camera.sources.frame_source import Clock, FrameSource, SourceSpecification
 from drake_pose.camera.sources.live import DeviceSource
 from drake_pose.camera.sources.recorded import (
     TIME_STAMPS,
@@ -25,7 +20,7 @@ from drake_pose.camera.sources.recorded import (
     VideoSource,
     find_picture_files,
 )
-from drake_pose.errors import CameraError, SceneError
+from drake_pose.errors import CameraError, SceneError, SettingsError
 from drake_pose.yaml_files import read_yaml
 
 SOURCES = "sources.yaml"
@@ -103,14 +98,9 @@ def load_background_pictures(specification: SourceSpecification) -> list[Picture
         )
     pictures = []
     for file in find_picture_files(folder, camera).values():
-        picture = read_picture(file, SceneError)
-        height, width = picture.shape[:2]
-        if (width, height) != (specification.width, specification.height):
-            raise SceneError(
-                f"{file}: has {width} x {height} pixels (width x height), but camera '{camera}' is "
-                f"calibrated for {specification.width} x {specification.height}"
-            )
-        pictures.append(picture)
+        pictures.append(read_picture(file, SceneError))
+        if wrong := specification.wrong_size(pictures[-1]):
+            raise SceneError(f"{file}: camera '{camera}' {wrong}")
     return pictures
 
 
@@ -122,16 +112,12 @@ def _read_entry(camera: Camera, entry: Any, path: Path) -> SourceSpecification:
     strange = [str(field)[:40] for field in entry if field not in _FIELDS]
     if strange:
         raise SceneError(f"{where}: unknown field {strange[0]}; a source has {', '.join(_FIELDS)}")
-    kind = entry.get("kind")
-    if kind not in KINDS:
-        raise SceneError(f"{where}: kind must be one of {', '.join(KINDS)}")
-    location = entry.get("location")
+    kind, location = entry.get("kind"), entry.get("location")
     if isinstance(location, bool) or not isinstance(location, str | int) or location == "":
         raise SceneError(f"{where}: location must be a path, or a device's number or address")
     if kind != "device":
         location = path.parent / str(location)
-    background = entry.get("background")
-    masks = entry.get("masks", False)
+    masks, background = entry.get("masks", False), entry.get("background")
     if not isinstance(masks, bool) or masks == (background is not None):
         raise SceneError(
             f"{where}: needs either 'masks: true', where its pictures are masks of the person, or "
@@ -143,13 +129,17 @@ def _read_entry(camera: Camera, entry: Any, path: Path) -> SourceSpecification:
         background = str(path.parent / background)
     try:
         rate, offset = entry.get("rate_hz"), entry.get("offset", 0.0)
-        if rate is not None:
-            rate = check_number(rate, "rate_hz", where, positive=True)
+        rate = None if rate is None else check_number(rate, "rate_hz", where)
         offset = check_number(offset, "offset", where)
     except CameraError as error:
         raise SceneError(str(error)) from None
     size = camera.width, camera.height
-    return SourceSpecification(camera.name, kind, str(location), *size, rate, background, offset)
+    try:
+        return SourceSpecification(
+            camera.name, str(kind), str(location), *size, rate, background, offset
+        )
+    except SettingsError as error:
+        raise SceneError(f"{path}: {error}") from None
 
 
 def _with_folders_beside(found: dict[str, SourceSpecification]) -> dict[str, SourceSpecification]:

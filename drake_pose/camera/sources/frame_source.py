@@ -50,7 +50,7 @@ class SourceSpecification:
     def __post_init__(self) -> None:
         where = f"the source of camera '{self.camera}'"
         if self.kind not in KINDS:
-            raise SettingsError(f"{where}: kind must be {', '.join(KINDS)}, not '{self.kind}'")
+            raise SettingsError(f"{where}: kind must be {', '.join(KINDS)}, not {self.kind!r}")
         if self.width < 1 or self.height < 1:
             raise SettingsError(f"{where}: pictures of {self.width} x {self.height} cannot be")
         if self.rate_hz is not None and not (math.isfinite(self.rate_hz) and self.rate_hz > 0):
@@ -65,6 +65,16 @@ class SourceSpecification:
     def gives_masks(self) -> bool:
         """Whether the source delivers masks of the person instead of pictures."""
         return self.background is None
+
+    def wrong_size(self, picture: Picture | Mask) -> str:
+        """What is wrong with a picture's size; "" where it is the calibrated one."""
+        height, width = picture.shape[:2]
+        if (width, height) == (self.width, self.height):
+            return ""
+        return (
+            f"has {width} x {height} pixels (width x height), but the camera is calibrated for "
+            f"{self.width} x {self.height}: give pictures of that size, or calibrate again"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,13 +140,3 @@ class FrameSource(abc.ABC):
     def report(self, problem: str) -> None:
         """Notes a problem."""
         self.problems.append(f"camera '{self.specification.camera}': {problem}")
-
-    def wrong_size(self, picture: Picture | Mask) -> str:
-        """What is wrong with a picture's size; "" where it is the calibrated one."""
-        (height, width), wanted = picture.shape[:2], self.specification
-        if (width, height) == (wanted.width, wanted.height):
-            return ""
-        return (
-            f"has {width} x {height} pixels (width x height), but the camera is calibrated for "
-            f"{wanted.width} x {wanted.height}: give pictures of that size, or calibrate again"
-        )

@@ -106,7 +106,7 @@ class DeviceSource(FrameSource):
                 return count
             time = self._clock() + self.specification.offset
             rgb = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-            if wrong := self.wrong_size(rgb):
+            if wrong := self.specification.wrong_size(rgb):
                 self.report(f"'{self.specification.location}' {wrong}")
                 self._stop.set()
                 return count

@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
+import abc
 import math
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from drake_pose.camera.picture_files import (
-    Mask,
-    Picture,
     list_pictures,
     mask_of_picture,
     read_person_mask,
     read_picture,
 )
-from drake_pose.camera.sources.frame_source import (
-    FrameSource,
-    SourceSpecification,
-    TimedPicture,
-)
+from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecification, TimedPicture
 from drake_pose.csv_files import read_csv
 from drake_pose.errors import SceneError
 
@@ -30,58 +26,96 @@ TIME_STAMPS = "timestamps.csv"
 _NUMBER = re.compile(r"(\d+)$")
 
 
-class FolderSource(FrameSource):
+class RecordedSource(FrameSource):
+    """Pictures that wait to be read, one of them read ahead, so that the end is known.
+
+    Raises:
+        SceneError: names the folder or file; no picture, or the first is of another size.
+    """
+
+    def __init__(self, specification: SourceSpecification) -> None:
+        super().__init__(specification)
+        self._ahead: TimedPicture | None = None
+        self._pictures = self._all()
+        self._ahead = self._advance()
+        if self._ahead is None:
+            raise SceneError(
+                f"{specification.location}: no picture can be read, though it is the source of "
+                f"camera '{specification.camera}'"
+            )
+
+    @abc.abstractmethod
+    def _all(self) -> Iterator[tuple[Path, TimedPicture]]:
+        """The pictures that can be read, and the file of each."""
+
+    @property
+    def ended(self) -> bool:
+        """Whether all pictures were read."""
+        return self._ahead is None
+
+    def close(self) -> None:
+        """Lets go of the file."""
+        self._ahead = None
+
+    def _read(self) -> TimedPicture | None:
+        taken = self._ahead
+        if taken is not None:
+            self._ahead = self._advance()
+        return taken
+
+    def _advance(self) -> TimedPicture | None:
+        """The next picture of the calibrated size."""
+        for path, one in self._pictures:
+            wrong = self.specification.wrong_size(one.picture)
+            if not wrong:
+                return one
+            if self._ahead is None:
+                raise SceneError(f"{path}: camera '{self.specification.camera}' {wrong}")
+            self.drop(f"{path}: {wrong}")
+        return None
+
+
+class FolderSource(RecordedSource):
     """Pictures or masks `<frame>.png` or `.jpg` of a folder.
 
     Their times are those of `timestamps.csv` (frame, time [s]) in that folder. Without it the
     frames follow each other in the order of their names at the given rate, and frames of the same
     name in the folders `beside` are of the same time; a number in a name means nothing.
-
-    Raises:
-        SceneError: names the folder; no picture, no times, or pictures of another size.
     """
 
     def __init__(self, specification: SourceSpecification) -> None:
+        self._times: list[float] = []
         super().__init__(specification)
-        folder = Path(specification.location)
-        files = find_picture_files(folder, specification.camera)
-        stamped = folder / TIME_STAMPS
-        times = read_time_stamps(stamped) if stamped.is_file() else self._counted(folder, files)
-        missing = [frame for frame in times if frame not in files]
-        if missing:
-            self.drop(f"{folder}: has no picture of {_listed(missing)}", len(missing))
-        strangers = [frame for frame in files if frame not in times]
-        if strangers:
-            self.drop(f"{stamped}: has no time of {_listed(strangers)}", len(strangers))
-        self._rows = [(files[frame], frame, times[frame]) for frame in times if frame in files]
-        if not self._rows:
-            raise SceneError(f"{stamped}: has no time of any picture in {folder}")
-        self._next = 0
-        # Pictures of a wrong size are refused before work begins.
-        for path, _, _ in self._rows:
-            try:
-                wrong = self.wrong_size(self._picture(path))
-            except SceneError:
-                continue  # It is named when its turn comes.
-            if wrong:
-                raise SceneError(f"{path}: camera '{specification.camera}' {wrong}")
-            return
-        raise SceneError(f"{folder}: not one of its pictures can be read")
-
-    @property
-    def ended(self) -> bool:
-        """Whether all pictures were read."""
-        return self._next >= len(self._rows)
 
     @property
     def rate_hz(self) -> float | None:
         """The given rate, or that of the time stamps."""
-        steps = np.diff([time for _, _, time in self._rows])
+        steps = np.diff(self._times)
         steps = steps[steps > 0]
         return self.specification.rate_hz or (1.0 / float(np.median(steps)) if len(steps) else None)
 
-    def close(self) -> None:
-        """Nothing is held open."""
+    def _all(self) -> Iterator[tuple[Path, TimedPicture]]:
+        given, folder = self.specification, Path(self.specification.location)
+        files = find_picture_files(folder, given.camera)
+        stamped = folder / TIME_STAMPS
+        times = read_time_stamps(stamped) if stamped.is_file() else self._counted(folder, files)
+        for what, where, frames in (
+            ("picture", folder, [frame for frame in times if frame not in files]),
+            ("time", stamped, [frame for frame in files if frame not in times]),
+        ):
+            if frames:
+                self.drop(f"{where}: has no {what} of {_listed(frames)}", len(frames))
+        self._times = [time for frame, time in times.items() if frame in files]
+        if not self._times:
+            raise SceneError(f"{stamped}: has no time of any picture in {folder}")
+        for frame in [frame for frame in times if frame in files]:
+            try:
+                read = read_person_mask if given.gives_masks else read_picture
+                seen = read(files[frame], SceneError)
+            except SceneError as error:
+                self.drop(str(error))
+                continue
+            yield files[frame], TimedPicture(times[frame] + given.offset, frame, seen)
 
     def _counted(self, folder: Path, files: dict[str, Path]) -> dict[str, float]:
         """The frames' times by their rate."""
@@ -102,54 +136,21 @@ class FolderSource(FrameSource):
             )
         return {frame: k / given.rate_hz for k, frame in enumerate(ordered)}
 
-    def _picture(self, path: Path) -> Picture | Mask:
-        read = read_person_mask if self.specification.gives_masks else read_picture
-        return read(path, SceneError)
 
-    def _read(self) -> TimedPicture | None:
-        while self._next < len(self._rows):
-            path, frame, time = self._rows[self._next]
-            self._next += 1
-            try:
-                picture = self._picture(path)
-            except SceneError as error:
-                self.drop(str(error))
-                continue
-            if wrong := self.wrong_size(picture):
-                self.drop(f"{path}: {wrong}")
-                continue
-            return TimedPicture(time + self.specification.offset, frame, picture)
-        return None
-
-
-class VideoSource(FrameSource):
-    """A video file's pictures, or masks, white on the person.
-
-    Raises:
-        SceneError: names the file; when it is no video, or of another size.
-    """
+class VideoSource(RecordedSource):
+    """A video file's pictures, or masks, white on the person."""
 
     def __init__(self, specification: SourceSpecification) -> None:
-        super().__init__(specification)
         path = specification.location
         if not Path(path).is_file():
             raise SceneError(f"{path}: no such video file of camera '{specification.camera}'")
         self._capture = cv2.VideoCapture(path)
-        self._count = 0
-        self._ahead = self._advance()
-        if self._ahead is None:
+        if not self._capture.isOpened():
             raise SceneError(
                 f"{path}: not a video that OpenCV can read, though the source of camera "
                 f"'{specification.camera}'"
             )
-        if wrong := self.wrong_size(self._ahead.picture):
-            self.close()
-            raise SceneError(f"{path}: camera '{specification.camera}' {wrong}")
-
-    @property
-    def ended(self) -> bool:
-        """Whether all pictures were read."""
-        return self._ahead is None
+        super().__init__(specification)
 
     @property
     def rate_hz(self) -> float | None:
@@ -159,32 +160,26 @@ class VideoSource(FrameSource):
 
     def close(self) -> None:
         """Lets go of the file."""
+        super().close()
         self._capture.release()
-        self._ahead = None
 
-    def _read(self) -> TimedPicture | None:
-        taken = self._ahead
-        if taken is not None:
-            self._ahead = self._advance()
-        return taken
-
-    def _advance(self) -> TimedPicture | None:
-        """Reads one picture ahead, so that the end is known."""
-        given = self.specification
-        found, picture = self._capture.read()
-        if not found or picture is None:
-            promised = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
-            if 0 < self._count < promised:
-                reason = f"{given.location}: ends after {self._count} of {promised} pictures"
-                self.drop(reason, promised - self._count)
-            return None
-        time = 1e-3 * self._capture.get(cv2.CAP_PROP_POS_MSEC)
-        if given.rate_hz is not None:
-            time = self._count / given.rate_hz
-        self._count += 1
-        rgb = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-        seen = mask_of_picture(rgb) if given.gives_masks else rgb
-        return TimedPicture(time + given.offset, f"{self._count - 1:06d}", seen)
+    def _all(self) -> Iterator[tuple[Path, TimedPicture]]:
+        given, count = self.specification, 0
+        while True:
+            found, picture = self._capture.read()
+            if not found or picture is None:
+                break
+            time = 1e-3 * self._capture.get(cv2.CAP_PROP_POS_MSEC)
+            if given.rate_hz is not None:
+                time = count / given.rate_hz
+            rgb = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+            seen = mask_of_picture(rgb) if given.gives_masks else rgb
+            yield Path(given.location), TimedPicture(time + given.offset, f"{count:06d}", seen)
+            count += 1
+        promised = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        if 0 < count < promised:
+            reason = f"{given.location}: ends after {count} of {promised} pictures"
+            self.drop(reason, promised - count)
 
 
 def find_picture_files(folder: Path, camera: str) -> dict[str, Path]:
@@ -212,12 +207,11 @@ def read_time_stamps(path: Path) -> dict[str, float]:
         if frame in found:
             raise SceneError(f"{path}: line {line}: has frame {frame} twice")
         try:
-            time = float(row[header.index("time")])
+            found[frame] = float(row[header.index("time")])
         except ValueError:
-            time = math.nan
-        if not math.isfinite(time):
+            found[frame] = math.nan
+        if not math.isfinite(found[frame]):
             raise SceneError(f"{path}: line {line}: the time must be a number of seconds")
-        found[frame] = time
     return found
 
 
@@ -229,6 +223,5 @@ def _by_number(name: str) -> tuple[str, int]:
 
 def _listed(frames: list[str]) -> str:
     """A few frames' names."""
-    some = ", ".join(frames[:5])
     more = f" and {len(frames) - 5} more" if len(frames) > 5 else ""
-    return f"frame{'s' if len(frames) > 1 else ''} {some}{more}"
+    return f"frame{'s' if len(frames) > 1 else ''} {', '.join(frames[:5])}{more}"

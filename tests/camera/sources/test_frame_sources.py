@@ -274,7 +274,7 @@ class TestSourcesFile:
         [
             ({"camera_9": {}}, "'camera_9' is not calibrated"),
             ({"camera_1": None}, "camera_1.*mapping"),
-            ({"camera_1": {"kind": "film"}}, "kind must be"),
+            ({"camera_1": VIDEO | {"kind": "film", "masks": True}}, "kind must be"),
             ({"camera_1": {"kind": "video"}}, "location"),
             ({"camera_1": VIDEO | {"colour": 1}}, "unknown field colour"),
             ({"camera_1": VIDEO}, "masks: true"),

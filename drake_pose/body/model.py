@@ -1,6 +1,7 @@
 """The articulated model: what a file says about links, joints, limits and looks, read once."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -23,14 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.body.files.parsing import ModelSource, limit_kinds
 from drake_pose.body.files.safety import check_in_child
-from drake_pose.body.files.urdf_shape import (
-    Factors,
-    stretched,
-    with_base_joints,
-    with_moved_looks,
-    with_shifted_joints,
-    without_visuals,
-)
+from drake_pose.body.files.urdf_shape import Vectors, reshaped, with_base_joints
 from drake_pose.body.limits import describe_positions
 from drake_pose.body.parsed_model import ParsedModel, link_names
 from drake_pose.body.surfaces.mesh import TriangleMesh
@@ -52,6 +46,7 @@ OBJECT_POSITIONS = tuple(f"{OBJECT}_{move}_{axis}" for move in ("shift", "turn")
 _FARTHEST = 10.0
 # So small is what stands for links without looks where they are needed in a tree [m].
 _DOT = 1e-6
+_NOTHING: Vectors = {}
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,48 +82,42 @@ class ArticulatedModel(ParsedModel):
 
         Raises UnknownNameError for an unknown link, ModelError for no URDF or nothing seen.
         """
-        for name in links:
-            self.link_index(name)
-        skin = [band for band in self.skin if not {band.parent, band.child} & set(links)]
-        return self._changed(without_visuals(self._urdf_text(), links), skin)
+        return self.reshaped(hidden=links)
 
-    def stretched(self, factors: Factors) -> "ArticulatedModel":
-        """The same with some links longer or wider; positions mean what they did.
+    def reshaped(
+        self,
+        *,
+        hidden: Collection[str] = (),
+        factors: Vectors = _NOTHING,
+        moves: Vectors = _NOTHING,
+        shifts: Vectors = _NOTHING,
+    ) -> "ArticulatedModel":
+        """The same with links and joints otherwise; positions mean what they did.
 
-        ``factors``: (3,) by link, along its frame's axes. Raises UnknownNameError for an unknown
-        link, ModelError for no URDF.
+        Args:
+            hidden: links without looks, and without skin between them and others.
+            factors: (3,) by link: so many times its size along its frame's axes.
+            moves: (3,) by link: how far its looks and joints lie elsewhere on it [m]; bands stay.
+            shifts: (3,) by joint: how far it stands elsewhere on its parent link [m].
+
+        Raises:
+            UnknownNameError: no such link.
+            ModelError: no URDF, or nothing is seen any more.
         """
-        for name in factors:
+        for name in (*hidden, *factors, *moves):
             self.link_index(name)
+        text = reshaped(
+            self._urdf_text(), hidden=hidden, factors=factors, moves=moves, shifts=shifts
+        )
+        kept = [band for band in self.skin if not {band.parent, band.child} & set(hidden)]
         # A band grows with the link in whose frame it is.
-        skin = [
-            replace(
-                band,
-                mesh=TriangleMesh(
-                    band.mesh.vertices * factors.get(band.child, (1.0, 1.0, 1.0)),
-                    band.mesh.triangles,
-                ),
-            )
-            for band in self.skin
+        sizes = [factors.get(band.child, (1.0, 1.0, 1.0)) for band in kept]
+        meshes = [
+            TriangleMesh(band.mesh.vertices * size, band.mesh.triangles)
+            for band, size in zip(kept, sizes, strict=True)
         ]
-        return self._changed(stretched(self._urdf_text(), factors), skin)
-
-    def with_shifted_joints(self, shifts: Mapping[str, Sequence[float]]) -> "ArticulatedModel":
-        """The same with some joints elsewhere on their parent links, whose looks stay.
-
-        ``shifts``: (3,) by joint, along its parent link's axes [m]. Raises ModelError for no URDF.
-        """
-        return self._changed(with_shifted_joints(self._urdf_text(), shifts), self.skin)
-
-    def with_moved_looks(self, moves: Mapping[str, Sequence[float]]) -> "ArticulatedModel":
-        """The same with some links' looks and joints elsewhere on them; bands of skin stay.
-
-        ``moves``: (3,) by link, along its frame's axes [m]. Raises UnknownNameError for an unknown
-        link, ModelError for no URDF.
-        """
-        for name in moves:
-            self.link_index(name)
-        return self._changed(with_moved_looks(self._urdf_text(), moves), self.skin)
+        skin = [replace(band, mesh=mesh) for band, mesh in zip(kept, meshes, strict=True)]
+        return self._changed(text, skin)
 
     def with_base_joints(self, X_WB: NDArray[np.float64]) -> "ArticulatedModel":
         """The same on BASE_JOINTS, which are 0 at X_WB (4, 4); ModelError for no URDF."""
@@ -235,12 +224,9 @@ def read_model(
     """As load_model, in this process and without the check."""
     source = ModelSource(path, packages)
     plant, scene_graph, instances, warnings = _parse(path, source)
-    try:
+    with _naming(path):
         plant.Finalize()
         positions, remarks = describe_positions(plant, {**source.limits, **limits}, str(path))
-    # Drake ends the process, which Python sees as SystemExit, at some values.
-    except (ModelError, RuntimeError, SystemExit) as error:
-        raise ModelError(f"{path}: {error}") from error
     meshes = _seen_meshes(path, plant, scene_graph)
     return ArticulatedModel(
         path=path,
@@ -255,6 +241,16 @@ def read_model(
     )
 
 
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Let what Drake and this package refuse be a ModelError that names the file."""
+    try:
+        yield
+    # Drake ends the process, which Python sees as SystemExit, at some values.
+    except (ModelError, RuntimeError, SystemExit) as error:
+        raise ModelError(f"{path}: {error}") from error
+
+
 def _parse(
     path: Path, source: ModelSource
 ) -> tuple[MultibodyPlant, SceneGraph, list[ModelInstanceIndex], list[str]]:
@@ -265,11 +261,8 @@ def _parse(
     instances, warnings = source.parse(plant, scene_graph)
     if not instances:
         raise ModelError(f"{path} holds no model")
-    try:
+    with _naming(path):
         make_drawable(plant, scene_graph, instances)
-    # Drake ends the process, which Python sees as SystemExit, at some values.
-    except (ModelError, RuntimeError, SystemExit) as error:
-        raise ModelError(f"{path}: {error}") from error
     return plant, scene_graph, instances, warnings
 
 
@@ -277,14 +270,11 @@ def _seen_meshes(
     path: Path, plant: MultibodyPlant, scene_graph: SceneGraph
 ) -> dict[str, TriangleMesh]:
     """The visual geometry of each link that has some."""
-    try:
+    with _naming(path):
         meshes = {
             name: body_mesh(plant, scene_graph, plant.get_body(BodyIndex(index)))
             for index, name in enumerate(link_names(plant))
         }
-    # Drake ends the process, which Python sees as SystemExit, at some values.
-    except (ModelError, RuntimeError, SystemExit) as error:
-        raise ModelError(f"{path}: {error}") from error
     meshes = {name: mesh for name, mesh in meshes.items() if not mesh.is_empty}
     if not meshes:
         raise ModelError(

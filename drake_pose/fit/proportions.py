@@ -154,12 +154,10 @@ class ProportionedBody(BodyParameters):
         """
         nodes, shares = self.kinematics.tree.nodes, self.joint_places(theta)
         factors = zip(nodes, self.factors(theta).tolist(), strict=True)
-        stretched = model.stretched({node.name: tuple(row) for node, row in factors})
-        shifted = stretched.with_shifted_joints(
-            {joint: tuple(shares[i] * self._rest[i]) for i, joint in self._joints.items()}
-        )
-        return shifted.with_moved_looks(
-            {nodes[i].name: tuple(-shares[i] * self._along[i]) for i in self._joints}
+        return model.reshaped(
+            factors={node.name: tuple(row) for node, row in factors},
+            shifts={joint: tuple(shares[i] * self._rest[i]) for i, joint in self._joints.items()},
+            moves={nodes[i].name: tuple(-shares[i] * self._along[i]) for i in self._joints},
         )
 
     def joint_places(self, theta: Array) -> Array:

@@ -34,7 +34,7 @@ def test_a_link_without_looks_is_drawn_by_nobody(tmp_path):
 def test_a_body_stretched_alike_everywhere_is_seen_larger(tmp_path):
     model = forked_body(tmp_path)
     q = np.array([0.1, 1.2, -0.8])
-    double = model.stretched({name: (2.0, 2.0, 2.0) for name in model.link_names})
+    double = model.reshaped(factors={name: (2.0, 2.0, 2.0) for name in model.link_names})
     assert area(double, q) == pytest.approx(area(model, q, scale=2.0), rel=0.02)
     assert area(double, q) > 3.5 * area(model, q)
     tree, larger = model.pose_tree(), double.pose_tree()

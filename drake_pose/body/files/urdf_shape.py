@@ -1,4 +1,4 @@
-"""Changes of a URDF model's shape, made in its cured text: parts not drawn, parts stretched."""
+"""Changes of a URDF model's shape, made in its text: parts hidden, stretched, moved, re-zeroed."""
 
 from __future__ import annotations
 
@@ -11,96 +11,49 @@ from scipy.spatial.transform import Rotation
 
 from drake_pose.body.files.xml_files import xml_text
 
-Factors = Mapping[str, Sequence[float]]
-"""For links by name, so many times (3,) a link's size along its frame's axes."""
+Vectors = Mapping[str, Sequence[float]]
+"""(3,) by the name of a link or joint."""
+
+_NOTHING: Vectors = {}
 
 
-def without_visuals(text: str, links: Collection[str]) -> str:
-    """A URDF text in which some links have no looks."""
+def reshaped(
+    text: str,
+    *,
+    hidden: Collection[str] = (),
+    factors: Vectors = _NOTHING,
+    moves: Vectors = _NOTHING,
+    shifts: Vectors = _NOTHING,
+    zeros: Mapping[str, float] | None = None,
+) -> str:
+    """A URDF text in which links and joints are otherwise.
+
+    Args:
+        hidden: links without looks.
+        factors: so many times a link's size along its frame's axes, with the joints that it
+            carries. A shape that is no mesh is stretched as its kind allows: spheres and capsules
+            by the mean.
+        moves: how far a link's looks, and the joints that it carries, lie elsewhere on it [m].
+        shifts: how far a joint stands elsewhere on its parent link [m].
+        zeros: by how much a joint stands further where it reads the same [rad or m]: its origin is
+            turned about its axis, or shifted along it; its limits stay in place.
+    """
     root = ElementTree.fromstring(text)
     for link in root.iterfind("link"):
-        if link.get("name") in links:
-            for visual in link.findall("visual"):
+        name = link.get("name", "")
+        for visual in link.findall("visual"):
+            if name in hidden:
                 link.remove(visual)
-    return xml_text(root)
-
-
-def stretched(text: str, factors: Factors) -> str:
-    """A URDF text in which some links are longer or wider, with the joints that they carry.
-
-    A shape that is no mesh is stretched as its kind allows: spheres and capsules by the mean.
-    """
-    root = ElementTree.fromstring(text)
-    for link in root.iterfind("link"):
-        factor = factors.get(link.get("name", ""))
-        if factor is None:
-            continue
-        for visual in link.iterfind("visual"):
-            origin = visual.find("origin")
-            turned = origin is not None and any(_numbers(origin.get("rpy", "0 0 0")))
-            _stretch_origin(visual, factor)
-            mean = float(np.prod(factor)) ** (1.0 / 3.0)
-            for shape in visual.iterfind("geometry/*"):
-                _stretch_shape(shape, [mean] * 3 if turned else factor)
+                continue
+            if name in factors:
+                _stretch_shapes(visual, np.array(factors[name]))
+            _place(visual, factors.get(name), moves.get(name))
     for joint in root.iterfind("joint"):
         parent = joint.find("parent")
-        factor = None if parent is None else factors.get(parent.get("link", ""))
-        if factor is not None:
-            _stretch_origin(joint, factor)
-    return xml_text(root)
-
-
-def with_zeros(text: str, zeros: Mapping[str, float]) -> str:
-    """A URDF text in which joints stand further by constants [rad or m] where they read the same.
-
-    Each joint's origin is turned about its axis, or shifted along it; its limits stay in place.
-    """
-    root = ElementTree.fromstring(text)
-    for joint in root.iterfind("joint"):
-        zero = zeros.get(joint.get("name", ""))
-        if not zero:
-            continue
-        axis_element = joint.find("axis")
-        axis = np.array(_numbers("1 0 0" if axis_element is None else axis_element.get("xyz", "")))
-        axis /= np.linalg.norm(axis)
-        origin = _origin(joint)
-        R = Rotation.from_euler("xyz", _numbers(origin.get("rpy", "0 0 0")))
-        if joint.get("type") == "prismatic":
-            _move(origin, R.apply(zero * axis))
-        else:
-            turned = R * Rotation.from_rotvec(zero * axis)
-            origin.set("rpy", _text(turned.as_euler("xyz")))
-        limit = joint.find("limit")
-        for end in ("lower", "upper"):
-            if limit is not None and joint.get("type") != "continuous" and end in limit.attrib:
-                limit.set(end, _text(np.array([float(limit.get(end, "0")) - zero])))
-    return xml_text(root)
-
-
-def with_shifted_joints(text: str, shifts: Mapping[str, Sequence[float]]) -> str:
-    """A URDF text in which joints stand elsewhere: (3,) along their parent links' axes [m]."""
-    root = ElementTree.fromstring(text)
-    for joint in root.iterfind("joint"):
-        shift = shifts.get(joint.get("name", ""))
-        if shift is not None:
-            _move(_origin(joint), shift)
-    return xml_text(root)
-
-
-def with_moved_looks(text: str, moves: Mapping[str, Sequence[float]]) -> str:
-    """A URDF text in which links look elsewhere, their joints too: (3,) along their axes [m]."""
-    root = ElementTree.fromstring(text)
-    moved = [
-        (visual, moves.get(link.get("name", "")))
-        for link in root.iterfind("link")
-        for visual in link.iterfind("visual")
-    ]
-    for joint in root.iterfind("joint"):
-        parent = joint.find("parent")
-        moved.append((joint, None if parent is None else moves.get(parent.get("link", ""))))
-    for element, move in moved:
-        if move is not None:
-            _move(_origin(element), move)
+        name, link_name = joint.get("name", ""), "" if parent is None else parent.get("link", "")
+        _place(joint, factors.get(link_name), shifts.get(name), moves.get(link_name))
+        if zeros and zeros.get(name):
+            _turn(joint, zeros[name])
     return xml_text(root)
 
 
@@ -133,18 +86,43 @@ def with_base_joints(text: str, place: Sequence[float], rpy: Sequence[float]) ->
         ElementTree.SubElement(joint, "limit", {**limit, "effort": "1", "velocity": "1"})
         parent = f"{name}_link"
     # The axes along which it moves are the world's; how it is turned comes after them.
-    _origin(root.findall("joint")[-6]).set("xyz", _text(np.array(place)))
+    ElementTree.SubElement(root.findall("joint")[-6], "origin", xyz=_text(place))
     for base in bases:
         joint = ElementTree.SubElement(root, "joint", name=f"free_{base}", type="fixed")
         ElementTree.SubElement(joint, "parent", link=parent)
         ElementTree.SubElement(joint, "child", link=str(base))
-        ElementTree.SubElement(joint, "origin", rpy=_text(np.array(rpy)))
+        ElementTree.SubElement(joint, "origin", rpy=_text(rpy))
     return xml_text(root)
 
 
-def _move(origin: ElementTree.Element, move: Sequence[float] | NDArray[np.float64]) -> None:
-    """Moves an origin by (3,) [m]."""
-    origin.set("xyz", _text(np.array(_numbers(origin.get("xyz", "0 0 0"))) + move))
+def _place(
+    element: ElementTree.Element,
+    factor: Sequence[float] | None,
+    *moves: Sequence[float] | NDArray[np.float64] | None,
+) -> None:
+    """Stretch an element's place (3,), then move it."""
+    given = [np.array(move) for move in moves if move is not None]
+    if factor is None and not given:
+        return
+    place = np.array(_numbers(_origin(element).get("xyz", "0 0 0")))
+    place = place if factor is None else place * factor
+    _origin(element).set("xyz", _text(sum(given, start=place)))
+
+
+def _turn(joint: ElementTree.Element, zero: float) -> None:
+    """Let a joint stand further by a constant [rad or m] where it reads the same."""
+    axis_element = joint.find("axis")
+    axis = np.array(_numbers("1 0 0" if axis_element is None else axis_element.get("xyz", "")))
+    axis /= np.linalg.norm(axis)
+    R = Rotation.from_euler("xyz", _numbers(_origin(joint).get("rpy", "0 0 0")))
+    if joint.get("type") == "prismatic":
+        _place(joint, None, R.apply(zero * axis))
+    else:
+        _origin(joint).set("rpy", _text((R * Rotation.from_rotvec(zero * axis)).as_euler("xyz")))
+    limit = joint.find("limit")
+    for end in ("lower", "upper"):
+        if limit is not None and joint.get("type") != "continuous" and end in limit.attrib:
+            limit.set(end, _text([float(limit.get(end, "0")) - zero]))
 
 
 def _origin(element: ElementTree.Element) -> ElementTree.Element:
@@ -153,29 +131,25 @@ def _origin(element: ElementTree.Element) -> ElementTree.Element:
     return ElementTree.SubElement(element, "origin") if origin is None else origin
 
 
-def _stretch_origin(element: ElementTree.Element, factor: Sequence[float]) -> None:
-    """Moves what stands on a link."""
-    origin = element.find("origin")
-    if origin is not None and "xyz" in origin.attrib:
-        origin.set("xyz", _text(np.array(_numbers(origin.get("xyz", ""))) * factor))
-
-
-def _stretch_shape(shape: ElementTree.Element, factor: Sequence[float]) -> None:
-    """Makes a shape larger."""
-    mean = float(np.prod(factor)) ** (1.0 / 3.0)
-    for name, by in (
-        ("scale", factor), ("size", factor), ("a", factor[:1]), ("b", factor[1:2]),
-        ("c", factor[2:]), ("radius", [mean]), ("length", [factor[2]]),
-    ):  # fmt: skip
-        if name in shape.attrib:
-            shape.set(name, _text(np.array(_numbers(shape.get(name, ""))) * by))
-        elif name == "scale" and shape.tag.removeprefix("drake:") == "mesh":
-            shape.set(name, _text(np.array(factor)))
+def _stretch_shapes(visual: ElementTree.Element, factor: NDArray[np.float64]) -> None:
+    """Make what a visual shows larger; where it is turned, by the mean."""
+    mean = [float(np.prod(factor)) ** (1.0 / 3.0)]
+    if any(_numbers(_origin(visual).get("rpy", "0 0 0"))):
+        factor = np.array(mean * 3)
+    for shape in visual.iterfind("geometry/*"):
+        if shape.tag.removeprefix("drake:") == "mesh":
+            shape.attrib.setdefault("scale", "1 1 1")
+        for name, by in (
+            ("scale", factor), ("size", factor), ("a", factor[:1]), ("b", factor[1:2]),
+            ("c", factor[2:]), ("radius", mean), ("length", factor[2:]),
+        ):  # fmt: skip
+            if name in shape.attrib:
+                shape.set(name, _text(np.array(_numbers(shape.get(name, ""))) * by))
 
 
 def _numbers(text: str) -> list[float]:
     return [float(number) for number in text.split()]
 
 
-def _text(numbers: np.ndarray) -> str:
+def _text(numbers: Sequence[float] | NDArray[np.float64]) -> str:
     return " ".join(repr(float(number)) for number in numbers)

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_pose.body.files.urdf_shape import with_shifted_joints, with_zeros
+from drake_pose.body.files.urdf_shape import reshaped
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.jobs.estimate.person_choice import missing_for_person
@@ -105,7 +105,7 @@ def find_zeros(
     seen = cameras[0].seen_object
     shifts = joint_shifts(tree, found)
     if shifts:
-        model = model.with_shifted_joints(shifts)
+        model = model.reshaped(shifts=shifts)
     if standing is not None and seen is not None:
         standing = standing.before(model)
         seen = standing.moved_pose(seen, found.object_values, found.object_covariance)
@@ -156,8 +156,9 @@ def corrected_urdf(
     if folder is None or not inputs.model.changes_shape or not (found.zeros or found.lengths):
         return None
     zeros = {zero.name: zero.value for zero in found.zeros if zero.determined}
-    text = with_zeros(model.read_text(encoding="utf-8"), zeros)
-    root = ElementTree.fromstring(with_shifted_joints(text, joint_shifts(tree, found)))
+    text = model.read_text(encoding="utf-8")
+    shifts = joint_shifts(tree, found)
+    root = ElementTree.fromstring(reshaped(text, zeros=zeros, shifts=shifts))
     for mesh in root.iter("mesh"):
         name = mesh.get("filename", "")
         if "://" not in name:

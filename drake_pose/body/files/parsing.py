@@ -40,8 +40,6 @@ _VARIABLE = re.compile(r"'[^']*'|-?\d[\d.e+-]*")
 _ABOUT_INERTIA = ("invalid inertia", "parsing inertia matrix", "as central inertia")
 # Some of Drake's messages hold whole files.
 _LONGEST_REASON = 1000
-# Directives that name a file.
-_NAMES_A_FILE = ("add_model", "add_directives")
 
 
 class ModelSource:
@@ -231,39 +229,19 @@ def _cure_directives(path: Path, finder: FileFinder, cure_file: Callable[[Path],
 
 
 def _files(node: yaml.Node) -> Iterator[tuple[str, yaml.ScalarNode]]:
-    """The scalars that name a file, each once, and the directive they belong to."""
-    waiting, seen = [node], set()
+    """The scalars that name a file, each once, and the directive that they belong to."""
+    waiting, seen = [("", node)], set()
     while waiting:
-        node = waiting.pop()
-        if id(node) in seen:
-            continue
-        seen.add(id(node))
-        if isinstance(node, yaml.SequenceNode):
-            waiting += reversed(node.value)
-        if not isinstance(node, yaml.MappingNode):
-            continue
-        for key, value in node.value:
-            waiting.append(value)
-            if key.value in _NAMES_A_FILE:
-                for scalar in _values_of_file(value):
-                    if id(scalar) not in seen:
-                        seen.add(id(scalar))
-                        yield key.value, scalar
-
-
-def _values_of_file(node: yaml.Node) -> Iterator[yaml.ScalarNode]:
-    """The values of the key ``file`` in a mapping, those it merges (<<) among them."""
-    waiting, seen = [node], set()
-    while waiting:
-        node = waiting.pop()
+        directive, node = waiting.pop()
         if id(node) in seen or isinstance(node, yaml.ScalarNode):
             continue
         seen.add(id(node))
         if isinstance(node, yaml.SequenceNode):
-            waiting += node.value
+            waiting += [(directive, one) for one in reversed(node.value)]
             continue
         for key, value in node.value:
-            if key.value == "file" and isinstance(value, yaml.ScalarNode):
-                yield value
-            elif key.value == "<<":
-                waiting.append(value)
+            if key.value != "file" or not isinstance(value, yaml.ScalarNode):
+                waiting.append((directive if key.value == "<<" else key.value, value))
+            elif id(value) not in seen:
+                seen.add(id(value))
+                yield directive, value

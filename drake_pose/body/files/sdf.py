@@ -5,17 +5,18 @@ from collections.abc import Callable
 from pathlib import Path
 
 from drake_pose.body.files.packages import FileFinder
-from drake_pose.body.files.urdf import mimic_warning
 from drake_pose.body.files.xml_files import (
     Warn,
-    close_loops,
     colour_text,
     leave_out,
+    leave_out_mimics,
+    open_loops,
     read_limits,
     read_numbers,
     read_xml,
     refuse_macros,
     require_scale,
+    require_shape,
     require_size,
     xml_text,
 )
@@ -31,8 +32,7 @@ _READ = {
     "joint": (
         "pose", "parent", "child", "axis", "axis2", "screw_thread_pitch", "thread_pitch",
     ),
-    "axis": ("xyz", "limit", "mimic", "use_parent_model_frame"),
-    "axis2": ("xyz", "limit", "mimic", "use_parent_model_frame"),
+    **dict.fromkeys(("axis", "axis2"), ("xyz", "limit", "mimic", "use_parent_model_frame")),
     "limit": ("lower", "upper"),
 }  # fmt: skip
 _KNOWN = (
@@ -141,10 +141,7 @@ def _check_visual(visual: ElementTree.Element, where: str, path: Path, finder: F
                 material.remove(colour)
     for shape in visual.findall("geometry/*"):
         kind = shape.tag.removeprefix("drake:")
-        if kind not in _SIZES:
-            raise ModelError(
-                f"{where}: the shape <{shape.tag}> cannot be drawn; use one of {', '.join(_SIZES)}"
-            )
+        require_shape(kind, _SIZES, where)
         # SDFormat's own reader takes sizes that cannot be for 1 m.
         for name, count in _SIZES[kind]:
             for size in shape.iterfind(name):
@@ -179,8 +176,7 @@ def _leave_out_constraints(model: ElementTree.Element, warn: Warn) -> None:
     ends = [
         [(joint.findtext(end) or "").strip() for end in ("parent", "child")] for joint in joints
     ]
-    for joint in close_loops(joints, ends, warn):
-        model.remove(joint)
+    open_loops(model, joints, ends, warn)
 
 
 def _check_joint(joint: ElementTree.Element, warn: Warn) -> Limits:
@@ -195,9 +191,7 @@ def _check_joint(joint: ElementTree.Element, warn: Warn) -> Limits:
                 numbers = read_numbers(axis.findtext("xyz"), 3, f"joint '{name}': its <xyz>")
                 if not any(numbers):
                     raise ModelError(f"joint '{name}': its axis is zero")
-            for mimic in axis.findall("mimic"):
-                warn(mimic_warning(name, mimic.get("joint", "")))
-                axis.remove(mimic)
+            leave_out_mimics(axis, name, warn)
             texts = [axis.findtext(f"limit/{side}") for side in ("lower", "upper")]
             lower, upper = read_limits(texts[0], texts[1], name)
             if tag in suffixes.get(kind, {}) and lower is not None and upper is not None:

@@ -13,14 +13,16 @@ from drake_pose.body.files.packages import FileFinder
 from drake_pose.body.files.xml_files import (
     OLD_XACRO_ELEMENTS,
     Warn,
-    close_loops,
     colour_text,
     leave_out,
+    leave_out_mimics,
+    open_loops,
     read_limits,
     read_numbers,
     read_xml,
     refuse_macros,
     require_scale,
+    require_shape,
     require_size,
     xml_text,
 )
@@ -69,8 +71,7 @@ def cure_urdf(path: Path, finder: FileFinder, warn: Warn) -> str:
             _check_visual(visual, f"link '{link.get('name')}'", path, finder)
     joints = _joints(root)
     ends = [[_end(joint, end) for end in ("parent", "child")] for joint in joints]
-    for joint in close_loops(joints, ends, warn):
-        root.remove(joint)
+    open_loops(root, joints, ends, warn)
     for joint in _joints(root):
         _check_joint(joint, warn)
     return xml_text(root)
@@ -132,9 +133,7 @@ def _check_visual(visual: ElementTree.Element, where: str, path: Path, finder: F
         raise ModelError(f"{where}: a <visual> without a shape in its <geometry>")
     for shape in shapes:
         kind = shape.tag.removeprefix("drake:")
-        if kind not in _SIZES:
-            known = ", ".join(_SIZES)
-            raise ModelError(f"{where}: there is no shape <{shape.tag}>; there is: {known}")
+        require_shape(kind, _SIZES, where)
         for name, count, zero in _SIZES[kind]:
             require_size(shape.get(name), count, f"{where}: {name} of its {kind}", zero=zero)
         if kind == "mesh":
@@ -172,9 +171,7 @@ def _check_joint(joint: ElementTree.Element, warn: Warn) -> None:
         for name_of_rate in ("effort", "drake:acceleration"):
             limit.attrib.pop(name_of_rate, None)
         _check_velocity(limit, name)
-    for mimic in joint.findall("mimic"):
-        warn(mimic_warning(name, mimic.get("joint", "")))
-        joint.remove(mimic)
+    leave_out_mimics(joint, name, warn)
 
 
 def _check_velocity(limit: ElementTree.Element, name: str) -> None:
@@ -188,14 +185,6 @@ def _check_velocity(limit: ElementTree.Element, name: str) -> None:
         raise ModelError(f"joint '{name}': velocity limit {text} is negative; give 0 or more")
     if not math.isfinite(velocity):
         del limit.attrib["velocity"]
-
-
-def mimic_warning(follower: str, leader: str) -> str:
-    """What is said of a joint that is written to follow another one."""
-    return (
-        f"joint '{follower}' is written to follow joint '{leader}' (<mimic>): not enforced, it is "
-        "searched by itself"
-    )
 
 
 def _give_colours(root: ElementTree.Element) -> None:

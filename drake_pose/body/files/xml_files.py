@@ -117,6 +117,12 @@ def require_scale(text: str, count: int, where: str) -> None:
         raise ModelError(f"{where} is '{text}'; no factor may be 0")
 
 
+def require_shape(kind: str, known: Collection[str], where: str) -> None:
+    """Refuse a kind of shape that cannot be drawn; ``where`` names the link."""
+    if kind not in known:
+        raise ModelError(f"{where}: there is no shape <{kind}>; there is: {', '.join(known)}")
+
+
 def read_limits(
     lower_text: str | None, upper_text: str | None, name: str
 ) -> tuple[float | None, float | None]:
@@ -163,12 +169,16 @@ def leave_out(
                 warn(f"{element.tag}{name}: the element <{child.tag}> is not known and left out")
 
 
-def close_loops(
+def open_loops(
+    model: ElementTree.Element,
     joints: Sequence[ElementTree.Element],
     ends: Sequence[Sequence[str]],
     warn: Warn,
-) -> list[ElementTree.Element]:
-    """The joints that close a loop of links, told to ``warn``; ``ends``: the two links of each."""
+) -> None:
+    """Remove the joints of a model that close a loop; ``ends`` are the two links of each."""
+    # First the joint that names a link as its child first: Drake cannot turn every kind over.
+    children = [child for _, child in ends]
+    order = sorted(range(len(joints)), key=lambda i: children[i] in children[:i])
     group: dict[str, str] = {}
 
     def find(link: str) -> str:
@@ -176,25 +186,26 @@ def close_loops(
             link = group[link]
         return link
 
-    # First the joint that names a link as its child first: Drake cannot turn every kind over.
-    children: set[str] = set()
-    first: list[tuple[ElementTree.Element, str, str]] = []
-    later: list[tuple[ElementTree.Element, str, str]] = []
-    for joint, (parent, child) in zip(joints, ends, strict=True):
-        (later if child in children else first).append((joint, parent, child))
-        children.add(child)
-    closing = []
-    for joint, parent, child in first + later:
-        one, other = find(parent), find(child)
+    for index in order:
+        one, other = map(find, ends[index])
         if one != other:
             group[other] = one
             continue
-        closing.append(joint)
+        model.remove(joints[index])
         warn(
-            f"joint '{joint.get('name')}' closes a loop of links at '{child}': not enforced, it is "
-            "left out"
+            f"joint '{joints[index].get('name')}' closes a loop of links at '{children[index]}': "
+            "not enforced, it is left out"
         )
-    return closing
+
+
+def leave_out_mimics(joint: ElementTree.Element, name: str, warn: Warn) -> None:
+    """Remove what lets a joint follow another one."""
+    for mimic in joint.findall("mimic"):
+        joint.remove(mimic)
+        warn(
+            f"joint '{name}' is written to follow joint '{mimic.get('joint', '')}' (<mimic>): not "
+            "enforced, it is searched by itself"
+        )
 
 
 def refuse_macros(root: ElementTree.Element) -> None:

@@ -79,7 +79,7 @@ def test_joints_that_couple_others_are_named(tmp_path):
         (sdf(link("a", "<sphere><radius>-1</radius></sphere>")), "link 'a': radius of its sphere"),
         (sdf(link("a", "<box><size>0 1 1</size></box>")), "link 'a': size of its box"),
         (sdf(link("a", "<cylinder><radius>x</radius></cylinder>")), "link 'a': radius of its cyl"),
-        (sdf(link("a", "<cone><radius>1</radius></cone>")), "link 'a': the shape <cone>"),
+        (sdf(link("a", "<cone><radius>1</radius></cone>")), "link 'a': there is no shape <cone>"),
         (sdf(link("a", "<mesh><uri>gone.stl</uri></mesh>")), "link 'a': mesh 'gone.stl'"),
         (sdf(link("a", "<mesh/>")), "link 'a': a mesh without a <uri>"),
         (

@@ -5,18 +5,19 @@ each point follows the joints by its weight, from 0 at the parent's end to 1 at 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.common.yaml import yaml_load_typed
 
 from drake_pose.body.surfaces.mesh import TriangleMesh, is_watertight
 from drake_pose.body.surfaces.mesh_files import read_mesh_file
 from drake_pose.errors import ModelError, UnknownNameError
+from drake_pose.yaml_files import read_yaml
 
-_LARGEST_FILE = 1 << 20
+_FIELDS = ("parent", "child", "mesh", "axis", "begin", "end", "colour")
 _COLOUR = (0.8, 0.8, 0.8)
 
 
@@ -43,24 +44,6 @@ class SkinBand:
         object.__setattr__(self, "weights", weights)
 
 
-@dataclass
-class _BandEntry:
-    """A band as a skin file writes it; lists, because Drake's reader knows no tuples."""
-
-    parent: str = ""
-    child: str = ""
-    mesh: str = ""
-    axis: list[float] = field(default_factory=list)
-    begin: float = 0.0
-    end: float = 0.0
-    colour: list[float] = field(default_factory=lambda: list(_COLOUR))
-
-
-@dataclass
-class _SkinFile:
-    bands: list[_BandEntry] = field(default_factory=list)
-
-
 def skin_file(model_path: Path) -> Path:
     """Where a model's skin is declared: ``woman.skin.yaml`` beside ``woman.urdf``."""
     return model_path.with_suffix(".skin.yaml")
@@ -81,7 +64,13 @@ def load_skin(model_path: Path, link_names: Sequence[str]) -> tuple[SkinBand, ..
     path = skin_file(model_path)
     if not path.is_file():
         return ()
-    bands = [_make_band(path, entry, link_names) for entry in _read_file(path).bands]
+    content = read_yaml(path, ModelError)
+    entries = content.get("bands") if isinstance(content, dict) and len(content) == 1 else None
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise ModelError(f"{path}: not a skin file (a list 'bands')")
+    if not entries:
+        raise ModelError(f"{path}: declares no band; add one under 'bands' or remove the file")
+    bands = [_make_band(path, entry, link_names) for entry in entries]
     pairs = [(band.parent, band.child) for band in bands]
     for parent, child in pairs:
         if pairs.count((parent, child)) > 1:
@@ -89,61 +78,43 @@ def load_skin(model_path: Path, link_names: Sequence[str]) -> tuple[SkinBand, ..
     return tuple(bands)
 
 
-def _read_file(path: Path) -> _SkinFile:
-    """The file's entries as they are written."""
-    try:
-        if path.stat().st_size > _LARGEST_FILE:
-            raise ModelError(f"{path}: larger than {_LARGEST_FILE} bytes, which is not expected")
-        text = path.read_text(encoding="utf-8")
-        content = yaml_load_typed(schema=_SkinFile, data=text)
-    except OSError as error:
-        raise ModelError(f"{path}: cannot read it: {error.strerror}") from error
-    except _reader_errors() as error:
-        reason = " ".join(str(error).split())
-        raise ModelError(f"{path}: not a skin file (a list 'bands'): {reason}") from error
-    if not isinstance(content, _SkinFile) or not content.bands:
-        raise ModelError(f"{path}: declares no band; add one under 'bands' or remove the file")
-    return content
-
-
-def _reader_errors() -> tuple[type[Exception], ...]:
-    """What Drake's YAML reader raises for broken files."""
-    from yaml import YAMLError
-
-    return (
-        YAMLError,
-        AssertionError,
-        AttributeError,
-        RecursionError,
-        RuntimeError,
-        TypeError,
-        ValueError,
-    )
-
-
-def _make_band(path: Path, entry: _BandEntry, link_names: Sequence[str]) -> SkinBand:
+def _make_band(path: Path, entry: dict[str, Any], link_names: Sequence[str]) -> SkinBand:
     """One band, after checks."""
-    where = f"{path}: band '{entry.parent}' - '{entry.child}'"
-    for link in (entry.parent, entry.child):
+    given = {"parent": "", "child": "", "mesh": "", "colour": _COLOUR, "begin": 0.0, "end": 0.0}
+    given |= {"axis": (), **entry}
+    parent, child, mesh_name = (str(given[name]) for name in ("parent", "child", "mesh"))
+    where = f"{path}: band '{parent}' - '{child}'"
+    unknown = [str(name)[:40] for name in entry if name not in _FIELDS]
+    if unknown:
+        raise ModelError(f"{where}: unknown field {unknown[0]}; a band has {', '.join(_FIELDS)}")
+    for link in (parent, child):
         if link not in link_names:
             raise UnknownNameError("link", link, link_names, str(path))
-    if entry.parent == entry.child:
+    if parent == child:
         raise ModelError(f"{where}: parent and child must be two links")
-    axis = np.array(entry.axis, dtype=np.float64)
-    if axis.shape != (3,) or not np.all(np.isfinite(axis)) or not axis.any():
+    axis, colour = _numbers(given["axis"]), _numbers(given["colour"])
+    if axis.shape != (3,) or not axis.any():
         raise ModelError(f"{where}: axis must be three finite numbers, not all zero")
-    if not (np.isfinite([entry.begin, entry.end]).all() and entry.begin < entry.end):
+    reach = _numbers([given["begin"], given["end"]])
+    if len(reach) != 2 or not reach[0] < reach[1]:
         raise ModelError(f"{where}: give begin and end along the axis [m], begin below end")
-    colour = np.array(entry.colour, dtype=np.float64)
     if colour.shape != (3,) or not np.all((colour >= 0.0) & (colour <= 1.0)):
         raise ModelError(f"{where}: colour must be three numbers from 0 to 1")
-    if not entry.mesh:
+    if not mesh_name:
         raise ModelError(f"{where}: name its mesh")
-    mesh = read_mesh_file(path.parent / entry.mesh)
+    mesh = read_mesh_file(path.parent / mesh_name)
     if not is_watertight(mesh):
-        raise ModelError(f"{where}: {entry.mesh} is not closed; close the band's ends")
+        raise ModelError(f"{where}: {mesh_name} is not closed; close the band's ends")
     along = mesh.vertices @ (axis / np.linalg.norm(axis))
-    share = np.clip((along - entry.begin) / (entry.end - entry.begin), 0.0, 1.0)
-    weights = share**2 * (3.0 - 2.0 * share)
+    share = np.clip((along - reach[0]) / (reach[1] - reach[0]), 0.0, 1.0)
     red, green, blue = colour.tolist()
-    return SkinBand(entry.parent, entry.child, mesh, weights, (red, green, blue))
+    return SkinBand(parent, child, mesh, share**2 * (3.0 - 2.0 * share), (red, green, blue))
+
+
+def _numbers(value: Any) -> NDArray[np.float64]:
+    """Finite numbers as an array; an empty one for anything else."""
+    try:
+        numbers = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        return np.zeros(0)
+    return numbers if np.all(np.isfinite(numbers)) else np.zeros(0)

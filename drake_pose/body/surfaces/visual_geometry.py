@@ -1,6 +1,6 @@
 """What Drake draws, read back from SceneGraph (perception role): visual geometry as triangles.
 
-Primitive shapes have the vertices of Drake's VTK renderer. Sources: RobotLocomotion/drake
+Primitive shapes have the surface of Drake's VTK renderer. Sources: RobotLocomotion/drake
 ``geometry/render_vtk/internal_render_engine_vtk_base.cc`` (resolutions), Kitware/VTK
 ``vtkTexturedSphereSource`` and ``vtkCylinderSource`` (vertices).
 """
@@ -157,53 +157,44 @@ def _box_mesh(width: float, depth: float, height: float) -> TriangleMesh:
     return TriangleMesh(corners * (width, depth, height), np.array(triangles, dtype=np.int32))
 
 
+def _round_mesh(
+    radii: NDArray[np.float64], heights: NDArray[np.float64], first: float = 0.0
+) -> TriangleMesh:
+    """A surface about z, closed between rings of radii (n,) at heights (n,) [m], the highest first.
+
+    The first vertex of each ring lies at the angle ``first`` [rad] from x.
+    """
+    angle = first + np.arange(_VTK_RESOLUTION) * (2.0 * np.pi / _VTK_RESOLUTION)
+    level = np.broadcast_to(heights[:, None], (len(heights), _VTK_RESOLUTION))
+    points = np.stack([np.outer(radii, np.cos(angle)), np.outer(radii, np.sin(angle)), level], -1)
+    index = np.arange(level.size).reshape(level.shape)
+    above, below = index[:-1], index[1:]
+    above_next, below_next = np.roll(above, -1, axis=1), np.roll(below, -1, axis=1)
+    triangles = [(above, below, below_next), (above, below_next, above_next)]
+    corners = np.concatenate([np.stack(three, axis=-1).reshape(-1, 3) for three in triangles])
+    return merge_duplicate_vertices(TriangleMesh(points.reshape(-1, 3), corners.astype(np.int32)))
+
+
 def _ellipsoid_mesh(a: float, b: float, c: float) -> TriangleMesh:
     """An ellipsoid with half axes a, b, c [m] along x, y and z."""
     polar = np.linspace(0.0, np.pi, _VTK_RESOLUTION + 1)
-    azimuth = np.arange(_VTK_RESOLUTION) * (2.0 * np.pi / _VTK_RESOLUTION)
-    return _closed_rings(_sphere_points(polar, azimuth) * (a, b, c))
+    sine = np.sin(polar)
+    sine[[0, -1]] = 0.0  # Both poles are exact.
+    ball = _round_mesh(sine, np.cos(polar))
+    return TriangleMesh(ball.vertices * (a, b, c), ball.triangles)
 
 
 def _cylinder_mesh(radius: float, length: float) -> TriangleMesh:
     """A cylinder along z, centred at the origin, of the given radius and length [m]."""
     # Drake turns VTK's cylinder a quarter about its axis, so the first vertex lies on y.
-    angle = np.pi / 2.0 + np.arange(_VTK_RESOLUTION) * (2.0 * np.pi / _VTK_RESOLUTION)
-    rim = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros_like(angle)], axis=-1)
-    half = np.array([0.0, 0.0, length / 2.0])
-    top, bottom = rim + half, rim - half
-    # A ring that is one single vertex of the rim turns the quads next to it into the cap's fan.
-    fans = (np.broadcast_to(top[0], top.shape), np.broadcast_to(bottom[0], bottom.shape))
-    return _closed_rings(np.stack([fans[0], top, bottom, fans[1]]))
+    half = 0.5 * length
+    radii = np.array([0.0, radius, radius, 0.0])
+    return _round_mesh(radii, np.array([half, half, -half, -half]), np.pi / 2.0)
 
 
 def _capsule_mesh(radius: float, length: float) -> TriangleMesh:
     """A capsule along z, centred at the origin; length [m] is that of its cylindrical part."""
     quarter = np.linspace(0.0, np.pi / 2.0, _VTK_RESOLUTION - 1)
-    azimuth = np.pi / 2.0 + np.arange(_VTK_RESOLUTION) * (2.0 * np.pi / _VTK_RESOLUTION)
-    upper = radius * _sphere_points(quarter, azimuth) + (0.0, 0.0, length / 2.0)
-    lower = (upper * (1.0, 1.0, -1.0))[::-1]
-    return _closed_rings(np.concatenate([upper, lower]))
-
-
-def _sphere_points(
-    polar: NDArray[np.float64], azimuth: NDArray[np.floating]
-) -> NDArray[np.float64]:
-    """Points (polar, azimuth, 3) of the unit sphere; both poles are exact."""
-    sine = np.where(np.isin(polar, (0.0, np.pi)), 0.0, np.sin(polar))
-    height = np.broadcast_to(np.cos(polar)[:, None], (len(polar), len(azimuth)))
-    return np.stack([np.outer(sine, np.cos(azimuth)), np.outer(sine, np.sin(azimuth)), height], -1)
-
-
-def _closed_rings(points: NDArray[np.float64]) -> TriangleMesh:
-    """Triangles between rings of points (rings, points of a ring, 3); each ring is closed."""
-    rings, count, _ = points.shape
-    index = np.arange(rings * count).reshape(rings, count)
-    above, below = index[:-1], index[1:]
-    above_next, below_next = np.roll(above, -1, axis=1), np.roll(below, -1, axis=1)
-    triangles = np.concatenate(
-        [
-            np.stack([above, below, below_next], axis=-1).reshape(-1, 3),
-            np.stack([above, below_next, above_next], axis=-1).reshape(-1, 3),
-        ]
-    )
-    return merge_duplicate_vertices(TriangleMesh(points.reshape(-1, 3), triangles.astype(np.int32)))
+    radii, heights = radius * np.sin(quarter), radius * np.cos(quarter) + 0.5 * length
+    every = np.concatenate([radii, radii[::-1]]), np.concatenate([heights, -heights[::-1]])
+    return _round_mesh(*every, np.pi / 2.0)

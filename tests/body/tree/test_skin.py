@@ -165,7 +165,7 @@ def test_a_surface_is_the_rigid_part_and_the_band(tmp_path: Path) -> None:
         ({"colour": [2, 0, 0]}, "colour must be three numbers from 0 to 1"),
         ({"child": "upper"}, "parent and child must be two links"),
         ({"length": 3}, "length"),
-        ({"begin": "x"}, "not a skin file"),
+        ({"begin": "x"}, "begin below end"),
         ({"mesh": "open.obj"}, "not closed"),
     ],
 )

@@ -132,7 +132,7 @@ def describe_positions(
             turn = one_turn(lower[span], upper[span], defaults[span])
             warnings += _remarks(joint, names[span], wide, (lower[span], upper[span]), turn)
             free[span] = wide & periodic[span]
-            # Slides may say where the object stands: see unlimited_slides.
+            # Slides may say where the object stands: see tree_builder.
             slides = np.array([kind == "length" for kind in kinds[span]], dtype=np.bool_)
             lower[span] = np.where(wide, np.where(slides, -np.inf, turn[0]), lower[span])
             upper[span] = np.where(wide, np.where(slides, np.inf, turn[1]), upper[span])

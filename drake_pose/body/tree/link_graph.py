@@ -45,6 +45,10 @@ class JointEdge:
     positions: tuple[int, ...]
     joint_map: JointMap | None
 
+    def other(self, group: int) -> int:
+        """The group at its other end."""
+        return self.inner if group == self.outer else self.outer
+
 
 @dataclass(frozen=True)
 class LinkGraph:
@@ -56,6 +60,10 @@ class LinkGraph:
     def group_of(self, link: str) -> int:
         """The group that a link belongs to; the link must exist."""
         return next(index for index, group in enumerate(self.groups) if link in group.links)
+
+    def seen(self, group: int) -> bool:
+        """Whether a group has geometry."""
+        return not self.groups[group].mesh.is_empty
 
     def edges_at(self, group: int) -> list[JointEdge]:
         """The edges that end at a group."""

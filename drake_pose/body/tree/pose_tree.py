@@ -71,12 +71,52 @@ class PoseTreeNode:
 class NodePlacement:
     """How a node's values place it: X_PN = X_PA R(rotation values) step(values) step(values) ...
 
-    X_PA is (4, 4), the identity but for roots; ``rotation`` turns a root that has a RootRotation.
+    Attributes:
+        X_PA: (4, 4), the identity but for roots.
+        rotation: turns a root that has a RootRotation.
+        lower, upper: (k,) limits of the values [rad or m], equal where held, one turn where free.
+        defaults: (k,) [rad or m].
+        is_angle: (k,) bool, angles, else lengths.
+        periodic: (k,) bool, angles that look the same after a full turn.
+        turns_freely: (k,) bool, angles without limits that are searched.
     """
 
     X_PA: NDArray[np.float64]
     rotation: RootRotation | None
     steps: tuple[ChainStep, ...]
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+    defaults: NDArray[np.float64]
+    is_angle: NDArray[np.bool_]
+    periodic: NDArray[np.bool_]
+    turns_freely: NDArray[np.bool_]
+
+
+def place_node(
+    model: ParsedModel,
+    positions: Sequence[int],
+    held: Mapping[int, float],
+    X_PA: NDArray[np.float64],
+    rotation: RootRotation | None,
+    steps: tuple[ChainStep, ...],
+) -> NodePlacement:
+    """The placement of a node with these positions in q, or of a root that a rotation turns."""
+    if rotation is not None:
+        lower, upper = rotation.lower, rotation.upper
+        every, none = np.full(len(lower), True), np.full(len(lower), False)
+        limited = every if rotation.kind == "limited" else none
+        middle = 0.5 * (lower + upper)
+        return NodePlacement(X_PA, rotation, steps, lower, upper, middle, every, limited, none)
+    index = list(positions)
+    known = np.array([position in held for position in index], dtype=np.bool_)
+    values = np.array([held.get(position, 0.0) for position in index])
+    lower = np.where(known, values, model.lower[index])
+    upper = np.where(known, values, model.upper[index])
+    defaults = np.where(known, values, model.default_positions[index])
+    is_angle = np.array([model.position_kinds[i] != "length" for i in index], dtype=np.bool_)
+    free = model.turns_freely[index] & (lower < upper)
+    periodic = model.periodic[index]
+    return NodePlacement(X_PA, None, steps, lower, upper, defaults, is_angle, periodic, free)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,63 +190,39 @@ class PoseTree:
             UnknownNameError: ``intervals`` names something that does not exist.
         """
         intervals = self._checked_intervals(intervals or {}, interval, length_interval)
-        rotation = self.placements[node].rotation
-        if rotation is not None and rotation.kind == "free":
-            return even_rotations(rotation.interval or interval)
+        placement, names = self.placements[node], self.nodes[node].value_names
+        rotation = placement.rotation
+        if rotation is not None:
+            interval = rotation.interval or interval
+            if rotation.kind == "free":
+                return even_rotations(interval)
         lower, upper = self.value_bounds(node)
-        periodic = self._periodic(node)
         axes = []
-        for index, name in enumerate(self.nodes[node].value_names):
-            if rotation is not None:
-                spacing = rotation.interval or interval
+        for k, name in enumerate(names):
+            spacing = intervals.get(name, interval if placement.is_angle[k] else length_interval)
+            is_angle = bool(placement.periodic[k])
+            if lower[k] == upper[k]:
+                axes.append([float(lower[k])])
             else:
-                kind = self.model.position_kinds[self.nodes[node].positions[index]]
-                spacing = interval if kind == "angle" else length_interval
-            if lower[index] == upper[index]:
-                axes.append([float(lower[index])])
-                continue
-            spacing = intervals.get(name, spacing)
-            is_angle = bool(periodic[index])
-            axes.append(axis_samples(lower[index], upper[index], spacing, is_angle=is_angle))
+                axes.append(axis_samples(lower[k], upper[k], spacing, is_angle=is_angle))
         return product_grid(axes, self.nodes[node].name)
 
     def value_bounds(self, node: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Limits (k,) for the search [rad or m], or one turn about the default position."""
-        lower, upper = self._limits(node)
-        around = self.turns_around(node)
-        low, high = one_turn(lower, upper, self._default_values(node))
-        return np.where(around, low, lower), np.where(around, high, upper)
+        given, around = self.placements[node], self.turns_around(node)
+        low, high = one_turn(given.lower, given.upper, given.defaults)
+        return np.where(around, low, given.lower), np.where(around, high, given.upper)
 
     def value_limits(self, node: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Limits (k,) of a node's values [rad or m]; equal where held, infinite where free."""
-        lower, upper = self._limits(node)
-        if self.nodes[node].positions:
-            free = self.model.turns_freely[list(self.nodes[node].positions)] & (lower < upper)
-            lower[free], upper[free] = -np.inf, np.inf
-        return lower, upper
+        given = self.placements[node]
+        lower = np.where(given.turns_freely, -np.inf, given.lower)
+        return lower, np.where(given.turns_freely, np.inf, given.upper)
 
     def turns_around(self, node: int) -> NDArray[np.bool_]:
         """Which of a node's values (k,) are periodic angles whose limits leave every direction."""
-        return turns_around(*self._limits(node), self._periodic(node))
-
-    def _limits(self, node: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """As value_limits, but one turn of what turns freely."""
-        rotation = self.placements[node].rotation
-        if rotation is not None:
-            return np.array(rotation.lower), np.array(rotation.upper)
-        positions = list(self.nodes[node].positions)
-        lower, upper = self.model.lower[positions], self.model.upper[positions]
-        for index, position in enumerate(positions):
-            if position in self.held:
-                lower[index] = upper[index] = self.held[position]
-        return lower, upper
-
-    def _periodic(self, node: int) -> NDArray[np.bool_]:
-        """Which of a node's values (k,) are angles that look the same after a full turn."""
-        rotation = self.placements[node].rotation
-        if rotation is not None:
-            return np.full(len(rotation.lower), rotation.kind == "limited")
-        return self.model.periodic[list(self.nodes[node].positions)]
+        given = self.placements[node]
+        return turns_around(given.lower, given.upper, given.periodic)
 
     def relative_transforms(self, node: int, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """X_PN (n, 4, 4) in the parent (or W) at values (n, k); SettingsError for a wrong width."""
@@ -241,14 +257,7 @@ class PoseTree:
 
     def default_values(self) -> list[NDArray[np.float64]]:
         """Each node's values (k_i,) at the model's default positions and the root as given."""
-        return [self._default_values(node) for node in range(len(self.nodes))]
-
-    def _default_values(self, node: int) -> NDArray[np.float64]:
-        rotation = self.placements[node].rotation
-        if rotation is not None:
-            return np.array(0.5 * (rotation.lower + rotation.upper))
-        q = self.model.default_positions
-        return np.array([self.held.get(index, q[index]) for index in self.nodes[node].positions])
+        return [np.array(placement.defaults) for placement in self.placements]
 
     def positions_from(
         self, values: Sequence[NDArray[np.float64]]

@@ -74,13 +74,7 @@ class TreeKinematics:
         self.turns_around = np.concatenate([tree.turns_around(i) for i in range(len(counts))])
         self.lower = np.where(self.turns_around, -np.inf, lower)
         self.upper = np.where(self.turns_around, np.inf, upper)
-        kinds = [
-            [tree.model.position_kinds[position] != "length" for position in node.positions]
-            if node.positions
-            else [True] * len(node.value_names)
-            for node in tree.nodes
-        ]
-        self.is_angle = np.array([kind for group in kinds for kind in group], dtype=np.bool_)
+        self.is_angle = np.concatenate([placement.is_angle for placement in tree.placements])
         self.packed = _pack_tree(tree)
         self._moves = self._find_moves()
 

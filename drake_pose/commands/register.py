@@ -115,7 +115,8 @@ def audit(
 
 def _print_registration(result: SceneRegistration) -> None:
     """A row a frame and camera, then where each camera stands and how sure that is."""
-    from drake_pose.jobs.registration.result import CAMERAS, PARAMETERS, parameter_rows
+    from drake_pose.jobs.estimate.inputs import CAMERA_FILE
+    from drake_pose.jobs.registration.result import PARAMETERS, parameter_rows
     from drake_pose.results.folder import REPORT
 
     console = output_console()
@@ -161,7 +162,7 @@ def _print_registration(result: SceneRegistration) -> None:
                 escape(f"camera '{name}': a picture at {values} would tell its poses apart")
             )
     if result.folder is not None:
-        for label, file in (("cameras", CAMERAS), ("report", REPORT)):
+        for label, file in (("cameras", CAMERA_FILE), ("report", REPORT)):
             console.print(f"{label:<14} {escape(str(result.folder / file))}", soft_wrap=True)
 
 

@@ -192,7 +192,7 @@ def _recorded_rows(data: Path) -> Iterator[list[str]]:
         inputs = read_inputs(scene, model, scene / f"{joints}.csv", settings)
         body = RegistrationBody(inputs.tree)
         for camera in inputs.searched:
-            frames = inputs.frames[camera.name]
+            frames = inputs.of(camera.name)
             start = time.process_time()
             found = CameraSearch(body).register(camera, frames)
             seconds = time.process_time() - start

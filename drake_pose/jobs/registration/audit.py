@@ -19,17 +19,16 @@ from drake_pose.errors import MaskError, SceneError
 from drake_pose.jobs.estimate.inputs import make_tree, select_cameras, select_seen_frames
 from drake_pose.jobs.estimate.scene_checks import check_scene, frame_ranges
 from drake_pose.jobs.registration.positions import KnownPositions, read_known_positions
+from drake_pose.jobs.registration.result import describe_run, drawn, write_overlays
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.registration.contradictions import Audit, Finding, FrameAudit, audit_frames
 from drake_pose.registration.per_frame_fit import PerFrameFit
-from drake_pose.registration.posed_frames import SeenFrame
+from drake_pose.registration.posed_frames import PosedFrame, SeenFrame
 from drake_pose.registration.register import RegistrationBody
-from drake_pose.results.folder import OVERLAY, ResultFolder, require_empty
-from drake_pose.results.overlay import draw_overlay, encode_png
+from drake_pose.results.folder import ResultFolder, require_empty
 from drake_pose.results.settings import EstimateSettings
-from drake_pose.results.summary import file_digest, mask_digests, versions
+from drake_pose.results.summary import mask_digests
 from drake_pose.results.texts import percent
-from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import Scene, load_scene
 
 OnFrame = Callable[[int], None]
@@ -122,13 +121,7 @@ def audit_scene(
         )
     summary = {
         **_summarize(inputs, found),
-        "seconds": seconds,
-        "warnings": warnings,
-        "scene": str(scene),
-        **{name: str(file) for name, file in files.items()},
-        "settings": settings.as_json(),
-        "sha256": {name: file_digest(file) for name, file in files.items()},
-        "versions": versions(),
+        **describe_run(Path(scene), files, settings, warnings, seconds),
         "unseen": unseen,
     }
     if folder is not None:
@@ -221,22 +214,24 @@ def describe_contradictions(found: Audit) -> list[dict[str, Any]]:
 
 
 def _write_result(
-    path: Path, inputs: _Inputs, drawn: tuple[str, ...], summary: Mapping[str, Any]
+    path: Path, inputs: _Inputs, named: tuple[str, ...], summary: Mapping[str, Any]
 ) -> None:
     """The summary, and the robot at its encoders' positions over the masks of some frames."""
-    folder, tree = ResultFolder(path, (), False), inputs.tree
-    kinematics = TreeKinematics(tree)
-    cameras = {camera.name: camera for camera in inputs.cameras}
-    renderers: dict[str, LabelRenderer] = {}
-    for frame in map(inputs.read, drawn):
-        q, X_WB = tree.positions_from(kinematics.split(frame.values))
-        for name, mask in frame.masks.items():
-            renderer = renderers.setdefault(name, LabelRenderer(inputs.model, cameras[name]))
-            segments = renderer.segments(q, X_WB)
-            fits = percent(summary["frames"][frame.name]["fits"][name])
-            title = f"{name}  frame {frame.name}  CONTRADICTS the others  {fits} fits"
-            picture = draw_overlay(mask, segments >= 0, segments, [title])
-            folder.write(f"{OVERLAY}/{name}/{frame.name}.png", encode_png(picture))
+    folder, frames = ResultFolder(path, (), False), summary["frames"]
+    for camera in inputs.cameras if named else ():
+        name = camera.name
+        posed = [
+            PosedFrame(one.name, one.values, one.masks[name])
+            for one in map(inputs.read, named)
+            if name in one.masks
+        ]
+        titles = [
+            f"{name}  frame {one.name}  CONTRADICTS the others  "
+            f"{percent(frames[one.name]['fits'][name])} fits"
+            for one in posed
+        ]
+        titled = zip(posed, titles, strict=True)
+        write_overlays(folder, drawn(inputs.tree, camera), name, titled)
     folder.write_summary(summary)
 
 

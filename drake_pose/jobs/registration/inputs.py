@@ -1,9 +1,9 @@
-"""What a registration needs, read and checked before the search begins."""
+"""What a registration or an audit needs, read and checked before any work begins."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.files import CameraFile, load_camera_file
-from drake_pose.camera.models import Camera, PinholeCamera
+from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import (
     CameraError,
     MaskError,
@@ -22,7 +22,7 @@ from drake_pose.errors import (
     SettingsError,
     UnknownNameError,
 )
-from drake_pose.jobs.estimate.inputs import make_tree, select_seen_frames
+from drake_pose.jobs.estimate.inputs import CAMERA_FILE, make_tree, select_seen_frames
 from drake_pose.jobs.estimate.measurements import read_true_angles
 from drake_pose.jobs.estimate.person_choice import missing_for_person
 from drake_pose.jobs.estimate.scene_checks import check_scene
@@ -34,7 +34,7 @@ from drake_pose.jobs.registration.positions import (
 )
 from drake_pose.jobs.registration.settings import ALL, RegistrationSettings
 from drake_pose.registration.joint_zeros import links_with_length, require_known
-from drake_pose.registration.posed_frames import PosedFrame
+from drake_pose.registration.posed_frames import PosedFrame, SeenFrame
 from drake_pose.registration.standing_object import StandingObject, require_turns
 from drake_pose.results.options import select_frames
 from drake_pose.results.settings import EstimateSettings
@@ -42,7 +42,6 @@ from drake_pose.silhouette.pictures.scenes import Scene, load_scene
 
 Array = NDArray[np.float64]
 
-_CAMERAS = "cameras.yaml"
 # With positions that were estimated cameras are found from so many frames: what the model lacks is
 # the same in all of them, so more tell little.
 _MOST_FRAMES = 12
@@ -55,43 +54,52 @@ _OF_A_PERSON = (
 
 
 @dataclass(frozen=True)
-class RegistrationInputs:
+class Inputs:
     """What is registered, from what.
 
     Args:
         scene: the recorded scene; cameras whose X_WC is missing stand at the world's origin.
-        model: the robot.
-        tree: its pose tree in the world, or in the frame of the link on which the cameras ride.
+        tree: the robot's pose tree in the world, or in the frame of the link on which cameras ride.
+        positions: of the joints in each frame.
+        frames: what the cameras see.
+        searched, held: the cameras that are to be found, and the others that have an X_WC.
         seen: the tree's nodes that the masks show; None: all.
         standing: the object that the cameras see from their link, if it is not the robot. Until it
             is found it is at the world's origin in the tree.
-        searched, held: the cameras that are to be found, and the others that have an X_WC.
-        frames: what each of these cameras sees, by name.
         zeros, lengths: the joints and links whose zeros and lengths are to be found.
         left_out: cameras without X_WC that are not to be found.
-        is_estimate: whether the positions were estimated, so that they are off.
-        girths: (nodes,) how many times as wide as the model's the nodes are; None: as the model's.
     """
 
     scene: Scene
     model: ArticulatedModel
     tree: PoseTree
-    seen: tuple[str, ...] | None
-    standing: StandingObject | None
+    positions: KnownPositions
+    frames: tuple[SeenFrame, ...]
     searched: tuple[PinholeCamera, ...]
     held: tuple[PinholeCamera, ...]
-    frames: Mapping[str, tuple[PosedFrame, ...]]
+    seen: tuple[str, ...] | None
+    standing: StandingObject | None
     zeros: tuple[str, ...]
     lengths: tuple[str, ...]
     left_out: tuple[str, ...]
     warnings: tuple[str, ...]
-    is_estimate: bool = False
-    girths: Array | None = None
+
+    def of(self, camera: str) -> list[PosedFrame]:
+        """What a camera sees."""
+        return [
+            PosedFrame(one.name, one.values, one.masks[camera])
+            for one in self.frames
+            if camera in one.masks
+        ]
+
+    def moved(self, values: Mapping[str, Array]) -> tuple[SeenFrame, ...]:
+        """The frames at other values (m,) of the tree, by name."""
+        return tuple(replace(one, values=values[one.name]) for one in self.frames)
 
 
 def read_inputs(
     scene_path: Path, model_path: Path, joints_path: Path | None, settings: RegistrationSettings
-) -> RegistrationInputs:
+) -> Inputs:
     """Reads and checks everything.
 
     Args:
@@ -102,16 +110,10 @@ def read_inputs(
         DrakePoseError: names the file, camera, frame or joint at fault.
     """
     if not scene_path.is_dir():
-        raise SceneError(f"{scene_path}: no such folder; a scene has {_CAMERAS} and masks")
-    file = load_camera_file(scene_path / _CAMERAS)
-    _check_links(scene_path, file.links, settings)
-    unplaced = (*file.unplaced, *file.links)
-    searched = _select_searched(scene_path, file.cameras, unplaced, settings.cameras)
+        raise SceneError(f"{scene_path}: no such folder; a scene has {CAMERA_FILE} and masks")
+    file = load_camera_file(scene_path / CAMERA_FILE)
     checked = check_scene(load_scene(scene_path, file.cameras))
-    scene = checked.scene
-    unseen = [name for name in unplaced if not any(owner == name for owner, _ in scene.masks)]
-    if not settings.cameras:
-        searched = [name for name in searched if name not in unseen]
+    searched, held = _select_cameras(checked.scene, file, settings)
     model = load_model(model_path, package_paths=settings.packages)
     table, standing = None, _read_target(model, settings)
     if joints_path is not None and standing is None:
@@ -123,8 +125,6 @@ def read_inputs(
     tree, seen = make_registration_tree(model, settings, standing)
     kinematics = TreeKinematics(tree)
     zeros, lengths = _select_parameters(model, kinematics, settings)
-    pinholes = [_require_pinhole(scene_path, file.cameras[name]) for name in searched]
-    held = _select_held(file, searched, settings)
     if joints_path is None:
         asked = EstimateSettings(
             frames=settings.frames, hold=settings.hold, packages=settings.packages
@@ -133,96 +133,62 @@ def read_inputs(
     else:
         on_link = settings.on is not None
         positions = read_known_positions(joints_path, kinematics, on_link, table)
-    wanted = settings.frames
-    if positions.is_estimate:
-        wanted = _spread_frames(scene, pinholes, positions, wanted)
-    frames = {camera.name: _read_frames(scene, camera, positions, wanted) for camera in pinholes}
-    for camera in held:
-        frames[camera.name] = _frames_of_held(scene, camera, positions, wanted)
-    if positions.is_estimate:
-        _require_held(scene_path, held, frames)
-    left_out = [name for name in unplaced if name not in searched]
-    warnings = [*checked.warnings, *model.warnings, *positions.warnings]
-    warnings += [_say_left_out(name) for name in left_out]
-    warnings += _say_of_body(model, pinholes, frames, positions, standing)
-    return RegistrationInputs(
-        scene, model, tree, seen, standing, tuple(pinholes), tuple(held), frames, zeros, lengths,
-        tuple(left_out), tuple(warnings), positions.is_estimate, positions.girths,
+    frames = _read_frames(checked.scene, searched, held, positions, settings.frames)
+    left_out = tuple(
+        name
+        for name in (*file.unplaced, *file.links)
+        if name not in [camera.name for camera in searched]
+    )
+    inputs = Inputs(
+        checked.scene, model, tree, positions, frames, searched, held, seen, standing, zeros,
+        lengths, left_out, (*checked.warnings, *model.warnings, *positions.warnings),
     )  # fmt: skip
+    return replace(inputs, warnings=(*inputs.warnings, *_look_at(inputs)))
 
 
-def _select_held(
-    file: CameraFile, searched: Sequence[str], settings: RegistrationSettings
-) -> list[PinholeCamera]:
-    """The cameras whose place is known and not to be found."""
-    if settings.on is not None:
-        return []
-    others = {*searched, *file.unplaced, *file.links}
-    return [
-        camera
-        for name, camera in file.cameras.items()
-        if name not in others and isinstance(camera, PinholeCamera)
-    ]
-
-
-def _require_held(
-    path: Path,
-    held: Sequence[PinholeCamera],
-    frames: Mapping[str, Sequence[PosedFrame]],
-) -> None:
-    """Refuses estimated positions that no camera whose place is known can hold in the world."""
-    if not any(frames[camera.name] for camera in held):
+def _select_cameras(
+    scene: Scene, file: CameraFile, settings: RegistrationSettings
+) -> tuple[tuple[PinholeCamera, ...], tuple[PinholeCamera, ...]]:
+    """The cameras that are to be found, and the others whose place is known."""
+    path, wanted, unplaced = scene.path, settings.cameras, {*file.unplaced, *file.links}
+    for name, link in file.links.items():
+        if link != settings.on:
+            raise SceneError(
+                f"{path / CAMERA_FILE}: camera '{name}' rides on link '{link}': find it with "
+                f"--on {link}, or take it out of the file"
+            )
+    for name in wanted:
+        if name not in file.cameras:
+            raise UnknownNameError("camera", name, file.cameras, str(path))
+    if not wanted and not unplaced:
         raise SceneError(
-            f"{path}: the joint positions were estimated, so they are fitted together with the "
-            "cameras, but no camera with an X_WC has a mask of those frames: leave X_WC of the "
-            "cameras by which they were estimated in the camera file"
+            f"{path / CAMERA_FILE}: every camera has an X_WC; name those that are to be found "
+            f"anew: --camera {next(iter(file.cameras))}"
         )
+    with_masks = {name for name, _ in scene.masks}
+    searched, held = [], []
+    for name, camera in file.cameras.items():
+        is_wanted = name in wanted if wanted else name in unplaced and name in with_masks
+        if is_wanted and not isinstance(camera, PinholeCamera):
+            raise CameraError(
+                f"{path / CAMERA_FILE}: camera '{name}' is a parallel camera, whose distance no "
+                "picture tells; a camera that is to be found needs a focal length (projection: "
+                "pinhole)"
+            )
+        if isinstance(camera, PinholeCamera) and is_wanted:
+            searched.append(camera)
+        elif isinstance(camera, PinholeCamera) and name not in unplaced and settings.on is None:
+            held.append(camera)
+    return tuple(searched), tuple(held)
 
 
 def _check_estimable(settings: RegistrationSettings) -> None:
     """Refuses what only measured joint positions tell."""
-    asked = {
-        "--zeros": settings.zeros, "--lengths": settings.lengths, "--focal": settings.focal,
-        "--on": settings.on, "--suggest": settings.suggest,
-    }  # fmt: skip
-    for name, value in asked.items():
-        if value:
+    for name in ("zeros", "lengths", "focal", "on", "suggest"):
+        if getattr(settings, name):
             raise SettingsError(
-                f"{name} needs measured joint positions (--joints FILE): those that are estimated "
-                "follow what it asks for"
-            )
-
-
-def _spread_frames(
-    scene: Scene,
-    cameras: Sequence[PinholeCamera],
-    positions: KnownPositions,
-    wanted: Sequence[str],
-) -> tuple[str, ...]:
-    """Frames with positions which the cameras see, as many as tell more than the first ones do."""
-    asked = select_frames(scene.frames, wanted, str(scene.path))
-    known = [frame for frame in asked if positions.has(frame)]
-    for camera in cameras:
-        if not any((camera.name, frame) in scene.masks for frame in known):
-            raise SceneError(
-                f"{scene.path}: camera '{camera.name}' has no mask of a frame in which the cameras "
-                "whose X_WC is known tell the body's pose; give masks of the same moments"
-            )
-    seen = [frame for frame in known if any((one.name, frame) in scene.masks for one in cameras)]
-    return tuple(
-        dict.fromkeys(
-            seen[k] for k in np.linspace(0, len(seen) - 1, _MOST_FRAMES).round().astype(int)
-        )
-    )
-
-
-def _check_links(path: Path, links: Mapping[str, str], settings: RegistrationSettings) -> None:
-    """Refuses a camera that rides on another link than those that are to be found."""
-    for name, link in links.items():
-        if link != settings.on:
-            raise SceneError(
-                f"{path / _CAMERAS}: camera '{name}' rides on link '{link}': find it with "
-                f"--on {link}, or take it out of the file"
+                f"--{name} needs measured joint positions (--joints FILE): those that are "
+                "estimated follow what it asks for"
             )
 
 
@@ -293,118 +259,112 @@ def _select_parameters(
     return zeros, lengths
 
 
-def _select_searched(
-    path: Path, cameras: Mapping[str, Camera], unplaced: Sequence[str], wanted: Sequence[str]
-) -> list[str]:
-    """The names of the cameras that are to be found, in the file's order."""
-    for name in wanted:
-        if name not in cameras:
-            raise UnknownNameError("camera", name, cameras, str(path))
-    if not wanted and not unplaced:
-        raise SceneError(
-            f"{path / _CAMERAS}: every camera has an X_WC; name those that are to be found anew: "
-            f"--camera {next(iter(cameras))}"
-        )
-    return [name for name in cameras if name in (wanted or unplaced)]
-
-
-def _require_pinhole(path: Path, camera: Camera) -> PinholeCamera:
-    if not isinstance(camera, PinholeCamera):
-        raise CameraError(
-            f"{path / _CAMERAS}: camera '{camera.name}' is a parallel camera, whose distance no "
-            "picture tells; a camera that is to be found needs a focal length (projection: pinhole)"
-        )
-    return camera
-
-
 def _read_frames(
-    scene: Scene, camera: PinholeCamera, positions: KnownPositions, wanted: Sequence[str]
-) -> tuple[PosedFrame, ...]:
-    """All frames of a camera that is to be found; a bad one is refused."""
-    found = []
-    for frame in select_seen_frames(scene, [camera], wanted):
-        values = positions.of(frame, camera.name)
-        try:
-            mask = scene.read(camera.name, frame, may_be_empty=positions.is_estimate)
-        except MaskError as error:
-            raise MaskError(
-                f"{error} (camera '{camera.name}', frame '{frame}'); mend it, or leave the frame "
-                "out (--frame)"
-            ) from error
-        if mask.any():
-            found.append(PosedFrame(frame, values, mask))
-    if not found:
-        raise MaskError(
-            f"camera '{camera.name}': no mask shows the body in the frames in which its pose was "
-            f"estimated: {', '.join(wanted)}"
-        )
-    return tuple(found)
+    scene: Scene,
+    searched: Sequence[PinholeCamera],
+    held: Sequence[PinholeCamera],
+    positions: KnownPositions,
+    wanted: Sequence[str],
+) -> tuple[SeenFrame, ...]:
+    """What cameras see; a bad mask of one that is to be found is refused.
 
-
-def _frames_of_held(
-    scene: Scene, camera: PinholeCamera, positions: KnownPositions, wanted: Sequence[str]
-) -> tuple[PosedFrame, ...]:
-    """Those frames of a camera that is held which can be compared with it."""
+    Of cameras that are held there is what can be compared with them.
+    """
+    if positions.is_estimate:
+        wanted = _spread_frames(scene, searched, positions, wanted)
+    asked = {one.name: select_seen_frames(scene, [one], wanted) for one in searched}
     found = []
     for frame in select_frames(scene.frames, wanted, str(scene.path)):
-        if (camera.name, frame) in scene.masks and positions.table.of(frame) is not None:
-            mask = scene.read(camera.name, frame, may_be_empty=True)
-            if mask.any():
-                found.append(PosedFrame(frame, positions.of(frame, camera.name), mask))
+        masks = {}
+        for camera in asked:
+            if frame in asked[camera]:
+                positions.of(frame, camera)
+                masks[camera] = _read_mask(scene, camera, frame, positions.is_estimate)
+        for one in held:
+            if (one.name, frame) in scene.masks and positions.has(frame):
+                masks[one.name] = scene.read(one.name, frame, may_be_empty=True)
+        masks = {camera: mask for camera, mask in masks.items() if mask.any()}
+        if masks:
+            found.append(SeenFrame(frame, positions.of(frame, next(iter(masks))), masks))
+    for camera in asked:
+        if not any(camera in one.masks for one in found):
+            raise MaskError(
+                f"camera '{camera}': no mask shows the body in the frames in which its pose was "
+                f"estimated: {', '.join(wanted)}"
+            )
+    if positions.is_estimate and not any(c.name in one.masks for c in held for one in found):
+        raise SceneError(
+            f"{scene.path}: the joint positions were estimated, so they are fitted together with "
+            "the cameras, but no camera with an X_WC has a mask of those frames: leave X_WC of the "
+            "cameras by which they were estimated in the camera file"
+        )
     return tuple(found)
 
 
-def _check_poses(
-    camera: PinholeCamera,
-    frames: Sequence[PosedFrame],
-    positions: KnownPositions,
-    standing: StandingObject | None,
-) -> list[str]:
-    """Says so where all frames show one pose of the robot; before an object it is refused."""
-    if standing is not None:
-        require_turns(camera.name, standing, frames)
-    rows, estimated = (frame.values for frame in frames), positions.is_estimate
-    if not positions.are_one_pose(rows, _ESTIMATES_DIFFER if estimated else 1.0):
-        return []
-    if len(frames) == 1:
-        what = f"there is one frame, '{frames[0].name}'"
-    elif estimated:
-        what = f"the body stands still in all {len(frames)} frames"
-    else:
-        what = f"all {len(frames)} frames show the robot in one pose, to a degree"
-    why = (
-        "what its surface lacks pulls the camera to one side unnoticed, about the body above all, "
-        "and no frame can be found to contradict the others; take frames in which it turns, moves "
-        "its limbs and walks about"
-        if estimated
-        else "errors of that mask and of the joints' zeros cannot be told from a camera elsewhere, "
-        "no frame can be found to contradict the others, and a mirrored pose may look alike; take "
-        "five or more poses that differ much"
-    )
-    return [f"camera '{camera.name}': {what}: {why}"]
+def _read_mask(scene: Scene, camera: str, frame: str, may_be_empty: bool) -> NDArray[np.bool_]:
+    try:
+        return scene.read(camera, frame, may_be_empty=may_be_empty)
+    except MaskError as error:
+        raise MaskError(
+            f"{error} (camera '{camera}', frame '{frame}'); mend it, or leave the frame out "
+            "(--frame)"
+        ) from error
 
 
-def _say_of_body(
-    model: ArticulatedModel,
+def _spread_frames(
+    scene: Scene,
     cameras: Sequence[PinholeCamera],
-    frames: Mapping[str, Sequence[PosedFrame]],
     positions: KnownPositions,
-    standing: StandingObject | None,
-) -> list[str]:
-    """What about the body, and how it moves, makes cameras less sure than they seem."""
-    is_person = positions.is_estimate and not missing_for_person(model)
-    return [
-        *([_OF_A_PERSON] if is_person else []),
-        *(
-            text
-            for camera in cameras
-            for text in _check_poses(camera, frames[camera.name], positions, standing)
-        ),
-    ]
+    wanted: Sequence[str],
+) -> tuple[str, ...]:
+    """Frames with positions which the cameras see, as many as tell more than the first ones do."""
+    asked = select_frames(scene.frames, wanted, str(scene.path))
+    known = [frame for frame in asked if positions.has(frame)]
+    for camera in cameras:
+        if not any((camera.name, frame) in scene.masks for frame in known):
+            raise SceneError(
+                f"{scene.path}: camera '{camera.name}' has no mask of a frame in which the cameras "
+                "whose X_WC is known tell the body's pose; give masks of the same moments"
+            )
+    seen = [frame for frame in known if any((one.name, frame) in scene.masks for one in cameras)]
+    chosen = np.linspace(0, len(seen) - 1, _MOST_FRAMES).round().astype(int)
+    return tuple(dict.fromkeys(seen[k] for k in chosen))
 
 
-def _say_left_out(name: str) -> str:
-    return (
+def _look_at(inputs: Inputs) -> list[str]:
+    """What of the cameras, the body, and how it moves, a user should know.
+
+    Raises:
+        RegistrationError: the link before an object does not turn enough.
+    """
+    texts = [
         f"camera '{name}' has no X_WC and is not to be found, or has no masks in masks/{name}: it "
         "is left out of the camera file that is written"
-    )
+        for name in inputs.left_out
+    ]
+    estimated = inputs.positions.is_estimate
+    if estimated and not missing_for_person(inputs.model):
+        texts.append(_OF_A_PERSON)
+    for camera in inputs.searched:
+        frames = inputs.of(camera.name)
+        if inputs.standing is not None:
+            require_turns(camera.name, inputs.standing, frames)
+        rows, times = (one.values for one in frames), _ESTIMATES_DIFFER if estimated else 1.0
+        if not inputs.positions.are_one_pose(rows, times):
+            continue
+        what = f"all {len(frames)} frames show the robot in one pose, to a degree"
+        if len(frames) == 1:
+            what = f"there is one frame, '{frames[0].name}'"
+        elif estimated:
+            what = f"the body stands still in all {len(frames)} frames"
+        why = (
+            "what its surface lacks pulls the camera to one side unnoticed, about the body above "
+            "all, and no frame can be found to contradict the others; take frames in which it "
+            "turns, moves its limbs and walks about"
+            if estimated
+            else "errors of that mask and of the joints' zeros cannot be told from a camera "
+            "elsewhere, no frame can be found to contradict the others, and a mirrored pose may "
+            "look alike; take five or more poses that differ much"
+        )
+        texts.append(f"camera '{camera.name}': {what}: {why}")
+    return texts

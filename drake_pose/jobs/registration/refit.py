@@ -13,12 +13,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drake_pose.body.files.urdf_shape import reshaped
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
+from drake_pose.camera.models import PinholeCamera
 from drake_pose.jobs.estimate.person_choice import missing_for_person
-from drake_pose.jobs.registration.inputs import RegistrationInputs, make_registration_tree
+from drake_pose.jobs.registration.inputs import Inputs, make_registration_tree
 from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.person.shape import shape_parts, shape_values
 from drake_pose.registration.bundle_adjustment import BundleAdjustment, CommonShape
@@ -27,20 +29,22 @@ from drake_pose.registration.joint_zeros import (
     calibrate_joints,
     lengthened_joints,
 )
-from drake_pose.registration.posed_frames import PosedFrame, PosedFrames, SeenFrame
-from drake_pose.registration.register import FrameMisfit, RegisteredCamera, RegistrationBody
+from drake_pose.registration.posed_frames import PosedFrames
+from drake_pose.registration.register import RegisteredCamera, RegistrationBody
 from drake_pose.registration.start_poses import E_total, areas, intersection_over_union
 
 Registered = Mapping[str, RegisteredCamera]
 
 
 def adjust_bundle(
-    inputs: RegistrationInputs,
-    body: RegistrationBody,
-    registered: Registered,
-) -> tuple[dict[str, RegisteredCamera], RegistrationInputs, RegistrationBody]:
+    inputs: Inputs, body: RegistrationBody, registered: Registered
+) -> tuple[dict[str, RegisteredCamera], Inputs, RegistrationBody]:
     """The cameras, the frames' estimated positions and the body, fitted to what all cameras see."""
-    frames = _seen_frames(inputs, registered)
+    wrong = {name: found.contradictions for name, found in registered.items()}
+    frames = [
+        replace(one, masks={c: m for c, m in one.masks.items() if one.name not in wrong.get(c, ())})
+        for one in inputs.frames
+    ]
     cameras = [*inputs.held, *(found.camera for found in registered.values())]
     shape = CommonShape(np.zeros(len(body.kinematics.names), np.bool_))
     if not missing_for_person(inputs.model):
@@ -48,53 +52,28 @@ def adjust_bundle(
     fitted = BundleAdjustment(
         body.kinematics, body.few, cameras, tuple(registered), frames, shape
     ).fit()
-    values = {frame.name: values for frame, values in zip(frames, fitted.values, strict=True)}
-    moved = {
-        name: tuple(PosedFrame(one.name, values[one.name], one.mask) for one in own)
-        for name, own in inputs.frames.items()
-    }
-    girths = fitted.girths * (1.0 if inputs.girths is None else inputs.girths)
+    values = {one.name: own for one, own in zip(frames, fitted.values, strict=True)}
+    inputs = replace(inputs, frames=inputs.moved(values))
+    known = inputs.positions.girths
+    girths = fitted.girths * (1.0 if known is None else known)
     worn = RegistrationBody(inputs.tree, inputs.seen, girths=girths)
     result = {}
     for camera, covariance in zip(fitted.cameras, fitted.covariances, strict=True):
         before = registered[camera.name]
-        misfits = misfits_now(
-            PosedFrames(worn.kinematics, worn.all, camera, moved[camera.name]), before
-        )
-        result[camera.name] = replace(before, camera=camera, covariance=covariance, frames=misfits)
-    return result, replace(inputs, frames=moved), worn
-
-
-def _seen_frames(
-    inputs: RegistrationInputs, registered: Mapping[str, RegisteredCamera]
-) -> list[SeenFrame]:
-    """What all cameras see, but for pictures that contradict the positions."""
-    frames: dict[str, SeenFrame] = {}
-    for name in (*(camera.name for camera in inputs.held), *registered):
-        wrong = registered[name].contradictions if name in registered else ()
-        for one in inputs.frames[name]:
-            before = frames.get(one.name)
-            masks = {} if before is None else dict(before.masks)
-            if one.name not in wrong:
-                masks[name] = one.mask
-            frames[one.name] = SeenFrame(one.name, one.values, masks)
-    return list(frames.values())
+        result[camera.name] = _now(inputs, worn, worn.kinematics, camera, covariance, before)
+    return result, inputs, worn
 
 
 def find_zeros(
-    inputs: RegistrationInputs,
-    settings: RegistrationSettings,
-    body: RegistrationBody,
-    registered: Registered,
-) -> tuple[dict[str, RegisteredCamera], RegistrationInputs, JointCalibration]:
+    inputs: Inputs, settings: RegistrationSettings, body: RegistrationBody, registered: Registered
+) -> tuple[dict[str, RegisteredCamera], Inputs, JointCalibration]:
     """The cameras, and the robot and the frames' positions, with what was found.
 
     Raises:
         RegistrationError: fewer frames than zeros and lengths.
     """
-    names = body.kinematics.names
-    cameras = list(registered.values())
-    frames = [inputs.frames[one.camera.name] for one in cameras]
+    names, cameras = body.kinematics.names, list(registered.values())
+    frames = [inputs.of(name) for name in registered]
     found = calibrate_joints(
         body, cameras, frames, inputs.zeros, settings.focal, lengths=inputs.lengths
     )
@@ -112,20 +91,29 @@ def find_zeros(
         tree = standing.tree(seen.X_WT)
     elif shifts:
         tree, _ = make_registration_tree(model, settings)
-    kinematics = TreeKinematics(tree)
-    corrected = dict(inputs.frames)
-    result = {}
+    values = {one.name: one.values + offsets for one in inputs.frames}
+    inputs = replace(inputs, model=model, tree=tree, frames=inputs.moved(values))
+    kinematics, result = TreeKinematics(tree), {}
     for camera, covariance, before in zip(found.cameras, found.covariances, cameras, strict=True):
-        own = tuple(
-            PosedFrame(one.name, one.values + offsets, one.mask)
-            for one in inputs.frames[camera.name]
-        )
-        corrected[camera.name] = own
-        again = misfits_now(PosedFrames(kinematics, body.all, camera, own), before)
-        result[camera.name] = replace(
-            before, camera=camera, covariance=covariance, frames=again, seen_object=seen
-        )
-    return result, replace(inputs, model=model, tree=tree, frames=corrected), found
+        again = _now(inputs, body, kinematics, camera, covariance, before)
+        result[camera.name] = replace(again, seen_object=seen)
+    return result, inputs, found
+
+
+def _now(
+    inputs: Inputs,
+    body: RegistrationBody,
+    kinematics: TreeKinematics,
+    camera: PinholeCamera,
+    covariance: NDArray[np.float64],
+    before: RegisteredCamera,
+) -> RegisteredCamera:
+    """A camera where it was found now, and its frames' misfits; which agree is as it was."""
+    frames = PosedFrames(kinematics, body.all, camera, inputs.of(camera.name))
+    found = areas(frames, camera.X_CW[None], np.inf)[0]
+    misfits = zip(before.frames, E_total(found), intersection_over_union(found), strict=True)
+    again = [replace(one, E_total=float(off), iou=float(iou)) for one, off, iou in misfits]
+    return replace(before, camera=camera, covariance=covariance, frames=tuple(again))
 
 
 def joint_shifts(tree: PoseTree, found: JointCalibration) -> dict[str, list[float]]:
@@ -135,19 +123,7 @@ def joint_shifts(tree: PoseTree, found: JointCalibration) -> dict[str, list[floa
     return {one.joint: (longer[one.link] * one.p_L).tolist() for one in offsets}
 
 
-def misfits_now(frames: PosedFrames, before: RegisteredCamera) -> tuple[FrameMisfit, ...]:
-    """How well the frames fit now; which of them agree is as it was found."""
-    found = areas(frames, frames.camera.X_CW[None], np.inf)[0]
-    iou = intersection_over_union(found)
-    return tuple(
-        replace(one, E_total=float(off), iou=float(share))
-        for one, off, share in zip(before.frames, E_total(found), iou, strict=True)
-    )
-
-
-def corrected_urdf(
-    inputs: RegistrationInputs, found: JointCalibration, folder: Path | None
-) -> bytes | None:
+def corrected_urdf(inputs: Inputs, found: JointCalibration, folder: Path | None) -> bytes | None:
     """The URDF with zeros and lengths in its joints' origins; its meshes as seen from a folder.
 
     None where there is no folder, nothing was asked for, or the model is no URDF.

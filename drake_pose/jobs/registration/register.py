@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,11 +13,9 @@ import numpy as np
 from drake_pose.body.model import OBJECT_POSITIONS
 from drake_pose.camera.models import Camera
 from drake_pose.jobs.estimate.fit_checks import BADLY_EXPLAINED
+from drake_pose.jobs.estimate.inputs import CAMERA_FILE
 from drake_pose.jobs.estimate.scene_checks import frame_ranges
-from drake_pose.jobs.registration.inputs import (
-    RegistrationInputs,
-    read_inputs,
-)
+from drake_pose.jobs.registration.inputs import Inputs, read_inputs
 from drake_pose.jobs.registration.misfit import (
     Search,
     check_focal_length,
@@ -28,11 +26,11 @@ from drake_pose.jobs.registration.refit import adjust_bundle, corrected_urdf, fi
 from drake_pose.jobs.registration.result import (
     describe_camera,
     describe_parameters,
-    say_zeros,
-    summarize,
+    describe_run,
     write_result,
 )
 from drake_pose.jobs.registration.settings import RegistrationSettings
+from drake_pose.registration.joint_zeros import JointCalibration
 from drake_pose.registration.object_search import ObjectSearch
 from drake_pose.registration.posed_frames import PosedFrames
 from drake_pose.registration.register import (
@@ -97,23 +95,22 @@ def register_scene(
     if folder is not None:
         require_empty(folder)
     inputs = read_inputs(*paths, settings)
-    body = RegistrationBody(inputs.tree, inputs.seen, girths=inputs.girths)
-    search = _Search(inputs, settings, body)
+    search = _Search(inputs, settings)
     warnings = [*inputs.warnings, *_check_held(inputs, search.body)]
     warnings += search.run(on_camera)
     inputs, registered = replace(inputs, tree=search.body.tree), search.registered
     start = time.perf_counter()
-    urdf, parameters = None, dict[str, Any]()
-    if inputs.is_estimate:
+    urdf, parameters = None, dict[str, dict[str, Any]](zeros={}, lengths={})
+    if inputs.positions.is_estimate:
         registered, inputs, body = adjust_bundle(inputs, search.body, registered)
         for found in registered.values():
-            require_explained(CameraSearch(body), found, inputs.frames[found.camera.name])
+            require_explained(CameraSearch(body), found, inputs.of(found.camera.name))
     # Cameras that see one object are found one after another, but it stands in one place.
     several = inputs.standing is not None and len(registered) > 1
     if settings.zeros or settings.lengths or settings.focal or several:
         registered, corrected, zeros = find_zeros(inputs, settings, search.body, registered)
         parameters = describe_parameters(zeros, search.body.kinematics)
-        warnings += say_zeros(zeros)
+        warnings += _say_zeros(zeros)
         urdf = corrected_urdf(inputs, zeros, folder)
         inputs = corrected
     more = (time.perf_counter() - start) / len(registered)
@@ -123,10 +120,27 @@ def register_scene(
         for name, camera in inputs.scene.cameras.items()
         if name not in inputs.left_out
     }
-    summary = summarize(paths, settings, described, warnings)
+    summary = _summarize(paths, settings, described, warnings)
     if folder is not None:
         write_result(folder, inputs, cameras, registered, summary, overlay, urdf)
     return SceneRegistration(cameras, registered, summary, tuple(warnings), folder)
+
+
+def _summarize(
+    paths: tuple[Path, Path, Path | None],
+    settings: RegistrationSettings,
+    cameras: Mapping[str, dict[str, Any]],
+    warnings: Sequence[str],
+) -> dict[str, Any]:
+    """The content of summary.json: a single camera's part stands at the top as well."""
+    scene, model, joints = paths
+    files = {"model": model, "cameras": scene / CAMERA_FILE, "joints": joints}
+    seconds = sum(one["seconds"] for one in cameras.values())
+    return {
+        **(next(iter(cameras.values())) if len(cameras) == 1 else {}),
+        **describe_run(scene, files, settings, warnings, seconds),
+        "cameras": dict(cameras),
+    }
 
 
 class _Search:
@@ -135,10 +149,9 @@ class _Search:
     An object whose place is not known is found with the first camera, and then stands there.
     """
 
-    def __init__(
-        self, inputs: RegistrationInputs, settings: RegistrationSettings, body: RegistrationBody
-    ) -> None:
-        self._inputs, self._settings, self.body = inputs, settings, body
+    def __init__(self, inputs: Inputs, settings: RegistrationSettings) -> None:
+        self._inputs, self._settings = inputs, settings
+        self.body = RegistrationBody(inputs.tree, inputs.seen, girths=inputs.positions.girths)
         self.registered = dict[str, RegisteredCamera]()
         self.seconds = dict[str, float]()
         self.suggestions = dict[str, dict[str, Any] | None]()
@@ -151,11 +164,11 @@ class _Search:
         """
         inputs, standing, seen = self._inputs, self._inputs.standing, None
         search: Search = CameraSearch(self.body) if standing is None else ObjectSearch(standing)
-        warnings: list[str] = []
+        measured, warnings = not inputs.positions.is_estimate, list[str]()
         for camera in inputs.searched:
-            start, frames = time.perf_counter(), inputs.frames[camera.name]
+            start, frames = time.perf_counter(), inputs.of(camera.name)
             found = search.register(camera, frames)
-            if not inputs.is_estimate:
+            if measured:
                 require_explained(search, found, frames)
             if standing is not None:
                 require_determined(found)
@@ -164,7 +177,7 @@ class _Search:
                     search = CameraSearch(self.body)
                     warnings += _say_object(seen)
                 found = replace(found, seen_object=seen)
-            if not inputs.is_estimate:
+            if measured:
                 warnings += check_focal_length(self.body, found, frames)
             self.registered[camera.name] = found
             self.suggestions[camera.name] = self._suggestion(found)
@@ -175,13 +188,14 @@ class _Search:
         return warnings + say_common(self.registered.values())
 
     def describe(
-        self, registered: Mapping[str, RegisteredCamera], more: float, parameters: dict[str, Any]
+        self, registered: Mapping[str, RegisteredCamera], more: float, parameters: Mapping[str, Any]
     ) -> dict[str, dict[str, Any]]:
         """The cameras' parts of the summary, each of which took so long more [s]."""
-        link = self._settings.on
         return {
-            name: describe_camera(one, self.seconds[name] + more, self.suggestions[name], link)
-            | parameters
+            name: dict(parameters)
+            | describe_camera(
+                one, self.seconds[name] + more, self.suggestions[name], self._settings.on
+            )
             for name, one in registered.items()
         }
 
@@ -198,6 +212,22 @@ class _Search:
             "positions": {name: value for name, value in values if name not in OBJECT_POSITIONS},
             "difference": told.difference,
         }
+
+
+def _say_zeros(found: JointCalibration) -> list[str]:
+    """What a user should know of zeros and lengths."""
+    asked = [(f"joint '{one.name}': its zero", one) for one in found.zeros]
+    asked += [(f"link '{one.name}': its length", one) for one in found.lengths]
+    texts = []
+    for what, one in asked:
+        if not one.determined:
+            goes_with = f" it goes with {', '.join(one.gauge)};" if one.gauge else ""
+            texts.append(
+                f"{what} is not determined by these silhouettes and was left as it is;{goes_with} "
+                "frames in which the robot stands otherwise, or a part of it that does not move "
+                "with this one, would tell it"
+            )
+    return texts
 
 
 def _say_object(seen: ObjectPose) -> list[str]:
@@ -273,11 +303,11 @@ def _warnings_of(found: RegisteredCamera) -> list[str]:
     return texts
 
 
-def _check_held(inputs: RegistrationInputs, body: RegistrationBody) -> list[str]:
+def _check_held(inputs: Inputs, body: RegistrationBody) -> list[str]:
     """Says so where a camera whose X_WC is given does not see the robot where it stands."""
     texts = []
     for camera in inputs.held:
-        frames = inputs.frames[camera.name]
+        frames = inputs.of(camera.name)
         if not frames:
             continue
         posed = PosedFrames(body.kinematics, body.all, camera, frames)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
@@ -11,12 +11,15 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.files import dump_cameras
 from drake_pose.camera.models import Camera
-from drake_pose.jobs.registration.inputs import RegistrationInputs
-from drake_pose.jobs.registration.settings import RegistrationSettings
+from drake_pose.jobs.estimate.inputs import CAMERA_FILE
+from drake_pose.jobs.registration.inputs import Inputs
+from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.registration.joint_zeros import JointCalibration
+from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import ObjectPose, RegisteredCamera
 from drake_pose.results.folder import OVERLAY, REPORT, ResultFolder, without_nan
 from drake_pose.results.overlay import draw_overlay, encode_png
@@ -29,7 +32,7 @@ from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
 Array = NDArray[np.float64]
 
-CAMERAS, REGISTRATION = "cameras.yaml", "registration.yaml"
+REGISTRATION = "registration.yaml"
 
 # So many pictures of each camera are shown: those that fit worst and best, and some between.
 _PICTURES = 6
@@ -66,8 +69,6 @@ def describe_camera(
         "rotation_sd_deg": float(np.degrees(found.rotation_sd)),
         "families": [{pose: np.asarray(X).tolist()} for X in poses],
         "mean_iou": float(np.mean([frame.iou for frame in found.frames])),
-        "zeros": {},
-        "lengths": {},
         "suggestion": suggestion,
         **({} if found.seen_object is None else {"target": _describe_object(found.seen_object)}),
         "seconds": seconds,
@@ -121,59 +122,28 @@ def describe_parameters(
     return described
 
 
-def say_zeros(found: JointCalibration) -> list[str]:
-    """What a user should know of zeros and lengths."""
-    asked = [(f"joint '{one.name}': its zero", one) for one in found.zeros]
-    asked += [(f"link '{one.name}': its length", one) for one in found.lengths]
-    texts = []
-    for what, one in asked:
-        if not one.determined:
-            goes_with = f" it goes with {', '.join(one.gauge)};" if one.gauge else ""
-            texts.append(
-                f"{what} is not determined by these silhouettes and was left as it is;{goes_with} "
-                "frames in which the robot stands otherwise, or a part of it that does not move "
-                "with this one, would tell it"
-            )
-    return texts
-
-
-def summarize(
-    paths: tuple[Path, Path, Path | None],
-    settings: RegistrationSettings,
-    cameras: Mapping[str, dict[str, Any]],
+def describe_run(
+    scene: Path,
+    files: Mapping[str, Path | None],
+    settings: AuditSettings,
     warnings: Sequence[str],
+    seconds: float,
 ) -> dict[str, Any]:
-    """The content of summary.json: a single camera's part stands at the top as well.
-
-    Args:
-        paths: scene, model and table of joint positions, if there is one.
-        settings: the settings.
-        cameras: by name, from describe_camera.
-        warnings: what the user should know.
-    """
-    scene, model, joints = paths
-    top = next(iter(cameras.values())) if len(cameras) == 1 else {}
+    """What summary.json says of every run: its files by what they are, and how it was made."""
     return {
-        **top,
-        "seconds": sum(camera["seconds"] for camera in cameras.values()),
-        "cameras": dict(cameras),
+        "seconds": seconds,
         "warnings": list(warnings),
         "scene": str(scene),
-        "model": str(model),
-        "joints": None if joints is None else str(joints),
+        **{name: None if file is None else str(file) for name, file in files.items()},
         "settings": settings.as_json(),
-        "sha256": {
-            "model": file_digest(model),
-            "cameras": file_digest(scene / CAMERAS),
-            "joints": None if joints is None else file_digest(joints),
-        },
+        "sha256": {k: None if file is None else file_digest(file) for k, file in files.items()},
         "versions": versions(),
     }
 
 
 def write_result(
     path: Path,
-    inputs: RegistrationInputs,
+    inputs: Inputs,
     cameras: Mapping[str, Camera],
     registered: Mapping[str, RegisteredCamera],
     summary: Mapping[str, Any],
@@ -195,9 +165,14 @@ def write_result(
         OutputError: the folder is not empty, or cannot be written.
     """
     folder = ResultFolder(path, (), False)
-    if overlay:
-        for found in registered.values():
-            _write_overlays(folder, inputs, found)
+    for name, found in registered.items() if overlay else ():
+        titles = [
+            f"{name}  frame {one.frame}  E_total {percent(one.E_total)}  IoU {one.iou:.2f}  "
+            f"{'agrees' if one.agrees else 'CONTRADICTS the others'}"
+            for one in found.frames
+        ]
+        draw = drawn(inputs.tree, found.camera, inputs.seen)
+        write_overlays(folder, draw, name, zip(inputs.of(name), titles, strict=True))
     if urdf is not None:
         folder.write(f"{inputs.model.path.stem}_calibrated.urdf", urdf)
     text = yaml.safe_dump(
@@ -208,7 +183,7 @@ def write_result(
     folder.write_summary(summary)
     folder.write(REPORT, make_registration_report(path, summary).encode())
     links = {name: one["link"] for name, one in summary["cameras"].items() if "link" in one}
-    folder.write(CAMERAS, dump_cameras(cameras, links).encode())
+    folder.write(CAMERA_FILE, dump_cameras(cameras, links).encode())
 
 
 class ParameterRow(NamedTuple):
@@ -294,35 +269,37 @@ def _uncertainty(found: RegisteredCamera, summary: Mapping[str, Any]) -> dict[st
     return values
 
 
-def _write_overlays(
-    folder: ResultFolder, inputs: RegistrationInputs, found: RegisteredCamera
+def write_overlays(
+    folder: ResultFolder,
+    draw: Callable[[Array], NDArray[np.int64]],
+    camera: str,
+    titled: Iterable[tuple[PosedFrame, str]],
 ) -> None:
-    """Draws the robot over each mask."""
-    camera, draw = found.camera, _drawn(inputs, found.camera)
-    for frame, misfit in zip(inputs.frames[camera.name], found.frames, strict=True):
+    """Draws the robot over each mask of a camera, below a title; draw: as of drawn."""
+    for frame, title in titled:
         segments = draw(frame.values)
-        word = "agrees" if misfit.agrees else "CONTRADICTS the others"
-        title = (
-            f"{camera.name}  frame {frame.name}  E_total {percent(misfit.E_total)}  "
-            f"IoU {misfit.iou:.2f}  {word}"
-        )
         picture = draw_overlay(frame.mask, segments >= 0, segments, [title])
-        folder.write(f"{OVERLAY}/{camera.name}/{frame.name}.png", encode_png(picture))
+        folder.write(f"{OVERLAY}/{camera}/{frame.name}.png", encode_png(picture))
 
 
-def _drawn(inputs: RegistrationInputs, camera: Camera) -> Callable[[Array], NDArray[np.int64]]:
-    """What draws the segments (H, W) at a tree's values (m,), -1 where there is none."""
-    kinematics = TreeKinematics(inputs.tree)
-    if inputs.seen is None:
-        renderer = LabelRenderer(inputs.model, camera)
+def drawn(
+    tree: PoseTree, camera: Camera, seen: Collection[str] | None = None
+) -> Callable[[Array], NDArray[np.int64]]:
+    """What draws the segments (H, W) at a tree's values (m,), -1 where there is none.
+
+    seen: the nodes that are drawn; None: all.
+    """
+    kinematics = TreeKinematics(tree)
+    if seen is None:
+        renderer = LabelRenderer(tree.model, camera)
 
         def render(values: Array) -> NDArray[np.int64]:
-            q, X_WB = inputs.tree.positions_from(kinematics.split(values))
+            q, X_WB = tree.positions_from(kinematics.split(values))
             return np.asarray(renderer.segments(q, X_WB), np.int64)
 
         return render
-    shown = [i for i, node in enumerate(inputs.tree.nodes) if node.name in inputs.seen]
-    outlines = [outline_from_mesh(inputs.tree.nodes[i].mesh) for i in shown]
+    shown = [i for i, node in enumerate(tree.nodes) if node.name in seen]
+    outlines = [outline_from_mesh(tree.nodes[i].mesh) for i in shown]
 
     def draw(values: Array) -> NDArray[np.int64]:
         mask = draw_mask(outlines, camera.X_CW @ kinematics.poses(values)[shown], camera)

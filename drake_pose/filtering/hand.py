@@ -1,4 +1,8 @@
-"""Observing Shimada's two-finger hand in weak perspective, with the Jacobian: (9) to (13)."""
+"""Observing Shimada's two-finger hand in weak perspective, with the Jacobian: (9) to (13).
+
+A point p of the hand's frame is seen at wrist + s (M(q) p)_xy, where M = |q|^2 R(q) is a polynomial
+of second degree: the quaternion's squared norm is the scale.
+"""
 
 import math
 from dataclasses import dataclass
@@ -34,16 +38,14 @@ MEASURED = (
 """What is measured (13): points [pixel]; lines by angle [rad] and distance [pixel]; the scale."""
 
 _FLEXIONS = HAND_STATE.indices(FLEXIONS).reshape(len(FINGERS), len(JOINTS))
+# What is seen, in the kernel's own order, and where its parts begin there.
 _SEEN = HAND_STATE.indices((*WRIST, *QUATERNION, *SPREADS, *FLEXIONS, *LENGTHS, *PALM))
-
-# Elements of the state that are seen, in the kernel's own order.
-_WRIST, _QUATERNION, _SPREAD, _FLEXION, _LENGTH, _PALM = 0, 2, 6, 8, 14, 20
-SEEN_ELEMENTS = 23
+_QUATERNION, _SPREAD, _FLEXION, _LENGTH, _PALM = 2, 6, 8, 14, 20
 # A mirrored angle closer than this is the same [rad].
 _SMALLEST_CHANGE = math.radians(8)
-# wrist 2, points 8 x 2, finger lines 6 x 2, palm lines 3 x 2, scale 1
-POINTS, FINGER_LINES, PALM_LINES, SCALE = 2, 18, 30, 36
-MEASUREMENTS = 37
+# Where lines and the scale stand among MEASURED, and between which of the points drawn lines are.
+_LINES, _SCALE = MEASURED.index("alpha_11"), MEASURED.index("scale")
+_STARTS, _ENDS = np.array([0, 1, 2, 4, 5, 6, 8, 10, 12]), np.array([1, 2, 3, 5, 6, 7, 9, 11, 13])
 
 
 @dataclass(frozen=True)
@@ -86,10 +88,10 @@ class HandObservation:
     @cached_property
     def variances(self) -> Array:
         """(37,) of the noise."""
-        deviations = np.full(MEASUREMENTS, self.point_deviation)
-        deviations[FINGER_LINES:SCALE:2] = self.angle_deviation
-        deviations[FINGER_LINES + 1 : SCALE : 2] = self.distance_deviation
-        deviations[SCALE] = self.scale_deviation
+        deviations = np.full(len(MEASURED), self.point_deviation)
+        deviations[_LINES:_SCALE:2] = self.angle_deviation
+        deviations[_LINES + 1 : _SCALE : 2] = self.distance_deviation
+        deviations[_SCALE] = self.scale_deviation
         return deviations**2
 
     @cached_property
@@ -100,7 +102,7 @@ class HandObservation:
     def predict(self, x: Array) -> tuple[Array, Array]:
         """Features (37,) of (13) and the scale ``|q|^2``, NaN for short axes; Jacobian (37, n)."""
         h, seen, _ = project_hand(x[_SEEN], self.pixels_per_metre, self.shortest)
-        H = np.zeros((MEASUREMENTS, len(HAND_STATE)))
+        H = np.zeros((len(MEASURED), len(HAND_STATE)))
         H[:, _SEEN] = seen
         return h, H
 
@@ -114,15 +116,24 @@ class HandObservation:
         A segment that points a little towards the camera looks like one that points as much away
         from it. Only the angle at its root is changed.
         """
-        x = belief.mean
-        reach = self.mirror_reach * np.sqrt(np.diag(belief.covariance)[_FLEXIONS])
-        changes = mirror_changes(x[_SEEN], reach.ravel(), self.mirror_slope)
-        found = []
-        for index, change in zip(_FLEXIONS.ravel(), changes, strict=True):
-            if change != 0.0:
-                mirrored = x.copy()
-                mirrored[index] += change
-                found.append(mirrored)
+        x, found = belief.mean, []
+        quaternion, spreads = x[_SEEN[_QUATERNION:_SPREAD]], x[_SEEN[_SPREAD:_FLEXION]].tolist()
+        M = scaled_rotation(quaternion)[0] / (quaternion @ quaternion)
+        reaches = self.mirror_reach * np.sqrt(np.diag(belief.covariance)[_FLEXIONS])
+        normal = M[:, 1].tolist()
+        for spread, flexions, own in zip(spreads, _FLEXIONS, reaches.tolist(), strict=True):
+            # Where the finger's plane points in the camera at flexions of 0 and of 90 degrees.
+            forward = (math.cos(spread) * M[:, 0] - math.sin(spread) * M[:, 2]).tolist()
+            direction = 0.0
+            for index, reach in zip(flexions.tolist(), own, strict=True):
+                direction += float(x[index])
+                u, v = math.cos(direction), math.sin(direction)
+                moved = math.hypot(*(u * normal[k] - v * forward[k] for k in range(2)))
+                change = 2.0 * (math.atan2(normal[2], forward[2]) - direction) + math.pi
+                change -= 2.0 * math.pi * round(change / (2.0 * math.pi))
+                if moved <= self.mirror_slope and _SMALLEST_CHANGE < abs(change) < reach:
+                    found.append(x.copy())
+                    found[-1][index] += change
         return found
 
 
@@ -150,130 +161,59 @@ def scaled_rotation(q: Array) -> tuple[Array, Array]:
     A polynomial of second degree: the quaternion's squared norm is the scale.
     """
     w, x, y, z = q
-    M = np.array(
-        [
-            [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
-        ]
-    )
     D = np.empty((4, 3, 3))
     copy_into(D[0], 2 * np.array([[w, -z, y], [z, w, -x], [-y, x, w]]))
     copy_into(D[1], 2 * np.array([[x, y, z], [y, -x, -w], [z, w, -x]]))
     copy_into(D[2], 2 * np.array([[-y, x, w], [x, y, z], [-w, z, -y]]))
     copy_into(D[3], 2 * np.array([[-z, -w, x], [w, -z, y], [x, y, z]]))
-    return M, D
+    return 0.5 * (w * D[0] + x * D[1] + y * D[2] + z * D[3]), D
 
 
 @compiled
-def _place(
-    x: Array, M: Array, D: Array, p: Array, dp: Array, scale: float, out: Array, jacobian: Array
-) -> None:
-    """Project a point p (3) of the hand frame with derivatives dp (3, 23) into the image."""
-    for a in range(2):
-        out[a] = x[_WRIST + a]
-        for c in range(3):
-            out[a] += scale * M[a, c] * p[c]
-        for e in range(SEEN_ELEMENTS):
-            jacobian[a, e] = scale * (M[a, 0] * dp[0, e] + M[a, 1] * dp[1, e] + M[a, 2] * dp[2, e])
-        jacobian[a, _WRIST + a] += 1.0
-        for k in range(4):
-            for c in range(3):
-                jacobian[a, _QUATERNION + k] += scale * D[k, a, c] * p[c]
-
-
-@compiled
-def _line(
-    start: Array, end: Array, d_start: Array, d_end: Array, shortest: float, h: Array, H: Array
-) -> None:
-    """Angle and signed distance from the origin of a line, (11) and (12), into h (2), H (2, 23)."""
-    dx, dy = end[0] - start[0], end[1] - start[1]
-    length = math.sqrt(dx * dx + dy * dy)
-    if length < shortest:
-        h[:] = np.nan
-        H[:] = 0.0
-        return
-    cosine, sine = dx / length, dy / length
-    h[0] = math.atan2(dy, dx)
-    h[1] = cosine * start[1] - sine * start[0]
-    along = cosine * start[0] + sine * start[1]
-    for e in range(SEEN_ELEMENTS):
-        turn = (
-            cosine * (d_end[1, e] - d_start[1, e]) - sine * (d_end[0, e] - d_start[0, e])
-        ) / length
-        H[0, e] = turn
-        H[1, e] = cosine * d_start[1, e] - sine * d_start[0, e] - along * turn
-
-
-@compiled
-def _finger(
-    x: Array, i: int, M: Array, D: Array, scale: float, points: Array, jacobians: Array
-) -> None:
-    """Base, two knuckles and tip of finger i (0 or 1): (9), (10)."""
-    side = 1.0 if i == 0 else -1.0
-    spread = x[_SPREAD + i]
-    c, s = math.cos(spread), math.sin(spread)
-    width, height = x[_PALM], x[_PALM + 1]
-    local = np.array([height, 0.0, 0.25 * side * width])
-    # Derivatives before the spread is applied.
-    d_local = np.zeros((3, SEEN_ELEMENTS))
-    d_local[0, _PALM + 1] = 1.0
-    d_local[2, _PALM] = 0.25 * side
-    p, dp = np.empty(3), np.empty((3, SEEN_ELEMENTS))
+def _place_finger(x: Array, i: int, count: int, p: Array, dp: Array) -> None:
+    """The end p (3,) of so many joints of finger i (0 or 1), and derivatives (3, 23): (9), (10)."""
+    c, s = math.cos(x[_SPREAD + i]), math.sin(x[_SPREAD + i])
+    width, height, side = x[_PALM], x[_PALM + 1], 0.25 - 0.5 * i
+    p[0], p[2] = c * height + s * side * width, c * side * width - s * height
+    dp[0, _PALM], dp[2, _PALM] = s * side, c * side
+    dp[0, _PALM + 1], dp[2, _PALM + 1] = c, -s
     psi = 0.0
-    for j in range(4):
-        if j > 0:
-            psi += x[_FLEXION + 3 * i + j - 1]
-            r = x[_LENGTH + 3 * i + j - 1]
-            u, v = math.cos(psi), math.sin(psi)
-            local[0] += r * u
-            local[1] += r * v
-            d_local[0, _LENGTH + 3 * i + j - 1] = u
-            d_local[1, _LENGTH + 3 * i + j - 1] = v
-            for k in range(j):
-                d_local[0, _FLEXION + 3 * i + k] -= r * v
-                d_local[1, _FLEXION + 3 * i + k] += r * u
-        p[0] = c * local[0] + s * local[2]
-        p[1] = local[1]
-        p[2] = -s * local[0] + c * local[2]
-        for e in range(SEEN_ELEMENTS):
-            dp[0, e] = c * d_local[0, e] + s * d_local[2, e]
-            dp[1, e] = d_local[1, e]
-            dp[2, e] = -s * d_local[0, e] + c * d_local[2, e]
-        dp[0, _SPREAD + i] += -s * local[0] + c * local[2]
-        dp[2, _SPREAD + i] += -c * local[0] - s * local[2]
-        _place(x, M, D, p, dp, scale, points[4 * i + j], jacobians[4 * i + j])
+    for j in range(3 * i, 3 * i + count):
+        psi += x[_FLEXION + j]
+        u, v, r = math.cos(psi), math.sin(psi), x[_LENGTH + j]
+        p[0] += r * u * c
+        p[1] += r * v
+        p[2] -= r * u * s
+        dp[0, _LENGTH + j], dp[1, _LENGTH + j], dp[2, _LENGTH + j] = u * c, v, -u * s
+        for k in range(_FLEXION + 3 * i, _FLEXION + j + 1):
+            dp[0, k] -= r * v * c
+            dp[1, k] += r * u
+            dp[2, k] += r * v * s
+    # The spread turns all about the palm's y axis.
+    dp[0, _SPREAD + i], dp[2, _SPREAD + i] = p[2], -p[0]
 
 
 @compiled
-def _palm(x: Array, M: Array, D: Array, scale: float, points: Array, jacobians: Array) -> None:
-    """Ends of the three outer edges of the palm's box: its two sides and its top."""
-    width, height, thickness = x[_PALM], x[_PALM + 1], x[_PALM + 2]
+def _palm_ends(M: Array) -> Array:
+    """(6, 3) ends of the outer edges of the palm's box, two sides and top, as shares of its size.
+
+    Of height, thickness and width, along the hand's x, y and z.
+    """
     # Across the palm's axis in the image, and along it: which face's edge lies outside.
-    nx, ny = -M[1, 0], M[0, 0]
-    wide = nx * M[0, 2] + ny * M[1, 2]
-    deep = nx * M[0, 1] + ny * M[1, 1]
-    side = 1.0 if wide * deep >= 0.0 else -1.0
-    top = 1.0 if M[0, 0] * M[0, 1] + M[1, 0] * M[1, 1] >= 0.0 else -1.0
-    corners = np.array(
+    wide = M[0, 0] * M[1, 2] - M[1, 0] * M[0, 2]
+    deep = M[0, 0] * M[1, 1] - M[1, 0] * M[0, 1]
+    side = 0.5 if wide * deep >= 0.0 else -0.5
+    top = 0.5 if M[0, 0] * M[0, 1] + M[1, 0] * M[1, 1] >= 0.0 else -0.5
+    return np.array(
         [
-            [0.0, side, 1.0],
-            [1.0, side, 1.0],
-            [0.0, -side, -1.0],
-            [1.0, -side, -1.0],
-            [1.0, top, 1.0],
-            [1.0, top, -1.0],
+            [0.0, side, 0.5],
+            [1.0, side, 0.5],
+            [0.0, -side, -0.5],
+            [1.0, -side, -0.5],
+            [1.0, top, 0.5],
+            [1.0, top, -0.5],
         ]
     )
-    p, dp = np.empty(3), np.zeros((3, SEEN_ELEMENTS))
-    for k in range(6):
-        p[0] = corners[k, 0] * height
-        p[1] = 0.5 * corners[k, 1] * thickness
-        p[2] = 0.5 * corners[k, 2] * width
-        dp[0, _PALM + 1] = corners[k, 0]
-        dp[1, _PALM + 2] = 0.5 * corners[k, 1]
-        dp[2, _PALM] = 0.5 * corners[k, 2]
-        _place(x, M, D, p, dp, scale, points[8 + k], jacobians[8 + k])
 
 
 @compiled
@@ -289,78 +229,50 @@ def project_hand(x: Array, scale: float, shortest: float) -> tuple[Array, Array,
         h (37,) of (13), NaN for lines too short; H (37, 23); and the points drawn (14, 2): base,
         knuckles, tip of both fingers, and the ends of the palm's three edges.
     """
-    M, D = scaled_rotation(x[_QUATERNION : _QUATERNION + 4])
-    points, jacobians = np.empty((14, 2)), np.empty((14, 2, SEEN_ELEMENTS))
-    for i in range(2):
-        _finger(x, i, M, D, scale, points, jacobians)
-    _palm(x, M, D, scale, points, jacobians)
-    h, H = np.empty(MEASUREMENTS), np.zeros((MEASUREMENTS, SEEN_ELEMENTS))
+    n = len(x)
+    M, D = scaled_rotation(x[_QUATERNION:_SPREAD])
+    ends = _palm_ends(M)
+    points, J = np.zeros((14, 2)), np.zeros((14, 2, n))
+    for k in range(14):
+        p, dp = np.zeros(3), np.zeros((3, n))
+        if k < 8:
+            _place_finger(x, k // 4, k % 4, p, dp)
+        for c in range(3):
+            if k >= 8:
+                size = _PALM + (c + 1) % 3
+                p[c], dp[c, size] = ends[k - 8, c] * x[size], ends[k - 8, c]
+            for a in range(2):
+                points[k, a] += scale * M[a, c] * p[c]
+                for e in range(n):
+                    J[k, a, e] += scale * M[a, c] * dp[c, e]
+                for q in range(4):
+                    J[k, a, _QUATERNION + q] += scale * D[q, a, c] * p[c]
+        for a in range(2):
+            points[k, a] += x[a]
+            J[k, a, a] += 1.0
+    h, H = np.zeros(_SCALE + 1), np.zeros((_SCALE + 1, n))
     for a in range(2):
-        h[a] = x[_WRIST + a]
-        H[a, _WRIST + a] = 1.0
-    for k in range(8):
-        row = POINTS + 2 * k
-        copy_into(h[row : row + 2], points[k])
-        copy_into(H[row : row + 2], jacobians[k])
-    for i in range(2):
-        for j in range(3):
-            k = 3 * i + j
-            end, start = 4 * i + j + 1, 4 * i + j
-            row = FINGER_LINES + 2 * k
-            _line(
-                points[start],
-                points[end],
-                jacobians[start],
-                jacobians[end],
-                shortest,
-                h[row : row + 2],
-                H[row : row + 2],
-            )
-    for k in range(3):
-        row, start = PALM_LINES + 2 * k, 8 + 2 * k
-        _line(
-            points[start],
-            points[start + 1],
-            jacobians[start],
-            jacobians[start + 1],
-            shortest,
-            h[row : row + 2],
-            H[row : row + 2],
-        )
-    h[SCALE] = 0.0
-    for k in range(4):
-        h[SCALE] += x[_QUATERNION + k] ** 2
-        H[SCALE, _QUATERNION + k] = 2.0 * x[_QUATERNION + k]
+        h[a], H[a, a] = x[a], 1.0
+        for k in range(8):
+            h[2 + 2 * k + a] = points[k, a]
+            copy_into(H[2 + 2 * k + a], J[k, a])
+    for line in range(len(_STARTS)):
+        # Angle and signed distance from the origin: (11) and (12).
+        row, start, end = _LINES + 2 * line, _STARTS[line], _ENDS[line]
+        u, v = points[start]
+        dx, dy = points[end, 0] - u, points[end, 1] - v
+        length = math.sqrt(dx * dx + dy * dy)
+        if length < shortest:
+            h[row], h[row + 1] = np.nan, np.nan
+            continue
+        dx, dy = dx / length, dy / length
+        h[row], h[row + 1] = math.atan2(dy, dx), dx * v - dy * u
+        for e in range(n):
+            du, dv = J[start, 0, e], J[start, 1, e]
+            turn = (dx * (J[end, 1, e] - dv) - dy * (J[end, 0, e] - du)) / length
+            H[row, e] = turn
+            H[row + 1, e] = dx * dv - dy * du - (dx * u + dy * v) * turn
+    for q in range(_QUATERNION, _SPREAD):
+        h[_SCALE] += x[q] ** 2
+        H[_SCALE, q] = 2.0 * x[q]
     return h, H, points
-
-
-@compiled
-def mirror_changes(x: Array, reach: Array, slope: float) -> Array:
-    """What to add to each flexion so that its segment looks the same, mirrored in depth.
-
-    Args:
-        reach: (6,) larger changes are not wanted [rad].
-        slope: nor segments whose end a turn moves by more than this, as a fraction of its length.
-
-    Returns:
-        (6,) [rad], 0 where there is nothing to mirror.
-    """
-    M, _ = scaled_rotation(x[_QUATERNION : _QUATERNION + 4])
-    M /= (x[_QUATERNION : _QUATERNION + 4] ** 2).sum()
-    changes = np.zeros(6)
-    for i in range(2):
-        c, s = math.cos(x[_SPREAD + i]), math.sin(x[_SPREAD + i])
-        # Where the finger's plane points in the camera at flexions of 0 and of 90 degrees.
-        forward, normal = c * M[:, 0] - s * M[:, 2], M[:, 1]
-        towards_camera = math.atan2(normal[2], forward[2])
-        direction = 0.0
-        for j in range(3):
-            direction += x[_FLEXION + 3 * i + j]
-            u, v = math.cos(direction), math.sin(direction)
-            if math.hypot(u * normal[0] - v * forward[0], u * normal[1] - v * forward[1]) > slope:
-                continue
-            change = 2 * (towards_camera - direction) + math.pi
-            change -= 2 * math.pi * round(change / (2 * math.pi))
-            if _SMALLEST_CHANGE < abs(change) < reach[3 * i + j]:
-                changes[3 * i + j] = change
-    return changes

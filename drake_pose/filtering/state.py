@@ -1,4 +1,7 @@
-"""What a state vector means, and how it moves: (5), (6) and (8) of Shimada et al."""
+"""What a state vector means, how it moves, and what is believed of it: (5), (6) and (8).
+
+Shimada, Shirai, Kuno and Miura; A of (8) is a step at constant velocity, U of (6) its noise.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,72 +16,43 @@ from drake_pose.errors import SettingsError, UnknownNameError
 Array = NDArray[np.float64]
 
 
-def check_moments(mean: ArrayLike, covariance: ArrayLike) -> tuple[Array, Array]:
-    """A mean (n,) and covariance (n, n) as arrays, the covariance made exactly symmetric.
-
-    Raises:
-        SettingsError: sizes that do not fit, NaN, infinity, asymmetry, or a negative variance.
-    """
-    q = np.array(mean, dtype=np.float64)
-    Q = np.array(covariance, dtype=np.float64, order="C")
-    if q.ndim != 1 or Q.shape != (q.size, q.size):
-        raise SettingsError(
-            f"mean {q.shape} and covariance {Q.shape} do not fit: give (n,) and (n, n)"
-        )
-    if not (np.isfinite(q).all() and np.isfinite(Q).all()):
-        raise SettingsError("the mean or the covariance holds NaN or infinity")
-    scale = np.sqrt(np.abs(np.diag(Q)))
-    if (np.abs(Q - Q.T) > 1e-6 * np.outer(scale, scale) + 1e-300).any():
-        raise SettingsError("the covariance is not symmetric")
-    return q, 0.5 * (Q + Q.T)
-
-
-def factor_of(covariance: Array) -> Array:
+def factor_of(covariance: Array, names: Sequence[str] = (), what: str = "the belief") -> Array:
     """(n, n) L with L L^T = covariance; variances of zero are allowed.
 
     Raises:
-        SettingsError: the covariance is indefinite: it has a clearly negative variance.
+        SettingsError: the covariance is indefinite; it says what has it, and which element it is.
     """
-    return factor_and_kind(covariance)[0]
-
-
-def factor_and_kind(covariance: Array) -> tuple[Array, bool]:
-    """``factor_of``, whose errors it raises, and whether the covariance is positive definite."""
     try:
-        return np.asarray(np.linalg.cholesky(covariance), dtype=np.float64), True
+        return np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
     except np.linalg.LinAlgError:
         pass
     # Semidefinite: scaled to correlations, so that small variances are not lost beside large ones.
-    scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    safe = np.where(scale > 0, scale, 1.0)
-    values, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))
-    if values[0] < -1e-8 or (np.diag(covariance) < 0).any():
+    scale = np.sqrt(np.abs(np.diag(covariance)))
+    scale[scale == 0] = 1.0
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    if values[0] < -1e-8:
+        k = int(np.argmax(np.abs(vectors[:, 0])))
         raise SettingsError(
-            "the covariance is indefinite: a combination of elements has a negative variance "
-            f"(lowest eigenvalue of the correlations {values[0]:.3g})"
+            f"{what}: the covariance is indefinite; the lowest eigenvalue of its correlations is "
+            f"{values[0]:.3g}, and '{names[k] if names else k}' has the largest part in it"
         )
-    root = (safe[:, None] * vectors) * np.sqrt(np.maximum(values, 0.0))
-    return np.ascontiguousarray(root), False
+    root = (scale[:, None] * vectors) * np.sqrt(np.maximum(values, 0.0))
+    return np.ascontiguousarray(root)
 
 
-def covariance_from(factor: Array, definite: bool = True) -> Array:
-    """(n, n) L L^T, exactly symmetric, of (n, k) L; positive definite after rounding if asked."""
+def covariance_from(factor: Array) -> Array:
+    """(n, n) L L^T of (n, k) L: symmetric, and positive definite after rounding if it can be."""
     product = factor @ factor.T
     product = 0.5 * (product + product.T)
     growth = 1e-15
-    while definite and growth < 1e-9 and not factor_exists(product):
-        product[np.diag_indices_from(product)] *= 1.0 + growth
-        growth *= 10.0
+    while growth < 1e-9:
+        try:
+            np.linalg.cholesky(product)
+            break
+        except np.linalg.LinAlgError:
+            product[np.diag_indices_from(product)] *= 1.0 + growth
+            growth *= 10.0
     return product
-
-
-def factor_exists(covariance: Array) -> bool:
-    """Whether Cholesky's factorisation of a symmetric matrix exists."""
-    try:
-        np.linalg.cholesky(covariance)
-    except np.linalg.LinAlgError:
-        return False
-    return True
 
 
 @dataclass(frozen=True)
@@ -186,47 +160,46 @@ class Belief:
         """(n,) standard deviations."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
+    def moved(self, A: Array, U: Array) -> "Belief":
+        """The belief (6) after a step x -> A x (n, n) with noise of covariance U (n, n)."""
+        P = A @ self.covariance @ A.T + U
+        return Belief(A @ self.mean, 0.5 * (P + P.T))
+
 
 def make_belief(
-    mean: ArrayLike, covariance: ArrayLike, layout: StateLayout | None = None
+    mean: ArrayLike,
+    covariance: ArrayLike,
+    layout: StateLayout | None = None,
+    what: str = "the belief",
 ) -> Belief:
-    """A belief from a mean (n,) and covariance (n, n) that are checked.
+    """A belief from a mean (n,) and covariance (n, n), checked, and made exactly symmetric.
 
     Raises:
-        SettingsError: sizes that do not fit, NaN, or a covariance that is indefinite.
+        SettingsError: sizes that do not fit, NaN, infinity, asymmetry, or a covariance that is
+            indefinite; where the layout is given, it names the element.
     """
-    if layout is not None:
-        name_flaws(mean, covariance, layout, "the belief")
-    q, Q = check_moments(mean, covariance)
-    factor_of(Q)
-    return Belief(q, Q)
-
-
-def name_flaws(mean: ArrayLike, covariance: ArrayLike, layout: StateLayout, what: str) -> None:
-    """Refuse moments that are no belief about a layout's elements, and say which element it is.
-
-    Raises:
-        SettingsError: wrong sizes, NaN or infinity, or a covariance that is indefinite.
-    """
-    q, Q = np.asarray(mean, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
-    n = len(layout)
-    if q.shape != (n,) or Q.shape != (n, n):
+    q = np.array(mean, dtype=np.float64)
+    Q = np.array(covariance, dtype=np.float64, order="C")
+    if q.ndim != 1 or Q.shape != (q.size, q.size):
         raise SettingsError(
-            f"{what} has a mean {q.shape} and a covariance {Q.shape}; the state has {n} elements"
+            f"mean {q.shape} and covariance {Q.shape} do not fit: give (n,) and (n, n)"
         )
+    if layout is not None and q.size != len(layout):
+        raise SettingsError(
+            f"{what} has a mean {q.shape} and a covariance {Q.shape}; the state has "
+            f"{len(layout)} elements"
+        )
+    names = layout.names if layout else [str(k) for k in range(q.size)]
     bad = np.flatnonzero(~np.isfinite(q) | ~np.isfinite(np.diag(Q)))
     if not bad.size:
         bad = np.flatnonzero(~np.isfinite(Q).all(axis=1))
     if bad.size:
         raise SettingsError(
-            f"{what}: the mean or the covariance of '{layout.names[bad[0]]}' is NaN or infinite"
+            f"{what}: the mean or the covariance of '{names[bad[0]]}' is NaN or infinity"
         )
     scale = np.sqrt(np.abs(np.diag(Q)))
-    scale[scale == 0] = 1.0
-    values, vectors = np.linalg.eigh(0.5 * (Q + Q.T) / np.outer(scale, scale))
-    if values[0] < -1e-8:
-        name = layout.names[int(np.argmax(np.abs(vectors[:, 0])))]
-        raise SettingsError(
-            f"{what}: the covariance is indefinite; the lowest eigenvalue of its correlations is "
-            f"{values[0]:.3g}, and '{name}' has the largest part in it"
-        )
+    if (np.abs(Q - Q.T) > 1e-6 * np.outer(scale, scale) + 1e-300).any():
+        raise SettingsError(f"{what}: the covariance is not symmetric")
+    belief = Belief(q, 0.5 * (Q + Q.T))
+    factor_of(belief.covariance, names, what)
+    return belief

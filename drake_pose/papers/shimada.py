@@ -22,8 +22,7 @@ from drake_pose.filtering.hand import (
     HandObservation,
 )
 from drake_pose.filtering.kalman.truncated_filter import FilterSettings, TruncatedFilter, Truncation
-from drake_pose.filtering.kalman.update import update
-from drake_pose.filtering.state import Belief
+from drake_pose.filtering.kalman.update import make_evidence, update
 from drake_pose.filtering.truncation.couplings import model_inequalities
 from drake_pose.papers.shimada_motion import (
     ACCELERATIONS,
@@ -214,8 +213,8 @@ def _bound(hand_filter: TruncatedFilter, sequence: SyntheticSequence) -> Array:
     belief = sequence.guess
     for t, (truth, y) in enumerate(zip(sequence.states, sequence.measurements, strict=True)):
         if t:
-            belief = Belief(A @ belief.mean, A @ belief.covariance @ A.T + U)
-        belief = update(belief, y, hand_filter.observation, 1, truth).belief
+            belief = belief.moved(A, U)
+        belief = update(belief, make_evidence(hand_filter.observation, y), 1, truth).belief
     return belief.mean
 
 

@@ -13,7 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from drake_pose.filtering.kalman.update import LinearObservation, ObservationModel, difference
+from drake_pose.filtering.kalman.update import (
+    Evidence,
+    LinearObservation,
+    ObservationModel,
+    difference,
+)
 from drake_pose.filtering.state import Belief, factor_of
 
 Array = NDArray[np.float64]
@@ -30,21 +35,22 @@ class View:
     count: int
 
 
-def next_view(view: View | None, y: Array, model: ObservationModel, significance: float) -> View:
+def next_view(view: View | None, seen: Evidence, significance: float) -> View:
     """The view a measurement belongs to: the one so far, or one that begins with it.
 
     Args:
         significance: a view is new when noise alone would make it differ so much from the reference
             with no more than this probability; 0: every one is new.
     """
+    y = seen.y
     if view is None or significance == 0 or len(view.reference) != len(y):
         return View(y, 1)
-    change = difference(y, view.reference, model.wraps)
+    change = difference(y, view.reference, seen.model.wraps)
     both = np.isfinite(change)
     new_rows = np.isfinite(y) & ~np.isfinite(view.reference)
     if new_rows.any() or not both.any():
         return View(y, 1)
-    size = float(np.sum(change[both] ** 2 / (2.0 * model.variances[both])))
+    size = float(np.sum(change[both] ** 2 / (2.0 * seen.variances[both])))
     is_new = size > _largest_change(significance, int(np.count_nonzero(both)))
     return View(y, 1) if is_new else View(view.reference, view.count + 1)
 
@@ -93,8 +99,7 @@ class RepeatedView:
         """One step at constant velocity; the offsets stay as they are."""
         n, P = len(self.tangent), self.belief.covariance.copy()
         mean = np.r_[A @ self.belief.mean[:n], self.belief.mean[n:]]
-        P[:n, :n] = A @ P[:n, :n] @ A.T + U
-        P[:n, :n] = 0.5 * (P[:n, :n] + P[:n, :n].T)
+        P[:n, :n] = self.state().moved(A, U).covariance
         P[:n, n:] = A @ P[:n, n:]
         P[n:, :n] = P[:n, n:].T
         return RepeatedView(self.tangent, Belief(mean, P))

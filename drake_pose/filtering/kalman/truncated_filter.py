@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,13 +23,14 @@ from drake_pose.filtering.kalman.repeated_views import (
     next_view,
 )
 from drake_pose.filtering.kalman.update import (
-    LimitedUpdate,
+    Evidence,
     ObservationModel,
-    check_measurement,
-    limited_update,
+    Truncate,
+    Updated,
+    make_evidence,
     update,
 )
-from drake_pose.filtering.state import Belief, StateLayout, check_moments, make_belief, name_flaws
+from drake_pose.filtering.state import Belief, StateLayout, make_belief
 from drake_pose.filtering.truncation.inequalities import Inequalities, inner_point
 from drake_pose.filtering.truncation.truncated_normal import (
     Truncated,
@@ -42,9 +43,8 @@ from drake_pose.filtering.truncation.truncated_normal import (
 
 Array = NDArray[np.float64]
 Truncation = Literal["joint", "sequential", "clip", "none"]
-Branch = tuple[Hypothesis, LimitedUpdate]
-_NO_SITES = np.zeros((0, 2))
-TRUNCATIONS: tuple[Truncation, ...] = ("joint", "sequential", "clip", "none")
+Branch = tuple[Hypothesis, Updated]
+TRUNCATIONS: tuple[Truncation, ...] = get_args(Truncation)
 
 
 @dataclass(frozen=True)
@@ -152,14 +152,16 @@ class TruncatedFilter:
         self.settings = settings or FilterSettings()
         self.inequalities = inequalities.for_columns(layout.names)
         inner_point(self.inequalities)
-        name_flaws(np.zeros(len(layout)), process_noise, layout, "the process noise")
-        _, self._U = check_moments(np.zeros(len(layout)), process_noise)
+        noise = make_belief(np.zeros(len(layout)), process_noise, layout, "the process noise")
+        self._U = noise.covariance
         self._A = layout.transition() if transition is None else transition
         self._rows = join_rows(self.inequalities)
         self.site_count = len(self._rows.directions) if self.settings.truncation == "joint" else 0
         # What is truncated and fed back has no offsets to keep.
         feeds_back = self.settings.truncation in ("sequential", "clip")
         self.novelty = 0.0 if feeds_back else self.settings.novelty
+        is_free = self.settings.truncation == "none" or not self.inequalities
+        self._limits: Truncate | None = None if is_free else self._truncate
 
     def start(self, belief: Belief) -> FilterState:
         """The state before the first measurement, truncated (but for "none").
@@ -168,7 +170,7 @@ class TruncatedFilter:
             SettingsError: a belief that does not fit, or is indefinite.
         """
         checked = make_belief(belief.mean, belief.covariance, self.layout)
-        truncated = self._truncate(checked, _NO_SITES)
+        truncated = self._cut(checked, np.zeros((0, 2)))
         return FilterState(0, (self._finish(Hypothesis(checked, checked), checked, truncated),))
 
     def predict(self, state: FilterState) -> FilterState:
@@ -176,99 +178,92 @@ class TruncatedFilter:
         moved = []
         for h in state.hypotheses:
             repeated = h.repeated.moved(self._A, self._U) if h.repeated else None
-            free = repeated.state() if repeated else self._move(h.free)
-            moved.append(replace(h, belief=self._move(h.belief), free=free, repeated=repeated))
+            free = repeated.state() if repeated else h.free.moved(self._A, self._U)
+            belief = h.belief.moved(self._A, self._U)
+            moved.append(replace(h, belief=belief, free=free, repeated=repeated))
         return replace(state, hypotheses=tuple(moved), rejections=())
 
     def update(
-        self, state: FilterState, y: Array, observation: ObservationModel | None = None
+        self,
+        state: FilterState,
+        y: Array,
+        observation: ObservationModel | None = None,
+        variances: Array | None = None,
     ) -> FilterState:
         """Use a measurement y (m,), NaN where occluded: section 5, steps 2 to 6.
+
+        Args:
+            observation: what is measured, if not what the filter was made for.
+            variances: (m,) of this measurement's noise, finite where it is; None: the model's.
 
         Raises:
             SettingsError: the measurement does not fit.
         """
-        step = state.step + 1
-        model = observation or self.observation
-        y = check_measurement(y, model)
-        view = next_view(state.view, y, model, self.novelty)
+        step, settings = state.step + 1, self.settings
+        seen = make_evidence(observation or self.observation, y, variances)
+        view = next_view(state.view, seen, self.novelty)
         if view.count > 1:
-            branches = [self._repeat(h, y, model) for h in state.hypotheses]
+            branches = [self._repeat(h, seen) for h in state.hypotheses]
         else:
             places = count()
-            branches = [
-                b for h in state.hypotheses for b in self._branches(h, y, model, step, places)
-            ]
+            branches = [b for h in state.hypotheses for b in self._branches(h, seen, step, places)]
         alive, rejected = self._reject(branches, step)
         finished = [
-            self._finish(h, done.updated.belief, done.truncated, done.updated.log_likelihood)
-            for h, done in alive
+            self._finish(h, done.belief, done.truncated, done.log_likelihood) for h, done in alive
         ]
         leader = max(range(len(finished)), key=lambda i: finished[i].log_weight)
-        merged, twins = merge_twins(normalise(finished), self.settings.twin_distance, step)
-        kept, pruned = prune(
-            merged, self.settings.hypothesis_cap, self.settings.smallest_weight, step
+        merged, twins = merge_twins(normalise(finished), settings.twin_distance, step)
+        kept, pruned = prune(merged, settings.hypothesis_cap, settings.smallest_weight, step)
+        best = alive[leader][1]
+        return FilterState(
+            step, tuple(kept), (*rejected, *twins, *pruned), best.distance, best.count, view
         )
-        rejections = (*rejected, *twins, *pruned)
-        updated = alive[leader][1].updated
-        return FilterState(step, tuple(kept), rejections, updated.distance, updated.count, view)
-
-    def _move(self, belief: Belief) -> Belief:
-        P = self._A @ belief.covariance @ self._A.T + self._U
-        return Belief(self._A @ belief.mean, 0.5 * (P + P.T))
 
     def _branches(
-        self,
-        hypothesis: Hypothesis,
-        y: Array,
-        model: ObservationModel,
-        step: int,
-        places: Iterator[int],
+        self, hypothesis: Hypothesis, seen: Evidence, step: int, places: Iterator[int]
     ) -> list[Branch]:
         """A hypothesis updated at its prediction, and at each mirrored one, which are counted."""
-        hypothesis = replace(hypothesis, repeated=None)
-        found = [(hypothesis, self._update(hypothesis, y, model, hypothesis.belief.mean))]
-        if self.settings.hypothesis_cap == 1:
-            return found
-        for start in model.mirrors(hypothesis.belief):
-            other = replace(hypothesis, born=step, place=next(places))
-            found.append((other, self._update(other, y, model, start, tempered=False)))
-        return found
+        own = replace(hypothesis, repeated=None)
+        starts = [(own, own.belief.mean)]
+        if self.settings.hypothesis_cap > 1:
+            for start in seen.model.mirrors(own.belief):
+                starts.append((replace(own, born=step, place=next(places)), start))
+        return [
+            (
+                h,
+                update(
+                    h.free,
+                    seen,
+                    self.settings.iterations,
+                    start,
+                    tempered=h is own,
+                    truncate=self._limits,
+                    sites=h.sites,
+                ),
+            )
+            for h, start in starts
+        ]
 
-    def _update(
-        self,
-        hypothesis: Hypothesis,
-        y: Array,
-        model: ObservationModel,
-        start: Array,
-        tempered: bool = True,
-    ) -> LimitedUpdate:
-        iterations = self.settings.iterations
-        if self.settings.truncation == "none" or not self.inequalities:
-            updated = update(hypothesis.free, y, model, iterations, start, tempered)
-            return LimitedUpdate(updated, unlimited(updated.belief))
-        return limited_update(
-            hypothesis.free, y, model, self._truncate, iterations, start, hypothesis.sites, tempered
-        )
-
-    def _repeat(self, hypothesis: Hypothesis, y: Array, model: ObservationModel) -> Branch:
+    def _repeat(self, hypothesis: Hypothesis, seen: Evidence) -> Branch:
         """A hypothesis updated by a further frame of the same view."""
         repeated = hypothesis.repeated
         if repeated is None:
             repeated = begin_repeated_view(
-                model, hypothesis.free, hypothesis.belief, hypothesis.tangent
+                seen.model, hypothesis.free, hypothesis.belief, hypothesis.tangent
             )
-        updated = update(repeated.belief, y, anchored(model, repeated.tangent))
+        tangent = seen._replace(model=anchored(seen.model, repeated.tangent))
+        updated = update(repeated.belief, tangent)
         repeated = replace(repeated, belief=updated.belief)
-        updated = replace(updated, belief=repeated.state())
-        truncated = self._truncate(updated.belief, hypothesis.sites)
-        return replace(hypothesis, repeated=repeated), LimitedUpdate(updated, truncated)
+        belief = repeated.state()
+        truncated = self._cut(belief, hypothesis.sites)
+        updated = replace(updated, belief=belief, truncated=truncated)
+        return replace(hypothesis, repeated=repeated), updated
 
     def _reject(
         self, branches: Sequence[Branch], step: int
     ) -> tuple[list[Branch], list[Rejection]]:
         """Section 5, step 5: give up what lies far beyond a row, but never all."""
-        if len(branches) == 1 or self.settings.truncation == "none" or not self.inequalities:
+        if len(branches) == 1 or self._limits is None:
             return list(branches), []
         alive, rejected, worst_c = [], [], []
         for hypothesis, result in branches:
@@ -277,7 +272,7 @@ class TruncatedFilter:
             worst_c.append(c[k])
             if c[k] < self.settings.reject_below:
                 name = self.inequalities.rows[k]
-                gone = replace(hypothesis, belief=result.updated.belief)
+                gone = replace(hypothesis, belief=result.belief)
                 rejected.append(Rejection(step, gone, "constraint", name, float(c[k])))
             else:
                 alive.append((hypothesis, result))
@@ -308,17 +303,13 @@ class TruncatedFilter:
             tangent=hypothesis.tangent if hypothesis.repeated else belief.mean,
         )
 
+    def _cut(self, belief: Belief, sites: Array) -> Truncated:
+        """A belief truncated by the limits, if there are any."""
+        return unlimited(belief) if self._limits is None else self._limits(belief, sites)
+
     def _truncate(self, belief: Belief, sites: Array) -> Truncated:
-        if self.settings.truncation == "none" or not self.inequalities:
-            return unlimited(belief)
         if self.settings.truncation == "sequential":
-            return truncate_sequential(belief.mean, belief.covariance, self.inequalities)
+            return truncate_sequential(belief, self.inequalities)
         if self.settings.truncation == "clip":
-            return clip(belief.mean, belief.covariance, self.inequalities)
-        return truncate_joint(
-            belief.mean,
-            belief.covariance,
-            self._rows,
-            tolerance=self.settings.tolerance,
-            start=sites if sites.size else None,
-        )
+            return clip(belief, self.inequalities)
+        return truncate_joint(belief, self._rows, self.settings.tolerance, sites)

@@ -15,7 +15,7 @@ from scipy.linalg.lapack import dpotrf, dpotrs
 
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.state import Belief
-from drake_pose.filtering.truncation.truncated_normal import Truncated
+from drake_pose.filtering.truncation.truncated_normal import Truncated, unlimited
 
 Array = NDArray[np.float64]
 Truncate = Callable[[Belief, Array], Truncated]
@@ -24,7 +24,7 @@ Truncate = Callable[[Belief, Array], Truncated]
 # narrow curved valleys, such as that of a known scale, would stop a descent.
 _GOOD_FIT = 9.0
 _COOLING = 6.0
-# Steps below this many predicted deviations end the iteration; with limits, below this many.
+# Steps below this many deviations end the iteration; with limits, below this many.
 _SETTLED = 0.01
 _SETTLED_WITH_LIMITS = 0.3
 # From this linearisation on the steps are halved: the tangents may point to and fro.
@@ -76,11 +76,21 @@ class LinearObservation:
         return []
 
 
+class Evidence(NamedTuple):
+    """A measurement y (m,), NaN where occluded, of a model, with this one's noise (m,)."""
+
+    model: ObservationModel
+    y: Array
+    variances: Array
+
+
 @dataclass(frozen=True, eq=False)
 class Updated:
     """A belief after a measurement.
 
     Attributes:
+        belief: without limits.
+        truncated: by the limits.
         log_likelihood: logarithm of the measurement's probability density, from the normal
             distribution fitted at the mean.
         distance: the squared distance of mean and measurement from the prediction: chi-squared
@@ -88,250 +98,134 @@ class Updated:
     """
 
     belief: Belief
+    truncated: Truncated
     log_likelihood: float
     distance: float
     count: int
-    iterations: int
 
 
-@dataclass(frozen=True, eq=False)
-class LimitedUpdate:
-    """A belief after a measurement: without its limits, and truncated by them."""
-
-    updated: Updated
-    truncated: Truncated
-
-
-@dataclass(frozen=True, eq=False)
-class _Weighed:
-    """An observation model with the noise of one measurement."""
-
-    model: ObservationModel
-    variances: Array
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self.model.names
-
-    @property
-    def wraps(self) -> NDArray[np.bool_]:
-        return self.model.wraps
-
-    def predict(self, x: Array) -> tuple[Array, Array]:
-        return self.model.predict(x)
-
-    def mirrors(self, belief: Belief) -> list[Array]:
-        return self.model.mirrors(belief)
-
-
-def with_variances(model: ObservationModel, y: Array, variances: Array) -> ObservationModel:
-    """The same model for one measurement whose noise is its own.
-
-    Args:
-        y, variances: (m,), NaN where occluded.
+def make_evidence(model: ObservationModel, y: Array, variances: Array | None = None) -> Evidence:
+    """A measurement y (m,), NaN where occluded, and its variances (m,), else the model's.
 
     Raises:
-        SettingsError: wrong sizes, or a variance of something measured that is not positive.
+        SettingsError: a wrong size, infinity, or a variance of something measured that is not
+            positive.
     """
-    check_measurement(y, model)
-    check_measurement(variances, model)
-    bad = np.isfinite(y) & ~(variances > 0)
-    if bad.any():
-        name = model.names[int(np.flatnonzero(bad)[0])]
-        raise SettingsError(f"the variance of measurement '{name}' must be positive")
-    return _Weighed(model, np.where(np.isfinite(variances), variances, model.variances))
-
-
-def check_measurement(y: Array, model: ObservationModel) -> Array:
-    """(m,) a measurement, NaN where occluded.
-
-    Raises:
-        SettingsError: it has the wrong size, or holds infinity.
-    """
-    values = np.asarray(y, dtype=np.float64)
-    if values.shape != (len(model.names),):
-        raise SettingsError(
-            f"a measurement has the shape {values.shape}; the model measures "
-            f"{len(model.names)} numbers (NaN where occluded)"
-        )
-    if np.isinf(values).any():
-        bad = model.names[int(np.flatnonzero(np.isinf(values))[0])]
-        raise SettingsError(f"measurement '{bad}' is infinite; give NaN where it is occluded")
-    return values
+    for values in (y,) if variances is None else (y, variances):
+        if np.shape(values) != (len(model.names),):
+            raise SettingsError(
+                f"a measurement has the shape {np.shape(values)}; the model measures "
+                f"{len(model.names)} numbers (NaN where occluded)"
+            )
+        infinite = np.flatnonzero(np.isinf(values))
+        if len(infinite):
+            raise SettingsError(
+                f"measurement '{model.names[infinite[0]]}' is infinite; give NaN where it is "
+                "occluded"
+            )
+    if variances is None:
+        return Evidence(model, np.asarray(y, dtype=np.float64), model.variances)
+    bad = np.flatnonzero(np.isfinite(y) & ~(variances > 0))
+    if len(bad):
+        raise SettingsError(f"the variance of measurement '{model.names[bad[0]]}' must be positive")
+    return Evidence(model, y, np.where(np.isfinite(variances), variances, model.variances))
 
 
 class _Line(NamedTuple):
     """A measurement made linear at x: innovation = H (x - prediction) + noise of these variances.
 
-    residual: measured minus expected at x; hidden: what is measured but cannot be seen at x.
+    misfit: squared distance of what was measured from what is expected at x, over its count.
     """
 
     H: Array
     noise: Array
-    residual: Array
     innovation: Array
-    hidden: int
-
-    @property
-    def misfit(self) -> float:
-        return float(np.sum(self.residual**2 / self.noise))
+    misfit: float
 
 
-def _linearise(prediction: Belief, values: Array, model: ObservationModel, x: Array) -> _Line:
-    h, H = model.predict(x)
-    seen = np.isfinite(values)
-    rows = seen & np.isfinite(h)
-    residual = difference(values[rows], h[rows], model.wraps[rows])
-    H, noise = H[rows], model.variances[rows]
-    innovation = residual + H @ (x - prediction.mean)
-    return _Line(H, noise, residual, innovation, int(np.count_nonzero(seen & ~rows)))
+def _linearise(prediction: Belief, seen: Evidence, x: Array) -> _Line:
+    h, H = seen.model.predict(x)
+    rows = np.isfinite(seen.y) & np.isfinite(h)
+    residual = difference(seen.y[rows], h[rows], seen.model.wraps[rows])
+    H, noise = H[rows], seen.variances[rows]
+    misfit = float(np.sum(residual**2 / noise)) / max(len(residual), 1)
+    return _Line(H, noise, residual + H @ (x - prediction.mean), misfit)
 
 
-class _Fusion:
-    """A prediction (P) and a line with noise of a temperature, S factorised.
+def _fuse(prediction: Belief, line: _Line, temperature: float = 1.0) -> tuple[Belief, float, float]:
+    """The belief with a line whose noise has a temperature, log likelihood, squared distance.
 
     Raises:
         SettingsError: S is not positive definite.
     """
-
-    def __init__(self, prediction: Belief, line: _Line, temperature: float = 1.0) -> None:
-        self._prediction, self._line = prediction, line
-        self._noise = temperature * line.noise
-        self._HP = line.H @ prediction.covariance
-        S = self._HP @ line.H.T
-        S[np.diag_indices_from(S)] += self._noise
-        self._root: Array
-        self._root, failed = dpotrf(S, lower=1) if len(S) else (S, 0)
-        if failed:
-            raise SettingsError(
-                "the covariance of the innovation is not positive definite: give every measurement "
-                "a positive variance"
-            )
-        self._weighed = self._solve(line.innovation)
-
-    def _solve(self, right: Array) -> Array:
-        """S^-1 times right (m, ...)."""
-        if not len(right):
-            return right
-        return np.asarray(dpotrs(self._root, right, lower=1)[0])
-
-    @property
-    def dual(self) -> Array:
-        """H^T S^-1 innovation (n,): P times it is the mean's step."""
-        return self._line.H.T @ self._weighed
-
-    def updated(self, made: int, distance: float | None = None) -> Updated:
-        """The belief after the measurement; ``distance``: if not that of the line."""
-        line, count = self._line, len(self._noise)
-        if distance is None:
-            distance = float(line.innovation @ self._weighed)
-        log_determinant = 2.0 * float(np.log(np.diag(self._root)).sum())
-        log_likelihood = -0.5 * (distance + log_determinant + count * math.log(2 * math.pi))
-        mean, P = self._prediction.mean, self._prediction.covariance
-        gain = self._solve(self._HP).T
-        root = self._prediction.root
-        rest = root - gain @ (line.H @ root)
-        covariance = rest @ rest.T + (gain * self._noise) @ gain.T
-        belief = Belief(mean + P @ self.dual, 0.5 * (covariance + covariance.T))
-        return Updated(belief, log_likelihood, distance, count, made)
+    count, P = len(line.noise), prediction.covariance
+    if not count:
+        return prediction, 0.0, 0.0
+    noise = temperature * line.noise
+    HP = line.H @ P
+    S = HP @ line.H.T
+    S[np.diag_indices_from(S)] += noise
+    root, failed = dpotrf(S, lower=1)
+    if failed:
+        raise SettingsError(
+            "the covariance of the innovation is not positive definite: give every measurement "
+            "a positive variance"
+        )
+    weighed = dpotrs(root, line.innovation, lower=1)[0]
+    distance = float(line.innovation @ weighed)
+    log_determinant = 2.0 * float(np.log(np.diag(root)).sum())
+    log_likelihood = -0.5 * (distance + log_determinant + count * math.log(2 * math.pi))
+    gain = dpotrs(root, HP, lower=1)[0].T
+    rest = prediction.root - gain @ (line.H @ prediction.root)
+    covariance = rest @ rest.T + (gain * noise) @ gain.T
+    mean = prediction.mean + P @ (line.H.T @ weighed)
+    return Belief(mean, 0.5 * (covariance + covariance.T)), log_likelihood, distance
 
 
 def update(
     prediction: Belief,
-    y: Array,
-    model: ObservationModel,
+    seen: Evidence,
     iterations: int = 1,
     start: Array | None = None,
     tempered: bool = True,
+    truncate: Truncate | None = None,
+    sites: Array | None = None,
 ) -> Updated:
-    """Fuse a belief with a measurement.
-
-    With one iteration this is (19) and (20), linearised at ``start``. With more, each
-    linearises where the last one ended (Gauss-Newton on the posterior, steps halved while they
-    make it worse): the overconfidence of a single linearisation far from the truth goes away.
-
-    Args:
-        y: (m,) measured, NaN where occluded.
-        start: (n,) where to linearise first; the predicted mean if not given.
-        tempered: whether a far start is approached with more noise than there is.
-
-    Raises:
-        SettingsError: the measurement does not fit.
-    """
-    values = check_measurement(y, model)
-    mean, P = prediction.mean, prediction.covariance
-    x = mean if start is None else start
-    deviations = np.maximum(prediction.deviations(), 1e-12)
-    dual = last_dual = np.zeros_like(mean)
-    last_x, last_cost, temperature, made = x, math.inf, 1.0, 0
-    for attempt in range(3 * iterations):
-        now = _linearise(prediction, values, model, x)
-        if attempt == 0 and iterations > 1 and tempered:
-            temperature = max(1.0, now.misfit / max(len(now.residual), 1) / _GOOD_FIT)
-        # What is hidden at one state and seen at another must not decide between them.
-        cost = float(dual @ P @ dual) + now.misfit + 9.0 * now.hidden
-        if made > 1 and temperature == 1.0 and cost > last_cost + 1e-9:
-            x, dual = 0.5 * (x + last_x), 0.5 * (dual + last_dual)
-            if np.abs((x - last_x) / deviations).max() < 1e-3:
-                break
-            continue
-        step = np.abs((x - last_x) / deviations).max() if attempt else math.inf
-        line, line_cost = now, cost
-        last_x, last_cost, last_dual = x, cost, dual
-        if made == iterations or iterations == 1 or (temperature == 1.0 and step < _SETTLED):
-            break
-        made += 1
-        dual = _Fusion(prediction, line, temperature).dual
-        temperature = max(1.0, temperature / _COOLING)
-        if temperature == 1.0:
-            last_cost = math.inf
-        x = mean + P @ dual
-    return _Fusion(prediction, line).updated(max(made, 1), None if iterations == 1 else line_cost)
-
-
-def limited_update(
-    prediction: Belief,
-    y: Array,
-    model: ObservationModel,
-    truncate: Truncate,
-    iterations: int,
-    start: Array,
-    sites: Array,
-    tempered: bool = True,
-) -> LimitedUpdate:
     """Fuse a belief with a measurement, and truncate it.
 
-    With one iteration this is (19), (20) and the truncation after it. With more, the measurement
-    is linearised anew at the mean of the truncated belief, until that stays where it is: a
-    tangent taken where the state cannot be says little about where it can be.
+    With one iteration this is (19) and (20), linearised at ``start``, and the truncation after it.
+    With more, the measurement is linearised anew at the mean of the truncated belief, until that
+    stays where it is: a tangent taken where the state cannot be says little about where it can be.
 
     Args:
-        prediction, y, model, iterations, start: as of ``update``.
-        truncate: a belief, and sites (S, 2) to begin with, to a result.
-        tempered: as of ``update``; a mirrored start would be drawn back to the prediction by it.
+        start: (n,) where to linearise first; the predicted mean if not given.
+        tempered: whether a far start is approached with more noise than there is, which would
+            draw a mirrored one back to the prediction.
+        truncate: a belief, and sites (S, 2) to begin with, to a result; None: there are no limits.
+        sites: of the last truncation.
 
     Raises:
-        SettingsError: the measurement does not fit, or the belief has no density inside.
+        SettingsError: the belief has no density inside the limits.
     """
-    values = check_measurement(y, model)
-    if iterations == 1 or not np.isfinite(values).any():
-        updated = update(prediction, values, model, 1, start)
-        return LimitedUpdate(updated, truncate(updated.belief, sites))
-    x, temperature = start, 1.0
+    x, temperature = prediction.mean if start is None else start, 1.0
+    sites = np.zeros((0, 2)) if sites is None else sites
+    settled = _SETTLED if truncate is None else _SETTLED_WITH_LIMITS
+    if not np.isfinite(seen.y).any():
+        iterations = 1
     for made in range(iterations):
-        line = _linearise(prediction, values, model, x)
-        if made == 0 and tempered:
-            temperature = max(1.0, line.misfit / max(len(line.residual), 1) / _GOOD_FIT)
-        updated = _Fusion(prediction, line, temperature).updated(made + 1)
-        truncated = truncate(updated.belief, sites)
+        line = _linearise(prediction, seen, x)
+        if made == 0 and iterations > 1 and tempered:
+            temperature = max(1.0, line.misfit / _GOOD_FIT)
+        belief, log_likelihood, distance = _fuse(prediction, line, temperature)
+        truncated = unlimited(belief) if truncate is None else truncate(belief, sites)
         sites = truncated.sites
         step = truncated.mean - x
-        size = np.abs(step / np.maximum(updated.belief.deviations(), 1e-12)).max()
-        if temperature == 1.0 and size < _SETTLED_WITH_LIMITS:
+        size = np.abs(step / np.maximum(belief.deviations(), 1e-12)).max()
+        if temperature == 1.0 and size < settled:
             break
         x = x + (step if made < _PATIENCE else 0.5 * step)
         temperature = max(1.0, temperature / _COOLING)
-    return LimitedUpdate(updated, truncated)
+    return Updated(belief, truncated, log_likelihood, distance, len(line.noise))
 
 
 def difference(values: Array, expected: Array, turning: NDArray[np.bool_]) -> Array:

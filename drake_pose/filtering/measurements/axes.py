@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
 from drake_pose.errors import MaskError, SettingsError
+from drake_pose.filtering.kalman.update import difference
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.state import Belief
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
@@ -20,6 +20,9 @@ Labels = NDArray[np.int16]
 Ends = tuple[Array, Array]
 
 _FEWEST_PIXELS = 12
+# A segment that points at the camera shows no axis [pixel].
+_SHORTEST = 5.0
+_STEP = 1e-5
 
 
 @dataclass(frozen=True)
@@ -63,84 +66,6 @@ class Axis:
     share: float
 
 
-class AxisObserver:
-    """Measures the axes of a body's segments beside a rough pose of it, such as a matcher's.
-
-    The principal axis of a segment's pixels is not its axis where a neighbour covers one end of it
-    obliquely. The rough pose is drawn, and measured in the same way: how much the picture differs
-    from the drawing corrects the axis of the rough pose.
-
-    Args:
-        axes: start and end of each segment's axis (3,), (3,) in the frame of its link, by the
-            link's name [m].
-        origin: (2,) where the image's origin is for rho [pixel].
-
-    Raises:
-        UnknownNameError: there is no link of such a name.
-    """
-
-    def __init__(
-        self,
-        model: ParsedModel,
-        camera: Camera,
-        axes: Mapping[str, Ends],
-        origin: tuple[float, float] = (0.0, 0.0),
-        settings: AxisSettings | None = None,
-    ) -> None:
-        self._renderer, self._camera = LabelRenderer(model, camera), camera
-        self._links = {name: model.link_index(name) for name in axes}
-        self._axes, self._origin = dict(axes), np.array(origin, dtype=np.float64)
-        self._settings = settings or AxisSettings()
-
-    def measure_labels(self, labels: Labels, q: Array) -> dict[str, Axis]:
-        """Axes of segments seen well enough in a label image (H, W) of links, -1 for none.
-
-        Args:
-            q: (nq,) a rough pose, within some degrees.
-
-        Raises:
-            MaskError: an image that is not of the camera's size.
-        """
-        size = (self._camera.height, self._camera.width)
-        if labels.shape != size:
-            raise MaskError(
-                f"camera '{self._camera.name}': an image of {labels.shape[::-1]} pixels, "
-                f"{size[::-1]} expected"
-            )
-        rough, poses = self._renderer.segments(q), self._renderer.link_poses(q)
-        found = {}
-        for name, link in self._links.items():
-            X, ends = poses[link], np.array(self._axes[name])
-            uv = self._camera.project(ends @ X[:3, :3].T + X[:3, 3])[0] - self._origin
-            seen, drawn = (self._fit(image == link) for image in (labels, rough))
-            if seen is None or drawn is None:
-                continue
-            share = seen.count / drawn.count
-            if not self._settings.smallest_share < share < 1 / self._settings.smallest_share:
-                continue
-            # A segment that another covers at the rough pose is much shorter than its axis.
-            if drawn.length < self._settings.smallest_share * float(np.linalg.norm(uv[1] - uv[0])):
-                continue
-            found[name] = _correct(uv, seen, drawn)
-        return found
-
-    def _fit(self, pixels: NDArray[np.bool_]) -> "_Fit | None":
-        v, u = np.nonzero(pixels)
-        if len(u) < _FEWEST_PIXELS:
-            return None
-        points = np.column_stack([u, v]) - self._origin
-        centre = points.mean(axis=0)
-        values, vectors = np.linalg.eigh(np.cov(points.T))
-        # A rectangle's standard deviation is its length over the root of 12.
-        length, width = math.sqrt(12 * values[1]), math.sqrt(12 * max(values[0], 1e-12))
-        if length < 1.3 * width:
-            return None
-        # The middle between two edges, at length / correlation independent places.
-        settings = self._settings
-        sideways = 0.5 * settings.edge_deviation**2 * settings.correlation / length
-        return _Fit(centre, vectors[:, 1], length, 12 * sideways / length**2, sideways, len(u))
-
-
 @dataclass(frozen=True, eq=False)
 class _Fit:
     """The principal axis of a region: its centre, direction, length and how sure these are."""
@@ -176,11 +101,6 @@ def _correct(uv: Array, seen: _Fit, drawn: _Fit) -> Axis:
     return Axis(alpha, float(rho), covariance, seen.count / drawn.count)
 
 
-# A segment that points at the camera shows no axis [pixel].
-_SHORTEST = 5.0
-_STEP = 1e-5
-
-
 class AxisObservation:
     """What a camera sees of segments' axes: alpha [rad] and rho [pixel] of each.
 
@@ -214,20 +134,16 @@ class AxisObservation:
         _, X_WB = tree.positions_from(tree.default_values())
         if not np.allclose(X_WB, np.eye(4), atol=1e-9):
             raise SettingsError(f"{tree.model.path}: the root moves beside the plant's positions")
-        self.body, self.observer = body, AxisObserver(tree.model, camera, axes, origin, settings)
+        self.body, self._renderer = body, LabelRenderer(tree.model, camera)
+        self._settings = settings or AxisSettings()
         self._camera, self._origin = camera, np.array(origin, dtype=np.float64)
         self._kinematics = TreeKinematics(tree)
         self._nodes = [tree.node_index(name) for name in axes]
         self._ends = np.array([axes[name] for name in axes], dtype=np.float64)
-        self._links = tuple(axes)
+        self.links = tuple(axes)
         self.names = tuple(f"{kind}_{name}" for name in axes for kind in ("alpha", "rho"))
         self.variances = np.tile([math.radians(2.0) ** 2, 2.0**2], len(axes))
         self.wraps = np.tile([True, False], len(axes))
-
-    @property
-    def links(self) -> tuple[str, ...]:
-        """The segments, in the order of their measurements."""
-        return self._links
 
     def predict(self, x: Array) -> tuple[Array, Array]:
         """Axes (m,) at a state (n,), NaN where too short; Jacobian by central differences."""
@@ -237,8 +153,7 @@ class AxisObservation:
         for name in (*layout.moving, *layout.constant):
             step = np.zeros_like(x)
             step[layout.index(name)] = _STEP
-            change = self._axes_at(x + step) - self._axes_at(x - step)
-            change[self.wraps] = np.remainder(change[self.wraps] + np.pi, 2 * np.pi) - np.pi
+            change = difference(self._axes_at(x + step), self._axes_at(x - step), self.wraps)
             H[:, layout.index(name)] = change / (2 * _STEP)
         return h, H
 
@@ -246,7 +161,7 @@ class AxisObservation:
         """None."""
         return []
 
-    def measure(self, labels: NDArray[np.int16], x: Array) -> tuple[Array, Array]:
+    def measure(self, labels: Labels, x: Array) -> tuple[Array, Array]:
         """Measure the axes in a label image (H, W) beside a rough state (n,).
 
         An axis' alpha and rho err together. Their variances are given out so large that two
@@ -258,14 +173,64 @@ class AxisObservation:
         Raises:
             MaskError: an image that is not of the camera's size.
         """
-        y = np.full((len(self._links), 2), np.nan)
+        y = np.full((len(self.links), 2), np.nan)
         variances = y.copy()
-        found = self.observer.measure_labels(labels, self.body.positions(x)[0])
-        for k, name in enumerate(self._links):
+        found = self.measure_labels(labels, self.body.positions(x)[0])
+        for k, name in enumerate(self.links):
             if name in found:
                 y[k] = found[name].alpha, found[name].rho
                 variances[k] = _independent(found[name])
         return y.ravel(), variances.ravel()
+
+    def measure_labels(self, labels: Labels, q: Array) -> dict[str, Axis]:
+        """Axes of segments seen well enough in a label image (H, W) of links, -1 for none.
+
+        The principal axis of a segment's pixels is not its axis where a neighbour covers one end
+        of it obliquely. So a rough pose q (nq,), within some degrees, is drawn and measured in the
+        same way: how much the picture differs from the drawing corrects the axis of that pose.
+
+        Raises:
+            MaskError: an image that is not of the camera's size.
+        """
+        size = (self._camera.height, self._camera.width)
+        if labels.shape != size:
+            raise MaskError(
+                f"camera '{self._camera.name}': an image of {labels.shape[::-1]} pixels, "
+                f"{size[::-1]} expected"
+            )
+        rough, poses = self._renderer.segments(q), self._renderer.link_poses(q)
+        found = {}
+        for name, ends in zip(self.links, self._ends, strict=True):
+            link = self.body.tree.model.link_index(name)
+            X = poses[link]
+            uv = self._camera.project(ends @ X[:3, :3].T + X[:3, 3])[0] - self._origin
+            seen, drawn = (self._fit(image == link) for image in (labels, rough))
+            if seen is None or drawn is None:
+                continue
+            share = seen.count / drawn.count
+            if not self._settings.smallest_share < share < 1 / self._settings.smallest_share:
+                continue
+            # A segment that another covers at the rough pose is much shorter than its axis.
+            if drawn.length < self._settings.smallest_share * float(np.linalg.norm(uv[1] - uv[0])):
+                continue
+            found[name] = _correct(uv, seen, drawn)
+        return found
+
+    def _fit(self, pixels: NDArray[np.bool_]) -> "_Fit | None":
+        v, u = np.nonzero(pixels)
+        if len(u) < _FEWEST_PIXELS:
+            return None
+        points = np.column_stack([u, v]) - self._origin
+        centre = points.mean(axis=0)
+        values, vectors = np.linalg.eigh(np.cov(points.T))
+        # A rectangle's standard deviation is its length over the root of 12.
+        length, width = math.sqrt(12 * values[1]), math.sqrt(12 * max(values[0], 1e-12))
+        if length < 1.3 * width:
+            return None
+        # The middle between two edges, at length / correlation independent places.
+        settings = self._settings
+        sideways = 0.5 * settings.edge_deviation**2 * settings.correlation / length
+        return _Fit(centre, vectors[:, 1], length, 12 * sideways / length**2, sideways, len(u))
 
     def _axes_at(self, x: Array) -> Array:
         values = self._kinematics.flatten(self.body.node_values(x))

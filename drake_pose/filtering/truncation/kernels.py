@@ -114,6 +114,24 @@ def apply_sites(
 
 
 @compiled
+def interval_site(
+    value: float, variance: float, lower: float, upper: float
+) -> tuple[float, float, float]:
+    """The site with which a belief along a line has its mean and variance between two bounds.
+
+    Returns:
+        tau and nu, 0 where both bounds are far, and the logarithm of the probability between them.
+    """
+    deviation = math.sqrt(variance)
+    alpha, beta = (lower - value) / deviation, (upper - value) / deviation
+    if alpha < -_FAR and beta > _FAR:
+        return 0.0, 0.0, 0.0
+    log_probability, shift, spread = interval_moments(alpha, beta)
+    tau = max((1.0 - spread) / (variance * spread), 0.0)
+    return tau, tau * value + shift / (deviation * spread), log_probability
+
+
+@compiled
 def propagate(
     base_mean: Array,
     base_factor: Array,
@@ -165,13 +183,7 @@ def propagate(
                 variance = (projected * projected).sum()
             if variance <= 0.0:
                 continue
-            deviation = math.sqrt(variance)
-            alpha, beta = (lower[i] - value) / deviation, (upper[i] - value) / deviation
-            tau, nu, log_probability = 0.0, 0.0, 0.0
-            if alpha > -_FAR or beta < _FAR:
-                log_probability, shift, spread = interval_moments(alpha, beta)
-                tau = max((1.0 - spread) / (variance * spread), 0.0)
-                nu = tau * value + shift / (deviation * spread)
+            tau, nu, log_probability = interval_site(value, variance, lower[i], upper[i])
             denominator = 1.0 + tau * variance
             integral = (2.0 * value * nu + variance * nu * nu - tau * value * value) / denominator
             corrections[i] = log_probability - 0.5 * integral + 0.5 * math.log(denominator)
@@ -179,8 +191,7 @@ def propagate(
             now = (value + variance * nu) / denominator
             before_denominator = 1.0 + old_tau * variance
             before = (value + variance * old_nu) / before_denominator
-            now_deviation = deviation / math.sqrt(denominator)
-            change = abs(now - before) / now_deviation
+            change = abs(now - before) / math.sqrt(variance / denominator)
             change = max(change, abs(before_denominator / denominator - 1.0))
             largest = max(largest, change)
             change_of_site[0, 0], change_of_site[0, 1] = tau - old_tau, nu - old_nu
@@ -215,30 +226,21 @@ def cut_one_by_one(
     Returns:
         The logarithm of the probability of all rows, as the chain of cuts has it.
     """
-    total = 0.0
-    n, width = factor.shape
+    total, site = 0.0, np.empty((1, 2))
     for row in range(phi.shape[0]):
         value, projected = project(mean, factor, phi[row])
-        size = 0.0
-        for i in range(n):
+        variance, size = (projected * projected).sum(), 0.0
+        for i in range(len(mean)):
             if phi[row, i] != 0.0:
                 size += abs(phi[row, i]) * math.sqrt((factor[i] * factor[i]).sum())
-        deviation = math.sqrt((projected * projected).sum())
         c[row] = np.inf
-        if deviation <= 1e-15 * size:
+        if math.sqrt(variance) <= 1e-15 * size:
             continue
-        c[row] = (b[row] - value) / deviation
-        if c[row] > skip_above:
-            continue
-        log_probability, nu, spread = interval_moments(-np.inf, c[row])
-        total += log_probability
-        shrink = (1.0 - math.sqrt(spread)) / deviation
-        for i in range(n):
-            gain = 0.0
-            for j in range(width):
-                gain += factor[i, j] * projected[j]
-            gain /= deviation
-            mean[i] += gain * nu
-            for j in range(width):
-                factor[i, j] -= shrink * gain * projected[j]
+        c[row] = (b[row] - value) / math.sqrt(variance)
+        if c[row] <= skip_above:
+            site[0, 0], site[0, 1], log_probability = interval_site(
+                value, variance, -np.inf, b[row]
+            )
+            apply_sites(mean, factor, phi[row : row + 1], site, -1, 1.0)
+            total += log_probability
     return total

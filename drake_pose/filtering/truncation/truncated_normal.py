@@ -3,16 +3,10 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.state import (
-    Belief,
-    check_moments,
-    covariance_from,
-    factor_and_kind,
-    factor_of,
-)
+from drake_pose.filtering.state import Belief, covariance_from
 from drake_pose.filtering.truncation.inequalities import Inequalities
 from drake_pose.filtering.truncation.kernels import apply_sites, cut_one_by_one, propagate
 
@@ -25,23 +19,19 @@ _SWEEPS, _PATIENCE = 400, 25
 
 
 @dataclass(frozen=True, eq=False)
-class Truncated:
-    """A truncated distribution.
+class Truncated(Belief):
+    """A truncated belief, whose covariance is positive definite where the given one was.
 
     Attributes:
-        mean: (n,).
-        covariance: (n, n), symmetric, and positive definite where the given one was.
         c: (K,) of (24), before the truncation: how many standard deviations inside of each row
             the mean was, negative if beyond; infinite where the row has no variance. For the
             sequential form, at the row's turn.
         active: (K,) whether the row took part (c_k at most SKIP_ABOVE).
         log_probability: logarithm of the probability that all rows held, as estimated.
         sites: what the joint form knows about each direction of ``JointRows`` (S, 2); empty for
-            the sequential form.
+            the others.
     """
 
-    mean: Array
-    covariance: Array
     c: Array
     active: NDArray[np.bool_]
     log_probability: float
@@ -80,14 +70,13 @@ def join_rows(inequalities: Inequalities) -> JointRows:
     """
     phi = inequalities.phi
     used = np.flatnonzero(phi.any(axis=0))
-    count = len(phi)
-    if count == 0:
-        nothing = np.zeros(0)
-        empty = np.zeros((0, phi.shape[1]))
-        return JointRows(inequalities, used, np.zeros((0, 0)), nothing, nothing, used, empty)
+    if not len(phi):
+        none, nothing = np.zeros((0, 0)), np.zeros(0)
+        whole = np.zeros((0, phi.shape[1]))
+        return JointRows(inequalities, used, none, nothing, nothing, used, whole)
     norms = np.linalg.norm(phi, axis=1)
     unit = phi[:, used] / norms[:, None]
-    leading = unit[np.arange(count), np.argmax(np.abs(unit) > 1e-9, axis=1)]
+    leading = unit[np.arange(len(phi)), np.argmax(np.abs(unit) > 1e-9, axis=1)]
     signs = np.sign(leading)
     unit, bounds = unit * signs[:, None], inequalities.b / norms
     # Adding 0 makes -0 into 0, which np.unique tells apart.
@@ -108,12 +97,18 @@ def join_rows(inequalities: Inequalities) -> JointRows:
     return JointRows(inequalities, used, directions, lower, upper, group, whole)
 
 
-def normalised_margins(mean: Array, covariance: Array, inequalities: Inequalities) -> Array:
+def _margins(belief: Belief, inequalities: Inequalities) -> Array:
     """(K,) c_k of (24); a row without variance has an infinite one.
 
     Raises:
-        SettingsError: a row without variance is not satisfied; it is named.
+        SettingsError: a belief of another size; or a row without variance is not satisfied.
     """
+    mean, covariance = belief.mean, belief.covariance
+    if inequalities.phi.shape[1] != mean.size:
+        raise SettingsError(
+            f"the inequalities are about {inequalities.phi.shape[1]} elements, the belief about "
+            f"{mean.size}; use Inequalities.for_columns"
+        )
     phi, margins = np.abs(inequalities.phi), inequalities.margins(mean)
     variance = np.einsum("ki,ki->k", inequalities.phi @ covariance, inequalities.phi)
     size = phi @ np.sqrt(np.abs(np.diag(covariance)))
@@ -132,11 +127,7 @@ def normalised_margins(mean: Array, covariance: Array, inequalities: Inequalitie
     return c
 
 
-def truncate_sequential(
-    mean: ArrayLike,
-    covariance: ArrayLike,
-    inequalities: Inequalities,
-) -> Truncated:
+def truncate_sequential(belief: Belief, inequalities: Inequalities) -> Truncated:
     """Truncate by one row after the other: (21) to (29) of Shimada et al.
 
     With s^2 = phi^T Q phi the rotations of (21) to (23) multiply out to
@@ -146,20 +137,17 @@ def truncate_sequential(
     The result depends on the order of the rows.
 
     Raises:
-        SettingsError: sizes that do not fit, NaN, an indefinite covariance, or a row without
-            variance that is not satisfied.
+        SettingsError: sizes that do not fit, an indefinite covariance, or a row without variance
+            that is not satisfied.
     """
-    q, Q = _check(mean, covariance, inequalities)
-    factor, definite = factor_and_kind(Q)
-    normalised_margins(q, Q, inequalities)
-    c = np.empty(len(inequalities))
+    c = _margins(belief, inequalities)
+    q, factor = belief.mean.copy(), belief.root.copy()
     total = cut_one_by_one(q, factor, inequalities.phi, inequalities.b, SKIP_ABOVE, c)
-    return Truncated(q, covariance_from(factor, definite), c, c <= SKIP_ABOVE, total)
+    return Truncated(q, covariance_from(factor), c, c <= SKIP_ABOVE, total)
 
 
 def truncate_joint(
-    mean: ArrayLike,
-    covariance: ArrayLike,
+    belief: Belief,
     rows: JointRows | Inequalities,
     tolerance: float = 1e-9,
     start: Array | None = None,
@@ -174,33 +162,23 @@ def truncate_joint(
     Args:
         rows: the inequalities, prepared by ``join_rows`` or not.
         tolerance: of the marginals' change from sweep to sweep.
-        start: (S, 2) sites of a similar problem to begin with, which saves sweeps.
+        start: (S, 2) sites of a similar problem to begin with, which saves sweeps; may be empty.
 
     Raises:
         SettingsError: as for ``truncate_sequential``, or parallel rows that exclude each other.
     """
     joint = join_rows(rows) if isinstance(rows, Inequalities) else rows
-    q, Q = _check(mean, covariance, joint.inequalities)
-    c = normalised_margins(q, Q, joint.inequalities)
-    factor, definite = factor_and_kind(Q)
+    inequalities = joint.inequalities
+    c = _margins(belief, inequalities)
     sites = np.zeros((len(joint.directions), 2))
-    if start is not None:
+    if start is not None and len(start):
         sites[:] = start
-    q, factor, log_probability = _settle(q, factor, joint, sites, tolerance)
-    active = (c <= SKIP_ABOVE) & (sites[joint.group, 0] > 0)
-    covariance_after = covariance_from(factor, definite)
-    return Truncated(q, covariance_after, c, active, log_probability, sites)
-
-
-def _settle(
-    q: Array, factor: Array, joint: JointRows, sites: Array, tolerance: float
-) -> tuple[Array, Array, float]:
-    """Expectation propagation from sites (S, 2), which are moved: mean, factor, log probability."""
-    base = factor_of(covariance_from(factor[joint.used], False))
-    free = q, factor
+    # (m, m) of the elements used: R^T R of the others' factor, whatever its rank.
+    base = np.asarray(np.linalg.qr(belief.root[joint.used].T, mode="r")).T.copy()
+    reach = np.abs(inequalities.b)
     for limit in (_SWEEPS, _PATIENCE * _SWEEPS):
         log_probability, sweeps = propagate(
-            free[0][joint.used],
+            belief.mean[joint.used],
             base,
             joint.directions,
             joint.lower,
@@ -209,21 +187,17 @@ def _settle(
             tolerance,
             limit,
         )
-        q, factor = free[0].copy(), free[1].copy()
+        q, factor = belief.mean.copy(), belief.root.copy()
         apply_sites(q, factor, joint.whole, sites, -1, 1.0)
         # Rows thousands of deviations away, almost parallel, settle slowly.
-        if sweeps < limit or _is_inside(q, joint.inequalities):
+        inside = reach + np.abs(inequalities.phi) @ np.abs(q)
+        if sweeps < limit or np.all(inequalities.margins(q) >= -1e-10 * inside):
             break
-    return q, factor, log_probability
+    active = (c <= SKIP_ABOVE) & (sites[joint.group, 0] > 0)
+    return Truncated(q, covariance_from(factor), c, active, log_probability, sites)
 
 
-def _is_inside(q: Array, inequalities: Inequalities) -> bool:
-    """Whether a point (n,) is inside all rows, but for rounding."""
-    reach = np.abs(inequalities.b) + np.abs(inequalities.phi) @ np.abs(q)
-    return bool(np.all(inequalities.margins(q) >= -1e-10 * reach))
-
-
-def clip(mean: ArrayLike, covariance: ArrayLike, inequalities: Inequalities) -> Truncated:
+def clip(belief: Belief, inequalities: Inequalities) -> Truncated:
     """Move the mean to the nearest point inside the rows; the covariance stays as it is.
 
     What is done where no truncation is at hand. Nearest in the sense of the covariance, one
@@ -232,33 +206,19 @@ def clip(mean: ArrayLike, covariance: ArrayLike, inequalities: Inequalities) -> 
     Raises:
         SettingsError: as for ``truncate_sequential``.
     """
-    q, Q = _check(mean, covariance, inequalities)
-    c = normalised_margins(q, Q, inequalities)
+    c, q = _margins(belief, inequalities), belief.mean
     for _ in range(100):
         margins = inequalities.margins(q)
         worst = int(np.argmin(margins)) if len(inequalities) else -1
         if worst < 0 or margins[worst] >= -1e-12:
             break
         row = inequalities.phi[worst]
-        gain = Q @ row
+        gain = belief.covariance @ row
         q = q + gain * margins[worst] / float(row @ gain)
-    return Truncated(q, Q, c, c < 0, 0.0)
+    return Truncated(q, belief.covariance, c, c < 0, 0.0)
 
 
 def unlimited(belief: Belief) -> Truncated:
     """A belief that no row cuts."""
     nothing = np.zeros(0)
-    active = np.zeros(0, dtype=np.bool_)
-    return Truncated(belief.mean, belief.covariance, nothing, active, 0.0)
-
-
-def _check(
-    mean: ArrayLike, covariance: ArrayLike, inequalities: Inequalities
-) -> tuple[Array, Array]:
-    q, Q = check_moments(mean, covariance)
-    if inequalities.phi.shape[1] != q.size:
-        raise SettingsError(
-            f"the inequalities are about {inequalities.phi.shape[1]} elements, the belief about "
-            f"{q.size}; use Inequalities.for_columns"
-        )
-    return q, Q
+    return Truncated(belief.mean, belief.covariance, nothing, nothing > 0, 0.0)

@@ -10,7 +10,6 @@ from scipy.special import chdtri
 
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.kalman.truncated_filter import FilterState, TruncatedFilter
-from drake_pose.filtering.kalman.update import with_variances
 from drake_pose.filtering.state import Belief, make_belief
 from drake_pose.systems.ports import (
     BeliefSystem,
@@ -143,10 +142,7 @@ class TruncatedEkf(BeliefSystem[_Known]):
             y = np.full(self._measured, np.nan)
         else:
             variances = self.given(context, "measurement_variances")
-        model = None
-        if variances is not None:
-            model = with_variances(self.filter.observation, y, variances)
-        now = self.filter.update(now, y, model)
+        now = self.filter.update(now, y, variances=variances)
         if now.count:
             is_unlikely = now.distance > chdtri(now.count, _LOSS_PROBABILITY)
             unlikely = unlikely + 1 if is_unlikely else 0

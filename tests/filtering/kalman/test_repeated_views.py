@@ -11,7 +11,7 @@ from drake_pose.filtering.kalman.repeated_views import (
     next_view,
 )
 from drake_pose.filtering.kalman.truncated_filter import FilterSettings
-from drake_pose.filtering.kalman.update import update
+from drake_pose.filtering.kalman.update import make_evidence, update
 from drake_pose.filtering.state import Belief
 from drake_pose.papers.shimada import experiment_filter
 from drake_pose.papers.shimada_motion import make_sequence
@@ -31,17 +31,17 @@ def test_a_view_lasts_while_only_noise_changes(hand):
     y = sequence.measurements[3]
     noise = np.sqrt(observation.variances)
     generator = np.random.default_rng(1)
-    view = next_view(None, y, observation, CHANCE)
+    view = next_view(None, make_evidence(observation, y), CHANCE)
     assert view.count == 1
     for count in range(2, 500):
         again = y + noise * generator.normal(size=len(y))
-        view = next_view(view, again, observation, CHANCE)
+        view = next_view(view, make_evidence(observation, again), CHANCE)
         assert view.count == count
-    assert next_view(view, y + 4 * noise, observation, CHANCE).count == 1
-    assert next_view(view, y, observation, 0.0).count == 1
+    assert next_view(view, make_evidence(observation, y + 4 * noise), CHANCE).count == 1
+    assert next_view(view, make_evidence(observation, y), 0.0).count == 1
     # An angle that jumps by a full turn has not changed.
     turned = y + 2 * np.pi * observation.wraps
-    assert next_view(view, turned, observation, CHANCE).count == view.count + 1
+    assert next_view(view, make_evidence(observation, turned), CHANCE).count == view.count + 1
 
 
 def test_a_few_numbers_may_differ_more_than_many(hand):
@@ -49,10 +49,10 @@ def test_a_few_numbers_may_differ_more_than_many(hand):
     _, observation, sequence = hand
     y = sequence.measurements[3].copy()
     y[4:] = np.nan
-    view = next_view(None, y, observation, CHANCE)
+    view = next_view(None, make_evidence(observation, y), CHANCE)
     noise = np.sqrt(observation.variances)
-    assert next_view(view, y + 3.5 * noise, observation, CHANCE).count == 2
-    assert next_view(view, y + 9 * noise, observation, CHANCE).count == 1
+    assert next_view(view, make_evidence(observation, y + 3.5 * noise), CHANCE).count == 2
+    assert next_view(view, make_evidence(observation, y + 9 * noise), CHANCE).count == 1
 
 
 def test_something_that_was_hidden_makes_a_new_view(hand):
@@ -60,9 +60,9 @@ def test_something_that_was_hidden_makes_a_new_view(hand):
     y = sequence.measurements[3]
     hidden = y.copy()
     hidden[5] = np.nan
-    view = next_view(None, hidden, observation, CHANCE)
-    assert next_view(view, y, observation, CHANCE).count == 1
-    assert next_view(view, np.full(len(y), np.nan), observation, CHANCE).count == 1
+    view = next_view(None, make_evidence(observation, hidden), CHANCE)
+    assert next_view(view, make_evidence(observation, y), CHANCE).count == 1
+    assert next_view(view, make_evidence(observation, np.full(len(y), np.nan)), CHANCE).count == 1
 
 
 class Parabola:
@@ -96,7 +96,7 @@ def test_a_thousand_frames_tell_the_sum_of_state_and_offset_and_no_more():
     frames, y = 1000, 0.4
     for _ in range(frames):
         repeated = RepeatedView(
-            repeated.tangent, update(repeated.belief, np.array([y]), tangent).belief
+            repeated.tangent, update(repeated.belief, make_evidence(tangent, np.array([y]))).belief
         )
     noise = Parabola.variances[0] / frames + C
     assert repeated.state().covariance[0, 0] == pytest.approx(1 / (1 / 0.09 + 1 / noise), rel=1e-6)

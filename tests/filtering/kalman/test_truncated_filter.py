@@ -5,7 +5,7 @@ from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.filtering.kalman.truncated_filter import FilterSettings, TruncatedFilter
-from drake_pose.filtering.kalman.update import update
+from drake_pose.filtering.kalman.update import make_evidence, update
 from drake_pose.filtering.state import Belief, StateLayout, make_belief
 from drake_pose.filtering.truncation.inequalities import from_bounds, stack, two_sided
 from drake_pose.filtering.truncation.truncated_normal import truncate_joint
@@ -66,7 +66,7 @@ def random_belief(seed):
 def test_a_linear_measurement_gives_bayes_rule_in_information_form(iterations):
     for seed in range(5):
         prior, y = random_belief(seed), np.array([1.0, -2.0])
-        result = update(prior, y, Linear(), iterations)
+        result = update(prior, make_evidence(Linear(), y), iterations)
         information = (
             np.linalg.inv(prior.covariance) + Linear.H.T @ np.diag(1 / Linear.variances) @ Linear.H
         )
@@ -84,9 +84,9 @@ def test_a_linear_measurement_gives_bayes_rule_in_information_form(iterations):
 
 def test_what_is_occluded_is_left_out():
     prior = random_belief(1)
-    one = update(prior, np.array([1.0, np.nan]), Linear())
+    one = update(prior, make_evidence(Linear(), np.array([1.0, np.nan])))
     assert one.count == 1
-    nothing = update(prior, np.array([np.nan, np.nan]), Linear())
+    nothing = update(prior, make_evidence(Linear(), np.full(2, np.nan)))
     np.testing.assert_allclose(nothing.belief.covariance, prior.covariance, atol=1e-12)
     np.testing.assert_allclose(nothing.belief.mean, prior.mean)
 
@@ -100,21 +100,23 @@ def test_iteration_finds_the_posteriors_largest_density():
         r = (y - model.predict(x)[0]) / 0.01
         return r @ r + (x - prior.mean) ** 2 @ (1 / np.diag(prior.covariance))
 
-    result = update(prior, y, model, iterations=20)
+    seen = make_evidence(model, y)
+    result = update(prior, seen, iterations=20)
     best = cost(result.belief.mean)
     generator = np.random.default_rng(0)
     for size in (1e-1, 1e-2, 1e-3):
         for step in generator.normal(size=(200, 3)) * size:
             assert cost(result.belief.mean + step) > best - 1e-3
-    assert cost(update(prior, y, model, 1).belief.mean) > best + 10
+    assert cost(update(prior, seen).belief.mean) > best + 10
     assert result.distance == pytest.approx(best, rel=1e-3)
 
 
 def test_covariances_stay_positive_definite_when_measurements_are_nearly_exact():
     model = Segment(deviation=1e-9)
     belief = Belief(np.array([0.2, 0.0, 1.0]), np.diag([1e4, 1e2, 1e4]))
+    seen = make_evidence(model, np.array([np.cos(0.3), np.sin(0.3)]))
     for _ in range(20):
-        belief = update(belief, np.array([np.cos(0.3), np.sin(0.3)]), model, 10).belief
+        belief = update(belief, seen, 10).belief
         np.testing.assert_array_equal(belief.covariance, belief.covariance.T)
         assert np.linalg.eigvalsh(belief.covariance).min() > -1e-12
         assert (belief.deviations() > 0).all()
@@ -163,7 +165,7 @@ def test_what_limits_say_of_a_constant_is_counted_once():
     f = make_filter(rows=from_bounds(["length"], [0.9], [1.1]))
     start = Belief(np.array([0.0, 0.0, 1.05]), np.diag([0.1, 0.01, 0.04]))
     state = f.start(start)
-    once = truncate_joint(start.mean, start.covariance, f.inequalities)
+    once = truncate_joint(start, f.inequalities)
     for _ in range(30):
         state = f.update(f.predict(state), np.full(2, np.nan))
     assert state.best.mean[2] == pytest.approx(once.mean[2], abs=1e-6)
@@ -199,8 +201,15 @@ def test_a_layout_from_a_model():
 @pytest.mark.parametrize(
     ("make", "word"),
     [
-        (lambda: update(random_belief(0), np.zeros(3), Linear()), "measures 2"),
-        (lambda: update(random_belief(0), np.array([0, np.inf]), Linear()), "'b' is infinite"),
+        (lambda: make_evidence(Linear(), np.zeros(3)), "measures 2"),
+        (lambda: make_evidence(Linear(), np.array([0, np.inf])), "'b' is infinite"),
+        (lambda: make_evidence(Linear(), np.ones(2), np.array([1, -1])), "'b' must be positive"),
+        (lambda: make_evidence(Linear(), np.ones(2), np.ones(3)), "measures 2"),
+        (lambda: make_belief([np.nan, 0], np.eye(2)), "'0' is NaN"),
+        (lambda: make_belief([0, 0], [[1, np.inf], [np.inf, 1]]), "NaN or infinity"),
+        (lambda: make_belief([0, 0], [[1, 0.5], [0, 1]]), "symmetric"),
+        (lambda: make_belief([0, 0], np.eye(3)), "fit"),
+        (lambda: make_belief([0, 0], [[1, 2], [2, 1]]), "indefinite"),
         (
             lambda: make_filter().start(Belief(np.zeros(3), np.full((3, 3), np.nan))),
             "'angle' is NaN",

@@ -17,11 +17,10 @@ from drake_pose.filtering.hand import (
     HandObservation,
     plant_positions,
 )
-from drake_pose.filtering.kalman.update import update, with_variances
+from drake_pose.filtering.kalman.update import make_evidence, update
 from drake_pose.filtering.measurements.axes import (
     Axis,
     AxisObservation,
-    AxisObserver,
     AxisSettings,
     _independent,
 )
@@ -47,11 +46,6 @@ def camera():
     X_WC = np.eye(4)
     X_WC[2, 3] = -1.0
     return ParallelCamera("top", SIDE, SIDE, 1000.0, CENTRE, CENTRE, X_WC)
-
-
-@pytest.fixture(scope="module")
-def observer(hand, camera):
-    return AxisObserver(hand, camera, SEGMENTS, (CENTRE, CENTRE))
 
 
 def state(flexions_deg, roll_deg=25.0):
@@ -92,45 +86,6 @@ TRUE = [30, 20, 15, 55, 10, 8]
 ROUGH = [35, 15, 20, 50, 14, 3]
 
 
-def test_axes_from_a_rendered_label_image(hand, camera, observer):
-    x, rough = state(TRUE), state(ROUGH)
-    q, q_rough = (plant_positions(s, hand.position_names, 1000.0) for s in (x, rough))
-    labels = LabelRenderer(hand, camera).segments(q)
-    axes = observer.measure_labels(labels, q_rough)
-    assert set(axes) == set(SEGMENTS)
-    errors, distances = compare(axes, x)
-    assert errors.max() < 1.0
-    # Chi-squared with two degrees of freedom.
-    assert distances.mean() < 3.0
-    before, _ = compare(axes, rough)
-    assert before.max(axis=0).min() > 4.0
-    assert all(0.7 < axis.share < 1.4 for axis in axes.values())
-
-
-def test_what_is_occluded_is_left_out(hand, camera, observer):
-    x = state(TRUE)
-    q = plant_positions(x, hand.position_names, 1000.0)
-    labels = LabelRenderer(hand, camera).segments(q)
-    link = hand.link_index("segment_12")
-    v, u = np.nonzero(labels == link)
-    assert "segment_12" in observer.measure_labels(labels, q)
-    covered = labels.copy()
-    covered[v[u > np.median(u)], u[u > np.median(u)]] = -1
-    assert "segment_12" not in observer.measure_labels(covered, q)
-    covered[labels == link] = -1
-    assert "segment_12" not in observer.measure_labels(covered, q)
-
-
-def test_at_the_rough_pose_the_axis_is_that_of_the_model(hand, camera, observer):
-    x = state(TRUE)
-    q = plant_positions(x, hand.position_names, 1000.0)
-    errors, distances = compare(
-        observer.measure_labels(LabelRenderer(hand, camera).segments(q), q), x
-    )
-    assert errors.max() < 1e-6
-    assert distances.max() < 1e-6
-
-
 @pytest.fixture(scope="module")
 def observation(hand, camera):
     x = state(TRUE)
@@ -148,6 +103,45 @@ def observation(hand, camera):
     )
     body = ContourObservation(tree, [camera])
     return AxisObservation(body, camera, SEGMENTS, (CENTRE, CENTRE))
+
+
+def test_axes_from_a_rendered_label_image(hand, camera, observation):
+    x, rough = state(TRUE), state(ROUGH)
+    q, q_rough = (plant_positions(s, hand.position_names, 1000.0) for s in (x, rough))
+    labels = LabelRenderer(hand, camera).segments(q)
+    axes = observation.measure_labels(labels, q_rough)
+    assert set(axes) == set(SEGMENTS)
+    errors, distances = compare(axes, x)
+    assert errors.max() < 1.0
+    # Chi-squared with two degrees of freedom.
+    assert distances.mean() < 3.0
+    before, _ = compare(axes, rough)
+    assert before.max(axis=0).min() > 4.0
+    assert all(0.7 < axis.share < 1.4 for axis in axes.values())
+
+
+def test_what_is_occluded_is_left_out(hand, camera, observation):
+    x = state(TRUE)
+    q = plant_positions(x, hand.position_names, 1000.0)
+    labels = LabelRenderer(hand, camera).segments(q)
+    link = hand.link_index("segment_12")
+    v, u = np.nonzero(labels == link)
+    assert "segment_12" in observation.measure_labels(labels, q)
+    covered = labels.copy()
+    covered[v[u > np.median(u)], u[u > np.median(u)]] = -1
+    assert "segment_12" not in observation.measure_labels(covered, q)
+    covered[labels == link] = -1
+    assert "segment_12" not in observation.measure_labels(covered, q)
+
+
+def test_at_the_rough_pose_the_axis_is_that_of_the_model(hand, camera, observation):
+    x = state(TRUE)
+    q = plant_positions(x, hand.position_names, 1000.0)
+    errors, distances = compare(
+        observation.measure_labels(LabelRenderer(hand, camera).segments(q), q), x
+    )
+    assert errors.max() < 1e-6
+    assert distances.max() < 1e-6
 
 
 def small_state(observation, hand, flexions):
@@ -178,7 +172,7 @@ def test_one_picture_corrects_a_rough_pose(observation, hand, camera):
     assert np.isfinite(y).all()
     n = len(x)
     prediction = Belief(rough, np.diag(np.full(n, 0.15**2)))
-    updated = update(prediction, y, with_variances(observation, y, variances), 10)
+    updated = update(prediction, make_evidence(observation, y, variances), 10)
     error, before = updated.belief.mean - x, rough - x
     assert np.degrees(np.abs(error[: n // 2])).max() < 0.5 * np.degrees(np.abs(before)).max()
     assert (np.abs(error) < 3 * updated.belief.deviations())[: n // 2].all()
@@ -195,10 +189,10 @@ def test_independent_errors_cover_the_joint_one():
         assert bound[1, 1] <= b + 2 * reach**2 * a + 1e-9
 
 
-def test_bad_arguments_are_named(hand, camera, observer, observation):
+def test_bad_arguments_are_named(hand, camera, observation):
     q = hand.default_positions
     with pytest.raises(MaskError, match="'top'"):
-        observer.measure_labels(np.zeros((3, 3), dtype=np.int16), q)
+        observation.measure_labels(np.zeros((3, 3), dtype=np.int16), q)
     with pytest.raises(SettingsError, match="correlation"):
         AxisSettings(correlation=0.0)
     body = observation.body
@@ -208,6 +202,6 @@ def test_bad_arguments_are_named(hand, camera, observer, observation):
         AxisObservation(body, camera, {"thumb": SEGMENTS["segment_11"]})
     y = np.zeros(len(observation.names))
     with pytest.raises(SettingsError, match="alpha_segment_11"):
-        with_variances(observation, y, -np.ones(len(y)))
+        make_evidence(observation, y, -np.ones(len(y)))
     with pytest.raises(SettingsError, match="shape"):
-        with_variances(observation, y, np.ones(3))
+        make_evidence(observation, y, np.ones(3))

@@ -117,12 +117,6 @@ def require_scale(text: str, count: int, where: str) -> None:
         raise ModelError(f"{where} is '{text}'; no factor may be 0")
 
 
-def require_shape(kind: str, known: Collection[str], where: str) -> None:
-    """Refuse a kind of shape that cannot be drawn; ``where`` names the link."""
-    if kind not in known:
-        raise ModelError(f"{where}: there is no shape <{kind}>; there is: {', '.join(known)}")
-
-
 def read_limits(
     lower_text: str | None, upper_text: str | None, name: str
 ) -> tuple[float | None, float | None]:

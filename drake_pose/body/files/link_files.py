@@ -1,0 +1,392 @@
+"""URDF and SDFormat files made fit for Drake: links, joints and looks alone, file names absolute.
+
+Collision geometry, transmissions and what simulators add are never drawn and move nothing, but
+Drake refuses many files because of them.
+"""
+
+import math
+import xml.etree.ElementTree as ElementTree
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+from drake_pose.body.files.packages import FileFinder
+from drake_pose.body.files.xml_files import (
+    OLD_XACRO_ELEMENTS,
+    Warn,
+    colour_text,
+    leave_out,
+    leave_out_mimics,
+    open_loops,
+    read_limits,
+    read_numbers,
+    read_xml,
+    refuse_macros,
+    require_scale,
+    require_size,
+    xml_text,
+)
+from drake_pose.errors import ModelError
+
+_URDF_READ = {
+    "robot": ("link", "joint", "frame", "material", *OLD_XACRO_ELEMENTS),
+    "link": ("visual", "inertial"),
+    "joint": ("parent", "child", "origin", "axis", "limit", "mimic"),
+    "visual": ("origin", "geometry", "material"),
+}
+_URDF_KNOWN = (
+    "collision", "gazebo", "transmission", "sensor", "plugin", "ros2_control", "mujoco", "group",
+    "group_state", "disable_collisions", "end_effector", "virtual_joint", "passive_joint",
+    "contact", "self_collision_checking", "self_filter", "verbose", "version", "dynamics",
+    "safety_controller", "calibration", "kinematic", "gravity", "surface",
+)  # fmt: skip
+_SDF_READ = {
+    "sdf": ("model", "world"),
+    "world": ("model", "include", "frame", "joint"),
+    "model": ("pose", "link", "joint", "frame", "include", "model", "static"),
+    "link": ("pose", "visual", "inertial"),
+    "visual": ("pose", "geometry", "material"),
+    "material": ("diffuse",),
+    "joint": (
+        "pose", "parent", "child", "axis", "axis2", "screw_thread_pitch", "thread_pitch",
+    ),
+    **dict.fromkeys(("axis", "axis2"), ("xyz", "limit", "mimic", "use_parent_model_frame")),
+    "limit": ("lower", "upper"),
+}  # fmt: skip
+_SDF_KNOWN = (
+    "light", "actor", "plugin", "physics", "scene", "gui", "gravity", "magnetic_field", "wind",
+    "atmosphere", "audio", "state", "road", "spherical_coordinates", "population", "gripper",
+    "self_collide", "allow_auto_disable", "enable_wind", "collision", "sensor", "projector",
+    "audio_source", "audio_sink", "battery", "particle_emitter", "must_be_base_link", "kinematic",
+    "velocity_decay", "cast_shadows", "laser_retro", "transparency", "visibility_flags", "meta",
+    "script", "shader", "render_order", "lighting", "ambient", "specular", "emissive", "shininess",
+    "double_sided", "pbr", "physics", "dynamics", "gearbox_ratio", "gearbox_reference_body",
+    "effort", "velocity", "stiffness", "dissipation", "initial_position",
+)  # fmt: skip
+# How many numbers each size of each shape has: attributes in URDF, elements in SDFormat.
+_SIZES: dict[str, dict[str, int]] = {
+    "box": {"size": 3},
+    "sphere": {"radius": 1},
+    "cylinder": {"radius": 1, "length": 1},
+    "capsule": {"radius": 1, "length": 1},
+    "ellipsoid": {"a": 1, "b": 1, "c": 1},
+    "mesh": {},
+}
+_SDF_SIZES = _SIZES | {
+    "ellipsoid": {"radii": 3, **_SIZES["ellipsoid"]},
+    "plane": {},
+    "empty": {},
+}
+Limits = dict[str, tuple[float, float]]
+
+
+def cure_urdf(path: Path, finder: FileFinder, warn: Warn) -> str:
+    """The text of a URDF file that Drake reads as URDF means it; it may be parsed from anywhere.
+
+    Raises ModelError, which names the link, joint or mesh at fault.
+    """
+    root = read_xml(path)
+    if root.tag != "robot":
+        raise ModelError(f"its outermost element is <{root.tag}>; a URDF file's is <robot>")
+    if not root.get("name"):
+        root.set("name", path.stem)
+    leave_out(root, _URDF_READ, _URDF_KNOWN, warn)
+    refuse_macros(root)
+    _require_names(root)
+    _give_colours(root)
+    for link in root.iterfind("link"):
+        _leave_out_inertia(link)
+        for visual in link.iterfind("visual"):
+            _check_urdf_visual(visual, f"link '{link.get('name')}'", path, finder)
+    joints = _joints(root)
+    ends = [[_end(joint, end) for end in ("parent", "child")] for joint in joints]
+    open_loops(root, joints, ends, warn)
+    for joint in _joints(root):
+        _check_urdf_joint(joint, warn)
+    return xml_text(root)
+
+
+def _joints(root: ElementTree.Element) -> list[ElementTree.Element]:
+    """All joints; a path with a prefix would need a namespace."""
+    return [child for child in root if child.tag in ("joint", "drake:joint")]
+
+
+def _end(joint: ElementTree.Element, end: str) -> str:
+    """The name of a joint's parent or child link; empty where it has none."""
+    element = joint.find(end)
+    return "" if element is None else element.get("link", "")
+
+
+def _require_names(root: ElementTree.Element) -> None:
+    """Every link and joint has a name of its own, and joints connect links that exist."""
+    links = [link.get("name") for link in root.iterfind("link")]
+    joints = _joints(root)
+    for kind, names in (("link", links), ("joint", [joint.get("name") for joint in joints])):
+        for name, count in Counter(names).items():
+            if not name:
+                raise ModelError(f"{count} <{kind}> without a name; give each of them one")
+            if count > 1:
+                raise ModelError(f"{kind} '{name}' is defined {count} times; rename all but one")
+    for joint in joints:
+        for end in ("parent", "child"):
+            name = _end(joint, end)
+            if name != "world" and name not in links:
+                raise ModelError(
+                    f"joint '{joint.get('name')}': its {end} link '{name}' does not exist"
+                )
+
+
+def _leave_out_inertia(link: ElementTree.Element) -> None:
+    """Remove an <inertial> that holds something else than numbers: poses do not need it."""
+    for inertial in link.findall("inertial"):
+        values = [value for element in inertial.iter() for value in element.attrib.values()]
+        try:
+            read_numbers(" ".join(values), len(" ".join(values).split()), "")
+        except ModelError:
+            link.remove(inertial)
+
+
+def _check_origin(element: ElementTree.Element, where: str) -> None:
+    for origin in element.iterfind("origin"):
+        for name in ("xyz", "rpy"):
+            if name in origin.attrib:
+                read_numbers(origin.get(name), 3, f"{where}: {name} of <origin>")
+
+
+def _check_urdf_visual(
+    visual: ElementTree.Element, where: str, path: Path, finder: FileFinder
+) -> None:
+    """Refuse what cannot be drawn, and make file names absolute."""
+    _check_origin(visual, where)
+    geometry = visual.find("geometry")
+    shapes = [] if geometry is None else list(geometry)
+    if not shapes:
+        raise ModelError(f"{where}: a <visual> without a shape in its <geometry>")
+    for shape in shapes:
+        kind = _kind_of_shape(shape, where, is_urdf=True)
+        if kind == "mesh":
+            _check_urdf_mesh(shape, where, path, finder)
+
+
+def _check_urdf_mesh(mesh: ElementTree.Element, where: str, path: Path, finder: FileFinder) -> None:
+    name = mesh.get("filename", "")
+    if not name.strip():
+        raise ModelError(f"{where}: a mesh without a filename")
+    mesh.set("filename", f"file://{finder.resolve(name, path, f'{where}: mesh')}")
+    if "scale" not in mesh.attrib:
+        return
+    text = mesh.get("scale", "")
+    count = 1 if len(text.split()) == 1 else 3
+    require_scale(text, count, f"{where}: scale of mesh '{name}'")
+    mesh.set("scale", " ".join(text.split() * (3 // count)))
+
+
+def _check_urdf_joint(joint: ElementTree.Element, warn: Warn) -> None:
+    """Refuse limits that end Drake, and leave out those that do not count."""
+    name = joint.get("name", "")
+    _check_origin(joint, f"joint '{name}'")
+    for axis in joint.iterfind("axis"):
+        read_numbers(axis.get("xyz"), 3, f"joint '{name}': xyz of <axis>")
+    for limit in joint.iterfind("limit"):
+        if joint.get("type") == "continuous":
+            # By URDF's definition a continuous joint has no limits, whatever the file says.
+            texts: tuple[str | None, str | None] = (None, None)
+        else:
+            texts = (limit.get("lower"), limit.get("upper"))
+        for side, value in zip(("lower", "upper"), read_limits(*texts, name), strict=True):
+            if value is None:
+                limit.attrib.pop(side, None)
+        for name_of_rate in ("effort", "drake:acceleration"):
+            limit.attrib.pop(name_of_rate, None)
+        _check_velocity(limit, name)
+    leave_out_mimics(joint, name, warn)
+
+
+def _check_velocity(limit: ElementTree.Element, name: str) -> None:
+    """Refuse a negative velocity limit, which ends Drake; leave out one that is no number."""
+    text = limit.get("velocity", "0")
+    try:
+        velocity = float(text)
+    except ValueError:
+        velocity = math.nan
+    if velocity < 0.0:
+        raise ModelError(f"joint '{name}': velocity limit {text} is negative; give 0 or more")
+    if not math.isfinite(velocity):
+        del limit.attrib["velocity"]
+
+
+def _give_colours(root: ElementTree.Element) -> None:
+    """Write out each visual's colour without a name, which Drake wants to be unique."""
+    everywhere = root.findall("material")
+    own = [one for visual in root.iterfind("link/visual") for one in visual.iterfind("material")]
+    colours: dict[str, str] = {}
+    for material in [*everywhere, *own]:
+        colour = _colour(material)
+        if colour is not None:
+            colours.setdefault(material.get("name", ""), colour)
+    for material in everywhere:
+        root.remove(material)
+    for visual in root.iterfind("link/visual"):
+        for material in visual.findall("material"):
+            visual.remove(material)
+            colour = _colour(material) or colours.get(material.get("name", ""))
+            if colour is not None:
+                plain = ElementTree.SubElement(visual, "material")
+                ElementTree.SubElement(plain, "color", {"rgba": colour})
+
+
+def _colour(material: ElementTree.Element) -> str | None:
+    """The colour of a material, its parts within 0 and 1; None: it has none that can be read."""
+    texts = (colour.get("rgba", "") for colour in material.iterfind("color"))
+    return next((colour for t in texts if len(t.split()) == 4 and (colour := colour_text(t))), None)
+
+
+def _kind_of_shape(shape: ElementTree.Element, where: str, *, is_urdf: bool) -> str:
+    """What a shape is; one that cannot be drawn is refused."""
+    kind, known = shape.tag.removeprefix("drake:"), _SIZES if is_urdf else _SDF_SIZES
+    if kind not in known:
+        raise ModelError(f"{where}: there is no shape <{kind}>; there is: {', '.join(known)}")
+    for name, count in known[kind].items():
+        # SDFormat's own reader takes sizes that cannot be for 1 m.
+        texts = [shape.get(name)] if is_urdf else [one.text for one in shape.iterfind(name)]
+        for text in texts:
+            no_size = is_urdf and kind == "sphere"
+            require_size(text, count, f"{where}: {name} of its {kind}", zero=no_size)
+    return kind
+
+
+def cure_sdf(
+    path: Path, finder: FileFinder, warn: Warn, cure_file: Callable[[Path], Path]
+) -> tuple[str, Limits]:
+    """The text of an SDFormat file that Drake reads; it may be parsed from anywhere.
+
+    ``cure_file`` makes a file that stands in for an included model.
+
+    Returns:
+        The text, and the limits (lower, upper) [rad] by position name of universal and screw
+        joints, which Drake's parser passes over.
+
+    Raises:
+        ModelError: names the link, joint or mesh at fault.
+    """
+    root = read_xml(path)
+    if root.tag != "sdf":
+        raise ModelError(f"its outermost element is <{root.tag}>; an SDFormat file's is <sdf>")
+    if "version" not in root.attrib:
+        raise ModelError('its <sdf> has no version; write for example <sdf version="1.9">')
+    leave_out(root, _SDF_READ, _SDF_KNOWN, warn)
+    refuse_macros(root)
+    for include in root.iter("include"):
+        _cure_include(include, path, finder, cure_file)
+    for link in root.iter("link"):
+        where = f"link '{link.get('name', '(unnamed)')}'"
+        _check_poses(link, where)
+        for visual in link.iterfind("visual"):
+            _check_sdf_visual(visual, where, path, finder)
+    for model in [*root.iter("model"), *root.iter("world")]:
+        _leave_out_constraints(model, warn)
+    limits: Limits = {}
+    for joint in root.iter("joint"):
+        limits.update(_check_sdf_joint(joint, warn))
+    return xml_text(root), limits
+
+
+def _cure_include(
+    include: ElementTree.Element,
+    path: Path,
+    finder: FileFinder,
+    cure_file: Callable[[Path], Path],
+) -> None:
+    """Name the file that stands in for an included model."""
+    uri = include.find("uri")
+    name = "" if uri is None else (uri.text or "").strip()
+    if uri is None or not name:
+        raise ModelError("an <include> without a <uri>")
+    found = finder.resolve(name, path, "included model")
+    if found.is_dir():
+        found = _model_of_folder(found, name)
+    uri.text = f"file://{cure_file(found)}"
+
+
+def _model_of_folder(folder: Path, name: str) -> Path:
+    """The newest model that a folder's model.config names."""
+    config = folder / "model.config"
+    if not config.is_file():
+        raise ModelError(f"included model '{name}': {config} does not exist")
+    files = [one for one in read_xml(config).iterfind("sdf") if (one.text or "").strip()]
+    if not files:
+        raise ModelError(f"included model '{name}': {config} names no <sdf> file")
+    newest = max(files, key=lambda one: [int(p) for p in one.get("version", "0").split(".")])
+    return folder / (newest.text or "").strip()
+
+
+def _check_poses(element: ElementTree.Element, where: str) -> None:
+    """Refuse a pose that holds something else than numbers."""
+    for pose in element.iterfind("pose"):
+        if (pose.text or "").strip() and pose.get("rotation_format", "euler_rpy") == "euler_rpy":
+            read_numbers(pose.text, 6, f"{where}: its <pose>")
+
+
+def _check_sdf_visual(
+    visual: ElementTree.Element, where: str, path: Path, finder: FileFinder
+) -> None:
+    """Refuse what cannot be drawn or would be drawn otherwise, and make file names absolute."""
+    _check_poses(visual, where)
+    for material in visual.findall("material"):
+        for colour in material.findall("diffuse"):
+            colour.text = colour_text(colour.text)
+            if colour.text is None:
+                material.remove(colour)
+    for shape in visual.findall("geometry/*"):
+        kind = _kind_of_shape(shape, where, is_urdf=False)
+        if kind == "mesh":
+            _check_sdf_mesh(shape, where, path, finder)
+
+
+def _check_sdf_mesh(mesh: ElementTree.Element, where: str, path: Path, finder: FileFinder) -> None:
+    uri = mesh.find("uri")
+    name = "" if uri is None else (uri.text or "").strip()
+    if uri is None or not name:
+        raise ModelError(f"{where}: a mesh without a <uri>")
+    uri.text = f"file://{finder.resolve(name, path, f'{where}: mesh')}"
+    if mesh.find("submesh") is not None:
+        raise ModelError(
+            f"{where}: Drake shows the whole mesh '{name}', not its <submesh> alone; put that part "
+            "into a file of its own"
+        )
+    scale = mesh.findtext("scale")
+    if scale is not None:
+        require_scale(scale, 3, f"{where}: scale of mesh '{name}'")
+
+
+def _leave_out_constraints(model: ElementTree.Element, warn: Warn) -> None:
+    """Remove joints that couple others, or close a loop of links: Drake refuses both."""
+    for joint in model.findall("joint"):
+        if joint.get("type") == "gearbox":
+            model.remove(joint)
+            warn(f"joint '{joint.get('name')}' is a gearbox: not enforced, it is left out")
+    joints = model.findall("joint")
+    ends = [
+        [(joint.findtext(end) or "").strip() for end in ("parent", "child")] for joint in joints
+    ]
+    open_loops(model, joints, ends, warn)
+
+
+def _check_sdf_joint(joint: ElementTree.Element, warn: Warn) -> Limits:
+    """Refuse limits that Drake refuses; returns those that its parser passes over."""
+    name, kind = joint.get("name", "(unnamed)"), joint.get("type", "")
+    _check_poses(joint, f"joint '{name}'")
+    suffixes = {"universal": {"axis": "_qx", "axis2": "_qy"}, "screw": {"axis": ""}}
+    passed_over: Limits = {}
+    for tag in ("axis", "axis2"):
+        for axis in joint.iterfind(tag):
+            if axis.findtext("xyz") is not None:
+                numbers = read_numbers(axis.findtext("xyz"), 3, f"joint '{name}': its <xyz>")
+                if not any(numbers):
+                    raise ModelError(f"joint '{name}': its axis is zero")
+            leave_out_mimics(axis, name, warn)
+            texts = [axis.findtext(f"limit/{side}") for side in ("lower", "upper")]
+            lower, upper = read_limits(texts[0], texts[1], name)
+            if tag in suffixes.get(kind, {}) and lower is not None and upper is not None:
+                passed_over[f"{name}{suffixes[kind][tag]}"] = (lower, upper)
+    return passed_over

@@ -157,7 +157,7 @@ def seen_from(X_CW: Array, X_WN: Array) -> Array:
 
 
 @compiled
-def picture_rows(p_W: Array, X_CW: Array, camera: Array, rows: Array) -> None:
+def _picture_rows(p_W: Array, X_CW: Array, camera: Array, rows: Array) -> None:
     """Writes du/dp_W and dv/dp_W (2, 3) of a point."""
     x, y, z = X_CW[0, 3], X_CW[1, 3], X_CW[2, 3]
     for k in range(3):
@@ -205,7 +205,6 @@ def add_residual(
         The cost.
     """
     unit, scale, worth = weights[0], weights[1], weights[3]
-    rows, p, w = scratch
     t = (r / scale) ** 2
     cost = worth * length * r * r / (1.0 + t)
     weight = worth * length / (1.0 + t) ** 2
@@ -216,11 +215,30 @@ def add_residual(
     sums[COST] += cost
     sums[SQUARES] += weight * r * r
     sums[WEIGHT] += weight
+    add_row(A, b, X_WN, p_N, camera, n0, n1, r, weight, scratch)
+    return cost
+
+
+@compiled
+def add_row(
+    A: Array,
+    b: Array,
+    X_WN: Array,
+    p_N: Array,
+    camera: tuple[Array, Array],
+    n0: float,
+    n1: float,
+    r: float,
+    weight: float,
+    scratch: tuple[Array, Array, Array],
+) -> None:
+    """As add_residual, of a distance that has its weight."""
+    rows, p, w = scratch
     for k in range(3):
         p[k] = X_WN[k, 3]
         for c in range(3):
             p[k] += X_WN[k, c] * p_N[c]
-    picture_rows(p, camera[0], camera[1], rows)
+    _picture_rows(p, camera[0], camera[1], rows)
     for k in range(3):
         along = n0 * rows[0, k] + n1 * rows[1, k]
         w[4 * k], w[4 * k + 1] = along * p[0], along * p[1]
@@ -230,18 +248,6 @@ def add_residual(
         b[k] += share * r
         for c in range(k + 1):
             A[k, c] += share * w[c]
-    return cost
-
-
-@compiled
-def speed_along(row: Array, p: Array, twist: Array) -> float:
-    """The speed of a point (3,) along a row (3,)."""
-    s = twist[6]
-    return (
-        row[0] * (twist[1] * p[2] - twist[2] * p[1] + twist[3] + s * p[0])
-        + row[1] * (twist[2] * p[0] - twist[0] * p[2] + twist[4] + s * p[1])
-        + row[2] * (twist[0] * p[1] - twist[1] * p[0] + twist[5] + s * p[2])
-    )
 
 
 @compiled
@@ -266,6 +272,8 @@ def collect(
     pull = np.empty(12)
     for node in range(len(A)):
         begin, end = starts[node], starts[node + 1]
+        if A[node, 3, 3] + A[node, 7, 7] + A[node, 11, 11] == 0.0:
+            continue
         for s in range(begin, end):
             motion = motions[owners[s]]
             for k in range(12):

@@ -161,7 +161,7 @@ def minimise(
         equations = evaluated(own, shared, part)
         evaluations, cost = evaluations + 1, equations.cost
         for _ in range(part.iterations):
-            trial = _stepped(equations, own, shared, limits, damping, settings, curvature)
+            trial = damped_step(equations, own, shared, limits, damping, settings, curvature)
             if part.iterations == 1:
                 own, shared = trial
                 break
@@ -181,14 +181,14 @@ def minimise(
     return Minimum(own, shared, float(cost), evaluations)
 
 
-def _stepped(
+def damped_step(
     equations: Equations,
     own: Array,
     shared: Array,
     limits: tuple[Array, Array],
     damping: float,
     settings: StepSettings,
-    curvature: csc_array | None,
+    curvature: csc_array | None = None,
 ) -> tuple[Array, Array]:
     """Own and shared unknowns after a damped step that stays inside the limits."""
     lower, upper = limits

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -99,7 +100,8 @@ class TreeKinematics:
 
     def split(self, values: np.ndarray) -> tuple[np.ndarray, ...]:
         """Each node's values (k_i,) of all values (m,)."""
-        return tuple(np.split(np.asarray(values), self.packed.value_starts[1:-1]))
+        starts = self.packed.value_starts.tolist()
+        return tuple(np.asarray(values)[a:b] for a, b in pairwise(starts))
 
     def nearest_turns(self, values: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
         """The same pose's values (m,), angles that turn around in the turn nearest to ``near``.

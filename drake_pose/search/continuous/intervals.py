@@ -26,8 +26,7 @@ from scipy.special import ndtri
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import JointEstimate, PoseFamily, PoseSet
-from drake_pose.search.raster_fit.body import Freedom
-from drake_pose.search.raster_fit.problem import FINE_PASSES, RefinementProblem
+from drake_pose.search.refinement import FINE_PASSES, Freedom, RefinementProblem
 
 # The variance of a border that lies anywhere between two pixel centres [pixel^2].
 _PIXEL_VARIANCE = 1.0 / 12.0
@@ -207,13 +206,13 @@ def _covariance(
     settings: IntervalSettings,
 ) -> np.ndarray:
     """The covariance (m, m) of the tree's values about the best pose."""
-    equations = problem.equations(parameters, freedom, 1, 0, FINE_PASSES[-1].scale)
+    equations = problem.equations(parameters, freedom, FINE_PASSES[-1])
     variance = max(_PIXEL_VARIANCE, equations.squares / max(equations.weight, 1e-9))
     variance *= settings.noise_factor**2
     lower, upper = problem.body.lower[freedom.columns], problem.body.upper[freedom.columns]
     # Limits are worth what a value spread evenly between them is.
     spans = np.clip(upper - lower, 1e-6, 2.0 * np.pi)
-    information = equations.H / variance + np.diag(12.0 / spans**2)
+    information = equations.H[0] / variance + np.diag(12.0 / spans**2)
     inverse = np.linalg.inv(information)
     covariance = np.zeros((len(parameters), len(parameters)))
     covariance[np.ix_(freedom.columns, freedom.columns)] = inverse

@@ -24,11 +24,11 @@ from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
 from drake_pose.search.grid.beam.hypotheses import Beam, Hypotheses
 from drake_pose.search.grid.beam.search import BeamSearch
 from drake_pose.search.grid.node_poses import Pictures, PoseStore, coarsen
-from drake_pose.search.raster_fit.body import RefinementBody
-from drake_pose.search.raster_fit.problem import (
+from drake_pose.search.refinement import (
     COARSE_PASSES,
     FINE_PASSES,
     Pass,
+    RefinementBody,
     RefinementProblem,
     descend,
 )
@@ -259,7 +259,7 @@ class RootPlacementSearch:
 
     def _settle(self, start: _Placed, passes: Sequence[Pass], moves: bool) -> _Placed:
         """The pose refined with its root free, growth turned into the camera's scale."""
-        problem = RefinementProblem(self._refined, start.views, start.parameters)
+        problem = RefinementProblem(self._refined, start.views)
         parameters, _, _ = descend(problem, start.parameters, self._free[moves], passes)
         refined = replace(start, parameters=parameters, J=float(problem.J(parameters)))
         growth, camera = math.exp(parameters[-1]), start.views[0].camera
@@ -276,7 +276,7 @@ class RootPlacementSearch:
 
     def _root_of(self, placed: _Placed) -> np.ndarray:
         """(3,) where its root is [m]."""
-        return np.array(self._refined.motions(placed.parameters).X_WN[0, :3, 3])
+        return np.array(self._refined.poses(placed.parameters)[0, :3, 3])
 
     def _search_again(self, start: _Placed, moves: bool) -> list[_Placed]:
         """Poses that the beam search finds with the root where it is, refined."""
@@ -294,7 +294,7 @@ class RootPlacementSearch:
     def _finish(self, start: _Placed, moves: bool, deadline: float) -> _Placed:
         """The pose refined to the end, and what fits badly placed anew."""
         near = self._settle(start, FINE_PASSES[:2], moves)
-        problem = RefinementProblem(self._refined, near.views, near.parameters)
+        problem = RefinementProblem(self._refined, near.views)
         enough = _ENOUGH * problem.area
         about = NeighbourhoodSearch(problem, self._parts)
         parameters, J = about.improve(near.parameters, enough, deadline)

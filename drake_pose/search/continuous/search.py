@@ -20,11 +20,11 @@ from drake_pose.search.continuous.intervals import (
 )
 from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
 from drake_pose.search.grid.beam.search import BeamSearch
-from drake_pose.search.raster_fit.body import RefinementBody
-from drake_pose.search.raster_fit.problem import (
+from drake_pose.search.refinement import (
     COARSE_PASSES,
     FINE_PASSES,
     LAST_PASSES,
+    RefinementBody,
     RefinementProblem,
     descend,
 )
@@ -169,7 +169,7 @@ class ContinuousSearch:
             raise SettingsError("a refinement needs at least one pose to start from")
         begin = time.perf_counter()
         poses = [self.body.parameters(start, root_position) for start in starts]
-        problem = RefinementProblem(self.body, views, poses[0])
+        problem = RefinementProblem(self.body, views)
         reached = self._descend_all(problem, poses, deadline)
         rounds = iter(others)
         fair = _FAIR * self.settings.enough * problem.border_length

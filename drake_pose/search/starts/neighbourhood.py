@@ -15,9 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_pose.search.raster_fit.body import Freedom
-from drake_pose.search.raster_fit.lines import Border
-from drake_pose.search.raster_fit.problem import Pass, RefinementProblem, descend
+from drake_pose.fit.raster_lines import Border
+from drake_pose.search.refinement import Freedom, Pass, RefinementProblem, descend
 from drake_pose.search.starts.depth_reflections import Reflection
 from drake_pose.search.starts.part_placement import Part, PartSearch
 
@@ -197,7 +196,7 @@ class NeighbourhoodSearch:
         """The best pose that a move leads to, and its J; what is nearly as good is kept."""
         problem, length = self.problem, self.problem.border_length
         freedom = self._freedoms[chosen]
-        still = problem.still(parameters, freedom.nodes)
+        still = problem.still(parameters, freedom.moved)
         starts = self._starts(parameters, self._moves[chosen], still, erring)
         rough = []
         for start in starts:

@@ -18,10 +18,10 @@ import numpy as np
 
 from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.fit.parameters import Placement
+from drake_pose.fit.raster_lines import Border
 from drake_pose.search.estimates import View
-from drake_pose.search.raster_fit.body import RefinementBody
-from drake_pose.search.raster_fit.lines import Border, clear_spans
-from drake_pose.search.raster_fit.problem import RefinementProblem
+from drake_pose.search.refinement import RefinementBody, RefinementProblem
 from drake_pose.search.starts.depth_reflections import Reflection, find_reflections
 from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh, pack
 from drake_pose.silhouette.areas.scoring import prefix_sums
@@ -37,6 +37,8 @@ _SPARE = 4
 # Placements whose nodes' middles are all nearer than this are one [node radii].
 _ALIKE = 0.35
 _LONGEST_PART = 3
+# Every so many rows are looked at where areas are only compared.
+_NEAR_STRIDE = 2
 # Steps of Gauss and Newton's method that bring nodes to given places.
 _MOVES = 12
 # Steps smaller than this end it [rad or m].
@@ -100,9 +102,10 @@ class PartSearch:
         self._grids = list(grids)
         self._X_PN = [body.tree.relative_transforms(i, grid) for i, grid in enumerate(grids)]
         # Bands of skin are small, and where they are depends on the sample.
-        rigid = body.outlines[: len(body.tree.nodes)]
+        rigid = body.surfaces.rigid
         self._outlines = tuple(_coarsen(outline) for outline in rigid)
-        self._columns = [body.columns(i) for i in range(len(grids))]
+        nodes = body.kinematics.value_nodes
+        self._columns = [np.flatnonzero(nodes == i) for i in range(len(grids))]
         self._balls = np.array([outline.ball for outline in rigid])
         self._firsts = [part.nodes[0] for part in self.parts]
         # How far a part reaches: from joint to joint, and from the last one to the surface's end.
@@ -137,7 +140,9 @@ class PartSearch:
             The parameters of each.
         """
         X_WN = self.body.poses(parameters)
-        still = problem.still(parameters, part.nodes) if still is None else still
+        if still is None:
+            moved = np.isin(np.arange(len(X_WN)), part.nodes)
+            still = problem.still(parameters, moved)
         regions = _find_regions(problem, still)
         samples = np.zeros((1, 0), dtype=np.int64)
         X_part, gains = np.zeros((1, 0, 4, 4)), np.zeros(1)
@@ -165,9 +170,16 @@ class PartSearch:
 
     def errors_near(self, problem: RefinementProblem, parameters: np.ndarray) -> np.ndarray:
         """For each part the area (parts,) wrong in any view within the part's reach [pixel]."""
-        return problem.apart_near(parameters, self._reaches(problem, parameters))
+        areas = np.zeros(len(self.parts))
+        discs = self.reaches(problem, parameters)
+        for wrong, places in zip(problem.wrong(parameters), discs, strict=True):
+            v, u = np.nonzero(wrong[::_NEAR_STRIDE])
+            x, y, r = places.T[:, :, None]
+            inside = (u - x) ** 2 + (_NEAR_STRIDE * v - y) ** 2 < r**2
+            areas += _NEAR_STRIDE * np.count_nonzero(inside, axis=1)
+        return areas
 
-    def _reaches(self, problem: RefinementProblem, parameters: np.ndarray) -> np.ndarray:
+    def reaches(self, problem: RefinementProblem, parameters: np.ndarray) -> np.ndarray:
         """For each view a disc in the picture that each part stays in (views, parts, 3) [pixel]."""
         X_WN = self.body.poses(parameters)
         origins = X_WN[self._firsts, :3, 3]
@@ -277,11 +289,9 @@ class PartSearch:
         lower, upper = body.lower[columns], body.upper[columns]
         moved = parameters.copy()
         for _ in range(_MOVES):
-            motions = body.motions(moved)
-            p_W = self._middles(motions.X_WN, nodes)
-            J = _velocities(motions.twists[columns], p_W)
-            J *= motions.moves[list(nodes)][:, columns].T[:, :, None]
-            A = J.reshape(len(columns), -1).T
+            placed = body.place(moved, bent=False)
+            p_W = self._middles(placed.X_WN, nodes)
+            A = _velocities(placed, nodes, columns, p_W)
             step = np.linalg.solve(
                 A.T @ A + 1e-4 * np.eye(len(columns)), A.T @ (wanted - p_W).ravel()
             )
@@ -296,15 +306,15 @@ class PartSearch:
         """The parameters with a node brought back to about X_WN by its own values."""
         columns = self._columns[node]
         lower, upper = self.body.lower[columns], self.body.upper[columns]
-        radius = max(float(self.body.outlines[node].ball[3]), 1e-6)
+        radius = max(float(self._balls[node, 3]), 1e-6)
         p_N = radius * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
         wanted = p_N @ X_WN[node, :3, :3].T + X_WN[node, :3, 3]
         held = parameters.copy()
         for _ in range(4):
-            motions = self.body.motions(held)
-            X = motions.X_WN[node]
+            placed = self.body.place(held, bent=False)
+            X = placed.X_WN[node]
             p_W = p_N @ X[:3, :3].T + X[:3, 3]
-            A = _velocities(motions.twists[columns], p_W).reshape(len(columns), -1).T
+            A = _velocities(placed, [node] * len(p_N), columns, p_W)
             step = np.linalg.lstsq(A, (wanted - p_W).ravel(), rcond=1e-6)[0]
             before = held[columns]
             held[columns] = np.clip(before + np.clip(step, -1.0, 1.0), lower, upper)
@@ -313,18 +323,14 @@ class PartSearch:
         return held
 
 
-def _velocities(twists: np.ndarray, p_W: np.ndarray) -> np.ndarray:
-    """How points (n, 3) move with twists (k, 7): (k, n, 3); quicker than ``np.cross``."""
-    w, v = twists[:, :3, None], twists[:, 3:6, None]
-    x, y, z = p_W.T
-    return np.stack(
-        [
-            w[:, 1] * z - w[:, 2] * y + v[:, 0],
-            w[:, 2] * x - w[:, 0] * z + v[:, 1],
-            w[:, 0] * y - w[:, 1] * x + v[:, 2],
-        ],
-        axis=-1,
-    )
+def _velocities(
+    placed: Placement, nodes: Sequence[int], columns: np.ndarray, p_W: np.ndarray
+) -> np.ndarray:
+    """How points (n, 3), each of a node, move with parameters (k,), by index: (3 n, k)."""
+    dense = placed.dense(len(placed.motions))
+    motions = dense[list(nodes)][:, columns].reshape(len(p_W), -1, 3, 4)
+    moved = np.einsum("nkij,nj->nik", motions[..., :3], p_W) + motions[..., 3].transpose(0, 2, 1)
+    return moved.reshape(3 * len(p_W), -1)
 
 
 def _find_regions(problem: RefinementProblem, still: Sequence[Border]) -> list[_Regions]:
@@ -342,8 +348,7 @@ def _find_regions(problem: RefinementProblem, still: Sequence[Border]) -> list[_
         camera = view.camera.kernel_parameters()
         camera[1:5] /= step
         camera[6:] = mask.shape[1], mask.shape[0]
-        free = np.ones(mask.shape, dtype=np.bool_)
-        clear_spans(border, step, free)
+        free = ~border.covered(step, mask.shape)
         sets = np.empty((2, mask.shape[0], mask.shape[1] + 1), dtype=np.int32)
         for index, region in enumerate((mask & free, ~mask & free)):
             sets[index] = prefix_sums(region)

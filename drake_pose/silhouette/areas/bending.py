@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drake_pose.body.tree.joint_kernel import place_band
 from drake_pose.silhouette.areas.outline import (
     Outline,
     PackedOutlines,
@@ -16,7 +17,7 @@ from drake_pose.silhouette.areas.outline import (
     outline_from_mesh,
     pack,
 )
-from drake_pose.silhouette.areas.projection import bend
+from drake_pose.silhouette.areas.projection import bend, own_copy
 
 if TYPE_CHECKING:
     from drake_pose.body.surfaces.mesh import TriangleMesh
@@ -113,22 +114,31 @@ class PackedSurfaces:
     def __init__(self, surfaces: TreeSurfaces) -> None:
         outlines = [surfaces.whole(node) for node in range(len(surfaces.rigid))]
         self._rest = pack(tuple(o.rest if isinstance(o, BendingOutline) else o for o in outlines))
+        self._own = own_copy(self._rest)
         self._bands = []
         for node, bending in enumerate(surfaces.bending):
             skin = surfaces.skins[node]
             if bending is not None and skin is not None:
                 rigid = bending.rigid
-                first = len(rigid.vertices), len(rigid.triangles)
-                self._bands.append((np.array([node, *first, 0], dtype=np.int64), skin))
+                part = np.array([node, len(rigid.vertices), len(rigid.triangles), 0], np.int64)
+                placed = np.empty((1, len(skin.weights), 3))
+                self._bands.append((node, part, skin.packed, placed))
+        self._bent = [b""] * len(outlines)
 
     def at(self, values: Sequence[np.ndarray]) -> PackedOutlines:
         """All nodes' surfaces at each node's values (k_i,) [rad or m]."""
-        rest = self._rest
-        if not self._bands:
-            return rest
-        own = rest._replace(
-            points=rest.points.copy(), planes=rest.planes.copy(), balls=rest.balls.copy()
-        )
-        for part, skin in self._bands:
-            bend(own, part, skin.vertices(values[part[0]][None])[0])
-        return own
+        return own_copy(self.bend_to(values)) if self._bands else self._rest
+
+    def bend_to(self, values: Sequence[np.ndarray] | None) -> PackedOutlines:
+        """As at, in arrays that the next call changes; None: as they are."""
+        if values is None:
+            return self._own
+        for node, part, band, placed in self._bands:
+            own = np.ascontiguousarray(values[node], dtype=np.float64)
+            # Bands whose values are as before stay.
+            if self._bent[node] != own.tobytes():
+                self._bent[node] = own.tobytes()
+                self._own.balls[node] = self._rest.balls[node]
+                place_band(band, own[None], placed)
+                bend(self._own, part, placed[0])
+        return self._own

@@ -56,7 +56,7 @@ def sample_contour(
         spacing: from row to row and from column to column [pixel], positive; the first row and
             column are pixel centres, and with a spacing of 1 all are.
     """
-    segments = find_segments(packed, X_CN, camera)
+    segments = find_segments(packed, X_CN, camera, np.ones(len(X_CN), dtype=np.bool_))
     ends = segments.ends
     crossings = [(np.zeros(1, np.int64), np.zeros(1), np.zeros(1, np.int64)) for _ in range(0)]
     capacity = 0

@@ -31,14 +31,21 @@ class Segments(NamedTuple):
 
 
 @compiled
-def find_segments(packed: PackedOutlines, X_CN: np.ndarray, camera: np.ndarray) -> Segments:
-    """The projected contour edges of all surfaces at X_CN (nodes, 4, 4), beyond the near plane."""
+def find_segments(
+    packed: PackedOutlines, X_CN: np.ndarray, camera: np.ndarray, wanted: np.ndarray
+) -> Segments:
+    """The projected contour edges, beyond the near plane, of surfaces at X_CN (nodes, 4, 4).
+
+    wanted: (nodes,) bool which surfaces.
+    """
     rows, _ = make_rows(packed, camera)
     capacity, count = 1024, 0
     ends, depths = np.empty((capacity, 4)), np.empty((capacity, 2))
     labels = np.empty((capacity, 4), dtype=np.int64)
     u, v, facings, edges, points = rows.u, rows.v, rows.facings, packed.edges, packed.points
     for node in range(X_CN.shape[0]):
+        if not wanted[node]:
+            continue
         project(packed, node, X_CN, camera, u, v)
         find_facings(packed, node, X_CN, camera, facings)
         X, ball = X_CN[node], packed.balls[node]

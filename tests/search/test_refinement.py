@@ -1,10 +1,9 @@
-"""Refinement against what is drawn, against finite differences and against scipy."""
+"""Refinement against what is drawn and against finite differences."""
 
 import math
 
 import numpy as np
 import pytest
-from scipy.optimize import lsq_linear
 
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import load_model
@@ -15,15 +14,14 @@ from drake_pose.search.continuous.intervals import (
     find_intervals,
 )
 from drake_pose.search.estimates import View
-from drake_pose.search.raster_fit.body import RefinementBody
-from drake_pose.search.raster_fit.problem import (
+from drake_pose.search.refinement import (
     COARSE_PASSES,
     FINE_PASSES,
     LAST_PASSES,
     Pass,
+    RefinementBody,
     RefinementProblem,
     descend,
-    limited_step,
 )
 from drake_pose.search.starts.depth_reflections import find_reflections
 from drake_pose.search.starts.neighbourhood import NeighbourhoodSearch
@@ -72,7 +70,7 @@ def random_pose(body, seed, share=0.8):
 
 def problem_of(body, pose, cameras):
     views = [View(camera, drawn(body, pose, camera)) for camera in cameras]
-    return RefinementProblem(body, views, pose)
+    return RefinementProblem(body, views)
 
 
 @pytest.mark.parametrize("kind", ["parallel", "pinhole"])
@@ -88,21 +86,18 @@ def test_J_is_that_of_the_drawn_body(body, kind):
     assert problem.J(random_pose(body, 1)) == 0
 
 
-def test_areas_and_borders_near(body):
+def test_areas_and_borders_near(body, search):
     camera = camera_of("parallel")
     problem = problem_of(body, random_pose(body, 1), [camera])
     pose = random_pose(body, 2)
-    mask = problem.views[0].mask
-    wrong = drawn(body, pose, camera) != mask
-    discs = np.array([[[200.0, 150.0, 40.0], [180.3, 220.0, 90.0], [5.0, 5.0, 3.0]]])
-    v, u = np.mgrid[:400, :400]
-    inside = [(u - x) ** 2 + (v - y) ** 2 < r**2 for x, y, r in discs[0]]
-    expected = [np.count_nonzero(wrong & disc) for disc in inside]
-    np.testing.assert_allclose(problem.apart_near(pose, discs), expected, rtol=0.03, atol=15.0)
+    v, u = np.nonzero(drawn(body, pose, camera) != problem.views[0].mask)
+    reaches = search.reaches(problem, pose)[0]
+    expected = [np.count_nonzero((u - x) ** 2 + (v - y) ** 2 < r**2) for x, y, r in reaches]
+    np.testing.assert_allclose(search.errors_near(problem, pose), expected, rtol=0.03, atol=15.0)
     # A square's border is as long as its sides but for what crosses at 0 and 90 degrees only.
     square = np.zeros((400, 400), dtype=bool)
     square[100:200, 100:300] = True
-    lone = RefinementProblem(body, [View(camera, square)], pose)
+    lone = RefinementProblem(body, [View(camera, square)])
     assert lone.border_length == pytest.approx(600.0 * math.pi / 4.0)
 
 
@@ -118,31 +113,11 @@ def test_one_step_takes_a_small_change_back(body, kind):
     for one, j in enumerate(freedom.columns):
         off = true.copy()
         off[j] += step
-        equations = problem.equations(off, freedom, 1, 0, 3.0)
-        shares.append(equations.g[one] / equations.H[one, one] / step)
+        equations = problem.equations(off, freedom, Pass(1, 1, 3.0, 1.0))
+        shares.append(equations.g[0, one] / equations.H[0, one, one] / step)
     # Pixels, and what the change covers and uncovers, leave some doubt.
     assert np.median(np.abs(np.array(shares) - 1.0)) < 0.1
     assert np.quantile(np.abs(np.array(shares) - 1.0), 0.85) < 0.35
-
-
-def test_limited_steps_solve_the_bounded_problem():
-    rng = np.random.default_rng(3)
-    for _ in range(20):
-        A, b = rng.normal(size=(9, 6)), rng.normal(size=9)
-        at_limit = rng.random(6) < 0.5
-        current, lower, upper = np.zeros(6), np.full(6, -50.0), np.full(6, 50.0)
-        lower[at_limit] = 0.0
-        found = limited_step(A.T @ A, -A.T @ b, current, lower, upper, 1e-9, 1e9)
-        assert np.all(found >= lower)
-        assert np.all(found <= upper)
-        expected = lsq_linear(A, b, (lower, upper), tol=1e-12)
-        # A value let go stays at its limit for the step: no better than the best, and near it.
-        assert np.linalg.norm(A @ found - b) <= 1.2 * np.sqrt(2.0 * expected.cost) + 1e-6
-        if not at_limit.any():
-            np.testing.assert_allclose(found, expected.x, rtol=1e-2)
-    g, one = np.array([-3.0, 1.0]), np.ones(2)
-    short = limited_step(np.eye(2), g, 0.0 * one, -one, one, 1e-9, 0.5)
-    assert np.abs(short).max() == pytest.approx(0.5)
 
 
 def test_a_refined_pose_is_a_local_optimum_inside_the_limits(body):
@@ -177,8 +152,8 @@ def test_a_part_in_the_wrong_place_is_found_again(body, search):
     problem = problem_of(body, true, [camera])
     wrong = true.copy()
     names = [node.name for node in body.tree.nodes]
-    shoulder = body.columns(names.index("left_upper_arm"))
-    elbow = body.columns(names.index("left_forearm"))
+    shoulder = np.flatnonzero(body.kinematics.value_nodes == names.index("left_upper_arm"))
+    elbow = np.flatnonzero(body.kinematics.value_nodes == names.index("left_forearm"))
     wrong[shoulder] = np.clip(wrong[shoulder] - 1.2, body.lower[shoulder], body.upper[shoulder])
     wrong[elbow] = np.clip(wrong[elbow] + 0.5, body.lower[elbow], body.upper[elbow])
     before = problem.J(wrong)
@@ -244,7 +219,7 @@ def test_parts_are_ends_of_limbs_and_nodes_of_the_trunk(body):
 def middles(body, parameters, part):
     """The middles of a part's nodes (k, 3)."""
     X_WN = body.poses(parameters)[list(part.nodes)]
-    p_N = np.array([body.outlines[node].ball[:3] for node in part.nodes])
+    p_N = np.array([body.surfaces.rigid[node].ball[:3] for node in part.nodes])
     return np.einsum("kij,kj->ki", X_WN[:, :3, :3], p_N) + X_WN[:, :3, 3]
 
 
@@ -335,7 +310,5 @@ def test_bad_settings_are_refused(body):
         IntervalSettings(confidence=1.0)
     with pytest.raises(SettingsError, match="noise_factor"):
         IntervalSettings(noise_factor=0.0)
-    with pytest.raises(SettingsError, match="extra"):
-        body.freedom(None, (4,))
     with pytest.raises(SettingsError, match="view"):
-        RefinementProblem(body, [], random_pose(body, 1))
+        RefinementProblem(body, [])

@@ -1,0 +1,338 @@
+"""Evidence exact to hundredths of a pixel on exact masks: contours compared along raster lines.
+
+Along every row (and column) the contour of the body and the border of the silhouette are crossed a
+few times, each time into or out of the covered part. Each crossing of the one is compared with the
+nearest of the same sense of the other, in both directions; their distance d along the line times
+the cosine c between line and contour normal is a residual [pixel], of weight
+c / 2 / (1 + (d c / scale)^2) (Geman and McClure 1987). A silhouette drawn by pixels has its border
+half way between two pixels there, which is where the truth is on average. As with edge points, what
+the crossings of a node say adds up to a 12 x 12 matrix.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_pose.compiled import compiled
+from drake_pose.fit.kernel import add_row, seen_from
+from drake_pose.silhouette.areas.outline import PackedOutlines
+from drake_pose.silhouette.contours.contour_segments import (
+    find_crossings,
+    find_line_spans,
+    find_segments,
+)
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_FAR = 1e9
+# What distances within the slack weigh: enough to choose among the poses that all bounds allow.
+_WITHIN = 0.03
+
+
+class Border(NamedTuple):
+    """Where a silhouette's border crosses rows and columns of pixel centres.
+
+    row_starts: (H + 1,) where each row's crossings begin; row_places: (n,) u, half way between two
+    pixels; column_starts: (W + 1,) and column_places: (m,) v likewise.
+    """
+
+    row_starts: NDArray[np.int64]
+    row_places: Array
+    column_starts: NDArray[np.int64]
+    column_places: Array
+
+    @classmethod
+    def nothing(cls, height: int, width: int) -> Border:
+        """Of an empty picture."""
+        rows, columns = np.zeros(height + 1, dtype=np.int64), np.zeros(width + 1, dtype=np.int64)
+        return cls(rows, np.zeros(0), columns, np.zeros(0))
+
+    @property
+    def length(self) -> float:
+        """About how long it is [pixel]: rows cross the cosine's share of it, columns the sine's."""
+        # Both together are 4 / pi on average.
+        return (len(self.row_places) + len(self.column_places)) * math.pi / 4.0
+
+    def covered(self, step: int, shape: tuple[int, ...]) -> Mask:
+        """What it bounds, in a picture (h, w) of every so many rows and columns."""
+        rows = np.repeat(np.arange(len(self.row_starts) - 1), np.diff(self.row_starts))
+        chosen = rows % step == 0
+        columns = np.clip(np.ceil(self.row_places[chosen] / step), 0, shape[1]).astype(np.int64)
+        changes = np.zeros((shape[0], shape[1] + 1), dtype=np.int8)
+        np.add.at(changes, (rows[chosen] // step, columns), 1)
+        return np.cumsum(changes, axis=1)[:, :-1] % 2 == 1
+
+
+def find_border(mask: NDArray[np.bool_]) -> Border:
+    """The border of a silhouette (H, W); what lies beyond the picture counts as outside."""
+    pixels = np.ascontiguousarray(mask).view(np.uint8)
+    return Border(*_find_changes(pixels), *_find_changes(np.ascontiguousarray(pixels.T)))
+
+
+def _find_changes(pixels: NDArray[np.uint8]) -> tuple[NDArray[np.int64], Array]:
+    """Where the lines of pixels (n, m) change between 0 and 1: Border's starts and places."""
+    lines, places = np.nonzero(np.diff(np.pad(pixels, ((0, 0), (1, 1)))))
+    starts = np.searchsorted(lines, np.arange(len(pixels) + 1))
+    return starts.astype(np.int64), np.asarray(places - 0.5)
+
+
+class SkinWeights(NamedTuple):
+    """Whom a body's vertices follow.
+
+    shares: (v,) how far each follows its own node, and how far that node's parent: less than 1 in
+    bands of skin; parents: (nodes,).
+    """
+
+    shares: Array
+    parents: NDArray[np.int64]
+
+
+@compiled
+def compare_raster(
+    packed: PackedOutlines,
+    skin: SkinWeights,
+    X_WN: Array,
+    wanted: Mask,
+    camera: tuple[Array, Array],
+    still: Border,
+    border: Border,
+    lines: tuple[int, int],
+    scale: float,
+    slack: float,
+    A: Array,
+    b: Array,
+) -> tuple[float, float, float]:
+    """Adds what one camera's silhouette says of the nodes' affine motions.
+
+    Args:
+        packed: the nodes' surfaces.
+        skin: whom their vertices follow.
+        X_WN: (nodes, 4, 4).
+        wanted: (nodes,) which nodes' motions are asked for.
+        camera: X_CW (4, 4) and kernel parameters (8,).
+        still: the border of all other nodes' union.
+        border: the silhouette's.
+        lines: every so many rows and columns are looked at, and the first of them.
+        scale: residuals beyond it lose weight [pixel].
+        slack: distances up to this hardly count, those beyond it by what they are more; 0: all
+            count [pixel].
+        A, b: (nodes, 12, 12), lower triangles, and (nodes, 12) added to, as of `compare_contours`.
+
+    Returns:
+        The pixels that body or silhouette covers, but not both, as the rows looked at show them;
+        the sum of all weights; and that of the weighted squares of the residuals.
+    """
+    stride, offset = lines
+    segments = find_segments(packed, seen_from(camera[0], X_WN), camera[1], wanted)
+    ends = segments.ends
+    apart, total, squares = 0.0, 0.0, 0.0
+    spans = np.empty((ends.shape[0] + 1, 2), dtype=np.int64)
+    most = 2 * ends.shape[0] + 2 + max(len(still.row_places), len(still.column_places))
+    chosen = np.empty(most, dtype=np.int64)
+    places, slopes = np.empty(most), np.empty(most)
+    weights, residuals = np.empty(most), np.empty(most)
+    p_N, scratch = np.empty(3), (np.empty((2, 3)), np.empty(3), np.empty(12))
+    for across in range(2):
+        border_starts = border.row_starts if across == 0 else border.column_starts
+        border_places = border.row_places if across == 0 else border.column_places
+        still_starts = still.row_starts if across == 0 else still.column_starts
+        still_places = still.row_places if across == 0 else still.column_places
+        extent = camera[1][6 + across] - 0.5
+        count = (int(camera[1][7 - across]) - 1 - offset) // stride + 1
+        crossings = find_crossings(segments, across, float(offset), float(stride), count)
+        for line in range(count):
+            at = offset + line * stride
+            first, end = border_starts[at], border_starts[at + 1]
+            moving = find_line_spans(segments, across, *crossings, line, spans)
+            found = _unite_line(
+                spans, moving, crossings[1], still_places, still_starts[at], still_starts[at + 1],
+                places, chosen,
+            )  # fmt: skip
+            if across == 0:
+                apart += _pixels_apart(places, found, border_places, first, end, int(extent + 1.0))
+            if first == end or moving == 0:
+                continue
+            for k in range(found):
+                slopes[k] = 1.0
+                if chosen[k] >= 0:
+                    chosen[k] = s = crossings[2][chosen[k]]
+                    du, dv = ends[s, 2] - ends[s, 0], ends[s, 3] - ends[s, 1]
+                    slopes[k] = abs(dv if across == 0 else du) / math.sqrt(du * du + dv * dv)
+            _compare_line(
+                places, slopes, found, border_places, first, end, extent, scale, slack, weights,
+                residuals,
+            )  # fmt: skip
+            for k in range(found):
+                s = chosen[k]
+                if s < 0 or weights[k] == 0.0:
+                    continue
+                node = segments.nodes[s]
+                low, high = ends[s, 1 - across], ends[s, 3 - across]
+                share = (at - low) / (high - low)
+                # Straight in the picture is not at even pace along the edge (perspective).
+                near, far = segments.depths[s, 0], segments.depths[s, 1]
+                share = share * near / (share * near + (1.0 - share) * far)
+                i, j = segments.vertices[s, 0], segments.vertices[s, 1]
+                for axis in range(3):
+                    begin, after = packed.points[axis, i], packed.points[axis, j]
+                    p_N[axis] = (1.0 - share) * begin + share * after
+                own = (1.0 - share) * skin.shares[i] + share * skin.shares[j]
+                # The normal that points on along the line, as the residuals do.
+                du, dv = ends[s, 2] - ends[s, 0], ends[s, 3] - ends[s, 1]
+                size = math.sqrt(du * du + dv * dv)
+                size = size if (high > low) == (across == 0) else -size
+                weight, residual = stride * weights[k], residuals[k] / weights[k]
+                total += weight
+                squares += weight * residual * residual
+                # A share of a weight for each node that the point follows: the slope is exact, and
+                # the curvature no less than it is.
+                add_row(
+                    A[node], b[node], X_WN[node], p_N, camera, dv / size, -du / size, -residual,
+                    own * weight, scratch,
+                )  # fmt: skip
+                if own < 1.0:
+                    parent = skin.parents[node]
+                    add_row(
+                        A[parent], b[parent], X_WN[node], p_N, camera, dv / size, -du / size,
+                        -residual, (1.0 - own) * weight, scratch,
+                    )  # fmt: skip
+    return stride * apart, total, squares
+
+
+@compiled
+def find_body_border(
+    packed: PackedOutlines, X_WN: Array, wanted: Mask, camera: tuple[Array, Array]
+) -> Border:
+    """The border of the wanted nodes' union; arguments as of compare_raster."""
+    segments = find_segments(packed, seen_from(camera[0], X_WN), camera[1], wanted)
+    spans = np.empty((segments.ends.shape[0] + 1, 2), dtype=np.int64)
+    borders = []
+    for across in range(2):
+        lines = int(camera[1][7 - across])
+        starts, places, owners = find_crossings(segments, across, 0.0, 1.0, lines)
+        kept, kept_starts = np.empty_like(places), np.zeros(lines + 1, dtype=np.int64)
+        count = 0
+        for line in range(lines):
+            found = find_line_spans(segments, across, starts, places, owners, line, spans)
+            for k in range(2 * found):
+                kept[count] = places[spans[k // 2, k % 2]]
+                count += 1
+            kept_starts[line + 1] = count
+        borders.append((kept_starts, kept[:count].copy()))
+    return Border(borders[0][0], borders[0][1], borders[1][0], borders[1][1])
+
+
+@compiled
+def _unite_line(
+    spans: NDArray[np.int64],
+    found: int,
+    moving: Array,
+    still: Array,
+    first: int,
+    end: int,
+    places: Array,
+    chosen: NDArray[np.int64],
+) -> int:
+    """Writes where a line enters and leaves the union of moving and still surfaces.
+
+    Args:
+        spans, found, moving: the line's moving spans, as from ``find_line_spans``.
+        still: the still surfaces' crossings; this line's are those from ``first`` to ``end``.
+        places: written.
+        chosen: written: the crossing of the moving surfaces, or -1.
+
+    Returns:
+        The number of crossings.
+    """
+    count, depth, i, j = 0, 0, 0, first
+    while i < 2 * found or j < end:
+        k = spans[i // 2, i % 2] if i < 2 * found else -1
+        if j >= end or (k >= 0 and moving[k] < still[j]):
+            place, step = moving[k], 1 - 2 * (i % 2)
+            i += 1
+        else:
+            k, place, step = -1, still[j], 1 - 2 * ((j - first) % 2)
+            j += 1
+        if depth == 0 or depth + step == 0:
+            places[count], chosen[count] = place, k
+            count += 1
+        depth += step
+    return count
+
+
+@compiled
+def _pixels_apart(
+    places: Array, count: int, border: Array, first: int, end: int, width: int
+) -> float:
+    """The number of a line's pixels that either body or silhouette covers, but not both.
+
+    A pixel is covered if its centre is. Arguments as of _compare_line; width: the line's length.
+    """
+    length, open_at, inside = 0.0, -0.5, False
+    i, j = 0, first
+    while i < count or j < end:
+        place = min(max(math.ceil(places[i]), 0), width) - 0.5 if i < count else _FAR
+        if j < end and border[j] <= place:
+            place = border[j]
+            j += 1
+        else:
+            i += 1
+        if inside:
+            length += place - open_at
+        inside, open_at = not inside, place
+    return length
+
+
+@compiled
+def _compare_line(
+    places: Array,
+    slopes: Array,
+    count: int,
+    border: Array,
+    first: int,
+    end: int,
+    extent: float,
+    scale: float,
+    slack: float,
+    weights: Array,
+    residuals: Array,
+) -> None:
+    """Writes each contour crossing's weight and weighted residual.
+
+    Args:
+        places: (count,) the contour's crossings, in turns in and out.
+        slopes: (count,) cosines between the line and the contour's normal there.
+        border: the silhouette's crossings; this line's are those from ``first`` to ``end``.
+        extent: the picture's end [pixel].
+        scale, slack: as of compare_raster.
+        weights, residuals: written.
+    """
+    for k in range(count):
+        weights[k] = residuals[k] = 0.0
+    # First each crossing of the contour with the nearest of the border, then the other way round.
+    for one in range(count + end - first):
+        begin, after = (first + one % 2, end) if one < count else ((one - count) % 2, count)
+        nearest, best = -1, _FAR
+        for other in range(begin, after, 2):
+            k, m = (one, other) if one < count else (other, first + one - count)
+            distance = places[k] - border[m]
+            if abs(distance) < abs(best):
+                best, nearest = distance, k
+        if nearest < 0 or not -0.5 <= places[nearest] <= extent:
+            continue
+        residual = best * slopes[nearest]
+        weight = 0.5 * slopes[nearest] / (1.0 + (residual / scale) ** 2)
+        if slack > 0.0:
+            beyond = abs(best) - slack
+            if beyond > 0.0:
+                hinge = math.copysign(beyond, best) * slopes[nearest]
+                residuals[nearest] += weight * hinge
+                weights[nearest] += weight
+            weight *= _WITHIN
+        weights[nearest] += weight
+        residuals[nearest] += weight * residual

@@ -21,13 +21,14 @@ if TYPE_CHECKING:
     from drake_pose.camera.drake import camera_from_drake
     from drake_pose.camera.files import load_cameras, save_cameras
     from drake_pose.camera.models import ParallelCamera, PinholeCamera
-    from drake_pose.jobs.estimate.scene import SceneEstimate, estimate_scene
+    from drake_pose.jobs.estimate.scene import estimate_scene
     from drake_pose.jobs.masks.masks import SceneMasks, make_masks
     from drake_pose.jobs.masks.settings import MaskSettings
     from drake_pose.jobs.registration.audit import SceneAudit, audit_scene
     from drake_pose.jobs.registration.register import SceneRegistration, register_scene
     from drake_pose.jobs.registration.settings import RegistrationSettings
     from drake_pose.results.settings import EstimateSettings
+    from drake_pose.results.writer import SceneEstimate
     from drake_pose.search.continuous.multi_start import MultiStartSearch
     from drake_pose.search.estimates import View
     from drake_pose.search.grid.beam.search import BeamSearch
@@ -54,7 +55,7 @@ _HOMES = {
     "RegistrationSettings": "jobs.registration.settings",
     "Scene": "silhouette.pictures.scenes",
     "SceneAudit": "jobs.registration.audit",
-    "SceneEstimate": "jobs.estimate.scene",
+    "SceneEstimate": "results.writer",
     "SceneMasks": "jobs.masks.masks",
     "SceneRegistration": "jobs.registration.register",
     "SilhouetteCamera": "systems.pictures.silhouette_camera",

@@ -1,25 +1,36 @@
-"""Reading small tables of comma-separated values that others wrote."""
+"""Small tables of comma-separated values: those that others wrote, and our own."""
 
 from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from drake_pose.errors import DrakePoseError
 from drake_pose.regular_files import read_regular
 
 
+def csv_text(rows: Iterable[Sequence[object]]) -> str:
+    """The text of a table."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
+
+
 def read_csv(
-    path: Path, error_type: type[DrakePoseError]
+    path: Path, error_type: type[DrakePoseError], *, whole_lines: bool = False
 ) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """Returns the first line's columns, and each other line's number and cells, without spaces.
+
+    whole_lines: what follows the last line break is a row that an interruption cut off.
 
     Raises:
         error_type: names the file; it cannot be read, or a line has more or fewer cells.
     """
     try:
         text = read_regular(path).decode("utf-8-sig")
+        text = text[: text.rfind("\n") + 1] if whole_lines else text
         reader = csv.reader(io.StringIO(text, newline=""))
         lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader if row]
     except (OSError, UnicodeDecodeError, csv.Error) as error:

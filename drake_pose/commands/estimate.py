@@ -27,8 +27,8 @@ from drake_pose.results.settings import EstimateSettings
 from drake_pose.results.texts import percent
 
 if TYPE_CHECKING:
-    from drake_pose.jobs.estimate.scene import SceneEstimate
-    from drake_pose.results.summary import FrameRecord
+    from drake_pose.results.records import FrameRecord
+    from drake_pose.results.writer import SceneEstimate
 
 
 def estimate(

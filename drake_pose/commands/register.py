@@ -115,9 +115,9 @@ def audit(
 
 def _print_registration(result: SceneRegistration) -> None:
     """A row a frame and camera, then where each camera stands and how sure that is."""
-    from drake_pose.jobs.estimate.inputs import CAMERA_FILE
     from drake_pose.jobs.registration.result import PARAMETERS, parameter_rows
     from drake_pose.results.folder import REPORT
+    from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 
     console = output_console()
     frames = Table("camera", "frame", "E_total", "IoU", "", title="Masks and robot")

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 if TYPE_CHECKING:
-    from drake_pose.results.summary import FrameRecord
+    from drake_pose.results.records import FrameRecord
 
 _LIMITS = {"run_limit": "run limit", "time_limit": "time limit"}
 

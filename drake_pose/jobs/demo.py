@@ -7,9 +7,10 @@ from pathlib import Path
 
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.errors import OutputError, SceneError
-from drake_pose.jobs.estimate.scene import OnFrame, SceneEstimate, estimate_scene
+from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.results.folder import OVERLAY, RESULT_FILES, SUMMARY, require_empty
 from drake_pose.results.settings import EstimateSettings
+from drake_pose.results.writer import OnFrame, SceneEstimate
 
 MODEL = "man"
 ROOT = "right_foot"

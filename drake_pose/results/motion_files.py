@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from io import StringIO
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,35 +16,30 @@ from drake_pose.body.landmarks import (
     load_landmarks,
 )
 from drake_pose.body.model import ArticulatedModel
+from drake_pose.csv_files import csv_text
 from drake_pose.results.bvh import motion_as_bvh
-from drake_pose.results.folder import (
-    BASE_COLUMNS,
-    BVH,
-    JOINT_CENTRES,
-    MOT,
-    TRC,
-    PoseRow,
-    ResultFolder,
-    base_cells,
-    base_pose,
-    csv_text,
-)
-from drake_pose.silhouette.pictures.scenes import Scene
+from drake_pose.results.folder import BVH, JOINT_CENTRES, MOT, TRC, write_file
+from drake_pose.results.poses import BASE_COLUMNS, PoseRow, base_cells, base_pose
+from drake_pose.results.records import user_units
 
 Array = NDArray[np.float64]
 
 
 def write_motion(
-    folder: ResultFolder,
+    folder: Path,
     model: ArticulatedModel,
-    scene: Scene,
+    frames: Sequence[str],
     rows: Sequence[PoseRow],
-    rate_hz: float,
+    rate_hz: float | None,
 ) -> list[str]:
     """Writes joint_centres.csv; of a sequence TRC, MOT and BVH files too; returns warnings.
 
     Joint centres need a landmarks.yaml beside the model. The files of a sequence hold every frame
-    of the scene from the first to the last of the rows, `rate_hz` frames a second.
+    from the first to the last of the rows.
+
+    Args:
+        frames: the scene's, in order.
+        rate_hz: frames a second; None: they do not follow each other.
 
     Raises:
         ModelError: the landmarks cannot be read.
@@ -52,23 +49,23 @@ def write_motion(
     landmarks = load_landmarks(model.path) if has_landmarks else {}
     if not any(row.found for row in rows):
         return []
-    places = [scene.frames.index(row.frame) for row in rows]
-    frames = scene.frames[places[0] : places[-1] + 1]
-    q = np.full((len(frames), len(model.position_names)), np.nan)
-    X_WB = np.tile(np.eye(4), (len(frames), 1, 1))
-    for place, row in zip(places, rows, strict=True):
-        q[place - places[0]], X_WB[place - places[0]] = row.q, base_pose(row.base)
-    bases = X_WB if folder.with_base else None
+    by_frame = {row.frame: row for row in rows}
+    frames = frames[frames.index(rows[0].frame) : frames.index(rows[-1].frame) + 1]
+    lost = PoseRow("", np.full(len(model.position_names), np.nan), None, np.nan, np.nan)
+    q = np.array([by_frame.get(frame, lost).q for frame in frames])
+    X_WB = None
+    if any(row.base is not None for row in rows):
+        X_WB = np.array([base_pose(by_frame.get(frame, lost).base) for frame in frames])
     if landmarks:
-        centres = joint_centres(model, landmarks, q, bases)
-        folder.write(JOINT_CENTRES, centres_as_csv(frames, list(landmarks), centres).encode())
-        if scene.sequence:
-            folder.write(TRC, centres_as_trc(list(landmarks), centres, rate_hz).encode())
-    if not scene.sequence:
+        names, centres = list(landmarks), joint_centres(model, landmarks, q, X_WB)
+        write_file(folder, JOINT_CENTRES, centres_as_csv(frames, names, centres))
+        if rate_hz is not None:
+            write_file(folder, TRC, centres_as_trc(names, centres, rate_hz))
+    if rate_hz is None:
         return []
-    folder.write(MOT, positions_as_mot(model, q, rate_hz, bases).encode())
-    text, filled = motion_as_bvh(model, q, bases, rate_hz)
-    folder.write(BVH, text.encode())
+    write_file(folder, MOT, positions_as_mot(model, q, rate_hz, X_WB))
+    text, filled = motion_as_bvh(model, q, X_WB, rate_hz)
+    write_file(folder, BVH, text)
     if not filled:
         return []
     return [
@@ -85,24 +82,21 @@ def joint_centres(
     X_WB: (frames, 4, 4) poses of the plant's world in the scene's; None: the same world.
     """
     places = np.full((len(q), len(landmarks), 3), np.nan)
-    for k, positions in enumerate(q):
-        if np.isfinite(positions).all():
-            base = None if X_WB is None else X_WB[k]
-            places[k] = landmark_positions(model, landmarks, positions, base)
+    for k in np.flatnonzero(np.isfinite(q).all(axis=1)):
+        base = None if X_WB is None else X_WB[k]
+        places[k] = landmark_positions(model, landmarks, q[k], base)
     return places
 
 
 def centres_as_csv(frames: Sequence[str], names: Sequence[str], places: Array) -> str:
     """joint_centres.csv: frame, joint, x, y, z [m] of places (frames, joints, 3); without nan."""
-    return csv_text(
-        ["frame", "joint", "x", "y", "z"],
-        [
-            [frame, name, *(f"{number:.4f}" for number in place)]
-            for frame, row in zip(frames, places, strict=True)
-            if np.isfinite(row).all()
-            for name, place in zip(names, row, strict=True)
-        ],
-    )
+    cells = [
+        [frame, name, *(f"{number:.4f}" for number in place)]
+        for frame, row in zip(frames, places, strict=True)
+        if np.isfinite(row).all()
+        for name, place in zip(names, row, strict=True)
+    ]
+    return csv_text([["frame", "joint", "x", "y", "z"], *cells])
 
 
 def centres_as_trc(names: Sequence[str], places: Array, rate_hz: float, name: str = TRC) -> str:
@@ -146,14 +140,11 @@ def positions_as_mot(
             base_x ... base_qz [m and unit quaternion]; None: the same world.
     """
     known = np.flatnonzero(np.isfinite(q).all(axis=1))
-    scale = np.array([np.degrees(1.0) if kind == "angle" else 1.0 for kind in model.position_kinds])
-    names, values = list(model.position_names), q * scale
+    names, columns = list(model.position_names), [known / rate_hz, q[known] * user_units(model)]
     if X_WB is not None:
         names += BASE_COLUMNS
-        bases = np.full((len(q), len(BASE_COLUMNS)), np.nan)
-        bases[known] = [base_cells(X) for X in X_WB[known]]
-        values = np.hstack([values, bases])
-    lines = [
+        columns.append(np.array([base_cells(X) for X in X_WB[known]]))
+    head = [
         "positions",
         "version=1",
         f"nRows={len(known)}",
@@ -162,7 +153,6 @@ def positions_as_mot(
         "endheader",
         "\t".join(["time", *names]),
     ]
-    for k in known:
-        cells = [f"{number:.6f}" for number in values[k]]
-        lines.append("\t".join([f"{k / rate_hz:.6f}", *cells]))
-    return "\n".join(lines) + "\n"
+    text = StringIO()
+    np.savetxt(text, np.column_stack(columns), "%.6f", "\t", header="\n".join(head), comments="")
+    return text.getvalue()

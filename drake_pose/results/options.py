@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from cyclopts import Parameter, Token
 
-from drake_pose.errors import SettingsError, UnknownNameError
+from drake_pose.errors import SettingsError
 
 Axis = Literal["x", "y", "z"]
 AXES: tuple[Axis, ...] = ("x", "y", "z")
@@ -156,46 +156,3 @@ def parse_root_rotation(text: str) -> Literal["fixed", "free"] | RotationLimits:
             raise SettingsError(f"{axis}: the lower limit {lower:g} exceeds the upper {upper:g}")
         limits[axis] = (lower, upper)
     return limits
-
-
-def select_frames(known: Sequence[str], wanted: Sequence[str], where: str) -> tuple[str, ...]:
-    """Returns the frames that were asked for, in the scene's order.
-
-    Args:
-        wanted: names, or ranges ``FIRST:LAST`` that include both ends; all frames where empty.
-            A number stands for the frame whose name is that number, with or without zeros before.
-        where: the scene, for messages.
-
-    Raises:
-        UnknownNameError: there is no such frame.
-        SettingsError: a range ends before it begins.
-    """
-    if not wanted:
-        return tuple(known)
-    chosen: set[int] = set()
-    for text in wanted:
-        if text in known:
-            chosen.add(known.index(text))
-            continue
-        first_text, colon, last_text = text.partition(":")
-        first = _frame_index(known, first_text, where)
-        last = _frame_index(known, last_text, where) if colon else first
-        if last < first:
-            raise SettingsError(f"--frame: the range '{text}' ends before it begins")
-        chosen.update(range(first, last + 1))
-    return tuple(frame for index, frame in enumerate(known) if index in chosen)
-
-
-def frame_number(frame: str) -> int | None:
-    """Returns the number that a frame's name is, or None."""
-    return int(frame) if frame.isascii() and frame.isdigit() else None
-
-
-def _frame_index(known: Sequence[str], name: str, where: str) -> int:
-    if name in known:
-        return known.index(name)
-    number = frame_number(name)
-    same = [i for i, frame in enumerate(known) if frame_number(frame) == number]
-    if number is None or len(same) != 1:
-        raise UnknownNameError("frame", name, known, where)
-    return same[0]

@@ -27,7 +27,7 @@ _BESIDE = np.radians(20.0)
 def make_replay(
     model: ArticulatedModel,
     positions: np.ndarray,
-    X_WB: Sequence[RigidTransform],
+    X_WB: np.ndarray,
     cameras: Sequence[Camera],
     period: float,
 ) -> str:
@@ -35,7 +35,7 @@ def make_replay(
 
     Args:
         positions: (frames, nq) its positions [rad or m].
-        X_WB: (frames) poses of the plant's world in the scene's world.
+        X_WB: (frames, 4, 4) poses of the plant's world in the scene's world.
         period: time between two frames [s]; those a second or more apart stand still.
     """
     # Port 0: any free one. The server lives for a moment only, and listens on this machine alone.
@@ -66,7 +66,7 @@ def _record(
     diagram: Diagram,
     source: ConstantVectorSource,
     positions: np.ndarray,
-    X_WB: Sequence[RigidTransform],
+    X_WB: np.ndarray,
     period: float,
 ) -> None:
     """Publishes every frame at its time; stills once more just before the next."""
@@ -81,18 +81,18 @@ def _record(
             time = index * period + offset
             context.SetTime(time)
             diagram.ForcedPublish(context)
-            meshcat.SetTransform(_BODY_PATH, X, time)
+            meshcat.SetTransform(_BODY_PATH, RigidTransform(X), time)
     meshcat.StopRecording()
     meshcat.PublishRecording()
 
 
-def _middle_of(plant: MultibodyPlant, q: np.ndarray, X_WB: RigidTransform) -> np.ndarray:
+def _middle_of(plant: MultibodyPlant, q: np.ndarray, X_WB: np.ndarray) -> np.ndarray:
     """Returns the mean position (3,) of the body's links in the scene's world."""
     context = plant.CreateDefaultContext()
     plant.SetPositions(context, q)
     bodies = [plant.get_body(BodyIndex(index)) for index in range(1, plant.num_bodies())]
     p_BL = np.array([body.EvalPoseInWorld(context).translation() for body in bodies])
-    return np.asarray(X_WB.multiply(p_BL.mean(axis=0)))
+    return np.asarray(X_WB[:3, :3] @ p_BL.mean(axis=0) + X_WB[:3, 3])
 
 
 def _draw_camera(meshcat: Meshcat, camera: Camera) -> None:

@@ -4,28 +4,22 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import quote
 
 import cv2
 import numpy as np
 from jinja2 import Environment, StrictUndefined, Template
 from markupsafe import Markup
-from numpy.typing import NDArray
 
 from drake_pose.body.model import ArticulatedModel
-from drake_pose.results.folder import OVERLAY, PoseRow
-from drake_pose.results.report_plots import Grid, Plot, draw_grid, plot_curves
-from drake_pose.results.summary import FrameRecord
-
-Array = NDArray[np.float64]
-
-USED, LEFT_OUT, NO_PICTURE = "used", "left-out", "no-picture"
-FOUND, NOT_FOUND = "found", "not-found"
+from drake_pose.results.folder import OVERLAY
+from drake_pose.results.poses import PoseRow
+from drake_pose.results.records import FrameRecord, user_units
+from drake_pose.results.report_plots import BOX, Plot, draw_grid, plot_curves
 
 # A position that changes by less is said in a table.
 _STAYS = 1e-9
@@ -51,11 +45,10 @@ _ABOUT = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class ReportContent:
+class ReportContent(NamedTuple):
     """What a report tells of.
 
-    Args:
+    Attributes:
         folder: the result's folder, whose files are linked.
         seen: (camera, frame) of every picture that there is.
         rows, records: the finished frames in order, and what is known of each, by name.
@@ -65,15 +58,14 @@ class ReportContent:
     folder: Path
     model: ArticulatedModel
     cameras: tuple[str, ...]
-    seen: frozenset[tuple[str, str]]
+    seen: Collection[tuple[str, str]]
     rows: tuple[PoseRow, ...]
     records: Mapping[str, FrameRecord]
     summary: Mapping[str, Any]
     joined: bool
 
 
-@dataclass(frozen=True)
-class JointPlot:
+class JointPlot(NamedTuple):
     """A joint's plot. unit: of its values; low, high, lower, upper: its range and its limits."""
 
     name: str
@@ -85,8 +77,7 @@ class JointPlot:
     plot: Plot
 
 
-@dataclass(frozen=True)
-class Picture:
+class Picture(NamedTuple):
     """An overlay. uri: of its data; link: of its file."""
 
     camera: str
@@ -101,25 +92,31 @@ def make_report(content: ReportContent) -> str:
     template = page_template("drake_pose.results", "report_template.html.j2")
     frames = [row.frame for row in content.rows]
     records = [content.records[frame] for frame in frames]
-    errors = np.array([np.nan if r.E_total is None else 100.0 * r.E_total for r in records])
-    moving, still = _joint_plots(content, frames, records)
+    found = ["found" if record.found else "not-found" for record in records]
+    use = [(name, _use(content, name)) for name in content.cameras]
+    errors = np.array([100.0 * row.error for row in content.rows])
+    ious = [
+        (name, np.array([100.0 * record.ious.get(name, np.nan) for record in records]))
+        for name in content.cameras
+    ]
+    joints = _joint_plots(content, frames)
+    stay = {one.name for one in joints if one.unit != "deg" and one.high - one.low < _STAYS}
     return template.render(
         summary=content.summary,
         title=Path(str(content.summary["scene"])).name or str(content.summary["scene"]),
         model=content.model.path.name,
         method=_METHODS[str(content.summary["method"])],
-        rows=[(frame, content.records[frame]) for frame in frames],
+        rows=list(zip(frames, records, strict=True)),
+        box=BOX,
         errors=plot_curves(frames, [("E_total", errors)], joined=content.joined, least=0.0),
-        ious=_plot_ious(content, frames, records),
-        cameras=_camera_rows(content),
-        grid=_draw_use(content, frames, records),
-        lost=[frame for frame in frames if not content.records[frame].found],
-        moving=moving,
-        still=still,
+        ious=plot_curves(frames, ious, joined=content.joined),
+        cameras=[_camera_row(content, name) for name in content.cameras],
+        grid=draw_grid(frames, [*use, ("pose", found)]),
+        lost=[row.frame for row in content.rows if not row.found],
+        moving=[one for one in joints if one.name not in stay],
+        still=[one for one in joints if one.name in stay],
         pictures=_pick_pictures(content),
-        files=[
-            (name, about) for name, about in _ABOUT.items() if (content.folder / name).is_file()
-        ],
+        files=[(name, text) for name, text in _ABOUT.items() if (content.folder / name).is_file()],
     )
 
 
@@ -135,117 +132,89 @@ def page_template(package: str, name: str) -> Template:
     return environment.from_string(source.read_text(encoding="utf-8"))
 
 
-def _joint_plots(
-    content: ReportContent, frames: list[str], records: list[FrameRecord]
-) -> tuple[list[JointPlot], list[JointPlot]]:
-    """The plots of positions that change, and of those that stay the same."""
-    model = content.model
-    moving: list[JointPlot] = []
-    still: list[JointPlot] = []
+def _joint_plots(content: ReportContent, frames: Sequence[str]) -> list[JointPlot]:
+    """The plots of all positions that are known in a frame."""
+    model, units = content.model, user_units(content.model)
+    of_kind = {"angle": "deg", "length": "m", "quaternion": ""}
     q = np.array([row.q for row in content.rows]).reshape(len(frames), -1)
+    plots = []
     for k, (name, kind) in enumerate(zip(model.position_names, model.position_kinds, strict=True)):
-        scale, unit = (np.degrees(1.0), "deg") if kind == "angle" else (1.0, "m")
-        values = scale * q[:, k]
+        values = units[k] * q[:, k]
         if not np.isfinite(values).any():
             continue
-        limits = float(scale * model.lower[k]), float(scale * model.upper[k])
-        known = [record.joints.get(name) for record in records]
+        lower, upper = float(units[k] * model.lower[k]), float(units[k] * model.upper[k])
+        known = [content.records[frame].joints.get(name) for frame in frames]
         intervals = None
-        if any(one is not None for one in known):
-            intervals = (
-                np.array([np.nan if one is None else one.low for one in known]),
-                np.array([np.nan if one is None else one.high for one in known]),
-                np.array([one is not None and one.determined for one in known]),
-            )
+        if any(known):
+            ends = [(np.nan, np.nan, False) if n is None else n.interval for n in known]
+            low, high, determined = np.array(ends).T
+            intervals = low, high, determined > 0.0
         plot = plot_curves(
             frames,
             [(name, values)],
             joined=content.joined,
-            limits=limits,
+            limits=(lower, upper),
             intervals=intervals,
         )
         low, high = float(np.nanmin(values)), float(np.nanmax(values))
-        joint = JointPlot(name, "" if kind == "quaternion" else unit, low, high, *limits, plot)
-        stays = kind != "angle" and high - low < _STAYS
-        (still if stays else moving).append(joint)
-    return moving, still
+        plots.append(JointPlot(name, of_kind[kind], low, high, lower, upper, plot))
+    return plots
 
 
-def _plot_ious(content: ReportContent, frames: list[str], records: list[FrameRecord]) -> Plot:
-    curves = [
-        (camera, np.array([100.0 * record.ious.get(camera, np.nan) for record in records]))
-        for camera in content.cameras
-    ]
-    return plot_curves(frames, curves, joined=content.joined)
-
-
-def _camera_rows(content: ReportContent) -> list[dict[str, Any]]:
+def _camera_row(content: ReportContent, camera: str) -> dict[str, Any]:
     """What the table of cameras says: pictures, those used, IoU, and whether it is suspicious."""
-    rows = []
-    for camera in content.cameras:
-        ious = {
-            frame: record.ious[camera]
-            for frame, record in content.records.items()
-            if camera in record.ious
-        }
-        worst = min(ious, key=lambda frame: ious[frame]) if ious else None
-        rows.append(
-            {
-                "name": camera,
-                "pictures": sum((camera, frame) in content.seen for frame in content.records),
-                "used": len(ious),
-                "mean": float(np.mean(list(ious.values()))) if ious else None,
-                "least": None if worst is None else ious[worst],
-                "worst": worst,
-                "bad": any(f"'{camera}'" in text for text in content.summary["warnings"]),
-            }
-        )
-    return rows
+    records = content.records
+    ious = {f: one.ious[camera] for f, one in records.items() if camera in one.ious}
+    worst = min(ious, key=lambda frame: ious[frame], default=None)
+    return {
+        "name": camera,
+        "pictures": sum((camera, frame) in content.seen for frame in records),
+        "used": len(ious),
+        "mean": float(np.mean(list(ious.values()))) if ious else None,
+        "least": None if worst is None else ious[worst],
+        "worst": worst,
+        "bad": any(f"'{camera}'" in text for text in content.summary["warnings"]),
+    }
 
 
-def _draw_use(content: ReportContent, frames: list[str], records: list[FrameRecord]) -> Grid:
-    """Which camera was used in which frame, and where a pose was found."""
-
-    def state(camera: str, frame: str, record: FrameRecord) -> str:
-        if camera in record.ious:
-            return USED
-        return LEFT_OUT if (camera, frame) in content.seen else NO_PICTURE
-
-    use = [
-        (camera, [state(camera, f, r) for f, r in zip(frames, records, strict=True)])
-        for camera in content.cameras
-    ]
-    found = [FOUND if record.found else NOT_FOUND for record in records]
-    return draw_grid(frames, [*use, ("pose", found)])
+def _use(content: ReportContent, camera: str) -> list[str]:
+    """In which frames a camera was used, or was there."""
+    states = []
+    for row in content.rows:
+        is_used = camera in content.records[row.frame].ious
+        is_there = (camera, row.frame) in content.seen
+        states.append("used" if is_used else "left-out" if is_there else "no-picture")
+    return states
 
 
 def _pick_pictures(content: ReportContent) -> list[Picture]:
     """Overlays of the frames that fit worst, as usual and best, as far as they were written."""
     known = [row for row in content.rows if row.found] or list(content.rows)
     in_order = sorted(known, key=lambda row: -row.error if row.found else 0.0)
-    chosen = list(dict.fromkeys([0, len(in_order) // 2, len(in_order) - 1])) if in_order else []
-    each = max(1, _PICTURES // max(1, len(chosen)))
+    last = len(in_order) - 1
+    chosen = list(dict.fromkeys([0, (last + 1) // 2, last])) if in_order else []
     pictures = []
-    for place in chosen:
-        row = in_order[place]
+    for row in (in_order[place] for place in chosen):
         ious = content.records[row.frame].ious
         cameras = sorted(content.cameras, key=lambda name: ious.get(name, 1.0))
-        found = [camera for camera in cameras if (content.folder / _overlay(camera, row)).is_file()]
-        for camera in found[:each]:
-            data = (content.folder / _overlay(camera, row)).read_bytes()
-            error = content.records[row.frame].E_total
-            link = quote(_overlay(camera, row))
-            uri = small_picture(data)
-            if uri:
-                pictures.append(Picture(camera, row.frame, error, uri, link))
+        shown = [
+            overlay_picture(content.folder, name, row.frame, row.error if row.found else None)
+            for name in cameras
+        ]
+        pictures += [one for one in shown if one is not None][: max(1, _PICTURES // len(chosen))]
     return pictures
 
 
-def _overlay(camera: str, row: PoseRow) -> str:
-    return f"{OVERLAY}/{camera}/{row.frame}.png"
+def overlay_picture(folder: Path, camera: str, frame: str, E_total: float | None) -> Picture | None:
+    """An overlay in a result's folder, made small; None where it is no picture any more."""
+    place = f"{OVERLAY}/{camera}/{frame}.png"
+    if not (folder / place).is_file():
+        return None
+    uri = _small_picture((folder / place).read_bytes())
+    return Picture(camera, frame, E_total, uri, quote(place)) if uri else None
 
 
-def small_picture(data: bytes) -> str:
+def _small_picture(data: bytes) -> str:
     """A PNG picture as the URI of a small JPEG picture; "" where it is none any more."""
     picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     if picture is None:

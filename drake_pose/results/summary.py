@@ -6,100 +6,34 @@ import hashlib
 import platform
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from drake_pose.errors import OutputError
+from drake_pose.body.model import ArticulatedModel
+from drake_pose.errors import OutputError, SettingsError
 from drake_pose.regular_files import digest, read_regular
+from drake_pose.results.folder import read_summary, require_empty
+from drake_pose.results.poses import PoseRow
+from drake_pose.results.records import FrameRecord
 from drake_pose.results.settings import EstimateSettings
+from drake_pose.results.texts import percent
+from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import Scene
 from drake_pose.version import VERSION
 
+BADLY_EXPLAINED = 0.25
+"""From this E_total on, a pose explains its pictures badly."""
+
+# A joint stands at a limit if it is so near to it, as a share of its range.
+_AT_LIMIT = 1e-3
 # A camera is suspicious where its pictures agree so much less than the others'.
 _SUSPICIOUS = 0.15
 # Of a mask's digest this many digits are kept.
 _DIGITS = 16
 _PACKAGES = ("drake", "numpy", "numba", "opencv-python-headless")
-
-
-@dataclass(frozen=True)
-class JointRecord:
-    """What is known of one value of the pose tree, as JointEstimate [deg or m].
-
-    From low to high it may be, or was seen; value is that of a family, None over all families.
-    """
-
-    determined: bool
-    low: float
-    high: float
-    value: float | None = None
-
-
-@dataclass(frozen=True)
-class FrameRecord:
-    """What the search said about one frame.
-
-    Args:
-        E_total: J over the silhouettes' area; None where no pose was found.
-        seconds: the search's wall time [s].
-        first_E_total: before the re-estimation.
-        runs: how often step 3 was run.
-        stopped_by: why the search ended: "end", "exact", "run_limit" or "time_limit";
-            "tracked" where the pose was tracked, "followed" where a person was.
-        outside_limit: r in each view [pixel].
-        joint_errors: estimate minus truth by position [deg or m], where the truth is known.
-        camera_scale: pixels a metre of a parallel camera whose scale was found.
-        explained: whether the pose explains the silhouettes at least roughly.
-        joints: what is known of each value of the pose tree, by name.
-        families: the same in the first families of poses that look the same.
-        family_count: how many families there are; None where the search does not say.
-        ious: by camera that was used, intersection over union of silhouette and body.
-        masks: by camera, what tells the mask's file from another (``mask_digests``).
-        share: of the contours' lengths, what fits; by the method person alone.
-    """
-
-    found: bool
-    E_total: float | None
-    seconds: float
-    first_E_total: float | None = None
-    runs: int | None = None
-    stopped_by: str | None = None
-    outside_limit: tuple[float, ...] | None = None
-    joint_errors: Mapping[str, float] = field(default_factory=dict)
-    camera_scale: float | None = None
-    explained: bool = True
-    joints: Mapping[str, JointRecord] = field(default_factory=dict)
-    families: tuple[Mapping[str, JointRecord], ...] = ()
-    family_count: int | None = None
-    ious: Mapping[str, float] = field(default_factory=dict)
-    share: float | None = None
-    masks: Mapping[str, str] = field(default_factory=dict)
-
-    @staticmethod
-    def from_json(values: Mapping[str, Any]) -> FrameRecord:
-        """Returns the record that as_json described."""
-        limits = values.get("outside_limit")
-        families = [_joint_records(family) for family in values.get("families", ())]
-        return FrameRecord(
-            **{
-                **values,
-                "outside_limit": None if limits is None else tuple(limits),
-                "joints": _joint_records(values.get("joints", {})),
-                "families": tuple(families),
-            }
-        )
-
-    def as_json(self) -> dict[str, Any]:
-        """Returns plain JSON values."""
-        return asdict(self)
-
-
-def _joint_records(values: Mapping[str, Any]) -> dict[str, JointRecord]:
-    return {name: JointRecord(**fields) for name, fields in values.items()}
 
 
 def describe_job(scene: Path, model: Path, settings: EstimateSettings) -> dict[str, Any]:
@@ -126,8 +60,22 @@ def mask_digests(scene: Scene, cameras: Iterable[str], frame: str) -> dict[str, 
     return found
 
 
-def check_same_job(job: Mapping[str, Any], recorded: Mapping[str, Any], folder: Path) -> None:
-    """Refuses (OutputError) to resume a job with other files or settings, but other frames."""
+def open_job(folder: Path | None, job: Mapping[str, Any], resume: bool) -> Mapping[str, Any] | None:
+    """The summary of the job that is resumed; None where it is a new one, for an empty folder.
+
+    Raises:
+        SettingsError: nothing says which job is to be resumed.
+        OutputError: that one had other files or settings, but for the frames; or the folder of a
+            new one is not empty.
+    """
+    if folder is None:
+        if resume:
+            raise SettingsError("resume needs the folder of the result that is to be resumed")
+        return None
+    if not resume:
+        require_empty(folder)
+        return None
+    recorded = read_summary(folder)
     for name in ("model", "cameras"):
         if recorded.get("sha256", {}).get(name) != job["sha256"][name]:
             raise OutputError(
@@ -141,6 +89,7 @@ def check_same_job(job: Mapping[str, Any], recorded: Mapping[str, Any], folder: 
                 f"{folder}: was made with {name} = {before.get(name)}, not {value}, so it cannot "
                 "be resumed; name another folder, or give the same options"
             )
+    return recorded
 
 
 def summarize(
@@ -197,6 +146,37 @@ def camera_warnings(
     )
 
 
+def poor_fit_warnings(
+    rows: Iterable[PoseRow],
+    records: Mapping[str, FrameRecord],
+    model: ArticulatedModel,
+    held: Iterable[str],
+) -> tuple[str, ...]:
+    """One warning where poses explain their pictures badly; `held` positions were not searched."""
+    # A followed person is judged by the contours (describe_fit): others in view are in the masks.
+    judged = [row for row in rows if row.found and records[row.frame].share is None]
+    bad = [row for row in judged if row.error >= BADLY_EXPLAINED]
+    if not bad:
+        return ()
+    several = f"of {len(judged)}, " if len(bad) > 1 else ""
+    error = percent(float(np.median([row.error for row in bad])))
+    q, span = np.array([row.q for row in bad]), model.upper - model.lower
+    with np.errstate(invalid="ignore"):
+        near = np.minimum(q - model.lower, model.upper - q) <= _AT_LIMIT * span
+    is_one = (near.mean(axis=0) > 0.5) & (span > 0.0) & (span < 2.0 * np.pi)
+    at_limits = [model.position_names[k] for k in np.flatnonzero(is_one)][:3]
+    advice = ["the cameras (exchanged? moved?)", "the model and its scale", "its limits"]
+    if at_limits:
+        advice[-1] += f" ({', '.join(at_limits)} at a limit)"
+    if names := ", ".join(held):
+        advice.append(f"what is held ({names})")
+    listed = frame_ranges([row.frame for row in bad], list(records))
+    return (
+        f"frame {listed} ({several}E_total {error}): the pose explains the pictures badly, so it "
+        f"may be wrong; look at the overlays, the masks, {', '.join(advice)} and where the root is",
+    )
+
+
 def _joint_errors(records: Mapping[str, FrameRecord]) -> dict[str, dict[str, float]]:
     """Mean and greatest absolute error of each position over the frames [deg or m]."""
     by_name: dict[str, list[float]] = {}
@@ -213,10 +193,8 @@ def versions() -> dict[str, str]:
     """The versions of drake_pose, Python and the packages that matter."""
     found = {"drake_pose": VERSION, "python": platform.python_version()}
     for package in _PACKAGES:
-        try:
+        with suppress(PackageNotFoundError):
             found[package] = version(package)
-        except PackageNotFoundError:
-            continue
     return found
 
 

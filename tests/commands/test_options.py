@@ -9,8 +9,8 @@ from drake_pose.results.options import (
     parse_root_position,
     parse_root_rotation,
     parse_size,
-    select_frames,
 )
+from drake_pose.silhouette.pictures.scene_files import select_frames
 from tests.cli import run_command
 
 FRAMES = ("0001", "0002", "0010", "still")

@@ -7,7 +7,6 @@ import pytest
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.landmarks import load_landmarks
 from drake_pose.body.model import load_model
-from drake_pose.results.folder import BASE_COLUMNS, PoseRow, ResultFolder
 from drake_pose.results.motion_files import (
     centres_as_csv,
     centres_as_trc,
@@ -15,6 +14,7 @@ from drake_pose.results.motion_files import (
     positions_as_mot,
     write_motion,
 )
+from drake_pose.results.poses import BASE_COLUMNS, PoseRow
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.jobs.bvh_reader import read_bvh
 from tests.jobs.scenes import write_scene
@@ -77,8 +77,7 @@ def test_a_results_files_honour_the_base_and_leave_out_what_is_not_known(tmp_pat
     q = np.array([0.5, -1.0])
     lost = PoseRow("0002", np.full(2, np.nan), None, np.nan, 0.1)
     rows = [PoseRow("0001", q, base, 0.1, 0.1), lost, PoseRow("0003", q, base, 0.1, 0.1)]
-    folder = ResultFolder(tmp_path / "out", model.position_names, with_base=True)
-    warnings = write_motion(folder, model, load_scene(scene.folder), rows, 25.0)
+    warnings = write_motion(tmp_path / "out", model, load_scene(scene.folder).frames, rows, 25.0)
     context = model.plant.CreateDefaultContext()
     model.plant.SetPositions(context, q)
     jib = model.plant.GetBodyByName("jib").EvalPoseInWorld(context)

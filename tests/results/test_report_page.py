@@ -1,5 +1,4 @@
 import re
-from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -9,11 +8,12 @@ import pytest
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.jobs.estimate.scene import estimate_scene
-from drake_pose.results.folder import PoseRow
+from drake_pose.results.poses import PoseRow
+from drake_pose.results.records import FrameRecord, JointRecord
 from drake_pose.results.report_page import ReportContent, make_report
-from drake_pose.results.report_plots import HEIGHT, WIDTH, draw_grid, plot_curves
+from drake_pose.results.report_plots import BOX, HEIGHT, WIDTH, draw_grid, plot_curves
 from drake_pose.results.settings import EstimateSettings
-from drake_pose.results.summary import FrameRecord, JointRecord, summarize
+from drake_pose.results.summary import summarize
 from tests.jobs.scenes import NAMES, TinyScene, read_rows
 
 VOID = {"meta", "img", "br", "link", "hr"}
@@ -179,9 +179,9 @@ def test_names_are_shown_as_they_are(content: ReportContent) -> None:
 
 
 def test_a_frame_or_none_is_enough(content: ReportContent) -> None:
-    one = replace(content, rows=content.rows[:1], records={"0000": content.records["0000"]})
+    one = content._replace(rows=content.rows[:1], records={"0000": content.records["0000"]})
     assert Page(make_report(one)).joints
-    lost = replace(content, rows=content.rows[100:101], records={"0100": content.records["0100"]})
+    lost = content._replace(rows=content.rows[100:101], records={"0100": content.records["0100"]})
     assert Page(make_report(lost)).joints == {}
 
 
@@ -197,13 +197,13 @@ def test_curves_break_at_gaps_and_keep_their_peaks() -> None:
     plot = plot_curves(
         [str(k) for k in range(5000)], [("one", values)], joined=True, limits=(-1, 4)
     )
-    path = plot.curves[0].path
+    path = plot.curves[0][1]
     assert path.count("M") == 2
     assert path.count("L") < 1500
     points = coordinates(path)
     assert ((points >= 0.0) & (points <= [WIDTH, HEIGHT])).all()
     peak = points[np.argmin(points[:, 1])]
-    left, _, width, _ = plot.box
+    left, _, width, _ = BOX
     assert peak[0] == pytest.approx(left + width * 2500 / 4999, abs=0.2)
     # Both limits are shown, and no point lies outside them but as the picture's scale says.
     assert len(plot.limits) == 2
@@ -215,20 +215,20 @@ def test_limits_that_are_far_do_not_flatten_the_curve() -> None:
     plot = plot_curves(
         [str(k) for k in range(50)], [("one", values)], joined=True, limits=(-90, 90)
     )
-    points = coordinates(plot.curves[0].path)
-    assert np.ptp(points[:, 1]) > 0.7 * plot.box[3]
+    points = coordinates(plot.curves[0][1])
+    assert np.ptp(points[:, 1]) > 0.7 * BOX[3]
     assert plot.limits == ()
 
 
 def test_stills_are_dots() -> None:
     plot = plot_curves(["a", "b"], [("one", np.array([1.0, np.nan]))], joined=False)
-    assert plot.curves[0].path.count("h0") == 1
-    assert plot.curves[0].dots
+    assert plot.curves[0][1].count("h0") == 1
+    assert plot.dots
 
 
 def test_grid_joins_neighbours_of_one_state() -> None:
     states = ["used", "used", "no-picture", "used"]
     grid = draw_grid(["0", "1", "2", "3"], [("left", states)])
-    runs = grid.rows[0].runs
+    runs = grid.rows[0][2]
     assert [run[2] for run in runs] == ["used", "no-picture", "used"]
     assert runs[0][1] == pytest.approx(2 * runs[1][1], abs=0.02)

@@ -23,15 +23,15 @@ from drake_pose.body.model import load_model
 from drake_pose.camera.files import load_cameras
 from drake_pose.errors import DrakePoseError, OutputError
 from drake_pose.jobs.batch.job import SceneJob
-from drake_pose.jobs.estimate.inputs import select_cameras, select_seen_frames
 from drake_pose.jobs.estimate.person_choice import follows_person
 from drake_pose.jobs.estimate.scene import estimate_scene
-from drake_pose.jobs.estimate.scene_checks import frame_ranges
 from drake_pose.jobs.registration.audit import audit_scene
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.results.folder import OVERLAY, POSES, SUMMARY, read_summary, without_nan
+from drake_pose.results.records import FrameRecord
 from drake_pose.results.settings import EstimateSettings
-from drake_pose.results.summary import FrameRecord, describe_job, mask_digests, summarize
+from drake_pose.results.summary import describe_job, mask_digests, summarize
+from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import Scene, load_scene
 
 WORK = ".chunks"
@@ -109,14 +109,13 @@ def plan_scene(job: SceneJob, out: Path) -> tuple[Task, ...]:
     Raises:
         DrakePoseError: the scene cannot be read.
     """
-    scene = _load(job)
-    cameras = select_cameras(scene, job.settings.cameras)
-    frames = select_seen_frames(scene, cameras, job.settings.frames)
+    scene = _load(job).of_cameras(job.settings.cameras)
+    frames = scene.seen_frames(job.settings.frames)
     is_whole = job.audit is not None
     # A model is read only where it may be a person's: that takes seconds.
     if landmarks_file(job.model).is_file() or job.settings.method == "person":
         model = load_model(job.model, package_paths=job.settings.packages)
-        is_whole = is_whole or follows_person(scene, cameras, model, job.settings)
+        is_whole = is_whole or follows_person(scene, model, job.settings)
     if is_whole:
         return (Task(job, out, None, frames),)
     cuts = range(0, len(frames), job.chunk)

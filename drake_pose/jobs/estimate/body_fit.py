@@ -6,7 +6,6 @@ followed; lengths, widths and all poses are fitted together, to a model, its pos
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,21 +14,23 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from drake_pose.body.model import ArticulatedModel
+from drake_pose.camera.models import ParallelCamera
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.tracking.contour_tracker import ContourTracker, TrackingSettings
 from drake_pose.filtering.tracking.match_and_track import make_tracker
 from drake_pose.filtering.tracking.sequence_fit import FittedSequence, fit_sequence, pose_set
 from drake_pose.filtering.tracking.start_poses import FollowedStart, StartSettings, find_start
-from drake_pose.jobs.estimate.inputs import Inputs, leave_out_links, make_placement_search
+from drake_pose.jobs.estimate.inputs import Inputs
 from drake_pose.jobs.estimate.matching import sequence_tracking
-from drake_pose.jobs.estimate.result import OnStage
+from drake_pose.jobs.estimate.searches import leave_out_links, make_placement_search
 from drake_pose.results.overlay import draw_shapes
+from drake_pose.results.records import user_units
 from drake_pose.results.settings import EstimateSettings
+from drake_pose.results.writer import USUAL_RATE_HZ, OnStage
 from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
 from drake_pose.search.estimates import TRACKED, PoseEstimate, View
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.scoring import draw_mask
-from drake_pose.systems.estimators.mask_player import DEFAULT_FRAME_RATE_HZ
 
 # A part that shows by itself with less than this share of its own area may not be there.
 _HIDDEN = 0.1
@@ -59,13 +60,13 @@ class FittedBody(NamedTuple):
 
 
 class _Fitted(NamedTuple):
-    """A sequence fitted as a whole: answers by frame number, the body, and its first state."""
+    """A body and its first state, and the answers that are known by frame number."""
 
-    search: RootPlacementSearch
-    known: dict[int, PoseEstimate]
     model: ArticulatedModel
+    search: RootPlacementSearch
     observation: ContourObservation
     x: np.ndarray
+    known: dict[int, PoseEstimate]
 
 
 class _StartedSearch(RootPlacementSearch):
@@ -107,11 +108,11 @@ class _BodyFit:
         self, inputs: Inputs, settings: EstimateSettings, tracking: TrackingSettings
     ) -> None:
         self._inputs, self._settings, self._tracking = inputs, settings, tracking
-        self._camera = inputs.cameras[0]
+        self._camera = next(iter(inputs.scene.cameras.values()))
         frames = inputs.frames[: StartSettings().frames]
         self._masks = [inputs.scene.read(self._camera.name, frame) for frame in frames]
         self._more: dict[str, Any] = {}
-        self._period = 1.0 / (inputs.scene.frame_rate_hz or DEFAULT_FRAME_RATE_HZ)
+        self._period = 1.0 / (inputs.scene.frame_rate_hz or USUAL_RATE_HZ)
 
     def run(self, search: RootPlacementSearch) -> FittedBody:
         """All of it."""
@@ -119,60 +120,60 @@ class _BodyFit:
         first = search.match([View(self._camera, self._masks[0])])
         if not first.found:
             return FittedBody(self._inputs, {}, None)
-        shapes = None
         search, first = self._without_hidden(search, first)
         tracker = self._tracker(search)
-        frames = [[mask] for mask in self._masks]
+        own = tracker.observation
         starts = find_start(
-            tracker, tracker.observation.state(first.q, first.X_WB, first.scale), frames
+            tracker, own.state(first.q, first.X_WB, first.scale), [[one] for one in self._masks]
         )
-        known = {0: self._answer(tracker.observation, starts[0].x, 0)}
-        fitted = self._fit(tracker, starts) if len(frames) >= _FEWEST else None
-        if fitted is not None:
-            search, known, model, other, x = fitted
-            shapes = self._draw_shapes((tracker.observation, starts[0].x), (other, x))
-            warnings = (*self._inputs.warnings, _INTERVALS)
-            self._inputs = replace(self._inputs, model=model, warnings=warnings)
+        known = {0: self._answer(own, starts[0].x, 0)}
+        body = _Fitted(self._inputs.model, search, own, starts[0].x, known)
+        fitted = self._fit(tracker, starts) if len(self._masks) >= _FEWEST else None
+        shapes = None if fitted is None else self._draw_shapes(body, fitted)
+        body = fitted or body
         seconds = time.perf_counter() - begin
         self._more["body_fit_seconds"] = round(seconds, 3)
-        known = {k: replace(one, seconds=seconds / len(known)) for k, one in known.items()}
-        started = _StartedSearch(search.tree, search.settings, search.scale_unknown)
+        share = seconds / len(body.known)
+        known = {k: replace(one, seconds=share) for k, one in body.known.items()}
+        started = _StartedSearch(body.search.tree, body.search.settings, body.search.scale_unknown)
         started.first = known[max(known)]
-        by_frame = {self._inputs.frames[k]: one for k, one in known.items()}
-        inputs = replace(self._inputs, search=started, known=by_frame)
+        frames, warnings = self._inputs.frames, self._inputs.warnings
+        inputs = replace(
+            self._inputs,
+            model=body.model,
+            search=started,
+            known={frames[k]: one for k, one in known.items()},
+            warnings=warnings if fitted is None else (*warnings, _INTERVALS),
+        )
         return FittedBody(inputs, self._more, shapes)
 
     def _fit(self, tracker: ContourTracker, starts: Sequence[FollowedStart]) -> _Fitted | None:
         """The sequence fitted as a whole; None where that explains it no better."""
-        begin = [start.states for start in starts]
-        explanations = fit_sequence(tracker, self._masks, begin, self._period)
-        models = [
-            one.body.applied_to(self._inputs.model, one.fitted.parameters[0])
-            for one in explanations
-        ]
+        explanations = fit_sequence(
+            tracker, self._masks, [start.states for start in starts], self._period
+        )
         model, tree = self._inputs.model, tracker.observation.tree
-        units = [math.degrees(1.0) if kind == "angle" else 1.0 for kind in model.position_kinds]
+        units = user_units(model)
         held = {model.position_names[i]: units[i] * value for i, value in tree.held.items()}
         settings = replace(self._settings, hold=held)
-        searches = [make_placement_search(one, settings, None, True) for one in models]
-        observations = [self._tracker(search).observation for search in searches]
         count = len(tracker.observation.parameters(starts[0].x))
-        states = [
-            [other.state_of(theta[:count]) for theta in one.fitted.parameters]
-            for other, one in zip(observations, explanations, strict=True)
-        ]
-        answers = [
-            [self._answer(other, x, k) for k, x in enumerate(path)]
-            for other, path in zip(observations, states, strict=True)
-        ]
-        if np.mean([one.E_total for one in answers[0]]) >= np.mean(starts[0].errors):
+        found = []
+        for one in explanations:
+            changed = one.body.applied_to(model, one.fitted.parameters[0])
+            search = make_placement_search(changed, settings, None, True)
+            own = self._tracker(search).observation
+            path = [own.state_of(theta[:count]) for theta in one.fitted.parameters]
+            known = {k: self._answer(own, x, k) for k, x in enumerate(path)}
+            found.append(_Fitted(changed, search, own, path[0], known))
+        best = found[0]
+        errors = [one.E_total for one in best.known.values()]
+        if np.mean(errors) >= np.mean(starts[0].errors):
             return None
-        known = {}
-        for k, answer in enumerate(answers[0]):
-            poses = [(path[k].q, path[k].X_WB, path[k].J) for path in answers]
-            known[k] = replace(answer, pose_set=pose_set(explanations, poses, k))
+        for k, answer in best.known.items():
+            poses = [(one.known[k].q, one.known[k].X_WB, one.known[k].J) for one in found]
+            best.known[k] = replace(answer, pose_set=pose_set(explanations, poses, k))
         self._tell(explanations)
-        return _Fitted(searches[0], known, models[0], observations[0], states[0][0])
+        return best
 
     def _tell(self, explanations: Sequence[FittedSequence]) -> None:
         """What the summary says of the fitted body, and of explanations that look alike."""
@@ -195,12 +196,12 @@ class _BodyFit:
         costs = [one.fitted.cost / explanations[0].fitted.cost for one in explanations]
         self._more["explanations"] = [round(cost, 4) for cost in costs]
 
-    def _draw_shapes(self, *bodies: tuple[ContourObservation, np.ndarray]) -> np.ndarray:
+    def _draw_shapes(self, *bodies: _Fitted) -> np.ndarray:
         """The file's body and the corrected one, each where it is in the first frame."""
         shapes = []
-        for observation, x in bodies:
-            outlines = TreeSurfaces(observation.tree).at(observation.node_values(x))
-            X_CN = self._camera.X_CW @ observation.node_poses(x)
+        for one in bodies:
+            outlines = TreeSurfaces(one.search.tree).at(one.observation.node_values(one.x))
+            X_CN = self._camera.X_CW @ one.observation.node_poses(one.x)
             shapes.append(draw_mask(outlines, X_CN, self._camera))
         title = f"frame {self._inputs.frames[0]}: the shape that explains the sequence"
         return draw_shapes(self._masks[0], shapes, ("the file's", "corrected"), [title])
@@ -247,14 +248,14 @@ class _BodyFit:
             rest = draw_mask([outlines[k] for k in others], X_CN[others], self._camera)
             shows = np.count_nonzero(own & ~rest & self._masks[0])
             # As large as it is, turned to the viewer, it has this area at least.
-            whole = _area(outlines[i].vertices) * match.scale**2 * self._pixels_per_metre**2
-            if shows < _HIDDEN * whole:
+            _, *sides = np.sort(np.ptp(outlines[i].vertices, axis=0))
+            assert isinstance(self._camera, ParallelCamera)
+            if (
+                shows
+                < _HIDDEN * np.prod(sides) * (match.scale * self._camera.pixels_per_metre) ** 2
+            ):
                 hidden.append(node.name)
         return tuple(hidden)
-
-    @property
-    def _pixels_per_metre(self) -> float:
-        return float(getattr(self._camera, "pixels_per_metre", 1.0))
 
     def _answer(self, observation: ContourObservation, x: np.ndarray, frame: int) -> PoseEstimate:
         """A state in a frame, by its number, as a search would give it."""
@@ -271,9 +272,3 @@ class _BodyFit:
             root_position=observation.root_position(x),
             scale=observation.scale(x),
         )
-
-
-def _area(points: np.ndarray) -> float:
-    """Area of the box about points (n, 3) across its shortest side."""
-    size = np.sort(np.ptp(points, axis=0))
-    return float(size[1] * size[2])

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
-from drake_pose.camera.models import Camera, ParallelCamera
+from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.tracking.contour_tracker import TrackingSettings
-from drake_pose.jobs.estimate.fit_checks import find_contradiction
+from drake_pose.jobs.estimate.contradictions import find_contradiction
 from drake_pose.jobs.estimate.inputs import Inputs
-from drake_pose.jobs.estimate.result import Drawn, FinishedFrame, OnStage, ResultWriter
-from drake_pose.results.folder import PoseRow, base_cells
-from drake_pose.results.joint_tables import record_pose_set
-from drake_pose.results.summary import FrameRecord
+from drake_pose.results.poses import PoseRow, base_cells
+from drake_pose.results.records import FrameRecord, record_pose_set
+from drake_pose.results.writer import USUAL_RATE_HZ, Drawn, FinishedFrame, OnStage
 from drake_pose.search.continuous.multi_start import MultiStartSearch
 from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
 from drake_pose.search.estimates import PoseEstimate, View
@@ -28,9 +28,7 @@ from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.mask_agreement import compare_masks
 from drake_pose.silhouette.pictures.scenes import Scene
 from drake_pose.systems.estimators.diagrams import build_recorded_matching
-from drake_pose.systems.estimators.mask_player import DEFAULT_FRAME_RATE_HZ
 
-_USUAL_FRAME_RATE_HZ = 30.0
 _REST_TIME = 1.0
 
 
@@ -39,26 +37,15 @@ def sequence_tracking(
 ) -> TrackingSettings | None:
     """How the body of a scene is tracked; None where every frame is matched on its own.
 
-    No frame rate means 30 frames a second; a searched root position or scale is tracked, too.
+    A searched root position or scale is tracked, too.
     """
     if not track or not scene.sequence:
         return None
-    tracking = TrackingSettings(
+    return TrackingSettings(
         root_moves=isinstance(search, RootPlacementSearch),
         scale_unknown=scene.scale_unknown,
         # A single parallel view is the same for poses mirrored in depth.
         rest_time=_REST_TIME if scene.scale_unknown else None,
-    )
-    if scene.frame_rate_hz is not None:
-        return tracking
-    # The diagram's frames are further apart than the video's were: the motion is slower as much.
-    slower = _USUAL_FRAME_RATE_HZ / DEFAULT_FRAME_RATE_HZ
-    return replace(
-        tracking,
-        angle_acceleration=tracking.angle_acceleration / math.pow(slower, 2),
-        length_acceleration=tracking.length_acceleration / math.pow(slower, 2),
-        growth_acceleration=tracking.growth_acceleration / math.pow(slower, 2),
-        memory=tracking.memory * slower,
     )
 
 
@@ -77,20 +64,20 @@ def estimate_frames(
     # is a track from the last frame that is known.
     follows = bool(inputs.scene.images or inputs.starts or inputs.known)
     played = inputs.frames[max(len(inputs.known) - 1, 0) :] if follows else left
+    rate_hz = inputs.scene.frame_rate_hz or USUAL_RATE_HZ
     matching = build_recorded_matching(
-        inputs.scene,
+        replace(inputs.scene, frame_rate_hz=rate_hz),
         search,
-        inputs.cameras,
+        tuple(inputs.scene.cameras.values()),
         played,
         inputs.root_positions,
         tracking=sequence_tracking(inputs.scene, search, track),
         starts=inputs.starts,
     )
-    period = 1.0 / (inputs.scene.frame_rate_hz or DEFAULT_FRAME_RATE_HZ)
     simulator = Simulator(matching.diagram)
     for index, frame in enumerate(played):
         # The frame is matched at index periods; half a period later the answer surely stands.
-        simulator.AdvanceTo((index + 0.5) * period)
+        simulator.AdvanceTo((index + 0.5) / rate_hz)
         if frame in left:
             pose = matching.estimate(simulator.get_context())
             if pose is None:
@@ -99,65 +86,79 @@ def estimate_frames(
 
 
 def match_frames(
-    result: ResultWriter, search: PoseSearch, track: bool, overlay: bool
+    inputs: Inputs, search: PoseSearch, track: bool, overlay: bool, missing: Sequence[str]
 ) -> Iterator[FinishedFrame]:
-    """The missing frames of a result, matched or tracked, compared with their masks and drawn."""
-    inputs, renderers = result.inputs, _Renderers(result.inputs)
-    model, scene = inputs.model, inputs.scene
-    kinds = dict(zip(model.position_names, model.position_kinds, strict=True))
-    for frame, pose in estimate_frames(inputs, search, track, result.missing):
-        base = base_cells(pose.X_WB) if result.with_base and pose.found else None
-        drawn: dict[str, Drawn] = {}
-        for camera in inputs.cameras:
-            key = camera.name, frame
-            if key in scene.masks or (overlay and key in scene.images):
-                seen = scene.read(*key) if key in scene.masks else scene.read_image(*key)
-                drawn[camera.name] = renderers.draw(camera, seen, pose)
-        of_masks = {name: one for name, one in drawn.items() if (name, frame) in scene.masks}
-        agreement = compare_masks(
-            {name: one.seen for name, one in of_masks.items()},
-            {name: one.body for name, one in of_masks.items()},
-        )
-        joints, families = record_pose_set(pose.pose_set, kinds)
-        search_said = pose.statistics
-        record = FrameRecord(
-            found=pose.found,
-            E_total=pose.E_total if pose.found else None,
-            seconds=pose.seconds,
+    """The missing frames, matched or tracked, compared with their masks and drawn."""
+    scene, model = inputs.scene, inputs.model
+    renderers: dict[str, LabelRenderer] = {}
+    for frame, pose in estimate_frames(inputs, search, track, missing):
+        shown = {name: scene.read(name, frame) for name in scene.cameras_of(frame)}
+        if overlay:
+            shown = {**read_pictures(scene, frame), **shown}
+        drawn = {name: _draw(inputs, renderers, name, seen, pose) for name, seen in shown.items()}
+        yield finish_frame(
+            inputs,
+            frame,
+            pose,
+            {name: drawn[name] for name in scene.cameras_of(frame)},
+            drawn if overlay else {},
             first_E_total=pose.first_E_total if pose.found else None,
-            runs=search_said.runs,
-            stopped_by=pose.stopped_by,
-            outside_limit=search_said.outside_limit,
-            joint_errors=result.joint_errors(frame, pose.q, pose.found),
+            runs=pose.statistics.runs,
+            outside_limit=pose.statistics.outside_limit,
             camera_scale=_camera_scale(scene, frame, pose),
             explained=pose.explained,
-            joints=joints,
-            families=families,
-            family_count=None if pose.pose_set is None else pose.pose_set.family_count,
-            ious=dict(agreement.ious) if pose.found else {},
+            **record_pose_set(pose.pose_set, model),
         )
-        row = PoseRow(frame, pose.q, base, pose.E_total, pose.seconds)
-        yield FinishedFrame(row, record, drawn if overlay else {})
 
 
-class _Renderers:
-    """Draw the body in the cameras of a scene, whose scale may have been found."""
+def finish_frame(
+    inputs: Inputs,
+    frame: str,
+    pose: PoseEstimate,
+    compared: Mapping[str, Drawn],
+    drawn: Mapping[str, Drawn],
+    **more: Any,
+) -> FinishedFrame:
+    """A frame as written, its masks ``compared`` with the body; more: fields of FrameRecord."""
+    agreement = compare_masks(
+        {name: one.seen for name, one in compared.items()},
+        {name: one.body for name, one in compared.items()},
+    )
+    base = base_cells(pose.X_WB) if inputs.base_moves and pose.found else None
+    row = PoseRow(frame, pose.q, base, pose.E_total, pose.seconds)
+    record = FrameRecord.of(
+        row,
+        stopped_by=pose.stopped_by,
+        joint_errors=inputs.joint_errors(frame, pose.q) if row.found else {},
+        ious=agreement.ious if row.found else {},
+        **more,
+    )
+    return FinishedFrame(row, record, drawn)
 
-    def __init__(self, inputs: Inputs) -> None:
-        self._model = inputs.model
-        self._renderers: dict[str, LabelRenderer] = {}
 
-    def draw(self, camera: Camera, seen: np.ndarray, pose: PoseEstimate) -> Drawn:
-        """The body beside what the camera saw."""
-        if not pose.found:
-            return Drawn(seen, np.zeros(seen.shape[:2], dtype=np.bool_), None)
-        if camera.name not in self._renderers:
-            self._renderers[camera.name] = LabelRenderer(self._model, camera)
-        renderer = self._renderers[camera.name]
-        if isinstance(camera, ParallelCamera):
-            renderer.camera = scale_camera(camera, pose.scale)
-        segments = renderer.segments(pose.q, pose.X_WB)
-        return Drawn(seen, segments >= 0, segments)
+def read_pictures(scene: Scene, frame: str) -> dict[str, np.ndarray]:
+    """The pictures (H, W, 3) of a frame by camera."""
+    names = [name for name in scene.cameras if (name, frame) in scene.images]
+    return {name: scene.read_image(name, frame) for name in names}
+
+
+def _draw(
+    inputs: Inputs,
+    renderers: dict[str, LabelRenderer],
+    name: str,
+    seen: np.ndarray,
+    pose: PoseEstimate,
+) -> Drawn:
+    """The body beside what a camera, whose scale may have been found, saw."""
+    if not pose.found:
+        return Drawn(seen, np.zeros(seen.shape[:2], dtype=np.bool_), None)
+    camera = inputs.scene.cameras[name]
+    if name not in renderers:
+        renderers[name] = LabelRenderer(inputs.model, camera)
+    if isinstance(camera, ParallelCamera):
+        renderers[name].camera = scale_camera(camera, pose.scale)
+    segments = renderers[name].segments(pose.q, pose.X_WB)
+    return Drawn(seen, segments >= 0, segments)
 
 
 def _camera_scale(scene: Scene, frame: str, pose: PoseEstimate) -> float | None:
@@ -168,11 +169,16 @@ def _camera_scale(scene: Scene, frame: str, pose: PoseEstimate) -> float | None:
     return pose.scale * camera.pixels_per_metre if isinstance(camera, ParallelCamera) else None
 
 
-def compare_cameras(result: ResultWriter, search: PoseSearch, on_stage: OnStage | None) -> None:
-    """Warn of cameras that contradict each other; few frames are matched again for it."""
-    inputs = result.inputs
-    if inputs.scene.images:
-        return
+def compare_cameras(
+    inputs: Inputs,
+    search: PoseSearch,
+    records: Mapping[str, FrameRecord],
+    on_stage: OnStage | None,
+) -> list[str]:
+    """A warning of cameras that contradict each other; few frames are matched again for it."""
+    scene = inputs.scene
+    if scene.images:
+        return []
     if isinstance(search, (BeamSearch, MultiStartSearch)):
         search = search.without_alternatives()
 
@@ -182,8 +188,4 @@ def compare_cameras(result: ResultWriter, search: PoseSearch, on_stage: OnStage 
         found = search.match(views, (inputs.root_positions or {}).get(frame))
         return found.E_total if found.found else math.inf
 
-    contradiction = find_contradiction(
-        match, inputs.cameras, inputs.scene.read, inputs.scene.masks, result.records
-    )
-    if contradiction is not None:
-        result.warn([contradiction.text])
+    return find_contradiction(match, scene.cameras, scene.read, scene.masks, records)

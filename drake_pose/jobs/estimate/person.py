@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.camera.models import Camera
 from drake_pose.errors import MaskError, SceneError
 from drake_pose.jobs.estimate.inputs import Inputs
-from drake_pose.jobs.estimate.result import Drawn, FinishedFrame, OnStage, ResultWriter
-from drake_pose.jobs.estimate.scene_checks import (
-    describe_unreadable,
-    frame_ranges,
-    require_readable,
-)
+from drake_pose.jobs.estimate.matching import finish_frame, read_pictures
 from drake_pose.person.recordings.checked_capture import (
     CheckedCapture,
     MovedCamera,
@@ -28,11 +22,16 @@ from drake_pose.person.recordings.colour_capture import capture_by_colour
 from drake_pose.person.recordings.person_capture import PersonCapture
 from drake_pose.person.recordings.persons_in_view import ReadFrame, ViewFaults
 from drake_pose.person.recordings.rig_faults import RigFault
-from drake_pose.results.folder import PoseRow
-from drake_pose.results.joint_tables import record_deviations
-from drake_pose.results.summary import FrameRecord
+from drake_pose.results.records import record_deviations
+from drake_pose.results.writer import Drawn, FinishedFrame, OnFrame, OnStage, ResultWriter
+from drake_pose.search.estimates import PoseEstimate
 from drake_pose.silhouette.areas.scoring import draw_labels
-from drake_pose.silhouette.pictures.mask_agreement import compare_masks, edge_area
+from drake_pose.silhouette.pictures.mask_agreement import edge_area
+from drake_pose.silhouette.pictures.scene_checks import (
+    describe_unreadable,
+    frame_ranges,
+    require_readable,
+)
 
 Mask = NDArray[np.bool_]
 
@@ -42,8 +41,7 @@ FOLLOWED = "followed"
 _FITS_BADLY = 0.6
 
 
-@dataclass(frozen=True, eq=False)
-class _Followed:
+class _Followed(NamedTuple):
     """A person's poses and shape, masks, warnings, and distances (frames,) [pixel] by colour."""
 
     captured: PersonCapture
@@ -53,9 +51,14 @@ class _Followed:
 
 
 def follow_person(
-    result: ResultWriter, track: bool, overlay: bool, on_stage: OnStage | None
-) -> Iterator[FinishedFrame]:
-    """Follows the person through all frames; then gives them, compared with their masks and drawn.
+    inputs: Inputs,
+    result: ResultWriter,
+    track: bool,
+    overlay: bool,
+    on_frame: OnFrame | None,
+    on_stage: OnStage | None,
+) -> None:
+    """Follows the person through all frames; then writes them, compared with their masks and drawn.
 
     A resumed recording is followed as a whole again.
 
@@ -68,30 +71,31 @@ def follow_person(
         SceneError: none of the masks can be read, or fewer than two are there of the first picture.
         SettingsError: in no frame two cameras see a person.
     """
-    inputs = result.inputs_of_all()
+    asked = {*inputs.frames, *result.rows}
+    frames = tuple(frame for frame in inputs.scene.frames if frame in asked)
+    inputs = replace(inputs, frames=frames)
     reader = _Reader(inputs, on_stage)
     begin = time.perf_counter()
     follow = _follow_colours if inputs.scene.images else _follow_masks
     followed = follow(inputs, reader, track)
     reader.on_stage = None
-    seconds = (time.perf_counter() - begin) / len(inputs.frames)
-    result.begin_again(inputs)
+    seconds = (time.perf_counter() - begin) / len(frames)
+    result.rows.clear()
+    result.records.clear()
+    result.begin()
     shape = followed.captured.shape
     if shape is not None:
         result.more |= {"lengths_m": shape.known.lengths, "girths": shape.known.girths}
-
-    def finished() -> Iterator[FinishedFrame]:
-        for index in range(len(inputs.frames)):
-            yield _finished_frame(inputs, result, followed, reader, index, seconds, overlay)
-        result.warn((*reader.warnings(), *followed.faults))
-
-    return finished()
+    finished = _finished_frames(inputs, followed, reader, seconds, overlay)
+    result.add_all(finished, frames, on_frame)
+    unread = describe_unreadable(reader.refused, inputs.scene.frames)
+    result.warnings += (*unread, *followed.faults)
 
 
 def _follow_masks(inputs: Inputs, reader: _Reader, track: bool) -> _Followed:
     checked = capture_checked(
         inputs.model.pose_tree(),
-        reader.cameras,
+        inputs.scene.cameras,
         reader,
         len(inputs.frames),
         inputs.scene.sequence and track,
@@ -109,15 +113,14 @@ def _follow_colours(inputs: Inputs, reader: _Reader, _track: bool) -> _Followed:
             f"{scene.path}: a person is found by the masks of two cameras or more, but the first "
             f"frame, '{frames[0]}', has fewer: add them (drake-pose masks), or --start FILE.csv"
         )
-    order = {frame: k for k, frame in enumerate(frames)}
     found = capture_by_colour(
         inputs.model.pose_tree(),
-        reader.cameras,
+        scene.cameras,
         len(frames),
         masked,
         reader,
-        lambda index: _read_pictures(inputs, frames[index]),
-        {order[frame]: q for frame, q in inputs.starts.items()},
+        lambda index: read_pictures(scene, frames[index]),
+        {frames.index(frame): q for frame, q in inputs.starts.items()},
         reader.count_followed,
     )
     faults: tuple[str, ...] = ()
@@ -134,43 +137,32 @@ def _follow_colours(inputs: Inputs, reader: _Reader, _track: bool) -> _Followed:
     return _Followed(found.captured, reader, faults, found.distances)
 
 
-def _read_pictures(inputs: Inputs, frame: str) -> dict[str, NDArray[np.uint8]]:
-    """The pictures (H, W, 3) of a frame by camera."""
-    names = [camera.name for camera in inputs.cameras]
-    images = inputs.scene.images
-    return {k: inputs.scene.read_image(k, frame) for k in names if (k, frame) in images}
-
-
 class _Reader:
     """Reads the masks of a frame by camera; one that cannot be read is left out, and said once."""
 
     def __init__(self, inputs: Inputs, on_stage: OnStage | None) -> None:
-        self.cameras: Mapping[str, Camera] = {camera.name: camera for camera in inputs.cameras}
-        self._inputs = inputs
+        self._scene, self._frames = inputs.scene, inputs.frames
         self.on_stage = on_stage
-        self._read_count = 0
-        self._followed = 0
-        self._refused: dict[tuple[str, str], str] = {}
+        self.refused: dict[tuple[str, str], str] = {}
+        self._read_count = self._followed = 0
 
     def __call__(self, index: int) -> dict[str, Mask]:
         """The masks of a frame, counted from 0, by camera."""
-        scene, frame = self._inputs.scene, self._inputs.frames[index]
-        masks = {}
-        for camera in scene.cameras_of(frame):
-            if camera not in self.cameras or (camera, frame) in self._refused:
-                continue
-            try:
-                masks[camera] = scene.read(camera, frame, may_be_empty=True)
-            except MaskError as error:
-                self._refused[camera, frame] = str(error)
-        require_readable(self._refused, scene)
+        frame, masks = self._frames[index], {}
+        for camera in self._scene.cameras_of(frame):
+            if (camera, frame) not in self.refused:
+                try:
+                    masks[camera] = self._scene.read(camera, frame, may_be_empty=True)
+                except MaskError as error:
+                    self.refused[camera, frame] = str(error)
+        require_readable(self.refused, self._scene)
         self._read_count += 1
         self._report_stage()
         return masks
 
     def _report_stage(self) -> None:
         """Says what a mask is read for: all are read once before anything else is done."""
-        count = len(self._inputs.frames)
+        count = len(self._frames)
         if self.on_stage is None:
             return
         if self._read_count <= count:
@@ -184,67 +176,59 @@ class _Reader:
         """Called after each frame in which the person was followed."""
         self._followed += 1
         if self.on_stage is not None:
-            self.on_stage("following", self._followed, len(self._inputs.frames))
-
-    def warnings(self) -> tuple[str, ...]:
-        """Which masks were left out, and why."""
-        return describe_unreadable(self._refused, self._inputs.scene)
+            self.on_stage("following", self._followed, len(self._frames))
 
 
-def _finished_frame(
-    inputs: Inputs,
-    result: ResultWriter,
-    followed: _Followed,
-    reader: Callable[[int], Mapping[str, Mask]],
-    index: int,
-    seconds: float,
-    overlay: bool,
-) -> FinishedFrame:
-    """A frame's masks compared with the captured person, of the girth that was found."""
-    frame, captured = inputs.frames[index], followed.captured
-    masks, q = followed.read(index), captured.q[index]
-    shown: Mapping[str, NDArray[Any]] = masks
-    # A camera that was left out is shown, too, so that one sees why.
-    if len(masks) < len(inputs.scene.cameras_of(frame)):
-        shown = {**reader(index), **shown}
-    if overlay and inputs.scene.images:
-        shown = {**_read_pictures(inputs, frame), **shown}
-    found = bool(np.isfinite(q).all())
-    by_colour = found and not masks and followed.distances is not None
-    wanted = [camera for camera in inputs.cameras if by_colour or camera.name in shown]
-    segments = _draw_parts(captured, q if found else None, wanted)
-    bodies = {name: one > 0 for name, one in segments.items()}
-    agreement = compare_masks(masks, bodies)
-    error = agreement.E_total if masks and found else float("nan")
-    if by_colour and followed.distances is not None:
-        # Without masks, E_total is the strip between both contours over the body's area.
-        area = sum(int(np.count_nonzero(body)) for body in bodies.values())
-        edge = sum(edge_area(body) for body in bodies.values())
-        error = float(edge * followed.distances[index] / max(area, 1))
-    row = PoseRow(frame, q, None, error, seconds)
-    record = FrameRecord(
-        found=row.found,
-        E_total=row.error if row.found else None,
-        seconds=seconds,
-        stopped_by=FOLLOWED,
-        joint_errors=result.joint_errors(frame, q, row.found),
-        joints=record_deviations(inputs.model, q, captured.deviations[index]),
-        ious=agreement.ious if row.found else {},
-        share=float(captured.shares[index]),
-    )
-    drawn = {name: Drawn(seen, bodies[name], segments[name]) for name, seen in shown.items()}
-    return FinishedFrame(row, record, drawn if overlay else {})
+def _finished_frames(
+    inputs: Inputs, followed: _Followed, reader: ReadFrame, seconds: float, overlay: bool
+) -> Iterator[FinishedFrame]:
+    """The frames' masks compared with the captured person, of the girth that was found."""
+    scene, captured = inputs.scene, followed.captured
+    for index, frame in enumerate(inputs.frames):
+        masks, q = followed.read(index), captured.q[index]
+        shown: dict[str, NDArray[np.generic]] = dict(masks)
+        # A camera that was left out is shown, too, so that one sees why.
+        if len(masks) < len(scene.cameras_of(frame)):
+            shown = {**reader(index), **shown}
+        if overlay:
+            shown = {**read_pictures(scene, frame), **shown}
+        found = bool(np.isfinite(q).all())
+        by_colour = found and not masks and followed.distances is not None
+        parts = _draw_parts(inputs, captured, q, scene.cameras if by_colour else shown)
+        bodies = {name: part > 0 for name, part in parts.items()}
+        wrong = float(sum(np.count_nonzero(mask ^ bodies[k]) for k, mask in masks.items()))
+        area = float(sum(np.count_nonzero(mask) for mask in masks.values()))
+        if by_colour and followed.distances is not None:
+            # Without masks, E_total is the strip between both contours over the body's area.
+            area = float(sum(np.count_nonzero(body) for body in bodies.values())) or 1.0
+            wrong = sum(map(edge_area, bodies.values())) * float(followed.distances[index])
+        if not (found and area):
+            wrong, area = np.nan, 1.0
+        pose = PoseEstimate(
+            found, q, np.eye(4), (), wrong, area, stopped_by=FOLLOWED, seconds=seconds
+        )
+        drawn = {name: Drawn(seen, bodies[name], parts[name]) for name, seen in shown.items()}
+        yield finish_frame(
+            inputs,
+            frame,
+            pose,
+            {name: drawn[name]._replace(seen=mask) for name, mask in masks.items()},
+            drawn if overlay else {},
+            joints=record_deviations(inputs.model, q, captured.deviations[index]),
+            share=float(captured.shares[index]),
+        )
 
 
 def _draw_parts(
-    captured: PersonCapture, q: NDArray[np.float64] | None, cameras: Sequence[Camera]
+    inputs: Inputs, captured: PersonCapture, q: NDArray[np.float64], names: Mapping[str, object]
 ) -> dict[str, NDArray[np.int16]]:
-    """Which part of the person each pixel of the cameras shows, from 1 on; 0: none."""
-    if q is None:
-        return {c.name: np.zeros((c.height, c.width), dtype=np.int16) for c in cameras}
+    """Which part of the person each pixel of cameras shows, from 1 on; 0: none."""
+    cameras = {name: inputs.scene.cameras[name] for name in names}
+    if not np.isfinite(q).all():
+        return {k: np.zeros((c.height, c.width), dtype=np.int16) for k, c in cameras.items()}
     X_WN = captured.tree.node_poses(captured.tree.values_from_positions(q))
-    labels = range(1, 1 + len(captured.outlines))
-    return {c.name: draw_labels(captured.outlines, labels, c.X_CW @ X_WN, c) for c in cameras}
+    labels, outlines = range(1, 1 + len(captured.outlines)), captured.outlines
+    return {k: draw_labels(outlines, labels, c.X_CW @ X_WN, c) for k, c in cameras.items()}
 
 
 def describe_faults(checked: CheckedCapture, frames: Sequence[str]) -> tuple[str, ...]:

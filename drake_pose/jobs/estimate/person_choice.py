@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.landmarks import landmarks_file, load_landmarks
 from drake_pose.body.model import ArticulatedModel
-from drake_pose.camera.models import Camera
 from drake_pose.errors import ModelError, SceneError
 from drake_pose.person.body_plan import PERSON_LANDMARKS
 from drake_pose.results.settings import EstimateSettings
@@ -20,29 +18,21 @@ def bundled_person() -> Path:
     return bundled_model("person").with_name("person_shape.urdf")
 
 
-def follows_person(
-    scene: Scene,
-    cameras: Sequence[Camera],
-    model: ArticulatedModel,
-    settings: EstimateSettings,
-) -> bool:
+def follows_person(scene: Scene, model: ArticulatedModel, settings: EstimateSettings) -> bool:
     """Whether the method is ``person``, by name or because ``auto`` chooses it.
 
     Raises:
         SceneError, ModelError: the method is asked for, but scene or model does not allow it.
     """
-    if settings.method not in ("auto", "person"):
-        return False
     wanted = settings.method == "person"
-    if not wanted and settings.search_settings:
+    if not wanted and (settings.method != "auto" or settings.search_settings):
         return False
-    if len(cameras) < 2 or scene.scale_unknown:
+    if len(scene.cameras) < 2 or scene.scale_unknown:
         if wanted:
-            names = [camera.name for camera in cameras]
-            strangers = ", ".join(scene.leftovers.uncalibrated)
+            strangers = ", ".join(scene.strangers)
             raise SceneError(
                 f"{scene.path}: a person is captured by two calibrated cameras or more, but masks "
-                f"are there of {', '.join(names)} alone"
+                f"are there of {', '.join(scene.cameras)} alone"
                 + (f"; cameras.yaml lacks {strangers}" if strangers else "")
             )
         return False
@@ -55,18 +45,12 @@ def follows_person(
 def missing_for_person(model: ArticulatedModel) -> str:
     """What a model lacks to be a person who can be anywhere; "" where nothing."""
     names = set(load_landmarks(model.path)) if landmarks_file(model.path).is_file() else set()
-    absent = sorted(PERSON_LANDMARKS - names)
-    if absent:
+    if absent := sorted(PERSON_LANDMARKS - names):
         return f"the landmarks {', '.join(absent)} in {landmarks_file(model.path).name} beside it"
-    tree = model.pose_tree()
-    roots = [node for node in tree.nodes if node.parent < 0]
-    lengths = [
-        position
-        for node in roots
-        for position in node.positions
-        if model.position_kinds[position] == "length"
-    ]
-    by_joints = all(node.value_names == node.position_names for node in tree.nodes)
-    if len(roots) != 1 or len(lengths) < 3 or not by_joints:
+    nodes = model.pose_tree().nodes
+    roots = [node for node in nodes if node.parent < 0]
+    kinds = [model.position_kinds[position] for node in roots for position in node.positions]
+    by_joints = all(node.value_names == node.position_names for node in nodes)
+    if len(roots) != 1 or kinds.count("length") < 3 or not by_joints:
         return "one root that joints of its own move to any place"
     return ""

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from drake_pose.errors import SettingsError
 from drake_pose.jobs.estimate.body_fit import fit_body
 from drake_pose.jobs.estimate.inputs import read_inputs
 from drake_pose.jobs.estimate.matching import compare_cameras, match_frames
 from drake_pose.jobs.estimate.person import follow_person
-from drake_pose.jobs.estimate.result import OnFrame, OnStage, ResultWriter, SceneEstimate
-from drake_pose.results.folder import SHAPES, read_summary, require_empty
+from drake_pose.results.folder import SHAPES
 from drake_pose.results.overlay import encode_png
 from drake_pose.results.settings import EstimateSettings
-from drake_pose.results.summary import check_same_job, describe_job
-from drake_pose.search.scoring import PoseSearch
+from drake_pose.results.summary import describe_job, open_job
+from drake_pose.results.writer import OnFrame, OnStage, ResultWriter, SceneEstimate
 
 
 def estimate_scene(
@@ -54,50 +48,29 @@ def estimate_scene(
     Raises:
         DrakePoseError: names the file, camera, frame, link or joint at fault.
     """
-    settings, folder_path = settings or EstimateSettings(), None if out is None else Path(out)
-    recorded = _recorded_summary(folder_path, resume)
-    inputs = read_inputs(Path(scene), Path(model), settings, None if truth is None else Path(truth))
+    settings, folder = settings or EstimateSettings(), None if out is None else Path(out)
     job = describe_job(Path(scene), Path(model), settings)
-    if recorded is not None and folder_path is not None:
-        check_same_job(job, recorded, folder_path)
+    earlier = open_job(folder, job, resume)
+    inputs = read_inputs(Path(scene), Path(model), settings, None if truth is None else Path(truth))
     inputs, of_body, shapes = fit_body(inputs, settings, on_stage)
-    search = inputs.search
-    with_base = search is not None and _base_moves(search)
-    result = ResultWriter(inputs, job, folder_path, recorded, with_base)
-    by_search = "paper" if settings.method == "paper" else "beam"
+    result = ResultWriter(
+        inputs.scene, inputs.model, job, folder, earlier=earlier, with_base=inputs.base_moves,
+        frames=inputs.frames, warnings=inputs.warnings,
+    )  # fmt: skip
+    search, by_search = inputs.search, "paper" if settings.method == "paper" else "beam"
     result.more |= {"method": by_search if search is not None else "person"} | of_body
-    result.open()
+    result.begin()
+    missing = [frame for frame in inputs.frames if frame not in result.rows]
     try:
         if shapes is not None:
             result.write(SHAPES, encode_png(shapes))
         if search is not None:
-            result.add_all(match_frames(result, search, settings.track, overlay), on_frame)
-            compare_cameras(result, search, on_stage)
-        elif result.missing:
-            result.add_all(follow_person(result, settings.track, overlay, on_stage), on_frame)
+            frames = match_frames(inputs, search, settings.track, overlay, missing)
+            result.add_all(frames, inputs.frames, on_frame)
+            result.warnings += compare_cameras(inputs, search, result.records, on_stage)
+        elif missing:
+            follow_person(inputs, result, settings.track, overlay, on_frame, on_stage)
         result.finish(replay)
     finally:
-        result.close()
+        result.write_summary()
     return result.result()
-
-
-def _recorded_summary(folder: Path | None, resume: bool) -> Mapping[str, Any] | None:
-    """The summary of the job that is resumed; None where it is a new one, for an empty folder."""
-    if folder is None:
-        if resume:
-            raise SettingsError("resume needs the folder of the result that is to be resumed")
-        return None
-    if resume:
-        return read_summary(folder)
-    require_empty(folder)
-    return None
-
-
-def _base_moves(search: PoseSearch) -> bool:
-    """Whether the root's rotation or position moves the plant's whole world in the scene's."""
-    tree, grids = search.tree, search.sampled.values
-    for pick in (0, -1):
-        _, X_WB = tree.positions_from([values[pick] for values in grids])
-        if not np.allclose(X_WB, np.eye(4), atol=1e-12):
-            return True
-    return False

@@ -109,13 +109,13 @@ def record_frames(
 ) -> LiveResult:
     """Runs the diagram of a capture, ``method`` in summary.json, and writes what comes out."""
     result.writer.more["method"] = method
-    result.writer.open()
+    result.writer.begin()
     try:
         interrupted = run_live(diagram, sensors, settings.seconds, result.tell, monitor=watch)
-        result.writer.warn(watch.doubts())
+        result.writer.warnings += watch.doubts()
         result.finish(sensors, settings.replay)
     finally:
-        result.writer.close()
+        result.writer.write_summary()
     return result.result(interrupted)
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -12,17 +10,17 @@ import numpy as np
 
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.camera.sources.recorded import TIME_STAMPS
-from drake_pose.jobs.estimate.inputs import Inputs
+from drake_pose.csv_files import csv_text
 from drake_pose.jobs.estimate.person import FOLLOWED
-from drake_pose.jobs.estimate.result import ResultWriter, SceneEstimate
 from drake_pose.jobs.live.run import LiveFrame, Mask
 from drake_pose.jobs.live.scene import LiveScene
 from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.recordings.persons_in_view import keep_person
-from drake_pose.results.folder import PoseRow
-from drake_pose.results.joint_tables import record_deviations
+from drake_pose.results.poses import PoseRow
+from drake_pose.results.records import FrameRecord, record_deviations
 from drake_pose.results.settings import EstimateSettings
-from drake_pose.results.summary import FrameRecord, describe_job
+from drake_pose.results.summary import describe_job
+from drake_pose.results.writer import ResultWriter, SceneEstimate
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.mask_agreement import compare_masks
 from drake_pose.silhouette.pictures.scenes import Scene
@@ -72,15 +70,14 @@ class LiveWriter:
         self._told: list[str] = []
         self._last = -1
         recorded = Scene(scene.path, scene.cameras, (), {}, True, 1.0 / period)
-        inputs = Inputs(recorded, model, tuple(scene.cameras.values()), (), None, None, None)
         settings = EstimateSettings(method="person", packages=packages)
         job = describe_job(scene.path, model.path, settings)
-        self.writer = ResultWriter(inputs, job, out, None, with_base=False)
+        self.writer = ResultWriter(recorded, model, job, out)
 
     def tell(self, text: str) -> None:
         """Tells the user while the capture runs, and notes it."""
         self._told.append(text)
-        self.writer.warn([text])
+        self.writer.warnings.append(text)
         self._on_report(text)
 
     def result(self, interrupted: bool) -> LiveResult:
@@ -99,16 +96,14 @@ class LiveWriter:
         for camera in frame.views:
             self._seen[camera, name] = Path(self._scene.specifications[camera].location)
         row = PoseRow(name, frame.q, None, error, frame.seconds)
-        record = FrameRecord(
-            found=row.found,
-            E_total=error if row.found else None,
-            seconds=frame.seconds,
+        record = FrameRecord.of(
+            row,
             stopped_by=FOLLOWED,
             joints=record_deviations(self._model, frame.q, frame.deviations),
             ious=ious,
             share=frame.share if np.isfinite(frame.share) else None,
         )
-        self.writer.finish_frame(row, record)
+        self.writer.add(row, record)
         self._on_frame(len(self._times), row.found)
 
     def finish(self, sensors: LiveSensors, replay: bool) -> None:
@@ -116,8 +111,7 @@ class LiveWriter:
         writer = self.writer
         # A moment that no camera saw, or nobody had time for, is a frame without a pose.
         frames = tuple(f"{k:06d}" for k in range(self._last + 1))
-        scene = replace(writer.inputs.scene, frames=frames, masks=self._seen)
-        writer.inputs = replace(writer.inputs, scene=scene, frames=tuple(self._times))
+        writer.scene = replace(writer.scene, frames=frames, masks=self._seen)
         counts, sources = sensors.counts(), {}
         for name, count in counts.items():
             given = self._scene.specifications[name]
@@ -128,14 +122,11 @@ class LiveWriter:
             sources[name] = {"kind": given.kind, "location": given.location, **asdict(count)}
             sources[name]["changes"] = changes
         writer.more |= {"sources": sources, "skipped_moments": sensors.skipped}
-        writer.warn(camera_troubles(counts, sensors.skipped))
+        writer.warnings += camera_troubles(counts, sensors.skipped)
         if writer.rows:
             writer.finish(replay)
-            text = io.StringIO()
-            table = csv.writer(text, lineterminator="\n")
-            table.writerow(["frame", "time"])
-            table.writerows([frame, f"{time:.6f}"] for frame, time in self._times.items())
-            writer.write(TIME_STAMPS, text.getvalue().encode())
+            times = [(frame, f"{time:.6f}") for frame, time in self._times.items()]
+            writer.write(TIME_STAMPS, csv_text([("frame", "time"), *times]))
 
     def _agreement(self, frame: LiveFrame) -> tuple[float, Mapping[str, float]]:
         """E_total over all views, and each one's IoU."""

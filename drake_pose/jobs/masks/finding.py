@@ -20,7 +20,7 @@ from drake_pose.errors import (
     SettingsError,
     UnknownNameError,
 )
-from drake_pose.jobs.estimate.inputs import make_tree
+from drake_pose.jobs.estimate.searches import make_tree
 from drake_pose.jobs.masks.settings import MEDIAN, MaskSettings
 from drake_pose.jobs.masks.sources import CAMERAS, FoundMask, Source
 from drake_pose.jobs.registration.positions import read_known_positions
@@ -238,7 +238,7 @@ def find_by_model(source: Source, model: Path, settings: MaskSettings) -> Iterat
     """
     cameras = _placed_cameras(source)
     body = load_model(model, package_paths=settings.packages)
-    kinematics = TreeKinematics(make_tree(body, EstimateSettings(hold=settings.hold), None))
+    kinematics = TreeKinematics(make_tree(body, EstimateSettings(hold=settings.hold)))
     if settings.start is None:
         raise SceneError(f"{model}: needs rough joint positions of each frame (--start FILE.csv)")
     table = read_known_positions(settings.start, kinematics)

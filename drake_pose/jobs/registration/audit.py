@@ -16,8 +16,7 @@ from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.files import load_cameras
 from drake_pose.camera.models import Camera
 from drake_pose.errors import MaskError, SceneError
-from drake_pose.jobs.estimate.inputs import make_tree, select_cameras, select_seen_frames
-from drake_pose.jobs.estimate.scene_checks import check_scene, frame_ranges
+from drake_pose.jobs.estimate.searches import make_tree
 from drake_pose.jobs.registration.positions import KnownPositions, read_known_positions
 from drake_pose.jobs.registration.result import describe_run, drawn, write_overlays
 from drake_pose.jobs.registration.settings import AuditSettings
@@ -25,11 +24,12 @@ from drake_pose.registration.contradictions import Audit, Finding, FrameAudit, a
 from drake_pose.registration.per_frame_fit import PerFrameFit
 from drake_pose.registration.posed_frames import PosedFrame, SeenFrame
 from drake_pose.registration.register import RegistrationBody
-from drake_pose.results.folder import ResultFolder, require_empty
+from drake_pose.results.folder import require_empty, write_summary
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.results.summary import mask_digests
 from drake_pose.results.texts import percent
-from drake_pose.silhouette.pictures.scenes import Scene, load_scene
+from drake_pose.silhouette.pictures.scene_checks import frame_ranges, read_scene
+from drake_pose.silhouette.pictures.scenes import Scene
 
 OnFrame = Callable[[int], None]
 """Called with the number of frames that are done."""
@@ -158,19 +158,18 @@ def _read_inputs(
     scene_path: Path, files: Mapping[str, Path], own: Path | None, settings: AuditSettings
 ) -> _Inputs:
     """Reads and checks everything; own: a camera file in place of the scene's."""
-    checked = check_scene(load_scene(scene_path, None if own is None else load_cameras(own)))
-    scene = checked.scene
+    given = None if own is None else load_cameras(own)
+    scene, frames = read_scene(scene_path, settings.cameras, settings.frames, given)
     if scene.scale_unknown:
         raise SceneError(
             f"{scene_path}: has no cameras.yaml; an audit needs to know where the cameras are: "
             "drake-pose register finds that"
         )
-    chosen = select_cameras(scene, settings.cameras)
-    frames = select_seen_frames(scene, chosen, settings.frames)
+    chosen = tuple(scene.cameras.values())
     model = load_model(files["model"], package_paths=settings.packages)
-    tree = make_tree(model, EstimateSettings(hold=settings.hold), None)
+    tree = make_tree(model, EstimateSettings(hold=settings.hold))
     positions = read_known_positions(files["joints"], TreeKinematics(tree))
-    warnings = [*checked.warnings, *model.warnings, *positions.warnings]
+    warnings = [*scene.warnings, *model.warnings, *positions.warnings]
     if positions.are_one_pose(positions.of(frame, chosen[0].name) for frame in frames):
         warnings.append(
             "all frames show the robot in one pose, to a degree: errors of a joint's zero and of a "
@@ -217,7 +216,7 @@ def _write_result(
     path: Path, inputs: _Inputs, named: tuple[str, ...], summary: Mapping[str, Any]
 ) -> None:
     """The summary, and the robot at its encoders' positions over the masks of some frames."""
-    folder, frames = ResultFolder(path, (), False), summary["frames"]
+    frames = summary["frames"]
     for camera in inputs.cameras if named else ():
         name = camera.name
         posed = [
@@ -231,8 +230,8 @@ def _write_result(
             for one in posed
         ]
         titled = zip(posed, titles, strict=True)
-        write_overlays(folder, drawn(inputs.tree, camera), name, titled)
-    folder.write_summary(summary)
+        write_overlays(path, drawn(inputs.tree, camera), name, titled)
+    write_summary(path, summary)
 
 
 def _numbers(one: Finding) -> dict[str, Any]:

@@ -22,10 +22,9 @@ from drake_pose.errors import (
     SettingsError,
     UnknownNameError,
 )
-from drake_pose.jobs.estimate.inputs import CAMERA_FILE, make_tree, select_seen_frames
 from drake_pose.jobs.estimate.measurements import read_true_angles
 from drake_pose.jobs.estimate.person_choice import missing_for_person
-from drake_pose.jobs.estimate.scene_checks import check_scene
+from drake_pose.jobs.estimate.searches import make_tree
 from drake_pose.jobs.registration.positions import (
     KnownPositions,
     estimate_positions,
@@ -36,9 +35,10 @@ from drake_pose.jobs.registration.settings import ALL, RegistrationSettings
 from drake_pose.registration.joint_zeros import links_with_length, require_known
 from drake_pose.registration.posed_frames import PosedFrame, SeenFrame
 from drake_pose.registration.standing_object import StandingObject, require_turns
-from drake_pose.results.options import select_frames
 from drake_pose.results.settings import EstimateSettings
-from drake_pose.silhouette.pictures.scenes import Scene, load_scene
+from drake_pose.silhouette.pictures.scene_checks import check_scene
+from drake_pose.silhouette.pictures.scene_files import select_frames
+from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, Scene, load_scene
 
 Array = NDArray[np.float64]
 
@@ -112,8 +112,8 @@ def read_inputs(
     if not scene_path.is_dir():
         raise SceneError(f"{scene_path}: no such folder; a scene has {CAMERA_FILE} and masks")
     file = load_camera_file(scene_path / CAMERA_FILE)
-    checked = check_scene(load_scene(scene_path, file.cameras))
-    searched, held = _select_cameras(checked.scene, file, settings)
+    scene = check_scene(load_scene(scene_path, file.cameras))
+    searched, held = _select_cameras(scene, file, settings)
     model = load_model(model_path, package_paths=settings.packages)
     table, standing = None, _read_target(model, settings)
     if joints_path is not None and standing is None:
@@ -133,15 +133,15 @@ def read_inputs(
     else:
         on_link = settings.on is not None
         positions = read_known_positions(joints_path, kinematics, on_link, table)
-    frames = _read_frames(checked.scene, searched, held, positions, settings.frames)
+    frames = _read_frames(scene, searched, held, positions, settings.frames)
     left_out = tuple(
         name
         for name in (*file.unplaced, *file.links)
         if name not in [camera.name for camera in searched]
     )
     inputs = Inputs(
-        checked.scene, model, tree, positions, frames, searched, held, seen, standing, zeros,
-        lengths, left_out, (*checked.warnings, *model.warnings, *positions.warnings),
+        scene, model, tree, positions, frames, searched, held, seen, standing, zeros,
+        lengths, left_out, (*scene.warnings, *model.warnings, *positions.warnings),
     )  # fmt: skip
     return replace(inputs, warnings=(*inputs.warnings, *_look_at(inputs)))
 
@@ -202,9 +202,9 @@ def _read_target(model: ArticulatedModel, settings: RegistrationSettings) -> Sta
             "tell nothing of the robot's world: name the link that the camera rides on (--on LINK)"
         )
     other = load_model(settings.target, package_paths=settings.packages)
-    held = make_tree(model, EstimateSettings(hold=settings.hold), None).held
+    held = make_tree(model, EstimateSettings(hold=settings.hold)).held
     named = {model.position_names[index]: value for index, value in held.items()}
-    return StandingObject(model, settings.on, named, make_tree(other, EstimateSettings(), None))
+    return StandingObject(model, settings.on, named, make_tree(other, EstimateSettings()))
 
 
 def make_registration_tree(
@@ -218,7 +218,7 @@ def make_registration_tree(
     """
     if standing is not None:
         return standing.tree(np.eye(4)), (OBJECT,)
-    tree = make_tree(model, EstimateSettings(hold=settings.hold), None)
+    tree = make_tree(model, EstimateSettings(hold=settings.hold))
     link = settings.on
     if link is None:
         return tree, None
@@ -272,7 +272,7 @@ def _read_frames(
     """
     if positions.is_estimate:
         wanted = _spread_frames(scene, searched, positions, wanted)
-    asked = {one.name: select_seen_frames(scene, [one], wanted) for one in searched}
+    asked = {one.name: scene.of_cameras([one.name]).seen_frames(wanted) for one in searched}
     found = []
     for frame in select_frames(scene.frames, wanted, str(scene.path)):
         masks = {}

@@ -11,7 +11,6 @@ import numpy as np
 
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
-from drake_pose.jobs.estimate.fit_checks import BADLY_EXPLAINED
 from drake_pose.registration.joint_zeros import calibrate_joints
 from drake_pose.registration.object_search import ObjectSearch
 from drake_pose.registration.posed_frames import PosedFrame
@@ -21,6 +20,7 @@ from drake_pose.registration.register import (
     RegistrationBody,
     spread,
 )
+from drake_pose.results.summary import BADLY_EXPLAINED
 from drake_pose.results.texts import percent
 
 # Of the contours in the two frames that fit best, this share fits at least. A robot that is the

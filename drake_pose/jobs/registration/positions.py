@@ -17,12 +17,11 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SceneError
-from drake_pose.jobs.estimate.measurements import TrueAngles, read_true_angles
+from drake_pose.jobs.estimate.measurements import TrueAngles, frame_key, read_true_angles
 from drake_pose.jobs.estimate.person_choice import missing_for_person
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.person.shape import shape_parts
-from drake_pose.results.folder import base_pose
-from drake_pose.results.options import frame_number
+from drake_pose.results.poses import base_pose
 from drake_pose.results.settings import EstimateSettings
 
 Array = NDArray[np.float64]
@@ -229,8 +228,7 @@ def estimate_positions(
     values: dict[int | str, Array] = {}
     for row in found.rows:
         if row.found:
-            number = frame_number(row.frame)
-            values[row.frame if number is None else number] = row.q
+            values[frame_key(row.frame)] = row.q
     if not values:
         raise SceneError(
             f"{scene_path}: camera {', '.join(names)}, whose X_WC is known, sees the body in no "

@@ -12,9 +12,6 @@ import numpy as np
 
 from drake_pose.body.model import OBJECT_POSITIONS
 from drake_pose.camera.models import Camera
-from drake_pose.jobs.estimate.fit_checks import BADLY_EXPLAINED
-from drake_pose.jobs.estimate.inputs import CAMERA_FILE
-from drake_pose.jobs.estimate.scene_checks import frame_ranges
 from drake_pose.jobs.registration.inputs import Inputs, read_inputs
 from drake_pose.jobs.registration.misfit import (
     Search,
@@ -42,7 +39,10 @@ from drake_pose.registration.register import (
 from drake_pose.registration.start_poses import E_total, areas
 from drake_pose.registration.suggestions import suggest_pose
 from drake_pose.results.folder import require_empty
+from drake_pose.results.summary import BADLY_EXPLAINED
 from drake_pose.results.texts import percent
+from drake_pose.silhouette.pictures.scene_checks import frame_ranges
+from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 
 OnCamera = Callable[[int], None]
 """Called with the number of cameras that are done."""

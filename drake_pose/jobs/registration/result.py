@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
-from urllib.parse import quote
 
 import numpy as np
 import yaml
@@ -15,20 +14,27 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.files import dump_cameras
 from drake_pose.camera.models import Camera
-from drake_pose.jobs.estimate.inputs import CAMERA_FILE
 from drake_pose.jobs.registration.inputs import Inputs
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.registration.joint_zeros import JointCalibration
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import ObjectPose, RegisteredCamera
-from drake_pose.results.folder import OVERLAY, REPORT, ResultFolder, without_nan
+from drake_pose.results.folder import (
+    OVERLAY,
+    REPORT,
+    require_empty,
+    without_nan,
+    write_file,
+    write_summary,
+)
 from drake_pose.results.overlay import draw_overlay, encode_png
-from drake_pose.results.report_page import Picture, page_template, small_picture
+from drake_pose.results.report_page import Picture, overlay_picture, page_template
 from drake_pose.results.summary import file_digest, versions
 from drake_pose.results.texts import percent
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 
 Array = NDArray[np.float64]
 
@@ -164,7 +170,7 @@ def write_result(
     Raises:
         OutputError: the folder is not empty, or cannot be written.
     """
-    folder = ResultFolder(path, (), False)
+    require_empty(path)
     for name, found in registered.items() if overlay else ():
         titles = [
             f"{name}  frame {one.frame}  E_total {percent(one.E_total)}  IoU {one.iou:.2f}  "
@@ -172,18 +178,18 @@ def write_result(
             for one in found.frames
         ]
         draw = drawn(inputs.tree, found.camera, inputs.seen)
-        write_overlays(folder, draw, name, zip(inputs.of(name), titles, strict=True))
+        write_overlays(path, draw, name, zip(inputs.of(name), titles, strict=True))
     if urdf is not None:
-        folder.write(f"{inputs.model.path.stem}_calibrated.urdf", urdf)
+        write_file(path, f"{inputs.model.path.stem}_calibrated.urdf", urdf)
     text = yaml.safe_dump(
         {name: _uncertainty(found, summary["cameras"][name]) for name, found in registered.items()},
         sort_keys=False,
     )
-    folder.write(REGISTRATION, text.encode())
-    folder.write_summary(summary)
-    folder.write(REPORT, make_registration_report(path, summary).encode())
+    write_file(path, REGISTRATION, text)
+    write_summary(path, summary)
+    write_file(path, REPORT, make_registration_report(path, summary))
     links = {name: one["link"] for name, one in summary["cameras"].items() if "link" in one}
-    folder.write(CAMERA_FILE, dump_cameras(cameras, links).encode())
+    write_file(path, CAMERA_FILE, dump_cameras(cameras, links))
 
 
 class ParameterRow(NamedTuple):
@@ -243,15 +249,10 @@ def _pick_pictures(folder: Path, camera: str, frames: Mapping[str, Any]) -> list
     in_order = sorted(frames, key=lambda frame: float(-frames[frame]["E_total"]))
     count = min(_PICTURES, len(in_order))
     chosen = [in_order[k] for k in np.linspace(0, len(in_order) - 1, count).round().astype(int)]
-    pictures = []
-    for frame in chosen:
-        place = f"{OVERLAY}/{camera}/{frame}.png"
-        if (folder / place).is_file():
-            uri = small_picture((folder / place).read_bytes())
-            if uri:
-                error = float(frames[frame]["E_total"])
-                pictures.append(Picture(camera, frame, error, uri, quote(place)))
-    return pictures
+    shown = (
+        overlay_picture(folder, camera, frame, float(frames[frame]["E_total"])) for frame in chosen
+    )
+    return [picture for picture in shown if picture is not None]
 
 
 def _uncertainty(found: RegisteredCamera, summary: Mapping[str, Any]) -> dict[str, Any]:
@@ -270,7 +271,7 @@ def _uncertainty(found: RegisteredCamera, summary: Mapping[str, Any]) -> dict[st
 
 
 def write_overlays(
-    folder: ResultFolder,
+    folder: Path,
     draw: Callable[[Array], NDArray[np.int64]],
     camera: str,
     titled: Iterable[tuple[PosedFrame, str]],
@@ -279,7 +280,7 @@ def write_overlays(
     for frame, title in titled:
         segments = draw(frame.values)
         picture = draw_overlay(frame.mask, segments >= 0, segments, [title])
-        folder.write(f"{OVERLAY}/{camera}/{frame.name}.png", encode_png(picture))
+        write_file(folder, f"{OVERLAY}/{camera}/{frame.name}.png", encode_png(picture))
 
 
 def drawn(

@@ -4,39 +4,24 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
+from typing import NamedTuple
 
-from drake_pose.errors import SceneError
+from drake_pose.camera.picture_files import SUFFIXES
+from drake_pose.errors import SceneError, SettingsError, UnknownNameError
 from drake_pose.silhouette.pictures.video_pictures import VIDEOS, VideoPictures
 
-_SUFFIX = ".png"
-_IMAGES = (".png", ".jpg", ".jpeg")
 _NUMBER = re.compile("([0-9]+)")
 
 
-@dataclass(frozen=True)
-class Leftovers:
-    """What lies in a scene's folder and is not used.
+class MaskFiles(NamedTuple):
+    """A scene's mask files by (camera, frame), folders of no camera, and what is not used."""
 
-    ``uncalibrated`` counts masks in folders of no camera; ``doubled``: further masks of the same
-    (camera, frame); ``foreign``: files that are no masks, "" for those in no camera's folder.
-    """
-
-    uncalibrated: Mapping[str, int] = field(default_factory=dict)
-    doubled: Mapping[tuple[str, str], tuple[Path, ...]] = field(default_factory=dict)
-    foreign: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class SceneFiles:
-    """A scene's mask files by (camera, frame), its frames in natural order, and what is left."""
-
-    masks: Mapping[tuple[str, str], Path]
-    frames: tuple[str, ...]
-    leftovers: Leftovers = field(default_factory=Leftovers)
+    masks: dict[tuple[str, str], Path]
+    strangers: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 def natural_key(name: str) -> tuple[tuple[str, int], ...]:
@@ -45,13 +30,49 @@ def natural_key(name: str) -> tuple[tuple[str, int], ...]:
     return tuple(zip(texts[::2], [*map(int, texts[1::2]), -1], strict=True))
 
 
-def close_names(name: str, known: Iterable[str]) -> list[str]:
-    """Those known names that a misspelt one may stand for."""
-    lower = {one.lower(): one for one in known}
-    return [lower[one] for one in get_close_matches(name.lower(), lower, n=2)]
+def in_order(frames: Iterable[str]) -> tuple[str, ...]:
+    """Frames in natural order, each once."""
+    return tuple(sorted(set(frames), key=lambda name: (natural_key(name), name)))
 
 
-def find_masks(folder: Path, cameras: Iterable[str]) -> SceneFiles:
+def frame_number(frame: str) -> int | None:
+    """Returns the number that a frame's name is, or None."""
+    return int(frame) if frame.isascii() and frame.isdigit() else None
+
+
+def select_frames(known: Sequence[str], wanted: Sequence[str], where: str) -> tuple[str, ...]:
+    """Returns the frames that were asked for, in the scene's order.
+
+    Args:
+        wanted: names, or ranges ``FIRST:LAST`` that include both ends; all frames where empty.
+            A number stands for the frame whose name is that number, with or without zeros before.
+        where: the scene, for messages.
+
+    Raises:
+        UnknownNameError: there is no such frame.
+        SettingsError: a range ends before it begins.
+    """
+
+    def place(name: str) -> int:
+        number = frame_number(name)
+        same = [k for k, frame in enumerate(known) if frame_number(frame) == number]
+        if name in known:
+            return known.index(name)
+        if number is None or len(same) != 1:
+            raise UnknownNameError("frame", name, known, where)
+        return same[0]
+
+    chosen: set[int] = set()
+    for text in wanted:
+        first, colon, last = (text, "", "") if text in known else text.partition(":")
+        ends = place(first), place(last if colon else first)
+        if ends[1] < ends[0]:
+            raise SettingsError(f"--frame: the range '{text}' ends before it begins")
+        chosen.update(range(ends[0], ends[1] + 1))
+    return tuple(frame for k, frame in enumerate(known) if k in chosen or not wanted)
+
+
+def find_masks(folder: Path, cameras: Iterable[str]) -> MaskFiles:
     """Finds masks/<camera>/<frame>.png, or masks/<frame>.png of a single camera.
 
     Hidden files are passed over. Folders that belong to no camera, and files that are no PNG
@@ -66,8 +87,7 @@ def find_masks(folder: Path, cameras: Iterable[str]) -> SceneFiles:
     if not root.is_dir():
         raise SceneError(f"{folder}: has no folder masks/<camera>/<frame>.png")
     flat, foreign = _list_pictures(root)
-    folders = [entry.name for entry in _visible(root) if entry.is_dir()]
-    found = {name: _list_pictures(root / name) for name in folders}
+    found = {entry.name: _list_pictures(root / entry.name) for entry in _folders(root)}
     known = {name: found[name][0] for name in names if name in found}
     strangers = {name: len(files) for name, (files, _) in found.items() if name not in names}
     if flat and not any(known.values()):
@@ -77,14 +97,16 @@ def find_masks(folder: Path, cameras: Iterable[str]) -> SceneFiles:
                 f"are {len(names)}: {', '.join(names)}"
             )
         known, flat = {names[0]: flat}, []
+    others = {name: found[name][1] for name in names if name in found}
     if not any(known.values()):
-        raise SceneError(_no_masks(root, names, strangers, found))
-    masks, frames, doubled = _join_frames(known)
+        raise SceneError(_no_masks(root, names, strangers, others))
     beside = [name for name in foreign if not name.endswith("/")]
-    others = {"": (*beside, *(path.name for path in flat))}
-    others |= {name: found[name][1] for name in names if name in found}
-    kept = {name: files for name, files in others.items() if files}
-    return SceneFiles(masks, frames, Leftovers(strangers, doubled, kept))
+    others = {"": [*beside, *(path.name for path in flat)], **others}
+    masks, doubled = _join_frames(known)
+    unused = [name for name in names if not known.get(name)]
+    return MaskFiles(
+        masks, tuple(strangers), (*_say_unused(strangers, unused), *doubled, *_say_foreign(others))
+    )
 
 
 def find_images(
@@ -102,39 +124,60 @@ def find_images(
     known = {int(frame): frame for frame in frames if frame.isdecimal()}
     for camera in cameras:
         own = folder / "images" / camera
+        videos = [folder / "videos" / f"{camera}{suffix}" for suffix in VIDEOS]
         if own.is_dir():
-            names = [entry.name for entry in _visible(own) if not entry.is_dir()]
-            pictures = [Path(name) for name in names if Path(name).suffix.lower() in _IMAGES]
+            names = [Path(entry.name) for entry in _visible(own) if not entry.is_dir()]
+            pictures = [name for name in names if name.suffix.lower() in SUFFIXES]
             found |= {(camera, name.stem): own / name for name in pictures}
-            continue
-        video = find_video(folder, camera)
-        if video is not None:
-            count = VideoPictures(video).count
-            names = [known.get(number, f"{number:06d}") for number in range(count)]
-            found |= {(camera, name): video for name in names}
+        elif video := next((file for file in videos if file.is_file()), None):
+            numbers = range(VideoPictures(video).count)
+            found |= {(camera, known.get(k, f"{k:06d}")): video for k in numbers}
     return found
-
-
-def find_video(folder: Path, camera: str) -> Path | None:
-    """The video of a camera in a scene's folder; None where there is none."""
-    files = [folder / "videos" / f"{camera}{suffix}" for suffix in VIDEOS]
-    return next((file for file in files if file.is_file()), None)
 
 
 def _no_masks(
     root: Path,
-    names: list[str],
-    strangers: Mapping[str, int],
-    found: Mapping[str, tuple[list[Path], tuple[str, ...]]],
+    names: Sequence[str],
+    strangers: Iterable[str],
+    others: Mapping[str, Sequence[str]],
 ) -> str:
     """What to say where no camera has a mask."""
     text = f"{root}: holds no mask <camera>/<frame>.png of: {', '.join(names)}"
-    if strangers:
-        text += f"; folder {', '.join(strangers)} belongs to no camera of the camera file"
-    others = [f"{name}/{file}" for name in names if name in found for file in found[name][1]]
-    if others:
-        text += f"; {others[0]} is {'a folder' if others[0].endswith('/') else 'no PNG picture'}"
+    if listed := ", ".join(strangers):
+        text += f"; folder {listed} belongs to no camera of the camera file"
+    if files := [f"{name}/{file}" for name, own in others.items() for file in own]:
+        text += f"; {files[0]} is {'a folder' if files[0].endswith('/') else 'no PNG picture'}"
     return text
+
+
+def _say_unused(strangers: Mapping[str, int], unused: Sequence[str]) -> list[str]:
+    """Folders without calibration, and cameras without masks."""
+    lower = {name.lower(): name for name in unused}
+    found = []
+    for name, count in strangers.items():
+        close = get_close_matches(name.lower(), lower, n=1)
+        advice = f"is it '{lower[close[0]]}'?" if close else "calibrate it"
+        found.append(
+            f"masks/{name}: no camera '{name}' in cameras.yaml; its {count} masks are left out: "
+            f"{advice}"
+        )
+    return found + [
+        f"camera '{name}' of cameras.yaml has no masks in masks/{name}; the others go on"
+        for name in unused
+    ]
+
+
+def _say_foreign(others: Mapping[str, Sequence[str]]) -> list[str]:
+    """Files that are no masks, by camera."""
+    found = []
+    for name, files in others.items():
+        if files:
+            more = f" and {len(files) - 1} more" if len(files) > 1 else ""
+            folder = f"masks/{name}" if name else "masks"
+            found.append(
+                f"{folder}: {files[0]}{more} left out: masks are PNG pictures in masks/<camera>"
+            )
+    return found
 
 
 def _visible(folder: Path) -> list[os.DirEntry[str]]:
@@ -147,41 +190,47 @@ def _visible(folder: Path) -> list[os.DirEntry[str]]:
     return sorted(seen, key=lambda entry: entry.name)
 
 
-def _list_pictures(folder: Path) -> tuple[list[Path], tuple[str, ...]]:
+def _folders(folder: Path) -> list[os.DirEntry[str]]:
+    return [entry for entry in _visible(folder) if entry.is_dir()]
+
+
+def _list_pictures(folder: Path) -> tuple[list[Path], list[str]]:
     """The PNG files of a folder, and the names of its other files."""
     pictures, others = [], []
     for entry in _visible(folder):
         if entry.is_dir():
             others.append(f"{entry.name}/")
-        elif entry.name.lower().endswith(_SUFFIX):
+        elif entry.name.lower().endswith(".png"):
             pictures.append(folder / entry.name)
         else:
             others.append(entry.name)
-    return pictures, tuple(others)
+    return pictures, others
 
 
 def _join_frames(
-    files: Mapping[str, list[Path]],
-) -> tuple[dict[tuple[str, str], Path], tuple[str, ...], dict[tuple[str, str], tuple[Path, ...]]]:
-    """Masks by camera and frame, the frames, and what is there twice."""
-    stems = {file: file.stem for own in files.values() for file in own}
-    spelt = sorted(set(stems.values()), key=lambda stem: (-len(stem), stem))
-    keys = {stem: natural_key(stem) for stem in spelt}
-    name_of = {stem: stem for stem in spelt}
-    if sum(bool(own) for own in files.values()) > 1:
-        first: dict[tuple[tuple[str, int], ...], str] = {}
-        name_of = {stem: first.setdefault(keys[stem], stem) for stem in spelt}
+    files: Mapping[str, Sequence[Path]],
+) -> tuple[dict[tuple[str, str], Path], list[str]]:
+    """Masks by camera and frame, whose longest spelling is its name, and what is there twice."""
+    spelt = {file.stem for own in files.values() for file in own}
+    several = sum(map(bool, files.values())) > 1
+    first: dict[object, str] = {}
+    name_of = {
+        stem: first.setdefault(natural_key(stem) if several else stem, stem)
+        for stem in sorted(spelt, key=lambda stem: (-len(stem), stem))
+    }
     masks: dict[tuple[str, str], Path] = {}
-    doubled: dict[tuple[str, str], tuple[Path, ...]] = {}
+    doubled = []
     for camera, own in files.items():
-        for file in sorted(own, key=lambda file: (-len(stems[file]), file.name)):
-            key = camera, name_of[stems[file]]
-            if key in masks:
-                doubled[key] = (*doubled.get(key, ()), file)
-            else:
-                masks[key] = file
-    frames = sorted({frame for _, frame in masks}, key=lambda name: (keys[name], name))
-    order = {frame: k for k, frame in enumerate(frames)}
-    cameras = {camera: k for k, camera in enumerate(files)}
-    listed = sorted(masks, key=lambda key: (cameras[key[0]], order[key[1]]))
-    return {key: masks[key] for key in listed}, tuple(frames), doubled
+        by_frame: dict[str, list[Path]] = {}
+        for file in sorted(own, key=lambda file: (-len(file.stem), file.name)):
+            by_frame.setdefault(name_of[file.stem], []).append(file)
+        for frame in in_order(by_frame):
+            used, *again = by_frame[frame]
+            masks[camera, frame] = used
+            if again:
+                names = ", ".join(file.name for file in again)
+                doubled.append(
+                    f"camera '{camera}', frame {frame}: {used.name} is used, {names} is the same "
+                    "frame again"
+                )
+    return masks, doubled

@@ -4,29 +4,29 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
-from drake_pose.camera.files import load_cameras
+from drake_pose.camera.files import load_camera_file, load_cameras
 from drake_pose.camera.models import Camera, ParallelCamera
+from drake_pose.camera.picture_files import read_picture
 from drake_pose.errors import SceneError, UnknownNameError
-from drake_pose.regular_files import read_regular
 from drake_pose.silhouette.pictures.masks import read_mask
 from drake_pose.silhouette.pictures.scene_files import (
-    Leftovers,
-    SceneFiles,
+    MaskFiles,
     find_images,
     find_masks,
-    natural_key,
+    in_order,
+    select_frames,
 )
 from drake_pose.silhouette.pictures.video_pictures import VIDEOS, VideoPictures
 from drake_pose.yaml_files import read_yaml
 
 _FIELDS = ("sequence", "frame_rate_hz")
+CAMERA_FILE = "cameras.yaml"
 
 # An uncalibrated camera looks along the world's -x: the picture's right is y, its up is z.
 _LOOKING_BACK = np.array(
@@ -47,10 +47,11 @@ class Scene:
         sequence: whether the frames follow each other in time.
         scale_unknown: whether the cameras are uncalibrated: each is a parallel camera that looks
             along the world's -x, and its pixels_per_metre and what it looks at are to be found.
-        leftovers: what lies in the folder and is not used.
         images: the files, pictures or videos, of (camera, frame) of a sequence that has masks of
             few frames, or none: where a camera has no mask the body is tracked by its colours.
             Empty where there is a mask for every picture.
+        strangers: folders of masks that belong to no camera.
+        warnings: what is wrong with the folder, but leaves enough to go on.
     """
 
     path: Path
@@ -60,8 +61,9 @@ class Scene:
     sequence: bool = False
     frame_rate_hz: float | None = None
     scale_unknown: bool = False
-    leftovers: Leftovers = field(default_factory=Leftovers)
     images: Mapping[tuple[str, str], Path] = field(default_factory=dict)
+    strangers: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     _videos: dict[Path, VideoPictures] = field(default_factory=dict, repr=False, compare=False)
 
     def cameras_of(self, frame: str) -> tuple[str, ...]:
@@ -71,14 +73,39 @@ class Scene:
             raise UnknownNameError("frame", frame, self.frames, str(self.path))
         return names
 
+    def of_cameras(self, wanted: Sequence[str]) -> Scene:
+        """What the wanted cameras see; all that have masks where none is named.
+
+        Raises UnknownNameError where there is no such camera.
+        """
+        for name in wanted:
+            if name not in self.cameras:
+                raise UnknownNameError("camera", name, self.cameras, str(self.path))
+        used = set(wanted) or {name for name, _ in (*self.masks, *self.images)}
+        return replace(
+            self,
+            cameras={name: camera for name, camera in self.cameras.items() if name in used},
+            masks={key: file for key, file in self.masks.items() if key[0] in used},
+            images={key: file for key, file in self.images.items() if key[0] in used},
+        )
+
+    def seen_frames(self, wanted: Sequence[str]) -> tuple[str, ...]:
+        """The wanted frames, as select_frames has them, that a camera has seen.
+
+        Raises:
+            SceneError: there is none.
+            UnknownNameError: there is no such frame.
+        """
+        seen = {frame for _, frame in (*self.masks, *self.images)}
+        asked = select_frames(self.frames, wanted, str(self.path))
+        if seen.isdisjoint(asked):
+            names = ", ".join(self.cameras)
+            raise SceneError(f"{self.path}: no mask of camera {names} in those frames")
+        return tuple(frame for frame in asked if frame in seen)
+
     def mask_path(self, camera: str, frame: str) -> Path:
         """The mask file of a camera's frame; UnknownNameError where there is none."""
-        if camera not in self.cameras:
-            raise UnknownNameError("camera", camera, self.cameras, str(self.path))
-        if (camera, frame) not in self.masks:
-            known = sorted(name for owner, name in self.masks if owner == camera)
-            raise UnknownNameError("frame", frame, known, f"{self.path}: camera '{camera}'")
-        return self.masks[camera, frame]
+        return self._file(self.masks, camera, frame)
 
     def read(self, camera: str, frame: str, *, may_be_empty: bool = False) -> np.ndarray:
         """The mask (H, W) of a camera's frame, which may be asked to show somebody.
@@ -87,8 +114,7 @@ class Scene:
             UnknownNameError: when there is no such camera, or it has no such frame.
             MaskError: when the file is not a mask of the camera's size.
         """
-        path = self.mask_path(camera, frame)
-        size = self.cameras[camera]
+        path, size = self.mask_path(camera, frame), self.cameras[camera]
         return read_mask(path, size.width, size.height, may_be_empty=may_be_empty)
 
     def read_image(self, camera: str, frame: str) -> np.ndarray:
@@ -98,16 +124,13 @@ class Scene:
             UnknownNameError: when there is no such camera, or it has no such picture.
             SceneError: when the file is no picture of the camera's size.
         """
-        if (camera, frame) not in self.images:
-            known = sorted(name for owner, name in self.images if owner == camera)
-            raise UnknownNameError("frame", frame, known, f"{self.path}: camera '{camera}'")
-        file, size = self.images[camera, frame], self.cameras[camera]
+        file, size = self._file(self.images, camera, frame), self.cameras[camera]
         if file.suffix.lower() in VIDEOS:
             if file not in self._videos:
                 self._videos[file] = VideoPictures(file)
             picture = self._videos[file].read(int(frame))
         else:
-            picture = _read_picture(file)
+            picture = read_picture(file, SceneError)
         if picture.shape[:2] != (size.height, size.width):
             raise SceneError(
                 f"{file}: is {picture.shape[1]} x {picture.shape[0]} pixels, but camera "
@@ -115,29 +138,27 @@ class Scene:
             )
         return picture
 
-
-def _read_picture(file: Path) -> np.ndarray:
-    """A picture (H, W, 3), red, green, blue, of a file."""
-    try:
-        data = np.frombuffer(read_regular(file), np.uint8)
-    except OSError as error:
-        raise SceneError(f"{file}: cannot be read: {error}") from error
-    picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
-    if picture is None:
-        raise SceneError(f"{file}: is no picture that can be read")
-    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
+    def _file(self, files: Mapping[tuple[str, str], Path], camera: str, frame: str) -> Path:
+        if camera not in self.cameras:
+            raise UnknownNameError("camera", camera, self.cameras, str(self.path))
+        if (camera, frame) not in files:
+            known = sorted(name for owner, name in files if owner == camera)
+            raise UnknownNameError("frame", frame, known, f"{self.path}: camera '{camera}'")
+        return files[camera, frame]
 
 
-def load_scene(path: str | Path, cameras: Mapping[str, Camera] | None = None) -> Scene:
+def load_scene(
+    path: str | Path, cameras: Mapping[str, Camera] | None = None, wanted: Sequence[str] = ()
+) -> Scene:
     """Reads what a scene's folder holds; masks are read when they are asked for.
 
     The folder has ``cameras.yaml``, ``masks/<camera>/<frame>.png`` and perhaps ``scene.yaml``
     (``sequence: true|false``, ``frame_rate_hz``). A sequence may have pictures
     ``images/<camera>/<frame>.png`` or ``.jpg``, or a video ``videos/<camera>.mp4``, where it has no
     masks. A single camera's masks may lie in ``masks/<frame>.png``; without a camera file they were
-    taken by an uncalibrated camera, or by several where the pictures' sizes differ. Masks of
-    cameras that are not in the camera file are left over, see ``Scene.leftovers``. Given
-    ``cameras`` are used instead of the folder's.
+    taken by an uncalibrated camera, or by several where the pictures' sizes differ. Given
+    ``cameras`` are used instead of the folder's. Where all the ``wanted`` ones have an X_WC, others
+    may lack it.
 
     Raises:
         SceneError: names the folder and what is missing or wrong in it.
@@ -148,57 +169,64 @@ def load_scene(path: str | Path, cameras: Mapping[str, Camera] | None = None) ->
         raise SceneError(f"{folder}: no such folder; a scene has cameras.yaml and masks")
     sequence, frame_rate_hz = _read_settings(folder / "scene.yaml")
     if cameras is None:
-        if not os.path.lexists(folder / "cameras.yaml"):
-            cameras, files = _unknown_cameras(folder)
-            return Scene(folder, cameras, files.frames, files.masks, sequence, frame_rate_hz, True)
-        cameras = load_cameras(folder / "cameras.yaml")
-    files = find_masks(folder, cameras) if _has_masks(folder) else SceneFiles({}, ())
-    images = find_images(folder, cameras, files.frames) if sequence else {}
-    if not (images or _has_masks(folder)):
+        if not os.path.lexists(folder / CAMERA_FILE):
+            cameras, masks = _unknown_cameras(folder)
+            frames = in_order(frame for _, frame in masks)
+            return Scene(folder, cameras, frames, masks, sequence, frame_rate_hz, True)
+        cameras = _load_wanted(folder / CAMERA_FILE, wanted)
+    has_masks = (folder / "masks").is_dir()
+    files = find_masks(folder, cameras) if has_masks else MaskFiles({})
+    images = {}
+    if sequence:
+        images = find_images(folder, cameras, in_order(frame for _, frame in files.masks))
+    if not (images or has_masks):
         files = find_masks(folder, cameras)
     videos = [file for file in images.values() if file.suffix.lower() in VIDEOS]
     if videos and frame_rate_hz is None:
         frame_rate_hz = VideoPictures(videos[0]).rate_hz
     if all(key in files.masks for key in images):
         images = {}
-    frames = sorted({*files.frames, *(frame for _, frame in images)}, key=natural_key)
     return Scene(
         folder,
         dict(cameras),
-        tuple(frames) if images else files.frames,
+        in_order(frame for _, frame in (*files.masks, *images)),
         files.masks,
         sequence,
         frame_rate_hz,
-        leftovers=files.leftovers,
         images=images,
+        strangers=files.strangers,
+        # Of pictures with few masks it is no fault that masks are missing.
+        warnings=() if images else files.warnings,
     )
 
 
-def _has_masks(folder: Path) -> bool:
-    return (folder / "masks").is_dir()
+def _load_wanted(path: Path, wanted: Sequence[str]) -> Mapping[str, Camera]:
+    """All cameras of a file, of which those that are not wanted need no place."""
+    if wanted:
+        file = load_camera_file(path)
+        if {*file.unplaced, *file.links}.isdisjoint(wanted):
+            return file.cameras
+    return load_cameras(path)
 
 
-def _unknown_cameras(folder: Path) -> tuple[dict[str, Camera], SceneFiles]:
+def _unknown_cameras(folder: Path) -> tuple[dict[str, Camera], dict[tuple[str, str], Path]]:
     """Returns a camera for every size of picture, and the masks."""
-    if not (folder / "masks").is_dir() or not any((folder / "masks").glob("*.png")):
+    if not any((folder / "masks").glob("*.png")):
         raise SceneError(
             f"{folder}: has no cameras.yaml, so its cameras must be given; only masks that lie in "
             "masks/<frame>.png need none"
         )
-    found = find_masks(folder, [_UNKNOWN])
-    sizes = {frame: read_mask(file).shape[::-1] for (_, frame), file in found.masks.items()}
+    found = find_masks(folder, [_UNKNOWN]).masks
+    sizes = {frame: read_mask(file).shape[::-1] for (_, frame), file in found.items()}
     several = len(set(sizes.values())) > 1
-    names = {
-        size: f"{_UNKNOWN}_{size[0]}x{size[1]}" if several else _UNKNOWN for size in sizes.values()
-    }
-    cameras: dict[str, Camera] = {
-        name: ParallelCamera(
+    cameras: dict[str, Camera] = {}
+    names = {}
+    for frame, (width, height) in sizes.items():
+        names[frame] = name = f"{_UNKNOWN}_{width}x{height}" if several else _UNKNOWN
+        cameras[name] = ParallelCamera(
             name, width, height, _ANY_SCALE, (width - 1) / 2, (height - 1) / 2, _LOOKING_BACK
         )
-        for (width, height), name in names.items()
-    }
-    masks = {(names[sizes[frame]], frame): file for (_, frame), file in found.masks.items()}
-    return cameras, SceneFiles(masks, found.frames)
+    return cameras, {(names[frame], frame): file for (_, frame), file in found.items()}
 
 
 def _read_settings(path: Path) -> tuple[bool, float | None]:

@@ -57,7 +57,7 @@ def test_the_recorded_arm(shared_data: Path) -> None:
     for frame in inputs.frames:
         views = [
             View(camera, inputs.scene.read(camera.name, frame))
-            for camera in inputs.cameras
+            for camera in inputs.scene.cameras.values()
             if (camera.name, frame) in inputs.scene.masks
         ]
         assert inputs.truth is not None

@@ -243,7 +243,7 @@ def test_options_of_the_search_lead_to_the_search(
     def search(*_: object, **__: object) -> None:
         raise Searched
 
-    monkeypatch.setattr("drake_pose.jobs.estimate.inputs._make_search", search)
+    monkeypatch.setattr("drake_pose.jobs.estimate.inputs.make_search", search)
     with pytest.raises(Searched):
         estimate_scene(recording.folder, recording.person.path, None, settings)
 

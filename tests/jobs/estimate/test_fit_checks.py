@@ -11,10 +11,10 @@ import yaml
 from drake_pose.body.model import load_model
 from drake_pose.camera.models import Camera
 from drake_pose.errors import OutputError
-from drake_pose.jobs.estimate.fit_checks import find_contradiction
+from drake_pose.jobs.estimate.contradictions import find_contradiction
 from drake_pose.jobs.estimate.scene import estimate_scene
+from drake_pose.results.records import FrameRecord
 from drake_pose.results.settings import EstimateSettings
-from drake_pose.results.summary import FrameRecord
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.silhouette.pictures.scenes import load_scene
@@ -146,9 +146,10 @@ def test_who_contradicts_whom(errors, cameras, exchanged):
     record = FrameRecord(True, 0.4, 1.0, ious={"a": 0.1, "b": 0.2, "c": 0.9})
     seen = [(name, "0") for name in rig]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("drake_pose.jobs.estimate.fit_checks.View", See)
-        found = find_contradiction(
-            match, list(rig.values()), lambda name, _: masks[name], seen, {"0": record}
-        )
-    assert (found and found.cameras) == cameras
-    assert found is None or found.exchanged is exchanged
+        patch.setattr("drake_pose.jobs.estimate.contradictions.View", See)
+        found = find_contradiction(match, rig, lambda name, _: masks[name], seen, {"0": record})
+    assert len(found) == (cameras is not None)
+    if cameras is not None:
+        named = " and ".join(f"'{name}'" for name in cameras)
+        what = "are exchanged" if exchanged else "contradict"
+        assert re.match(rf"cameras? {named} {what}", found[0])

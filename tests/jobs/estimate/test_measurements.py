@@ -1,14 +1,9 @@
-import math
 from pathlib import Path
 
 import pytest
 
 from drake_pose.errors import SceneError, UnknownNameError
-from drake_pose.jobs.estimate.measurements import (
-    angle_difference,
-    read_joint_centres,
-    read_true_angles,
-)
+from drake_pose.jobs.estimate.measurements import read_joint_centres, read_true_angles
 
 CENTRES = "frame,joint,x,y,z\n0,ankle,1,2,3\n0,knee,4,5,6\n7,ankle,-1,-2,-3\n"
 
@@ -74,10 +69,3 @@ def test_true_angles_of_an_unknown_joint(tmp_path: Path) -> None:
     path = written(tmp_path / "angles.csv", "frame,b,d\n3,0.5,-1\n")
     with pytest.raises(UnknownNameError, match=r"angles.csv.*'d'.*a, b, c"):
         read_true_angles(path, ["a", "b", "c"])
-
-
-def test_angles_differ_by_at_most_half_a_turn() -> None:
-    assert angle_difference(math.radians(170), math.radians(-170)) == pytest.approx(
-        math.radians(-20)
-    )
-    assert angle_difference(7.0, 7.0 - 4.0 * math.pi) == pytest.approx(0.0)

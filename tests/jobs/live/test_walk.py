@@ -26,7 +26,8 @@ from drake_pose.jobs.live.walk import (
     walk,
 )
 from drake_pose.person.date.walk_commands import WalkSettings
-from drake_pose.results.folder import PoseRow, ResultFolder
+from drake_pose.results.folder import write_summary
+from drake_pose.results.poses import PoseRow, PoseTable
 from drake_pose.systems.walk.garden import START
 from tests.cli import CliRunner
 
@@ -34,17 +35,16 @@ from tests.cli import CliRunner
 def record(folder, ahead, lost=()):
     """A result of capture with the model whose lengths are fitted: stands, then stands ahead."""
     model = load_model(bundled_model("person").with_name("person_shape.urdf"), check=False)
-    result = ResultFolder(folder, model.position_names, with_base=False)
-    result.open()
+    rows = []
     standing = stride_positions(model)[-1]
     for index, x in enumerate(ahead):
         q = standing.copy()
         q[model.position_index("position_x")] = x
         if index in lost:
             q[:] = np.nan
-        result.add(PoseRow(f"{index:04d}", q, None, math.nan if index in lost else 0.1, 0.1))
-    result.close()
-    result.write_summary({"model": model.path.name, "frame_rate_hz": 10.0})
+        rows.append(PoseRow(f"{index:04d}", q, None, math.nan if index in lost else 0.1, 0.1))
+    PoseTable(folder, model.position_names, with_base=False).write(rows)
+    write_summary(folder, {"model": model.path.name, "frame_rate_hz": 10.0})
     return model
 
 

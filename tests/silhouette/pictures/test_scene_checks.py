@@ -12,13 +12,13 @@ from drake_pose.camera.files import save_cameras
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.errors import MaskError
-from drake_pose.jobs.estimate.scene_checks import (
+from drake_pose.silhouette.pictures.masks import write_mask
+from drake_pose.silhouette.pictures.scene_checks import (
     check_scene,
     check_upright,
     frame_ranges,
     leave_out_unreadable,
 )
-from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.silhouette.pictures.scenes import Scene, load_scene
 
 NAMES = ("left", "middle", "right")
@@ -50,15 +50,15 @@ def test_frozen_camera_is_left_out(tmp_path: Path) -> None:
     scene = record(tmp_path, ["1", "2", "3", "4", "5"], still=("middle",))
     (warning,) = check_scene(scene).warnings
     assert "camera 'middle' shows its last picture again in frame 4-5" in warning
-    assert ("middle", "4") not in check_scene(scene).scene.masks
-    assert ("middle", "3") in check_scene(scene).scene.masks
+    assert ("middle", "4") not in check_scene(scene).masks
+    assert ("middle", "3") in check_scene(scene).masks
 
 
 def test_frames_recorded_twice_are_kept(tmp_path: Path) -> None:
     scene = record(tmp_path, ["1", "2", "3", "4"], still=NAMES)
     (warning,) = check_scene(scene).warnings
     assert warning.startswith("frame 4: all cameras show the frame before again")
-    assert check_scene(scene).scene.masks == scene.masks
+    assert check_scene(scene).masks == scene.masks
 
 
 def test_dropped_frames(tmp_path: Path) -> None:
@@ -105,13 +105,13 @@ def test_unreadable_masks_are_left_out_where_others_have_the_frame(tmp_path: Pat
     (tmp_path / "masks" / "right" / "3.png").unlink()
     (tmp_path / "masks" / "right" / "3.png").symlink_to("nowhere.png")
     scene = load_scene(tmp_path)
-    checked = leave_out_unreadable(scene, NAMES, scene.frames)
+    checked = leave_out_unreadable(scene, scene.frames)
     left, right = checked.warnings
     assert left.startswith("frame 2-3 without camera 'left'")
     assert right.startswith("frame 3 without camera 'right'")
-    assert checked.scene.cameras_of("3") == ("middle",)
+    assert checked.cameras_of("3") == ("middle",)
     with pytest.raises(MaskError, match=r"3\.png"):
-        leave_out_unreadable(scene, ("left", "right"), scene.frames)
+        leave_out_unreadable(scene.of_cameras(("left", "right")), scene.frames)
 
 
 @pytest.mark.parametrize(("axis", "name"), [((1.0, 0.0, 0.0), "-z"), ((0.0, 1.0, 0.0), "x")])
@@ -142,8 +142,8 @@ def test_many_masks_are_listed_in_linear_time(tmp_path: Path) -> None:
     begin = time.process_time()
     checked = check_scene(load_scene(tmp_path))
     assert time.process_time() - begin < 5.0
-    assert len(checked.scene.frames) == 5000
-    assert len(checked.scene.masks) == 3 * 5000
+    assert len(checked.frames) == 5000
+    assert len(checked.masks) == 3 * 5000
 
 
 def test_ranges() -> None:

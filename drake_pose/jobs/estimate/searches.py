@@ -1,0 +1,161 @@
+"""The pose tree and the search for it that settings ask for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from pydrake.multibody.tree import BodyIndex
+
+from drake_pose.body.model import ArticulatedModel
+from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body.tree.root import RootRotation
+from drake_pose.errors import SettingsError
+from drake_pose.results.settings import EstimateSettings, RootTurns
+from drake_pose.search.continuous.multi_start import MultiStartSearch, MultiStartSettings
+from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
+from drake_pose.search.grid.beam.search import BeamSearch
+from drake_pose.search.grid.families.examination import ExaminationSettings
+from drake_pose.search.kameda import PaperSearch
+from drake_pose.search.scoring import PoseSearch
+from drake_pose.search.settings import BeamSearchSettings, PaperSearchSettings
+from drake_pose.search.starts.root_placement import hub, turns_freely
+
+# Sampling interval of a root that can be turned in all ways, where its position is searched [deg].
+_FREE_ROOT_INTERVAL = 30.0
+
+
+def make_search(
+    model: ArticulatedModel, settings: EstimateSettings, position: np.ndarray | None
+) -> PoseSearch:
+    """The search for a root at its own place, or at a position (3,) in the world [m]."""
+    tree, sampling = make_tree(model, settings, position), _sampling(model, settings)
+    if settings.method == "paper":
+        paper = PaperSearchSettings(
+            **sampling,
+            outside_limit=settings.outside_limit,
+            candidate_limit=settings.candidates,
+            run_limit=settings.run_limit,
+        )
+        return PaperSearch(tree, paper)
+    beam = BeamSearchSettings(**sampling, time_limit=settings.time_limit)
+    if settings.angles == "grid":
+        return BeamSearch(tree, beam, ExaminationSettings())
+    # It samples as coarsely as it likes; but intervals of joints that are none are refused.
+    tree.grid(0, beam.interval, beam.intervals, beam.length_interval)
+    return MultiStartSearch(tree, MultiStartSettings(beam))
+
+
+def make_placement_search(
+    model: ArticulatedModel,
+    settings: EstimateSettings,
+    position: np.ndarray | None,
+    scale_unknown: bool,
+) -> RootPlacementSearch:
+    """The search for a root that can be anywhere.
+
+    Where joints turn the root freely, the tree begins at the node of most neighbours, coarsely.
+
+    Raises:
+        SettingsError: if the method is the paper's, or angles on the grid are wanted.
+    """
+    if settings.method == "paper":
+        raise SettingsError(
+            "the paper's search must know where the root is and how large it looks; where the "
+            "scene has no cameras.yaml or the root position is unknown, use --method beam"
+        )
+    if settings.angles == "grid":
+        raise SettingsError(
+            "angles on the grid need a known root; where the scene has no cameras.yaml or the root "
+            "position is unknown, angles are continuous"
+        )
+    first = np.zeros(3) if position is None else position
+    tree = make_tree(model, settings, None if settings.root is None else first)
+    if settings.root is None and settings.root_rotation is None and turns_freely(tree):
+        held = _in_plant_units(model, settings.hold)
+        rotation = RootRotation.free(interval_deg=_FREE_ROOT_INTERVAL)
+        tree = model.pose_tree(hub(tree), root_position=first, root_rotation=rotation, held=held)
+    beam = BeamSearchSettings(**_sampling(model, settings), time_limit=settings.time_limit)
+    return RootPlacementSearch(tree, beam, scale_unknown)
+
+
+def make_tree(
+    model: ArticulatedModel, settings: EstimateSettings, position: np.ndarray | None = None
+) -> PoseTree:
+    """The pose tree, its root placed as the settings say.
+
+    A model without a joint in the world stays in place unless a root or rotation is asked for.
+    """
+    held = _in_plant_units(model, settings.hold)
+    root, turns = settings.root, settings.root_rotation
+    own = model.pose_tree(root_position=position, held=held)
+    floats = any(node.value_names != node.position_names for node in own.nodes)
+    if turns is None and floats and root in (None, own.root):
+        turns = "fixed"
+    if turns is None:
+        return own if root is None else model.pose_tree(root, root_position=position, held=held)
+    root = root or own.root
+    if root == "world":
+        raise SettingsError(
+            f"{model.path}: its own joints hold it in the world; a root rotation needs the name of "
+            f"a root; links that can be one: {', '.join(model.link_meshes)}"
+        )
+    rotation = _root_rotation(model, root, turns)
+    return model.pose_tree(root, root_position=position, root_rotation=rotation, held=held)
+
+
+def leave_out_links(
+    model: ArticulatedModel, settings: EstimateSettings
+) -> tuple[ArticulatedModel, EstimateSettings]:
+    """The model without the links that are not in the pictures, their joints held.
+
+    Raises:
+        ModelError: the model is no URDF, or nothing would be seen.
+        UnknownNameError: there is no such link.
+    """
+    centre = model.pose_tree(
+        hub(model.pose_tree()), root_position=np.zeros(3), root_rotation=RootRotation.free()
+    )
+    held = {}
+    for node in centre.nodes:
+        if node.name in settings.unseen:
+            for name in node.value_names:
+                index = model.position_index(name)
+                unit = math.degrees(1.0) if model.position_kinds[index] == "angle" else 1.0
+                held[name] = unit * float(model.default_positions[index])
+    return model.without(settings.unseen), replace(settings, hold={**held, **settings.hold})
+
+
+def _root_rotation(model: ArticulatedModel, root: str, turns: RootTurns) -> RootRotation:
+    """How the root may be turned, from how it stands in the world at the model's defaults."""
+    context = model.plant.CreateDefaultContext()
+    model.plant.SetPositions(context, model.default_positions)
+    body = model.plant.get_body(BodyIndex(model.link_index(root)))
+    R_WR = body.EvalPoseInWorld(context).rotation().matrix()
+    if turns == "fixed":
+        return RootRotation.fixed(R_WR)
+    if turns == "free":
+        return RootRotation.free(rotation=R_WR)
+    ranges = [(axis, lower, upper) for axis, (lower, upper) in turns.items()]
+    return RootRotation.limited(ranges, rotation=R_WR)
+
+
+def _in_plant_units(model: ArticulatedModel, values: Mapping[str, float]) -> dict[str, float]:
+    """Degrees become radians; lengths stay metres. Names that are no positions are angles."""
+    kinds = dict(zip(model.position_names, model.position_kinds, strict=True))
+    return {
+        name: math.radians(value) if kinds.get(name, "angle") == "angle" else value
+        for name, value in values.items()
+    }
+
+
+def _sampling(model: ArticulatedModel, settings: EstimateSettings) -> dict[str, Any]:
+    """The sampling intervals that all searches take."""
+    return {
+        "interval": math.radians(settings.interval),
+        "length_interval": settings.length_interval,
+        "intervals": _in_plant_units(model, settings.joint_intervals),
+    }

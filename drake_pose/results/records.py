@@ -1,0 +1,191 @@
+"""What is known of each frame and joint: in summary.json, joints.csv and families.csv."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from drake_pose.body.model import ArticulatedModel
+from drake_pose.csv_files import csv_text
+from drake_pose.results.poses import PoseRow
+from drake_pose.search.estimates import JointEstimate, PoseSet
+
+JOINT_COLUMNS = ("frame", "joint", "determined", "low", "high", "families")
+"""A row for each frame and joint, over all families [deg or m]."""
+FAMILY_COLUMNS = ("frame", "family", "joint", "value", "determined", "low", "high")
+"""A row for each frame, family and joint; family 1 holds the answer [deg or m]."""
+
+# Of a normal distribution, 95 % lie within this many standard deviations.
+_NORMAL_95 = 1.96
+
+
+@dataclass(frozen=True)
+class JointRecord:
+    """What is known of one value of the pose tree, as JointEstimate [deg or m].
+
+    From low to high it may be, or was seen; value is that of a family, None over all families.
+    """
+
+    determined: bool
+    low: float
+    high: float
+    value: float | None = None
+
+    @property
+    def interval(self) -> tuple[float, float, bool]:
+        """``low``, ``high`` and ``determined``."""
+        return self.low, self.high, self.determined
+
+
+@dataclass(frozen=True)
+class FrameRecord:
+    """What the search said about one frame.
+
+    Args:
+        E_total: J over the silhouettes' area; None where no pose was found.
+        seconds: the search's wall time [s].
+        first_E_total: before the re-estimation.
+        runs: how often step 3 was run.
+        stopped_by: why the search ended: "end", "exact", "run_limit" or "time_limit";
+            "tracked" where the pose was tracked, "followed" where a person was.
+        outside_limit: r in each view [pixel].
+        joint_errors: estimate minus truth by position [deg or m], where the truth is known.
+        camera_scale: pixels a metre of a parallel camera whose scale was found.
+        explained: whether the pose explains the silhouettes at least roughly.
+        joints: what is known of each value of the pose tree, by name.
+        families: the same in the first families of poses that look the same.
+        family_count: how many families there are; None where the search does not say.
+        ious: by camera that was used, intersection over union of silhouette and body.
+        masks: by camera, what tells the mask's file from another (``mask_digests``).
+        share: of the contours' lengths, what fits; by the method person alone.
+    """
+
+    found: bool
+    E_total: float | None
+    seconds: float
+    first_E_total: float | None = None
+    runs: int | None = None
+    stopped_by: str | None = None
+    outside_limit: tuple[float, ...] | None = None
+    joint_errors: Mapping[str, float] = field(default_factory=dict)
+    camera_scale: float | None = None
+    explained: bool = True
+    joints: Mapping[str, JointRecord] = field(default_factory=dict)
+    families: tuple[Mapping[str, JointRecord], ...] = ()
+    family_count: int | None = None
+    ious: Mapping[str, float] = field(default_factory=dict)
+    share: float | None = None
+    masks: Mapping[str, str] = field(default_factory=dict)
+
+    @staticmethod
+    def of(row: PoseRow, **more: Any) -> FrameRecord:
+        """The record of a frame's row; ``more``: other fields."""
+        return FrameRecord(row.found, row.error if row.found else None, row.seconds, **more)
+
+    @staticmethod
+    def from_json(values: Mapping[str, Any]) -> FrameRecord:
+        """Returns the record that as_json described."""
+
+        def joints(known: Mapping[str, Any]) -> dict[str, JointRecord]:
+            return {name: JointRecord(**fields) for name, fields in known.items()}
+
+        limits = values.get("outside_limit")
+        read = {
+            "outside_limit": None if limits is None else tuple(limits),
+            "joints": joints(values.get("joints", {})),
+            "families": tuple(map(joints, values.get("families", ()))),
+        }
+        return FrameRecord(**{**values, **read})
+
+    def as_json(self) -> dict[str, Any]:
+        """Returns plain JSON values."""
+        return asdict(self)
+
+
+def user_units(model: ArticulatedModel) -> np.ndarray:
+    """What each position (nq,) is multiplied by to be told: radians become degrees."""
+    return np.array([math.degrees(1.0) if k == "angle" else 1.0 for k in model.position_kinds])
+
+
+def record_pose_set(pose_set: PoseSet | None, model: ArticulatedModel) -> dict[str, Any]:
+    """FrameRecord's fields of what is known of each joint, over all families and in each."""
+    if pose_set is None:
+        return {}
+    kinds = dict(zip(model.position_names, model.position_kinds, strict=True))
+
+    def record(
+        joints: Sequence[JointEstimate], values: Sequence[float | None]
+    ) -> dict[str, JointRecord]:
+        records = {}
+        for joint, value in zip(joints, values, strict=True):
+            unit = 1.0 if kinds.get(joint.name) == "length" else math.degrees(1.0)
+            records[joint.name] = JointRecord(
+                joint.determined,
+                unit * joint.low,
+                unit * joint.high,
+                None if value is None else unit * value,
+            )
+        return records
+
+    families = [
+        record(one.joints, [float(value) for node in one.node_values for value in node])
+        for one in pose_set.families
+    ]
+    return {
+        "joints": record(pose_set.joints, [None] * len(pose_set.joints)),
+        "families": tuple(families),
+        "family_count": pose_set.family_count,
+    }
+
+
+def record_deviations(
+    model: ArticulatedModel, q: np.ndarray, deviations: np.ndarray
+) -> dict[str, JointRecord]:
+    """Each position within 95 % and its limits, determined where that is less than half its range.
+
+    Positions q (nq,) and deviations (nq,) are in rad or m; nan: nothing is known.
+    """
+    if not np.isfinite(q).all():
+        return {}
+    half = _NORMAL_95 * np.where(np.isfinite(deviations), deviations, np.inf)
+    # An interval about half a turn goes on beyond it.
+    lower = np.where(model.turns_freely, q - math.pi, model.lower)
+    upper = np.where(model.turns_freely, q + math.pi, model.upper)
+    low, high = np.maximum(q - half, lower), np.minimum(q + half, upper)
+    determined = 2.0 * half < 0.5 * (model.upper - model.lower)
+    unit = user_units(model)
+    return {
+        model.position_names[k]: JointRecord(
+            bool(determined[k]), float(unit[k] * low[k]), float(unit[k] * high[k])
+        )
+        for k in np.flatnonzero(np.isfinite(low) & np.isfinite(high))
+    }
+
+
+def joint_table(records: Mapping[str, FrameRecord]) -> str:
+    """Returns the text of joints.csv."""
+    rows = [
+        (frame, name, *_ends(joint), record.family_count)
+        for frame, record in records.items()
+        for name, joint in record.joints.items()
+    ]
+    return csv_text([JOINT_COLUMNS, *rows])
+
+
+def family_table(records: Mapping[str, FrameRecord]) -> str:
+    """Returns the text of families.csv."""
+    rows = [
+        (frame, number, name, "" if one.value is None else f"{one.value:.6g}", *_ends(one))
+        for frame, record in records.items()
+        for number, family in enumerate(record.families, start=1)
+        for name, one in family.items()
+    ]
+    return csv_text([FAMILY_COLUMNS, *rows])
+
+
+def _ends(joint: JointRecord) -> tuple[str, str, str]:
+    return "yes" if joint.determined else "no", f"{joint.low:.6g}", f"{joint.high:.6g}"

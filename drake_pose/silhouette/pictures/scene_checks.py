@@ -1,0 +1,221 @@
+"""What is wrong with a scene of several cameras but leaves enough to go on: each fault is named."""
+
+from __future__ import annotations
+
+import filecmp
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from drake_pose.camera.models import Camera
+from drake_pose.errors import MaskError, SceneError
+from drake_pose.regular_files import require_regular
+from drake_pose.silhouette.pictures.scene_files import natural_key
+from drake_pose.silhouette.pictures.scenes import Scene, load_scene
+
+# A camera that stands still while the others' silhouettes change by so much of their area.
+_CHANGED = 0.02
+# Cameras that look up or down steeply do not say where up is.
+_UPRIGHT = 0.5
+# Ranges of frames that are listed before "and more".
+_LISTED = 6
+
+
+def read_scene(
+    path: Path,
+    wanted: Sequence[str] = (),
+    frames: Sequence[str] = (),
+    cameras: Mapping[str, Camera] | None = None,
+) -> tuple[Scene, tuple[str, ...]]:
+    """A checked scene of the wanted cameras, and its wanted frames; none named: all.
+
+    Given ``cameras`` are used instead of the folder's.
+
+    Raises:
+        DrakePoseError: names the file, camera or frame that is wrong or not there.
+    """
+    scene = check_scene(load_scene(path, cameras, wanted)).of_cameras(wanted)
+    return scene, scene.seen_frames(frames)
+
+
+def check_scene(scene: Scene) -> Scene:
+    """A scene with what its files' faults are, without masks of cameras that stood still alone."""
+    if scene.scale_unknown or scene.images:
+        return scene
+    warnings = list(scene.warnings)
+    several = len(scene.cameras) > 1
+    if several:
+        warnings += _check_counts(scene)
+    if scene.sequence:
+        warnings += _check_gaps(scene.frames)
+        if several:
+            frozen, repeated = _find_repeats(scene)
+            gone = {(name, frame) for name, frames in frozen.items() for frame in frames}
+            masks = {key: path for key, path in scene.masks.items() if key not in gone}
+            warnings += _describe_repeats(scene.frames, frozen, repeated)
+            scene = replace(scene, masks=masks)
+    return replace(scene, warnings=tuple(warnings))
+
+
+def check_upright(cameras: Iterable[Camera]) -> tuple[str, ...]:
+    """Whether the pictures' up is the world's z, as it must be where a person is to stand."""
+    up = -np.mean([camera.X_WC[:3, 1] for camera in cameras], axis=0)
+    axis = int(np.argmax(np.abs(up)))
+    if (axis == 2 and up[2] > 0.0) or abs(up[axis]) < _UPRIGHT:
+        return ()
+    text = (
+        f"cameras.yaml: up in the pictures is the world's {'+' if up[axis] > 0.0 else '-'}"
+        f"{'xyz'[axis]}, but should be +z: the world lies on its side or upside down; turn X_WC"
+    )
+    return (text,)
+
+
+def leave_out_unreadable(scene: Scene, frames: Iterable[str]) -> Scene:
+    """A scene without masks that cannot be read, where another camera has the frame, too.
+
+    Raises:
+        MaskError: a mask cannot be read, and no other camera has a readable one of that frame.
+    """
+    refused: dict[tuple[str, str], str] = {}
+    for frame in frames:
+        errors: dict[str, MaskError] = {}
+        present = scene.cameras_of(frame)
+        for name in present:
+            try:
+                scene.read(name, frame)
+            except MaskError as error:
+                errors[name] = error
+        if present and len(errors) == len(present):
+            raise errors[present[0]]
+        refused |= {(name, frame): str(error) for name, error in errors.items()}
+    masks = {key: path for key, path in scene.masks.items() if key not in refused}
+    texts = describe_unreadable(refused, scene.frames)
+    return replace(scene, masks=masks, warnings=(*scene.warnings, *texts))
+
+
+def require_readable(refused: Mapping[tuple[str, str], str], scene: Scene) -> None:
+    """Refuses a scene none of whose masks can be read: SceneError says why of the first."""
+    if refused and len(refused) == len(scene.masks):
+        first = next(iter(refused.values()))
+        raise SceneError(f"{scene.path}: none of {len(refused)} masks can be used: {first}")
+
+
+def describe_unreadable(
+    refused: Mapping[tuple[str, str], str], known: Sequence[str]
+) -> tuple[str, ...]:
+    """One warning a camera of what is wrong with the masks of (camera, frame)."""
+    found = []
+    for camera in dict.fromkeys(name for name, _ in refused):
+        frames = [frame for name, frame in refused if name == camera]
+        first = refused[camera, frames[0]]
+        found.append(f"frame {frame_ranges(frames, known)} without camera '{camera}': {first}")
+    return tuple(found)
+
+
+def frame_ranges(frames: Iterable[str], known: Sequence[str]) -> str:
+    """Frames as text: those that follow each other as first-last; many are not all listed."""
+    order = {frame: k for k, frame in enumerate(known)}
+    places = np.sort([order[frame] for frame in frames]).astype(int)
+    runs = np.split(places, np.flatnonzero(np.diff(places) > 1) + 1) if len(places) else []
+    texts = [known[run[0]] + (f"-{known[run[-1]]}" if len(run) > 1 else "") for run in runs]
+    rest = sum(map(len, runs[_LISTED:]))
+    return ", ".join(texts[:_LISTED]) + (f" and {rest} more" if rest else "")
+
+
+def _find_repeats(scene: Scene) -> tuple[dict[str, list[str]], list[str]]:
+    """By camera the frames in which it alone shows its last picture again; those where all do."""
+    repeats = _repeated_files(scene)
+    frozen: dict[str, list[str]] = {}
+    repeated = []
+    for last, frame in pairwise(scene.frames):
+        both = [name for name in scene.cameras_of(frame) if (name, last) in scene.masks]
+        alike = [name for name in both if (name, frame) in repeats]
+        others = [name for name in both if name not in alike]
+        if len(both) > 1 and not others:
+            repeated.append(frame)
+        elif alike and len(others) > len(alike) and _has_changed(scene, others, last, frame):
+            for name in alike:
+                frozen.setdefault(name, []).append(frame)
+    return frozen, repeated
+
+
+def _repeated_files(scene: Scene) -> set[tuple[str, str]]:
+    """The masks, (camera, frame), whose file is that of the frame before again, byte for byte.
+
+    Files are read only where sizes are equal; what cannot be read is like none.
+    """
+    found = set()
+    for name in scene.cameras:
+        last: tuple[Path, int] | None = None
+        for frame in scene.frames:
+            path, size = scene.masks.get((name, frame)), None
+            if path is not None:
+                with suppress(OSError):
+                    size = require_regular(path)
+                    if last and last[1] == size and filecmp.cmp(last[0], path, shallow=False):
+                        found.add((name, frame))
+            last = None if path is None or size is None else (path, size)
+    return found
+
+
+def _has_changed(scene: Scene, names: Sequence[str], last: str, frame: str) -> bool:
+    """Whether the silhouettes of cameras changed more than a hand behind the body would."""
+    changes = []
+    for name in names:
+        with suppress(MaskError):
+            one, other = (scene.read(name, f, may_be_empty=True) for f in (last, frame))
+            changes.append((one != other).sum() / max(one.sum(), other.sum(), 1))
+    return bool(changes) and float(np.median(changes)) > _CHANGED
+
+
+def _describe_repeats(
+    known: Sequence[str], frozen: Mapping[str, Sequence[str]], repeated: Sequence[str]
+) -> list[str]:
+    texts = [
+        f"camera '{name}' shows its last picture again in frame {frame_ranges(frames, known)}, "
+        "while the others' changed: left out there; did the camera stand still, or drop frames?"
+        for name, frames in frozen.items()
+    ]
+    if repeated:
+        texts.append(
+            f"frame {frame_ranges(repeated, known)}: all cameras show the frame before again; was "
+            "it recorded twice?"
+        )
+    return texts
+
+
+def _check_counts(scene: Scene) -> list[str]:
+    """Cameras that lack frames which others have."""
+    found = []
+    for name in scene.cameras:
+        lacking = [frame for frame in scene.frames if (name, frame) not in scene.masks]
+        if count := (len(scene.frames) - len(lacking)) * bool(lacking):
+            found.append(
+                f"camera '{name}' has {count} of {len(scene.frames)} frames; it lacks "
+                f"{frame_ranges(lacking, scene.frames)}, where the others go on without it"
+            )
+    return found
+
+
+def _check_gaps(frames: Sequence[str]) -> list[str]:
+    """Numbers that no camera has between frames that are numbered one by one."""
+    keys = [natural_key(frame) for frame in frames]
+    if len(keys) < 3 or any(key[:-2] != keys[0][:-2] or key[-1][0] for key in keys):
+        return []
+    steps = np.diff([key[-2][1] for key in keys])
+    usual = int(np.median(steps))
+    wide = np.flatnonzero(steps > usual) if usual > 0 else np.empty(0, dtype=int)
+    if not len(wide):
+        return []
+    texts = [f"between {frames[k]} and {frames[k + 1]}" for k in wide[:_LISTED]]
+    rest = f" and at {len(wide) - _LISTED} more places" if len(wide) > _LISTED else ""
+    missing = int((steps[wide] // usual - 1).sum())
+    text = (
+        f"{missing} frames dropped by all cameras {', '.join(texts)}{rest}; the times of all later "
+        "frames count on without them"
+    )
+    return [text]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
@@ -67,34 +68,16 @@ class FittedFrames:
     equations: Equations
     coupling: Coupling | None = None
 
-    @property
-    def shared_covariance(self) -> Array:
-        """(q, q) of the shared unknowns, if the noise is what the fit was told."""
-        p = self.own.shape[1]
-        return np.asarray(np.linalg.inv(_reduced(self.equations, p)[0]))
-
-    def frame_covariance(self, frame: int) -> Array:
-        """(p, p) of a frame's own unknowns, the shared ones' uncertainty included."""
-        p = self.own.shape[1]
-        S, gains = _reduced(self.equations, p)
-        own = np.asarray(np.linalg.inv(self.equations.H[frame, :p, :p]))
-        if not len(S):
-            return own
-        return np.asarray(own + gains[frame] @ np.linalg.inv(S) @ gains[frame].T)
-
     def own_deviations(self) -> Array:
         """(frames, p) standard deviations, with the coupling and what shared unknowns may be.
 
-        With a coupling they are 100 [of the unknown's unit] at most, where nothing tells.
+        They are 100 [of the unknown's unit] at most, where nothing tells.
         """
         frames, p = self.own.shape
-        if self.coupling is None:
-            variances = [np.diag(self.frame_covariance(k)) for k in range(frames)]
-            return np.sqrt(np.array(variances))
         H = self.equations.H
-        whole = self.coupling.curvature().toarray() + _LEAST_INFORMATION * np.eye(frames * p)
-        for k in range(frames):
-            whole[k * p : (k + 1) * p, k * p : (k + 1) * p] += H[k, :p, :p]
+        whole = block_diag(*H[:, :p, :p]) + _LEAST_INFORMATION * np.eye(frames * p)
+        if self.coupling is not None:
+            whole += self.coupling.curvature().toarray()
         covariance = np.linalg.inv(whole)
         mixed = H[:, :p, p:].reshape(frames * p, -1)
         gains = covariance @ mixed
@@ -375,14 +358,3 @@ class FramesFit:
         turned = (look >= 0) & (look < len(CAMERA_NAMES)) & (entries < self._first_width)
         moves[:, turned] = motions[camera, look[turned]]
         return moves
-
-
-def _reduced(equations: Equations, p: int) -> tuple[Array, list[Array]]:
-    """What all frames together tell of the shared unknowns, and how each frame follows them."""
-    S = equations.H[:, p:, p:].sum(axis=0)
-    gains = []
-    for H in equations.H:
-        gain = np.linalg.solve(H[:p, :p], H[:p, p:]) if p else np.zeros((0, len(S)))
-        S = S - H[p:, :p] @ gain
-        gains.append(gain)
-    return S, gains

@@ -10,7 +10,7 @@ joints keep their meaning.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,10 @@ Indices = NDArray[np.int64]
 LENGTH_PREFIX, WIDTH_PREFIX, PLACE_PREFIX = "log_length_", "log_width_", "joint_place_"
 """Begin the names of the logarithms of how much longer a part is, and of how much wider a part or
 all parts of a limb are; and of how far along a part its own joint lies, over the part's length."""
+
+# Of the logarithms of lengths and widths, as people differ, and of where a joint lies along its
+# part, over the part's length: standard deviations.
+_LENGTH_DEVIATION, _WIDTH_DEVIATION, _PLACE_DEVIATION = 0.15, 0.1, 0.15
 
 
 class ProportionedBody(BodyParameters):
@@ -288,101 +292,58 @@ class SequencePrior:
         )
 
 
-@dataclass(frozen=True)
-class ProportionSettings:
-    """How proportions are fitted.
-
-    Args:
-        length_deviation, width_deviation: standard deviations of the logarithms of lengths and
-            widths, as people differ.
-        place_deviation: of where a joint lies along its part, over the part's length.
-        angle_deviation, shift_deviation, growth_deviation: how far each frame's angles [rad], other
-            values and root [m] and the logarithm of its scale may be off where the fit starts.
-        rounds: the parts of the fit [pixel].
-        noise: what a point of contour is worth [pixel].
-    """
-
-    length_deviation: float = 0.15
-    width_deviation: float = 0.1
-    place_deviation: float = 0.15
-    angle_deviation: float = 0.3
-    shift_deviation: float = 0.03
-    growth_deviation: float = 0.02
-    rounds: tuple[AnnealingStage, ...] = (
-        AnnealingStage(15.0, 3.0, 6),
-        AnnealingStage(6.0, 3.0, 6),
-        AnnealingStage(3.0, 3.0, 8),
-    )
-    noise: Noise = field(default_factory=lambda: Noise(2.0, 12.0))
-
-
 def fit_proportions(
     body: ProportionedBody,
     camera: Camera,
     frames: Sequence[EdgePoints],
     starts: Array,
-    settings: ProportionSettings | None = None,
-    sequence: SequencePrior | None = None,
+    rounds: Sequence[AnnealingStage],
+    noise: Noise,
+    sequence: SequencePrior,
 ) -> FittedProportions:
     """The proportions of a body that several frames of one camera show, its pose near in each.
 
     Args:
         body: the body.
         camera: the camera.
-        frames: the edges that it sees.
+        frames: the edges that it sees, of three frames or more.
         starts: (frames, k) about what the tree's values and ROOT_NAMES are; or (frames, n) all
             parameters, those of proportions as in the first frame.
-        settings: how.
-        sequence: what is known of three frames or more that follow one another; None: each pose is
-            about where the fit starts.
+        rounds: the parts of the fit [pixel].
+        noise: what a point of contour is worth [pixel].
+        sequence: what is known of the frames without pictures.
     """
-    settings = settings or ProportionSettings()
-    unknowns = _unknowns(body, settings, sequence)
-    fit = FramesFit(body, [camera], unknowns, noise=settings.noise, pixels=1.0)
+    unknowns = _unknowns(body, sequence)
+    fit = FramesFit(body, [camera], unknowns, noise=noise, pixels=1.0)
     held = np.zeros((len(frames), len(body.names)))
     held[:, : starts.shape[1]] = starts
     own, common = np.split(unknowns.entries, [unknowns.own_count])
-    first = held[:, own].copy()
-    held[:, own] = 0.0
-    shared, nothing = held[0, common].copy(), np.zeros(len(common))
-    held[:, common] = 0.0
-    evidence = [pack_evidence([edge]) for edge in frames]
+    first, shared = held[:, own].copy(), held[0, common].copy()
+    held[:, own] = held[:, common] = 0.0
     found = fit.fit(
-        evidence,
+        [pack_evidence([edge]) for edge in frames],
         held,
         first,
         shared,
-        settings.rounds,
-        expected=(first, nothing),
-        coupling=None if sequence is None else sequence.coupling(len(frames)),
+        rounds,
+        expected=(first, np.zeros(len(common))),
+        coupling=sequence.coupling(len(frames)),
     )
     off = np.zeros((len(frames), len(body.kinematics.names) + len(ROOT_NAMES)))
     off[:, own] = found.own_deviations()
     return FittedProportions(found.parameters[:, : len(body.names)], off, found.cost)
 
 
-def _unknowns(
-    body: ProportionedBody, settings: ProportionSettings, sequence: SequencePrior | None
-) -> Unknowns:
+def _unknowns(body: ProportionedBody, sequence: SequencePrior) -> Unknowns:
     """The pose of each frame, then lengths, widths and places that all share."""
     kinematics = body.kinematics
-    free = kinematics.lower < kinematics.upper
-    values = [name for name, is_free in zip(kinematics.names, free, strict=True) if is_free]
-    # A fit's unknown is what is added; limits are those of the values, about each frame's start.
-    deviations = np.where(
-        kinematics.is_angle[free], settings.angle_deviation, settings.shift_deviation
+    moving = np.array(kinematics.names)[kinematics.lower < kinematics.upper]
+    own = choose(
+        body.names, [*moving.tolist(), *ROOT_NAMES], lower=sequence.lower, upper=sequence.upper
     )
-    moving = np.array([*[settings.shift_deviation] * 3, settings.growth_deviation])
-    lower = np.r_[kinematics.lower[free], np.full(4, -np.inf)]
-    upper = np.r_[kinematics.upper[free], np.full(4, np.inf)]
-    if sequence is not None:
-        deviations, moving = np.full(len(values), np.inf), np.full(4, np.inf)
-        lower, upper = sequence.lower, sequence.upper
-    names = [*values, *ROOT_NAMES]
-    own = choose(body.names, names, lower=lower, upper=upper, deviation=np.r_[deviations, moving])
-    lengths = choose(
-        body.names, body.length_names, shared=True, deviation=settings.length_deviation
+    shared = (
+        (body.length_names, _LENGTH_DEVIATION),
+        (body.width_names, _WIDTH_DEVIATION),
+        (body.place_names, _PLACE_DEVIATION),
     )
-    widths = choose(body.names, body.width_names, shared=True, deviation=settings.width_deviation)
-    places = choose(body.names, body.place_names, shared=True, deviation=settings.place_deviation)
-    return join(own, lengths, widths, places)
+    return join(own, *(choose(body.names, names, shared=True, deviation=d) for names, d in shared))

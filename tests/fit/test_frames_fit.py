@@ -164,8 +164,6 @@ class TestKnownAnswers:
         frames = [draw(body, rig, theta) for theta in truth]
         found = fit.fit(frames, readings, np.zeros((4, 0)), np.zeros(4), ROUNDS)
         np.testing.assert_allclose(found.shared, zeros, atol=0.012)
-        deviations = np.sqrt(np.diag(found.shared_covariance))
-        assert (np.abs(found.shared - zeros) < 4.0 * deviations).all()
 
     def test_growth_and_girths_of_all_frames_beside_their_poses(self, body, rig):
         truth = poses(body, 3, 5)

@@ -8,8 +8,10 @@ from drake_pose.body.model import load_model
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import ParallelCamera
+from drake_pose.fit.contour_fit import Noise
 from drake_pose.fit.evidence import find_edge_points
-from drake_pose.fit.proportions import ProportionedBody, fit_proportions
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
+from drake_pose.fit.proportions import ProportionedBody, SequencePrior, fit_proportions
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_packed
@@ -114,7 +116,15 @@ def test_lengths_and_widths_are_found_in_drawn_frames(body):
         start[3:count] += generator.normal(0.0, 0.05, count - 3) * free[3:]
         starts.append(np.clip(start, -10, 10))
     edges = [find_edge_points(mask, 2.0) for mask in masks]
-    found = fit_proportions(body, camera, edges, np.array(starts))
+    p = int(np.count_nonzero(free)) + 4
+    about = np.mean(starts, axis=0)[: count + 4][np.r_[free, np.ones(4, bool)]]
+    lower = np.r_[body.kinematics.lower[free], np.full(4, -np.inf)]
+    upper = np.r_[body.kinematics.upper[free], np.full(4, np.inf)]
+    known = np.repeat([0.3, 0.03, 0.02], [p - 4, 3, 1]) ** -2
+    prior = SequencePrior(np.eye(p), about, known, np.full(p, 100.0), lower, upper)
+    rounds = [AnnealingStage(scale, 3.0, 8) for scale in (15.0, 6.0, 3.0)]
+    noise = Noise(2.0, 12.0)
+    found = fit_proportions(body, camera, edges, np.array(starts), rounds, noise, prior)
     before = np.abs(np.log(body.factors(truth)))
     after = np.abs(np.log(body.factors(found.parameters[0]) / body.factors(truth)))
     assert np.median(after) < 0.5 * np.median(before)

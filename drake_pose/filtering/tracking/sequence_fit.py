@@ -22,7 +22,6 @@ from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.proportions import (
     FittedProportions,
     ProportionedBody,
-    ProportionSettings,
     SequencePrior,
     fit_proportions,
 )
@@ -99,11 +98,9 @@ def fit_sequence(
         apart = period * float(frames[1] - frames[0])
         worth = min(1.0, apart / _MEMORY)
         noise = Noise(_DEVIATION, _CORRELATION / worth)
-        plan = ProportionSettings(noise=noise, rounds=_ROUNDS[-1:] if last else _ROUNDS)
-        prior = _sequence_prior(tracker, apart)
-        return fit_proportions(
-            body, camera, [edges[k] for k in frames.tolist()], begin, plan, prior
-        )
+        prior, rounds = _sequence_prior(tracker, apart), _ROUNDS[-1:] if last else _ROUNDS
+        seen = [edges[k] for k in frames.tolist()]
+        return fit_proportions(body, camera, seen, begin, rounds, noise, prior)
 
     coarse = []
     for states in starts[:_STARTS]:

@@ -51,24 +51,10 @@ _SURE = 3.0
 _UNKNOWN_SIZES = ErrorSizes(1.0, 0.0, 1.0, 1.0, 1.0)
 # A silhouette's width was put right to within this [pixel].
 _WIDTH = 2.0
-
-
 # What is right is named by chance this often, and not where it moves outlines by less [pixel].
 _SIGNIFICANCE, _LEAST_PIXELS = 1e-4, 1.0
 # Joints, or sliding ones and the base, may be off by so much in each frame by itself [rad; m].
 _ANGLE_SD, _SHIFT_SD = np.radians(0.1), 0.001
-
-
-class Cause(NamedTuple):
-    """What may be off: a "joint", a "camera" or the "base", and its name.
-
-    moves: (p, d) how what was free to move follows it: a joint's position [rad or m], or a rotation
-    vector [rad] and a shift [m] of a camera along its axes, or of the base in the world.
-    """
-
-    kind: str
-    name: str
-    moves: Array
 
 
 @dataclass(frozen=True)
@@ -130,8 +116,8 @@ class Audit:
         return tuple(one.frame for one in self.frames if one.finding is not None)
 
 
-class FrameInformation(NamedTuple):
-    """What a frame tells of what was free, in units of its deviations: x^T N x - 2 h^T x.
+class _Told(NamedTuple):
+    """What frames tell of what was free, in units of its deviations: x^T N x - 2 h^T x.
 
     N: (p, p); h: (p,); of_surface: (p, 12 nodes) how h follows the surfaces, which are the same in
     all frames; outlines: (nodes, p, p) squares of how far x moves each part's outline, summed along
@@ -147,47 +133,76 @@ class FrameInformation(NamedTuple):
     scale: float
     freedom: float
 
-
-class _Sum(NamedTuple):
-    """Sums over frames of N, h and of_surface, each by the scale of the frame's errors."""
-
-    frames: int
-    N: Array
-    h: Array
-    of_surface: Array
-
-    def with_frame(self, told: FrameInformation, sign: float) -> _Sum:
-        """With another frame, or without one of them: sign -1."""
-        weight = sign / told.scale
-        return _Sum(
-            self.frames + int(sign),
-            self.N + weight * told.N,
-            self.h + weight * told.h,
-            self.of_surface + weight * told.of_surface,
-        )
+    def pixels(self, x: Array) -> float:
+        """How far x moves the outlines of the parts that it moves, root mean square [pixel]."""
+        squares = np.einsum("p,npq,q->n", x, self.outlines, x)
+        moved = squares > 1e-6 * squares.max(initial=0.0)
+        return float(np.sqrt(squares[moved].sum() / max(self.lengths[moved].sum(), 1e-9)))
 
 
-class FrameDeviation(NamedTuple):
-    """By how much a frame is off from the others, in units of the deviations.
+class _Cause(NamedTuple):
+    """What may be off: a "joint", a "camera" or the "base", and its name.
 
-    r: (p,) its h without what is common, and Q: (p, p) the covariance of that; x: (p,) by how much
-    what was free is off, as far as that is told, and covariance: (p, p).
+    moves: (p, d) how what was free follows it: a joint's position [rad or m], or a rotation vector
+    [rad] and a shift [m] of a camera along its axes, or of the base in the world; units: (d,).
     """
 
+    kind: str
+    name: str
+    moves: Array
+    units: Array
+
+
+class _Test(NamedTuple):
+    """Whether one cause is off: by how much, with covariance; with what chance; Akaike's gain."""
+
+    cause: _Cause
+    amount: Array
+    covariance: Array
+    p_value: float
+    gain: float
+
+    @property
+    def x(self) -> Array:
+        """(p,) what was free, off by this cause."""
+        return np.asarray(self.cause.moves @ self.amount)
+
+
+class _Left(NamedTuple):
+    """What is off, r (p,) of N x = r with r's covariance Q, in what frames tell."""
+
+    told: _Told
+    N: Array
     r: Array
     Q: Array
-    x: Array
-    covariance: Array
 
+    def solved(self, r: Array) -> Array:
+        """(p,) x of another r, as far as it is told."""
+        return np.asarray(np.linalg.solve(self.N + np.eye(len(r)), r))
 
-class _Common(NamedTuple):
-    """What frames have in common: x (p,), its covariance, and the sums it is from."""
+    def test(self, cause: _Cause) -> _Test:
+        """Whether a cause is off."""
+        M = cause.moves
+        N, r, Q = M.T @ self.N @ M, M.T @ self.r, M.T @ self.Q @ M
+        T, rank = _statistic(r, Q, N)
+        inverse = np.linalg.inv(N + 1e-3 * np.eye(len(r)))
+        p_value = _p_value(T, rank, self.told.freedom)
+        # More numbers explain more by chance.
+        return _Test(cause, inverse @ r, inverse @ Q @ inverse, p_value, T - 2.0 * rank)
 
-    x: Array
-    covariance: Array
-    N: Array
-    h: Array
-    Q: Array
+    def sufficing(self, tests: Sequence[_Test]) -> list[_Test]:
+        """Causes that leave little of what is off, those of fewer numbers first."""
+        most = max(_LEAST_PIXELS, _EXPLAINED * self.told.pixels(self.solved(self.r)))
+        left = [
+            one for one in tests if self.told.pixels(self.solved(self.r - self.N @ one.x)) < most
+        ]
+        return sorted(left, key=lambda one: (len(one.amount), -one.gain))
+
+    def without(self, cause: _Cause) -> _Left:
+        """What is left once a cause was put right."""
+        M, N = cause.moves, self.N
+        gain = np.eye(len(N)) - N @ M @ np.linalg.pinv(M.T @ N @ M) @ M.T
+        return _Left(self.told, gain @ N @ gain.T, gain @ self.r, gain @ self.Q @ gain.T)
 
 
 def audit_frames(fit: PerFrameFit, frames: Sequence[FrameFit]) -> Audit:
@@ -200,27 +215,23 @@ class _Auditor:
 
     def __init__(self, fit: PerFrameFit, frames: Sequence[FrameFit]) -> None:
         self._fit, self._frames = fit, frames
-        self._joints = len(fit.joints)
-        self._is_angle = fit.is_angle
-        tolerance = np.where(self._is_angle, _ANGLE_SD, _SHIFT_SD)
+        tolerance = np.where(fit.is_angle, _ANGLE_SD, _SHIFT_SD)
         self._tolerance = np.diag((tolerance / fit.deviations) ** 2)
         self._explained = _explained(frames)
 
     def audit(self) -> Audit:
         """Does it."""
         # As long as nobody knows which frames agree, each one by itself tells how large errors are.
-        sizes = self._pooled_sizes(np.flatnonzero(self._explained), 1)
-        self._told = [self._tell(one, sizes) for one in self._frames]
-        self._surface = sizes.surface
-        agreeing = self._agreeing()
-        # Contradicting frames no longer make errors seem large.
-        sizes = self._pooled_sizes(np.flatnonzero(agreeing), _IN_GROUP)
-        self._told = [self._tell(one, sizes) for one in self._frames]
-        self._surface = sizes.surface
-        agreeing = self._agreeing()
+        agreeing, together = self._explained, 1
+        for _ in range(2):
+            sizes = self._pooled_sizes(np.flatnonzero(agreeing), together)
+            self._told = [self._tell(one, sizes) for one in self._frames]
+            self._surface = sizes.surface
+            # Contradicting frames no longer make errors seem large.
+            agreeing, together = self._agreeing(), _IN_GROUP
         total = self._sum(agreeing)
         frames = tuple(
-            self._audit_frame(k, total.with_frame(told, -1.0) if agreeing[k] else total)
+            self._audit_frame(k, _plus(total, told, -1.0) if agreeing[k] else total)
             for k, told in enumerate(self._told)
         )
         kept = np.array([one.finding is None for one in frames])
@@ -237,7 +248,7 @@ class _Auditor:
         for k in range(groups):
             pictures = [one for i in spread[k::groups] for one in self._frames[i].pictures]
             seen = self._distances(pictures)
-            is_angle = np.append(self._is_angle, np.zeros(len(pictures), bool))
+            is_angle = np.append(self._fit.is_angle, np.zeros(len(pictures), bool))
             sizes.append(estimate_sizes(seen, is_angle, least_camera=0.0))
         return ErrorSizes(*np.median(np.array(sizes), axis=0).tolist())
 
@@ -246,7 +257,7 @@ class _Auditor:
         outlines = self._fit.outlines
         return distances_in_pictures(outlines, with_widths(outlines, pictures))
 
-    def _tell(self, fitted: FrameFit, sizes: ErrorSizes) -> FrameInformation:
+    def _tell(self, fitted: FrameFit, sizes: ErrorSizes) -> _Told:
         seen = self._distances(fitted.pictures)
         own, widths = np.split(seen.X, [len(self._fit.names)], axis=1)
         X = own * self._fit.deviations
@@ -255,16 +266,13 @@ class _Auditor:
         N, h = X.T @ PX, PX.T @ seen.y
         T, rank = _statistic(h, N)
         left = max(float(seen.y @ Py[:, 0]) - T, 0.0)
-        freedom = KNOWN_BEFOREHAND + len(seen.y) - rank
-        scale = (KNOWN_BEFOREHAND + left) / freedom
-        moves = [one.moves * self._fit.deviations[:, None] for one in fitted.pictures]
-        outlines = sum(
-            m @ one.A @ np.swapaxes(m, 1, 2) for m, one in zip(moves, fitted.pictures, strict=True)
-        )
-        return FrameInformation(
-            N, h, PX.T @ seen.bends, np.asarray(outlines), fitted.weights, max(scale, 1.0),
-            float(freedom),
-        )  # fmt: skip
+        freedom = float(KNOWN_BEFOREHAND + len(seen.y) - rank)
+        scale = max((KNOWN_BEFOREHAND + left) / freedom, 1.0)
+        outlines = np.zeros((len(self._fit.outlines), *N.shape))
+        for one in fitted.pictures:
+            moves = one.moves * self._fit.deviations[:, None]
+            outlines += moves @ one.A @ np.swapaxes(moves, 1, 2)
+        return _Told(N, h, PX.T @ seen.bends, outlines, fitted.weights, scale, freedom)
 
     def _agreeing(self) -> Mask:
         """(frames,) the frames that agree: the likeliest of the sets that some starts lead to."""
@@ -276,192 +284,144 @@ class _Auditor:
         for kept in starts:
             for _ in range(_ROUNDS):
                 common = self._common(self._sum(kept))
-                now = self._explained & [
-                    self._p_value_of(told, common) > _SIGNIFICANCE for told in self._told
-                ]
+                left = [self._left(told, *common) for told in self._told]
+                now = self._explained & [_chance(one) > _SIGNIFICANCE for one in left]
                 if (now == kept).all():
                     break
                 kept = now
-            off = self._common(self._sum(kept)).x / _USUAL
+            off = self._common(self._sum(kept))[0] / _USUAL
             unlikely = _WRONG * np.count_nonzero(~kept) + 0.5 * float(off @ off)
             if unlikely < least:
                 best, least = kept, unlikely
         return best
 
-    def _sum(self, kept: Mask) -> _Sum:
-        """What some frames tell together."""
-        first = self._told[0]
-        total = _Sum(0, *(np.zeros_like(one) for one in (first.N, first.h, first.of_surface)))
+    def _sum(self, kept: Mask) -> _Told:
+        """What some frames tell together, each by the scale of its errors."""
+        arrays = (np.zeros_like(one) for one in self._told[0][:5])
+        total = _Told(*arrays, 1.0, 0.0)
         for k in np.flatnonzero(kept):
-            total = total.with_frame(self._told[k], 1.0)
+            total = _plus(total, self._told[k], 1.0)
         return total
 
-    def _common(self, total: _Sum) -> _Common:
-        """What some frames have in common; without any, that nothing is off."""
-        p = len(total.h)
-        Q = total.N + self._surface**2 * total.of_surface @ total.of_surface.T
+    def _covariance(self, total: _Told) -> Array:
+        """(p, p) of a sum's h, the surfaces' errors included."""
+        surface = self._surface * total.of_surface
+        return np.asarray(total.N + surface @ surface.T)
+
+    def _common(self, total: _Told) -> tuple[Array, Array]:
+        """What frames have in common, x (p,), and its covariance; without any, nothing is off."""
         # Without other frames what is given is right to within a tolerance.
-        prior = np.eye(p) if total.frames else np.linalg.inv(self._tolerance)
+        prior = np.eye(len(total.h)) if total.freedom else np.linalg.inv(self._tolerance)
         inverse = np.linalg.inv(total.N + prior)
-        covariance = inverse @ (Q + prior) @ inverse
-        return _Common(inverse @ total.h, covariance, total.N, total.h, Q)
+        return inverse @ total.h, inverse @ (self._covariance(total) + prior) @ inverse
 
-    def _left(self, told: FrameInformation, common: _Common) -> tuple[Array, Array]:
-        """A frame's h without what is common, and its covariance."""
-        Q = told.scale * told.N + told.N @ (common.covariance + self._tolerance) @ told.N
-        return told.h - told.N @ common.x, Q
+    def _left(self, told: _Told, x: Array, covariance: Array) -> _Left:
+        """What a frame tells beside what is common, x (p,) with its covariance."""
+        Q = told.scale * told.N + told.N @ (covariance + self._tolerance) @ told.N
+        return _Left(told, told.N, told.h - told.N @ x, Q)
 
-    def _p_value_of(self, told: FrameInformation, common: _Common) -> float:
-        return _p_value(*_statistic(*self._left(told, common), told.N), told.freedom)
-
-    def _audit_frame(self, k: int, others: _Sum) -> FrameAudit:
-        told, fitted = self._told[k], self._frames[k]
-        r, Q = self._left(told, self._common(others))
-        spread = told.scale * np.linalg.inv(told.N + np.eye(len(r)))
-        off = FrameDeviation(r, Q, np.asarray(spread @ r / told.scale), np.asarray(spread))
-        finding = self._frame_finding(told, off, self._causes(fitted), bool(self._explained[k]))
-        return FrameAudit(fitted.name, *fitted.inlier_ratios, _pixels([told], off.x), finding)
+    def _audit_frame(self, k: int, others: _Told) -> FrameAudit:
+        """A frame beside the others."""
+        fitted = self._frames[k]
+        left = self._left(self._told[k], *self._common(others))
+        pixels = left.told.pixels(left.solved(left.r))
+        finding = self._frame_finding(left, self._causes(fitted), pixels, bool(self._explained[k]))
+        return FrameAudit(fitted.name, *fitted.inlier_ratios, pixels, finding)
 
     def _frame_finding(
-        self, told: FrameInformation, off: FrameDeviation, causes: Sequence[Cause], explained: bool
+        self, left: _Left, causes: Sequence[_Cause], pixels: float, explained: bool
     ) -> Finding | None:
         """What contradicts the other frames in one of them."""
-        T, rank = _statistic(off.r, off.Q, told.N)
-        p_value = _p_value(T, rank, told.freedom)
-        pixels = _pixels([told], off.x)
+        p_value = _chance(left)
         if not explained:
-            return self._joints_finding("unexplained", off, p_value, pixels)
-        tests = [_Test.of(cause, off.r, told.N, off.Q, told.freedom) for cause in causes]
+            return self._joints_finding("unexplained", left, p_value, pixels)
+        tests = [left.test(cause) for cause in causes]
         # Each of the tests may find something by chance.
         least = min(p_value, *(one.p_value for one in tests)) * (1 + len(tests))
         if least > _SIGNIFICANCE or pixels < _LEAST_PIXELS:
             return None
-        sufficing = self._sufficing(tests, [told], off.r, told.N)
+        sufficing = left.sufficing(tests)
         if not sufficing:
-            return self._joints_finding("joints", off, p_value, pixels)
-        best, *rivals = sufficing
-        return self._finding(best, rivals, _pixels([told], best.x))
+            return self._joints_finding("joints", left, p_value, pixels)
+        return self._finding(sufficing, left.told.pixels(sufficing[0].x))
 
-    def _sufficing(
-        self, tests: Sequence[_Test], told: Sequence[FrameInformation], r: Array, N: Array
-    ) -> list[_Test]:
-        """Causes that leave little of what is off, r, those of fewer numbers first."""
-        solve = np.linalg.inv(N + np.eye(len(r)))
-        most = max(_LEAST_PIXELS, _EXPLAINED * _pixels(told, solve @ r))
-        left = [one for one in tests if _pixels(told, solve @ (r - N @ one.x)) < most]
-        return sorted(left, key=lambda one: (one.cause.moves.shape[1], -one.aic_gain))
-
-    def _causes(self, fitted: FrameFit | None) -> list[Cause]:
+    def _causes(self, fitted: FrameFit | None) -> list[_Cause]:
         """All that may be off by itself; of the cameras those that see a frame."""
-        eye = np.eye(len(self._fit.names))
-        causes = [Cause("joint", name, eye[:, [k]]) for k, name in enumerate(self._fit.joints)]
-        names = self._fit.camera_names
-        for c, name in enumerate(names):
+        p, deviations = len(self._fit.names), self._fit.deviations
+        joints, six = len(self._fit.joints), len(POSE_NAMES)
+        eye = np.eye(p)
+        causes = [
+            _Cause("joint", name, eye[:, [k]], deviations[[k]])
+            for k, name in enumerate(self._fit.joints)
+        ]
+        for c, name in enumerate(self._fit.camera_names):
             if fitted is None or c in {one.camera for one in fitted.pictures}:
-                first = self._joints + c * len(POSE_NAMES)
-                causes.append(Cause("camera", name, eye[:, first : first + len(POSE_NAMES)]))
-        if len(names) > 1:
-            causes.append(Cause(BASE, BASE, self._fit.base_moves()))
+                own = slice(joints + c * six, joints + (c + 1) * six)
+                causes.append(_Cause("camera", name, eye[:, own], deviations[own]))
+        if len(self._fit.camera_names) > 1:
+            causes.append(_Cause(BASE, BASE, self._fit.base_moves(), np.ones(six)))
         return causes
 
-    def _finding(self, best: _Test, others: Sequence[_Test], pixels: float) -> Finding:
+    def _finding(self, sufficing: Sequence[_Test], pixels: float) -> Finding:
+        """The first of the causes that suffice, and its rivals."""
+        best, *others = sufficing
         rivals = [one.cause.name for one in others]
-        if (
-            any(one.cause.kind == "camera" for one in (best, *others))
-            and len(self._fit.camera_names) == 1
-        ):
+        seen_by_one = len(self._fit.camera_names) == 1
+        if seen_by_one and any(one.cause.kind == "camera" for one in sufficing):
             rivals.append(BASE)
-        x = best.amount * best.units(self._fit.deviations)
-        sd = np.sqrt(np.diag(best.covariance)) * best.units(self._fit.deviations)
-        if best.cause.kind == "joint":
-            turns = bool(self._is_angle[self._fit.joints.index(best.cause.name)])
-            off = (float(x[0]), 0.0, float(sd[0]), 0.0)
-            if not turns:
-                off = (0.0, off[0], 0.0, off[2])
+        kind, name, _, units = best.cause
+        x, sd = best.amount * units, np.sqrt(np.diag(best.covariance)) * units
+        if kind != "joint":
+            turn, shift, turn_sd, shift_sd = (
+                float(np.linalg.norm(one)) for one in (x[:3], x[3:], sd[:3], sd[3:])
+            )
+        elif self._fit.is_angle[self._fit.joints.index(name)]:
+            turn, shift, turn_sd, shift_sd = float(x[0]), 0.0, float(sd[0]), 0.0
         else:
-            off = (
-                float(np.linalg.norm(x[:3])), float(np.linalg.norm(x[3:])),
-                float(np.linalg.norm(sd[:3])), float(np.linalg.norm(sd[3:])),
-            )  # fmt: skip
-        return Finding(best.cause.kind, best.cause.name, *off, pixels, best.p_value, tuple(rivals))
+            turn, shift, turn_sd, shift_sd = 0.0, float(x[0]), 0.0, float(sd[0])
+        off = (turn, shift, turn_sd, shift_sd)
+        return Finding(kind, name, *off, pixels, best.p_value, tuple(rivals))
 
-    def _joints_finding(
-        self, kind: str, off: FrameDeviation, p_value: float, pixels: float
-    ) -> Finding:
+    def _joints_finding(self, kind: str, left: _Left, p_value: float, pixels: float) -> Finding:
         """What is off in a frame where no cause by itself explains it."""
-        joints = (off.x * self._fit.deviations)[: self._joints]
-        turns = self._is_angle[: self._joints]
+        x, names = left.solved(left.r), self._fit.joints
+        sd = np.sqrt(left.told.scale * np.diag(np.linalg.inv(left.N + np.eye(len(x)))))
+        joints = (x * self._fit.deviations)[: len(names)]
+        turns = self._fit.is_angle[: len(names)]
         angle = float(np.abs(joints[turns]).max(initial=0.0))
         shift = float(np.abs(joints[~turns]).max(initial=0.0))
-        sure = np.abs(off.x) > _SURE * np.sqrt(np.diag(off.covariance))
-        named = {
-            name: float(one)
-            for name, one, is_sure in zip(self._fit.joints, joints, sure, strict=False)
-            if is_sure
-        }
+        sure = np.flatnonzero((np.abs(x) > _SURE * sd)[: len(names)])
+        named = {names[k]: float(joints[k]) for k in sure}
         return Finding(kind, "", angle, shift, 0.0, 0.0, pixels, p_value, (), named)
 
     def _common_findings(self, kept: Mask) -> tuple[Finding, ...]:
         """What is off in all frames that agree."""
         if not kept.any():
             return ()
-        told = [self._told[k] for k in np.flatnonzero(kept)]
-        common = self._common(self._sum(kept))
-        freedom = float(sum(one.freedom for one in told))
-        findings: list[Finding] = []
-        causes = self._causes(None)
-        r, N, Q = common.h, common.N, common.Q + common.N @ self._tolerance @ common.N / len(told)
+        told, count = self._sum(kept), np.count_nonzero(kept)
+        Q = self._covariance(told) + told.N @ self._tolerance @ told.N / count
+        left, causes, findings = _Left(told, told.N, told.h, Q), self._causes(None), list[Finding]()
         while causes:
-            tests = [_Test.of(cause, r, N, Q, freedom) for cause in causes]
-            sufficing = self._sufficing(tests, told, r, N)
-            best, *rivals = sufficing or [max(tests, key=lambda one: one.aic_gain)]
-            pixels = _pixels(told, best.x)
+            tests = [left.test(cause) for cause in causes]
+            sufficing = left.sufficing(tests) or [max(tests, key=lambda one: one.gain)]
+            best, pixels = sufficing[0], left.told.pixels(sufficing[0].x)
             if best.p_value * len(tests) > _SIGNIFICANCE or pixels < _LEAST_PIXELS:
                 break
-            findings.append(self._finding(best, rivals, pixels))
-            # What is left once that was put right.
-            M = best.cause.moves
-            gain = np.eye(len(r)) - N @ M @ np.linalg.pinv(M.T @ N @ M) @ M.T
-            r, Q, N = gain @ r, gain @ Q @ gain.T, gain @ N @ gain.T
+            findings.append(self._finding(sufficing, pixels))
+            left = left.without(best.cause)
             causes = [one for one in causes if one is not best.cause]
         return tuple(findings)
 
 
-class _Test(NamedTuple):
-    """Whether one cause is off: its statistic, rank and chance; by how much, with covariance."""
-
-    cause: Cause
-    T: float
-    rank: int
-    p_value: float
-    amount: Array
-    covariance: Array
-
-    @classmethod
-    def of(cls, cause: Cause, r: Array, N: Array, Q: Array, freedom: float) -> _Test:
-        M = cause.moves
-        T, rank = _statistic(M.T @ r, M.T @ Q @ M, M.T @ N @ M)
-        inverse = np.linalg.inv(M.T @ N @ M + 1e-3 * np.eye(M.shape[1]))
-        amount = inverse @ M.T @ r
-        return cls(
-            cause, T, rank, _p_value(T, rank, freedom), amount, inverse @ M.T @ Q @ M @ inverse
-        )
-
-    @property
-    def aic_gain(self) -> float:
-        """How well the cause explains what is off; more numbers explain more by chance."""
-        return self.T - 2.0 * self.rank
-
-    @property
-    def x(self) -> Array:
-        """(p,) what was free, off by this cause."""
-        return np.asarray(self.cause.moves @ self.amount)
-
-    def units(self, deviations: Array) -> Array:
-        """(d,) the units of the amount [rad or m]."""
-        if self.cause.kind == BASE:
-            return np.ones(self.cause.moves.shape[1])
-        return np.asarray(np.abs(self.cause.moves).T @ deviations)
+def _plus(total: _Told, told: _Told, sign: float) -> _Told:
+    """A sum with another frame, or without one of them: sign -1."""
+    weight = sign / told.scale
+    return _Told(
+        *(one + weight * other for one, other in zip(total[:3], told[:3], strict=True)),
+        *(one + sign * other for one, other in zip(total[3:5], told[3:5], strict=True)),
+        1.0,
+        total.freedom + sign * told.freedom,
+    )
 
 
 def _statistic(r: Array, Q: Array, N: Array | None = None) -> tuple[float, int]:
@@ -474,26 +434,22 @@ def _statistic(r: Array, Q: Array, N: Array | None = None) -> tuple[float, int]:
     return float(along @ np.linalg.solve(turn.T @ Q @ turn, along)), turn.shape[1]
 
 
+def _chance(left: _Left) -> float:
+    """How often so much is left by chance."""
+    return _p_value(*_statistic(left.r, left.Q, left.N), left.told.freedom)
+
+
 def _p_value(T: float, rank: int, freedom: float) -> float:
     """How often a statistic is as large by chance."""
     return float(fisher.sf(T / rank, rank, freedom)) if rank else 1.0
 
 
-def _pixels(told: Sequence[FrameInformation], x: Array) -> float:
-    """How far x moves the outlines of the parts that it moves, root mean square [pixel]."""
-    squares = np.sum([np.einsum("p,npq,q->n", x, one.outlines, x) for one in told], axis=0)
-    lengths = np.sum([one.lengths for one in told], axis=0)
-    moved = squares > 1e-6 * squares.max(initial=0.0)
-    return float(np.sqrt(squares[moved].sum() / max(lengths[moved].sum(), 1e-9)))
-
-
 def _explained(frames: Sequence[FrameFit]) -> Mask:
     """(frames,) whether something within reach explains all its pictures."""
-    best = {}
-    for name in {name for one in frames for name in one.inlier_ratios[1]}:
-        ratios = [one.inlier_ratios[1][name] for one in frames if name in one.inlier_ratios[1]]
-        best[name] = float(np.mean(sorted(ratios)[-max(2, len(ratios) // 4) :]))
-    least = {name: max(_FITS * ratio, _FITS_AT_ALL) for name, ratio in best.items()}
-    return np.array(
-        [all(ratio >= least[n] for n, ratio in one.inlier_ratios[1].items()) for one in frames]
-    )
+    fitted = [one.inlier_ratios[1] for one in frames]
+    least = {}
+    for name in {name for one in fitted for name in one}:
+        ratios = sorted(one[name] for one in fitted if name in one)
+        best = float(np.mean(ratios[-max(2, len(ratios) // 4) :]))
+        least[name] = max(_FITS * best, _FITS_AT_ALL)
+    return np.array([all(ratio >= least[name] for name, ratio in one.items()) for one in fitted])

@@ -7,7 +7,7 @@ cameras whose places are known hold the whole.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -17,7 +17,8 @@ from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.fit.contour_fit import Noise
 from drake_pose.fit.covariance import distances_in_pictures, estimate_sizes, values_covariance
-from drake_pose.fit.frames_fit import FittedFrames, FramesFit, parameter_names
+from drake_pose.fit.evidence import Evidence
+from drake_pose.fit.frames_fit import FramesFit, parameter_names
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import CAMERA_NAMES, GIRTH_PREFIX, BodyParameters
 from drake_pose.fit.unknowns import Unknowns, choose, join
@@ -81,8 +82,15 @@ class AdjustedBundle:
     girths: Array
 
 
-class BundleAdjustment:
-    """Fits poses and cameras together.
+def adjust_bundle(
+    kinematics: TreeKinematics,
+    outlines: Sequence[Outline],
+    cameras: Sequence[PinholeCamera],
+    unknown: Collection[str],
+    frames: Sequence[SeenFrame],
+    shape: CommonShape,
+) -> AdjustedBundle:
+    """Fits poses and cameras together, in the end as finely as the model is like the body.
 
     Args:
         cameras: all cameras, those that are unknown near where they stand.
@@ -91,106 +99,83 @@ class BundleAdjustment:
     Raises:
         MaskError: a mask of another size than its camera's picture, or no mask shows the body.
     """
+    values, size = np.array([frame.values for frame in frames]), common_size(cameras, frames)
+    body = BodyParameters(kinematics, outlines, shape.groups or None, shape.parts)
+    free = (kinematics.lower < kinematics.upper) & ~shape.lengths
+    looks = [k for k, camera in enumerate(cameras) if camera.name in unknown]
+    unknowns = _unknowns(body, free, shape.lengths, cameras, looks)
+    fit = FramesFit(
+        body, cameras, unknowns, pivot=middle_of(kinematics, frames),
+        noise=Noise.of_a_pixel(size), steps=STEPS, pixels=size,
+    )  # fmt: skip
+    edges = [frame.edges(cameras, _EDGE_SPACING * size) for frame in frames]
+    lengths = values[0, shape.lengths]
+    shared = np.zeros(len(unknowns.names) - unknowns.own_count)
+    shared[: len(lengths)] = lengths
+    start = own, now = values[:, free], shared
+    held = np.where(free | shape.lengths, 0.0, values)
+    found, rounds = None, list(_FIRST)
+    for scale in _SCALES:
+        rounds.append(AnnealingStage(scale, _SPACING, _ITERATIONS))
+        tried = fit.fit(edges, held, own, now, rounds, expected=start)
+        if found and tried.inlier_ratios[tried.inlier_ratios > 0.0].mean() < _FITS:
+            break
+        found, own, now, rounds = tried, tried.own, tried.shared, []
+    assert found is not None
+    girths = np.append(found.shared[len(lengths) : len(lengths) + len(shape.parts)], 0.0)
+    X_CW, _, _ = fit.places(found.parameters[0])
+    return AdjustedBundle(
+        tuple(replace(cameras[k], X_WC=np.linalg.inv(X_CW[k])) for k in looks),
+        _covariances(fit, edges, found.parameters, kinematics.is_angle[free], looks),
+        found.parameters[:, : values.shape[1]],
+        np.exp(girths[body.groups]),
+    )
 
-    def __init__(
-        self,
-        kinematics: TreeKinematics,
-        outlines: Sequence[Outline],
-        cameras: Sequence[PinholeCamera],
-        unknown: Sequence[str],
-        frames: Sequence[SeenFrame],
-        shape: CommonShape,
-    ) -> None:
-        self._kinematics, self._cameras = kinematics, tuple(cameras)
-        self._start = np.array([frame.values for frame in frames])
-        self._size = common_size(cameras, frames)
-        groups = shape.groups or [-1] * len(outlines)
-        self._body = BodyParameters(kinematics, outlines, groups, shape.parts)
-        self._unknown = [k for k, camera in enumerate(cameras) if camera.name in unknown]
-        self._own = np.flatnonzero((kinematics.lower < kinematics.upper) & ~shape.lengths)
-        self._shape = shape
-        self._fit = FramesFit(
-            self._body, cameras, self._unknowns(), pivot=middle_of(kinematics, frames),
-            noise=Noise.of_a_pixel(self._size), steps=STEPS, pixels=self._size,
-        )  # fmt: skip
-        self._evidence = [frame.edges(cameras, _EDGE_SPACING * self._size) for frame in frames]
 
-    def fit(self) -> AdjustedBundle:
-        """Fits all, in the end as finely as the model is like the body."""
-        found = self._fitted([*_FIRST, AnnealingStage(_SCALES[0], _SPACING, _ITERATIONS)], None)
-        for scale in _SCALES[1:]:
-            tried = self._fitted([AnnealingStage(scale, _SPACING, _ITERATIONS)], found)
-            if tried.inlier_ratios[tried.inlier_ratios > 0.0].mean() < _FITS:
-                break
-            found = tried
-        X_CW, _, _ = self._fit.places(found.parameters[0])
-        cameras = tuple(
-            replace(self._cameras[k], X_WC=np.linalg.inv(X_CW[k])) for k in self._unknown
+def _unknowns(
+    body: BodyParameters,
+    free: Mask,
+    lengths: Mask,
+    cameras: Sequence[PinholeCamera],
+    looks: Sequence[int],
+) -> Unknowns:
+    """Each frame's pose; and lengths, girths and cameras of all frames."""
+    kinematics, worth = body.kinematics, _POINT_ERROR * np.sqrt(_ERROR_LENGTH)
+    deviations = np.where(lengths, _LENGTH, np.where(kinematics.is_angle, _ANGLE, _PLACE))
+    girths = [name for name in body.names if name.startswith(GIRTH_PREFIX)]
+    names = [f"{cameras[k].name}.{name}" for k in looks for name in POSE_NAMES]
+    every = parameter_names(body, cameras)
+    own, shared = (
+        choose(
+            every, np.array(kinematics.names)[which].tolist(), shared=is_shared,
+            lower=kinematics.lower[which], upper=kinematics.upper[which],
+            deviation=deviations[which] / worth,
         )
-        girths = np.append(found.shared[self._girths()], 0.0)
-        groups = np.array(self._body.groups)
-        values = found.parameters[:, : len(self._kinematics.names)]
-        covariances = self._covariances(found)
-        return AdjustedBundle(cameras, covariances, values, np.exp(girths[groups]))
+        for which, is_shared in ((free, False), (lengths, True))
+    )  # fmt: skip
+    return join(
+        own, shared, choose(every, girths, shared=True, deviation=_GIRTH / worth),
+        choose(every, names, shared=True),
+    )  # fmt: skip
 
-    def _unknowns(self) -> Unknowns:
-        """Each frame's pose; and lengths, girths and cameras of all frames."""
-        body, kinematics = self._body, self._kinematics
-        worth = _POINT_ERROR * np.sqrt(_ERROR_LENGTH)
-        names = np.array(kinematics.names)
-        free = np.where(kinematics.is_angle, _ANGLE, _PLACE) / worth
-        girths = [name for name in body.names if name.startswith(GIRTH_PREFIX)]
-        lengths = np.flatnonzero(self._shape.lengths)
-        all_names = parameter_names(body, self._cameras)
 
-        def values(which: NDArray[np.intp], deviation: Array | float, shared: bool) -> Unknowns:
-            return choose(
-                all_names, names[which].tolist(), shared=shared, lower=kinematics.lower[which],
-                upper=kinematics.upper[which], deviation=deviation,
-            )  # fmt: skip
-
-        cameras = [f"{self._cameras[k].name}.{name}" for k in self._unknown for name in POSE_NAMES]
-        return join(
-            values(self._own, free[self._own], shared=False),
-            values(lengths, _LENGTH / worth, shared=True),
-            choose(all_names, girths, shared=True, deviation=_GIRTH / worth),
-            choose(all_names, cameras, shared=True),
-        )
-
-    def _girths(self) -> slice:
-        """Where among the shared unknowns the girths are."""
-        first = int(np.count_nonzero(self._shape.lengths))
-        return slice(first, first + len(self._shape.parts))
-
-    def _fitted(self, rounds: Sequence[AnnealingStage], found: FittedFrames | None) -> FittedFrames:
-        """Fitted from where an earlier fit ended, or from the start."""
-        held, lengths = self._start.copy(), np.flatnonzero(self._shape.lengths)
-        held[:, self._own] = held[:, lengths] = 0.0
-        shared = np.zeros(len(self._fit.unknowns.names) - len(self._own))
-        shared[: len(lengths)] = self._start[0, lengths]
-        start = self._start[:, self._own], shared
-        own, now = start if found is None else (found.own, found.shared)
-        return self._fit.fit(self._evidence, held, own, now, rounds, expected=start)
-
-    def _covariances(self, found: FittedFrames) -> Array:
-        """(c, 6, 6) of the unknown cameras' poses."""
-        frames = np.unique(
-            np.linspace(0, len(self._start) - 1, _TELLING_FRAMES).round().astype(int)
-        )
-        pictures = self._fit.pictures(
-            [self._evidence[k] for k in frames], found.parameters[frames], _UNCUT
-        )
-        seen = distances_in_pictures(self._body.outlines, pictures, _MOST_DISTANCES)
-        own = self._kinematics.is_angle[self._own]
-        shared = [name.split(".")[-1] in CAMERA_NAMES[:3] for name in self._fit.unknowns.names]
-        is_angle = np.concatenate([np.tile(own, len(frames)), shared[len(own) :]])
-        sizes = estimate_sizes(seen, is_angle, prior_deviation=PRIOR_DEVIATION)
-        whole = values_covariance(seen, sizes, np.arange(len(is_angle)), is_angle)
-        X_CW, _, motions = self._fit.places(found.parameters[0])
-        first = len(whole) - len(POSE_NAMES) * len(self._unknown)
-        return np.array(
-            [
-                pose_covariance(X_CW[k], motions[k, :6], whole[at : at + 6, at : at + 6])
-                for at, k in zip(range(first, len(whole), 6), self._unknown, strict=True)
-            ]
-        )
+def _covariances(
+    fit: FramesFit, edges: Sequence[Evidence], parameters: Array, own: Mask, looks: Sequence[int]
+) -> Array:
+    """(c, 6, 6) of the unknown cameras' poses; own: (p,) which own unknowns are angles."""
+    count = len(edges)
+    frames = np.unique(np.linspace(0, count - 1, _TELLING_FRAMES).round().astype(int))
+    pictures = fit.pictures([edges[k] for k in frames], parameters[frames], _UNCUT)
+    seen = distances_in_pictures(fit.body.outlines, pictures, _MOST_DISTANCES)
+    shared = [name.split(".")[-1] in CAMERA_NAMES[:3] for name in fit.unknowns.names[len(own) :]]
+    is_angle = np.concatenate([np.tile(own, len(frames)), shared])
+    sizes = estimate_sizes(seen, is_angle, prior_deviation=PRIOR_DEVIATION)
+    whole = values_covariance(seen, sizes, np.arange(len(is_angle)), is_angle)
+    X_CW, _, motions = fit.places(parameters[0])
+    first = len(whole) - 6 * len(looks)
+    return np.array(
+        [
+            pose_covariance(X_CW[k], motions[k, :6], whole[at : at + 6, at : at + 6])
+            for at, k in zip(range(first, len(whole), 6), looks, strict=True)
+        ]
+    )

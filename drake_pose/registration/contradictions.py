@@ -297,8 +297,8 @@ class _Auditor:
 
     def _sum(self, kept: Mask) -> _Told:
         """What some frames tell together, each by the scale of its errors."""
-        arrays = (np.zeros_like(one) for one in self._told[0][:5])
-        total = _Told(*arrays, 1.0, 0.0)
+        first = self._told[0]
+        total = _plus(first._replace(scale=1.0), first._replace(scale=1.0), -1.0)
         for k in np.flatnonzero(kept):
             total = _plus(total, self._told[k], 1.0)
         return total
@@ -416,11 +416,13 @@ class _Auditor:
 def _plus(total: _Told, told: _Told, sign: float) -> _Told:
     """A sum with another frame, or without one of them: sign -1."""
     weight = sign / told.scale
-    return _Told(
-        *(one + weight * other for one, other in zip(total[:3], told[:3], strict=True)),
-        *(one + sign * other for one, other in zip(total[3:5], told[3:5], strict=True)),
-        1.0,
-        total.freedom + sign * told.freedom,
+    return total._replace(
+        N=total.N + weight * told.N,
+        h=total.h + weight * told.h,
+        of_surface=total.of_surface + weight * told.of_surface,
+        outlines=total.outlines + sign * told.outlines,
+        lengths=total.lengths + sign * told.lengths,
+        freedom=total.freedom + sign * told.freedom,
     )
 
 

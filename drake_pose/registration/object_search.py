@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +21,7 @@ from drake_pose.body.model import OBJECT_POSITIONS
 from drake_pose.body.tree.joint_map import inverse_transforms
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
+from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.registration.posed_frames import LAST_SPACING, PosedFrame, PosedFrames
 from drake_pose.registration.register import (
     COARSE,
@@ -39,11 +39,11 @@ from drake_pose.registration.register import (
 )
 from drake_pose.registration.shared_fit import ROUNDS_WITH_CONSTANTS, Shared, SharedFit
 from drake_pose.registration.standing_object import StandingObject, require_turns, turns_between
-from drake_pose.registration.start_poses import E_total, areas
+from drake_pose.registration.start_poses import E_total, apart_from_before, areas
 
 Array = NDArray[np.float64]
-Look = tuple[Array, Array]
-"""X_LC and X_WT, (4, 4) each."""
+Look = Array
+"""(2, 4, 4): the camera's pose X_LC in the hand's frame, and the object's, X_WT."""
 
 # Of each picture so many poses of the object are kept; and so many starts and looks of all.
 _OF_A_PICTURE, _STARTS, _LOOKS = 8, 12, 4
@@ -57,16 +57,6 @@ _WORSE_BY, _WORSE_TIMES = 0.02, 2.0
 _SAME_ANGLE = np.radians(20.0)
 # So many threes of pictures are looked at, and of each so many of the object's poses.
 _THREES, _MOST_OF_ONE = 24, 500
-
-
-class HandEye(NamedTuple):
-    """Cameras on a hand, and where an object stands.
-
-    X_LC: (n, 4, 4) the cameras' poses in the hand's frame; X_WT: (n, 4, 4) the object's.
-    """
-
-    X_LC: Array
-    X_WT: Array
 
 
 class ObjectSearch:
@@ -99,33 +89,31 @@ class ObjectSearch:
             (FINE, FINE_SPACING, "few"),
             (ROUNDS_WITH_CONSTANTS, LAST_SPACING, "all"),
         ):
-            fits = [self._fit(camera, frames, look, spacing, surfaces) for look in looks]
             fitted = [
-                self._look(fit, fit.fit(rounds), look[1])
-                for fit, look in zip(fits, looks, strict=True)
+                self._fitted(self._fit(camera, frames, look, spacing, surfaces), rounds, look)
+                for look in looks
             ]
             looks = self._distinct(fitted, frames)
-        fits, founds = [], []
+        fits = []
         for k, look in enumerate(looks):
             fit = self._fit(camera, frames, look)
             now = with_widths(fit)
             # Where it stands now is where a last fit finds it.
-            looks[k] = self._look(fit, now, look[1])
-            fits.append(self._fit(camera, frames, looks[k]))
-            founds.append(Shared(0.0 * now.shared, now.widths))
-        found, covariance, as_good = describe_fitted(list(zip(fits, founds, strict=True)))
+            looks[k] = self._look(fit, now, look)
+            fits.append(
+                (self._fit(camera, frames, looks[k]), now._replace(shared=0.0 * now.shared))
+            )
+        found, covariance, as_good = describe_fitted(fits)
         X_LC, X_WT = looks[as_good[0]]
         others = [X_WT @ turn for turn in self._standing.symmetry.told_apart[1:]]
         # Where the camera would be elsewhere, too, that is told with the camera.
-        others += [
-            X
-            for camera_too, X in (looks[k] for k in as_good[1:])
-            if not self._differ(camera_too[None], X_LC[None])
-        ]
+        as_well = [looks[k] for k in as_good[1:]]
+        others += [one[1] for one in as_well if not self._differ(one[:1], X_LC[None])]
+        apart = [X[0] for X in self._apart([X[None] for X in (X_WT, *others)], np.eye(4)[None])]
         seen = ObjectPose(
             X_WT,
             self._standing.pose_covariance(X_WT, covariance[6:, 6:]),
-            np.array(self._apart([X_WT, *others])[1:]).reshape(-1, 4, 4),
+            np.array(apart[1:]).reshape(-1, 4, 4),
             self._standing.symmetry.axes,
         )
         agreeing = [one for one, fit in zip(frames, found.frames, strict=True) if fit.agrees]
@@ -136,33 +124,26 @@ class ObjectSearch:
         """Where the best one may be near, best first."""
         some = spread(frames)
         alone = [PosedFrame(one.name, np.zeros(0), one.mask) for one in some]
-        X_CT = [
-            np.array(self._apart(self._alone.search(camera, [one], _OF_A_PICTURE), alike=True))
-            for one in alone
-        ]
+        turns = self._standing.symmetry.turns
+        X_CT = []
+        for one in alone:
+            found = self._alone.search(camera, [one], _OF_A_PICTURE)
+            X_CT.append(np.concatenate(self._apart([X[None] for X in found], turns)))
         X_WL = self._standing.hand_poses(np.array([one.values for one in some]))
-        found = hand_eye_starts(X_WL, X_CT, self._standing.symmetry.turns)
-        if not len(found.X_LC):
+        starts = hand_eye_starts(X_WL, X_CT, turns)
+        if not len(starts):
             raise RegistrationError(
                 f"camera '{camera.name}': in no three of its frames the object turns before the "
                 "camera as the link does: are these masks of this object, did it stand still, are "
                 "the joint positions those of these frames, and is it this link that the camera "
                 "rides on? Nothing was written"
             )
-        off = self._misfits(camera, alone, X_WL, found, FIRST_SIDE)
-        order = np.argsort(off, kind="stable")
-        starts = self._distinct(
-            [(found.X_LC[k], found.X_WT[k]) for k in order[: 10 * _STARTS]], some
-        )
-        fits = [
-            self._fit(camera, some, look, COARSE_SPACING, "very_few") for look in starts[:_STARTS]
-        ]
+        order = np.argsort(self._misfits(camera, alone, X_WL, starts, FIRST_SIDE), kind="stable")
         fitted = [
-            self._look(fit, fit.fit(COARSE), look[1])
-            for fit, look in zip(fits, starts, strict=False)
+            self._fitted(self._fit(camera, some, look, COARSE_SPACING, "very_few"), COARSE, look)
+            for look in self._distinct(starts[order[: 10 * _STARTS]], some)[:_STARTS]
         ]
-        both = HandEye(np.array([one[0] for one in fitted]), np.array([one[1] for one in fitted]))
-        off = self._misfits(camera, alone, X_WL, both, SECOND_SIDE)
+        off = self._misfits(camera, alone, X_WL, np.array(fitted), SECOND_SIDE)
         limit = _WORSE_BY + _WORSE_TIMES * float(off.min())
         order = np.argsort(off, kind="stable")
         return self._distinct([fitted[k] for k in order if off[k] <= limit], some)[:_LOOKS]
@@ -172,15 +153,15 @@ class ObjectSearch:
         camera: PinholeCamera,
         alone: Sequence[PosedFrame],
         X_WL: Array,
-        looks: HandEye,
+        looks: Array,
         side: float,
     ) -> Array:
-        """(n,) E_total in the mean of the frames; one counts one at most."""
-        off = np.zeros(len(looks.X_LC))
+        """(n,) E_total of looks (n, 2, 4, 4) in the mean of the frames; one counts one at most."""
+        off = np.zeros(len(looks))
         for frame, X in zip(alone, X_WL, strict=True):
             body = self._standing.alone
             posed = PosedFrames(body.kinematics, body.very_few, camera, [frame])
-            X_CT = inverse_transforms(X @ looks.X_LC) @ looks.X_WT
+            X_CT = inverse_transforms(X @ looks[:, 0]) @ looks[:, 1]
             off += np.minimum(E_total(areas(posed, X_CT, side))[:, 0], 1.0) / len(alone)
         return off
 
@@ -197,37 +178,32 @@ class ObjectSearch:
         seen = PosedFrames(body.kinematics, getattr(body, surfaces), camera, frames, spacing)
         return SharedFit([seen], [inverse_transforms(look[0])], OBJECT_POSITIONS)
 
-    def _look(self, fit: SharedFit, found: Shared, X_WT: Array) -> Look:
-        """What was found, from where the object stood before."""
-        moved = self._standing.moved(X_WT, found.shared[fit.per_camera :])
-        return fit.cameras(found)[0].X_WC, moved
+    def _look(self, fit: SharedFit, found: Shared, look: Look) -> Look:
+        """What was found from where a look has camera and object."""
+        moved = self._standing.moved(look[1], found.shared[fit.per_camera :])
+        return np.array([fit.cameras(found)[0].X_WC, moved])
 
-    def _distinct(self, looks: Sequence[Look], frames: Sequence[PosedFrame]) -> list[Look]:
+    def _fitted(self, fit: SharedFit, rounds: Sequence[AnnealingStage], look: Look) -> Look:
+        return self._look(fit, fit.fit(rounds), look)
+
+    def _distinct(self, looks: Sequence[Look] | Array, frames: Sequence[PosedFrame]) -> list[Look]:
         """Those of some looks that see the object otherwise than all before them.
 
         An object that looks alike after a turn is the same.
         """
         X_WL = self._standing.hand_poses(np.array([one.values for one in frames]))
-        kept: list[Look] = []
-        seen: list[Array] = []
-        for X_LC, X_WT in looks:
-            X_CT = inverse_transforms(X_WL @ X_LC) @ X_WT
-            if all(self._differ(X_CT, one) for one in seen):
-                kept.append((X_LC, X_WT))
-                seen += list(X_CT[None] @ self._standing.symmetry.turns[:, None])
-        return kept
+        X_CT = [inverse_transforms(X_WL @ X_LC) @ X_WT for X_LC, X_WT in looks]
+        kept = self._apart(X_CT, self._standing.symmetry.turns)
+        return [look for look, X in zip(looks, X_CT, strict=True) if any(X is one for one in kept)]
 
-    def _apart(self, poses: Sequence[Array], alike: bool = False) -> list[Array]:
-        """Those of some poses (4, 4) of the object that are apart from all before them.
+    def _apart(self, poses: Sequence[Array], turns: Array) -> list[Array]:
+        """Those of some poses (n, 4, 4) of the object that are apart from all before them.
 
-        alike: whether those at which it looks alike are one.
+        turns: (t, 4, 4) after which they are the same.
         """
-        turns = self._standing.symmetry.turns if alike else np.eye(4)[None]
-        kept: list[Array] = []
-        for X in poses:
-            if all(self._differ(X[None], one @ turn) for one in kept for turn in turns):
-                kept.append(X)
-        return kept
+        return apart_from_before(
+            poses, lambda X, other: all(self._differ(X, other @ turn) for turn in turns)
+        )
 
     def _differ(self, X: Array, others: Array) -> bool:
         """Whether poses (n, 4, 4) put the object's ball elsewhere, root mean square."""
@@ -238,8 +214,8 @@ class ObjectSearch:
         return bool(off > _APART * self._standing.radius)
 
 
-def hand_eye_starts(X_WL: Array, X_CT: Sequence[Array], turns: Array) -> HandEye:
-    """What three pictures each say, those that turn the hand most first.
+def hand_eye_starts(X_WL: Array, X_CT: Sequence[Array], turns: Array) -> Array:
+    """(n, 2, 4, 4) looks that three pictures each say, those that turn the hand most first.
 
     Args:
         X_WL: (frames, 4, 4) the hand's poses.
@@ -256,10 +232,10 @@ def hand_eye_starts(X_WL: Array, X_CT: Sequence[Array], turns: Array) -> HandEye
     turned = [(one[:, None] @ turns).reshape(-1, 4, 4) for one in X_CT]
     # The object's frame is as it is in the first one, however it looks.
     found = [_of_three(X_WL[[i, j, k]], (X_CT[i], turned[j], turned[k])) for i, j, k in chosen]
-    return HandEye(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+    return np.concatenate(found)
 
 
-def _of_three(X_WL: Array, X_CT: Sequence[Array]) -> HandEye:
+def _of_three(X_WL: Array, X_CT: Sequence[Array]) -> Array:
     """What three pictures say: for those of the object's poses that turn as the hand does."""
     pairs = ((0, 1), (0, 2), (1, 2))
     A = np.array([np.linalg.inv(X_WL[j]) @ X_WL[i] for i, j in pairs])
@@ -281,7 +257,7 @@ def _of_three(X_WL: Array, X_CT: Sequence[Array]) -> HandEye:
     X_LC = np.tile(np.eye(4), (len(kept), 1, 1))
     X_LC[:, :3, :3] = R_LC
     X_LC[:, :3, 3] = np.einsum("nij,nj->ni", np.linalg.pinv(M, rcond=1e-3), t)
-    return HandEye(X_LC, _mean_poses(X_WL @ X_LC[:, None] @ poses))
+    return np.stack([X_LC, _mean_poses(X_WL @ X_LC[:, None] @ poses)], axis=1)
 
 
 def _angles(X: Array, others: Array) -> Array:

@@ -21,7 +21,7 @@ from scipy.special import fdtri
 
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, SettingsError
-from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
+from drake_pose.registration.posed_frames import PosedFrame, PosedFrames, placed_points
 from drake_pose.registration.register import CameraSearch, RegisteredCamera, RegistrationBody
 from drake_pose.registration.start_poses import E_total, areas
 
@@ -149,15 +149,12 @@ class OnlineRegistration:
         """
         if not frame.mask.any():
             return state
-        if state.registered is None:
-            return self._collect(state, frame)
-        return self._follow(state, state.registered, frame)
-
-    def _collect(self, state: OnlineState, frame: PosedFrame) -> OnlineState:
-        """Before the camera is found."""
-        if self._nearest(frame, state.keyframes) is not None:
+        near = self._nearest(frame, state.keyframes)
+        if state.registered is not None:
+            return self._follow(state, state.registered, frame, near)
+        if near is not None:
             return state
-        keyframes = (*state.keyframes, frame)[-self.settings.most_frames :]
+        keyframes = self._kept(state.keyframes, frame, None)
         if len(keyframes) >= self.settings.least_frames:
             found = self._find(keyframes)
             if found is not None:
@@ -165,20 +162,20 @@ class OnlineRegistration:
         return replace(state, keyframes=keyframes)
 
     def _follow(
-        self, state: OnlineState, registered: RegisteredCamera, frame: PosedFrame
+        self, state: OnlineState, registered: RegisteredCamera, frame: PosedFrame, near: int | None
     ) -> OnlineState:
-        """After it was found."""
-        near = self._nearest(frame, state.keyframes)
+        """After the camera was found; near: the keyframe in which the body stands alike."""
         if near is not None:
+            posed = PosedFrames(self.body.kinematics, self.body.few, registered.camera, [frame])
+            found = areas(posed, registered.camera.X_CW[None], np.inf)
             usual = registered.frames[near].E_total
-            if self._misfit(registered.camera, frame) <= usual + self.settings.tolerance:
+            if float(E_total(found)[0, 0]) <= usual + self.settings.tolerance:
                 return replace(state, contradicting=(), contradictions=0)
-        kept = [one for k, one in enumerate(state.keyframes) if k != near]
-        keyframes = (*kept, frame)[-self.settings.most_frames :]
-        found = self._search.refine(registered.camera, keyframes)
-        newest = found.frames[-1]
-        if newest.agrees and newest.inlier_ratio >= _CONTRADICTS * _usual_inlier_ratio(registered):
-            return self._settle(_registered(state, found, keyframes), found)
+        keyframes = self._kept(state.keyframes, frame, near)
+        again = self._search.refine(registered.camera, keyframes)
+        newest = again.frames[-1]
+        if newest.agrees and newest.inlier_ratio >= _least_inlier_ratio(registered):
+            return self._settle(_registered(state, again, keyframes), again)
         return self._contradict(state, registered, frame)
 
     def _settle(self, state: OnlineState, registered: RegisteredCamera) -> OnlineState:
@@ -190,7 +187,7 @@ class OnlineRegistration:
         if alone.contradictions:
             return state
         if self._is_elsewhere(state, alone, registered):
-            return _moved(state, alone, newest)
+            return _registered(state, alone, newest, moved=True)
         distances = (*state.distances, _distance(alone, registered))
         return replace(state, distances=distances[-2 * self.settings.most_frames :])
 
@@ -211,31 +208,26 @@ class OnlineRegistration:
     ) -> OnlineState:
         """Another frame contradicts; the camera elsewhere, where they agree with one another."""
         near = self._nearest(frame, state.contradicting)
-        kept = [one for k, one in enumerate(state.contradicting) if k != near]
-        frames = (*kept, frame)[-self.settings.most_frames :]
+        frames = self._kept(state.contradicting, frame, near)
         state = replace(state, contradicting=frames, contradictions=state.contradictions + 1)
         if near is not None or len(frames) < self.settings.newest:
             return state
-        found = self._find_again(registered, frames)
+        least = _least_inlier_ratio(registered)
+        found: RegisteredCamera | None = self._search.refine(registered.camera, frames)
+        assert found is not None
+        if not (
+            self._is_bump(registered.camera, found.camera, frame)
+            and self._is_found(found, self.settings.newest, least)
+        ):
+            enough = len(frames) >= self.settings.least_frames
+            found = self._find(frames, least) if enough else None
         if found is None:
             return state
         if self._is_elsewhere(state, found, registered):
-            return _moved(state, found, frames)
+            return _registered(state, found, frames, moved=True)
         # What is known of the pose was not worth as much as it seemed.
         frames = (*state.keyframes, *frames)[-self.settings.most_frames :]
         return _registered(state, self._search.refine(found.camera, frames), frames)
-
-    def _find_again(
-        self, registered: RegisteredCamera, frames: Sequence[PosedFrame]
-    ) -> RegisteredCamera | None:
-        """Where frames that contradict the pose agree with one another; None: nowhere."""
-        least = _CONTRADICTS * _usual_inlier_ratio(registered)
-        found = self._search.refine(registered.camera, frames)
-        if self._is_bump(registered.camera, found.camera, frames[-1]) and self._is_found(
-            found, self.settings.newest, least
-        ):
-            return found
-        return self._find(frames, least) if len(frames) >= self.settings.least_frames else None
 
     def _is_bump(self, camera: PinholeCamera, moved: PinholeCamera, frame: PosedFrame) -> bool:
         """Whether a camera is still near to where it was."""
@@ -254,19 +246,20 @@ class OnlineRegistration:
 
     def _is_found(self, found: RegisteredCamera, count: int, least: float) -> bool:
         """Whether so many frames, and more than half, agree; of which a share fits at least."""
-        if len(found.alternatives):
-            return False
         agreeing = [frame for frame in found.frames if frame.agrees]
         return (
-            len(agreeing) >= max(count, len(found.frames) // 2 + 1)
+            not len(found.alternatives)
+            and len(agreeing) >= max(count, len(found.frames) // 2 + 1)
             and float(np.mean([frame.iou for frame in agreeing])) >= self.settings.lowest_iou
             and float(np.median([frame.inlier_ratio for frame in agreeing])) >= least
         )
 
-    def _misfit(self, camera: PinholeCamera, frame: PosedFrame) -> float:
-        """A frame's E_total at a camera's pose."""
-        posed = PosedFrames(self.body.kinematics, self.body.few, camera, [frame])
-        return float(E_total(areas(posed, camera.X_CW[None], np.inf))[0, 0])
+    def _kept(
+        self, frames: Sequence[PosedFrame], frame: PosedFrame, instead_of: int | None
+    ) -> tuple[PosedFrame, ...]:
+        """The newest of some frames and another one, which may stand for one of them."""
+        others = [one for k, one in enumerate(frames) if k != instead_of]
+        return (*others, frame)[-self.settings.most_frames :]
 
     def _nearest(self, frame: PosedFrame, frames: Sequence[PosedFrame]) -> int | None:
         """The last of the frames in which the body stands as in another one; None: none does."""
@@ -280,9 +273,7 @@ class OnlineRegistration:
 
     def _points(self, frame: PosedFrame) -> Array:
         """(n, 3) of the body in the world."""
-        X_WN = self.body.kinematics.poses(frame.values)
-        placed = zip(self.body.very_few, X_WN, strict=True)
-        return np.concatenate([one.vertices @ X[:3, :3].T + X[:3, 3] for one, X in placed])
+        return placed_points(self.body.very_few, self.body.kinematics.poses(frame.values))
 
 
 def pose_difference(X_WC: Array, from_X_WC: Array) -> Array:
@@ -293,21 +284,13 @@ def pose_difference(X_WC: Array, from_X_WC: Array) -> Array:
 
 
 def _registered(
-    state: OnlineState, found: RegisteredCamera, frames: Sequence[PosedFrame]
+    state: OnlineState, found: RegisteredCamera, frames: Sequence[PosedFrame], moved: bool = False
 ) -> OnlineState:
-    """The state in which the frames that agree are kept."""
+    """The state in which the frames that agree are kept; moved: the camera is elsewhere."""
     pairs = [(one, frame) for one, frame in zip(frames, found.frames, strict=True) if frame.agrees]
     kept = replace(found, frames=tuple(frame for _, frame in pairs))
-    return OnlineState(
-        tuple(one for one, _ in pairs), (), kept, moves=state.moves, distances=state.distances
-    )
-
-
-def _moved(
-    state: OnlineState, found: RegisteredCamera, frames: Sequence[PosedFrame]
-) -> OnlineState:
-    """The same for a camera that was found elsewhere."""
-    return _registered(replace(state, moves=state.moves + 1), found, frames)
+    keyframes = tuple(one for one, _ in pairs)
+    return OnlineState(keyframes, (), kept, 0, state.moves + moved, state.distances)
 
 
 def _distance(found: RegisteredCamera, registered: RegisteredCamera) -> float:
@@ -316,6 +299,6 @@ def _distance(found: RegisteredCamera, registered: RegisteredCamera) -> float:
     return float(off @ np.linalg.solve(found.covariance, off))
 
 
-def _usual_inlier_ratio(registered: RegisteredCamera) -> float:
-    """Of both contours' lengths, what fits in the median frame."""
-    return float(np.median([frame.inlier_ratio for frame in registered.frames]))
+def _least_inlier_ratio(registered: RegisteredCamera) -> float:
+    """Of both contours' lengths, what fits at least in a frame that does not contradict."""
+    return _CONTRADICTS * float(np.median([frame.inlier_ratio for frame in registered.frames]))

@@ -94,8 +94,7 @@ class PosedFrames:
         return float(np.sqrt((off**2).sum(axis=1).mean()))
 
     def _hull(self, X_WN: Array) -> Array:
-        placed = zip(self.outlines, X_WN, strict=True)
-        points = np.concatenate([one.vertices @ X[:3, :3].T + X[:3, 3] for one, X in placed])
+        points = placed_points(self.outlines, X_WN)
         try:
             return np.asarray(points[ConvexHull(points).vertices])
         except QhullError:
@@ -133,6 +132,12 @@ class PosedFrames:
             )
             sums.append(prefix_sums(shrunk > 0.5))
         return small, np.array(sums)
+
+
+def placed_points(outlines: Sequence[Outline], X_WN: Array) -> Array:
+    """(n, 3) the vertices of nodes' surfaces in the world, the nodes at X_WN (nodes, 4, 4)."""
+    placed = zip(outlines, X_WN, strict=True)
+    return np.concatenate([one.vertices @ X[:3, :3].T + X[:3, 3] for one, X in placed])
 
 
 @dataclass(frozen=True, eq=False)

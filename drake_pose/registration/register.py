@@ -27,6 +27,7 @@ from drake_pose.registration.posed_frames import LAST_SPACING, PosedFrame, Posed
 from drake_pose.registration.shared_fit import Shared, SharedFit, fit_pose
 from drake_pose.registration.start_poses import (
     E_total,
+    apart_from_before,
     areas,
     intersection_over_union,
     place_by_bounds,
@@ -288,16 +289,14 @@ def mean_misfit(frames: PosedFrames, X_CW: Array, side: float) -> Array:
 def distinct(frames: PosedFrames, X_CW: Sequence[Array]) -> list[Array]:
     """Those of some poses (4, 4) that show the bodies elsewhere than all before them."""
     points = np.concatenate(frames.points)
-    kept: list[Array] = []
-    pictures: list[Array] = []
-    for X in X_CW:
-        uv, _ = frames.camera.with_pose(np.linalg.inv(X)).project(points)
+    uv = [frames.camera.with_pose(np.linalg.inv(X)).project(points)[0] for X in X_CW]
+
+    def differ(i: int, j: int) -> bool:
         # A point behind the camera is nowhere.
-        off = [np.nan_to_num(uv - one, nan=frames.size) for one in pictures]
-        if all(np.sqrt((one**2).sum(axis=1).mean()) > _APART * frames.size for one in off):
-            kept.append(X)
-            pictures.append(uv)
-    return kept
+        off = np.nan_to_num(uv[i] - uv[j], nan=frames.size)
+        return bool(np.sqrt((off**2).sum(axis=1).mean()) > _APART * frames.size)
+
+    return [X_CW[k] for k in apart_from_before(range(len(X_CW)), differ)]
 
 
 def with_widths(fit: SharedFit) -> Shared:

@@ -23,6 +23,7 @@ from drake_pose.errors import RegistrationError, SettingsError
 from drake_pose.fit.surfaces import FEW, few_triangles, surface_distance
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import ObjectPose, RegistrationBody
+from drake_pose.registration.start_poses import apart_from_before
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 
@@ -53,13 +54,14 @@ class Symmetry(NamedTuple):
     @property
     def told_apart(self) -> Array:
         """(n, 4, 4) those of the turns that differ in more than a turn about such axes."""
-        kept: list[Array] = []
-        for X in self.turns:
-            # Where the axes point is all that is seen of a round object's turn.
-            directions = [self.axes @ (X[:3, :3] - one[:3, :3]).T for one in kept]
-            if not len(self.axes) or all(np.abs(one).max() > 0.1 for one in directions):
-                kept.append(X)
-        return np.array(kept)
+        if not len(self.axes):
+            return self.turns
+        points = self.axes @ np.swapaxes(self.turns[:, :3, :3], 1, 2)
+        # Where the axes point is all that is seen of a round object's turn.
+        pointing = apart_from_before(
+            range(len(self.turns)), lambda i, j: bool(np.abs(points[i] - points[j]).max() > 0.1)
+        )
+        return self.turns[pointing]
 
 
 class StandingObject:
@@ -219,11 +221,8 @@ class StandingObject:
 
 def _with_products(rotations: list[Array], own: list[Array]) -> list[Array]:
     """Rotations (3, 3), and those after each of some others; each of them once."""
-    found: list[Array] = []
-    for R in [*rotations, *(one @ R for R in rotations for one in own)]:
-        if all(np.trace(R.T @ other) < 2.999 for other in found):
-            found.append(R)
-    return found
+    products = [*rotations, *(one @ R for R in rotations for one in own)]
+    return apart_from_before(products, lambda R, other: bool(np.trace(R.T @ other) < 2.999))
 
 
 def turns_between(R_WL: Array) -> Array:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from drake_pose.registration.posed_frames import PosedFrames
 from drake_pose.silhouette.areas.scoring import score_bodies
 
 Array = NDArray[np.float64]
+T = TypeVar("T")
 
 # Alexa's constants: psi is the positive root of x^4 = x + 4.
 _PHI, _PSI = np.sqrt(2.0), 1.533751168755204288118041
@@ -21,6 +23,15 @@ _PLACING_STEPS, _ROBUST_FROM = 8, 2
 _ROBUST_SCALE = 0.5
 # Points are no nearer to the camera than this share of the bodies' extent.
 _NEAREST = 0.05
+
+
+def apart_from_before(items: Iterable[T], differ: Callable[[T, T], bool]) -> list[T]:
+    """Those of some items that differ from all that were kept before them."""
+    kept: list[T] = []
+    for item in items:
+        if all(differ(item, one) for one in kept):
+            kept.append(item)
+    return kept
 
 
 def spread_rotations(count: int) -> Array:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.camera.models import PinholeCamera
+from drake_pose.registration.posed_frames import placed_points
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.silhouette.areas.scoring import draw_mask
 
@@ -61,13 +62,14 @@ def suggest_pose(
     generator, kinematics = np.random.default_rng(seed), body.kinematics
     lower = np.where(np.isfinite(kinematics.lower), kinematics.lower, -_TURN)
     upper = np.where(np.isfinite(kinematics.upper), kinematics.upper, _TURN)
-    cameras = [_small(camera.with_pose(one)) for one in X_WC]
+    share = min(1.0, _WIDTH / camera.width)
+    size = (max(1, round(share * camera.width)), max(1, round(share * camera.height)))
+    cameras = [camera.with_pose(one).resized(*size) for one in X_WC]
     best: Suggestion | None = None
     for _ in range(tried):
         values = generator.uniform(lower, upper)
         X_WN = kinematics.poses(values)
-        placed = zip(body.very_few, X_WN, strict=True)
-        points = np.concatenate([one.vertices @ X[:3, :3].T + X[:3, 3] for one, X in placed])
+        points = placed_points(body.very_few, X_WN)
         if any(np.all((points >= low) & (points <= high), axis=1).any() for low, high in keep_out):
             continue
         masks = [draw_mask(body.very_few, one.X_CW @ X_WN, one) for one in cameras]
@@ -80,10 +82,3 @@ def suggest_pose(
         if best is None or difference > best.difference:
             best = Suggestion(values, float(difference))
     return best
-
-
-def _small(camera: PinholeCamera) -> PinholeCamera:
-    """The camera with pictures of few pixels."""
-    share = min(1.0, _WIDTH / camera.width)
-    width, height = max(1, round(share * camera.width)), max(1, round(share * camera.height))
-    return camera.resized(width, height)

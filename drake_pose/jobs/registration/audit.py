@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body.model import load_model
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.files import load_cameras
@@ -29,7 +29,7 @@ from drake_pose.results.settings import EstimateSettings
 from drake_pose.results.summary import mask_digests
 from drake_pose.results.texts import percent
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges, read_scene
-from drake_pose.silhouette.pictures.scenes import Scene
+from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, Scene
 
 OnFrame = Callable[[int], None]
 """Called with the number of frames that are done."""
@@ -42,10 +42,9 @@ _NAMED = 3
 
 @dataclass(frozen=True)
 class _Inputs:
-    """What is audited."""
+    """What is audited; frames are names, whose masks are read one after another."""
 
     scene: Scene
-    model: ArticulatedModel
     tree: PoseTree
     cameras: tuple[Camera, ...]
     frames: tuple[str, ...]
@@ -54,13 +53,13 @@ class _Inputs:
 
     def read(self, frame: str) -> SeenFrame:
         """A frame's positions, and its masks by camera, but for those that show nothing."""
-        masks = {}
-        for camera in self.cameras:
-            if (camera.name, frame) in self.scene.masks:
-                mask = self.scene.read(camera.name, frame, may_be_empty=True)
-                if mask.any():
-                    masks[camera.name] = mask
-        return SeenFrame(frame, self.positions.of(frame, self.cameras[0].name), masks)
+        masks = {
+            camera.name: self.scene.read(camera.name, frame, may_be_empty=True)
+            for camera in self.cameras
+            if (camera.name, frame) in self.scene.masks
+        }
+        seen = {name: mask for name, mask in masks.items() if mask.any()}
+        return SeenFrame(frame, self.positions.of(frame, self.cameras[0].name), seen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +101,7 @@ def audit_scene(
         require_empty(folder)
     files = {
         "model": Path(model),
-        "cameras": Path(cameras or Path(scene) / "cameras.yaml"),
+        "cameras": Path(cameras or Path(scene) / CAMERA_FILE),
         "joints": Path(joints),
     }
     inputs = _read_inputs(Path(scene), files, None if cameras is None else Path(cameras), settings)
@@ -113,14 +112,20 @@ def audit_scene(
     if unseen:
         named = frame_ranges(unseen, inputs.scene.frames)
         warnings.append(f"frame {named}: the masks show nothing: there is nothing to compare")
-    agreeing = len(found.frames) - len(found.contradicting)
-    if 2 * agreeing < len(found.frames):
+    count, agreeing = len(found.frames), len(found.frames) - len(found.contradicting)
+    if 2 * agreeing < count:
         warnings.append(
-            f"{agreeing} of {len(found.frames)} frames agree with each other: which of them are "
+            f"{agreeing} of {count} frames agree with each other: which of them are "
             "right is told by their being near to what is given, not by their number"
         )
     summary = {
-        **_summarize(inputs, found),
+        "contradictions": describe_contradictions(found),
+        "frame_count": count,
+        "agreeing_count": agreeing,
+        "frames": {one.frame: _describe_frame(inputs, one) for one in found.frames},
+        "error_sizes_px": {
+            name: float(getattr(found.sizes, name)) for name in ("surface", "mask", "camera")
+        },
         **describe_run(Path(scene), files, settings, warnings, seconds),
         "unseen": unseen,
     }
@@ -129,28 +134,15 @@ def audit_scene(
     return SceneAudit(found, summary, tuple(warnings), folder)
 
 
-def _summarize(inputs: _Inputs, found: Audit) -> dict[str, Any]:
-    """What was found, as summary.json holds it."""
+def _describe_frame(inputs: _Inputs, one: FrameAudit) -> dict[str, Any]:
+    """A frame's part of summary.json."""
     names = [camera.name for camera in inputs.cameras]
     return {
-        "contradictions": describe_contradictions(found),
-        "frame_count": len(found.frames),
-        "agreeing_count": len(found.frames) - len(found.contradicting),
-        "frames": {
-            one.frame: {
-                "agrees": one.finding is None,
-                "fits": dict(one.given),
-                "fits_when_freed": dict(one.fitted),
-                "pixels": one.pixels,
-                "masks": mask_digests(inputs.scene, names, one.frame),
-            }
-            for one in found.frames
-        },
-        "error_sizes_px": {
-            name: float(size)
-            for name, size in found.sizes._asdict().items()
-            if name not in ("noise", "repeated")
-        },
+        "agrees": one.finding is None,
+        "fits": dict(one.given),
+        "fits_when_freed": dict(one.fitted),
+        "pixels": one.pixels,
+        "masks": mask_digests(inputs.scene, names, one.frame),
     }
 
 
@@ -175,7 +167,7 @@ def _read_inputs(
             "all frames show the robot in one pose, to a degree: errors of a joint's zero and of a "
             "camera that are the same in all frames can hardly be told apart"
         )
-    return _Inputs(scene, model, tree, chosen, frames, positions, tuple(warnings))
+    return _Inputs(scene, tree, chosen, frames, positions, tuple(warnings))
 
 
 def _audit(inputs: _Inputs, on_frame: OnFrame | None) -> tuple[Audit, list[str]]:
@@ -200,12 +192,9 @@ def _audit(inputs: _Inputs, on_frame: OnFrame | None) -> tuple[Audit, list[str]]
 
 def describe_contradictions(found: Audit) -> list[dict[str, Any]]:
     """What contradicts the rest, worst first: joints, cameras and the base, then frames."""
-    common = [
-        {"what": one.kind, "name": one.name, "text": _say_common(one), **_numbers(one)}
-        for one in found.common
-    ]
+    common = [_describe(one, one.kind, one.name, _say_common(one)) for one in found.common]
     frames = [
-        {"what": "frame", "name": one.frame, "text": _say_frame(one), **_numbers(one.finding)}
+        _describe(one.finding, "frame", one.frame, _say_frame(one, one.finding))
         for one in sorted(found.frames, key=lambda one: -one.pixels)
         if one.finding is not None
     ]
@@ -234,9 +223,12 @@ def _write_result(
     write_summary(path, summary)
 
 
-def _numbers(one: Finding) -> dict[str, Any]:
-    """A finding's numbers: lengths in mm, angles in degrees."""
+def _describe(one: Finding, what: str, name: str, text: str) -> dict[str, Any]:
+    """A finding as summary.json holds it: lengths in mm, angles in degrees."""
     return {
+        "what": what,
+        "name": name,
+        "text": text,
         "cause": one.kind,
         "cause_name": one.name,
         "angle_deg": float(np.degrees(one.angle)),
@@ -252,14 +244,11 @@ def _numbers(one: Finding) -> dict[str, Any]:
 
 def _say_common(one: Finding) -> str:
     """A contradiction of all frames in words."""
-    rivals = f" (or {', '.join(one.rivals)}: the masks cannot tell)" if one.rivals else ""
-    return f"{_name(one)}{rivals}: off {_amount(one)} in all frames that agree, {_pixels(one)}"
+    return f"{_name(one)}: off {_amount(one)} in all frames that agree, {_pixels(one)}"
 
 
-def _say_frame(one: FrameAudit) -> str:
+def _say_frame(one: FrameAudit, found: Finding) -> str:
     """A frame that contradicts the others in words."""
-    found = one.finding
-    assert found is not None
     if found.kind == "unexplained":
         worst = min(one.fitted, key=lambda name: one.fitted[name])
         return (
@@ -271,12 +260,13 @@ def _say_frame(one: FrameAudit) -> str:
         joints = ", ".join(name for name, _ in named[:_NAMED])
         more = f" ({joints} most)" if joints else ""
         return f"frame '{one.frame}': is of other positions: joints are off{more}, {_pixels(found)}"
-    rivals = f" (or {', '.join(found.rivals)}: the masks cannot tell)" if found.rivals else ""
-    return f"frame '{one.frame}': {_name(found)}{rivals} is off {_amount(found)}, {_pixels(found)}"
+    return f"frame '{one.frame}': {_name(found)} is off {_amount(found)}, {_pixels(found)}"
 
 
 def _name(one: Finding) -> str:
-    return "the base" if one.kind == "base" else f"{one.kind} '{one.name}'"
+    """What is off, and what explains it as well."""
+    name = "the base" if one.kind == "base" else f"{one.kind} '{one.name}'"
+    return name + (f" (or {', '.join(one.rivals)}: the masks cannot tell)" if one.rivals else "")
 
 
 def _amount(one: Finding) -> str:

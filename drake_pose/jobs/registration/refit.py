@@ -23,7 +23,7 @@ from drake_pose.jobs.estimate.person_choice import missing_for_person
 from drake_pose.jobs.registration.inputs import Inputs, make_registration_tree
 from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.person.shape import shape_parts, shape_values
-from drake_pose.registration.bundle_adjustment import BundleAdjustment, CommonShape
+from drake_pose.registration.bundle_adjustment import CommonShape, adjust_bundle
 from drake_pose.registration.joint_zeros import (
     JointCalibration,
     calibrate_joints,
@@ -36,7 +36,7 @@ from drake_pose.registration.start_poses import E_total, areas, intersection_ove
 Registered = Mapping[str, RegisteredCamera]
 
 
-def adjust_bundle(
+def refit_poses(
     inputs: Inputs, body: RegistrationBody, registered: Registered
 ) -> tuple[dict[str, RegisteredCamera], Inputs, RegistrationBody]:
     """The cameras, the frames' estimated positions and the body, fitted to what all cameras see."""
@@ -49,9 +49,7 @@ def adjust_bundle(
     shape = CommonShape(np.zeros(len(body.kinematics.names), np.bool_))
     if not missing_for_person(inputs.model):
         shape = CommonShape(shape_values(inputs.tree), *shape_parts(inputs.tree))
-    fitted = BundleAdjustment(
-        body.kinematics, body.few, cameras, tuple(registered), frames, shape
-    ).fit()
+    fitted = adjust_bundle(body.kinematics, body.few, cameras, registered, frames, shape)
     values = {one.name: own for one, own in zip(frames, fitted.values, strict=True)}
     inputs = replace(inputs, frames=inputs.moved(values))
     known = inputs.positions.girths

@@ -19,7 +19,7 @@ from drake_pose.jobs.registration.misfit import (
     require_determined,
     require_explained,
 )
-from drake_pose.jobs.registration.refit import adjust_bundle, corrected_urdf, find_zeros
+from drake_pose.jobs.registration.refit import corrected_urdf, find_zeros, refit_poses
 from drake_pose.jobs.registration.result import (
     describe_camera,
     describe_parameters,
@@ -102,7 +102,7 @@ def register_scene(
     start = time.perf_counter()
     urdf, parameters = None, dict[str, dict[str, Any]](zeros={}, lengths={})
     if inputs.positions.is_estimate:
-        registered, inputs, body = adjust_bundle(inputs, search.body, registered)
+        registered, inputs, body = refit_poses(inputs, search.body, registered)
         for found in registered.values():
             require_explained(CameraSearch(body), found, inputs.of(found.camera.name))
     # Cameras that see one object are found one after another, but it stands in one place.

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+Colour = tuple[int, int, int]
+
 # Okabe and Ito's blue and vermilion differ for every kind of colour vision, and in a grey print.
 BACKGROUND_RGB = (24, 24, 24)
 AGREEMENT_RGB = (215, 215, 215)
@@ -15,8 +17,7 @@ EXCESS_RGB = (213, 94, 0)
 OUTLINE_RGB = (0, 0, 0)
 
 _TEXT_RGB = (255, 255, 255)
-_FONT = cv2.FONT_HERSHEY_SIMPLEX
-_LINE_HEIGHT = 26
+_BAND = 36
 _LEAST_WIDTH = 560
 _LEAST_HEIGHT = 480
 _MARGIN = 0.12
@@ -29,80 +30,55 @@ def paint_agreement(
 
     Either is alone in MISSING_RGB or EXCESS_RGB. Borders between segments (H, W) are drawn.
     """
-    picture = np.full((*mask.shape, 3), BACKGROUND_RGB, dtype=np.uint8)
-    picture[mask & body] = AGREEMENT_RGB
-    picture[mask & ~body] = MISSING_RGB
-    picture[body & ~mask] = EXCESS_RGB
-    if segments is not None:
-        picture[_inner_borders(body, segments)] = OUTLINE_RGB
+    colours = np.array([BACKGROUND_RGB, MISSING_RGB, EXCESS_RGB, AGREEMENT_RGB], dtype=np.uint8)
+    picture = colours[np.add(mask, 2 * body, dtype=np.intp)]
+    _draw_borders(picture, body, segments)
     return picture
 
 
 def draw_overlay(
-    mask: np.ndarray, body: np.ndarray, segments: np.ndarray | None, title: Sequence[str]
+    seen: np.ndarray, body: np.ndarray, segments: np.ndarray | None, title: str
 ) -> np.ndarray:
-    """Draws the overlay of one camera and frame, with a legend.
+    """Draws the overlay of one camera and frame.
 
     Args:
-        mask, body: (H, W) bool, silhouette and estimated body; all False where no pose was found.
+        seen: (H, W) bool, a silhouette with which the body is compared; or (H, W, 3), a picture
+            over which its contour is drawn.
+        body: (H, W) bool, the estimated body; all False where no pose was found.
         segments: (H, W) int, which segment is seen, or None.
-        title: lines of text above the picture.
+        title: the text above the picture.
 
     Returns:
-        (h, w, 3) uint8: the surroundings, enlarged by a whole number where small, and the legend.
+        (h, w, 3) uint8: the surroundings, all of the picture where nothing is shown; a small
+        silhouette is enlarged by a whole number, and has a legend below.
     """
-    rows, columns = _surroundings(mask | body)
-    window = (slice(*rows), slice(*columns))
-    picture = paint_agreement(mask, body, segments)[window]
-    height, width = picture.shape[:2]
-    picture = _widen(_enlarged(picture, _enlargement(height, width)), _LEAST_WIDTH)
-    area = max(1, int(mask.sum()))
+    if seen.ndim == 3:
+        painted = seen.copy()
+        _draw_contour(painted, body, EXCESS_RGB, max(1, len(seen) // 500))
+        _draw_borders(painted, body, segments)
+        return _framed(painted[_surroundings(body)], title)
+    window = _surroundings(seen | body)
+    picture = _enlarged(paint_agreement(seen, body, segments)[window])
+    area = max(1, int(seen.sum()))
     legend = [
-        (AGREEMENT_RGB, f"agreement {100.0 * (mask & body).sum() / area:.1f} %"),
-        (MISSING_RGB, f"missing {100.0 * (mask & ~body).sum() / area:.1f} %"),
-        (EXCESS_RGB, f"excess {100.0 * (body & ~mask).sum() / area:.1f} %"),
+        (AGREEMENT_RGB, f"agreement {100.0 * (seen & body).sum() / area:.1f} %"),
+        (MISSING_RGB, f"missing {100.0 * (seen & ~body).sum() / area:.1f} %"),
+        (EXCESS_RGB, f"excess {100.0 * (body & ~seen).sum() / area:.1f} %"),
     ]
-    return np.vstack(
-        [_text_band(title, picture.shape[1]), picture, _legend_band(legend, picture.shape[1])]
-    )
-
-
-def draw_over_picture(
-    picture: np.ndarray, body: np.ndarray, segments: np.ndarray | None, title: Sequence[str]
-) -> np.ndarray:
-    """Draws the body's contour, and the borders between its parts, over a picture (H, W, 3).
-
-    Otherwise as draw_overlay; the whole picture where no pose was found.
-    """
-    painted = picture.copy()
-    contours, _ = cv2.findContours(body.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(painted, contours, -1, EXCESS_RGB, max(1, len(picture) // 500))
-    if segments is not None:
-        painted[_inner_borders(body, segments)] = OUTLINE_RGB
-    rows, columns = _surroundings(body)
-    painted = _widen(painted[slice(*rows), slice(*columns)], _LEAST_WIDTH)
-    return np.vstack([_text_band(title, painted.shape[1]), painted])
+    return _framed(picture, title, legend)
 
 
 def draw_shapes(
-    mask: np.ndarray, shapes: Sequence[np.ndarray], names: Sequence[str], title: Sequence[str]
+    mask: np.ndarray, shapes: Sequence[np.ndarray], names: Sequence[str], title: str
 ) -> np.ndarray:
     """Draws the contours of one or two named bodies (H, W) over a silhouette; see draw_overlay."""
     colours = (MISSING_RGB, EXCESS_RGB)[: len(shapes)]
-    rows, columns = _surroundings(np.logical_or.reduce([mask, *shapes]))
-    window = (slice(*rows), slice(*columns))
-    scale = _enlargement(rows[1] - rows[0], columns[1] - columns[0])
-    grown = [_enlarged(one[window], scale) for one in (mask, *shapes)]
-    picture = np.full((*grown[0].shape, 3), BACKGROUND_RGB, dtype=np.uint8)
-    picture[grown[0]] = AGREEMENT_RGB
-    for shape, colour in zip(grown[1:], colours, strict=True):
-        contours, _ = cv2.findContours(shape.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-        cv2.drawContours(picture, contours, -1, colour, 2)
-    picture = _widen(picture, _LEAST_WIDTH)
+    window = _surroundings(np.logical_or.reduce([mask, *shapes]))
+    picture = _enlarged(np.where(mask[..., None], AGREEMENT_RGB, BACKGROUND_RGB)[window])
+    for shape, colour in zip(shapes, colours, strict=True):
+        _draw_contour(picture, _enlarged(shape[window]), colour, 2)
     legend = [(AGREEMENT_RGB, "silhouette"), *zip(colours, names, strict=True)]
-    return np.vstack(
-        [_text_band(title, picture.shape[1]), picture, _legend_band(legend, picture.shape[1])]
-    )
+    return _framed(picture, title, legend)
 
 
 def encode_png(picture: np.ndarray) -> bytes:
@@ -111,63 +87,60 @@ def encode_png(picture: np.ndarray) -> bytes:
     return data.tobytes()
 
 
-def _inner_borders(body: np.ndarray, segments: np.ndarray) -> np.ndarray:
-    """Pixels of the body whose right or lower neighbour is another segment of the body."""
-    borders = np.zeros_like(body)
+def _draw_contour(picture: np.ndarray, body: np.ndarray, colour: Colour, width: int) -> None:
+    shape = body.astype(np.uint8)
+    contours, _ = cv2.findContours(shape, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(picture, contours, -1, colour, width)
+
+
+def _draw_borders(picture: np.ndarray, body: np.ndarray, segments: np.ndarray | None) -> None:
+    """Draws pixels of the body whose right or lower neighbour is another segment of the body."""
+    if segments is None:
+        return
     right = body[:, :-1] & body[:, 1:] & (segments[:, :-1] != segments[:, 1:])
     lower = body[:-1] & body[1:] & (segments[:-1] != segments[1:])
-    borders[:, :-1] |= right
-    borders[:-1] |= lower
-    return borders
+    picture[:, :-1][right] = OUTLINE_RGB
+    picture[:-1][lower] = OUTLINE_RGB
 
 
-def _surroundings(shown: np.ndarray) -> tuple[tuple[int, int], tuple[int, int]]:
+def _surroundings(shown: np.ndarray) -> tuple[slice, slice]:
     """The rows and columns around what is shown, with a margin; the picture's where nothing is."""
-    if not shown.any():
-        return (0, shown.shape[0]), (0, shown.shape[1])
-    spans = [np.flatnonzero(shown.any(axis=axis)) for axis in (1, 0)]
-    margin = 8 + int(_MARGIN * max(span[-1] - span[0] for span in spans))
-    first, second = (
-        (max(0, int(span[0]) - margin), min(size, int(span[-1]) + 1 + margin))
-        for span, size in zip(spans, shown.shape, strict=True)
-    )
-    return first, second
+    left, top, width, height = cv2.boundingRect(shown.astype(np.uint8))
+    if not width:
+        return slice(None), slice(None)
+    margin = 8 + int(_MARGIN * (max(width, height) - 1))
+    rows = slice(max(0, top - margin), top + height + margin)
+    return rows, slice(max(0, left - margin), left + width + margin)
 
 
-def _enlargement(height: int, width: int) -> int:
-    """By how much a small picture is enlarged."""
-    return max(1, min(_LEAST_HEIGHT // height, 2 * _LEAST_WIDTH // width, 8))
+def _enlarged(picture: np.ndarray) -> np.ndarray:
+    """A picture whose pixels are whole squares, so that it is not too small."""
+    height, width = picture.shape[:2]
+    scale = max(1, min(_LEAST_HEIGHT // height, 2 * _LEAST_WIDTH // width, 8))
+    return np.repeat(np.repeat(picture, scale, axis=0), scale, axis=1).astype(np.uint8)
 
 
-def _enlarged(picture: np.ndarray, scale: int) -> np.ndarray:
-    return np.repeat(np.repeat(picture, scale, axis=0), scale, axis=1)
-
-
-def _widen(picture: np.ndarray, width: int) -> np.ndarray:
-    """Pads a picture with background on both sides, so that the text below it has room."""
-    height, own = picture.shape[:2]
-    left = max(0, width - own) // 2
-    wide = np.full((height, max(width, own), 3), BACKGROUND_RGB, dtype=np.uint8)
-    wide[:, left : left + own] = picture
+def _framed(
+    picture: np.ndarray, title: str, legend: Sequence[tuple[Colour, str]] = ()
+) -> np.ndarray:
+    """A picture, wide enough for the title above and the legend below it."""
+    pad = max(0, _LEAST_WIDTH - picture.shape[1])
+    wide = cv2.copyMakeBorder(
+        picture, _BAND, _BAND + 2 if legend else 0, pad // 2, pad - pad // 2,
+        cv2.BORDER_CONSTANT, value=BACKGROUND_RGB,
+    )  # fmt: skip
+    wide[:_BAND] = 0
+    _put_text(wide, title, (10, _BAND - 14))
+    if legend:
+        band = wide[-_BAND - 2 :]
+        band[:] = 0
+        step = band.shape[1] // len(legend)
+        for number, (colour, text) in enumerate(legend):
+            left = 10 + number * step
+            cv2.rectangle(band, (left, 10), (left + 16, 26), colour, cv2.FILLED)
+            _put_text(band, text, (left + 24, 25))
     return wide
 
 
-def _text_band(lines: Sequence[str], width: int) -> np.ndarray:
-    band = np.zeros((_LINE_HEIGHT * len(lines) + 10, width, 3), dtype=np.uint8)
-    for number, line in enumerate(lines):
-        _put_text(band, line, (10, _LINE_HEIGHT * (number + 1) - 4))
-    return band
-
-
-def _legend_band(legend: Sequence[tuple[tuple[int, int, int], str]], width: int) -> np.ndarray:
-    band = np.zeros((_LINE_HEIGHT + 12, width, 3), dtype=np.uint8)
-    step = width // len(legend)
-    for number, (colour, text) in enumerate(legend):
-        left = 10 + number * step
-        cv2.rectangle(band, (left, 10), (left + 16, 26), colour, cv2.FILLED)
-        _put_text(band, text, (left + 24, 25))
-    return band
-
-
 def _put_text(picture: np.ndarray, text: str, position: tuple[int, int]) -> None:
-    cv2.putText(picture, text, position, _FONT, 0.5, _TEXT_RGB, 1, cv2.LINE_AA)
+    cv2.putText(picture, text, position, cv2.FONT_HERSHEY_SIMPLEX, 0.5, _TEXT_RGB, 1, cv2.LINE_AA)

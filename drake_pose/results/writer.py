@@ -23,7 +23,7 @@ from drake_pose.results.folder import (
     write_summary,
 )
 from drake_pose.results.motion_files import write_motion
-from drake_pose.results.overlay import draw_over_picture, draw_overlay, encode_png
+from drake_pose.results.overlay import draw_overlay, encode_png
 from drake_pose.results.poses import PoseRow, PoseTable, base_pose
 from drake_pose.results.records import FrameRecord, family_table, joint_table
 from drake_pose.results.replay import make_replay
@@ -193,8 +193,7 @@ class ResultWriter:
 
     def _write_overlay(self, camera: str, row: PoseRow, drawn: Drawn) -> None:
         error = f"E_total {100.0 * row.error:.1f} %" if row.found else "no pose found"
-        draw = draw_overlay if drawn.seen.ndim == 2 else draw_over_picture
-        picture = draw(*drawn, [f"{camera}  frame {row.frame}  {error}"])
+        picture = draw_overlay(*drawn, f"{camera}  frame {row.frame}  {error}")
         self.write(f"{OVERLAY}/{camera}/{row.frame}.png", encode_png(picture))
 
     def write(self, name: str, content: bytes | str) -> None:

@@ -56,7 +56,7 @@ DICHROMATS = {
 def test_a_large_picture_is_cut_to_the_surroundings_of_the_body() -> None:
     mask = rectangle((1900, 1100), slice(1000, 1600), slice(300, 600))
     body = rectangle((1900, 1100), slice(1000, 1600), slice(310, 610))
-    picture = draw_overlay(mask, body, None, ["title"])
+    picture = draw_overlay(mask, body, None, "title")
     assert picture.shape[0] < 900
     assert picture.shape[1] < 900
     assert count(picture, MISSING_RGB) >= 600 * 10
@@ -69,8 +69,8 @@ def test_shapes_are_drawn_as_contours_over_the_silhouette() -> None:
     first = rectangle((600, 600), slice(100, 500), slice(150, 450))
     corrected = rectangle((600, 600), slice(100, 500), slice(200, 400))
     names = ("the file's", "corrected")
-    picture = draw_shapes(mask, [first, corrected], names, ["title"])
-    legend = draw_shapes(mask, [np.zeros_like(mask)] * 2, names, ["title"])
+    picture = draw_shapes(mask, [first, corrected], names, "title")
+    legend = draw_shapes(mask, [np.zeros_like(mask)] * 2, names, "title")
     # Their upper and lower sides lie upon each other, where the corrected one is drawn last.
     for colour, own in ((MISSING_RGB, 2 * 400 + 2 * 100), (EXCESS_RGB, 2 * 400 + 2 * 200)):
         shown = count(picture, colour) - count(legend, colour)
@@ -80,8 +80,8 @@ def test_shapes_are_drawn_as_contours_over_the_silhouette() -> None:
 
 def test_a_small_picture_is_enlarged_by_whole_pixels() -> None:
     mask = rectangle((40, 40), slice(15, 25), slice(15, 25))
-    picture = draw_overlay(mask, np.zeros_like(mask), None, ["title"])
-    legend = count(draw_overlay(mask, mask, None, ["title"]), MISSING_RGB)
+    picture = draw_overlay(mask, np.zeros_like(mask), None, "title")
+    legend = count(draw_overlay(mask, mask, None, "title"), MISSING_RGB)
     shown = count(picture, MISSING_RGB) - legend
     scale = int(np.sqrt(shown / 100))
     assert scale > 1
@@ -90,12 +90,12 @@ def test_a_small_picture_is_enlarged_by_whole_pixels() -> None:
 
 def test_where_nothing_is_shown_the_whole_picture_stays() -> None:
     nothing = np.zeros((500, 700), dtype=bool)
-    assert draw_overlay(nothing, nothing, None, ["title"]).shape[1] == 700
+    assert draw_overlay(nothing, nothing, None, "title").shape[1] == 700
 
 
 def test_title_and_legend_are_written() -> None:
     mask = rectangle((500, 700), slice(100, 400), slice(100, 600))
-    picture = draw_overlay(mask, mask, None, ["cam  frame 1  E_total 3.0 %"])
+    picture = draw_overlay(mask, mask, None, "cam  frame 1  E_total 3.0 %")
     assert (picture[:36] > 200).any()
     assert (picture[-38:] == np.array(EXCESS_RGB, dtype=np.uint8)).all(axis=2).any()
 

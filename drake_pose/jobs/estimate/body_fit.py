@@ -204,7 +204,7 @@ class _BodyFit:
             X_CN = self._camera.X_CW @ one.observation.node_poses(one.x)
             shapes.append(draw_mask(outlines, X_CN, self._camera))
         title = f"frame {self._inputs.frames[0]}: the shape that explains the sequence"
-        return draw_shapes(self._masks[0], shapes, ("the file's", "corrected"), [title])
+        return draw_shapes(self._masks[0], shapes, ("the file's", "corrected"), title)
 
     def _without_hidden(
         self, search: RootPlacementSearch, first: PoseEstimate

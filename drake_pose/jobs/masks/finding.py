@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from drake_pose.body.model import load_model
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
-from drake_pose.camera.picture_files import SUFFIXES, Picture, read_picture
+from drake_pose.camera.picture_files import SUFFIXES, Mask, Picture, read_picture
 from drake_pose.camera.sources.recorded import find_picture_files
 from drake_pose.errors import (
     CameraError,
@@ -22,7 +22,7 @@ from drake_pose.errors import (
 )
 from drake_pose.jobs.estimate.searches import make_tree
 from drake_pose.jobs.masks.settings import MEDIAN, MaskSettings
-from drake_pose.jobs.masks.sources import CAMERAS, FoundMask, Source
+from drake_pose.jobs.masks.sources import FoundMask, Source
 from drake_pose.jobs.registration.positions import read_known_positions
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.search.segmentation.pose_and_mask import (
@@ -30,7 +30,8 @@ from drake_pose.search.segmentation.pose_and_mask import (
     PoseAndMask,
     PoseAndMaskSettings,
 )
-from drake_pose.silhouette.pictures.scene_files import natural_key
+from drake_pose.silhouette.pictures.scene_files import in_order
+from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 from drake_pose.silhouette.segmentation.background import (
     Background,
     background_of_recording,
@@ -61,14 +62,50 @@ _REFUSED, _DOUBTED = 0.85, 0.9
 # A value so many standard deviations from its start is suspicious.
 _FAR = 3.0
 
+Find = Callable[[str, Picture], tuple[Mask, tuple[str, ...]]]
+"""The mask of a camera's picture, and what its user should look at."""
 
-def read_given_masks(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
-    """Masks of other tools in COCO files, pictures or videos.
+
+def find_masks(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
+    """The masks of a source, one by one, in the way that the settings choose.
 
     Raises:
-        MaskError: names the file; it is no mask, or which class is meant is not said.
-        UnknownNameError: there is no such class.
+        DrakePoseError: names the file, camera or frame at fault.
     """
+    background = settings.background
+    if settings == MaskSettings(largest=settings.largest, cameras=settings.cameras):
+        # Beside its pictures a scene may have those of the empty room, which say what is meant.
+        room = source.path / "background"
+        background = room if room.is_dir() else None
+    ways = (background, settings.box, settings.model, settings.network)
+    if all(way is None for way in ways):
+        return _read_given(source, settings)
+    if source.annotated:
+        raise SceneError(
+            f"{source.path}: has annotations, but the object is to be found in pictures"
+        )
+    if background is not None:
+        return _find_each(source, _by_empty_room(source, background))
+    if settings.box is not None:
+        return _find_each(source, _by_box(settings.box))
+    if settings.model is not None:
+        return _find_by_model(source, settings.model, settings)
+    return _find_each(source, _by_network(settings))
+
+
+def _find_each(source: Source, find: Find) -> Iterator[FoundMask]:
+    """What is found in each picture by itself; errors name the picture."""
+    for camera in source.names:
+        for frame, where, picture in source.read(camera):
+            try:
+                mask, warnings = find(camera, picture)
+            except (SceneError, SettingsError) as error:
+                raise type(error)(f"{where}: {error}") from error
+            yield FoundMask(camera, frame, where, mask, picture, "", warnings)
+
+
+def _read_given(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
+    """Masks of other tools in COCO files, pictures or videos."""
     if source.annotated:
         yield from _read_annotated(source, settings.classes)
     for camera, files in source.pictures.items():
@@ -106,70 +143,57 @@ def _read_annotated(source: Source, wanted: Sequence[str]) -> Iterator[FoundMask
         yield FoundMask(camera, frame, where, mask, warnings=warnings)
 
 
-def cut_boxes(source: Source, box: Sequence[float]) -> Iterator[FoundMask]:
-    """What GrabCut finds in a box, x, y, width and height [pixel], in all pictures.
+def _by_box(box: Sequence[float]) -> Find:
+    """GrabCut within x, y, width and height [pixel]."""
 
-    Raises:
-        SettingsError: the box tells no object from its surroundings.
-    """
-    for camera in source.names:
-        for frame, where, picture in source.read(camera):
-            try:
-                mask = cut_box(picture, box)
-            except SettingsError as error:
-                raise SettingsError(f"{where}: {error}") from error
-            part = mask.sum() / (box[2] * box[3])
-            warnings: tuple[str, ...] = ()
-            if part > _ALL_OF_BOX or 0.0 < part < _NONE_OF_BOX:
-                warnings = (f"the mask is {part:.1%} of its box: find it another way",)
-            yield FoundMask(camera, frame, where, mask, picture, "", warnings)
+    def find(_: str, picture: Picture) -> tuple[Mask, tuple[str, ...]]:
+        mask = cut_box(picture, box)
+        part = mask.sum() / (box[2] * box[3])
+        is_good = part == 0.0 or _NONE_OF_BOX <= part <= _ALL_OF_BOX
+        return mask, () if is_good else (f"the mask is {part:.1%} of its box: find it another way",)
+
+    return find
 
 
-def segment_by_network(source: Source, file: Path, settings: MaskSettings) -> Iterator[FoundMask]:
-    """The masks that a network finds in all pictures.
-
-    Raises:
-        SettingsError: the network cannot be read, or does not take the pictures.
-    """
-    taken = (settings.network_size, settings.network_mean, settings.network_std)
-    network = SegmentationNetwork(file, settings.classes, *taken, settings.network_bgr)
-    for camera in source.names:
-        for frame, where, picture in source.read(camera):
-            try:
-                mask = network.find(picture)
-            except SettingsError as error:
-                raise SettingsError(f"{where}: {error}") from error
-            yield FoundMask(camera, frame, where, mask, picture)
+def _by_network(settings: MaskSettings) -> Find:
+    assert settings.network is not None
+    network = SegmentationNetwork(
+        settings.network, settings.classes, settings.network_size, settings.network_mean,
+        settings.network_std, settings.network_bgr,
+    )  # fmt: skip
+    return lambda _, picture: (network.find(picture), ())
 
 
-def compare_with_empty_room(source: Source, background: Path | str) -> Iterator[FoundMask]:
-    """Masks of what differs from the background, as of ``MaskSettings.background``.
+def _by_empty_room(source: Source, background: Path | str) -> Find:
+    """What differs from the background, as of ``MaskSettings.background``."""
+    rooms, doubts = {}, {}
+    for name in source.names:
+        rooms[name], doubts[name] = _background(source, name, background)
 
-    Raises:
-        SceneError: a camera has no background, or one of another size.
-        SettingsError: a recording too short for a median.
-    """
-    rooms = {name: _background(source, name, background) for name in source.names}
-    for name, (room, doubt) in rooms.items():
-        warnings: tuple[str, ...] = (doubt,) if doubt else ()
-        for frame, where, picture in source.read(name):
-            if picture.shape != room.mean.shape:
-                height, width = room.mean.shape[:2]
-                raise SceneError(
-                    f"{where}: is not of the background's size, {width} x {height} (width x height)"
-                )
-            mask = person_region(picture, room)
-            if mask.mean() > _CHANGED:
-                warnings += (
-                    f"{mask.mean():.0%} of it differ from the background: did the light change, or "
-                    "the camera move?",
-                )
-            yield FoundMask(name, frame, where, mask, picture, "", warnings)
-            warnings = ()
+    def find(camera: str, picture: Picture) -> tuple[Mask, tuple[str, ...]]:
+        room = rooms[camera]
+        if picture.shape != room.mean.shape:
+            height, width = room.mean.shape[:2]
+            raise SceneError(
+                f"is not of the background's size, {width} x {height} (width x height)"
+            )
+        mask = person_region(picture, room)
+        # A bad background is told of once.
+        warnings = doubts.pop(camera, ())
+        if mask.mean() > _CHANGED:
+            warnings += (
+                f"{mask.mean():.0%} of it differ from the background: did the light change, or "
+                "the camera move?",
+            )
+        return mask, warnings
+
+    return find
 
 
-def _background(source: Source, camera: str, given: Path | str) -> tuple[Background, str]:
-    """A camera's background, and why it is not good; "" where it is."""
+def _background(
+    source: Source, camera: str, given: Path | str
+) -> tuple[Background, tuple[str, ...]]:
+    """A camera's background, and why it is not good."""
     if given == MEDIAN:
         recording = _spread_pictures(source, camera)
         try:
@@ -181,18 +205,16 @@ def _background(source: Source, camera: str, given: Path | str) -> tuple[Backgro
     for file in _background_files(Path(given), camera):
         pictures.append(read_picture(file, SceneError))
         source.check_size(camera, pictures[-1].shape, str(file))
-    return learn_background(pictures), ""
+    return learn_background(pictures), ()
 
 
 def _background_files(given: Path, camera: str) -> list[Path]:
     """The pictures of the empty room before a camera."""
-    if given.is_file():
-        return [given]
     if (given / camera).is_dir():
         return list(find_picture_files(given / camera, camera).values())
-    for suffix in SUFFIXES:
-        if (given / f"{camera}{suffix}").is_file():
-            return [given / f"{camera}{suffix}"]
+    for file in (given, *(given / f"{camera}{suffix}" for suffix in SUFFIXES)):
+        if file.is_file():
+            return [file]
     raise SceneError(
         f"{given}: has no picture of the empty room before camera '{camera}': {camera}.png, or a "
         f"folder {camera}; or give --background median"
@@ -213,40 +235,35 @@ def _spread_pictures(source: Source, camera: str) -> list[Picture]:
     return kept
 
 
-def _doubt(room: Background, recording: Sequence[Picture]) -> str:
-    """Why a recording's median is no good background; "" where it is one."""
+def _doubt(room: Background, recording: Sequence[Picture]) -> tuple[str, ...]:
+    """Why a recording's median is no good background."""
     support = background_support(recording, room)
     masks = [person_region(picture, room) for picture in recording]
     doubtful = [float((support[mask] < _SUPPORT).mean()) for mask in masks if mask.any()]
     part = float(np.median(doubtful)) if doubtful else 0.0
     if part <= _DOUBTFUL:
-        return ""
-    return (
+        return ()
+    text = (
         f"the median of {len(recording)} pictures is no good background, here and in this camera's "
         f"other pictures: in {part:.0%} of the masks' area it is seen in fewer than three of four "
         "pictures, so the body may stand in it; give pictures of the empty room, or a longer "
         "recording in which the body leaves every place"
     )
+    return (text,)
 
 
-def find_by_model(source: Source, model: Path, settings: MaskSettings) -> Iterator[FoundMask]:
-    """The masks of a body whose pose is about known in each frame (``settings.start``).
-
-    Raises:
-        CameraError: a camera has no X_WC.
-        SceneError: a frame has no row in the table of joint positions.
-    """
+def _find_by_model(source: Source, model: Path, settings: MaskSettings) -> Iterator[FoundMask]:
+    """The masks of a body whose pose is about known in each frame (``settings.start``)."""
+    assert settings.start is not None
     cameras = _placed_cameras(source)
     body = load_model(model, package_paths=settings.packages)
     kinematics = TreeKinematics(make_tree(body, EstimateSettings(hold=settings.hold)))
-    if settings.start is None:
-        raise SceneError(f"{model}: needs rough joint positions of each frame (--start FILE.csv)")
     table = read_known_positions(settings.start, kinematics)
     seen = {
         name: {frame: (where, picture) for frame, where, picture in source.read(name)}
         for name in source.names
     }
-    frames = sorted({frame for own in seen.values() for frame in own}, key=natural_key)
+    frames = in_order(frame for own in seen.values() for frame in own)
     starts = [
         table.of(frame, next(name for name in seen if frame in seen[name])) for frame in frames
     ]
@@ -256,35 +273,36 @@ def find_by_model(source: Source, model: Path, settings: MaskSettings) -> Iterat
     search = PoseAndMask(
         kinematics, cameras, PoseAndMaskSettings(angle=math.radians(settings.start_error))
     )
-    found = search.run(pictures, starts)
     warned = table.warnings
+    found = dict(zip(frames, search.run(pictures, starts), strict=True))
     for c, (name, own) in enumerate(seen.items()):
-        for frame, pose in zip(frames, found, strict=True):
-            mask = pose.masks[c]
+        for frame in frames:
+            mask = found[frame].masks[c]
             if mask is not None:
                 where, picture = own[frame]
-                refusal, warnings = _judge(pose, c, kinematics.names)
+                refusal, warnings = _judge(found[frame], c, kinematics.names)
                 yield FoundMask(name, frame, where, mask, picture, refusal, (*warned, *warnings))
                 warned = ()
 
 
 def _placed_cameras(source: Source) -> list[Camera]:
     """The cameras of all pictures, which have an X_WC."""
-    if source.cameras is None:
+    file = source.cameras
+    if file is None:
         raise CameraError(
-            f"{source.path}: a model's silhouette needs to know the cameras: {CAMERAS} or --cameras"
+            f"{source.path}: a model's silhouette needs to know the cameras: {CAMERA_FILE} or "
+            "--cameras"
         )
     for name in source.names:
-        if name in source.cameras.links:
+        where = f"{source.camera_file}: camera '{name}'"
+        if name in file.links:
             raise CameraError(
-                f"{source.camera_file}: camera '{name}' rides on a link, but the background "
-                "beside a body is told from cameras that stand still"
+                f"{where} rides on a link, but the background beside a body is told from cameras "
+                "that stand still"
             )
-        if name in source.cameras.unplaced:
-            raise CameraError(
-                f"{source.camera_file}: camera '{name}' needs X_WC: where it stands before the body"
-            )
-    return [source.cameras.cameras[name] for name in source.names]
+        if name in file.unplaced:
+            raise CameraError(f"{where} needs X_WC: where it stands before the body")
+    return [file.cameras[name] for name in source.names]
 
 
 def _judge(pose: FoundPose, camera: int, names: Sequence[str]) -> tuple[str, tuple[str, ...]]:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import shutil
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,23 +13,17 @@ import numpy as np
 import yaml
 
 from drake_pose.camera.picture_files import Picture
-from drake_pose.errors import DrakePoseError, MaskError, OutputError, SceneError
-from drake_pose.jobs.masks.finding import (
-    compare_with_empty_room,
-    cut_boxes,
-    find_by_model,
-    read_given_masks,
-    segment_by_network,
-)
+from drake_pose.errors import DrakePoseError, MaskError, OutputError
+from drake_pose.jobs.masks.finding import find_masks
 from drake_pose.jobs.masks.settings import MaskSettings
-from drake_pose.jobs.masks.sources import CAMERAS, SCENE, UNNAMED, FoundMask, Source, open_source
-from drake_pose.results.folder import OVERLAY, SUMMARY, require_empty
-from drake_pose.silhouette.pictures.masks import write_mask
+from drake_pose.jobs.masks.sources import UNNAMED, Source, open_source
+from drake_pose.results.folder import OVERLAY, require_empty, write_file, write_summary
+from drake_pose.silhouette.pictures.masks import encode_mask
+from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, SCENE_FILE
 
-BACKGROUND, MASKS = "background", "masks"
 _PARTIAL = "masks.part"
-# Of the mask's outline in an overlay, (red, green, blue): Okabe and Ito's vermilion.
-_OUTLINE_RGB = (213, 94, 0)
+# Of the mask's outline in an overlay, (blue, green, red): Okabe and Ito's vermilion.
+_OUTLINE_BGR = (0, 94, 213)
 # A second patch of this fraction of the largest one's area may be another object.
 _SECOND = 0.25
 # Beyond this fraction of the picture no surroundings are seen.
@@ -86,136 +79,89 @@ def make_masks(
     settings, folder = settings or MaskSettings(), Path(out)
     require_empty(folder)
     opened = open_source(Path(source), settings.cameras)
-    writer = _Writer(folder, opened, settings, overlay)
+    cameras: dict[str, dict[str, Any]] = {}
+    doubts: list[str] = []
+    refused: list[str] = []
     try:
-        for k, found in enumerate(_find(opened, settings), 1):
-            writer.add(found)
-            on_mask(k)
-        return writer.finish()
-    except DrakePoseError:
-        writer.discard()
-        raise
-
-
-def _find(source: Source, settings: MaskSettings) -> Iterator[FoundMask]:
-    """The masks, one by one."""
-    background = settings.background
-    if settings == MaskSettings(largest=settings.largest, cameras=settings.cameras):
-        # Beside its pictures a scene may have those of the empty room, which say what is meant.
-        room = source.path / BACKGROUND
-        background = room if room.is_dir() else None
-    ways = (background, settings.box, settings.model, settings.network)
-    if source.annotated and any(way is not None for way in ways):
-        raise SceneError(
-            f"{source.path}: has annotations, but the object is to be found in pictures"
-        )
-    if background is not None:
-        return compare_with_empty_room(source, background)
-    if settings.box is not None:
-        return cut_boxes(source, settings.box)
-    if settings.model is not None:
-        return find_by_model(source, settings.model, settings)
-    if settings.network is not None:
-        return segment_by_network(source, settings.network, settings)
-    return read_given_masks(source, settings)
-
-
-class _Writer:
-    """Writes masks, then the scene around them."""
-
-    def __init__(self, folder: Path, source: Source, settings: MaskSettings, overlay: bool) -> None:
-        self._folder, self._source, self._settings = folder, source, settings
-        self._overlay = overlay
-        self._summary: dict[str, dict[str, Any]] = {}
-        self._warnings: list[str] = []
-        self._refused: list[str] = []
-        self._count = 0
-
-    def add(self, found: FoundMask) -> None:
-        """Judges a mask, and writes it where it is good."""
-        if self._settings.largest:
-            found = replace(found, mask=largest_patch(found.mask))
-        refusal = found.refusal or refuse_mask(found.mask)
-        warnings = (*found.warnings, *(() if refusal else doubt_mask(found.mask)))
-        entry: dict[str, Any] = {"refusal": refusal} if refusal else {"area": int(found.mask.sum())}
-        entry |= {"warnings": list(warnings)} if warnings else {}
-        self._summary.setdefault(found.camera, {})[found.frame] = entry
-        self._warnings += [f"{found.where}: {text}" for text in warnings]
-        if refusal:
-            self._refused.append(f"{found.where}: {refusal}")
-        else:
-            self._write(self._place(_PARTIAL, found, ".png"), found.mask)
-            self._count += 1
-        if self._overlay and found.picture is not None:
-            data = _draw_outline(found.picture, found.mask, bool(refusal))
-            self._write(self._place(OVERLAY, found, ".jpg"), data)
-
-    def finish(self) -> SceneMasks:
-        """Writes what else belongs to the scene; MaskError: no picture has a good mask."""
-        if not self._count:
-            more = len(self._refused) - 1
-            first = self._refused[0] if self._refused else f"{self._source.path}: has no picture"
-            raise MaskError(first + (f" (and {more} more)" if more > 0 else ""))
-        warnings = [f"{text}; no mask is written" for text in self._refused] + self._warnings
-        if self._source.cameras is None and set(self._summary) != {UNNAMED}:
-            warnings.append(
-                f"{self._folder}: its cameras {', '.join(self._summary)} have no {CAMERAS}, which "
-                "estimate needs (--cameras)"
-            )
-        summary = {
-            "source": str(self._source.path),
-            "settings": self._settings.as_json(),
-            "mask_count": self._count,
-            "cameras": self._summary,
-            "warnings": warnings,
-        }
-        try:
-            self._write_scene_file()
-            if self._source.camera_file is not None:
-                shutil.copyfile(self._source.camera_file, self._folder / CAMERAS)
-            text = json.dumps(summary, indent=2, ensure_ascii=False)
-            (self._folder / SUMMARY).write_text(text + "\n", encoding="utf-8")
-            (self._folder / _PARTIAL).rename(self._folder / MASKS)
-        except OSError as error:
-            raise OutputError(f"{self._folder}: cannot be written: {error.strerror}") from error
-        return SceneMasks(self._folder, summary)
-
-    def _write_scene_file(self) -> None:
-        """The source's own, or what a video says."""
-        own = self._source.path / SCENE
-        if self._source.path.is_dir() and own.is_file():
-            shutil.copyfile(own, self._folder / SCENE)
-        elif self._source.videos:
-            rate = self._source.frame_rate_hz()
-            content = {"sequence": True} | ({} if rate is None else {"frame_rate_hz": rate})
-            (self._folder / SCENE).write_text(yaml.safe_dump(content), encoding="utf-8")
-
-    def discard(self) -> None:
-        """Removes what was written; the folder was new or empty."""
-        for name in (_PARTIAL, OVERLAY):
-            shutil.rmtree(self._folder / name, ignore_errors=True)
-
-    def _place(self, folder: str, found: FoundMask, suffix: str) -> Path:
-        """Where a mask or an overlay belongs."""
-        return self._folder / folder / found.camera / f"{found.frame}{suffix}"
-
-    def _write(self, path: Path, content: np.ndarray) -> None:
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            if content.dtype == np.bool_:
-                write_mask(path, content)
+        for done, found in enumerate(find_masks(opened, settings), 1):
+            mask = largest_patch(found.mask) if settings.largest else found.mask
+            refusal = found.refusal or refuse_mask(mask)
+            warnings = [*found.warnings, *([] if refusal else doubt_mask(mask))]
+            entry: dict[str, Any] = {"area": int(mask.sum())}
+            entry = {"refusal": refusal} if refusal else entry
+            entry |= {"warnings": warnings} if warnings else {}
+            cameras.setdefault(found.camera, {})[found.frame] = entry
+            doubts += [f"{found.where}: {text}" for text in warnings]
+            place = f"{found.camera}/{found.frame}".lstrip("/")
+            if refusal:
+                refused.append(f"{found.where}: {refusal}")
             else:
-                path.write_bytes(content.tobytes())
-        except OSError as error:
-            raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
+                write_file(folder, f"{_PARTIAL}/{place}.png", encode_mask(mask))
+            if overlay and found.picture is not None:
+                drawn = _draw_outline(found.picture, mask, bool(refusal))
+                write_file(folder, f"{OVERLAY}/{place}.jpg", drawn)
+            on_mask(done)
+        summary = _summarize(opened, settings, cameras, refused, doubts, folder)
+        _write_scene(opened, folder, summary)
+    except DrakePoseError:
+        for name in (_PARTIAL, OVERLAY):
+            shutil.rmtree(folder / name, ignore_errors=True)
+        raise
+    return SceneMasks(folder, summary)
 
 
-def _draw_outline(picture: Picture, mask: np.ndarray, refused: bool) -> np.ndarray:
+def _summarize(
+    source: Source,
+    settings: MaskSettings,
+    cameras: Mapping[str, Mapping[str, Any]],
+    refused: Sequence[str],
+    doubts: Sequence[str],
+    folder: Path,
+) -> dict[str, Any]:
+    """What summary.json says; MaskError: no picture has a good mask."""
+    count = sum(len(frames) for frames in cameras.values()) - len(refused)
+    if not count:
+        first, *more = refused or [f"{source.path}: has no picture"]
+        raise MaskError(first + (f" (and {len(more)} more)" if more else ""))
+    warnings = [*(f"{text}; no mask is written" for text in refused), *doubts]
+    if source.cameras is None and set(cameras) != {UNNAMED}:
+        warnings.append(
+            f"{folder}: its cameras {', '.join(cameras)} have no {CAMERA_FILE}, which estimate "
+            "needs (--cameras)"
+        )
+    return {
+        "source": str(source.path),
+        "settings": settings.as_json(),
+        "mask_count": count,
+        "cameras": cameras,
+        "warnings": warnings,
+    }
+
+
+def _write_scene(source: Source, folder: Path, summary: Mapping[str, Any]) -> None:
+    """Writes what else belongs to the scene; its masks come last."""
+    own = source.path / SCENE_FILE
+    try:
+        if source.path.is_dir() and own.is_file():
+            shutil.copyfile(own, folder / SCENE_FILE)
+        elif source.videos:
+            rate = source.frame_rate_hz()
+            content = {"sequence": True} | ({} if rate is None else {"frame_rate_hz": rate})
+            write_file(folder, SCENE_FILE, yaml.safe_dump(content))
+        if source.camera_file is not None:
+            shutil.copyfile(source.camera_file, folder / CAMERA_FILE)
+        write_summary(folder, summary)
+        (folder / _PARTIAL).rename(folder / "masks")
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error
+
+
+def _draw_outline(picture: Picture, mask: np.ndarray, refused: bool) -> bytes:
     """A JPEG file of a picture (H, W, 3) with the mask's outline; one that is refused is dark."""
     drawn = np.array(picture[:, :, ::-1] // (3 if refused else 1))
     contours, _ = cv2.findContours(mask.view(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(drawn, contours, -1, _OUTLINE_RGB[::-1], 1)
-    return np.asarray(cv2.imencode(".jpg", drawn)[1])
+    cv2.drawContours(drawn, contours, -1, _OUTLINE_BGR, 1)
+    return cv2.imencode(".jpg", drawn)[1].tobytes()
 
 
 def refuse_mask(mask: np.ndarray) -> str:

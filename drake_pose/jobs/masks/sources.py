@@ -4,21 +4,16 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
-import numpy as np
-from numpy.typing import NDArray
-
 from drake_pose.camera.files import CameraFile, load_camera_file
-from drake_pose.camera.picture_files import SUFFIXES, Picture, read_picture
-from drake_pose.camera.sources.recorded import find_picture_files
+from drake_pose.camera.picture_files import SUFFIXES, Mask, Picture, list_pictures, read_picture
 from drake_pose.errors import SceneError
+from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 from drake_pose.silhouette.pictures.video_pictures import VIDEOS, VideoPictures
 from drake_pose.silhouette.segmentation.coco import AnnotatedPicture, Annotations, read_coco
 
-CAMERAS = "cameras.yaml"
-SCENE = "scene.yaml"
 UNNAMED = ""
 """The only camera's name, where nothing names it: its masks lie in no folder of their own."""
 
@@ -41,7 +36,7 @@ class FoundMask:
     camera: str
     frame: str
     where: str
-    mask: NDArray[np.bool_]
+    mask: Mask
     picture: Picture | None = None
     refusal: str = ""
     warnings: tuple[str, ...] = ()
@@ -58,11 +53,11 @@ class Source:
     """
 
     path: Path
-    camera_file: Path | None
-    cameras: CameraFile | None
-    pictures: Mapping[str, Mapping[str, Path]]
-    videos: Mapping[str, Path]
-    annotated: Sequence[tuple[str | None, Annotations]] = ()
+    camera_file: Path | None = None
+    cameras: CameraFile | None = None
+    pictures: Mapping[str, Mapping[str, Path]] = field(default_factory=dict)
+    videos: Mapping[str, Path] = field(default_factory=dict)
+    annotated: Sequence[tuple[str, Annotations]] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -152,51 +147,50 @@ def open_source(path: Path, camera_file: Path | None = None) -> Source:
     """
     if not path.exists():
         raise SceneError(f"{path}: there is no such folder or file")
-    if camera_file is None and path.is_dir() and (path / CAMERAS).is_file():
-        camera_file = path / CAMERAS
+    if camera_file is None and path.is_dir() and (path / CAMERA_FILE).is_file():
+        camera_file = path / CAMERA_FILE
     cameras = None if camera_file is None else load_camera_file(camera_file)
     try:
-        pictures, videos, annotated = _find(path)
+        found = _open_file(path) if path.is_file() else _open_folder(path)
     except OSError as error:
         raise SceneError(f"{error.filename or path}: cannot be read: {error.strerror}") from error
-    if not (pictures or videos or annotated):
+    if not (found.names or found.annotated):
         raise SceneError(
             f"{path}: holds no pictures images/<camera>/<frame>.png or .jpg, no videos "
             "videos/<camera>.mp4, and no COCO file (.json)"
         )
+    pictures, videos = found.pictures, found.videos
     if cameras is not None:
         known = list(cameras.cameras)
-        for name in (*pictures, *videos):
+        for name in found.names:
             if name not in (*known, UNNAMED):
                 raise SceneError(
                     f"{path}: the pictures of '{name}' belong to no camera of {camera_file}, which "
                     f"has {', '.join(known)}; take them out, or calibrate that camera"
                 )
-        if UNNAMED in (*pictures, *videos):
-            if len(known) > 1:
-                raise SceneError(
-                    f"{path}: its pictures lie in no camera's folder, but {camera_file} has "
-                    f"{len(known)} cameras: {', '.join(known)}"
-                )
-            pictures = {name or known[0]: files for name, files in pictures.items()}
-            videos = {name or known[0]: file for name, file in videos.items()}
-    return Source(path, camera_file, cameras, pictures, videos, annotated)
+        if UNNAMED in found.names and len(known) > 1:
+            raise SceneError(
+                f"{path}: its pictures lie in no camera's folder, but {camera_file} has "
+                f"{len(known)} cameras: {', '.join(known)}"
+            )
+        pictures = {name or known[0]: files for name, files in pictures.items()}
+        videos = {name or known[0]: file for name, file in videos.items()}
+    return Source(path, camera_file, cameras, pictures, videos, found.annotated)
 
 
-_Found = tuple[dict[str, dict[str, Path]], dict[str, Path], list[tuple[str | None, Annotations]]]
+def _open_file(path: Path) -> Source:
+    kind = path.suffix.lower()
+    if kind == _JSON:
+        return Source(path, annotated=[(UNNAMED, read_coco(path))])
+    if kind in VIDEOS:
+        return Source(path, videos={UNNAMED: path})
+    if kind in SUFFIXES:
+        return Source(path, pictures={UNNAMED: {path.stem: path}})
+    raise SceneError(f"{path}: is no picture, video or COCO file")
 
 
-def _find(path: Path) -> _Found:
-    """Pictures, videos and COCO files by camera, which nothing may name."""
-    if path.is_file():
-        kind = path.suffix.lower()
-        if kind == _JSON:
-            return {}, {}, [(None, read_coco(path))]
-        if kind in VIDEOS:
-            return {}, {UNNAMED: path}, []
-        if kind in SUFFIXES:
-            return {UNNAMED: {path.stem: path}}, {}, []
-        raise SceneError(f"{path}: is no picture, video or COCO file")
+def _open_folder(path: Path) -> Source:
+    """Pictures, videos or COCO files by camera, which nothing may name."""
     places = [path / name for name in ("images", "videos") if (path / name).is_dir()]
     if len(places) > 1:
         raise SceneError(f"{path}: has images and videos; name one of them: {places[0]}")
@@ -208,25 +202,26 @@ def _find(path: Path) -> _Found:
         if entry.is_dir() and not entry.name.startswith(".") and entry.name not in _NOT_CAMERAS
     }
     pictures: dict[str, dict[str, Path]] = {}
-    annotated: list[tuple[str | None, Annotations]] = []
+    videos: dict[str, Path] = {}
+    annotated: list[tuple[str, Annotations]] = []
     for name, folder in folders.items():
-        files = [file for file in sorted(folder.iterdir()) if not file.name.startswith(".")]
-        if any(file.suffix.lower() in SUFFIXES for file in files):
-            pictures[name] = find_picture_files(folder, name)
-        annotated += [(name or None, read_coco(f)) for f in files if f.suffix.lower() == _JSON]
+        if files := list_pictures(folder, SceneError):
+            pictures[name] = files
+        for file in sorted(folder.iterdir()):
+            kind = "" if file.name.startswith(".") else file.suffix.lower()
+            if kind == _JSON:
+                annotated.append((name, read_coco(file)))
+            elif kind in VIDEOS and folder == root:
+                if file.stem in videos:
+                    raise SceneError(f"{file}: there is a second video of camera '{file.stem}'")
+                videos[file.stem] = file
     # COCO files lie beside the pictures that they are of.
     if annotated:
-        return {}, {}, annotated
-    videos: dict[str, Path] = {}
-    for file in sorted(root.iterdir()):
-        if file.suffix.lower() in VIDEOS:
-            if file.stem in videos:
-                raise SceneError(f"{file}: there is a second video of camera '{file.stem}'")
-            videos[file.stem] = file
+        return Source(path, annotated=annotated)
     if UNNAMED in pictures and len(pictures) > 1:
         raise SceneError(
             f"{root}: has pictures beside folders of pictures; put them in a camera's folder"
         )
     if pictures and videos:
         raise SceneError(f"{root}: has pictures and videos; give one of them")
-    return pictures, videos, annotated
+    return Source(path, pictures=pictures, videos=videos)

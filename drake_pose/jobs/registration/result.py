@@ -279,7 +279,7 @@ def write_overlays(
     """Draws the robot over each mask of a camera, below a title; draw: as of drawn."""
     for frame, title in titled:
         segments = draw(frame.values)
-        picture = draw_overlay(frame.mask, segments >= 0, segments, [title])
+        picture = draw_overlay(frame.mask, segments >= 0, segments, title)
         write_file(folder, f"{OVERLAY}/{camera}/{frame.name}.png", encode_png(picture))
 
 

@@ -50,14 +50,15 @@ def read_mask(
 
 def write_mask(path: str | Path, mask: np.ndarray) -> None:
     """Writes a mask (H, W) as a grey PNG, 255 on the object; MaskError names an unwritable file."""
-    path = Path(path)
-    done, data = cv2.imencode(".png", np.where(mask, 255, 0).astype(np.uint8))
-    if not done:
-        raise MaskError(f"{path}: cannot encode a mask of shape {mask.shape}")
     try:
-        path.write_bytes(data.tobytes())
+        Path(path).write_bytes(encode_mask(mask))
     except OSError as error:
         raise MaskError(f"{path}: cannot write the mask: {error.strerror}") from error
+
+
+def encode_mask(mask: np.ndarray) -> bytes:
+    """Returns a mask (H, W) as the content of a grey PNG file, 255 on the object."""
+    return cv2.imencode(".png", np.where(mask, 255, 0).astype(np.uint8))[1].tobytes()
 
 
 def _to_mask(picture: np.ndarray, path: Path, may_be_empty: bool) -> np.ndarray:

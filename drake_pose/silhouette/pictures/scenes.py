@@ -26,7 +26,7 @@ from drake_pose.silhouette.pictures.video_pictures import VIDEOS, VideoPictures
 from drake_pose.yaml_files import read_yaml
 
 _FIELDS = ("sequence", "frame_rate_hz")
-CAMERA_FILE = "cameras.yaml"
+CAMERA_FILE, SCENE_FILE = "cameras.yaml", "scene.yaml"
 
 # An uncalibrated camera looks along the world's -x: the picture's right is y, its up is z.
 _LOOKING_BACK = np.array(
@@ -167,7 +167,7 @@ def load_scene(
     folder = Path(path)
     if not folder.is_dir():
         raise SceneError(f"{folder}: no such folder; a scene has cameras.yaml and masks")
-    sequence, frame_rate_hz = _read_settings(folder / "scene.yaml")
+    sequence, frame_rate_hz = _read_settings(folder / SCENE_FILE)
     if cameras is None:
         if not os.path.lexists(folder / CAMERA_FILE):
             cameras, masks = _unknown_cameras(folder)

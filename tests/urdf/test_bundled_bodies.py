@@ -1,5 +1,6 @@
 """The bundled models: reproducible, closed, mirrored, jointed as in the papers, no gaps."""
 
+import itertools
 from functools import cache
 from pathlib import Path
 
@@ -54,21 +55,12 @@ TABLE_2 = {
     "left_shin": "X 0 120",
     "left_foot": "X -40 40 Y 0 40 Z -50 20",
 }
-PARENTS = {
-    "chest": "head",
-    "right_upper_arm": "chest",
-    "right_forearm": "right_upper_arm",
-    "right_hand": "right_forearm",
-    "left_upper_arm": "chest",
-    "left_forearm": "left_upper_arm",
-    "left_hand": "left_forearm",
-    "waist": "chest",
-    "right_thigh": "waist",
-    "right_shin": "right_thigh",
-    "right_foot": "right_shin",
-    "left_thigh": "waist",
-    "left_shin": "left_thigh",
-    "left_foot": "left_shin",
+LIMBS = ("chest upper_arm forearm hand", "waist thigh shin foot")
+PARENTS = {"chest": "head", "waist": "chest"} | {
+    f"{side}_{child}": parent if parent in ("chest", "waist") else f"{side}_{parent}"
+    for side in ("left", "right")
+    for limb in LIMBS
+    for parent, child in itertools.pairwise(limb.split())
 }
 # A ball of this radius [m] round each joint lies in the parent and in the child: whatever the
 # joint's angles, the ball joins the two.
@@ -241,19 +233,14 @@ def test_link_axes_are_the_papers_when_standing(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", BODIES)
-@pytest.mark.parametrize("link", ["upper_arm", "forearm", "hand", "thigh", "shin", "foot"])
-def test_no_limb_is_rotationally_symmetric(name: str, link: str) -> None:
-    mesh = mesh_of(name, f"left_{link}")
-    changes = [silhouette_area_changed(mesh, turn, turn + 20.0) for turn in range(0, 180, 20)]
-    assert min(changes) >= 10.0
-    assert float(np.mean(changes)) >= 20.0
-
-
-@pytest.mark.parametrize("name", BODIES)
-@pytest.mark.parametrize("link", ["head", "chest", "waist"])
-def test_front_and_back_differ(name: str, link: str) -> None:
-    mesh = mesh_of(name, link)
-    assert silhouette_area_changed(mesh, 90.0, 270.0) >= 50.0
+def test_no_part_looks_the_same_turned(name: str) -> None:
+    for link in ("upper_arm", "forearm", "hand", "thigh", "shin", "foot"):
+        mesh = mesh_of(name, f"left_{link}")
+        changes = [silhouette_area_changed(mesh, turn, turn + 20.0) for turn in range(0, 180, 20)]
+        assert min(changes) >= 10.0
+        assert float(np.mean(changes)) >= 20.0
+    for link in ("head", "chest", "waist"):
+        assert silhouette_area_changed(mesh_of(name, link), 90.0, 270.0) >= 50.0
 
 
 def test_files_stay_small() -> None:

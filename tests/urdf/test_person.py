@@ -1,5 +1,6 @@
 """The bundled person: 23 degrees of freedom, coloured for skin blobs, and its shape joints."""
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -24,46 +25,14 @@ from tests.urdf.surfaces import URDF, Silhouettes, read_obj, written_again
 PERSON = URDF / "person" / "person.urdf"
 SHAPE = URDF / "person" / "person_shape.urdf"
 STATURE = 0.5 * (1.6285 + 1.7562)
-# Date et al., figure 5: head 3 + 2, neck base 2, shoulders 3, elbows 1, hips 3, knees 1.
-LIMITS = {
-    "position_x": (-10, 10),
-    "position_y": (-10, 10),
-    "position_z": (-10, 10),
-    "head_y": (-180, 180),
-    "head_x": (-60, 90),
-    "neck_base_x": (-50, 75),
-    "neck_base_z": (-45, 45),
-    "left_upper_arm_x": (-180, 60),
-    "left_upper_arm_z": (-45, 180),
-    "left_upper_arm_y": (-70, 90),
-    "right_upper_arm_x": (-180, 60),
-    "right_upper_arm_z": (-180, 45),
-    "right_upper_arm_y": (-90, 70),
-    "left_forearm_x": (-150, 0),
-    "right_forearm_x": (-150, 0),
-    "left_thigh_y": (-45, 45),
-    "left_thigh_z": (-30, 45),
-    "left_thigh_x": (-120, 30),
-    "right_thigh_y": (-45, 45),
-    "right_thigh_z": (-45, 30),
-    "right_thigh_x": (-120, 30),
-    "left_shin_x": (0, 150),
-    "right_shin_x": (0, 150),
-}
+SIDES = ("left_", "right_")
 SKIN = ("head", "left_hand", "right_hand", "left_foot", "right_foot")
-# Shape joint -> the landmarks whose distance it changes one for one.
-LENGTHS = {
-    **{
-        f"{side}_{part}_stretch": (f"{side}_{start}", f"{side}_{end}")
-        for side in ("left", "right")
-        for part, start, end in (
-            ("upper_arm", "shoulder", "elbow"),
-            ("forearm", "elbow", "wrist"),
-            ("thigh", "hip", "knee"),
-            ("shin", "knee", "ankle"),
-        )
-    },
-}
+PARTS = (
+    ("upper_arm", "shoulder", "elbow"),
+    ("forearm", "elbow", "wrist"),
+    ("thigh", "hip", "knee"),
+    ("shin", "knee", "ankle"),
+)
 
 
 @pytest.fixture(scope="module")
@@ -129,14 +98,25 @@ def test_script_refuses_bad_factors(word: str, tmp_path: Path) -> None:
         written_again("person", tmp_path, "--lengths", word)
 
 
-def test_degrees_of_freedom_are_those_of_figure_5(person: ArticulatedModel) -> None:
-    assert len(person.position_names) == 23
-    assert set(person.position_names) == set(LIMITS)
-    for name, limits in LIMITS.items():
-        index = person.position_index(name)
-        scale = np.pi / 180.0 if person.position_kinds[index] == "angle" else 1.0
-        found = [person.lower[index], person.upper[index]]
-        np.testing.assert_allclose(found, np.array(limits) * scale, atol=1e-12)
+def test_degrees_of_freedom_are_those_of_figure_5_and_limits_are_mirrored(
+    person: ArticulatedModel,
+) -> None:
+    """Date et al., figure 5: head 3 + 2, neck base 2, shoulders 3, elbows 1, hips 3, knees 1."""
+    rows = ["position x y z", "head y x", "neck_base x z"]
+    for side in ("left", "right"):
+        rows += [f"{side}_upper_arm x z y", f"{side}_forearm x", f"{side}_thigh y z x"]
+        rows += [f"{side}_shin x"]
+    split = [row.split() for row in rows]
+    wanted = {f"{part}_{axis}" for part, *axes in split for axis in axes}
+    assert (len(person.position_names), set(person.position_names)) == (23, wanted)
+    for name in wanted:
+        left, right = person.position_index(name), person.position_index(name.replace(*SIDES))
+        ends = [person.lower[left], person.upper[left]]
+        if name.startswith("left_") and not name.endswith("_x"):
+            ends = [-ends[1], -ends[0]]
+        np.testing.assert_allclose([person.lower[right], person.upper[right]], ends)
+    assert not person.upper[person.position_index("left_forearm_x")]
+    assert not person.lower[person.position_index("left_shin_x")]
 
 
 def test_stands_upright_facing_forward(person: ArticulatedModel) -> None:
@@ -200,9 +180,10 @@ def test_shape_joints_change_the_lengths_one_for_one(shape: ArticulatedModel) ->
     rng = np.random.default_rng(6)
     q = random_pose(shape, rng)
     before = marks(shape, q)
-    for joint, (start, end) in LENGTHS.items():
+    for side, (part, begin, close) in itertools.product(SIDES, PARTS):
+        start, end = side + begin, side + close
         longer = q.copy()
-        longer[shape.position_index(joint)] = 0.02
+        longer[shape.position_index(f"{side}{part}_stretch")] = 0.02
         after = marks(shape, longer)
         change = np.linalg.norm(after[end] - after[start])
         change -= np.linalg.norm(before[end] - before[start])

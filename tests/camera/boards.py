@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from drake_pose.camera.calibration.board import Board, BoardDetections, Detection
+from drake_pose.camera.rigs import look_at
 
 CHECKERBOARD = Board("checkerboard", 8, 5, 0.12)
 CHARUCO = Board("charuco", 8, 5, 0.12, marker_length=0.09, dictionary="4X4_50")
@@ -46,24 +47,6 @@ class TrueCamera:
         return self.distort(p_C[:, :2] / p_C[:, 2:]) * self.focal + self.center
 
 
-def look_at(eye, target, up=(0.0, 0.0, 1.0)):
-    """Camera pose (4, 4): x right, y down, z towards the target."""
-    z = np.asarray(target, float) - eye
-    z /= np.linalg.norm(z)
-    x = np.cross(z, up)
-    x /= np.linalg.norm(x)
-    X = np.eye(4)
-    X[:3, :3] = np.column_stack([x, np.cross(z, x), z])
-    X[:3, 3] = eye
-    return X
-
-
-def turned(vector):
-    X = np.eye(4)
-    X[:3, :3] = cv2.Rodrigues(np.asarray(vector, float))[0]
-    return X
-
-
 def ring(count, generator, radius=2.5, spread=360.0, distorted=True):
     """Cameras on part of a circle, which look at its middle, 1.2 m up."""
     cameras = {}
@@ -82,16 +65,15 @@ def ring(count, generator, radius=2.5, spread=360.0, distorted=True):
 
 def board_pose(board, generator, towards):
     """A board near the middle of the ring that faces `towards` (3,), turned at random."""
-    tilt = turned(generator.uniform(-0.35, 0.35, 3))
+    tilt = cv2.Rodrigues(generator.uniform(-0.35, 0.35, 3))[0]
     z = np.asarray(towards, float) - [0, 0, 1.2]
     z /= np.linalg.norm(z)
     x = np.cross([0, 0, 1], z)
     x /= np.linalg.norm(x)
     X = np.eye(4)
-    X[:3, :3] = np.column_stack([x, np.cross(z, x), z]) @ tilt[:3, :3]
+    X[:3, :3] = np.column_stack([x, np.cross(z, x), z]) @ tilt
     middle = np.array([board.columns, board.rows, 0]) * 0.5 * board.square_length
-    p = np.array([0, 0, 1.2]) + generator.uniform(-0.25, 0.25, 3)
-    X[:3, 3] = p - X[:3, :3] @ middle
+    X[:3, 3] = [0, 0, 1.2] + generator.uniform(-0.25, 0.25, 3) - X[:3, :3] @ middle
     return X
 
 

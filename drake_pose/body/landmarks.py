@@ -135,10 +135,8 @@ def _landmark(entry: Any, where: str) -> Landmark:
     link, point = entry["link"], entry["point"]
     if not isinstance(link, str) or not link:
         raise ModelError(f"{where}: link must be a link's name, not {link!r}")
-    numbers = isinstance(point, list) and all(
-        isinstance(value, int | float) and not isinstance(value, bool) for value in point
-    )
-    if not numbers or len(point) != 3 or not np.all(np.isfinite(np.array(point, dtype=float))):
+    numbers = [v for v in point if type(v) in (int, float)] if isinstance(point, list) else []
+    if len(numbers) != 3 or len(point) != 3 or not np.all(np.isfinite(numbers)):
         raise ModelError(f"{where}: point must be three finite numbers [m], not {point!r}")
     array = np.array(point, dtype=np.float64)
     array.setflags(write=False)

@@ -23,15 +23,9 @@ _KINDS: dict[str, tuple[PositionKind, ...]] = {
     "planar": ("length", "length", "angle"),
     "rpy_floating": ("angle", "angle", "angle", "length", "length", "length"),
     "quaternion_floating": (
-        "quaternion",
-        "quaternion",
-        "quaternion",
-        "quaternion",
-        "length",
-        "length",
-        "length",
+        "quaternion", "quaternion", "quaternion", "quaternion", "length", "length", "length",
     ),
-}
+}  # fmt: skip
 FLOATING_TYPES = ("rpy_floating", "quaternion_floating")
 
 _FULL_TURN = 2.0 * np.pi
@@ -187,27 +181,26 @@ def _remarks(
     remarks = []
     for index in np.flatnonzero(wide):
         low, high = float(limits[0][index]), float(limits[1][index])
-        title, is_screw = _title(joint, int(index)), joint.type_name() == "screw"
-        unlimited = bool(np.isinf(low) and np.isinf(high))
-        one_sided = bool(np.isinf(low) or np.isinf(high)) and not unlimited
+        title, kind = _title(joint, int(index)), joint.type_name()
+        unlimited, one_sided = low == -high == -np.inf, np.isinf(low) != np.isinf(high)
         advice = (
             "give it a lower and an upper limit in the model file (or to load_model: "
             f"limits={{'{names[index]}': (low, high)}})"
         )
         answers = f"{np.degrees(turn[0][index]):.6g} to {np.degrees(turn[1][index]):.6g} degrees"
-        if _KINDS[joint.type_name()][index] == "length":
+        if _KINDS[kind][index] == "length":
             if not unlimited and not one_sided:
                 remarks.append(
                     f"{title} has limits of {low:g} and {high:g} m, more than {_WIDEST_LENGTH:g} m "
                     "apart: they are taken as none"
                 )
-        elif one_sided or (is_screw and not unlimited):
+        elif one_sided or (kind == "screw" and not unlimited):
             lacks = "limits" if one_sided else "limits that can be searched"
             raise ModelError(
                 f"{title} has no {lacks}: lower {low:g}, upper {high:g} [rad]; {advice}, so that "
                 "its values can be searched"
             )
-        elif is_screw:
+        elif kind == "screw":
             remarks.append(f"{title} is a screw without limits: searched from {answers}; {advice}")
         elif not unlimited:
             remarks.append(

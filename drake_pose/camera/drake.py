@@ -106,16 +106,20 @@ def camera_from_drake(
     else:
         near, intrinsics = {"near": source.clipping().near()}, source.intrinsics()
         pose = pose @ source.sensor_pose_in_camera_body().GetAsMatrix4()
+    return _pinhole(name, intrinsics, pose, **near)
+
+
+def _pinhole(
+    name: str, source: CameraInfo | CameraConfig, X_WC: np.ndarray, **near: float
+) -> PinholeCamera:
+    """The camera of what has Drake's intrinsics."""
+    if isinstance(source, CameraInfo):
+        size, center = (source.width(), source.height()), (source.center_x(), source.center_y())
+    else:
+        size, center = (source.width, source.height), source.principal_point()
+    focal = source.focal_x(), source.focal_y()
     return PinholeCamera(
-        name=name,
-        width=intrinsics.width(),
-        height=intrinsics.height(),
-        focal_x=intrinsics.focal_x(),
-        focal_y=intrinsics.focal_y(),
-        center_x=intrinsics.center_x() - HALF_PIXEL,
-        center_y=intrinsics.center_y() - HALF_PIXEL,
-        X_WC=pose,
-        **near,
+        name, *size, *focal, center[0] - HALF_PIXEL, center[1] - HALF_PIXEL, X_WC, **near
     )
 
 
@@ -139,18 +143,8 @@ def camera_from_config(config: CameraConfig) -> PinholeCamera:
         if not pose.IsDeterministic():
             raise CameraError(f"{where}: {name} is drawn by lot; give the pose that was drawn")
         poses.append(pose.GetDeterministicValue())
-    center_x, center_y = config.principal_point()
-    return PinholeCamera(
-        name=config.name,
-        width=config.width,
-        height=config.height,
-        focal_x=config.focal_x(),
-        focal_y=config.focal_y(),
-        center_x=center_x - HALF_PIXEL,
-        center_y=center_y - HALF_PIXEL,
-        X_WC=(poses[0] @ poses[1]).GetAsMatrix4(),
-        near=config.clipping_near,
-    )
+    X_WC = (poses[0] @ poses[1]).GetAsMatrix4()
+    return _pinhole(config.name, config, X_WC, near=config.clipping_near)
 
 
 def camera_to_config(camera: Camera) -> CameraConfig:

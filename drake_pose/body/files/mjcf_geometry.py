@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
+from drake_pose.body.files.xml_files import read_numbers
 from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.body.surfaces.mesh_files import drawable_file, read_mesh_file, write_obj
 from drake_pose.errors import ModelError
@@ -53,17 +54,8 @@ def numbers(
     element: ElementTree.Element, attribute: str, count: int, default: str = ""
 ) -> NDArray[np.float64]:
     """The numbers of an attribute, of which there must be ``count``; else a ModelError."""
-    text = element.get(attribute, default)
-    try:
-        values = np.array([float(word) for word in text.split()])
-    except ValueError:
-        values = np.array([])
-    if len(values) != count or not np.all(np.isfinite(values)):
-        raise ModelError(
-            f"<{element.tag}> '{element.get('name', '(unnamed)')}': {attribute}=\"{text}\" must "
-            f"be {count} numbers"
-        )
-    return values
+    where = f"<{element.tag}> '{element.get('name', '(unnamed)')}': {attribute}"
+    return np.array(read_numbers(element.get(attribute, default), count, where))
 
 
 def _number_text(values: NDArray[np.float64]) -> str:
@@ -93,25 +85,25 @@ def _pose(
         return position, Rotation.identity()
     kind = given[0]
     values = numbers(element, kind, ORIENTATIONS[kind])
-    vectors = {"euler": [], "axisangle": [values[:3]], "xyaxes": [values[:3], values[3:]]}
-    if any(np.linalg.norm(vector) < 1e-10 for vector in vectors.get(kind, [values])):
-        raise ModelError(f"<{element.tag}> '{name}': {kind}=\"{element.get(kind)}\" has no length")
     unit = np.pi / 180.0 if compiler.get("angle", "degree") == "degree" else 1.0
+    if kind == "euler":
+        return position, _euler(values * unit, compiler.get("eulerseq", "xyz"))
+    vectors = {"axisangle": [values[:3]], "xyaxes": [values[:3], values[3:]]}.get(kind, [values])
+    lengths = [np.linalg.norm(vector) for vector in vectors]
+    if min(lengths) < 1e-10:
+        raise ModelError(f"<{element.tag}> '{name}': {kind}=\"{element.get(kind)}\" has no length")
+    first = vectors[0] / lengths[0]
     if kind == "quat":
         return position, Rotation.from_quat(values[[1, 2, 3, 0]])
     if kind == "axisangle":
-        axis = values[:3] / np.linalg.norm(values[:3])
-        return position, Rotation.from_rotvec(axis * values[3] * unit)
+        return position, Rotation.from_rotvec(first * values[3] * unit)
     if kind == "zaxis":
         return position, _rotation_to_direction(values)
-    if kind == "euler":
-        return position, _euler(values * unit, compiler.get("eulerseq", "xyz"))
-    x = values[:3] / np.linalg.norm(values[:3])
-    y = values[3:] - (x @ values[3:]) * x
+    y = values[3:] - (first @ values[3:]) * first
     if np.linalg.norm(y) < 1e-10:
         raise ModelError(f"<{element.tag}> '{name}': the axes of xyaxes are parallel")
     y = y / np.linalg.norm(y)
-    return position, Rotation.from_matrix(np.stack([x, y, np.cross(x, y)], axis=1))
+    return position, Rotation.from_matrix(np.stack([first, y, np.cross(first, y)], axis=1))
 
 
 def _euler(angles: NDArray[np.float64], sequence: str) -> Rotation:

@@ -212,7 +212,7 @@ def test_meshes_are_placed_as_in_mujoco(tmp_path, asset, corner):
     ("more", "body", "message"),
     [
         ("", '<body name="a"><geom class="k" size="1"/></body>', "class 'k'"),
-        ("", '<body name="a" pos="1 2"><geom size="1"/></body>', "'a': pos=\"1 2\" must be 3"),
+        ("", '<body name="a" pos="1 2"><geom size="1"/></body>', "'a': pos is '1 2'; expected 3"),
         ("", '<body name="a"><joint name="j" axis="0 0 0"/><geom size="1"/></body>', "joint 'j'"),
         (
             "",

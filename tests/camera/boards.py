@@ -73,7 +73,7 @@ def board_pose(board, generator, towards):
     X = np.eye(4)
     X[:3, :3] = np.column_stack([x, np.cross(z, x), z]) @ tilt
     middle = np.array([board.columns, board.rows, 0]) * 0.5 * board.square_length
-    X[:3, 3] = [0, 0, 1.2] + generator.uniform(-0.25, 0.25, 3) - X[:3, :3] @ middle
+    X[:3, 3] = np.array([0, 0, 1.2]) - X[:3, :3] @ middle + generator.uniform(-0.25, 0.25, 3)
     return X
 
 

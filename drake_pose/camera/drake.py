@@ -110,7 +110,10 @@ def camera_from_drake(
 
 
 def _pinhole(
-    name: str, source: CameraInfo | CameraConfig, X_WC: np.ndarray, **near: float
+    name: str,
+    source: CameraInfo | CameraConfig,
+    X_WC: np.ndarray,
+    near: float = PinholeCamera.near,
 ) -> PinholeCamera:
     """The camera of what has Drake's intrinsics."""
     if isinstance(source, CameraInfo):
@@ -118,9 +121,8 @@ def _pinhole(
     else:
         size, center = (source.width, source.height), source.principal_point()
     focal = source.focal_x(), source.focal_y()
-    return PinholeCamera(
-        name, *size, *focal, center[0] - HALF_PIXEL, center[1] - HALF_PIXEL, X_WC, **near
-    )
+    x, y = center[0] - HALF_PIXEL, center[1] - HALF_PIXEL
+    return PinholeCamera(name, *size, *focal, x, y, X_WC, near)
 
 
 def camera_from_config(config: CameraConfig) -> PinholeCamera:

@@ -166,7 +166,7 @@ def calibrate_joints(
     told: dict[str, KinematicParameter] = {}
     while True:
         fit = SharedFit(seen, X_CW, [*standing, *sought], offsets=offsets, focal=focal)
-        found, covariance, pictures = _fitted(fit)
+        fit, found, covariance, pictures = _fitted(fit)
         values = _constants(fit, found, pictures, covariance, sought)
         told |= values
         # The cameras shall fit what is answered: nothing is added where it cannot be told.
@@ -187,14 +187,14 @@ def calibrate_joints(
     )
 
 
-def _fitted(fit: SharedFit) -> tuple[Shared, Array, int]:
+def _fitted(fit: SharedFit) -> tuple[SharedFit, Shared, Array, int]:
     """What was found, its covariance (u, u), and how many pictures counted."""
     # Constants that are off let good frames contradict, so all count at first.
-    found = fit.fit(ROUNDS_WITH_CONSTANTS)
+    fit, found = fit.from_found(fit.fit(ROUNDS_WITH_CONSTANTS))
     which = fit.agreeing(fit.inlier_ratios(found))
-    found = fit.fit(ROUNDS_WITH_CONSTANTS, found, which)
+    fit, found = fit.from_found(fit.fit(ROUNDS_WITH_CONSTANTS, found, which))
     covariance = _as_the_cost_bends(fit, found, which, fit.covariance(found, which))
-    return found, covariance, int(np.count_nonzero(which))
+    return fit, found, covariance, int(np.count_nonzero(which))
 
 
 def _as_the_cost_bends(fit: SharedFit, found: Shared, which: Mask, covariance: Array) -> Array:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,6 +121,7 @@ class SharedFit:
         widths: bool = True,
     ) -> None:
         self.seen, self.constants = tuple(seen), tuple(constants)
+        self._options: dict[str, Any] = {"offsets": offsets, "focal": focal, "widths": widths}
         first, body = seen[0], seen[0].body
         if offsets:
             body = LengthenedBody(first.kinematics, first.outlines, offsets)
@@ -172,6 +173,15 @@ class SharedFit:
         widths = np.zeros(len(self.rows))
         widths[which] = found.own.sum(axis=1)
         return Shared(found.shared, widths)
+
+    def from_found(self, found: Shared) -> tuple[SharedFit, Shared]:
+        """The same fit, whose cameras' unknowns count from where they were found."""
+        X_CW = [camera.X_CW for camera in self.cameras(found)]
+        count = self.per_camera * len(X_CW)
+        shared = found.shared.copy()
+        shared[:count].reshape(len(X_CW), -1)[:, : len(POSE_NAMES)] = 0.0
+        fit = SharedFit(self.seen, X_CW, self.constants, **self._options)
+        return fit, Shared(shared, found.widths)
 
     def equations(self, at: Shared, step: AnnealingStage, which: Mask | None = None) -> Equations:
         """The normal equations of the masks (rows,) that count, own unknowns first."""

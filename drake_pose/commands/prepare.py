@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
+from rich.markup import escape
+from rich.table import Table
 
 from drake_pose.commands.options import Json
 from drake_pose.commands.terminal import output_console, print_json, say, warn
 from drake_pose.errors import ModelError
 from drake_pose.results.settings import Packages
+
+if TYPE_CHECKING:
+    from drake_pose.body.report import ModelReport
 
 
 def check(file: Path, /, *, package: Packages | None = None, json: Json = False) -> None:
@@ -31,18 +37,35 @@ def check(file: Path, /, *, package: Packages | None = None, json: Json = False)
         file: The model: URDF, SDFormat, MJCF or .dmd.yaml.
     """
     from drake_pose.body.report import describe_model
-    from drake_pose.jobs.check import report_as_json, report_as_table
 
     report = describe_model(file, package_paths=package or {})
     if json:
-        print_json(report_as_json(report))
+        print_json({**asdict(report), "path": str(report.path), "usable": report.usable})
     elif report.usable:
-        output_console().print(report_as_table(report))
+        output_console().print(_segments(report))
     for text in report.warnings:
         warn(text)
     if report.errors:
         raise ModelError("; ".join(report.errors))
     say("drake-pose: fit for use")
+
+
+def _segments(report: ModelReport) -> Table:
+    """The segments of a model's pose tree, their joints' limits in degrees and metres."""
+    table = Table(
+        "segment", "hangs on", "joints in the order of rotation", "triangles", "closed",
+        title=escape(f"{report.name}: {len(report.nodes)} segments"),
+    )  # fmt: skip
+    units = {"angle": " deg", "length": " m"}
+    for node in report.nodes:
+        joints = [
+            f"{joint.name}  {joint.lower:g} .. {joint.upper:g}{units.get(joint.kind, '')}"
+            for joint in node.joints
+        ]
+        closed = "yes" if node.watertight else "no"
+        texts = (node.name, node.parent, "\n".join(joints) or "fixed", str(node.triangles), closed)
+        table.add_row(*map(escape, texts))
+    return table
 
 
 def calibrate(

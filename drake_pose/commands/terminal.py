@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -19,19 +19,6 @@ _LIMITS = {"run_limit": "run limit", "time_limit": "time limit"}
 
 class UsageError(Exception):
     """Options that do not go together; exit status 2."""
-
-
-class _Result(Protocol):
-    """What a command's work comes to."""
-
-    @property
-    def warnings(self) -> Sequence[str]: ...
-
-    @property
-    def summary(self) -> Mapping[str, Any]: ...
-
-
-_R = TypeVar("_R", bound=_Result)
 
 
 def say(message: str) -> None:
@@ -51,7 +38,7 @@ def print_json(value: Mapping[str, Any]) -> None:
     print(json.dumps(without_nan(value), indent=2, ensure_ascii=False, allow_nan=False))
 
 
-def print_result(result: _R, json: bool, print_text: Callable[[_R], None]) -> None:
+def print_result(result: Any, json: bool, print_text: Callable[[Any], None]) -> None:
     """Writes a result's warnings to stderr and, to stdout, its summary as JSON or its text."""
     for text in result.warnings:
         warn(text)

@@ -18,7 +18,7 @@ from drake_pose.camera.models import Camera
 from drake_pose.errors import MaskError, SceneError
 from drake_pose.jobs.estimate.searches import make_tree
 from drake_pose.jobs.registration.positions import KnownPositions, read_known_positions
-from drake_pose.jobs.registration.result import describe_run, drawn, write_overlays
+from drake_pose.jobs.registration.result import describe_run, write_overlays
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.registration.contradictions import Audit, Finding, FrameAudit, audit_frames
 from drake_pose.registration.per_frame_fit import PerFrameFit
@@ -218,8 +218,7 @@ def _write_result(
             f"{percent(frames[one.name]['fits'][name])} fits"
             for one in posed
         ]
-        titled = zip(posed, titles, strict=True)
-        write_overlays(path, drawn(inputs.tree, camera), name, titled)
+        write_overlays(path, inputs.tree, camera, zip(posed, titles, strict=True))
     write_summary(path, summary)
 
 

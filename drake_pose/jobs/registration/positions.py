@@ -42,22 +42,23 @@ class KnownPositions:
     """Where all joints are in each frame.
 
     Args:
-        path: the table.
         kinematics: of the pose tree.
         table: its columns and rows.
         order: (m,) the column of each value of the pose tree; -1: it is held.
         warnings: what the user should know of it.
-        is_estimate: whether they were estimated, so that they are off.
         girths: (nodes,) how many times as wide as the model's the nodes were found to be.
     """
 
-    path: Path
     kinematics: TreeKinematics
     table: TrueAngles
     order: NDArray[np.intp]
     warnings: tuple[str, ...] = ()
-    is_estimate: bool = False
     girths: Array | None = None
+
+    @property
+    def is_estimate(self) -> bool:
+        """Whether they were estimated, so that they are off."""
+        return self.table.is_estimate
 
     def has(self, frame: str) -> bool:
         """Whether there is a row of a frame."""
@@ -72,8 +73,8 @@ class KnownPositions:
         values = self.table.of(frame)
         if values is None:
             raise SceneError(
-                f"{self.path}: has no row of frame '{frame}', which camera '{camera}' has a mask "
-                "of; add the joint positions of that moment, or leave the frame out (--frame)"
+                f"{self.table.path}: has no row of frame '{frame}', which camera '{camera}' has a "
+                "mask of; add the joint positions of that moment, or leave the frame out (--frame)"
             )
         return np.where(self.order < 0, self.kinematics.lower, values[self.order])
 
@@ -154,7 +155,7 @@ def read_known_positions(
         dtype=np.intp,
     )
     warnings = _check_units(table, order, kinematics)
-    return KnownPositions(path, kinematics, table, order, warnings, table.is_estimate)
+    return KnownPositions(kinematics, table, order, warnings)
 
 
 def _as_they_are(table: TrueAngles, tree: PoseTree) -> set[str]:
@@ -236,16 +237,10 @@ def estimate_positions(
             "joint positions (--joints), or cameras with X_WC that see it"
         )
     index = [found.position_names.index(name) for name in kinematics.names]
-    table = TrueAngles(scene_path, found.position_names, values)
-    return KnownPositions(
-        scene_path,
-        kinematics,
-        table,
-        np.array(index, dtype=np.intp),
-        found.warnings,
-        is_estimate=True,
-        girths=_girths(kinematics.tree, found.summary.get("girths", {})),
-    )
+    table = TrueAngles(scene_path, found.position_names, values, is_estimate=True)
+    girths = _girths(kinematics.tree, found.summary.get("girths", {}))
+    order = np.array(index, dtype=np.intp)
+    return KnownPositions(kinematics, table, order, found.warnings, girths)
 
 
 def _require_enough(path: Path, model: ArticulatedModel, names: Sequence[str]) -> None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import yaml
@@ -32,8 +32,7 @@ from drake_pose.results.report_page import Picture, overlay_picture, page_templa
 from drake_pose.results.summary import file_digest, versions
 from drake_pose.results.texts import percent
 from drake_pose.silhouette.areas.outline import outline_from_mesh
-from drake_pose.silhouette.areas.scoring import draw_mask
-from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from drake_pose.silhouette.areas.scoring import draw_labels
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 
 Array = NDArray[np.float64]
@@ -159,12 +158,7 @@ def write_result(
     """Writes the result folder; the camera file comes last, when all else is there.
 
     Args:
-        path: the folder.
-        inputs: what was registered.
         cameras: all that the camera file is to hold.
-        registered: the cameras that were found, by name.
-        summary: from summarize.
-        overlay: whether overlays are written.
         urdf: the robot with the zeros and lengths that were found.
 
     Raises:
@@ -177,8 +171,8 @@ def write_result(
             f"{'agrees' if one.agrees else 'CONTRADICTS the others'}"
             for one in found.frames
         ]
-        draw = drawn(inputs.tree, found.camera, inputs.seen)
-        write_overlays(path, draw, name, zip(inputs.of(name), titles, strict=True))
+        titled = zip(inputs.of(name), titles, strict=True)
+        write_overlays(path, inputs.tree, found.camera, titled, inputs.seen)
     if urdf is not None:
         write_file(path, f"{inputs.model.path.stem}_calibrated.urdf", urdf)
     text = yaml.safe_dump(
@@ -192,33 +186,23 @@ def write_result(
     write_file(path, CAMERA_FILE, dump_cameras(cameras, links))
 
 
-class ParameterRow(NamedTuple):
-    """A zero or a length as it is shown: with units, and what to make of it."""
+def parameter_rows(parameters: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, ...]]:
+    """Zeros or lengths of a camera's part of summary.json as they are shown.
 
-    name: str
-    value: str
-    interval: str
-    word: str
-
-
-def parameter_rows(parameters: Mapping[str, Mapping[str, Any]]) -> list[ParameterRow]:
-    """The zeros or the lengths of a camera's part of summary.json, as they are shown."""
-    rows = []
+    Of each the name, the value with its unit, the interval, and what to make of it.
+    """
+    rows: list[tuple[str, ...]] = []
     for name, one in parameters.items():
         if not one["determined"]:
             goes_with = f", goes with {', '.join(one['gauge'])}" if one["gauge"] else ""
-            rows.append(ParameterRow(name, "", "", f"not determined{goes_with}"))
+            rows.append((name, "", "", f"not determined{goes_with}"))
             continue
         key = next(key for key in one if key.startswith("value_"))
         unit = key.removeprefix("value_")
-        rows.append(
-            ParameterRow(
-                name,
-                f"{one[key]:.3f} {'%' if unit == 'percent' else unit}",
-                f"{one[f'low_{unit}']:.3f} to {one[f'high_{unit}']:.3f}",
-                "significant" if one["significant"] else "as good as 0",
-            )
-        )
+        value = f"{one[key]:.3f} {'%' if unit == 'percent' else unit}"
+        interval = f"{one[f'low_{unit}']:.3f} to {one[f'high_{unit}']:.3f}"
+        word = "significant" if one["significant"] else "as good as 0"
+        rows.append((name, value, interval, word))
     return rows
 
 
@@ -272,38 +256,20 @@ def _uncertainty(found: RegisteredCamera, summary: Mapping[str, Any]) -> dict[st
 
 def write_overlays(
     folder: Path,
-    draw: Callable[[Array], NDArray[np.int64]],
-    camera: str,
+    tree: PoseTree,
+    camera: Camera,
     titled: Iterable[tuple[PosedFrame, str]],
+    seen: Collection[str] | None = None,
 ) -> None:
-    """Draws the robot over each mask of a camera, below a title; draw: as of drawn."""
-    for frame, title in titled:
-        segments = draw(frame.values)
-        picture = draw_overlay(frame.mask, segments >= 0, segments, title)
-        write_file(folder, f"{OVERLAY}/{camera}/{frame.name}.png", encode_png(picture))
-
-
-def drawn(
-    tree: PoseTree, camera: Camera, seen: Collection[str] | None = None
-) -> Callable[[Array], NDArray[np.int64]]:
-    """What draws the segments (H, W) at a tree's values (m,), -1 where there is none.
+    """Draws the robot over each mask of a camera, below a title.
 
     seen: the nodes that are drawn; None: all.
     """
     kinematics = TreeKinematics(tree)
-    if seen is None:
-        renderer = LabelRenderer(tree.model, camera)
-
-        def render(values: Array) -> NDArray[np.int64]:
-            q, X_WB = tree.positions_from(kinematics.split(values))
-            return np.asarray(renderer.segments(q, X_WB), np.int64)
-
-        return render
-    shown = [i for i, node in enumerate(tree.nodes) if node.name in seen]
-    outlines = [outline_from_mesh(tree.nodes[i].mesh) for i in shown]
-
-    def draw(values: Array) -> NDArray[np.int64]:
-        mask = draw_mask(outlines, camera.X_CW @ kinematics.poses(values)[shown], camera)
-        return np.where(mask, 0, -1)
-
-    return draw
+    shown = [k for k, node in enumerate(tree.nodes) if seen is None or node.name in seen]
+    outlines = [outline_from_mesh(tree.nodes[k].mesh) for k in shown]
+    for frame, title in titled:
+        X_CN = camera.X_CW @ kinematics.poses(frame.values)[shown]
+        segments = draw_labels(outlines, shown, X_CN, camera, empty=-1)
+        picture = draw_overlay(frame.mask, segments >= 0, segments, title)
+        write_file(folder, f"{OVERLAY}/{camera.name}/{frame.name}.png", encode_png(picture))

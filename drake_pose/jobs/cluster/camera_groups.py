@@ -9,15 +9,14 @@ import uuid
 from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecification, TimedPicture
 from drake_pose.errors import ClusterError, DrakePoseError
 from drake_pose.jobs.cluster import camera_worker
-from drake_pose.jobs.cluster.camera_worker import WatchReply, WatchRequest, host_of
+from drake_pose.jobs.cluster.camera_worker import WatchReply, host_of
 from drake_pose.jobs.cluster.lines import Line, Listening
 from drake_pose.jobs.cluster.remote_keeper import RemoteKeeper
 from drake_pose.jobs.cluster.worker import worker_resources
@@ -27,8 +26,6 @@ if TYPE_CHECKING:
 
 # How many pictures of each camera are asked for at once, and asked for again when fewer wait here.
 _COUNT = 4
-# How long a worker waits for a live camera's picture before it says that there is none [s].
-_LIVE_PATIENCE = 0.1
 # How long a recording waits for a worker, which may be started again meanwhile [s].
 _PATIENCE = 10.0
 # How long opening the sources may take, with all that a worker must import for it [s].
@@ -40,8 +37,7 @@ _SILENCE = 3.0
 _POLL_PAUSE = 0.0005
 
 
-@dataclass(frozen=True)
-class CameraAssignment:
+class CameraAssignment(NamedTuple):
     """Cameras that one worker looks through. hosts: where; empty: anywhere."""
 
     specifications: tuple[SourceSpecification, ...]
@@ -111,17 +107,17 @@ class Watchers:
         spacings: Mapping[str, float],
         waits: bool,
     ) -> None:
-        self.client, self.waits = client, waits
+        self.client, self.spacings, self.waits = client, spacings, waits
         self.reports: list[str] = []
         self.overdue: Callable[[str], float] = lambda _: -np.inf
         self._addresses: tuple[str, ...] = ()
         self._warm: dict[str, Future] = {}
         self._looked = self._pumped = -np.inf
         assignments = assign_cameras(specifications, client.run(worker_resources))
-        self.groups = [WatchedGroup(self, assignment, spacings) for assignment in assignments]
+        self.groups = [WatchedGroup(self, assignment) for assignment in assignments]
         try:
             for group in self.groups:
-                group.prepare()
+                group.settle()
             for group in self.groups:
                 group.require_ready()
         except DrakePoseError:
@@ -135,21 +131,24 @@ class Watchers:
             self._looked = time.monotonic()
         return self._addresses
 
-    def free_address(self, group: WatchedGroup) -> str | None:
-        """The worker with the fewest groups; None where none can look through the cameras."""
+    def free_address(self, group: WatchedGroup) -> tuple[str, bool]:
+        """The worker with the fewest groups, "" where there is none; whether it has no group."""
         loads = dict.fromkeys(filter(group.assignment.allows, self.addresses()), 0)
-        for other in self.groups:
+        for other in self.groups if loads else ():
             if other is not group and other.address in loads:
                 loads[other.address] += 1
-        return min(loads, key=loads.__getitem__, default=None)
+        best = min(loads, key=loads.__getitem__, default="")
+        return best, not loads.get(best)
 
     def is_warm(self, address: str) -> bool:
         """Whether a worker has imported what it needs; it begins to where it has not."""
         if address not in self._warm:
-            self._warm[address] = self.client.submit(
-                camera_worker.warm, workers=[address], pure=False
-            )
+            self._warm[address] = self.submit(address, camera_worker.warm)
         return bool(self._warm[address].done())
+
+    def submit(self, address: str, function: Callable, *arguments: object) -> Future:
+        """Has a worker call a function."""
+        return self.client.submit(function, *arguments, workers=[address], pure=False)
 
     def pump(self) -> None:
         """Takes what came, and asks for more."""
@@ -167,7 +166,7 @@ class Watchers:
 
 
 class WatchedGroup:
-    """Cameras that one worker, of an address, watches.
+    """Cameras that one worker, of an address, watches: Dask opens them, a line brings their views.
 
     Attributes:
         queues: by camera, what came and was not read yet.
@@ -177,9 +176,7 @@ class WatchedGroup:
         views, view_bytes, seconds: how many views came, of how many bytes, and the work for them.
     """
 
-    def __init__(
-        self, watchers: Watchers, assignment: CameraAssignment, spacings: Mapping[str, float]
-    ) -> None:
+    def __init__(self, watchers: Watchers, assignment: CameraAssignment) -> None:
         self.assignment, self.address = assignment, ""
         self.specifications = {one.camera: one for one in assignment.specifications}
         names = tuple(self.specifications)
@@ -189,55 +186,73 @@ class WatchedGroup:
         self.dropped = dict.fromkeys(names, 0)
         self.views, self.view_bytes, self.seconds = 0, 0, 0.0
         self.keeper = RemoteKeeper(names, lambda text: watchers.reports.append(text))
-        self._watchers, self._spacings = watchers, spacings
+        self._watchers, self._key = watchers, uuid.uuid4().hex
         self._names = ", ".join(f"'{name}'" for name in names)
-        self._key = uuid.uuid4().hex
         self._after = dict.fromkeys(names, -np.inf)
-        # Who was asked: the worker by the connection beside Dask, or by a task.
-        self._future: Future | None = None
+        self._opening: Future | None = None
         self._line: Line | None = None
-        self._listening: Listening | None = None
-        self._asked: float | None = None
+        # Since when the worker has not answered; whether it is still to be asked.
+        self._since, self._is_asked = time.monotonic(), False
         self._silent = self._given_up = False
 
-    def prepare(self) -> None:
-        """Begins to open the sources."""
-        self.address = self._watchers.free_address(self) or ""
-        self._ask(0)
+    def settle(self) -> None:
+        """Finds a worker where there is none; moves to a free one from one that has two groups."""
+        watchers = self._watchers
+        best, is_free = watchers.free_address(self)
+        if self.address:
+            shares = any(o.address == self.address for o in watchers.groups if o is not self)
+            if not (best and is_free and shares and watchers.is_warm(best)):
+                return
+            watchers.reports.append(f"camera {self._names} moves to a worker of its own")
+            self._close_watch()
+            self._hang_up()
+        self.address = best
+        if best:
+            given = self._key, self.assignment.specifications, watchers.spacings
+            self._opening = watchers.submit(best, camera_worker.open_watch, *given)
+            self._since = time.monotonic()
 
     def require_ready(self) -> None:
-        """Waits until the sources are open, or raises why they cannot be."""
-        future, self._future, self._asked = self._future, None, None
-        if future is None:
+        """Waits until the sources are open and answer, or raises why they do not."""
+        if self._opening is None:
             return
         try:
-            self._take(future.result(timeout=_OPENING))
+            self._connect(self._opening.result(timeout=_OPENING))
         except asyncio.TimeoutError:
             raise ClusterError(f"the worker of camera {self._names} does not get ready") from None
+        end, line = time.monotonic() + _PATIENCE, self._line
+        while line is not None and not self._ask(line, 0):
+            if time.monotonic() > end:
+                raise ClusterError(
+                    f"the worker of camera {self._names} at {self.address} cannot be reached at a "
+                    "port of its own, beside Dask's: let programs on its machine listen"
+                )
+            time.sleep(_POLL_PAUSE)
+        # What it says of the pictures' rates decides how often the sensors are looked at.
+        self._receive(_PATIENCE)
 
     def pump(self) -> None:
         """Takes what came, asks for more, and looks for another worker where this one died."""
-        if self._asked is None:
-            self._settle()
-            waiting = [len(q) for name, q in self.queues.items() if name not in self.ended]
-            if self.address and min(waiting, default=_COUNT) < _COUNT:
-                self._ask(_COUNT)
-            return
-        elapsed = time.monotonic() - self._asked
-        if self.address not in self._watchers.addresses():
+        if self.address and self.address not in self._watchers.addresses():
             self._lose("was lost")
-        elif (reply := self._reply()) is not None:
-            self._asked = self._future = None
-            if isinstance(reply, WatchReply):
-                self._take(reply)
+        elif self._opening is not None:
+            if self._opening.done():
+                self._finish_opening(self._opening)
+        elif self._is_asked:
+            self._receive()
+        else:
+            self.settle()
+            waiting = [len(q) for name, q in self.queues.items() if name not in self.ended]
+            if self._line is not None and min(waiting, default=_COUNT) < _COUNT:
+                self._ask(self._line, _COUNT)
             else:
-                self._lose(f"failed ({reply})")
-        elif elapsed > _SILENCE:
+                self._since = time.monotonic()
+        silence = time.monotonic() - self._since
+        if self.address and silence > _SILENCE:
             self._report_silence("does not answer")
-            if self._future is None and elapsed > _PATIENCE:
+            if self._opening is None and silence > _PATIENCE:
                 # The connection may be dead and the worker alive: Dask finds out.
-                self._hang_up()
-                self._asked = None
+                self._lose("does not answer")
 
     def await_camera(self, camera: str) -> None:
         """Waits until there is something of a camera, or nothing is to be expected."""
@@ -256,58 +271,52 @@ class WatchedGroup:
             with suppress(asyncio.TimeoutError):
                 self._close_watch().exception(timeout=_PATIENCE)
 
-    def _ask(self, count: int) -> None:
-        request = WatchRequest(
-            self._key,
-            tuple(self.specifications.values()),
-            self._spacings,
-            {name: max(time, self._watchers.overdue(name)) for name, time in self._after.items()},
-            count,
-            _LIVE_PATIENCE,
-        )
-        self._asked = time.monotonic()
-        if not count or self._line is None or not self._line.send(pickle.dumps(request)):
-            self._future = self._watchers.client.submit(
-                camera_worker.poll, request, workers=[self.address], pure=False
-            )
+    def _ask(self, line: Line, count: int) -> bool:
+        """Asks for views; False where there is no connection, yet or any more."""
+        overdue = self._watchers.overdue
+        after = {name: max(stamp, overdue(name)) for name, stamp in self._after.items()}
+        self._is_asked = line.send(pickle.dumps((count, after)))
+        if self._is_asked:
+            self._since = time.monotonic()
+        return self._is_asked
 
-    def _reply(self) -> WatchReply | DrakePoseError | str | None:
-        """What the worker answers or has raised; None: nothing yet."""
-        if self._future is None:
-            data = None if self._line is None else self._line.receive()
-            return None if data is None else pickle.loads(data)
-        if not self._future.done():
-            return None
-        error = self._future.exception() if self._future.status == "error" else None
-        if self._future.status == "finished":
-            with suppress(asyncio.TimeoutError, asyncio.CancelledError):
-                return self._future.result(timeout=_ALIVE_PERIOD)
-            return None
-        return error if isinstance(error, DrakePoseError) else "its task was lost"
+    def _receive(self, patience: float = 0.0) -> None:
+        data = None if self._line is None else self._line.receive(patience)
+        if data is not None:
+            self._is_asked, self._since = False, time.monotonic()
+            self._take(pickle.loads(data))
 
-    def _move_to(self, listening: Listening | None) -> None:
-        """Connects to where the worker listens beside Dask; None: nowhere."""
-        if listening == self._listening:
-            return
-        self._hang_up()
-        self._listening = listening
-        if listening is not None:
-            host = host_of(self.address)
-            self._line, sums = (Line(host, port, listening.key) for port in listening.ports)
-            self.keeper.move_to(sums)
+    def _finish_opening(self, opening: Future) -> None:
+        self._opening = None
+        try:
+            self._connect(opening.result(timeout=_ALIVE_PERIOD))
+        except (asyncio.TimeoutError, asyncio.CancelledError):
+            self._lose("failed (its task was lost)")
+        except Exception as error:  # noqa: BLE001
+            # Whatever a task raises comes here: Dask's own errors, too.
+            is_ours = isinstance(error, DrakePoseError)
+            self._lose(f"failed ({error if is_ours else 'its task was lost'})")
+
+    def _connect(self, listening: Listening) -> None:
+        """Connects to where the worker listens beside Dask."""
+        host = host_of(self.address)
+        self._line, sums = (Line(host, port, listening.key) for port in listening.ports)
+        self.keeper.move_to(sums)
+        self._opening, self._is_asked, self._since = None, False, time.monotonic()
 
     def _hang_up(self) -> None:
-        self.keeper.close()
+        self.keeper.move_to(None)
         if self._line is not None:
             self._line.close()
-        if self._future is not None:
-            self._future.cancel()
-        self._line = self._listening = self._future = None
+        if self._opening is not None:
+            self._opening.cancel()
+        self._line = self._opening = None
+        self._is_asked = False
 
     def _lose(self, how: str) -> None:
         self._report_silence(how)
         self._hang_up()
-        self._asked, self.address = None, ""
+        self.address = ""
 
     def _report_silence(self, how: str) -> None:
         if not self._silent:
@@ -316,32 +325,13 @@ class WatchedGroup:
             )
         self._silent = True
 
-    def _settle(self) -> None:
-        """Finds a worker where there is none; moves to a free one from one that has two groups."""
-        from distributed import fire_and_forget
-
-        free = self._watchers.free_address(self)
-        if free is None:
-            return
-        taken = {group.address for group in self._watchers.groups if group is not self}
-        if not self.address:
-            self.address = free
-        elif self.address in taken and free not in taken and self._watchers.is_warm(free):
-            fire_and_forget(self._close_watch())
-            self._watchers.reports.append(f"camera {self._names} moves to a worker of its own")
-            self._hang_up()
-            self.address = free
-
     def _close_watch(self) -> Future:
-        return self._watchers.client.submit(
-            camera_worker.close, self._key, workers=[self.address], pure=False
-        )
+        return self._watchers.submit(self.address, camera_worker.close_watch, self._key)
 
     def _take(self, reply: WatchReply) -> None:
         if self._silent:
             self._watchers.reports.append(f"a worker goes on with camera {self._names}")
         self._silent = self._given_up = False
-        self._move_to(reply.listening)
         for name, views in reply.views.items():
             for stamp, frame, view in views:
                 packed = np.frombuffer(view, dtype=np.uint8)

@@ -9,14 +9,15 @@ import pickle
 import threading
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import ExitStack, closing
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from distributed import get_worker
 
 from drake_pose.camera.sources.files import load_background_pictures, open_source
 from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecification
-from drake_pose.errors import DrakePoseError
 from drake_pose.fit.camera_sums import (
     Views,
     answer_request,
@@ -39,28 +40,10 @@ from drake_pose.silhouette.segmentation.background import (
 _IDLE = 30.0
 # Between two checks whether a live camera has a new picture [s].
 _POLL_PAUSE = 0.002
+# How long it is waited for a live camera's picture before it is said that there is none [s].
+_LIVE_PATIENCE = 0.1
 # How many of each camera's last pictures are kept: who follows the person is a few of them behind.
 _KEPT = 64
-
-
-@dataclass(frozen=True)
-class WatchRequest:
-    """What a worker is asked for.
-
-    Args:
-        key: the same sources stay open under it.
-        spacings: from edge point to edge point, by camera [pixel].
-        after: by camera, the time stamp up to which pictures came already or come too late [s].
-        count: how many pictures of each camera at most; 0: the sources are opened, no more.
-        patience: how long at most until a live camera gives a picture [s].
-    """
-
-    key: str
-    specifications: tuple[SourceSpecification, ...]
-    spacings: Mapping[str, float]
-    after: Mapping[str, float]
-    count: int
-    patience: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,16 +56,14 @@ class WatchReply:
         dropped: by camera, pictures that could not be used since the sources were opened.
         rates: by camera, pictures a second, where known.
         seconds: of its processor's time, for views and sums [s].
-        listening: the ports for polls and sums, at the address where Dask reaches the worker.
     """
 
     views: Mapping[str, Sequence[tuple[float, str, bytes]]]
-    ended: tuple[str, ...] = ()
-    problems: tuple[str, ...] = ()
-    dropped: Mapping[str, int] = field(default_factory=dict)
-    rates: Mapping[str, float | None] = field(default_factory=dict)
-    seconds: float = 0.0
-    listening: Listening | None = None
+    ended: tuple[str, ...]
+    problems: tuple[str, ...]
+    dropped: Mapping[str, int]
+    rates: Mapping[str, float | None]
+    seconds: float
 
 
 class EdgeServer:
@@ -130,46 +111,74 @@ def _load_kernels(surfaces: PackedOutlines) -> None:
     compare_placed(surfaces, np.tile(np.eye(4), (nodes, 1, 1)), views, np.ones((1, 4)))
 
 
-class _Watch:
-    """Some cameras' sources, open."""
+class CameraWatch:
+    """Some cameras' sources, open until they are closed or nobody asks.
 
-    def __init__(self, request: WatchRequest) -> None:
-        self.lock = threading.Lock()
-        self.used = time.monotonic()
-        self._closed = threading.Event()
-        self._sources: dict[str, FrameSource] = {}
-        self._backgrounds: dict[str, Background] = {}
-        self._edges = EdgeServer(len(request.specifications))
-        self._seconds = 0.0
+    Raises:
+        SceneError: a source cannot be opened.
+        ClusterError: this worker's own address cannot be listened at.
+    """
+
+    def __init__(
+        self, specifications: Sequence[SourceSpecification], spacings: Mapping[str, float]
+    ) -> None:
+        self._spacings, self._edges = spacings, EdgeServer(len(specifications))
+        self._closed, self._lock = threading.Event(), threading.Lock()
+        self._used, self._seconds = time.monotonic(), 0.0
         warm()
-        try:
-            for one in request.specifications:
-                if not one.gives_masks:
-                    self._backgrounds[one.camera] = learn_background(load_background_pictures(one))
-                # Machines share no other clock than that of the day.
-                self._sources[one.camera] = open_source(one, time.time)
-        except DrakePoseError:
-            self.close()
-            raise
-        host = _own_host()
-        answers = (_poll_pickled, self._edges.answer)
-        self._listening = None if host is None else serve(host, answers, self._closed)
+        with ExitStack() as opened:
+            self._backgrounds: dict[str, Background] = {
+                one.camera: learn_background(load_background_pictures(one))
+                for one in specifications
+                if not one.gives_masks
+            }
+            # Machines share no other clock than that of the day.
+            self._sources: dict[str, FrameSource] = {
+                one.camera: opened.enter_context(closing(open_source(one, time.time)))
+                for one in specifications
+            }
+            host = host_of(get_worker().address)
+            self.listening = serve(host, (self._answer, self._edges.answer), self._closed)
+            self._opened = opened.pop_all()
+        threading.Thread(target=self._close_when_idle, daemon=True).start()
 
-    def poll(self, request: WatchRequest) -> WatchReply:
-        """What the cameras see now, or next."""
+    def close(self) -> None:
+        """Lets go of the sources."""
+        self._closed.set()
+        with self._lock:
+            self._opened.close()
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the sources were let go."""
+        return self._closed.is_set()
+
+    def _close_when_idle(self) -> None:
+        """Lets go of sources whose capture ended without a word."""
+        while not self._closed.wait(_IDLE / 10.0):
+            if time.monotonic() - self._used > _IDLE:
+                self.close()
+
+    def _answer(self, parts: Sequence[bytes]) -> bytes:
+        """The pickled reply to a pickled request."""
+        with self._lock:
+            return pickle.dumps(self._poll(*pickle.loads(parts[0])))
+
+    def _poll(self, count: int, after: Mapping[str, float]) -> WatchReply:
+        """What the cameras see now, or next: of each so many pictures, after a time stamp [s]."""
         sources = self._sources
         views: dict[str, list[tuple[float, str, bytes]]] = {name: [] for name in sources}
-        end = time.monotonic() + request.patience
-        while request.count and not all(source.ended for source in sources.values()):
+        end = time.monotonic() + _LIVE_PATIENCE
+        while not all(source.ended for source in sources.values()):
             begin = time.thread_time()
-            for number, (name, source) in enumerate(sources.items()):
-                self._see(number, source, views[name], request)
+            for number, name in enumerate(sources):
+                self._see(number, name, views[name], count, after[name])
             self._seconds += time.thread_time() - begin
             live = any(one.specification.live for one in sources.values())
             if not live or any(views.values()) or time.monotonic() > end:
                 break
             time.sleep(_POLL_PAUSE)
-        self.used = time.monotonic()
+        self._used = time.monotonic()
         problems = tuple(text for one in sources.values() for text in one.problems)
         for source in sources.values():
             source.problems.clear()
@@ -181,46 +190,30 @@ class _Watch:
             {name: source.dropped for name, source in sources.items()},
             {name: source.rate_hz for name, source in sources.items()},
             seconds,
-            self._listening,
         )
 
     def _see(
         self,
         number: int,
-        source: FrameSource,
+        name: str,
         views: list[tuple[float, str, bytes]],
-        request: WatchRequest,
+        count: int,
+        after: float,
     ) -> None:
         """The next views of one camera."""
-        name = source.specification.camera
-        while len(views) < request.count and (one := source.read()) is not None:
+        source = self._sources[name]
+        while len(views) < count and (one := source.read()) is not None:
             # A recording that is opened again begins at its beginning.
-            if one.time <= request.after.get(name, -np.inf):
+            if one.time <= after:
                 continue
             if source.specification.gives_masks:
                 region = np.asarray(one.picture, dtype=np.bool_)
             else:
                 picture = np.asarray(one.picture, dtype=np.uint8)
                 region = person_region(picture, self._backgrounds[name])
-            view = see_silhouette(region, request.spacings[name])
+            view = see_silhouette(region, self._spacings[name])
             self._edges.put(number, one.time, view.edge)
             views.append((one.time, one.frame, pack_view(view)))
-
-    def close(self) -> None:
-        """Lets go of the sources."""
-        self._closed.set()
-        for source in self._sources.values():
-            source.close()
-
-
-def _own_host() -> str | None:
-    """Where this worker listens to Dask; None where it is no worker."""
-    from distributed import get_worker
-
-    try:
-        return host_of(get_worker().address)
-    except ValueError:
-        return None
 
 
 def host_of(address: str) -> str:
@@ -228,7 +221,7 @@ def host_of(address: str) -> str:
     return address.split("://")[-1].rsplit(":", 1)[0]
 
 
-_watches: dict[str, _Watch] = {}
+_watches: dict[str, CameraWatch] = {}
 _watches_lock = threading.Lock()
 
 
@@ -241,39 +234,23 @@ def warm() -> None:
     pack_view(see_silhouette(region, 4.0))
 
 
-def poll(request: WatchRequest) -> WatchReply:
-    """Opens the sources if they are not open yet (SceneError), and says what the cameras see."""
+def open_watch(
+    key: str, specifications: Sequence[SourceSpecification], spacings: Mapping[str, float]
+) -> Listening:
+    """Opens sources if they are not open yet under this key; where polls and sums are answered.
+
+    Raises:
+        SceneError: a source cannot be opened.
+        ClusterError: this worker's own address cannot be listened at.
+    """
     with _watches_lock:
-        watch = _watches.get(request.key)
-        if watch is None:
-            watch = _watches[request.key] = _Watch(request)
-            threading.Thread(
-                target=_close_when_idle, args=(request.key, watch), daemon=True
-            ).start()
-    with watch.lock:
-        return watch.poll(request)
+        if key not in _watches or _watches[key].is_closed:
+            _watches[key] = CameraWatch(specifications, spacings)
+        return _watches[key].listening
 
 
-def _poll_pickled(parts: Sequence[bytes]) -> bytes:
-    """As poll, of a request that came by a connection of its own."""
-    try:
-        return pickle.dumps(poll(pickle.loads(parts[0])))
-    except DrakePoseError as error:
-        return pickle.dumps(error)
-
-
-def close(key: str) -> None:
+def close_watch(key: str) -> None:
     """Lets go of a watch's sources."""
     with _watches_lock:
-        watch = _watches.pop(key, None)
-    if watch is not None:
-        with watch.lock:
-            watch.close()
-
-
-def _close_when_idle(key: str, watch: _Watch) -> None:
-    """Lets go of sources whose capture ended without a word."""
-    while _watches.get(key) is watch:
-        time.sleep(0.1 * _IDLE)
-        if time.monotonic() - watch.used > _IDLE:
-            close(key)
+        if key in _watches:
+            _watches.pop(key).close()

@@ -9,6 +9,8 @@ from typing import NamedTuple
 
 import zmq
 
+from drake_pose.errors import ClusterError
+
 # How often a server looks whether it was closed [ms].
 _LOOK = 200
 
@@ -24,16 +26,19 @@ class Line:
     """The asking end of a connection: one request at a time; nothing waits for a dead peer."""
 
     def __init__(self, host: str, port: int, key: bytes) -> None:
-        self._socket: zmq.Socket = zmq.Context.instance().socket(zmq.REQ)
-        # A request whose reply did not come may be followed by another, whose reply is told apart;
-        # without a connection nothing is sent.
-        for option in (zmq.REQ_RELAXED, zmq.REQ_CORRELATE, zmq.IMMEDIATE):
-            self._socket.setsockopt(option, 1)
-        self._socket.setsockopt(zmq.LINGER, 0)
         own, secret = zmq.curve_keypair()
-        for option, value in (
-            (zmq.CURVE_PUBLICKEY, own), (zmq.CURVE_SECRETKEY, secret), (zmq.CURVE_SERVERKEY, key),
-        ):  # fmt: skip
+        self._socket: zmq.Socket = zmq.Context.instance().socket(zmq.REQ)
+        for option, value in {
+            # A request whose reply did not come may be followed by another, whose reply is told
+            # apart; without a connection nothing is sent.
+            zmq.REQ_RELAXED: 1,
+            zmq.REQ_CORRELATE: 1,
+            zmq.IMMEDIATE: 1,
+            zmq.LINGER: 0,
+            zmq.CURVE_PUBLICKEY: own,
+            zmq.CURVE_SECRETKEY: secret,
+            zmq.CURVE_SERVERKEY: key,
+        }.items():
             self._socket.setsockopt(option, value)
         self._socket.connect(f"tcp://{host}:{port}")
 
@@ -59,23 +64,27 @@ Answer = Callable[[Sequence[bytes]], bytes]
 """The reply to a request's parts."""
 
 
-def serve(host: str, answers: Sequence[Answer], closed: threading.Event) -> Listening | None:
+def serve(host: str, answers: Sequence[Answer], closed: threading.Event) -> Listening:
     """Answers requests, each kind at a port and in a thread of its own, until it is closed.
 
-    None: the host's address cannot be listened at.
+    Raises:
+        ClusterError: the host's address cannot be listened at.
     """
     key, secret = zmq.curve_keypair()
     ports = []
     for answer in answers:
         socket: zmq.Socket = zmq.Context.instance().socket(zmq.REP)
-        socket.setsockopt(zmq.LINGER, 0)
-        socket.setsockopt(zmq.CURVE_SERVER, 1)
-        socket.setsockopt(zmq.CURVE_SECRETKEY, secret)
+        for option, value in {
+            zmq.LINGER: 0, zmq.CURVE_SERVER: 1, zmq.CURVE_SECRETKEY: secret,
+        }.items():  # fmt: skip
+            socket.setsockopt(option, value)
         try:
             ports.append(socket.bind_to_random_port(f"tcp://{host}"))
-        except zmq.ZMQError:
+        except zmq.ZMQError as error:
             closed.set()
-            return None
+            raise ClusterError(
+                f"a worker cannot listen at its own address {host}: {error}"
+            ) from None
         threading.Thread(target=_serve, args=(socket, answer, closed), daemon=True).start()
     return Listening(key, tuple(ports))
 

@@ -29,17 +29,18 @@ class RemoteKeeper:
 
     def __init__(self, cameras: Iterable[str], report: Callable[[str], None]) -> None:
         self._numbers = {name: k for k, name in enumerate(cameras)}
-        self._report, self._is_reported = report, False
+        self._report = report
         self._line: Line | None = None
         self._packed: PackedOutlines | None = None
-        self._is_ready = False
+        self._is_ready = self._is_reported = False
         self._sent_at = self._retry_at = 0.0
         self._retry_pause = _RETRY
         self.answers = 0
 
     def move_to(self, line: Line | None) -> None:
-        """Says by which connection the worker is asked."""
-        self.close()
+        """Says by which connection the worker is asked; None: by none."""
+        if self._line is not None:
+            self._line.close()
         self._line, self._packed = line, None
         self._sent_at, self._retry_at, self._retry_pause = time.monotonic(), 0.0, _RETRY
 
@@ -49,19 +50,18 @@ class RemoteKeeper:
             return False
         if self._packed is not request.packed:
             self._is_ready = False
-            if self._send(SURFACES, pack_surfaces(request.packed)):
+            if self._send(self._line, SURFACES, pack_surfaces(request.packed)):
                 self._packed = request.packed
             return False
         # The worker says when it has loaded all it needs.
         self._is_ready = self._is_ready or self._line.receive() is not None
-        if not self._is_ready:
-            return False
-        return self._send(SUM, pack_request(request, [self._numbers[n] for n in request.names]))
+        data = pack_request(request, [self._numbers[name] for name in request.names])
+        return self._is_ready and self._send(self._line, SUM, data)
 
     def answer(self) -> CameraSum | None:
         """The sum that was asked for; None where it does not come in time."""
-        assert self._line is not None, "it was asked"
-        data = self._line.receive(self._sent_at + _PATIENCE - time.monotonic())
+        patience = self._sent_at + _PATIENCE - time.monotonic()
+        data = None if self._line is None else self._line.receive(patience)
         if data is None:
             self._put_off("do not come in time")
             return None
@@ -69,21 +69,13 @@ class RemoteKeeper:
         self.answers += bool(data)
         return unpack_sum(data) if data else None
 
-    def close(self) -> None:
-        """Hangs up."""
-        if self._line is not None:
-            self._line.close()
-            self._line = None
-
-    def _send(self, kind: bytes, data: bytes) -> bool:
-        assert self._line is not None, "it is checked before"
-        now = time.monotonic()
-        if not self._line.send(kind, data):
-            if now - self._sent_at > _CONNECTING:
-                self._put_off("cannot be asked for")
-            return False
-        self._sent_at = now
-        return True
+    def _send(self, line: Line, kind: bytes, data: bytes) -> bool:
+        is_sent, now = line.send(kind, data), time.monotonic()
+        if is_sent:
+            self._sent_at = now
+        elif now - self._sent_at > _CONNECTING:
+            self._put_off("cannot be asked for")
+        return is_sent
 
     def _put_off(self, why: str) -> None:
         """Tries again later."""

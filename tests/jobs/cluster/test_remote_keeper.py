@@ -14,6 +14,7 @@ from drake_pose.body.model import load_model
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.jobs.cluster.camera_worker import EdgeServer
+from drake_pose.errors import ClusterError
 from drake_pose.jobs.cluster.lines import Line, serve
 from drake_pose.jobs.cluster.remote_keeper import RemoteKeeper
 from drake_pose.person.pose_tracker import PersonPoseTracker
@@ -104,7 +105,7 @@ def test_the_answer_is_that_of_one_process_which_unpacks_nothing(world, closed):
     world.same(world.follow(world.kept(keepers[0], None)))
     assert not reports
     for keeper in keepers:
-        keeper.close()
+        keeper.move_to(None)
 
 
 def test_moments_that_are_not_kept_are_compared_here_and_old_ones_are_forgotten(world, closed):
@@ -119,7 +120,7 @@ def test_moments_that_are_not_kept_are_compared_here_and_old_ones_are_forgotten(
     world.same(world.follow(world.kept(keeper, None)))
     assert keeper.answers == before
     assert not reports
-    keeper.close()
+    keeper.move_to(None)
 
 
 def test_an_answer_that_nobody_took_is_not_taken_for_another(closed):
@@ -159,7 +160,7 @@ def test_nobody_waits_for_the_silent(world, closed):
     begin = time.monotonic()
     world.same(world.follow(views))
     assert time.monotonic() - begin < 0.4, "it is not asked again at once"
-    keeper.close()
+    keeper.move_to(None)
 
 
 def test_who_does_not_know_the_key_is_not_answered(world, closed, monkeypatch):
@@ -172,7 +173,7 @@ def test_who_does_not_know_the_key_is_not_answered(world, closed, monkeypatch):
         world.same(world.follow(world.kept(keeper, None)))
     assert "camera 'camera_0', 'camera_1' cannot be asked for" in reports[0]
     assert not asked
-    keeper.close()
+    keeper.move_to(None)
 
 
 def test_a_server_listens_at_its_own_address_alone(closed):
@@ -183,4 +184,5 @@ def test_a_server_listens_at_its_own_address_alone(closed):
         if one.status == psutil.CONN_LISTEN
     }
     assert [open_at[port] for port in listening.ports] == [HOST, HOST]
-    assert serve("192.0.2.1", [lambda parts: b""], threading.Event()) is None
+    with pytest.raises(ClusterError, match="192.0.2.1"):
+        serve("192.0.2.1", [lambda parts: b""], threading.Event())

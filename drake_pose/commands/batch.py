@@ -59,20 +59,17 @@ def batch(
     """
     from drake_pose.jobs.batch.batch import run_batch
     from drake_pose.jobs.batch.job import read_job
-    from drake_pose.jobs.batch.workers import ClusterPool
 
     read = read_job(jobs, chunk)
-    with workers_of(workers, scheduler, out.absolute().parent) as client:
-        pool = None if client is None else ClusterPool(client)
-        with progress_bar() as bar:
-            task = bar.add_task("reading", total=None)
+    with workers_of(workers, scheduler, out.absolute().parent) as client, progress_bar() as bar:
+        task = bar.add_task("reading", total=None)
 
-            def show(done: int, total: int, message: str) -> None:
-                bar.update(task, description="frames", completed=done, total=total)
-                if message:
-                    warn(message)
+        def show(done: int, total: int, message: str) -> None:
+            bar.update(task, description="frames", completed=done, total=total)
+            if message:
+                warn(message)
 
-            result = run_batch(read, out, pool, resume, show)
+        result = run_batch(read, out, client, resume, show)
     if json:
         print_json(result.as_json())
     else:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
-
-from cyclopts import Parameter
 
 from drake_pose.commands.estimate import estimate, print_estimate
 from drake_pose.commands.options import (
@@ -19,8 +17,6 @@ from drake_pose.commands.options import (
     Replay,
     Resume,
     Scheduler,
-    Seconds,
-    Shape,
     Truth,
     within,
     workers_of,
@@ -34,44 +30,14 @@ from drake_pose.commands.terminal import (
     warn,
 )
 from drake_pose.errors import SceneError
+from drake_pose.jobs.live.settings import LiveSettings
 from drake_pose.results.settings import CaptureSettings, EstimateSettings, changed
 
 if TYPE_CHECKING:
+    from distributed import Client
     from rich.table import Table
 
-    from drake_pose.jobs.live.capture import LiveResult, LiveSettings
-
-
-@dataclass(frozen=True, kw_only=True)
-class LiveOptions:
-    """Options of a capture that are for a sources.yaml."""
-
-    seconds: Seconds = None
-    """Stop after this time [s]. Live capture (sources.yaml) only."""
-    shape: Shape = None
-    fit_shape: Annotated[bool, Parameter(negative="--no-fit-shape")] = True
-    """Fit lengths and girths to the first frames; or keep the model's. Live capture only."""
-    tolerance: Annotated[float | None, within(0.0), Parameter(metavar="SECONDS")] = None
-    """Largest difference of time stamps of simultaneous pictures. Default: half the time between
-    two pictures of a camera, or 0.9 of it if cameras are live."""
-    workers: CaptureWorkers = 0
-    scheduler: Scheduler = None
-    face_camera: Annotated[str | None, Parameter(metavar="NAME")] = None
-    """With --method paper: the camera before the face, which tells where the person looks; needs
-    --faces."""
-    faces: Annotated[Path | None, Parameter(metavar="FOLDER")] = None
-    """With --method paper: pictures of the person's face, and directions.csv:
-    picture,turn,nod [deg]."""
-
-    @property
-    def of_paper(self) -> bool:
-        """Whether one is given that is for --method paper alone."""
-        return self.face_camera is not None or self.faces is not None
-
-    @property
-    def of_person(self) -> bool:
-        """Whether one is given that is for --method person alone."""
-        return bool(self.shape or not self.fit_shape or self.workers or self.scheduler)
+    from drake_pose.jobs.live.frame_results import LiveResult
 
 
 def capture(
@@ -82,7 +48,9 @@ def capture(
     model: Path | None = None,
     method: Literal["person", "paper"] = "person",
     settings: Annotated[CaptureSettings | None, SPREAD] = None,
-    live: Annotated[LiveOptions | None, SPREAD] = None,
+    live: Annotated[LiveSettings | None, SPREAD] = None,
+    workers: CaptureWorkers = 0,
+    scheduler: Scheduler = None,
     truth: Truth = None,
     resume: Resume = False,
     overlay: Overlay = True,
@@ -104,11 +72,12 @@ def capture(
         method: person: by all silhouettes at once; paper: by skin seen in colour pictures, and a
             search for elbows and knees, as Date et al. published it.
     """
-    settings, live = settings or CaptureSettings(), live or LiveOptions()
+    settings, live = settings or CaptureSettings(), live or LiveSettings()
     of_masks = bool(truth or resume or set(changed(settings)) - {"packages"})
     # The name of SOURCES; its module would make every command's start slow.
     has_sources = (scene / "sources.yaml").is_file()
-    _check(scene, method, of_masks, has_sources, live)
+    on_workers = bool(workers or scheduler)
+    _check(scene, method, of_masks, has_sources, live, on_workers)
     if method == "person" and not has_sources:
         from drake_pose.jobs.estimate.person_choice import bundled_person
 
@@ -119,29 +88,34 @@ def capture(
             truth=truth, resume=resume, overlay=overlay, replay=replay, json=json,
         )  # fmt: skip
         return
-    from drake_pose.jobs.live.capture import LiveSettings
+    live = replace(live, replay=replay, packages=settings.packages)
+    with workers_of(workers, scheduler) as client:
+        _print_result(_capture_live(scene, out, model, method, live, client), json)
 
-    how = LiveSettings(live.seconds, live.shape, live.fit_shape, replay, settings.packages)
-    _print_result(_capture_live(scene, out, model, method, how, live), json)
 
-
-def _check(scene: Path, method: str, of_masks: bool, has_sources: bool, live: LiveOptions) -> None:
+def _check(
+    scene: Path,
+    method: str,
+    of_masks: bool,
+    has_sources: bool,
+    live: LiveSettings,
+    on_workers: bool,
+) -> None:
     """Refuses options that do not go together."""
-    if method == "paper" and (of_masks or live.of_person):
+    of_person = bool(live.shape or not live.fit_shape or on_workers)
+    if method == "paper" and (of_masks or of_person):
         raise UsageError(
             "--camera, --frame, --truth, --start, --no-track, --resume, --shape, --no-fit-shape, "
             "--workers and --scheduler are for --method person"
         )
-    if method == "person" and live.of_paper:
+    if method == "person" and live.faces is not None:
         raise UsageError("--face-camera and --faces are for --method paper")
-    if (live.face_camera is None) != (live.faces is None):
-        raise UsageError("--face-camera and --faces go together")
     if has_sources and of_masks:
         raise UsageError(
             "--camera, --frame, --truth, --start, --no-track and --resume are for a folder of "
             f"masks or pictures; {scene} has a sources.yaml"
         )
-    if method == "person" and not has_sources and live != LiveOptions():
+    if method == "person" and not has_sources and (on_workers or live != LiveSettings()):
         raise UsageError(f"{scene} has no sources.yaml, which that option is for")
 
 
@@ -170,11 +144,11 @@ def _capture_live(
     model: Path | None,
     method: str,
     settings: LiveSettings,
-    live: LiveOptions,
+    client: Client | None,
 ) -> LiveResult:
     """Captures as the pictures come, here or on workers, or by the paper's stages."""
     from drake_pose.jobs.live.capture import capture_live
-    from drake_pose.jobs.live.paper_capture import FaceFolder, capture_paper
+    from drake_pose.jobs.live.paper_capture import capture_paper
     from drake_pose.jobs.live.scene import hush_opencv, is_live_scene, load_live_scene
     from drake_pose.systems.person.live_capture import LiveSensors
 
@@ -184,31 +158,25 @@ def _capture_live(
             "which masks do not show: name the pictures and those of the empty room there"
         )
     hush_opencv()
-    with workers_of(live.workers, live.scheduler) as client, FrameProgress() as progress:
+    with FrameProgress() as progress:
         # Workers may have another working folder.
         scene = load_live_scene(folder if client is None else folder.absolute())
 
         def sensors() -> LiveSensors:
             if client is None:
-                return scene.open_sensors(tolerance=live.tolerance)
-            from drake_pose.jobs.cluster.remote_views import opener
+                return scene.open_sensors(tolerance=settings.tolerance)
+            from drake_pose.jobs.cluster.remote_views import ClusterSensors
 
-            return opener(client, live.tolerance)(scene)
+            return ClusterSensors(client, scene, tolerance=settings.tolerance)
 
         def show(count: int, _: bool) -> None:
             progress.show_stage("frames", count, None)
 
         if method == "person":
             return capture_live(scene, out, model, settings, sensors, warn, show)
-        face = None
-        if live.face_camera is not None and live.faces is not None:
-            face = FaceFolder(live.face_camera, live.faces)
         if any(one.live for one in scene.specifications.values()):
             say("drake-pose: stand upright before the cameras, both arms spread to the sides")
-        return capture_paper(
-            scene, out, model, settings, face,
-            lambda: scene.open_sensors(tolerance=live.tolerance), warn, show,
-        )  # fmt: skip
+        return capture_paper(scene, out, model, settings, sensors, warn, show)
 
 
 def _print_result(result: LiveResult, json: bool) -> None:

@@ -4,27 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from math import inf, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from drake_pose.commands.terminal import UsageError
+from drake_pose.results.options import within
 
 if TYPE_CHECKING:
     from distributed import Client
-
-
-def within(low: float, high: float = inf) -> Parameter:
-    """Returns the check of an option: a finite number in this range."""
-
-    def check(hint: object, value: float | None) -> None:
-        if value is not None and not (isfinite(value) and low <= value <= high):
-            wanted = f"{low:g} or more" if high == inf else f"{low:g} to {high:g}"
-            raise ValueError(f"It must be {wanted}.")
-
-    return Parameter(validator=check)
 
 
 SPREAD = Parameter("*")
@@ -51,15 +40,6 @@ Truth = Annotated[
         "frame and one for each joint. Default: SCENE/joint_angles.csv, if it exists."
     ),
 ]
-Shape = Annotated[
-    Path | None,
-    Parameter(
-        metavar="RESULT",
-        help="Take lengths and girths from this result of capture with the same person. Live "
-        "capture (sources.yaml) only.",
-    ),
-]
-Seconds = Annotated[float | None, within(0.01)]
 Seed = Annotated[int, within(0), Parameter(help="Seed of the random numbers.")]
 CaptureWorkers = Annotated[
     int,

@@ -15,13 +15,12 @@ from drake_pose.commands.options import (
     CaptureWorkers,
     Json,
     Scheduler,
-    Seconds,
-    Shape,
     within,
     workers_of,
 )
 from drake_pose.commands.terminal import UsageError, print_json, say, warn
 from drake_pose.errors import SettingsError
+from drake_pose.jobs.live.settings import Seconds, Shape
 from drake_pose.results.settings import Packages
 
 if TYPE_CHECKING:
@@ -155,10 +154,10 @@ def _opener(client: Client | None, scene: LiveScene) -> Callable[[], LiveSensors
     """What opens the sensors on the workers; None: they are opened here."""
     if client is None:
         return None
-    from drake_pose.jobs.cluster.remote_views import opener
+    from drake_pose.jobs.cluster.remote_views import ClusterSensors
 
     # A recording cannot be skipped from afar as fast as its moments pass, so that it is waited for.
-    return lambda: opener(client)(scene)
+    return lambda: ClusterSensors(client, scene)
 
 
 def _open_page(options: WalkOptions, waits: bool = False) -> Meshcat:

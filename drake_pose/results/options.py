@@ -49,6 +49,17 @@ def from_text(
     )
 
 
+def within(low: float, high: float = math.inf) -> Parameter:
+    """Returns the check of an option: a finite number in this range."""
+
+    def check(hint: object, value: float | None) -> None:
+        if value is not None and not (math.isfinite(value) and low <= value <= high):
+            wanted = f"{low:g} or more" if high == math.inf else f"{low:g} to {high:g}"
+            raise ValueError(f"It must be {wanted}.")
+
+    return Parameter(validator=check)
+
+
 def parse_number(text: str) -> float:
     """Returns a finite number."""
     try:

@@ -61,6 +61,11 @@ def export_outputs(builder: DiagramBuilder, system: System) -> None:
         builder.ExportOutput(port, port.get_name())
 
 
+def evaluate(port: OutputPort, context: Context) -> Any:
+    """What an output port of a system inside a diagram gives; context: the diagram's."""
+    return port.Eval(port.get_system().GetMyContextFromRoot(context))
+
+
 class PortedSystem(LeafSystem):
     """A system whose ports are declared by what is like their values: an int is a vector's size."""
 

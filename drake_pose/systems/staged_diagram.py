@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 from pydrake.systems.framework import Context, Diagram, OutputPort
 
+from drake_pose.systems.ports import evaluate
+
 
 @dataclass(frozen=True, eq=False)
 class StagedDiagram:
@@ -23,4 +25,4 @@ class StagedDiagram:
     def evaluate(self, context: Context, stage: str) -> None:
         """Have a stage, one of stages, compute what it has not computed yet."""
         for port in self.stages[stage]:
-            port.Eval(port.get_system().GetMyContextFromRoot(context))
+            evaluate(port, context)

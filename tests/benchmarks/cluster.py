@@ -23,7 +23,6 @@ from drake_pose.camera.files import save_cameras
 from drake_pose.camera.rigs import FACE_CAMERA
 from drake_pose.jobs.batch.batch import run_batch
 from drake_pose.jobs.batch.job import SceneJob
-from drake_pose.jobs.batch.workers import ClusterPool
 from drake_pose.jobs.cluster.remote_views import ClusterSensors
 from drake_pose.jobs.cluster.scheduler import open_cluster
 from drake_pose.jobs.live.run import FrameWatch, run_live
@@ -125,12 +124,11 @@ def write_studio(folder: Path) -> LiveScene:
 
 def measure_batch(job: SceneJob, out: Path, client: Client | None) -> BatchFigures:
     """Times a batch; what is loaded or compiled once, or what workers need to start, is not."""
-    pool = None if client is None else ClusterPool(client)
     settings = replace(job.settings, frames=("0000",))
     warm_up = [replace(job, name=f"warm_up_{k}", settings=settings) for k in range(2)]
-    run_batch(warm_up, out / "warm_up", pool)
+    run_batch(warm_up, out / "warm_up", client)
     begin, processor = time.perf_counter(), time.process_time()
-    result = run_batch([job], out / "out", pool)
+    result = run_batch([job], out / "out", client)
     seconds, processor = time.perf_counter() - begin, time.process_time() - processor
     frames = result.scenes[job.name].frame_count
     size = sum(path.stat().st_size for path in (out / "out").rglob("*") if path.is_file())

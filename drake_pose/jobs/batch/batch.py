@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import pickle
 import shutil
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from drake_pose.errors import DrakePoseError
+from drake_pose.errors import ClusterError, DrakePoseError
 from drake_pose.jobs.batch.job import SceneJob
 from drake_pose.jobs.batch.state import (
     FAILED,
@@ -22,13 +24,19 @@ from drake_pose.jobs.batch.tasks import (
     Outcome,
     Task,
     count_attempts,
+    describe_failure,
     finishing_task,
+    perform,
     plan_scene,
     remove_parts,
     work_folder,
 )
-from drake_pose.jobs.batch.workers import WorkerPool
+from drake_pose.jobs.cluster.scheduler import TRIES, address_of
+from drake_pose.jobs.cluster.worker import call_in_child
 from drake_pose.results.folder import require_empty
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
 
 # A scene of which this many chunks have failed is given up.
 _HOPELESS = 3
@@ -42,17 +50,19 @@ OnProgress = Callable[[int, int, str], None]
 def run_batch(
     jobs: Sequence[SceneJob],
     out: Path,
-    pool: WorkerPool | None = None,
+    client: Client | None = None,
     resume: bool = False,
     on_progress: OnProgress = lambda *_: None,
+    work: Callable[[Task], Outcome] = perform,
 ) -> BatchResult:
     """Estimates many scenes; each gets a result folder in ``out``, which is empty or not there.
 
     A scene that fails does not stop the others. Interrupted, finished chunks are in ``out``.
 
     Args:
-        pool: who works; this process where None.
+        client: of the workers; this process works where None.
         resume: go on with what is in ``out``, and try failed scenes again.
+        work: does a task.
 
     Raises:
         OutputError: the folder cannot be used, or holds another job.
@@ -67,7 +77,7 @@ def run_batch(
     try:
         batch.write()
         batch.plan()
-        batch.run(pool or WorkerPool())
+        batch.run(client, work)
     finally:
         batch.write()
     return batch.result()
@@ -99,17 +109,36 @@ class _Batch:
             self._waiting.extend(missing or [whole])
         self._report()
 
-    def run(self, pool: WorkerPool) -> None:
+    def run(self, client: Client | None, work: Callable[[Task], Outcome]) -> None:
         """Does what is missing."""
-        running = 0
-        while self._waiting or running:
-            while self._waiting and running < pool.size:
-                pool.start(self._waiting.popleft())
-                running += 1
-            self._note(*pool.next())
-            running -= 1
-            if time.monotonic() - self._written > _SUMMARY_PERIOD:
-                self.write()
+        if client is not None:
+            self._run_on(client, work)
+        while self._waiting:
+            task = self._waiting.popleft()
+            self._note(task, work(task))
+
+    def _run_on(self, client: Client, work: Callable[[Task], Outcome]) -> None:
+        """Does it on workers, a task a thread, so that none waits at a worker that may die."""
+        from distributed import as_completed
+
+        completed, tasks = as_completed(loop=client.loop), {}
+        while self._waiting or tasks:
+            # A worker that died is being started again.
+            while self._waiting and len(tasks) < max(1, sum(client.nthreads().values())):
+                task = self._waiting.popleft()
+                # A worker that knows neither side of the pickle need not import Drake.
+                payload = pickle.dumps((work, task))
+                future = client.submit(call_in_child, payload, retries=TRIES - 1, pure=False)
+                tasks[future.key] = task
+                completed.add(future)
+            future = next(completed)
+            task = tasks.pop(future.key)
+            if future.status not in ("finished", "error"):
+                raise ClusterError(
+                    f"the scheduler at {address_of(client)} has gone; finished chunks are in "
+                    f"{self._out}; go on with --resume"
+                )
+            self._note(task, _outcome(future))
 
     def result(self) -> BatchResult:
         """What became of it."""
@@ -138,6 +167,8 @@ class _Batch:
                 # The last scene leaves it empty.
                 work.parent.rmdir()
         self._report()
+        if time.monotonic() - self._written > _SUMMARY_PERIOD:
+            self.write()
 
     def _finish(self, state: SceneState, outcome: Outcome) -> None:
         state.totals = outcome.totals or {}
@@ -162,3 +193,18 @@ class _Batch:
         states = self._scenes.values()
         done = sum(one.frames_done for one in states)
         self._on_progress(done, sum(one.frame_count for one in states), message)
+
+
+def _outcome(future: Future) -> Outcome:
+    """What became of a worker's task."""
+    from distributed import KilledWorker
+
+    if future.status == "finished":
+        outcome: Outcome = pickle.loads(future.result())
+        return outcome
+    error = future.exception()
+    if isinstance(error, KilledWorker):
+        return Outcome("given up: it has killed its worker again and again")
+    if isinstance(error, ClusterError):
+        return Outcome(f"given up after {TRIES} tries: {error}")
+    return Outcome(describe_failure(error))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -19,11 +19,6 @@ from drake_pose.systems.person.live_capture import LiveSensors
 
 if TYPE_CHECKING:
     from distributed import Client
-
-
-def opener(client: Client, tolerance: float | None = None) -> Callable[[LiveScene], ClusterSensors]:
-    """What opens the sensors of a scene on the workers of a cluster."""
-    return lambda scene: ClusterSensors(client, scene, tolerance=tolerance)
 
 
 class ClusterSensors(LiveSensors):

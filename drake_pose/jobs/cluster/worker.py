@@ -35,22 +35,20 @@ def worker_resources(dask_worker: Worker) -> tuple[str, ...]:
     return tuple(dask_worker.state.total_resources)
 
 
-def call_in_child(payload: bytes, tries: int) -> bytes:
-    """Calls a function in the main thread of this worker's child; the pickled result.
+def call_in_child(payload: bytes) -> bytes:
+    """Calls a pickled pair of a function and its argument in the main thread of a worker's child.
 
-    Args:
-        payload: the pickled pair of a function and its argument.
-        tries: how many children may die of it, before ClusterError.
+    Returns:
+        The pickled result.
+
+    Raises:
+        ClusterError: the child died of it.
     """
-    reason = ""
-    for _ in range(tries):
-        child = getattr(_local, "child", None) or _Child(_memory_limit())
-        _local.child = child
-        try:
-            return child.call(payload)
-        except ClusterError as error:
-            reason, _local.child = str(error), None
-    raise ClusterError(f"given up after {tries} tries: {reason}")
+    child = getattr(_local, "child", None) or _Child(_memory_limit())
+    _local.child = None
+    result = child.call(payload)
+    _local.child = child
+    return result
 
 
 def _memory_limit() -> int:
@@ -67,7 +65,7 @@ def _memory_limit() -> int:
 class _Child:
     """The child, as its parent sees it. memory_limit: of its data [byte]; 0: none."""
 
-    def __init__(self, memory_limit: int = 0) -> None:
+    def __init__(self, memory_limit: int) -> None:
         paths = os.pathsep.join(path for path in sys.path if path)
         # Whatever it says to stderr may tell why it died.
         self._remarks = tempfile.TemporaryFile()  # noqa: SIM115

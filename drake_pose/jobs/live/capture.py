@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,39 +13,19 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.errors import OutputError, SettingsError
 from drake_pose.jobs.estimate.person_choice import bundled_person
 from drake_pose.jobs.live.frame_results import LiveResult, LiveWriter
-from drake_pose.jobs.live.run import FrameWatch, Mask, run_live
+from drake_pose.jobs.live.run import FrameWatch, Mask, look_until, run_live
 from drake_pose.jobs.live.scene import LiveScene
+from drake_pose.jobs.live.settings import LiveSettings
 from drake_pose.person.recordings.person_capture import capture_person
 from drake_pose.person.recordings.persons_in_view import PersonRecording
 from drake_pose.person.shape import KnownShape, shape_values, tracker_of_person
 from drake_pose.person.views import shows_somebody
 from drake_pose.results.folder import read_summary, require_empty
 from drake_pose.systems.person.live_capture import LiveSensors, build_live_capture
+from drake_pose.systems.ports import evaluate
 
-# How many frames give a person's shape, and how long it is waited for the person [s].
-_FRAMES, _PATIENCE = 40, 60.0
-
-
-@dataclass(frozen=True)
-class LiveSettings:
-    """How a live capture is made; SettingsError: a time that cannot be.
-
-    Args:
-        seconds: how long; None: until the recordings end, or Ctrl-C.
-        shape: a result of capture with the same person, whose lengths and girths are taken.
-        fit_shape: whether otherwise the first frames give them; else they are the model's.
-        packages: folders of packages that the model's ``package://`` names mean, by name.
-    """
-
-    seconds: float | None = None
-    shape: Path | None = None
-    fit_shape: bool = True
-    replay: bool = True
-    packages: Mapping[str, Path] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        if self.seconds is not None and not 0.0 < self.seconds < np.inf:
-            raise SettingsError(f"the capture's length must be positive, not {self.seconds} s")
+# How many frames give a person's shape.
+_FRAMES = 40
 
 
 def capture_live(
@@ -75,7 +54,7 @@ def capture_live(
         SceneError, ModelError, SettingsError: what was given cannot be captured.
         OutputError: the result cannot be written.
     """
-    settings, opener = settings or LiveSettings(), open_sensors or (lambda: scene.open_sensors())
+    settings, opener = settings or LiveSettings(), open_sensors or scene.open_sensors
     model = load_model(model_path or bundled_person(), package_paths=settings.packages)
     # A folder that cannot be written is refused before a camera is opened.
     require_empty(out)
@@ -144,34 +123,24 @@ def _fit_first_frames(
     on_report: Callable[[str], None],
 ) -> KnownShape | None:
     """Lengths and girths by the first frames that two cameras see; None without shape joints."""
+    if not shape_values(tree).any():
+        sensors.close()
+        return None
     frames: list[dict[str, Mask]] = []
     builder = DiagramBuilder()
-    ports = sensors.add(builder)
-    for name, port in ports.items():
-        builder.ExportOutput(port, name)
-    builder.ExportOutput(sensors.GetOutputPort("time"), "time")
-    diagram = builder.Build()
-    last = np.nan
+    ports, time, last = sensors.add(builder), sensors.GetOutputPort("time"), np.nan
 
-    def look(context: Context) -> None:
+    def look(context: Context) -> bool:
         nonlocal last
-        before, last = last, float(diagram.GetOutputPort("time").Eval(context)[0])
+        before, last = last, float(evaluate(time, context)[0])
         if last != before and not np.isnan(last):
-            views = {name: diagram.GetOutputPort(name).Eval(context) for name in ports}
+            views = {name: evaluate(port, context) for name, port in ports.items()}
             seen = {name: view.region for name, view in views.items() if shows_somebody(view)}
             if len(seen) >= 2:
                 frames.append(seen)
+        return len(frames) >= _FRAMES
 
-    try:
-        if not shape_values(tree).any():
-            return None
-        # What is wrong with recorded pictures is said when they are captured.
-        report = on_report if sensors.live else lambda _: None
-        waited = _PATIENCE if sensors.live else None
-        if run_live(diagram, sensors, waited, report, lambda: len(frames) >= _FRAMES, look):
-            raise KeyboardInterrupt
-    finally:
-        sensors.close()
+    look_until(builder.Build(), sensors, look, on_report)
     # Whoever else is in view is cut out.
     alone = PersonRecording(scene.cameras, lambda k: frames[k], len(frames), True)
     seen = alone.seen

@@ -6,7 +6,6 @@ The registered pose, upright with both arms spread, begins it and sets it right.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +16,11 @@ from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError, SceneError, SettingsError, UnknownNameError
-from drake_pose.jobs.live.capture import LiveSettings, record_frames
+from drake_pose.jobs.live.capture import record_frames
 from drake_pose.jobs.live.frame_results import LiveResult, LiveWriter
-from drake_pose.jobs.live.run import FrameWatch, LiveFrame, run_live
+from drake_pose.jobs.live.run import FrameWatch, LiveFrame, look_until
 from drake_pose.jobs.live.scene import LiveScene
+from drake_pose.jobs.live.settings import LiveSettings
 from drake_pose.person.date.capture import CaptureSettings, CaptureSetup, PersonView
 from drake_pose.person.date.faces import FaceTemplates, learn_recorded_faces
 from drake_pose.person.date.recognition import (
@@ -40,6 +40,7 @@ from drake_pose.systems.date.preparation import prepare_paper_capture
 from drake_pose.systems.date.stages import HorizontalImage
 from drake_pose.systems.person.live_capture import LiveSensors
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
+from drake_pose.systems.ports import evaluate
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -49,18 +50,8 @@ METHOD = "paper_capture"
 
 # A choice: of simulated persons who are followed the mean IoU is about 0.8 and more.
 _LEAST_IOU = 0.6
-# How long it is waited for the registered pose before live cameras [s].
-_PATIENCE = 60.0
 # The arms may still be on their way up: so many more moments are looked at for a better one.
 _MORE_MOMENTS = 10
-
-
-@dataclass(frozen=True)
-class FaceFolder:
-    """The camera before the face, and a folder of templates as of learn_recorded_faces."""
-
-    camera: str
-    templates: Path
 
 
 def capture_paper(
@@ -68,7 +59,6 @@ def capture_paper(
     out: Path,
     model_path: Path | None = None,
     settings: LiveSettings | None = None,
-    face: FaceFolder | None = None,
     open_sensors: Callable[[], LiveSensors] | None = None,
     on_report: Callable[[str], None] = lambda _: None,
     on_frame: Callable[[int, bool], None] = lambda _, __: None,
@@ -82,8 +72,8 @@ def capture_paper(
         out: the result's folder, empty or not there.
         model_path: a person of the same build as the bundled one, which is taken where not given;
             its measures are taken as they are.
-        settings: no shape can be given or fitted.
-        face: how the face's direction is found; None: by inverse kinematics alone.
+        settings: no shape can be given or fitted; without a camera before the face, and templates
+            as of learn_recorded_faces, its direction is found by inverse kinematics alone.
         open_sensors: opens the sensors; where not given the scene's. Called twice.
         on_report: called at once when cameras stop and return, and with bad pictures.
         on_frame: called with each frame: how many there are, and whether a person was found.
@@ -98,8 +88,8 @@ def capture_paper(
         raise SettingsError("the paper's method takes the model's measures: give no shape")
     model = load_model(model_path or bundled_model("person"), package_paths=settings.packages)
     require_empty(out)
-    templates = None if face is None else learn_recorded_faces(face.templates)
-    search = RegisteredPoseSearch(scene, model, None if face is None else face.camera, templates)
+    faces = None if settings.faces is None else learn_recorded_faces(settings.faces)
+    search = RegisteredPoseSearch(scene, model, settings.face_camera, faces)
     setup = search.run(opener(), on_report)
     sensors = opener()
     try:
@@ -161,42 +151,27 @@ class RegisteredPoseSearch:
             KeyboardInterrupt: the user gave up.
         """
         builder = DiagramBuilder()
-        capture = builder.AddNamedSystem("picture_capture", sensors)
+        builder.AddNamedSystem("picture_capture", sensors)
+        images = {name: sensors.GetOutputPort(f"color_image_{name}") for name in self._cameras}
+        seers = {}
         for name, camera in self._setup.cameras.items():
-            image = HorizontalImage(camera, self._scene.backgrounds[name], self._settings.skin)
-            builder.AddNamedSystem(f"horizontal_image_{name}", image)
-            port = capture.GetOutputPort(f"color_image_{name}")
-            builder.Connect(port, image.GetInputPort("color_image"))
-            builder.ExportOutput(port, f"color_image_{name}")
-            builder.ExportOutput(image.GetOutputPort("person_view"), f"person_view_{name}")
-        builder.ExportOutput(capture.GetOutputPort("fresh"), "fresh")
-        diagram = builder.Build()
+            seer = HorizontalImage(camera, self._scene.backgrounds[name], self._settings.skin)
+            builder.AddNamedSystem(f"horizontal_image_{name}", seer)
+            builder.Connect(images[name], seer.GetInputPort("color_image"))
+            seers[name] = seer.GetOutputPort("person_view")
 
-        def look(context: Context) -> None:
-            if diagram.GetOutputPort("fresh").Eval(context)[0]:
-                views = {
-                    name: diagram.GetOutputPort(f"person_view_{name}").Eval(context)
-                    for name in self._setup.cameras
-                }
+        def look(context: Context) -> bool:
+            if evaluate(sensors.GetOutputPort("fresh"), context)[0]:
+                views = {name: evaluate(port, context) for name, port in seers.items()}
                 seen = {name: view for name, view in views.items() if view is not None}
                 if self._is_best(seen):
-                    images = {n: diagram.GetOutputPort(f"color_image_{n}") for n in seen}
                     self._shown = {
-                        name: colour_image_to_picture(port.Eval(context)).copy()
-                        for name, port in images.items()
+                        name: colour_image_to_picture(evaluate(images[name], context)).copy()
+                        for name in seen
                     }
-
-        def is_done() -> bool:
             return self._similarity >= self._settings.recognition and self._since >= _MORE_MOMENTS
 
-        # What is wrong with recorded pictures is said when they are captured.
-        report = on_report if sensors.live else lambda _: None
-        waited = _PATIENCE if sensors.live else None
-        try:
-            if run_live(diagram, sensors, waited, report, is_done, look):
-                raise KeyboardInterrupt
-        finally:
-            sensors.close()
+        look_until(builder.Build(), sensors, look, on_report)
         return self._prepared(on_report)
 
     @property

@@ -21,6 +21,8 @@ Mask = NDArray[np.bool_]
 
 # Between two looks whether a walk without cameras has ended [s].
 _LOOK = 0.5
+# How long it is waited for the person before live cameras [s].
+_PATIENCE = 60.0
 # A simulation that lags behind the clock by more [s] does not try to make up for it.
 _LARGEST_LAG = 0.2
 
@@ -71,6 +73,33 @@ def run_live(
     except KeyboardInterrupt:
         return True
     return False
+
+
+def look_until(
+    diagram: Diagram,
+    sensors: LiveSensors,
+    looks: Callable[[Context], bool],
+    on_report: Callable[[str], None],
+) -> None:
+    """Runs a diagram until what looks at it has seen enough; uses the sensors up.
+
+    Raises:
+        KeyboardInterrupt: the user gave up.
+    """
+    enough = False
+
+    def look(context: Context) -> None:
+        nonlocal enough
+        enough = looks(context) or enough
+
+    # What is wrong with recorded pictures is said when they are captured.
+    report = on_report if sensors.live else lambda _: None
+    waited = _PATIENCE if sensors.live else None
+    try:
+        if run_live(diagram, sensors, waited, report, lambda: enough, look):
+            raise KeyboardInterrupt
+    finally:
+        sensors.close()
 
 
 @dataclass(frozen=True, eq=False)

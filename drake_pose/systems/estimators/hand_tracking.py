@@ -1,7 +1,6 @@
 """Tracking by segments' axes: a camera, the matcher at first and after a loss, the filter.
 
-label image -> StateMatcher (first frame, and after a loss), AxisSensor -> TruncatedEkf ->
-BodyBelief -> logs.
+label image -> AxisSensor <-> TruncatedEkf; AxisSensor -> logs.
 """
 
 from __future__ import annotations
@@ -13,12 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import Meshcat, SceneGraph
-from pydrake.systems.framework import (
-    Context,
-    Diagram,
-    DiagramBuilder,
-    OutputPort,
-)
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
 from pydrake.systems.sensors import ImageLabel16I
 from pydrake.trajectories import Trajectory
@@ -49,54 +43,68 @@ _FEWEST_PIXELS = 30
 
 
 class AxisSensor(PortedSystem):
-    """Measures segments' axes in a label image, beside the filter's prediction.
+    """Measures segments' axes in a label image, beside the prediction of the filter that uses them.
 
     .. pydrake_system::
 
         name: AxisSensor
-        input_ports: [label_image, estimated_state, statistics, matched_state (optional)]
-        output_ports: [measurement, measurement_variances, restart]
+        input_ports: [label_image, estimated_state, covariance, statistics]
+        output_ports: [measurement, measurement_variances, restart, matched_state,
+          estimated_positions, position_deviations]
 
-    ``estimated_state`` and ``statistics`` come from the ``TruncatedEkf`` that takes the outputs,
-    whose ports have the same names; ``restart`` goes there, too. The label image's labels are the
-    indices of the links, as Drake's renderer gives them to a plant that holds the body alone; an
-    image that is not connected shows nothing.
+    The inputs but the image come from the ``TruncatedEkf`` that takes the first four outputs, the
+    last of them as its ``reset_state``. The label image's labels are the indices of the links, as
+    Drake's renderer gives them to a plant that holds the body alone; an image that is not connected
+    shows nothing.
 
     ``restart`` is 1 at the filter's first step, while it says that the track is lost, and where
     fewer than half of the segments in the picture are where they were predicted. Then the axes are
-    measured beside ``matched_state`` (n), which the filter must take for its ``reset_state``; it is
-    evaluated at no other time. Where the first pictures are blank, the filter begins with its own
-    start instead, and asks when that proves wrong; a gap later is bridged by the prediction.
+    measured beside ``matched_state`` (n), a state at rest that the search finds, NaN where it finds
+    none; the search is asked at no other time. Where the first pictures are blank, the filter
+    begins with its own start instead, and asks when that proves wrong; a gap later is bridged by
+    the prediction. ``estimated_positions`` and ``position_deviations`` (nq) are the filter's belief
+    as positions of the plant; deviations are NaN where a position is held.
 
     Args:
         transition: (n, n) one step of the filter's prediction.
 
     Raises:
-        SettingsError: a transition of another size than the state's.
+        SettingsError: a transition of another size than the state's, or a search that is made for
+            another tree than that of the observation's body.
     """
 
-    def __init__(self, observation: AxisObservation, transition: Array, camera: Camera) -> None:
+    def __init__(
+        self, observation: AxisObservation, transition: Array, search: PoseSearch, camera: Camera
+    ) -> None:
         super().__init__()
-        n, m = len(observation.body.layout), len(observation.names)
+        self._body = body = observation.body
+        n, m = len(body.layout), len(observation.names)
         if transition.shape != (n, n):
             raise SettingsError(f"the transition must be {(n, n)}, not {transition.shape}")
+        if search.tree is not body.tree:
+            raise SettingsError("the search and the observation must share one pose tree")
         self._observation, self._transition = observation, transition
-        model = observation.body.tree.model
-        self._labels = [model.link_index(link) for link in observation.links]
-        self.add_input("label_image", ImageLabel16I(camera.width, camera.height))
-        self.add_input("estimated_state", n)
+        self._search, self._camera = search, camera
+        self._labels = [body.tree.model.link_index(link) for link in observation.links]
+        image = self.add_input("label_image", ImageLabel16I(camera.width, camera.height))
+        state = self.add_input("estimated_state", n)
+        covariance = self.add_input("covariance", n * n)
         self.add_input("statistics", len(STATISTICS))
-        self.add_input("matched_state", n)
         measured = self.add_cache("measured", self._measure)
         for row, (name, size) in enumerate(
             (("measurement", m), ("measurement_variances", m), ("restart", 1))
         ):
-
-            def read(context: Context, row: int = row) -> Array:
-                found: Array = measured.Eval(context)[row]
-                return found
-
-            self.add_output(name, size, read, {measured.ticket()})
+            self.add_output(name, size, lambda context, row=row: measured.Eval(context)[row])
+        self._matched = self.add_output("matched_state", n, self._match, {image.ticket()})
+        nq = len(body.tree.model.position_names)
+        # What shows the estimated body must not seem to depend on the image that it is beside.
+        self.add_output(
+            "estimated_positions",
+            nq,
+            lambda context: body.positions(state.Eval(context))[0],
+            {state.ticket()},
+        )
+        self.add_output("position_deviations", nq, self._deviations, {covariance.ticket()})
 
     def _measure(self, context: Context) -> tuple[Array, Array, Array]:
         nothing = np.full(len(self._observation.names), np.nan)
@@ -109,7 +117,7 @@ class AxisSensor(PortedSystem):
         visible = sum(np.count_nonzero(labels == k) >= _FEWEST_PIXELS for k in self._labels)
         astray = 2 * np.count_nonzero(np.isfinite(y[::2])) < visible
         restart = statistics["step"] == 0 or statistics["lost"] > 0 or astray
-        matched = self.given(context, "matched_state") if restart else None
+        matched = self._matched.Eval(context) if restart else None
         if matched is not None and np.isfinite(matched).all():
             y, variances = self._observation.measure(labels, matched)
         return y, variances, np.array([float(restart)])
@@ -122,32 +130,8 @@ class AxisSensor(PortedSystem):
             return None
         return np.where(labels == EMPTY, np.int16(-1), labels)
 
-
-class StateMatcher(PortedSystem):
-    """Matches a body's silhouette whenever its output is asked for, and never else.
-
-    .. pydrake_system::
-
-        name: StateMatcher
-        input_ports: [label_image]
-        output_ports: [matched_state]
-
-    ``SilhouetteMatcher`` matches once a period; this one costs nothing while a filter tracks.
-    ``matched_state`` (n) is a state at rest; NaN where no pose is found.
-
-    Raises:
-        SettingsError: the search is made for another tree than that of the observation's body.
-    """
-
-    def __init__(self, search: PoseSearch, observation: AxisObservation, camera: Camera) -> None:
-        super().__init__()
-        if search.tree is not observation.body.tree:
-            raise SettingsError("the search and the observation must share one pose tree")
-        self._search, self._body, self._camera = search, observation.body, camera
-        self.add_input("label_image", ImageLabel16I(camera.width, camera.height))
-        self.add_output("matched_state", len(self._body.layout), self._match)
-
     def _match(self, context: Context) -> Array:
+        """The state at rest (n,) that the search finds."""
         image = self.given(context, "label_image")
         mask = None if image is None else label_image_to_mask(image)
         if mask is not None and mask.any():
@@ -156,39 +140,14 @@ class StateMatcher(PortedSystem):
                 return self._body.state(result.q, result.X_WB)
         return np.full(len(self._body.layout), np.nan)
 
-
-class BodyBelief(PortedSystem):
-    """A filter's belief as positions of the plant, with their standard deviations.
-
-    .. pydrake_system::
-
-        name: BodyBelief
-        input_ports: [estimated_state, covariance]
-        output_ports: [estimated_positions, position_deviations]
-
-    ``position_deviations`` (nq) are NaN where a position is held.
-    """
-
-    def __init__(self, observation: AxisObservation) -> None:
-        super().__init__()
-        body = observation.body
-        model, seen = body.tree.model, [*body.layout.moving, *body.layout.constant]
-        n, nq = len(body.layout), len(model.position_names)
-        state, covariance = (
-            self.add_input("estimated_state", n),
-            self.add_input("covariance", n * n),
-        )
-
-        def deviate(context: Context) -> Array:
-            deviations, P = np.full(nq, np.nan), covariance.Eval(context).reshape(n, n)
-            own = [model.position_index(name) for name in seen]
-            deviations[own] = np.sqrt(np.diag(P)[body.layout.indices(seen)])
-            return deviations
-
-        self.add_output(
-            "estimated_positions", nq, lambda context: body.positions(state.Eval(context))[0]
-        )
-        self.add_output("position_deviations", nq, deviate)
+    def _deviations(self, context: Context) -> Array:
+        layout, model = self._body.layout, self._body.tree.model
+        P = self.given(context, "covariance").reshape(len(layout), len(layout))
+        seen = [*layout.moving, *layout.constant]
+        deviations = np.full(len(model.position_names), np.nan)
+        own = [model.position_index(name) for name in seen]
+        deviations[own] = np.sqrt(np.diag(P)[layout.indices(seen)])
+        return deviations
 
 
 @dataclass(frozen=True)
@@ -197,13 +156,13 @@ class HandTracking:
 
     Attributes:
         ekf: the filter; its ports give the hypotheses and the active limits.
-        belief: the estimated positions and their standard deviations.
+        sensor: gives the estimated positions and their standard deviations.
         positions_log, deviations_log: log them once a period; 2 sigma is twice the latter.
         statistics_log, restart_log: log the filter's ``statistics`` and the sensor's ``restart``.
     """
 
     ekf: TruncatedEkf
-    belief: BodyBelief
+    sensor: AxisSensor
     positions_log: VectorLogSink
     deviations_log: VectorLogSink
     statistics_log: VectorLogSink
@@ -240,23 +199,21 @@ def add_hand_tracking(
         observation, period, tracking or TrackingSettings()
     )
     ekf = builder.AddNamedSystem("truncated_ekf", TruncatedEkf(belief_filter, start, period))
-    sensor = builder.AddNamedSystem("axis_sensor", AxisSensor(observation, transition, camera))
-    matcher = builder.AddNamedSystem("matcher", StateMatcher(search, observation, camera))
-    belief = builder.AddNamedSystem("belief", BodyBelief(observation))
-    for system in (sensor, matcher):
-        builder.Connect(label_image, system.GetInputPort("label_image"))
-    builder.Connect(matcher.GetOutputPort("matched_state"), ekf.GetInputPort("reset_state"))
-    for giver, taker in ((matcher, sensor), (sensor, ekf), (ekf, sensor), (ekf, belief)):
-        connect_same(builder, giver, taker)
+    sensor = AxisSensor(observation, transition, search, camera)
+    builder.AddNamedSystem("axis_sensor", sensor)
+    builder.Connect(label_image, sensor.GetInputPort("label_image"))
+    builder.Connect(sensor.GetOutputPort("matched_state"), ekf.GetInputPort("reset_state"))
+    connect_same(builder, sensor, ekf)
+    connect_same(builder, ekf, sensor)
 
     def log(port: OutputPort) -> VectorLogSink:
         return LogVectorOutput(port, builder, publish_period=period)
 
     return HandTracking(
         ekf=ekf,
-        belief=belief,
-        positions_log=log(belief.GetOutputPort("estimated_positions")),
-        deviations_log=log(belief.GetOutputPort("position_deviations")),
+        sensor=sensor,
+        positions_log=log(sensor.GetOutputPort("estimated_positions")),
+        deviations_log=log(sensor.GetOutputPort("position_deviations")),
         statistics_log=log(ekf.GetOutputPort("statistics")),
         restart_log=log(sensor.GetOutputPort("restart")),
     )
@@ -306,6 +263,6 @@ def build_hand_tracking(
     _, images = add_simulated_cameras(builder, scene_graph, model, [camera], true_positions)
     parts = add_hand_tracking(builder, search, camera, axes, images[0], period, tracking, settings)
     if meshcat is not None:
-        estimate = parts.belief.GetOutputPort("estimated_positions")
+        estimate = parts.sensor.GetOutputPort("estimated_positions")
         show_estimate(builder, scene_graph, model, estimate, meshcat, ESTIMATE_COLOUR)
     return builder.Build(), parts

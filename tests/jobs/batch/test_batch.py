@@ -22,7 +22,6 @@ from drake_pose.errors import ClusterError, OutputError, SettingsError
 from drake_pose.jobs.batch.batch import run_batch
 from drake_pose.jobs.batch.job import SceneJob, read_job
 from drake_pose.jobs.batch.tasks import WORK, Outcome, Task, perform
-from drake_pose.jobs.batch.workers import ClusterPool
 from drake_pose.jobs.cluster.scheduler import open_cluster, require_fit_workers
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.results.settings import EstimateSettings
@@ -80,18 +79,11 @@ def same_results(one: Path, other: Path) -> bool:
     return all(rows(one / name) == rows(other / name) for name in ("stills", "motion"))
 
 
-class OneAtATime(ClusterPool):
-    """As if there were one worker."""
-
-    size = 1
-
-
 @pytest.mark.slow
 def test_results_do_not_depend_on_who_works(jobs, alone, cluster, scenes, tmp_path):
-    for name, pool in (("one", OneAtATime(cluster)), ("two", ClusterPool(cluster))):
-        result = run_batch(jobs, tmp_path / name, pool)
-        assert not result.failed
-        assert same_results(alone, tmp_path / name)
+    result = run_batch(jobs, tmp_path / "two", cluster)
+    assert not result.failed
+    assert same_results(alone, tmp_path / "two")
     # Three chunks and two, and each scene put together.
     assert {name: one.attempts for name, one in result.scenes.items()} == {"stills": 4, "motion": 3}
     assert sorted(path.name for path in (tmp_path / "two").iterdir()) == [
@@ -177,11 +169,11 @@ def die_on_second_chunk(task: Task) -> Outcome:
 def test_poisoned_chunk_is_given_up_and_the_rest_is_kept(
     jobs, alone, cluster, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr("drake_pose.jobs.batch.workers.TRIES", 2)
+    monkeypatch.setattr("drake_pose.jobs.batch.batch.TRIES", 2)
     out = tmp_path / "out"
     heard = []
     result = run_batch(
-        jobs, out, ClusterPool(cluster, die_on_second_chunk),
+        jobs, out, cluster, work=die_on_second_chunk,
         on_progress=lambda done, total, message: heard.append((done, total, message)),
     )  # fmt: skip
     assert result.failed == ("stills",)
@@ -216,7 +208,7 @@ def test_killed_worker_loses_and_repeats_nothing(jobs, alone, cluster, tmp_path)
         if done and victims:
             os.kill(victims.pop(), signal.SIGKILL)
 
-    result = run_batch(jobs, out, ClusterPool(cluster, slow), on_progress=kill)
+    result = run_batch(jobs, out, cluster, work=slow, on_progress=kill)
     assert not victims
     assert not result.failed
     assert same_results(alone, out)

@@ -12,9 +12,9 @@ import zmq
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.camera.rigs import circle_of_cameras
+from drake_pose.errors import ClusterError
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.jobs.cluster.camera_worker import EdgeServer
-from drake_pose.errors import ClusterError
 from drake_pose.jobs.cluster.lines import Line, serve
 from drake_pose.jobs.cluster.remote_keeper import RemoteKeeper
 from drake_pose.person.pose_tracker import PersonPoseTracker
@@ -184,5 +184,5 @@ def test_a_server_listens_at_its_own_address_alone(closed):
         if one.status == psutil.CONN_LISTEN
     }
     assert [open_at[port] for port in listening.ports] == [HOST, HOST]
-    with pytest.raises(ClusterError, match="192.0.2.1"):
+    with pytest.raises(ClusterError, match=r"192\.0\.2\.1"):
         serve("192.0.2.1", [lambda parts: b""], threading.Event())

@@ -6,8 +6,9 @@ import pytest
 
 from drake_pose.commands.main import app
 from drake_pose.errors import OutputError, SceneError, SettingsError
-from drake_pose.jobs.live.capture import LiveSettings, capture_live
+from drake_pose.jobs.live.capture import capture_live
 from drake_pose.jobs.live.scene import load_live_scene, take_empty_room
+from drake_pose.jobs.live.settings import LiveSettings
 from drake_pose.person.shape import KnownShape, tracker_of_person
 from tests.cli import CliRunner
 from tests.jobs.live_scenes import RATE_HZ, absent, load_person, standing, write_studio

@@ -8,9 +8,9 @@ import pytest
 
 from drake_pose.commands.main import app
 from drake_pose.errors import SceneError, SettingsError
-from drake_pose.jobs.live.capture import LiveSettings
 from drake_pose.jobs.live.paper_capture import METHOD, capture_paper
 from drake_pose.jobs.live.scene import load_live_scene
+from drake_pose.jobs.live.settings import LiveSettings
 from drake_pose.person.date.recognition import registered_positions
 from drake_pose.person.date.skeleton import load_skeleton
 from tests.cli import CliRunner

@@ -26,7 +26,6 @@ from drake_pose.silhouette.pictures.label_images import EMPTY
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.systems.estimators.hand_tracking import (
     AxisSensor,
-    StateMatcher,
     add_hand_tracking,
     build_hand_tracking,
 )
@@ -246,21 +245,23 @@ def test_meshcat_shows_both_hands(camera, search):
 def test_bad_arguments_are_named(hand, camera, search):
     body = ContourObservation(search.tree, [camera])
     observation = AxisObservation(body, camera, SEGMENTS)
+    n = len(body.layout)
     with pytest.raises(SettingsError, match="transition"):
-        AxisSensor(observation, np.eye(3), camera)
+        AxisSensor(observation, np.eye(3), search, camera)
     other = BeamSearch(hand.pose_tree(root_position=(0.0, 0.0, 0.0), held=SHAPE))
     with pytest.raises(SettingsError, match="one pose tree"):
-        StateMatcher(other, observation, camera)
+        AxisSensor(observation, np.eye(n), other, camera)
 
 
 def test_without_a_hand_there_is_nothing_to_start_from(camera, search):
     body = ContourObservation(search.tree, [camera])
-    matcher = StateMatcher(search, AxisObservation(body, camera, SEGMENTS), camera)
-    context = matcher.CreateDefaultContext()
-    output = matcher.GetOutputPort("matched_state")
+    observation = AxisObservation(body, camera, SEGMENTS)
+    sensor = AxisSensor(observation, np.eye(len(body.layout)), search, camera)
+    context = sensor.CreateDefaultContext()
+    output = sensor.GetOutputPort("matched_state")
     assert np.isnan(output.Eval(context)).all()
     image = ImageLabel16I(camera.width, camera.height)
     image.mutable_data[:] = EMPTY
-    matcher.GetInputPort("label_image").FixValue(context, image)
+    sensor.GetInputPort("label_image").FixValue(context, image)
     assert np.isnan(output.Eval(context)).all()
     assert search.count == 0

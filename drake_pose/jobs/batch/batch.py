@@ -121,7 +121,7 @@ class _Batch:
         """Does it on workers, a task a thread, so that none waits at a worker that may die."""
         from distributed import as_completed
 
-        completed, tasks = as_completed(loop=client.loop), {}
+        completed, tasks = as_completed(loop=client.loop), dict[object, Task]()
         while self._waiting or tasks:
             # A worker that died is being started again.
             while self._waiting and len(tasks) < max(1, sum(client.nthreads().values())):

@@ -74,10 +74,9 @@ def serve(host: str, answers: Sequence[Answer], closed: threading.Event) -> List
     ports = []
     for answer in answers:
         socket: zmq.Socket = zmq.Context.instance().socket(zmq.REP)
-        for option, value in {
-            zmq.LINGER: 0, zmq.CURVE_SERVER: 1, zmq.CURVE_SECRETKEY: secret,
-        }.items():  # fmt: skip
-            socket.setsockopt(option, value)
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.setsockopt(zmq.CURVE_SERVER, 1)
+        socket.setsockopt(zmq.CURVE_SECRETKEY, secret)
         try:
             ports.append(socket.bind_to_random_port(f"tcp://{host}"))
         except zmq.ZMQError as error:

@@ -94,7 +94,12 @@ class AxisSensor(PortedSystem):
         for row, (name, size) in enumerate(
             (("measurement", m), ("measurement_variances", m), ("restart", 1))
         ):
-            self.add_output(name, size, lambda context, row=row: measured.Eval(context)[row])
+
+            def read(context: Context, row: int = row) -> Array:
+                found: Array = measured.Eval(context)[row]
+                return found
+
+            self.add_output(name, size, read)
         self._matched = self.add_output("matched_state", n, self._match, {image.ticket()})
         nq = len(body.tree.model.position_names)
         # What shows the estimated body must not seem to depend on the image that it is beside.

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from drake_pose.compiled import compiled
 from drake_pose.fit.kernel import add_row, seen_from
 from drake_pose.silhouette.areas.outline import PackedOutlines
-from drake_pose.silhouette.contours.contour_segments import (
+from drake_pose.silhouette.contours.contour_points import (
     find_crossings,
     find_line_spans,
     find_segments,

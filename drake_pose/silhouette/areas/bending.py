@@ -13,11 +13,12 @@ from drake_pose.body.tree.joint_kernel import place_band
 from drake_pose.silhouette.areas.outline import (
     Outline,
     PackedOutlines,
-    edge_records,
     outline_from_mesh,
+    outline_of_triangles,
+    own_copy,
     pack,
 )
-from drake_pose.silhouette.areas.projection import bend, own_copy
+from drake_pose.silhouette.areas.projection import bend
 
 if TYPE_CHECKING:
     from drake_pose.body.surfaces.mesh import TriangleMesh
@@ -32,14 +33,16 @@ class BendingOutline:
 
     def __init__(self, rigid: Outline, band: TriangleMesh) -> None:
         self.rigid = rigid
-        triangles = np.asarray(band.triangles, dtype=np.int32)
-        edges = edge_records(triangles)
+        own = outline_of_triangles(band.vertices, band.triangles)
+        edges = own.edges.copy()
         edges[:, :2] += len(rigid.vertices)
         edges[:, 2] += len(rigid.triangles)
         edges[:, 4] += np.where(edges[:, 4] < 0, 0, len(rigid.triangles))
         self.rest = Outline(
-            vertices=np.concatenate([rigid.vertices, band.vertices]),
-            triangles=np.concatenate([rigid.triangles, triangles + np.int32(len(rigid.vertices))]),
+            vertices=np.concatenate([rigid.vertices, own.vertices]),
+            triangles=np.concatenate(
+                [rigid.triangles, own.triangles + np.int32(len(rigid.vertices))]
+            ),
             edges=np.concatenate([rigid.edges, edges]),
         )
 

@@ -96,12 +96,13 @@ def outline_from_mesh(mesh: TriangleMesh) -> Outline:
     a, b, c = triangles.T
     triangles = triangles[(a != b) & (b != c) & (c != a)]
     used, renumbered = np.unique(triangles, return_inverse=True)
-    triangles = renumbered.reshape(-1, 3).astype(np.int32)
-    return Outline(
-        vertices=np.ascontiguousarray(vertices[used]),
-        triangles=triangles,
-        edges=edge_records(triangles),
-    )
+    return outline_of_triangles(np.ascontiguousarray(vertices[used]), renumbered.reshape(-1, 3))
+
+
+def outline_of_triangles(vertices: np.ndarray, triangles: np.ndarray) -> Outline:
+    """The outline of vertices (n, 3) and triangles (m, 3) as they are."""
+    indices = np.asarray(triangles, dtype=np.int32).reshape(-1, 3)
+    return Outline(np.asarray(vertices).reshape(-1, 3), indices, edge_records(indices))
 
 
 def edge_records(triangles: np.ndarray) -> np.ndarray:
@@ -151,6 +152,13 @@ def pack(outlines: tuple[Outline, ...]) -> PackedOutlines:
         points=np.concatenate([o.vertices for o in outlines]).T.copy(),
         planes=np.concatenate([o.planes for o in outlines]).T.copy(),
         balls=np.array([o.ball for o in outlines]),
+    )
+
+
+def own_copy(packed: PackedOutlines) -> PackedOutlines:
+    """The surfaces with points, planes and balls that may be changed."""
+    return packed._replace(
+        points=packed.points.copy(), planes=packed.planes.copy(), balls=packed.balls.copy()
     )
 
 

@@ -117,21 +117,6 @@ def clip_triangle(
 
 
 @compiled
-def own_copy(packed: PackedOutlines) -> PackedOutlines:
-    """The surfaces with points, planes and balls that may be changed."""
-    return PackedOutlines(
-        packed.points.copy(),
-        packed.planes.copy(),
-        packed.balls.copy(),
-        packed.triangles,
-        packed.edges,
-        packed.sides,
-        packed.starts,
-        packed.ordinary_ends,
-    )
-
-
-@compiled
 def bend(own: PackedOutlines, part: np.ndarray, band: np.ndarray) -> None:
     """Puts the vertices of one surface's band at other places; the surface's ball only grows.
 

@@ -9,7 +9,7 @@ import numpy as np
 from drake_pose.camera.models import Camera
 from drake_pose.silhouette.areas.bending import BendingOutline
 from drake_pose.silhouette.areas.label_kernel import paint_labels
-from drake_pose.silhouette.areas.outline import Outline, PackedOutlines, pack
+from drake_pose.silhouette.areas.outline import Outline, PackedOutlines, own_copy, pack
 from drake_pose.silhouette.areas.span_kernel import paint, score
 
 
@@ -62,6 +62,7 @@ def score_bodies(
             f"not {sums.shape}"
         )
     numbers = np.array(parts, dtype=np.int64).reshape(-1, 4)
+    packed = own_copy(packed) if len(parts) else packed
     return score(packed, numbers, vertices, poses, camera.kernel_parameters(), sums)
 
 

@@ -25,7 +25,6 @@ from drake_pose.silhouette.areas.projection import (
     bend,
     clip_triangle,
     find_facings,
-    own_copy,
     project,
 )
 
@@ -285,6 +284,7 @@ def score(
     """Areas of whole bodies, and of their intersections with sets.
 
     Args:
+        packed: the surfaces, whose bands are bent in place.
         parts: (b, 4) int64 the bands of skin, as in ``bend``; b may be 0.
         bands: (n, v, 3) the vertices of all bands, one band after the other, at each pose [m].
         X_CN: (n, nodes, 3, 4) the surfaces' poses in the camera.
@@ -293,14 +293,13 @@ def score(
     Returns:
         (n, 1 + k) int64 area inside the picture, then area of intersection with each set [pixel].
     """
-    own = own_copy(packed) if parts.shape[0] > 0 else packed
     rows, crossings = make_rows(packed, camera)
     areas = np.zeros((X_CN.shape[0], 1 + prefixes.shape[0]), dtype=np.int64)
     spans = rows.spans
     for n in range(X_CN.shape[0]):
         for k in range(parts.shape[0]):
-            bend(own, parts[k], bands[n])
-        crossings = fill_rows(own, 0, X_CN.shape[1], X_CN[n], camera, crossings, rows)
+            bend(packed, parts[k], bands[n])
+        crossings = fill_rows(packed, 0, X_CN.shape[1], X_CN[n], camera, crossings, rows)
         for row in range(rows.reach[0], rows.reach[1]):
             for k in range(find_spans(row, crossings, rows.counts, rows.changes, spans)):
                 a, b = spans[k, 0], spans[k, 1]

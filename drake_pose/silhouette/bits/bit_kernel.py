@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_pose.compiled import compiled, multiply, with_room
-from drake_pose.silhouette.areas.projection import bend, own_copy, viewpoint_in_node
+from drake_pose.silhouette.areas.projection import bend, viewpoint_in_node
 from drake_pose.silhouette.areas.span_kernel import (
     BIAS,
     SHIFT,
@@ -54,7 +54,7 @@ def draw_bits(
     """Draws a surface at many poses as bits.
 
     Args:
-        celled: the surface; if it has a band of skin, the band is that of the pair's sample.
+        celled: the surface; its band of skin, if it has one, is bent as at the pair's sample.
         X_WP: (g, 4, 4) poses of the parent.
         X_PN: (n, 4, 4) poses of the node in its parent at its samples.
         pairs: (m, 2) int32 parent pose and sample.
@@ -67,8 +67,8 @@ def draw_bits(
         both; runs (m', 2, 3) int64 for the silhouette and the band the first word, the number of
         words, and where they begin in words; words (n,) uint64.
     """
-    camera, e = view.camera, celled.packed.edges.shape[1] + 1
-    rows, crossings = make_rows(celled.whole, camera)
+    camera, packed, e = view.camera, celled.packed, celled.edges.shape[0] + 1
+    rows, crossings = make_rows(packed, camera)
     scratch = _Scratch(
         np.empty(e, dtype=np.int32),
         np.empty(e, dtype=np.int32),
@@ -76,10 +76,8 @@ def draw_bits(
         np.empty(e, dtype=np.int32),
         np.empty(e, dtype=np.int32),
     )
-    bends, band, whole = celled.bands.shape[0] > 0, celled.band, celled.whole
-    if bends:
-        band, whole = own_copy(band), own_copy(whole)
-    X_WN, X_CN = np.zeros((4, 4)), np.empty((1, 3, 4))
+    bends, part = celled.bands.shape[0] > 0, np.array([1, 0, 0, 0])
+    X_WN, X_CN = np.zeros((4, 4)), np.empty((2, 3, 4))
     X_WN[3, 3] = 1.0
     kept = np.zeros(pairs.shape[0], dtype=np.bool_)
     areas = np.empty((pairs.shape[0], 3), dtype=np.int32)
@@ -94,17 +92,17 @@ def draw_bits(
             continue
         multiply(X_WP[pairs[i, 0]], X_PN[pairs[i, 1]], X_WN)
         multiply(view.X_CW, X_WN, X_CN[0])
+        multiply(view.X_CW, X_WN, X_CN[1])
+        if bends:
+            bend(packed, part, celled.bands[pairs[i, 1]])
         rows.reach[0], rows.reach[1], rows.reach[2] = rows.counts.shape[0], 0, 0
         filled = _walk_cell(celled, X_CN[0], camera, crossings, rows, scratch)
-        if bends and filled:
-            bend(band, np.zeros(4, dtype=np.int64), celled.bands[pairs[i, 1]])
-            add_surface(band, 0, X_CN, camera, crossings, rows)
+        if filled:
+            add_surface(packed, 1, X_CN, camera, crossings, rows)
         if rows.reach[2] != 0 or not filled:
             for row in range(rows.reach[0], rows.reach[1]):
                 rows.counts[row] = 0
-            if bends:
-                bend(whole, celled.part, celled.bands[pairs[i, 1]])
-            crossings = fill_rows(whole, 0, 1, X_CN, camera, crossings, rows)
+            crossings = fill_rows(packed, 0, 2, X_CN, camera, crossings, rows)
         count, spans = _gather_spans(view, crossings, rows, limit, spans, areas[found])
         if count < 0:
             continue
@@ -130,10 +128,10 @@ def _walk_cell(
     scratch: _Scratch,
 ) -> bool:
     """Walks the contour edges of the cell exactly as the span kernel does."""
-    packed, counts, reach = celled.packed, rows.counts, rows.reach
-    if packed.planes.shape[1] == 0:
+    counts, reach = rows.counts, rows.reach
+    if celled.edges.shape[0] == 0:
         return True
-    ball, parallel, cx, cy = packed.balls[0], camera[0] == 1.0, camera[3], camera[4]
+    ball, parallel, cx, cy = celled.packed.balls[0], camera[0] == 1.0, camera[3], camera[4]
     e0, e1, e2, share = viewpoint_in_node(X, camera)
     d0, d1, d2 = e0 - share * ball[0], e1 - share * ball[1], e2 - share * ball[2]
     c0, c1, c2, c3 = X[2, 0], X[2, 1], X[2, 2], X[2, 3]

@@ -12,13 +12,155 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_pose.compiled import compiled
+from drake_pose.compiled import compiled, with_room
 from drake_pose.silhouette.areas.outline import PackedOutlines
-from drake_pose.silhouette.contours.contour_segments import (
-    find_crossings,
-    find_line_spans,
-    find_segments,
-)
+from drake_pose.silhouette.areas.projection import find_facings, project
+from drake_pose.silhouette.areas.span_kernel import make_rows
+
+# Slits and overlaps narrower than this [pixel] are rounding where surfaces touch.
+_SLIT = 1e-6
+
+
+class Segments(NamedTuple):
+    """Projected contour edges.
+
+    ends: (n, 4) u, v of their start and end [pixel]; depths: (n, 2) there [m]; ones for a parallel
+    camera; weights: (n,) int64 how the winding number changes across; nodes: (n,) int64; vertices:
+    (n, 2) int64 indices into the packed points.
+    """
+
+    ends: np.ndarray
+    depths: np.ndarray
+    weights: np.ndarray
+    nodes: np.ndarray
+    vertices: np.ndarray
+
+
+@compiled
+def find_segments(
+    packed: PackedOutlines, X_CN: np.ndarray, camera: np.ndarray, wanted: np.ndarray
+) -> Segments:
+    """The projected contour edges, beyond the near plane, of surfaces at X_CN (nodes, 4, 4).
+
+    wanted: (nodes,) bool which surfaces.
+    """
+    rows, _ = make_rows(packed, camera)
+    capacity, count = 1024, 0
+    ends, depths = np.empty((capacity, 4)), np.empty((capacity, 2))
+    labels = np.empty((capacity, 4), dtype=np.int64)
+    u, v, facings, edges, points = rows.u, rows.v, rows.facings, packed.edges, packed.points
+    for node in range(X_CN.shape[0]):
+        if not wanted[node]:
+            continue
+        project(packed, node, X_CN, camera, u, v)
+        find_facings(packed, node, X_CN, camera, facings)
+        X, ball = X_CN[node], packed.balls[node]
+        first, t0 = packed.starts[node, 0], packed.starts[node, 1]
+        depth = X[2, 0] * ball[0] + X[2, 1] * ball[1] + X[2, 2] * ball[2] + X[2, 3]
+        radius = 1.000001 * ball[3] * np.sqrt(X[2, 0] ** 2 + X[2, 1] ** 2 + X[2, 2] ** 2)
+        if camera[0] == 0.0 and not depth - radius > camera[5]:
+            for t in range(packed.starts[node + 1, 1] - t0):
+                for k in range(3):
+                    i = first + packed.triangles[t0 + t, k]
+                    depth = X[2, 0] * points[0, i] + X[2, 1] * points[1, i]
+                    if not depth + X[2, 2] * points[2, i] + X[2, 3] >= camera[5]:
+                        facings[t] = 0
+        for e in range(packed.starts[node, 2], packed.starts[node + 1, 2]):
+            weight = int(facings[edges[2, e]]) + int(packed.sides[e]) * int(facings[edges[3, e]])
+            if weight == 0:
+                continue
+            if count == capacity:
+                capacity *= 2
+                ends, depths = with_room(ends, count, capacity), with_room(depths, count, capacity)
+                labels = with_room(labels, count, capacity)
+            labels[count, 0], labels[count, 1] = weight, node
+            for k in range(2):
+                i = np.int64(edges[k, e])
+                ends[count, 2 * k], ends[count, 2 * k + 1] = u[i], v[i]
+                i += first
+                labels[count, 2 + k], depths[count, k] = i, 1.0
+                if camera[0] == 0.0:
+                    depth = X[2, 0] * points[0, i] + X[2, 1] * points[1, i]
+                    depths[count, k] = depth + X[2, 2] * points[2, i] + X[2, 3]
+            count += 1
+    return Segments(
+        ends[:count], depths[:count], labels[:count, 0], labels[:count, 1], labels[:count, 2:]
+    )
+
+
+@compiled
+def find_crossings(
+    segments: Segments, across: int, first: float, spacing: float, lines: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where contour edges cross lines of a raster, sorted along each line; upper ends excluded.
+
+    Args:
+        across: 0: the lines are rows, along u; 1: columns, along v.
+        first, spacing: the first line on the other axis, and from line to line [pixel].
+
+    Returns:
+        starts (lines + 1,) of the lines' crossings, their places (n,) [pixel] and segments (n,).
+    """
+    ends = segments.ends
+    counts = np.zeros(lines + 1, dtype=np.int64)
+    begin = np.empty(ends.shape[0], dtype=np.int64)
+    after = np.empty(ends.shape[0], dtype=np.int64)
+    for s in range(ends.shape[0]):
+        a, b = ends[s, 1 - across], ends[s, 3 - across]
+        low, high = (min(a, b) - first) / spacing, (max(a, b) - first) / spacing
+        begin[s] = after[s] = 0
+        if high > 0.0 and low <= lines - 1:
+            begin[s] = np.int64(np.ceil(max(low, 0.0)))
+            after[s] = np.int64(np.ceil(min(high, float(lines))))
+        for line in range(begin[s], after[s]):
+            counts[line + 1] += 1
+    for line in range(lines):
+        counts[line + 1] += counts[line]
+    starts = counts
+    places = np.empty(starts[lines])
+    owners = np.empty(starts[lines], dtype=np.int64)
+    used = starts[:-1].copy()
+    for s in range(ends.shape[0]):
+        a, b = ends[s, 1 - across], ends[s, 3 - across]
+        for line in range(begin[s], after[s]):
+            share = (first + line * spacing - a) / (b - a)
+            place = ends[s, across] + share * (ends[s, 2 + across] - ends[s, across])
+            k = used[line]
+            used[line] += 1
+            while k > starts[line] and places[k - 1] > place:
+                places[k], owners[k] = places[k - 1], owners[k - 1]
+                k -= 1
+            places[k], owners[k] = place, s
+    return starts, places, owners
+
+
+@compiled
+def find_line_spans(
+    segments: Segments,
+    across: int,
+    starts: np.ndarray,
+    places: np.ndarray,
+    owners: np.ndarray,
+    line: int,
+    spans: np.ndarray,
+) -> int:
+    """Writes the covered spans of one line as indices of crossings (k, 2); returns their number."""
+    found, winding, start = 0, 0, 0
+    ends = segments.ends
+    for k in range(starts[line], starts[line + 1]):
+        s = owners[k]
+        if winding == 0:
+            start = k
+        # Both runs of an edge cross a line at one place, in opposite directions.
+        rising = ends[s, 1 - across] < ends[s, 3 - across]
+        winding += segments.weights[s] if rising else -segments.weights[s]
+        if winding == 0 and places[k] - places[start] > _SLIT:
+            if found > 0 and places[start] - places[spans[found - 1, 1]] <= _SLIT:
+                spans[found - 1, 1] = k
+            else:
+                spans[found, 0], spans[found, 1] = start, k
+                found += 1
+    return found
 
 
 class ContourPoints(NamedTuple):

@@ -15,8 +15,13 @@ import numpy as np
 
 from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.compiled import compiled
-from drake_pose.silhouette.areas.bending import BendingOutline
-from drake_pose.silhouette.areas.outline import Outline, PackedOutlines, outline_from_mesh, pack
+from drake_pose.silhouette.areas.outline import (
+    Outline,
+    PackedOutlines,
+    outline_of_triangles,
+    own_copy,
+    pack,
+)
 
 _CELLS_A_SIDE = 20
 # A little more than rounding can move a direction.
@@ -24,29 +29,24 @@ _MARGIN = 1e-6
 
 
 class CelledOutline(NamedTuple):
-    """One surface, packed for the kernels, with the edges of every cell.
+    """One surface with the edges of every cell, and its band of skin.
 
-    packed: the surface alone; points: (n, 4) its vertices, a record each; planes: (m + 1, 4)
-    likewise, and a plane that faces nowhere; edges: (e, 5) int32 v0, v1, t0, t1, s1 as in packed;
-    cell_starts: (cells + 1,) int64; cell_edges: (k,) int32 indices into edges, cell after cell;
-    reach: (1,) the sine of how far the directions in which a camera sees the surface's points may
-    differ from that of its ball's centre; bands: (n, v, 3) the vertices of the surface's band of
-    skin at the samples of its node [m], n = 0 where it has none; band: the band alone, packed;
-    whole: the surface with its band, packed; part: (4,) int64 the band in the latter, as the
-    bending kernel wants it.
+    points: (n, 4) vertices, a record each; planes: (m + 1, 4) likewise, and a plane that faces
+    nowhere; edges: (e, 5) int32 v0, v1, t0, t1, s1 as packed; cell_starts: (cells + 1,) int64;
+    cell_edges: (k,) int32 indices into edges, cell after cell; reach: (1,) the sine of how far the
+    directions in which a camera sees the surface's points may differ from that of its ball's
+    centre; packed: the surface, then its band, which kernels bend in place; bands: (n, v, 3) the
+    band's vertices at the samples of its node [m], n = 0 where there is none.
     """
 
-    packed: PackedOutlines
     points: np.ndarray
     planes: np.ndarray
     edges: np.ndarray
     cell_starts: np.ndarray
     cell_edges: np.ndarray
     reach: np.ndarray
+    packed: PackedOutlines
     bands: np.ndarray
-    band: PackedOutlines
-    whole: PackedOutlines
-    part: np.ndarray
 
 
 def divide_outline(
@@ -63,26 +63,18 @@ def divide_outline(
         band: the band of skin that belongs to the surface, at rest; it gets no cells.
         bands: (n, v, 3) its vertices at the samples of its node [m].
     """
-    packed = pack((outline,))
-    skin = band or TriangleMesh.empty()
-    whole = BendingOutline(outline, skin)
-    alone = BendingOutline(outline_from_mesh(TriangleMesh.empty()), skin)
-    starts, edges = _find_cell_edges(packed, _CELLS_A_SIDE, spread)
-    points = np.column_stack([packed.points.T, np.ones(packed.points.shape[1])])
-    planes = np.vstack([packed.planes.T, np.zeros(4)])
-    records = np.vstack([packed.edges, packed.sides]).T.astype(np.int32)
+    rigid, skin = pack((outline,)), band or TriangleMesh.empty()
+    starts, edges = _find_cell_edges(rigid, _CELLS_A_SIDE, spread)
+    records = np.vstack([rigid.edges, rigid.sides]).T
     return CelledOutline(
-        packed=packed,
-        points=np.ascontiguousarray(points),
-        planes=planes,
-        edges=np.ascontiguousarray(records),
+        points=np.column_stack([outline.vertices, np.ones(len(outline.vertices))]),
+        planes=np.vstack([outline.planes, np.zeros(4)]),
+        edges=np.ascontiguousarray(records, dtype=np.int32),
         cell_starts=starts,
         cell_edges=edges,
         reach=np.array([math.sin(spread)]),
+        packed=own_copy(pack((outline, outline_of_triangles(skin.vertices, skin.triangles)))),
         bands=np.ascontiguousarray(np.zeros((0, 0, 3)) if bands is None else bands),
-        band=pack((alone.rest,)),
-        whole=pack((whole.rest,)),
-        part=np.array([0, len(outline.vertices), len(outline.triangles), 0], dtype=np.int64),
     )
 
 

@@ -27,7 +27,6 @@ from drake_pose.results.settings import EstimateSettings
 from drake_pose.results.texts import percent
 
 if TYPE_CHECKING:
-    from drake_pose.results.records import FrameRecord
     from drake_pose.results.writer import SceneEstimate
 
 
@@ -112,7 +111,6 @@ def demo(
 def print_estimate(result: SceneEstimate) -> None:
     """Prints a row a frame, the joint errors where the truth is known, and where the result is."""
     console = output_console()
-    with_truth = any(record.joint_errors for record in result.records.values())
     if result.summary["method"] == "person":
         console.print("One person was followed by all silhouettes at once (--method person).")
         table = Table("camera", "frames", "mean IoU")
@@ -120,27 +118,27 @@ def print_estimate(result: SceneEstimate) -> None:
             table.add_row(escape(camera), str(one["frames"]), percent(one["mean_iou"]))
         console.print(table)
     else:
-        console.print(_frame_table(result, with_truth))
-    if with_truth:
+        console.print(_frame_table(result))
+    if any(record.joint_errors for record in result.records.values()):
         console.print(_error_table(result))
     _print_totals(console, result)
 
 
-def _frame_table(result: SceneEstimate, with_truth: bool) -> Table:
-    table = Table("frame", "E_total", "before", "runs", "seconds", title="Estimate")
-    if with_truth:
-        table.add_column("mean joint error")
+def _frame_table(result: SceneEstimate) -> Table:
+    with_truth = any(record.joint_errors for record in result.records.values())
+    errors = ["mean joint error"] if with_truth else []
+    table = Table("frame", "E_total", "before", "runs", "seconds", *errors, title="Estimate")
+    angles = set(_angles(result))
     for frame, record in result.records.items():
-        cells = [
+        turns = [abs(e) for name, e in record.joint_errors.items() if name in angles]
+        table.add_row(
             escape(frame),
             percent(record.E_total),
             percent(record.first_E_total),
             "" if record.runs is None else str(record.runs),
             f"{record.seconds:.2f}",
-        ]
-        if with_truth:
-            cells.append(_mean_angle_error(result, record))
-        table.add_row(*cells)
+            *([f"{sum(turns) / len(turns):.1f} deg" if turns else "-"] if with_truth else []),
+        )
     return table
 
 
@@ -149,10 +147,13 @@ def _print_demo(result: SceneEstimate) -> None:
     from drake_pose.results.folder import OVERLAY
 
     console = output_console()
-    row = result.rows[0]
     table = Table("joint", "value", title="Joint angles of the man in the picture")
-    for name, kind, value in zip(result.position_names, result.position_kinds, row.q, strict=True):
-        table.add_row(escape(name), _position_text(kind, value))
+    for name, kind, value in zip(
+        result.position_names, result.position_kinds, result.rows[0].q, strict=True
+    ):
+        text = f"{value:.3f} m" if kind == "length" else f"{value:.4f}"
+        text = f"{math.degrees(value):.1f} deg" if kind == "angle" else text
+        table.add_row(escape(name), text if math.isfinite(value) else "-")
     console.print(table)
     _print_totals(console, result)
     if result.folder is not None:
@@ -164,14 +165,6 @@ def _print_demo(result: SceneEstimate) -> None:
     )
 
 
-def _position_text(kind: str, value: float) -> str:
-    if not math.isfinite(value):
-        return "-"
-    if kind == "angle":
-        return f"{math.degrees(value):.1f} deg"
-    return f"{value:.3f} m" if kind == "length" else f"{value:.4f}"
-
-
 def _print_totals(console: Console, result: SceneEstimate) -> None:
     from drake_pose.results.folder import POSES, REPLAY, REPORT
 
@@ -181,36 +174,25 @@ def _print_totals(console: Console, result: SceneEstimate) -> None:
     console.print(f"seconds        {summary['median_seconds']:.2f} a frame in the median")
     if summary["mean_iou"] is not None:
         console.print(f"IoU            {percent(summary['mean_iou'])} in the mean")
-    if result.folder is None:
-        return
     for label, file in (("poses", POSES), ("report", REPORT), ("replay", REPLAY)):
-        if (result.folder / file).is_file():
+        if result.folder is not None and (result.folder / file).is_file():
             console.print(f"{label:<14} {escape(str(result.folder / file))}", soft_wrap=True)
 
 
-def _mean_angle_error(result: SceneEstimate, record: FrameRecord) -> str:
-    kinds = dict(zip(result.position_names, result.position_kinds, strict=True))
-    errors = [abs(e) for name, e in record.joint_errors.items() if kinds[name] == "angle"]
-    return f"{sum(errors) / len(errors):.1f} deg" if errors else "-"
+def _angles(result: SceneEstimate) -> list[str]:
+    kinds = zip(result.position_names, result.position_kinds, strict=True)
+    return [name for name, kind in kinds if kind == "angle"]
 
 
 def _error_table(result: SceneEstimate) -> Table:
     """Estimate minus truth: a row a joint, a column a frame."""
-    kinds = dict(zip(result.position_names, result.position_kinds, strict=True))
-    compared = {
-        frame: record.joint_errors
-        for frame, record in result.records.items()
-        if record.joint_errors
-    }
+    angles = set(_angles(result))
+    compared = {f: one.joint_errors for f, one in result.records.items() if one.joint_errors}
     shown = list(compared)[:8]
     table = Table("joint", "mean", "greatest", *map(escape, shown), title="Joint errors")
     for name, errors in result.summary["joint_errors"].items():
-        unit, digits = ("deg", 1) if kinds[name] == "angle" else ("m", 3)
-        each = [f"{compared[frame][name]:+.{digits}f}" for frame in shown]
-        table.add_row(
-            escape(name),
-            f"{errors['mean']:.{digits}f} {unit}",
-            f"{errors['greatest']:.{digits}f} {unit}",
-            *each,
-        )
+        unit, digits = ("deg", 1) if name in angles else ("m", 3)
+        ends = (f"{errors[key]:.{digits}f} {unit}" for key in ("mean", "greatest"))
+        each = (f"{compared[frame][name]:+.{digits}f}" for frame in shown)
+        table.add_row(escape(name), *ends, *each)
     return table

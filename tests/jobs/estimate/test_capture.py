@@ -6,19 +6,15 @@ import numpy as np
 import pytest
 
 from drake_pose.body.files.packages import bundled_model
-from drake_pose.camera.files import save_cameras
-from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.commands.main import app
 from drake_pose.errors import ModelError, SceneError, SettingsError
 from drake_pose.fit.contour_fit import ContourFit
-from drake_pose.jobs.estimate.person_choice import bundled_person
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.person.recordings.checked_capture import CheckedCapture
 from drake_pose.person.recordings.person_capture import PersonCapture
 from drake_pose.person.recordings.persons_in_view import ViewFaults
 from drake_pose.results.settings import EstimateSettings
-from drake_pose.silhouette.pictures.masks import write_mask
-from tests.cli import CliRunner
+from tests.cli import CliRunner, Result
 from tests.jobs.persons import PersonScene, record_person
 from tests.jobs.scenes import read_rows
 
@@ -67,16 +63,14 @@ def known(recording: PersonScene, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return counts
 
 
-def arguments(scene: PersonScene, out: Path, *more: str) -> list[str]:
-    return [
-        "estimate",
-        str(scene.folder),
-        "--model",
-        str(scene.person.path),
-        "--out",
-        str(out),
-        *more,
-    ]
+def estimate(
+    runner: CliRunner, scene: PersonScene, out: Path, *more: str, status: int = 0
+) -> tuple[Result, dict]:
+    """What the command said, and the summary that it wrote."""
+    given = [str(scene.folder), "--model", str(scene.person.path), "--out", str(out)]
+    result = runner.invoke(app, ["estimate", *given, "--no-replay", *more])
+    assert result.exit_code == status, result.output
+    return result, json.loads((out / "summary.json").read_text())
 
 
 @pytest.mark.slow
@@ -111,12 +105,10 @@ def test_estimate_follows_a_person_and_says_so(
     recording: PersonScene, known: list[int], runner: CliRunner, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    result = runner.invoke(app, arguments(recording, out, "--no-replay"))
-    assert result.exit_code == 0, result.output
+    result, summary = estimate(runner, recording, out)
     assert "followed by all silhouettes" in result.stdout
     assert known == [FRAMES]
     assert {path.name for path in out.iterdir()} == FILES | {"overlay"}
-    summary = json.loads((out / "summary.json").read_text())
     assert summary["complete"] is True
     assert summary["method"] == "person"
     assert summary["cameras"]["camera_3"]["frames"] == FRAMES
@@ -124,22 +116,13 @@ def test_estimate_follows_a_person_and_says_so(
     assert summary["mean_iou"] > 0.94
     assert {path.parent.name for path in out.glob("overlay/*/*.png")} == set(summary["cameras"])
     assert len(list(out.glob("overlay/*/*.png"))) == 4 * FRAMES
-
-
-def test_deviations_become_intervals_of_95_percent(
-    recording: PersonScene, known: list[int], tmp_path: Path
-) -> None:
-    out = tmp_path / "out"
-    estimate_scene(recording.folder, recording.person.path, out, replay=False, overlay=False)
-    rows = read_rows(out / "joints.csv")
-    row = next(r for r in rows if (r["frame"], r["joint"]) == ("0001", "left_upper_arm_z"))
-    half = np.degrees(1.96 * 0.01)
+    # Deviations become intervals of 95 %; at a limit the interval ends there.
+    joints = {(row["frame"], row["joint"]): row for row in read_rows(out / "joints.csv")}
+    row, half = joints["0001", "left_upper_arm_z"], np.degrees(1.96 * 0.01)
     assert float(row["low"]) == pytest.approx(40.0 - half, abs=1e-3)
     assert float(row["high"]) == pytest.approx(40.0 + half, abs=1e-3)
     assert row["determined"] == "yes"
-    # At a limit the interval ends there.
-    elbow = next(r for r in rows if (r["frame"], r["joint"]) == ("0001", "left_forearm_x"))
-    assert float(elbow["high"]) == 0.0
+    assert float(joints["0001", "left_forearm_x"]["high"]) == 0.0
 
 
 def test_stills_cameras_and_frames_are_chosen_like_an_estimates(
@@ -147,10 +130,8 @@ def test_stills_cameras_and_frames_are_chosen_like_an_estimates(
 ) -> None:
     scene = record_person(tmp_path / "scene", FRAMES, sequence=False)
     out = tmp_path / "out"
-    some = ("--frame", "0:1", "--camera", "camera_0", "--camera", "camera_2", "--no-replay")
-    result = runner.invoke(app, arguments(scene, out, *some, "--json", "--no-overlay"))
-    assert result.exit_code == 0, result.output
-    summary = json.loads(result.stdout)
+    some = ("--frame", "0:1", "--camera", "camera_0", "--camera", "camera_2", "--no-overlay")
+    _, summary = estimate(runner, scene, out, *some)
     assert list(summary["frames"]) == ["0000", "0001"]
     assert set(summary["cameras"]) == {"camera_0", "camera_2"}
     assert not (out / "motion.bvh").exists()
@@ -181,47 +162,27 @@ def interrupt(*_: object) -> None:
     raise KeyboardInterrupt
 
 
-def test_an_interrupted_recording_does_not_look_whole_and_can_be_begun_again(
-    recording: PersonScene,
-    known: list[int],
-    runner: CliRunner,
-    tmp_path: Path,
+def test_an_interrupted_recording_does_not_look_whole_and_loses_no_frames(
+    recording: PersonScene, known: list[int], runner: CliRunner, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("drake_pose.jobs.estimate.person.capture_checked", interrupt)
-        result = runner.invoke(app, arguments(recording, out, "--no-replay"))
-    assert result.exit_code == 1
-    assert "--resume" in result.stderr
-    assert json.loads((out / "summary.json").read_text())["complete"] is False
-    assert read_rows(out / "poses.csv") == []
-    assert not (out / "report.html").exists()
-    result = runner.invoke(app, arguments(recording, out, "--no-replay", "--resume"))
-    assert result.exit_code == 0, result.output
-    assert json.loads((out / "summary.json").read_text())["complete"] is True
-    assert len(read_rows(out / "poses.csv")) == FRAMES
-    # Nothing is left to be done.
-    assert known == [FRAMES]
-    again = runner.invoke(app, arguments(recording, out, "--no-replay", "--resume"))
-    assert again.exit_code == 0
-    assert known == [FRAMES]
-
-
-def test_resuming_with_more_frames_loses_none(
-    recording: PersonScene, known: list[int], tmp_path: Path
-) -> None:
-    out = tmp_path / "out"
-    first = EstimateSettings(frames=("0",))
-    estimate_scene(recording.folder, recording.person.path, out, first, replay=False)
-    more = EstimateSettings(frames=("1:2",))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("drake_pose.jobs.estimate.person.capture_checked", interrupt)
-        with pytest.raises(KeyboardInterrupt):
-            estimate_scene(recording.folder, recording.person.path, out, more, resume=True)
-    assert [row["frame"] for row in read_rows(out / "poses.csv")] == ["0000"]
-    estimate_scene(recording.folder, recording.person.path, out, more, resume=True, replay=False)
-    assert known == [1, FRAMES]
-    assert [row["frame"] for row in read_rows(out / "poses.csv")] == ["0000", "0001", "0002"]
+        result, summary = estimate(runner, recording, out, "--frame", "0", status=1)
+        assert "--resume" in result.stderr
+        assert summary["complete"] is False
+        assert read_rows(out / "poses.csv") == []
+        assert not (out / "report.html").exists()
+    for frames, finished, asked in (
+        ("0", ["0000"], [1]),
+        ("1:2", ["0000", "0001", "0002"], [1, FRAMES]),
+        # Nothing is left to be done.
+        ("0:2", ["0000", "0001", "0002"], [1, FRAMES]),
+    ):
+        _, summary = estimate(runner, recording, out, "--resume", "--frame", frames)
+        assert summary["complete"] is True
+        assert [row["frame"] for row in read_rows(out / "poses.csv")] == finished
+        assert known == asked
 
 
 @pytest.mark.parametrize(
@@ -256,16 +217,7 @@ def test_what_the_method_person_cannot_do_is_refused(
     hand = bundled_model("hand")
     with pytest.raises(ModelError, match=r"left_ankle.*landmarks\.yaml"):
         estimate_scene(recording.folder, hand, tmp_path / "out", EstimateSettings(method="person"))
-    assert not (tmp_path / "out").exists()
-
-
-def test_one_camera_is_too_few(tmp_path: Path) -> None:
-    cameras = circle_of_cameras(1, size=(160, 120), face_camera=False)
-    save_cameras(tmp_path / "cameras.yaml", cameras)
-    path = tmp_path / "masks" / "camera_0" / "0000.png"
-    path.parent.mkdir(parents=True)
-    mask = np.zeros((120, 160), dtype=bool)
-    mask[40:80, 60:90] = True
-    write_mask(path, mask)
+    alone = EstimateSettings(method="person", cameras=("camera_0",))
     with pytest.raises(SceneError, match="two calibrated cameras"):
-        estimate_scene(tmp_path, bundled_person(), None, EstimateSettings(method="person"))
+        estimate_scene(recording.folder, recording.person.path, tmp_path / "out", alone)
+    assert not (tmp_path / "out").exists()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from drake_pose.jobs.estimate.person import (
-    describe_cameras,
+    describe_camera,
     describe_fit,
     describe_rig,
     describe_views,
@@ -44,7 +44,7 @@ def test_a_camera_that_moved_or_contradicts():
     motion = CameraMotion(np.eye(4), np.array([3.0, -4.0]), 5.0, 0.07, 0.1, 0.5, 0.9)
     moved = MovedCamera(CameraFault("a", motion, True, (), 0.95), 2, True)
     unclear = MovedCamera(CameraFault("a", motion, False, ("b",), 0.95), 0, False)
-    first, second = describe_cameras([moved, unclear], FRAMES)
+    first, second = (describe_camera(one, FRAMES) for one in (moved, unclear))
     assert first.startswith("camera 'a' has moved since frame 2 after it was calibrated")
     assert "5.0 pixels off in its pictures (3.0 to the right, 4.0 up" in first
     assert "left out since frame 2" in first

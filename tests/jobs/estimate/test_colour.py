@@ -48,13 +48,6 @@ def errors(estimate, truth):
     return np.degrees(np.abs(found - truth).max(axis=1))
 
 
-def test_pictures_and_a_start_are_enough(recording):
-    scene, model, truth, start = recording
-    estimate = estimate_scene(scene, model, settings=EstimateSettings(start=start))
-    assert estimate.found_count == FRAMES
-    assert np.median(errors(estimate, truth)) < 1.5
-
-
 @pytest.fixture(scope="module")
 def filmed(recording, tmp_path_factory):
     """The same scene with a video in place of the pictures."""
@@ -90,48 +83,36 @@ def test_a_video_stands_for_pictures(recording, filmed):
 
 
 def test_frames_of_a_video_are_named_as_its_masks_are(recording, filmed, tmp_path):
-    copy = tmp_path / "scene"
-    shutil.copytree(filmed, copy)
+    copy = shutil.copytree(filmed, tmp_path / "scene")
     (copy / "masks" / "front").mkdir(parents=True)
     shutil.copy(recording[0].parent / "first.png", copy / "masks" / "front" / "0.png")
     loaded = load_scene(copy)
     assert loaded.frames == ("0", *(f"{k:06d}" for k in range(1, FRAMES)))
     assert ("front", "0") in loaded.images
-
-
-def test_what_is_no_video_is_named(filmed, tmp_path):
-    copy = tmp_path / "scene"
-    shutil.copytree(filmed, copy)
     (copy / "videos" / "front.avi").write_bytes(b"no video")
     with pytest.raises(SceneError, match=r"front\.avi.*not a video"):
         load_scene(copy)
 
 
-def test_nothing_says_where_the_body_is_at_first(recording):
-    scene, model, _, _ = recording
-    with pytest.raises(SceneError, match=r"'0000'.*masks/front/0000\.png.*--start"):
-        estimate_scene(scene, model)
-
-
-def test_a_start_of_another_frame_is_refused(recording):
+@pytest.mark.parametrize(
+    ("with_start", "more", "words"),
+    [
+        (False, {}, r"'0000'.*masks/front/0000\.png.*--start"),
+        (True, {"frames": ("0003:0005",)}, r"start\.csv.*'0003'"),
+        (True, {"track": False}, "sequence: true"),
+        (False, {"track": False}, "--no-track"),
+    ],
+)
+def test_what_does_not_say_where_the_body_is_is_refused(recording, with_start, more, words):
     scene, model, _, start = recording
-    settings = EstimateSettings(start=start, frames=("0003:0005",))
-    with pytest.raises(SceneError, match=r"start\.csv.*'0003'"):
+    settings = EstimateSettings(start=start if with_start else None, **more)
+    with pytest.raises((SceneError, SettingsError), match=words):
         estimate_scene(scene, model, settings=settings)
-
-
-def test_pictures_without_masks_are_refused_where_nothing_is_tracked(recording):
-    scene, model, _, start = recording
-    with pytest.raises(SettingsError, match="sequence: true"):
-        estimate_scene(scene, model, settings=EstimateSettings(start=start, track=False))
-    with pytest.raises(SettingsError, match="--no-track"):
-        estimate_scene(scene, model, settings=EstimateSettings(track=False))
 
 
 def test_a_bad_picture_is_met_before_the_work_begins(recording, tmp_path):
     scene, model, _, start = recording
-    copy = tmp_path / "scene"
-    shutil.copytree(scene, copy)
+    copy = shutil.copytree(scene, tmp_path / "scene")
     cv2.imwrite(str(copy / "images" / "front" / "0005.png"), np.zeros((10, 20, 3), np.uint8))
     with pytest.raises(SceneError, match=r"0005\.png.*20 x 10"):
         estimate_scene(copy, model, tmp_path / "out", EstimateSettings(start=start))
@@ -146,28 +127,24 @@ def test_an_interrupted_sequence_of_pictures_goes_on_as_if_it_had_not_been(recor
     settings, heard = EstimateSettings(start=start), []
 
     def stop(done, total, frame, record):
-        if done == 3:
+        heard.append((done, frame))
+        if done == 3 and frame:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        estimate_scene(scene, model, tmp_path / "out", settings, on_frame=stop, overlay=False)
+        estimate_scene(scene, model, tmp_path / "out", settings, on_frame=stop)
     resumed = estimate_scene(
-        scene, model, tmp_path / "out", settings, resume=True, overlay=False,
-        on_frame=lambda done, total, frame, record: heard.append((done, frame)),
-    )  # fmt: skip
-    assert heard == [(3, ""), *((k + 1, f"{k:04d}") for k in range(3, FRAMES))]
+        scene, model, tmp_path / "out", settings, resume=True, on_frame=stop, replay=False
+    )
+    assert heard[4:] == [(3, ""), *((k + 1, f"{k:04d}") for k in range(3, FRAMES))]
     whole = estimate_scene(scene, model, settings=settings)
     for one, other in zip(resumed.rows, whole.rows, strict=True):
         np.testing.assert_allclose(one.q, other.q, atol=1e-6)
-
-
-def test_overlays_show_the_body_over_the_pictures(recording, tmp_path):
-    scene, model, _, start = recording
-    settings = EstimateSettings(start=start, frames=("0000:0001",))
-    estimate_scene(scene, model, tmp_path / "out", settings)
+    assert whole.found_count == FRAMES
+    assert np.median(errors(whole, recording[2])) < 1.5
+    # Overlays show the body over the pictures: an orange contour; the rest is the picture's.
     shown = cv2.imread(str(tmp_path / "out" / "overlay" / "front" / "0001.png"))
     picture = cv2.imread(str(scene / "images" / "front" / "0001.png"))
-    # The contour is orange, blue green red; the rest is the picture's.
     line = np.all(shown == (0, 94, 213), axis=-1)
     assert 100 < line.sum() < 0.1 * line.size
     colours = {tuple(one) for one in picture.reshape(-1, 3).tolist()}
@@ -177,8 +154,7 @@ def test_overlays_show_the_body_over_the_pictures(recording, tmp_path):
 
 def test_stills_have_no_pictures_and_full_masks_need_none(recording, tmp_path):
     scene, _, _, _ = recording
-    copy = tmp_path / "scene"
-    shutil.copytree(scene, copy)
+    copy = shutil.copytree(scene, tmp_path / "scene")
     (copy / "masks" / "front").mkdir(parents=True)
     for k in range(FRAMES):
         shutil.copy(scene.parent / "first.png", copy / "masks" / "front" / f"{k:04d}.png")

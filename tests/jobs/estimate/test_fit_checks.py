@@ -1,7 +1,6 @@
 """A pose that does not explain its pictures is said to be doubtful, and what may be the reason."""
 
 import re
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,19 +8,18 @@ import pytest
 import yaml
 
 from drake_pose.body.model import load_model
-from drake_pose.camera.models import Camera
 from drake_pose.errors import OutputError
 from drake_pose.jobs.estimate.contradictions import find_contradiction
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.results.records import FrameRecord
 from drake_pose.results.settings import EstimateSettings
+from drake_pose.results.writer import SceneEstimate
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.jobs.scenes import URDF, TinyScene, camera, write_scene
 
 ANGLES = ((20.0, -40.0), (-40.0, -80.0))
-SETTINGS = EstimateSettings(interval=20.0)
 
 
 @pytest.fixture
@@ -32,13 +30,6 @@ def scene(tmp_path: Path) -> TinyScene:
 def warnings_of(scene: TinyScene, model: Path | None = None, **more: object) -> tuple[str, ...]:
     settings = EstimateSettings(interval=20.0, **more)  # type: ignore[arg-type]
     return estimate_scene(scene.folder, model or scene.model, None, settings).warnings
-
-
-def swap(scene: TinyScene) -> None:
-    masks = scene.folder / "masks"
-    (masks / "front").rename(masks / "other")
-    (masks / "side").rename(masks / "front")
-    (masks / "other").rename(masks / "side")
 
 
 def turn_camera(scene: TinyScene, name: str, degrees: float) -> None:
@@ -54,26 +45,24 @@ def test_a_sound_scene_has_no_warning(scene: TinyScene) -> None:
     assert warnings_of(scene, cameras=("side",)) == ()
 
 
-def test_exchanged_cameras(scene: TinyScene) -> None:
-    swap(scene)
+def test_cameras_that_are_exchanged_or_moved(scene: TinyScene) -> None:
+    masks = scene.folder / "masks"
+    for one, other in (("front", "other"), ("side", "front"), ("other", "side")):
+        (masks / one).rename(masks / other)
     first, *_ = warnings_of(scene)
     assert re.match(r"cameras '(front|side)' and '(side|front)' are exchanged", first)
-
-
-def test_a_camera_that_moved(scene: TinyScene) -> None:
+    for one, other in (("front", "other"), ("side", "front"), ("other", "side")):
+        (masks / one).rename(masks / other)
     turn_camera(scene, "side", 20.0)
     first, *_ = warnings_of(scene)
     assert re.match(r"camera(s 'front' and)? 'side' contradicts? ", first)
 
 
-def test_a_joint_held_at_a_wrong_value(scene: TinyScene) -> None:
+def test_what_keeps_the_truth_out(scene: TinyScene, tmp_path: Path) -> None:
     (text,) = warnings_of(scene, hold={"lift": 80.0})
     assert "frame 0000-0001 (of 2, E_total " in text
     assert "the pose explains the pictures badly" in text
     assert "what is held (lift)" in text
-
-
-def test_a_limit_that_keeps_the_truth_out(scene: TinyScene, tmp_path: Path) -> None:
     model = tmp_path / "stiff.urdf"
     model.write_text(URDF.replace('lower="-1.6" upper="1.6"', 'lower="1.2" upper="1.6"'))
     *_, text = warnings_of(scene, model)
@@ -81,41 +70,30 @@ def test_a_limit_that_keeps_the_truth_out(scene: TinyScene, tmp_path: Path) -> N
 
 
 def test_masks_that_were_replaced_are_estimated_again(scene: TinyScene, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    estimate_scene(scene.folder, scene.model, out, SETTINGS, replay=False)
-    before = estimate_scene(scene.folder, scene.model, out, SETTINGS, resume=True, replay=False)
+    def resume(frames: tuple[str, ...] = (), resume: bool = True) -> SceneEstimate:
+        settings = EstimateSettings(interval=20.0, frames=frames)
+        return estimate_scene(
+            scene.folder, scene.model, tmp_path / "out", settings, resume=resume, replay=False
+        )
+
+    first = resume(resume=False)
+    path = scene.folder / "masks" / "front" / "0000.png"
+    path.write_bytes(path.read_bytes())
+    before = resume()
     assert before.warnings == ()
-    replace_masks(scene, "0001", (60.0, 0.0))
-    only = EstimateSettings(interval=20.0, frames=("0000",))
+    assert before.rows[0].seconds == pytest.approx(first.rows[0].seconds, abs=1e-4)
+    model = load_model(scene.model)
+    for name, one in load_scene(scene.folder).cameras.items():
+        mask = LabelRenderer(model, one).mask(np.radians((60.0, 0.0)))
+        write_mask(scene.folder / "masks" / name / "0001.png", mask)
     with pytest.raises(OutputError, match=r"frame 0001: the masks were replaced"):
-        estimate_scene(scene.folder, scene.model, out, only, resume=True, replay=False)
-    after = estimate_scene(scene.folder, scene.model, out, SETTINGS, resume=True, replay=False)
+        resume(("0000",))
+    after = resume()
     assert [row.frame for row in after.rows] == ["0000", "0001"]
     np.testing.assert_array_equal(after.rows[0].q, before.rows[0].q)
     np.testing.assert_allclose(after.rows[1].q, np.radians((60.0, 0.0)), atol=np.radians(2.0))
     (text,) = after.warnings
     assert text.startswith("frame 0001: estimated again")
-
-
-def replace_masks(scene: TinyScene, frame: str, angles: tuple[float, float]) -> None:
-    cameras: dict[str, Camera] = dict(load_scene(scene.folder).cameras)
-    model = load_model(scene.model)
-    for name, one in cameras.items():
-        mask = LabelRenderer(model, one).mask(np.radians(angles))
-        write_mask(scene.folder / "masks" / name / f"{frame}.png", mask)
-
-
-def test_a_mask_that_is_touched_but_the_same_stays_finished(
-    scene: TinyScene, tmp_path: Path
-) -> None:
-    out = tmp_path / "out"
-    first = estimate_scene(scene.folder, scene.model, out, SETTINGS, replay=False)
-    path = scene.folder / "masks" / "front" / "0000.png"
-    shutil.copyfile(path, tmp_path / "copy.png")
-    shutil.copyfile(tmp_path / "copy.png", path)
-    again = estimate_scene(scene.folder, scene.model, out, SETTINGS, resume=True, replay=False)
-    assert again.rows[0].seconds == pytest.approx(first.rows[0].seconds, abs=1e-4)
-    assert again.warnings == ()
 
 
 @pytest.mark.parametrize(

@@ -41,17 +41,11 @@ def assert_names_option(result: Result) -> None:
     assert "--package parts=FOLDER" in message
 
 
-def test_check(far: tuple[Path, Path]) -> None:
-    model, folder = far
-    assert_names_option(run("check", model))
-    assert run("check", model, "--package", f"parts={folder}").exit_code == 0
-
-
-@pytest.mark.parametrize("text", ["parts", "=x", "parts=", "parts=/no/such/folder"])
-def test_another_form_is_wrong_usage(far: tuple[Path, Path], text: str) -> None:
-    result = run("check", far[0], "--package", text)
-    assert result.exit_code == 2
-    assert "--package" in result.stderr
+def test_another_form_is_wrong_usage(far: tuple[Path, Path]) -> None:
+    for text in ("parts", "=x", "parts=", "parts=/no/such/folder"):
+        result = run("check", far[0], "--package", text)
+        assert result.exit_code == 2
+        assert "--package" in result.stderr
     with pytest.raises(SettingsError, match="given twice"):
         parse_packages([f"a={far[1]}", f"a={far[1]}"])
 
@@ -64,7 +58,9 @@ def test_estimate_and_its_resumption(
     arguments = ("estimate", tiny_scene.folder, "--model", model, "--out", out, "--interval", 20)
     arguments = (*arguments, "--no-replay", "--no-overlay")
     assert_names_option(run(*arguments))
+    assert_names_option(run("check", model))
     package = ("--package", f"parts={folder}")
+    assert run("check", model, *package).exit_code == 0
     result = run(*arguments, *package, "--frame", "0")
     assert result.exit_code == 0, result.output
     summary = json.loads((out / "summary.json").read_text())

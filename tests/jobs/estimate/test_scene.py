@@ -1,6 +1,7 @@
 import csv
 import html
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,23 +17,29 @@ from drake_pose.results.overlay import AGREEMENT_RGB, EXCESS_RGB, MISSING_RGB
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import load_scene
-from tests.cli import CliRunner
+from tests.cli import CliRunner, Result
 from tests.jobs.scenes import NAMES, URDF, TinyScene, read_rows, write_scene, write_truth
 
 
-def arguments(scene: TinyScene, out: Path, *more: str) -> list[str]:
+def estimate(
+    runner: CliRunner, scene: TinyScene, out: Path, *more: str, status: int = 0
+) -> tuple[Result, dict]:
+    """What the command said, and the summary that it wrote."""
     given = [str(scene.folder), "--model", str(scene.model), "--out", str(out), "--interval", "20"]
-    return ["estimate", *given, *more]
+    result = runner.invoke(app, ["estimate", *given, *more])
+    assert result.exit_code == status, result.output
+    return result, json.loads((out / "summary.json").read_text())
 
 
-def paper_arguments(scene: TinyScene, out: Path, *more: str) -> list[str]:
-    return arguments(scene, out, "--method", "paper", *more)
+def positions(out: Path) -> dict[str, np.ndarray]:
+    """The positions [rad] by frame."""
+    rows = read_rows(out / "poses.csv")
+    return {row["frame"]: np.array([float(row[name]) for name in NAMES]) for row in rows}
 
 
 def test_result_folder(tiny_scene: TinyScene, runner: CliRunner, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    result = runner.invoke(app, arguments(tiny_scene, out, "--angles", "grid"))
-    assert result.exit_code == 0, result.output
+    estimate(runner, tiny_scene, out, "--angles", "grid")
     assert sorted(path.name for path in out.iterdir()) == [
         "families.csv", "joints.csv", "overlay", "poses.csv", "replay.html", "report.html",
         "summary.json",
@@ -41,33 +48,36 @@ def test_result_folder(tiny_scene: TinyScene, runner: CliRunner, tmp_path: Path)
     assert list(rows[0]) == ["frame", *NAMES, "error", "seconds"]
     assert [row["frame"] for row in rows] == list(tiny_scene.truth)
     for row in rows:
-        q = np.array([float(row[name]) for name in NAMES])
-        np.testing.assert_allclose(q, tiny_scene.truth[row["frame"]], atol=np.radians(0.5))
         assert 0.0 <= float(row["error"]) < 0.005
         assert float(row["seconds"]) > 0.0
+    for frame, q in positions(out).items():
+        np.testing.assert_allclose(q, tiny_scene.truth[frame], atol=np.radians(0.5))
+    page = (out / "replay.html").read_text()
+    assert page.lstrip().startswith("<!DOCTYPE html>")
+    assert 'src="http' not in page
 
 
 def test_summary(tiny_scene: TinyScene, runner: CliRunner, tmp_path: Path) -> None:
     out = tmp_path / "out"
     options = ["--json", "--no-replay", "--hold", "lift=20", "--joint-interval", "luff=40"]
-    result = runner.invoke(app, paper_arguments(tiny_scene, out, "--frame", "0:1", *options))
-    assert result.exit_code == 0, result.output
-    summary = json.loads(result.stdout)
-    assert summary == json.loads((out / "summary.json").read_text())
+    result, summary = estimate(
+        runner, tiny_scene, out, "--method", "paper", "--frame", "0:1", *options
+    )
+    assert summary == json.loads(result.stdout)
     assert not (out / "replay.html").exists()
     assert summary["complete"] is True
     assert (summary["frame_count"], summary["found_count"]) == (2, 2)
     assert summary["settings"]["hold"] == {"lift": 20.0}
     assert set(summary["versions"]) >= {"drake_pose", "drake", "numpy"}
-    rows = read_rows(out / "poses.csv")
-    errors = [float(row["error"]) for row in rows]
+    errors = [float(row["error"]) for row in read_rows(out / "poses.csv")]
     assert summary["mean_E_total"] == pytest.approx(np.mean(errors), rel=1e-6)
     frame = summary["frames"]["0001"]
     assert frame["found"] is True
     assert frame["runs"] >= 3
     assert frame["E_total"] == pytest.approx(errors[1], rel=1e-6)
-    assert [float(row["lift"]) for row in rows] == pytest.approx([np.radians(20)] * 2)
-    steps = np.array([float(row["luff"]) for row in rows]) / np.radians(40)
+    lift, luff = np.array(list(positions(out).values())).T
+    np.testing.assert_allclose(lift, np.radians(20), atol=1e-7)
+    steps = luff / np.radians(40)
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-7)
 
 
@@ -108,14 +118,6 @@ def test_overlay_shows_what_differs(tiny_scene: TinyScene, tmp_path: Path) -> No
         assert 0.9 * scale * share < painted <= scale * share
 
 
-def test_replay_is_one_page_with_an_animation(tiny_scene: TinyScene, tmp_path: Path) -> None:
-    settings = EstimateSettings(interval=20.0)
-    estimate_scene(tiny_scene.folder, tiny_scene.model, tmp_path / "out", settings)
-    page = (tmp_path / "out" / "replay.html").read_text()
-    assert page.lstrip().startswith("<!DOCTYPE html>")
-    assert 'src="http' not in page
-
-
 def test_nothing_is_written_without_a_folder(tiny_scene: TinyScene) -> None:
     heard = []
     result = estimate_scene(
@@ -132,36 +134,28 @@ def test_nothing_is_written_without_a_folder(tiny_scene: TinyScene) -> None:
 
 def test_several_cameras_are_matched_together(runner: CliRunner, tmp_path: Path) -> None:
     scene = write_scene(tmp_path / "scene", [(20.0, -40.0)], ["front", "side"])
-    out = tmp_path / "out"
-    result = runner.invoke(app, paper_arguments(scene, out, "--json", "--no-replay"))
-    assert result.exit_code == 0, result.output
-    assert len(json.loads(result.stdout)["frames"]["0000"]["outside_limit"]) == 2
-    assert (out / "overlay" / "front" / "0000.png").is_file()
-    assert (out / "overlay" / "side" / "0000.png").is_file()
-    only = tmp_path / "only"
-    result = runner.invoke(app, arguments(scene, only, "--camera", "side", "--no-replay"))
-    assert result.exit_code == 0, result.output
-    assert [path.name for path in (only / "overlay").iterdir()] == ["side"]
+    for options, names in (
+        (("--method", "paper"), ["front", "side"]),
+        (("--method", "paper", "--camera", "side"), ["side"]),
+    ):
+        out = tmp_path / str(len(names))
+        _, summary = estimate(runner, scene, out, *options, "--no-replay")
+        assert len(summary["frames"]["0000"]["outside_limit"]) == len(names)
+        assert sorted(path.name for path in (out / "overlay").iterdir()) == names
 
 
 def test_truth_in_the_scene_is_compared_with(own_scene: TinyScene, runner: CliRunner) -> None:
     write_truth(own_scene)
-    out = own_scene.folder.parent / "out"
+    folder = own_scene.folder.parent
     held = ["--hold", "lift=27", "--frame", "0", "--no-replay"]
-    result = runner.invoke(app, arguments(own_scene, out, *held))
-    assert result.exit_code == 0, result.output
+    result, summary = estimate(runner, own_scene, folder / "out", *held)
     assert "Joint errors" in result.stdout
-    summary = json.loads((out / "summary.json").read_text())
     assert summary["frames"]["0000"]["joint_errors"]["lift"] == pytest.approx(7.0)
     assert summary["joint_errors"]["lift"]["greatest"] == pytest.approx(7.0)
-
-
-def test_the_truth_of_another_model_is_left_alone(own_scene: TinyScene, runner: CliRunner) -> None:
+    # That of another model is left alone.
     (own_scene.folder / "joint_angles.csv").write_text("frame,A1\n0,0.5\n")
-    out = own_scene.folder.parent / "out"
-    result = runner.invoke(app, arguments(own_scene, out, "--frame", "0", "--no-replay"))
-    assert result.exit_code == 0, result.output
-    assert json.loads((out / "summary.json").read_text())["joint_errors"] == {}
+    _, summary = estimate(runner, own_scene, folder / "other", *held)
+    assert summary["joint_errors"] == {}
 
 
 def jib_positions(scene: TinyScene) -> dict[str, np.ndarray]:
@@ -189,74 +183,57 @@ def test_another_root_with_a_position_for_each_frame(
             writer.writerow([int(frame), "hook", *p_WJ])
     out = own_scene.folder.parent / "out"
     root = ["--root", "jib", "--root-position", f"{centres}:hook", "--root-rotation", "x=-180:180"]
-    result = runner.invoke(app, paper_arguments(own_scene, out, *root))
-    assert result.exit_code == 0, result.output
+    estimate(runner, own_scene, out, "--method", "paper", *root)
+    for frame, q in positions(out).items():
+        np.testing.assert_allclose(q, own_scene.truth[frame], atol=1e-8)
     for row in read_rows(out / "poses.csv"):
-        q = np.array([float(row[name]) for name in NAMES])
-        np.testing.assert_allclose(q, own_scene.truth[row["frame"]], atol=1e-8)
         assert [float(row[f"base_{axis}"]) for axis in "xyz"] == pytest.approx([0, 0, 0], abs=1e-8)
         assert abs(float(row["base_qw"])) == pytest.approx(1.0)
 
 
 def test_a_frame_without_a_pose(own_scene: TinyScene, runner: CliRunner) -> None:
     out = own_scene.folder.parent / "out"
-    options = ["--no-replay", "--outside-limit", "0", "--hold", "lift=-90"]
-    lost = runner.invoke(app, paper_arguments(own_scene, out, *options))
-    assert lost.exit_code == 1
+    options = ["--method", "paper", "--no-replay", "--outside-limit", "0", "--hold", "lift=-90"]
+    lost, summary = estimate(runner, own_scene, out, *options, status=1)
     assert "frame '0001': no pose was found" in lost.stderr
     assert "no pose was found in any frame" in lost.stderr
     rows = read_rows(out / "poses.csv")
     assert [row["frame"] for row in rows] == ["0000", "0001", "0002"]
     assert {row[name] for row in rows for name in (*NAMES, "error")} == {""}
-    summary = json.loads((out / "summary.json").read_text())
     assert summary["found_count"] == 0
     assert summary["frames"]["0000"]["found"] is False
     assert (out / "overlay" / "front" / "0000.png").is_file()
 
 
-def test_resume_estimates_the_missing_frames(
-    tiny_scene: TinyScene, runner: CliRunner, tmp_path: Path
+def test_what_is_known_of_each_joint_and_of_frames_before(
+    own_scene: TinyScene, runner: CliRunner
 ) -> None:
-    out = tmp_path / "out"
-    first = runner.invoke(app, arguments(tiny_scene, out, "--frame", "2"))
-    assert first.exit_code == 0, first.output
-    before = (out / "poses.csv").read_text().splitlines()[1]
-    second = runner.invoke(app, arguments(tiny_scene, out, "--resume"))
-    assert second.exit_code == 0, second.output
-    rows = (out / "poses.csv").read_text().splitlines()[1:]
-    assert [row.split(",")[0] for row in rows] == ["0000", "0001", "0002"]
-    assert rows[2] == before
-    summary = json.loads((out / "summary.json").read_text())
-    assert list(summary["frames"]) == ["0000", "0001", "0002"]
-    assert all(frame["runs"] for frame in summary["frames"].values())
-
-
-def test_what_is_known_of_each_joint(own_scene: TinyScene, runner: CliRunner) -> None:
     """One camera, angles between the samples: the truth lies in the intervals of some family."""
     scene = write_scene(own_scene.folder.parent / "between", [(13.0, -47.0), (-31.0, -22.0)])
     out = own_scene.folder.parent / "out"
-    first = runner.invoke(app, arguments(scene, out, "--frame", "0", "--no-replay"))
-    assert first.exit_code == 0, first.output
-    result = runner.invoke(app, arguments(scene, out, "--resume", "--no-replay"))
-    assert result.exit_code == 0, result.output
-    poses, joints = read_rows(out / "poses.csv"), read_rows(out / "joints.csv")
-    families = read_rows(out / "families.csv")
-    assert [(row["frame"], row["joint"]) for row in joints] == [
-        (frame, name) for frame in scene.truth for name in NAMES
-    ]
-    for row, pose in zip(joints, (pose for pose in poses for _ in NAMES), strict=True):
-        truth = np.degrees(scene.truth[row["frame"]][NAMES.index(row["joint"])])
-        found = np.degrees(float(pose[row["joint"]]))
-        assert abs(found - truth) < 2.0
+    estimate(runner, scene, out, "--frame", "1", "--no-replay")
+    before = (out / "poses.csv").read_text().splitlines()[1]
+    _, summary = estimate(runner, scene, out, "--resume", "--no-replay")
+    assert list(summary["frames"]) == ["0000", "0001"]
+    assert all(frame["runs"] for frame in summary["frames"].values())
+    assert (out / "poses.csv").read_text().splitlines()[2] == before
+    joints, families = read_rows(out / "joints.csv"), read_rows(out / "families.csv")
+    cells = [(frame, name) for frame in scene.truth for name in NAMES]
+    assert [(row["frame"], row["joint"]) for row in joints] == cells
+    found = positions(out)
+    for row, (frame, name) in zip(joints, cells, strict=True):
+        k = NAMES.index(name)
+        truth, value = np.degrees(scene.truth[frame][k]), np.degrees(found[frame][k])
+        assert abs(value - truth) < 2.0
         # A pixel, by which the camera may be off, is half a segment's width here.
-        assert row["determined"] == "yes" or row["joint"] == "luff"
+        assert row["determined"] == "yes" or name == "luff"
         assert float(row["low"]) <= truth <= float(row["high"]) < float(row["low"]) + 30.0
-        answers = [
+        (answer,) = (
             float(one["value"])
             for one in families
-            if (one["frame"], one["joint"], one["family"]) == (row["frame"], row["joint"], "1")
-        ]
-        assert answers == [pytest.approx(found, abs=1e-3)]
+            if (one["frame"], one["joint"], one["family"]) == (frame, name, "1")
+        )
+        assert answer == pytest.approx(value, abs=1e-3)
 
 
 def test_what_the_model_does_not_enforce_is_told(
@@ -267,14 +244,11 @@ def test_what_the_model_does_not_enforce_is_told(
     end = text.index("</joint>", joint)
     model, out = tmp_path / "loose.urdf", tmp_path / "out"
     model.write_text(f'{text[:end]}<mimic joint="lift"/>{text[end:]}')
-    arguments = ["--interval", "20", "--method", "paper", "--frame", "0", "--no-replay"]
-    place = ["--model", str(model), "--out", str(out)]
-    result = runner.invoke(app, ["estimate", str(tiny_scene.folder), *place, *arguments])
-    assert result.exit_code == 0, result.output
+    scene, options = replace(tiny_scene, model=model), ("--frame", "0", "--no-replay")
+    result, summary = estimate(runner, scene, out, "--method", "paper", *options)
     checked = runner.invoke(app, ["check", str(model), "--json"])
     warnings = json.loads(checked.stdout)["warnings"]
     assert len(warnings) == 2
-    summary = json.loads((out / "summary.json").read_text())
     assert summary["warnings"] == warnings
     page = html.unescape((out / "report.html").read_text())
     for named, warning in zip(("<mimic>", "where the object stands"), warnings, strict=True):

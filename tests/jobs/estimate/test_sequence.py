@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,8 @@ from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
 from drake_pose.search.estimates import TRACKED
-from drake_pose.silhouette.pictures.scenes import Scene, load_scene
+from drake_pose.search.grid.beam.search import BeamSearch
+from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.jobs.scenes import TinyScene, write_scene
 
 # A crane that swings, and stands otherwise after a cut.
@@ -54,18 +56,14 @@ def test_a_sequence_need_not_be_tracked(tmp_path: Path) -> None:
 
 
 def test_how_a_scene_is_tracked(tiny_scene: TinyScene) -> None:
-    def scene_with(text: str) -> Scene:
-        (tiny_scene.folder / "scene.yaml").write_text(text)
-        return load_scene(tiny_scene.folder)
-
-    search = _Known()
-    assert sequence_tracking(scene_with("sequence: false\n"), search) is None
-    video = scene_with("sequence: true\nframe_rate_hz: 60\n")
-    known = sequence_tracking(video, search)
+    stills = load_scene(tiny_scene.folder)
+    video, search = replace(stills, sequence=True), RootPlacementSearch.__new__(RootPlacementSearch)
+    assert sequence_tracking(stills, search) is None
+    assert sequence_tracking(video, search, track=False) is None
+    known = sequence_tracking(video, BeamSearch.__new__(BeamSearch))
     assert known is not None
     assert not known.root_moves
-    assert sequence_tracking(video, search, track=False) is None
-    moved = sequence_tracking(video, RootPlacementSearch.__new__(RootPlacementSearch))
+    moved = sequence_tracking(video, search)
     assert moved is not None
     assert moved.root_moves
 
@@ -77,7 +75,3 @@ def test_a_track_goes_on_from_what_is_known_and_searches_after_a_loss() -> None:
         patch.setattr(RootPlacementSearch, "match", lambda *_: "searched")
         assert search.match([]) is known
         assert search.match([]) == "searched"
-
-
-class _Known:
-    """Stands for a search whose root is known."""

@@ -2,12 +2,16 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from drake_pose.commands.main import app
+from drake_pose.errors import SettingsError
+from drake_pose.jobs.estimate.scene import estimate_scene
+from drake_pose.results.settings import EstimateSettings
 from tests.cli import CliRunner
 from tests.jobs.scenes import NAMES, TinyScene, camera, read_rows
 
@@ -55,26 +59,14 @@ def test_a_root_position_that_is_not_known(
     assert record["camera_scale"] is None
 
 
-@pytest.mark.parametrize("unknown", ["camera", "position"])
-@pytest.mark.parametrize(
-    ("options", "told"),
-    [
-        (["--method", "paper"], "--method beam"),
-        (["--method", "beam", "--angles", "grid"], "angles are continuous"),
-    ],
-)
-def test_what_needs_a_known_root_is_refused(
-    bare_scene: TinyScene,
-    tiny_scene: TinyScene,
-    runner: CliRunner,
-    tmp_path: Path,
-    unknown: str,
-    options: list[str],
-    told: str,
-) -> None:
-    scene = bare_scene if unknown == "camera" else tiny_scene
-    more = ["--root-position", "unknown"] if unknown == "position" else []
-    given = [str(scene.folder), "--model", str(scene.model), "--out", str(tmp_path / "out")]
-    result = runner.invoke(app, ["estimate", *given, *options, *more])
-    assert result.exit_code == 1
-    assert told in " ".join(result.stderr.split())
+def test_what_needs_a_known_root_is_refused(tiny_scene: TinyScene, bare_scene: TinyScene) -> None:
+    for method, angles, told in (
+        ("paper", "continuous", "--method beam"),
+        ("beam", "grid", "angles are continuous"),
+    ):
+        settings = EstimateSettings(method=method, angles=angles)
+        with pytest.raises(SettingsError, match=told):
+            estimate_scene(bare_scene.folder, bare_scene.model, None, settings)
+        settings = replace(settings, root_position="unknown")
+        with pytest.raises(SettingsError, match=told):
+            estimate_scene(tiny_scene.folder, tiny_scene.model, None, settings)

@@ -50,8 +50,7 @@ def load_landmarks(model_path: Path | str) -> dict[str, Landmark]:
         landmarks:
           left_elbow: {link: left_forearm, point: [0, 0, 0]}
 
-    Raises:
-        ModelError: the file cannot be read; the message names it and the entry.
+    Raises ModelError: the file cannot be read; the message names it and the entry.
     """
     file = landmarks_file(model_path)
     content = read_yaml(file, ModelError)

@@ -55,8 +55,7 @@ class ParsedModel(Positions):
             scene_graph: the SceneGraph it is or shall be registered with; None for no geometry.
             prefix: put before the model's name, to tell several copies apart.
 
-        Raises:
-            ModelError: Drake refuses the model in that plant.
+        Raises ModelError: Drake refuses the model in that plant.
         """
         instances, _ = self._source.parse(plant, scene_graph, prefix)
         if plant.geometry_source_is_registered():

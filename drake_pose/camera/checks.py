@@ -50,8 +50,7 @@ def check_pose(value: Any, field: str, where: str) -> np.ndarray:
 
     A rounded rotation is replaced by the nearest exact one, on which Drake insists.
 
-    Raises:
-        CameraError: not a finite 4 x 4 matrix, a last row that is not 0 0 0 1, or no rotation.
+    Raises CameraError: not a finite 4 x 4 matrix, a last row that is not 0 0 0 1, or no rotation.
     """
     rows = value.tolist() if isinstance(value, np.ndarray) else value
     if not (

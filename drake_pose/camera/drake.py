@@ -54,9 +54,8 @@ def camera_to_drake(
             camera: depths of the body in its frame (may be negative), tight, since the depth buffer
             has few bits; left out, -2 to 2 m.
 
-    Raises:
-        CameraError: the principal point of a pinhole lies outside the picture (Drake refuses it),
-            or the depth range is not finite, positive and increasing.
+    Raises CameraError: the principal point of a pinhole lies outside the picture (Drake refuses
+    it), or the depth range is not finite, positive and increasing.
     """
     X_CT = RigidTransform()
     if isinstance(camera, PinholeCamera):
@@ -128,9 +127,8 @@ def _pinhole(
 def camera_from_config(config: CameraConfig) -> PinholeCamera:
     """The camera of a CameraConfig's colour and label sensor, at X_PB X_BC.
 
-    Raises:
-        CameraError: the camera hangs on a frame other than the world, a pose is drawn by lot, or a
-            number is none that a camera can have.
+    Raises CameraError: the camera hangs on a frame other than the world, a pose is drawn by lot, or
+    a number is none that a camera can have.
     """
     where = f"camera '{config.name}'"
     frame = config.X_PB.base_frame
@@ -152,8 +150,7 @@ def camera_from_config(config: CameraConfig) -> PinholeCamera:
 def camera_to_config(camera: Camera) -> CameraConfig:
     """A CameraConfig with label images on; everything else is Drake's default.
 
-    Raises:
-        CameraError: a parallel camera, or one whose principal point lies outside its picture.
+    Raises CameraError: a parallel camera, or one whose principal point lies outside its picture.
     """
     if not isinstance(camera, PinholeCamera):
         raise CameraError(f"camera '{camera.name}': a CameraConfig is a pinhole, not parallel")
@@ -187,8 +184,7 @@ def read_configs(entries: Mapping[str, Any], path: Path) -> dict[str, PinholeCam
 
     An entry's key is the camera's name unless its ``name`` says another.
 
-    Raises:
-        CameraError: names the file, the camera and what is wrong.
+    Raises CameraError: names the file, the camera and what is wrong.
     """
     cameras: dict[str, PinholeCamera] = {}
     for key, entry in entries.items():
@@ -217,8 +213,7 @@ def read_configs(entries: Mapping[str, Any], path: Path) -> dict[str, PinholeCam
 def dump_scenario(cameras: Mapping[str, Camera] | Iterable[Camera]) -> str:
     """The text of a Scenario with these cameras and label images on, for ``LoadScenario``.
 
-    Raises:
-        CameraError: a parallel camera, or one whose principal point lies outside its picture.
+    Raises CameraError: a parallel camera, or one whose principal point lies outside its picture.
     """
     listed = cameras.values() if isinstance(cameras, Mapping) else cameras
     content = {}
@@ -233,8 +228,7 @@ def dump_scenario(cameras: Mapping[str, Camera] | Iterable[Camera]) -> str:
 def save_scenario(path: str | Path, cameras: Mapping[str, Camera] | Iterable[Camera]) -> None:
     """Writes the ``cameras`` of a Drake Scenario, which ``load_cameras`` reads, too.
 
-    Raises:
-        CameraError: as ``dump_scenario``; and when the file cannot be written.
+    Raises CameraError: as ``dump_scenario``; and when the file cannot be written.
     """
     write_file(path, dump_scenario(cameras), "the cameras")
 

@@ -58,8 +58,8 @@ class PinholeCamera(_PosedCamera):
         X_WC: (4, 4) the camera's pose in the world, x right, y down, z forward [m]; read-only.
         near: the nearest visible depth [m].
 
-    Raises:
-        CameraError: a parameter is not finite or out of its range, or X_WC is no rigid transform.
+    Raises CameraError: a parameter is not finite or out of its range, or X_WC is no rigid
+    transform.
     """
 
     name: str

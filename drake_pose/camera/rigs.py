@@ -43,8 +43,7 @@ def circle_of_cameras(
         field_of_view: of a camera on the circle, upright [rad].
         size: width and height of the pictures [pixel].
 
-    Raises:
-        CameraError: when there is no camera, or a number is out of its range.
+    Raises CameraError when there is no camera, or a number is out of its range.
     """
     if count < 1 and not face_camera:
         raise CameraError("a rig needs at least one camera")
@@ -68,8 +67,7 @@ def look_at(
 ) -> Array:
     """The pose X_WC (4, 4) of a camera at `eye` (3,) that looks at `target` (3,) [m].
 
-    Raises:
-        CameraError: when both points coincide, or the camera looks along `up`.
+    Raises CameraError when both points coincide, or the camera looks along `up`.
     """
     forward = np.asarray(target, dtype=np.float64) - np.asarray(eye, dtype=np.float64)
     right = np.cross(forward, np.asarray(up, dtype=np.float64))

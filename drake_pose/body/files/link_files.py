@@ -266,8 +266,7 @@ def cure_sdf(
         The text, and the limits (lower, upper) [rad] by position name of universal and screw
         joints, which Drake's parser passes over.
 
-    Raises:
-        ModelError: names the link, joint or mesh at fault.
+    Raises ModelError: names the link, joint or mesh at fault.
     """
     root = read_xml(path)
     if root.tag != "sdf":

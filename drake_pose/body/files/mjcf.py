@@ -51,9 +51,8 @@ _Settings = dict[str, dict[str, str]]
 def cure_mjcf(path: Path) -> str:
     """The text of an MJCF file, paths absolute, that Drake reads as MuJoCo does.
 
-    Raises:
-        ModelError: unreadable, no MJCF, an include that includes itself, a broken mesh, or an
-            element that Drake ignores although it carries bodies, joints or shapes.
+    Raises ModelError: unreadable, no MJCF, an include that includes itself, a broken mesh, or an
+    element that Drake ignores although it carries bodies, joints or shapes.
     """
     folder = path.resolve().parent
     root = read_xml(path)

@@ -49,9 +49,8 @@ class ModelSource:
         warnings: what of the file is not read, or not enforced, each once.
         limits: limits (lower, upper) [rad] by position name that Drake's parser passes over.
 
-    Raises:
-        ModelError: missing, unreadable, of an unknown kind, or it cannot be cured; the message
-            names the file and the link, joint or mesh.
+    Raises ModelError: missing, unreadable, of an unknown kind, or it cannot be cured; the message
+    names the file and the link, joint or mesh.
     """
 
     def __init__(self, path: Path, package_paths: Mapping[str, str]) -> None:
@@ -83,8 +82,7 @@ class ModelSource:
             scene_graph: to register geometry with; None where the plant is registered already.
             prefix: put before the model's name.
 
-        Raises:
-            ModelError: Drake cannot read the model.
+        Raises ModelError: Drake cannot read the model.
         """
         parser = (
             Parser(plant, prefix) if scene_graph is None else Parser(plant, scene_graph, prefix)

@@ -28,8 +28,8 @@ def check_in_child(
     Drake 1.51 can crash on a broken glTF, a texture or a file that includes itself, and a YAML
     alias bomb takes all memory. A success is remembered while the file's content stays the same.
 
-    Raises:
-        ModelError: the model cannot be used, or reading it crashed, hung or took too much memory.
+    Raises ModelError: the model cannot be used, or reading it crashed, hung or took too much
+    memory.
     """
     try:
         digest = hashlib.sha256(path.read_bytes()).hexdigest()

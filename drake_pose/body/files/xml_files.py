@@ -30,8 +30,7 @@ def read_xml(path: Path) -> ElementTree.Element:
     that nobody declares is plain text, and text in UTF-8 that is none is taken for Latin-1. Nothing
     outside the file is read.
 
-    Raises:
-        ModelError: unreadable, or not well-formed; the message names the file and the line.
+    Raises ModelError: unreadable, or not well-formed; the message names the file and the line.
     """
     try:
         data = path.read_bytes()

@@ -32,8 +32,8 @@ def read_mesh_file(path: Path, scale: NDArray[np.float64] | None = None) -> Tria
 
     ``scale``: (3,) factors along x, y and z.
 
-    Raises:
-        ModelError: unknown extension, unreadable, no triangle, or a coordinate that is not finite.
+    Raises ModelError: unknown extension, unreadable, no triangle, or a coordinate that is not
+    finite.
     """
     mesh = _read_unscaled(path.resolve())
     if scale is None:

@@ -111,8 +111,7 @@ def make_drawable(
     STL, DAE, GLB and OBJ without normals become OBJ with normals in a temporary folder. A half
     space loses its perception role. The world's own geometry is looked at with the instances'.
 
-    Raises:
-        ModelError: a mesh file cannot be drawn, or one must be replaced and scene_graph is None.
+    Raises ModelError: a mesh file cannot be drawn, or one must be replaced and scene_graph is None.
     """
     bodies = [plant.get_body(index) for i in instances for index in plant.GetBodyIndices(i)]
     source = plant.get_source_id()

@@ -268,8 +268,7 @@ class PoseTree:
             q (nq,) and X_WB (4, 4), the pose of the plant's world frame B in the world W; X_WB is
             the identity where the plant's base joint can take up the root's pose.
 
-        Raises:
-            ModelError: the base joints cannot be solved for.
+        Raises ModelError: the base joints cannot be solved for.
         """
         return self._base.solve(self.model, self._completed(values), self.node_poses(values))
 

@@ -70,8 +70,7 @@ class RootRotation:
             rotation: R_W0 (3, 3); None for the identity.
             interval_deg: None for the search's general one.
 
-        Raises:
-            SettingsError: repeated or unknown axes, crossed limits, or not a rotation matrix.
+        Raises SettingsError: repeated or unknown axes, crossed limits, or not a rotation matrix.
         """
         axes = tuple(axis for axis, _, _ in ranges_deg)
         if not axes or len(set(axes)) != len(axes) or not set(axes) <= {"x", "y", "z"}:

@@ -53,8 +53,7 @@ class Board:
         legacy_pattern: drawn by OpenCV before 4.6: an even number of rows begins with a white
             square.
 
-    Raises:
-        CameraError: when a value is out of its range.
+    Raises CameraError when a value is out of its range.
     """
 
     kind: str
@@ -218,8 +217,7 @@ class BoardDetections:
 def find_pictures(folder: str | Path) -> dict[str, dict[str, Path]]:
     """The picture files of a folder's `images/<camera>/<frame>.png` or .jpg, or of its own.
 
-    Raises:
-        CameraError: when there are none, or a camera has two files of one frame.
+    Raises CameraError when there are none, or a camera has two files of one frame.
     """
     root = Path(folder)
     root = root / "images" if (root / "images").is_dir() else root
@@ -244,8 +242,7 @@ def find_boards(
         files: by camera, then by frame.
         on_picture: called with camera and frame before each picture.
 
-    Raises:
-        CameraError: when a camera's pictures differ in size, or none of them can be read.
+    Raises CameraError when a camera's pictures differ in size, or none of them can be read.
     """
     sizes: dict[str, tuple[int, int]] = {}
     detections: dict[str, dict[str, Detection]] = {camera: {} for camera in files}

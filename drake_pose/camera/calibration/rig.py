@@ -72,8 +72,8 @@ def own_rig(name: str, seen: BoardDetections, model: str = "standard") -> tuple[
     ``model`` is a key of FREE_COEFFICIENTS. Returns the focal length's standard deviation over the
     focal length, too.
 
-    Raises:
-        CameraError: when there are fewer than three pictures of the board, or OpenCV finds no lens.
+    Raises CameraError when there are fewer than three pictures of the board, or OpenCV finds no
+    lens.
     """
     detections, points = seen.detections[name], seen.board.points
     if len(detections) < _FEWEST_PICTURES:
@@ -123,8 +123,7 @@ def require_shared_pictures(detections: Mapping[str, Mapping[str, Detection]]) -
 def chain_rig(seen: BoardDetections, own: Mapping[str, Rig]) -> Rig:
     """A rig of the most trustworthy pairs of cameras, in the first one's frame.
 
-    Raises:
-        CameraError: when the cameras fall into groups that share no picture.
+    Raises CameraError when the cameras fall into groups that share no picture.
     """
     require_shared_pictures(seen.detections)
     names = list(own)

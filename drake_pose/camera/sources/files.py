@@ -72,9 +72,8 @@ def load_sources(
 def open_source(specification: SourceSpecification, clock: Clock = time.monotonic) -> FrameSource:
     """Opens a source; the clock gives the time stamps of a live camera's pictures [s].
 
-    Raises:
-        SceneError: a folder or video that cannot be read, is empty, or whose pictures are not of
-            the calibrated size. A live camera that cannot be opened is tried again and again.
+    Raises SceneError: a folder or video that cannot be read, is empty, or whose pictures are not of
+    the calibrated size. A live camera that cannot be opened is tried again and again.
     """
     if specification.live:
         return DeviceSource(specification, clock)
@@ -84,8 +83,7 @@ def open_source(specification: SourceSpecification, clock: Clock = time.monotoni
 def load_background_pictures(specification: SourceSpecification) -> list[Picture]:
     """The pictures (H, W, 3) of the empty room that a camera's specification names.
 
-    Raises:
-        SceneError: there is none, or one cannot be read or is not of the calibrated size.
+    Raises SceneError: there is none, or one cannot be read or is not of the calibrated size.
     """
     camera = specification.camera
     if specification.background is None:

@@ -33,8 +33,7 @@ class SourceSpecification:
         offset: is added to time stamps [s], where cameras' clocks differ.
         beside: other cameras' folders whose pictures of the same name were taken at the same time.
 
-    Raises:
-        SettingsError: an unknown kind, a size or a rate that cannot be.
+    Raises SettingsError: an unknown kind, a size or a rate that cannot be.
     """
 
     camera: str

@@ -29,8 +29,7 @@ _NUMBER = re.compile(r"(\d+)$")
 class RecordedSource(FrameSource):
     """Pictures that wait to be read, one of them read ahead, so that the end is known.
 
-    Raises:
-        SceneError: names the folder or file; no picture, or the first is of another size.
+    Raises SceneError: names the folder or file; no picture, or the first is of another size.
     """
 
     def __init__(self, specification: SourceSpecification) -> None:
@@ -185,8 +184,7 @@ class VideoSource(RecordedSource):
 def find_picture_files(folder: Path, camera: str) -> dict[str, Path]:
     """The picture files of a folder, by frame, in the order of the names.
 
-    Raises:
-        SceneError: there is no such folder, no picture in it, or a frame twice.
+    Raises SceneError: there is no such folder, no picture in it, or a frame twice.
     """
     if not folder.is_dir():
         raise SceneError(f"{folder}: no such folder of camera '{camera}'s pictures")

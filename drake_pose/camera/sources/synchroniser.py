@@ -52,8 +52,7 @@ class Synchroniser(Generic[Item]):
             frames where the cameras are triggered together.
         patience: how long a moment waits for a camera [s], at least the tolerance.
 
-    Raises:
-        SettingsError: no camera, one twice, or times that cannot be.
+    Raises SettingsError: no camera, one twice, or times that cannot be.
     """
 
     def __init__(self, cameras: Iterable[str], tolerance: float, patience: float) -> None:
@@ -89,8 +88,7 @@ class Synchroniser(Generic[Item]):
     def add(self, camera: str, time: float, item: Item) -> bool:
         """Takes a camera's next picture, of a time stamp [s]; whether it can be part of a moment.
 
-        Raises:
-            UnknownNameError: there is no such camera.
+        Raises UnknownNameError: there is no such camera.
         """
         if camera not in self._queues:
             raise UnknownNameError("camera", camera, self.cameras, "the synchroniser")

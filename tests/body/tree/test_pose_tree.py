@@ -1,10 +1,7 @@
 import numpy as np
 import pytest
-from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import MultibodyPlant
 
 from drake_pose.body.model import ArticulatedModel, load_model
-from drake_pose.body.tree.joint_map import JointMap
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
@@ -27,45 +24,47 @@ def largest_difference_from_drake(
     """Compare node_poses, positions_from and values_from_positions with the plant."""
     random = np.random.default_rng(1)
     context = model.plant.CreateDefaultContext()
+    bounds = [tree.value_bounds(i) for i in range(len(tree.nodes))]
+    drawn = [random.uniform(low, high, (samples, len(low))) for low, high in bounds]
     worst = 0.0
-    for _ in range(samples):
-        values = [random.uniform(*tree.value_bounds(i)) for i in range(len(tree.nodes))]
-        X_WN = tree.node_poses(values)
+    for k, X_WN in enumerate(tree.node_poses_batch(drawn)):
+        values = [rows[k] for rows in drawn]
         q, X_WB = tree.positions_from(values)
         model.plant.SetPositions(context, q)
         again = tree.node_poses(tree.values_from_positions(q, X_WB))
         worst = max(worst, np.abs(again - X_WN).max())
-        for node, X in zip(tree.nodes, X_WN, strict=True):
+        for node, X, given in zip(tree.nodes, X_WN, values, strict=True):
             body = model.plant.GetBodyByName(node.name)
             X_BN = model.plant.EvalBodyPoseInWorld(context, body).GetAsMatrix4()
             worst = max(worst, np.abs(X_WB @ X_BN - X).max())
-        for node, node_values in zip(tree.nodes, values, strict=True):
-            assert np.all(q[list(node.positions)] == node_values[: len(node.positions)])
+            assert np.all(q[list(node.positions)] == given[: len(node.positions)])
     return worst
 
 
-@pytest.fixture(scope="module")
-def floating(tmp_path_factory):
-    return load_model(write(tmp_path_factory.mktemp("f"), FLOATING_URDF), check=False)
+TEXTS = {
+    "floating": FLOATING_URDF,
+    "jointed": JOINTED_BASE_URDF,
+    "welded": WELDED_URDF,
+    "all_joints": JOINTS_SDF,
+}
 
 
 @pytest.fixture(scope="module")
-def jointed(tmp_path_factory):
-    return load_model(write(tmp_path_factory.mktemp("j"), JOINTED_BASE_URDF), check=False)
+def models(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("models")
+    files = {
+        name: write(folder, text, f"{name}.{'sdf' if text.startswith('<sdf') else 'urdf'}")
+        for name, text in TEXTS.items()
+    }
+    return {name: load_model(file, check=False) for name, file in files.items()}
 
 
-@pytest.fixture(scope="module")
-def welded(tmp_path_factory):
-    return load_model(write(tmp_path_factory.mktemp("w"), WELDED_URDF), check=False)
+def loaded(folder, *parts):
+    return load_model(write(folder, urdf(*parts)), check=False)
 
 
-@pytest.fixture(scope="module")
-def all_joints(tmp_path_factory):
-    path = write(tmp_path_factory.mktemp("s"), JOINTS_SDF, "joints.sdf")
-    return load_model(path, check=False)
-
-
-def test_links_without_geometry_make_one_node_and_welded_links_merge(floating):
+def test_links_without_geometry_make_one_node_and_welded_links_merge(models):
+    floating = models["floating"]
     tree = floating.pose_tree()
     assert [node.name for node in tree.nodes] == ["trunk", "arm", "leg", "hand"]
     assert [node.parent for node in tree.nodes] == [-1, 0, 0, 1]
@@ -80,35 +79,46 @@ def test_links_without_geometry_make_one_node_and_welded_links_merge(floating):
 
 
 @pytest.mark.parametrize(
-    "rotation",
+    ("name", "root"),
     [
-        None,
-        RootRotation.fixed(),
-        RootRotation.limited([("y", -170.0, 180.0), ("z", -10.0, 10.0)]),
+        *(("floating", root) for root in (None, "trunk", "arm", "hand", "welded", "leg")),
+        *(("jointed", root) for root in ("head", "chest", "arm")),
+        *(("welded", root) for root in (None, "base", "upper", "lower")),
+        *(("all_joints", root) for root in ("a", "c", "e", "f")),
     ],
 )
-@pytest.mark.parametrize("root", [None, "trunk", "arm", "hand", "welded", "leg"])
-def test_floating_base_agrees_with_drake(floating, root, rotation):
-    tree = floating.pose_tree(root, root_position=[0.3, 0.2, 0.1], root_rotation=rotation)
-    assert largest_difference_from_drake(floating, tree) < 1e-9
+@pytest.mark.parametrize("kind", ["own", "free", "fixed", "limited"])
+def test_every_tree_agrees_with_drake(models, name, root, kind):
+    rotation = {
+        "own": None,
+        "free": RootRotation.free(20.0),
+        "fixed": RootRotation.fixed(),
+        "limited": RootRotation.limited([("y", -170.0, 180.0), ("z", -10.0, 10.0)]),
+    }[kind]
+    tree = models[name].pose_tree(root, root_position=[0.3, 0.2, 0.1], root_rotation=rotation)
+    assert largest_difference_from_drake(models[name], tree, samples=8) < 1e-9
+    np.testing.assert_allclose(
+        tree.node_poses(tree.default_values())[0][:3, 3], [0.3, 0.2, 0.1], atol=1e-12
+    )
     if root is not None:
         assert tree.nodes[0].name == root
-        np.testing.assert_allclose(
-            tree.node_poses(tree.default_values())[0][:3, 3], [0.3, 0.2, 0.1]
-        )
+    if name == "jointed":
+        _, X_WB = tree.positions_from(tree.default_values())
+        np.testing.assert_array_equal(X_WB, np.eye(4))
 
 
-@pytest.mark.parametrize("root", ["head", "chest", "arm"])
-@pytest.mark.parametrize("rotation", [None, RootRotation.free(20.0)])
-def test_jointed_base_agrees_with_drake(jointed, root, rotation):
-    tree = jointed.pose_tree(root, root_position=[0.3, 0.2, 0.1], root_rotation=rotation)
-    assert largest_difference_from_drake(jointed, tree, samples=8) < 1e-9
-    _, X_WB = tree.positions_from(tree.default_values())
-    np.testing.assert_array_equal(X_WB, np.eye(4))
+def test_a_tree_without_a_place_hangs_where_the_file_says(models):
+    parents = {"welded": [-1, 0, 1], "all_joints": [-1, 0, 1, 2, 3, 4]}
+    for name, wanted in parents.items():
+        tree = models[name].pose_tree()
+        assert [node.parent for node in tree.nodes] == wanted
+        assert tree.nodes[0].positions == ()
+        assert largest_difference_from_drake(models[name], tree) < 1e-9
+    assert [len(node.positions) for node in tree.nodes] == [0, 2, 3, 1, 1, 1]
 
 
-def test_own_root_keeps_its_joints_and_is_held_at_root_position(jointed):
-    tree = jointed.pose_tree("head", root_position=[0.3, 0.2, 0.1])
+def test_own_root_keeps_its_joints_and_is_held_at_root_position(models):
+    tree = models["jointed"].pose_tree("head", root_position=[0.3, 0.2, 0.1])
     assert tree.nodes[0].position_names == ("x", "y", "z", "head_y", "head_z", "head_x")
     grid = tree.grid(0, np.radians(20.0))
     assert len(grid) == 5**3
@@ -116,28 +126,8 @@ def test_own_root_keeps_its_joints_and_is_held_at_root_position(jointed):
     np.testing.assert_allclose(origins, np.tile([0.3, 0.2, 0.1], (len(grid), 1)), atol=1e-12)
 
 
-@pytest.mark.parametrize("root", [None, "base", "upper", "lower"])
-@pytest.mark.parametrize("rotation", [None, RootRotation.free()])
-def test_welded_base_moves_the_whole_plant(welded, root, rotation):
-    if root is None and rotation is None:
-        tree = welded.pose_tree()
-        assert [node.parent for node in tree.nodes] == [-1, 0, 1]
-        assert tree.nodes[0].positions == ()
-    else:
-        tree = welded.pose_tree(root, root_position=[1.0, 2.0, 3.0], root_rotation=rotation)
-        origin = tree.node_poses(tree.default_values())[0][:3, 3]
-        np.testing.assert_allclose(origin, [1.0, 2.0, 3.0], atol=1e-12)
-    assert largest_difference_from_drake(welded, tree) < 1e-9
-
-
-@pytest.mark.parametrize("root", [None, "a", "c", "e", "f"])
-def test_every_joint_type_agrees_with_drake(all_joints, root):
-    tree = all_joints.pose_tree(root, root_position=[0.1, 0.2, 0.3])
-    assert largest_difference_from_drake(all_joints, tree) < 1e-9
-    assert [len(node.positions) for node in all_joints.pose_tree().nodes] == [0, 2, 3, 1, 1, 1]
-
-
-def test_limits_that_drake_does_not_read_are_kept(all_joints):
+def test_limits_that_drake_does_not_read_are_kept(models):
+    all_joints = models["all_joints"]
     names = ("u_qx", "u_qy", "ball_qx", "screw", "back", "turn")
     index = [all_joints.position_index(name) for name in names]
     np.testing.assert_allclose(all_joints.upper[index], [1, 1, np.pi, 3, 2, np.pi])
@@ -173,15 +163,6 @@ def test_slides_without_limits_say_where_the_only_object_stands(tmp_path):
     assert largest_difference_from_drake(model, turned) < 1e-9
 
 
-def test_what_hangs_on_an_unseen_world_is_in_the_tree_of_a_floating_object(tmp_path):
-    arm = joint("a1", "revolute", "world", "upper") + joint("a2", "revolute", "upper", "lower")
-    text = urdf(link("ball", SPHERE), link("upper"), link("lower"), arm)
-    model = load_model(write(tmp_path, text), check=False)
-    tree = model.pose_tree()
-    assert [node.name for node in tree.nodes] == ["ball", "upper", "lower"]
-    assert largest_difference_from_drake(model, tree) < 1e-9
-
-
 def test_slides_without_limits_are_refused_where_they_must_be_searched(tmp_path):
     ball = link("ball") + joint("y", "prismatic", "world", "ball", limits=None)
     model = load_model(write(tmp_path, planar_robot(ball)), check=False)
@@ -210,84 +191,61 @@ def test_planar_joint_agrees_with_drake_and_needs_limits(tmp_path):
     assert largest_difference_from_drake(model, model.pose_tree()) < 1e-9
     with pytest.raises(UnknownNameError, match="joint 'nose'"):
         load_model(path, limits={"nose": (0.0, 1.0)}, check=False)
-    plant = MultibodyPlant(0.0)
-    Parser(plant).AddModels(path)
-    plant.Finalize()
-    context = plant.CreateDefaultContext()
-
-    def pose(values):
-        q = np.concatenate([[1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], values])
-        plant.SetPositions(context, q)
-        frame = plant.GetFrameByName("b")
-        return frame.CalcPose(context, plant.GetFrameByName("a")).GetAsMatrix4()
-
-    measured = JointMap.measure(pose, 3, "p")
-    values = np.random.default_rng(5).uniform(-3.0, 3.0, (20, 3))
-    for row, X in zip(values, measured.transforms(values), strict=True):
-        np.testing.assert_allclose(X, pose(row), atol=1e-12)
 
 
-def test_links_on_an_unseen_link_make_a_node_with_an_empty_mesh(tmp_path):
-    text = urdf(
-        link("palm", ""),
-        link("thumb"),
-        link("finger"),
-        joint("wrist", "revolute", "world", "palm"),
-        joint("t", "revolute", "palm", "thumb"),
-        joint("f", "revolute", "palm", "finger"),
-    )
-    model = load_model(write(tmp_path, text), check=False)
-    tree = model.pose_tree()
-    assert [(node.name, node.parent) for node in tree.nodes] == [
-        ("palm", -1),
-        ("thumb", 0),
-        ("finger", 0),
-    ]
-    assert tree.nodes[0].mesh.is_empty
-    assert largest_difference_from_drake(model, tree) < 1e-9
-    turned = model.pose_tree("finger", root_position=[0, 0, 1])
-    assert [node.name for node in turned.nodes] == ["finger", "thumb"]
-    assert largest_difference_from_drake(model, turned) < 1e-9
-
-
-def test_world_geometry_stands_beside_a_floating_body(tmp_path):
-    text = urdf(
-        link("table"),
-        link("cup"),
-        link("handle"),
-        joint("t", "fixed", "world", "table", limits=None),
-        joint("h", "revolute", "cup", "handle"),
-    )
-    model = load_model(write(tmp_path, text), check=False)
-    tree = model.pose_tree("handle", root_position=[0, 0, 1])
-    assert [(node.name, node.parent) for node in tree.nodes] == [
-        ("handle", -1),
-        ("cup", 0),
-        ("table", -1),
-    ]
+@pytest.mark.parametrize(
+    ("parts", "root", "nodes"),
+    [
+        (  # Links on a link that is not seen make a node with an empty mesh ...
+            [link("palm", ""), link("thumb"), link("finger"),
+             joint("wrist", "revolute", "world", "palm"),
+             joint("t", "revolute", "palm", "thumb"), joint("f", "revolute", "palm", "finger")],
+            None,
+            [("palm", -1), ("thumb", 0), ("finger", 0)],
+        ),
+        (  # ... that merely continues a chain where the tree starts at one of them.
+            [link("palm", ""), link("thumb"), link("finger"),
+             joint("wrist", "revolute", "world", "palm"),
+             joint("t", "revolute", "palm", "thumb"), joint("f", "revolute", "palm", "finger")],
+            "finger",
+            [("finger", -1), ("thumb", 0)],
+        ),
+        (  # What is seen in the world stands beside a floating body.
+            [link("table"), link("cup"), link("handle"),
+             joint("t", "fixed", "world", "table", limits=None),
+             joint("h", "revolute", "cup", "handle")],
+            "handle",
+            [("handle", -1), ("cup", 0), ("table", -1)],
+        ),
+        (  # What hangs on a world that is not seen, too.
+            [link("ball", SPHERE), link("upper"), link("lower"),
+             joint("a1", "revolute", "world", "upper"), joint("a2", "revolute", "upper", "lower")],
+            None,
+            [("ball", -1), ("upper", -1), ("lower", 1)],
+        ),
+    ],
+    ids=["unseen", "unseen inside", "seen world", "unseen world"],
+)  # fmt: skip
+def test_what_is_not_seen_and_what_stands_in_the_world(tmp_path, parts, root, nodes):
+    model = loaded(tmp_path, *parts)
+    tree = model.pose_tree(root, root_position=None if root is None else [0, 0, 1])
+    assert [(node.name, node.parent) for node in tree.nodes] == nodes
+    assert [node.mesh.is_empty for node in tree.nodes] == [name == "palm" for name, _ in nodes]
     assert largest_difference_from_drake(model, tree) < 1e-9
 
 
-def test_batch_equals_single_poses(floating):
-    tree = floating.pose_tree("leg", root_position=[0, 0, 0])
-    random = np.random.default_rng(2)
-    values = [random.uniform(-0.2, 0.3, (5, len(node.value_names))) for node in tree.nodes]
-    batch = tree.node_poses_batch(values)
-    for row in range(5):
-        single = tree.node_poses([array[row] for array in values])
-        np.testing.assert_allclose(batch[row], single, atol=1e-14)
-
-
-def test_moving_the_root_equals_building_the_tree_there(jointed, floating, welded):
-    for model, root in ((jointed, "arm"), (floating, "leg"), (welded, None), (jointed, "head")):
+def test_moving_the_root_equals_building_the_tree_there(models):
+    names = {"jointed": "arm", "floating": "leg", "welded": None, "all_joints": "c"}
+    for name, root in (*names.items(), ("jointed", "head")):
+        model = models[name]
         moved = model.pose_tree(root, root_position=[0, 0, 0]).with_root_position([1, 2, 3])
         built = model.pose_tree(root, root_position=[1, 2, 3])
         values = built.default_values()
         np.testing.assert_allclose(moved.node_poses(values), built.node_poses(values), atol=1e-12)
 
 
-def test_held_joint_has_one_sample(floating):
-    tree = floating.pose_tree(held={"shoulder_y": 0.4})
+def test_held_joint_has_one_sample(models):
+    tree = models["floating"].pose_tree(held={"shoulder_y": 0.4})
     arm = tree.node_index("arm")
     grid = tree.grid(arm, np.radians(20.0))
     assert set(grid[:, 1]) == {0.4}
@@ -303,7 +261,8 @@ def test_real_arm_agrees_with_drake(shared_data):
     assert largest_difference_from_drake(model, turned) < 1e-9
 
 
-def test_bad_arguments_name_what_exists(floating, jointed):
+def test_bad_arguments_name_what_exists(models):
+    floating, jointed = models["floating"], models["jointed"]
     with pytest.raises(UnknownNameError, match=r"link 'nose'.*trunk"):
         floating.pose_tree("nose")
     with pytest.raises(ModelError, match="'between' has no visual geometry"):
@@ -328,7 +287,6 @@ def test_bad_arguments_name_what_exists(floating, jointed):
 
 
 def test_two_floating_bodies_are_refused(tmp_path):
-    text = urdf(link("a"), link("b"))
-    model = load_model(write(tmp_path, text), check=False)
+    model = loaded(tmp_path, link("a"), link("b"))
     with pytest.raises(ModelError, match="a, b float freely"):
         model.pose_tree()

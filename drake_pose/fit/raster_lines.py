@@ -149,6 +149,8 @@ def compare_raster(
             at = offset + line * stride
             first, end = border_starts[at], border_starts[at + 1]
             moving = find_line_spans(segments, across, *crossings, line, spans)
+            if moving == 0 and across == 1:
+                continue
             found = _unite_line(
                 spans, moving, crossings[1], still_places, still_starts[at], still_starts[at + 1],
                 places, chosen,

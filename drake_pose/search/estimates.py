@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
 from drake_pose.errors import MaskError
 
@@ -74,6 +75,31 @@ class JointEstimate:
         return self.low - margin <= value <= self.high + margin
 
 
+def joint_estimates(
+    kinematics: TreeKinematics,
+    low: np.ndarray,
+    high: np.ndarray,
+    determined: np.ndarray,
+    seen: np.ndarray,
+) -> tuple[JointEstimate, ...]:
+    """What is known of each of a pose tree's values: ends and whether determined (m,).
+
+    ``seen``: (n, m) those of the poses that were found.
+    """
+    return tuple(
+        JointEstimate(
+            name,
+            int(kinematics.value_nodes[k]),
+            bool(determined[k]),
+            float(low[k]),
+            float(high[k]),
+            np.unique(seen[:, k]),
+            bool(kinematics.turns_around[k]),
+        )
+        for k, name in enumerate(kinematics.names)
+    )
+
+
 @dataclass(frozen=True)
 class PoseFamily:
     """Poses that differ by small steps, with one that stands for all.
@@ -92,6 +118,18 @@ class PoseFamily:
     J: float
     joints: tuple[JointEstimate, ...]
     size: float
+
+    @classmethod
+    def of_values(
+        cls,
+        tree: PoseTree,
+        node_values: tuple[np.ndarray, ...],
+        J: float,
+        joints: tuple[JointEstimate, ...],
+        size: float = 1.0,
+    ) -> PoseFamily:
+        """The family of a pose tree's values, (k_i,) of each node."""
+        return cls(*tree.positions_from(node_values), node_values, J, joints, size)
 
 
 @dataclass(frozen=True)

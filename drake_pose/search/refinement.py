@@ -35,8 +35,6 @@ _EXTRA = len(ROOT_NAMES)
 _STANDSTILL = 5e-4
 # A share of the diagonal, which keeps the equations solvable.
 _RELATIVE_DAMPING = 1e-3
-# While larger distances count [pixel], skin is bent again only at every so many lines' first.
-_BENDS = 8.0
 
 
 class Freedom(NamedTuple):
@@ -217,9 +215,8 @@ class RefinementProblem:
         """
         free, moved = freedom
         still = self.still(parameters, moved) if still is None else still
-        bent = offset == 0 or part.scale < _BENDS
         rooted = bool((free >= len(parameters) - _EXTRA).any())
-        placed = self.body.place(parameters, bent=bent, rooted=rooted)
+        placed = self.body.place(parameters, rooted=rooted)
         nodes = len(placed.X_WN)
         A, b, sums = np.zeros((nodes, 12, 12)), np.zeros((nodes, 12)), np.zeros(3)
         for camera, rest, border in zip(self._cameras, still, self._silhouettes, strict=True):

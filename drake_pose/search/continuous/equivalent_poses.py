@@ -21,7 +21,7 @@ from drake_pose.errors import SettingsError
 from drake_pose.fit.covariance import ErrorSizes, estimate_sizes, excess, values_covariance
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.search.continuous.views_fit import FittedPose, ViewsFit
-from drake_pose.search.estimates import JointEstimate, PoseFamily, PoseSet
+from drake_pose.search.estimates import JointEstimate, PoseFamily, PoseSet, joint_estimates
 from drake_pose.search.starts.self_motions import Flip, flips
 
 _LOOK = AnnealingStage(0.0125, 0.026, 2)
@@ -256,22 +256,18 @@ class RobustFamilies:
 
     def _describe(self, families: Sequence[_Family], J: Callable[[np.ndarray], float]) -> PoseSet:
         kinematics = self._kinematics
-        described = []
-        for family in families:
-            node_values = tuple(kinematics.split(family.values))
-            q, X_WB = kinematics.tree.positions_from(node_values)
-            described.append(
-                PoseFamily(
-                    q, X_WB, node_values, J(family.values), self._joints([family]), family.size
-                )
+        described = tuple(
+            PoseFamily.of_values(
+                kinematics.tree, kinematics.split(family.values), J(family.values),
+                self._joints([family]), family.size,
             )
-        return PoseSet(
-            tuple(described), self._joints(families), self._tolerance, False, len(described)
-        )
+            for family in families
+        )  # fmt: skip
+        return PoseSet(described, self._joints(families), self._tolerance, False, len(described))
 
     def _joints(self, families: Sequence[_Family]) -> tuple[JointEstimate, ...]:
         """Each value over some families."""
-        kinematics, widest = self._kinematics, self._widest()
+        kinematics = self._kinematics
         # All in the turns nearest to the first one.
         seen = np.array(
             [kinematics.nearest_turns(family.values, families[0].values) for family in families]
@@ -280,18 +276,5 @@ class RobustFamilies:
         lower, upper = kinematics.reach(families[0].values)
         low = np.maximum(np.min([one.low for one in families] + turns, axis=0), lower)
         high = np.minimum(np.max([one.high for one in families] + turns, axis=0), upper)
-        estimates = []
-        for i, name in enumerate(kinematics.names):
-            determined = not self._broken and bool(high[i] - low[i] <= widest[i])
-            estimates.append(
-                JointEstimate(
-                    name,
-                    int(kinematics.value_nodes[i]),
-                    determined,
-                    float(low[i]),
-                    float(high[i]),
-                    np.unique(np.round(seen[:, i], 12)),
-                    bool(kinematics.turns_around[i]),
-                )
-            )
-        return tuple(estimates)
+        determined = (high - low <= self._widest()) & (not self._broken)
+        return joint_estimates(kinematics, low, high, determined, np.round(seen, 12))

@@ -25,8 +25,8 @@ from scipy.special import ndtri
 
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.errors import SettingsError
-from drake_pose.search.estimates import JointEstimate, PoseFamily, PoseSet
-from drake_pose.search.refinement import FINE_PASSES, Freedom, RefinementProblem
+from drake_pose.search.estimates import JointEstimate, PoseFamily, PoseSet, joint_estimates
+from drake_pose.search.refinement import FINE_PASSES, RefinementProblem
 
 # The variance of a border that lies anywhere between two pixel centres [pixel^2].
 _PIXEL_VARIANCE = 1.0 / 12.0
@@ -70,47 +70,13 @@ class IntervalSettings:
             raise SettingsError("tolerance and misfit must not be negative")
 
 
-@dataclass(frozen=True, eq=False)
-class RefinedFamily:
-    """Poses that differ by small steps.
-
-    Attributes:
-        members: their parameters, best first.
-        joints: each of the tree's values, as far as these go.
-    """
-
-    members: tuple[np.ndarray, ...]
-    joints: tuple[JointEstimate, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Intervals:
-    """What is known of the tree's values.
-
-    Attributes:
-        joints: an estimate of each value, node after node.
-        covariance: (m, m) of the tree's values about the best pose; 0 where they are held.
-        families: the poses that are as good; the best pose leads the first.
-        tolerance: by how much their J may be larger than the best pose's [pixel].
-    """
-
-    joints: tuple[JointEstimate, ...]
-    covariance: np.ndarray
-    families: tuple[RefinedFamily, ...]
-    tolerance: float
-
-    @property
-    def alternatives(self) -> tuple[np.ndarray, ...]:
-        """The parameters of all poses as good but the best one."""
-        return tuple(p for family in self.families for p in family.members)[1:]
-
-
 def find_intervals(
     problem: RefinementProblem,
     others: Sequence[np.ndarray],
     parameters: np.ndarray,
     settings: IntervalSettings,
-) -> Intervals:
+    tree: PoseTree | None = None,
+) -> tuple[PoseSet, np.ndarray]:
     """What the silhouettes say of each value.
 
     Args:
@@ -118,43 +84,46 @@ def find_intervals(
         others: (m + 4,) each: other poses that are as good, best first.
         parameters: (m + 4,) the best pose, refined.
         settings: the parameters.
+        tree: the pose tree, with its root where the body is; None: the body's.
+
+    Returns:
+        The poses that are as good, the best leading the first family, and the covariance (m, m) of
+        the tree's values about the best pose, 0 where they are held.
     """
-    covariance = _covariance(problem, parameters, problem.body.freedom(), settings)
+    body = problem.body
+    tree, count = tree or body.tree, len(body.kinematics.names)
+    covariance = _covariance(problem, parameters, settings)
     z = float(ndtri(0.5 + 0.5 * settings.confidence))
     margins = z * np.sqrt(np.diag(covariance))
-    tolerance = settings.tolerance * problem.border_length
-    poses = [parameters]
+    fits = problem.J(parameters) <= settings.misfit * problem.border_length
+    near = np.maximum(margins, settings.same)
+    poses, groups = [parameters], [[parameters]]
     for other in others:
         # The same pose is not another one for a full turn.
-        other = problem.body.nearest_turns(other, parameters)
+        pose = body.nearest_turns(other, parameters)
         # What differs less is the same optimum, not quite reached.
-        if np.abs(other - parameters).max() > settings.same:
-            poses.append(other)
-    fits = problem.J(parameters) <= settings.misfit * problem.border_length
-    families = []
-    for members in _group(poses, margins, settings):
-        first = problem.body.nearest_turns(members[0])
-        members = [problem.body.nearest_turns(member, first) for member in members]
-        joints = _estimates(problem, members, margins, fits, settings)
-        families.append(RefinedFamily(tuple(members), joints))
-    joints = _estimates(problem, poses, margins, fits, settings)
-    return Intervals(joints, covariance, tuple(families), tolerance)
-
-
-def _group(
-    poses: Sequence[np.ndarray], margins: np.ndarray, settings: IntervalSettings
-) -> list[list[np.ndarray]]:
-    """Poses in groups whose members all differ little from the first."""
-    groups: list[list[np.ndarray]] = []
-    near = np.maximum(margins, settings.same)
-    for pose in poses:
-        for group in groups:
-            if np.all(np.abs(pose - group[0])[: len(near)] <= near):
-                group.append(pose)
-                break
-        else:
+        if np.abs(pose - parameters).max() <= settings.same:
+            continue
+        poses.append(pose)
+        of_group = (g for g in groups if np.all(np.abs(pose - g[0])[:count] <= near))
+        group = next(of_group, None)
+        if group is None:
             groups.append([pose])
-    return groups
+        else:
+            group.append(pose)
+
+    def estimates(members: Sequence[np.ndarray]) -> tuple[JointEstimate, ...]:
+        return _estimates(problem, [m[:count] for m in members], margins, fits, settings)
+
+    families = []
+    for group in groups:
+        first = body.nearest_turns(group[0])
+        joints = estimates([body.nearest_turns(member, first) for member in group])
+        J, size = float(problem.J(first)), float(len(group))
+        families.append(PoseFamily.of_values(tree, body.node_values(first), J, joints, size))
+    tolerance = settings.tolerance * problem.border_length
+    pose_set = PoseSet(tuple(families), estimates(poses), tolerance, False, len(families))
+    return pose_set, covariance
 
 
 def _estimates(
@@ -168,77 +137,34 @@ def _estimates(
 
     Args:
         problem: gives the body.
-        poses: their parameters, the best first.
+        poses: (m,) values of each, the best first.
         margins: (m,) how far the truth may be from a pose.
         fits: whether the best pose may be the true one; else nothing is known.
         settings: the parameters.
     """
     kinematics = problem.body.kinematics
-    ends = kinematics.reach(poses[0][: len(kinematics.names)])
-    estimates = []
-    for j, name in enumerate(kinematics.names):
-        node = int(kinematics.value_nodes[j])
-        seen = np.array(sorted({float(pose[j]) for pose in poses}))
-        lower, upper = float(ends[0][j]), float(ends[1][j])
-        low, high = max(seen[0] - margins[j], lower), min(seen[-1] + margins[j], upper)
-        widest = settings.widest_angle if kinematics.is_angle[j] else settings.widest_length
-        determined = bool(high - low <= 2.0 * widest and fits)
-        if not fits:
-            low, high = lower, upper
-        estimates.append(
-            JointEstimate(
-                name,
-                node,
-                determined,
-                float(low),
-                float(high),
-                seen,
-                bool(kinematics.turns_around[j]),
-            )
-        )
-    return tuple(estimates)
+    lower, upper = kinematics.reach(poses[0])
+    low = np.maximum(np.min(poses, axis=0) - margins, lower)
+    high = np.minimum(np.max(poses, axis=0) + margins, upper)
+    widest = np.where(kinematics.is_angle, settings.widest_angle, settings.widest_length)
+    determined = (high - low <= 2.0 * widest) & fits
+    if not fits:
+        low, high = lower, upper
+    return joint_estimates(kinematics, low, high, determined, np.array(poses))
 
 
 def _covariance(
-    problem: RefinementProblem,
-    parameters: np.ndarray,
-    freedom: Freedom,
-    settings: IntervalSettings,
+    problem: RefinementProblem, parameters: np.ndarray, settings: IntervalSettings
 ) -> np.ndarray:
     """The covariance (m, m) of the tree's values about the best pose."""
-    equations = problem.equations(parameters, freedom, FINE_PASSES[-1])
+    body = problem.body
+    free = body.freedom()
+    equations = problem.equations(parameters, free, FINE_PASSES[-1])
     variance = max(_PIXEL_VARIANCE, equations.squares / max(equations.weight, 1e-9))
     variance *= settings.noise_factor**2
-    lower, upper = problem.body.lower[freedom.columns], problem.body.upper[freedom.columns]
     # Limits are worth what a value spread evenly between them is.
-    spans = np.clip(upper - lower, 1e-6, 2.0 * np.pi)
+    spans = np.clip(body.upper[free.columns] - body.lower[free.columns], 1e-6, 2.0 * np.pi)
     information = equations.H[0] / variance + np.diag(12.0 / spans**2)
-    inverse = np.linalg.inv(information)
-    covariance = np.zeros((len(parameters), len(parameters)))
-    covariance[np.ix_(freedom.columns, freedom.columns)] = inverse
-    count = len(problem.body.kinematics.names)
-    return covariance[:count, :count]
-
-
-def pose_set(problem: RefinementProblem, tree: PoseTree, intervals: Intervals) -> PoseSet:
-    """The intervals with the poses that they come from, as other searches give them.
-
-    Args:
-        problem: the silhouettes.
-        tree: the pose tree, with its root where the body is.
-        intervals: what is known.
-    """
-    families = []
-    for family in intervals.families:
-        node_values = problem.body.node_values(family.members[0])
-        q, X_WB = tree.positions_from(node_values)
-        J = float(problem.J(family.members[0]))
-        size = float(len(family.members))
-        families.append(PoseFamily(q, X_WB, node_values, J, family.joints, size))
-    return PoseSet(
-        families=tuple(families),
-        joints=intervals.joints,
-        tolerance=intervals.tolerance,
-        complete=False,
-        family_count=len(families),
-    )
+    covariance = np.zeros((len(body.kinematics.names),) * 2)
+    covariance[np.ix_(free.columns, free.columns)] = np.linalg.inv(information)
+    return covariance

@@ -26,9 +26,8 @@ from drake_pose.search.continuous.views_fit import (
     distinct,
     refine_best,
 )
-from drake_pose.search.estimates import PoseEstimate, PoseSet, SearchStatistics, View
+from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
 from drake_pose.search.grid.sampled_body import SampledBody
-from drake_pose.search.scoring import Scoring
 from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.search.starts.coarse_search import (
     HYPOTHESES,
@@ -38,7 +37,7 @@ from drake_pose.search.starts.coarse_search import (
     CoarseSearch,
 )
 from drake_pose.search.starts.self_motions import counter_turns, flips
-from drake_pose.silhouette.areas.scoring import score_bodies
+from drake_pose.silhouette.areas.scoring import draw_mask
 
 # Connected pixels, or holes, no larger than this are specks [pixel].
 _SPECK = 6
@@ -158,7 +157,7 @@ class _MultiStartRun:
         self.kinematics = kinematics
         self.fit = fit
         self.poses: list[FittedPose] = []
-        self.first: FittedPose | None = None
+        self.first = FittedPose(np.zeros(0), np.inf)
         self.stopped_by = "end"
         self._views = views
         self._deadline = deadline
@@ -241,36 +240,30 @@ class _MultiStartRun:
             found.append(self.kinematics.flatten(parts))
         return found
 
-    def _pose_set(self, scoring: Scoring) -> PoseSet | None:
-        if self._families is None:
-            return None
-        return self._families.find(self.poses, lambda values: self._J(scoring, values))
-
-    def _J(self, scoring: Scoring, values: np.ndarray) -> float:
+    def _J(self, views: Sequence[View], values: np.ndarray) -> float:
         """The objective (1) at values (m,), skin included [pixel]."""
         outlines = self.body.sampled.surfaces.at(self.kinematics.split(values))
         X_WN = self.kinematics.poses(values)
-        total = scoring.silhouette_area
-        for view, prefixes in zip(scoring.views, scoring.silhouette_prefixes, strict=True):
-            areas = score_bodies(outlines, (view.camera.X_CW @ X_WN)[None], view.camera, prefixes)
-            total += float(areas[0, 0] - 2 * areas[0, 1])
-        return total
+        drawn = (draw_mask(outlines, view.camera.X_CW @ X_WN, view.camera) for view in views)
+        return float(sum(np.count_nonzero(d != v.mask) for d, v in zip(drawn, views, strict=True)))
 
     def result(self, views: Sequence[View]) -> PoseEstimate:
         """What the search found, judged by silhouettes as they were given."""
-        scoring = Scoring(self.body.sampled, views)
-        best, area = self.poses[0], scoring.silhouette_area
-        J = self._J(scoring, best.values)
-        first = J if self.first is None else self._J(scoring, self.first.values)
+        best = self.poses[0]
+        J = self._J(views, best.values)
+        # Before the families, whose evaluations are not the search's.
+        statistics = SearchStatistics(self.fit.evaluations, self._J(views, self.first.values))
+        pose_set = None
+        if self._families is not None:
+            pose_set = self._families.find(self.poses, lambda values: self._J(views, values))
         return PoseEstimate.of_values(
             self.body.sampled.tree,
             self.kinematics.split(best.values),
             J,
-            area,
+            float(sum(np.count_nonzero(view.mask) for view in views)),
             stopped_by=self.stopped_by,
-            # Before the families, whose evaluations are not the search's.
-            statistics=SearchStatistics(self.fit.evaluations, first),
-            pose_set=self._pose_set(scoring),
+            statistics=statistics,
+            pose_set=pose_set,
         )
 
 

@@ -44,8 +44,6 @@ from drake_pose.search.starts.root_placement import (
     slide_root,
     whereabouts,
 )
-from drake_pose.silhouette.areas.outline import outline_from_mesh
-from drake_pose.silhouette.areas.scoring import prefix_sums, score_bodies
 
 # What may lie outside, as in the beam search's tolerant stages; the root is off by half a step.
 _OUTSIDE_SHARE, _OUTSIDE_WEIGHT = 0.6, 2
@@ -316,7 +314,7 @@ class RootPlacementSearch:
         return PoseEstimate.of_values(
             tree,
             node_values,
-            _objective(tree, node_values, best.views),
+            RefinementProblem(self._refined, best.views).J(parameters),
             area,
             stopped_by=stopped_by,
             root_position=p_WR,
@@ -328,21 +326,6 @@ class RootPlacementSearch:
 def _area(views: Sequence[View]) -> float:
     """The silhouettes' area [pixel]."""
     return float(sum(view.mask.sum() for view in views))
-
-
-def _objective(tree: PoseTree, node_values: Sequence[np.ndarray], views: Sequence[View]) -> float:
-    """The objective (1) of a pose, skin included [pixel]."""
-    outlines = [
-        outline_from_mesh(node.surface(values))
-        for node, values in zip(tree.nodes, node_values, strict=True)
-    ]
-    X_WN = tree.node_poses(node_values)
-    total = 0.0
-    for view in views:
-        X_CN = view.camera.X_CW @ X_WN[None]
-        areas = score_bodies(outlines, X_CN, view.camera, prefix_sums(view.mask)[None])[0]
-        total += float(areas[0] + view.mask.sum() - 2 * areas[1])
-    return total
 
 
 def _within_quota(groups: np.ndarray, quota: int) -> np.ndarray:

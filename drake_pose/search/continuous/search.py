@@ -12,12 +12,7 @@ import numpy as np
 
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.errors import SettingsError
-from drake_pose.search.continuous.intervals import (
-    Intervals,
-    IntervalSettings,
-    find_intervals,
-    pose_set,
-)
+from drake_pose.search.continuous.intervals import IntervalSettings, find_intervals
 from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
 from drake_pose.search.grid.beam.search import BeamSearch
 from drake_pose.search.refinement import (
@@ -190,13 +185,16 @@ class ContinuousSearch:
         nearest = self.body.nearest_turns(reached.parameters)
         reached = reached._replace(parameters=nearest)
         middle = time.perf_counter()
-        intervals, settings = None, self.settings
-        if settings.intervals is not None:
-            reached, found = self._find_others(problem, reached, settings.intervals)
-            intervals = find_intervals(problem, found, reached.parameters, settings.intervals)
-        end = time.perf_counter()
-        stopped_by = "end" if in_time else "time_limit"
-        return self._answer(problem, reached, intervals, (middle - begin, end - middle), stopped_by)
+        as_good: list[np.ndarray] = []
+        if self.settings.intervals is not None:
+            reached, as_good = self._find_others(problem, reached, self.settings.intervals)
+        found = self._answer(problem, reached, as_good)
+        return replace(
+            found,
+            seconds=middle - begin,
+            stopped_by="end" if in_time else "time_limit",
+            statistics=replace(found.statistics, interval_seconds=time.perf_counter() - middle),
+        )
 
     def _descend_all(
         self, problem: RefinementProblem, poses: Sequence[np.ndarray], deadline: float
@@ -253,32 +251,26 @@ class ContinuousSearch:
         return reached, others
 
     def _answer(
-        self,
-        problem: RefinementProblem,
-        reached: _Reached,
-        intervals: Intervals | None,
-        seconds: tuple[float, float],
-        stopped_by: str,
+        self, problem: RefinementProblem, reached: _Reached, others: Sequence[np.ndarray]
     ) -> PoseEstimate:
-        """The result."""
+        """The result, with intervals where these are asked for."""
         parameters = reached.parameters
         tree, root_position = self.tree, None
         if parameters[-4:-1].any():
             root_position = self.body.poses(parameters)[0, :3, 3]
             tree = tree.with_root_position(root_position)
-        node_values = self.body.node_values(parameters)
+        pose_set, covariance, settings = None, None, self.settings.intervals
+        if settings is not None:
+            pose_set, covariance = find_intervals(problem, others, parameters, settings, tree)
         return PoseEstimate.of_values(
             tree,
-            node_values,
+            self.body.node_values(parameters),
             reached.J,
             problem.area,
-            stopped_by=stopped_by,
-            seconds=seconds[0],
+            stopped_by="end",
             root_position=root_position,
             scale=float(np.exp(parameters[-1])),
-            covariance=None if intervals is None else intervals.covariance,
-            pose_set=None if intervals is None else pose_set(problem, tree, intervals),
-            statistics=SearchStatistics(
-                reached.steps, reached.first_J, interval_seconds=seconds[1]
-            ),
+            covariance=covariance,
+            pose_set=pose_set,
+            statistics=SearchStatistics(reached.steps, reached.first_J),
         )

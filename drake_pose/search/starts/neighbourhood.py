@@ -15,9 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_pose.fit.raster_lines import Border
 from drake_pose.search.refinement import Freedom, Pass, RefinementProblem, descend
-from drake_pose.search.starts.depth_reflections import Reflection
 from drake_pose.search.starts.part_placement import Part, PartSearch
 
 # From nodes mirrored or placed anew to the local optimum: what is far after a pass is left.
@@ -69,25 +67,20 @@ class NeighbourhoodSearch:
     """
 
     def __init__(
-        self,
-        problem: RefinementProblem,
-        search: PartSearch,
-        *,
-        reflections: bool = True,
+        self, problem: RefinementProblem, search: PartSearch, *, reflections: bool = True
     ) -> None:
-        self.problem = problem
-        self.search = search
+        self.problem, self.search = problem, search
         # What is mirrored in the depth of one camera another one sees.
         mirrored = search.reflections if reflections and len(problem.views) == 1 else ()
-        self._moves: tuple[Part | Reflection, ...] = (*search.parts, *mirrored)
+        self._parts = (*search.parts, *mirrored)
         self._freedoms = [
-            problem.body.freedom(None if isinstance(move, Reflection) else search.moving(move))
-            for move in self._moves
+            problem.body.freedom(None if part.exchanged else (*part.nodes, *part.held))
+            for part in self._parts
         ]
-        self._sizes = np.array([len(move.nodes) for move in self._moves])
-        self._seen = np.full(len(self._moves), np.inf)
-        self._tried = np.zeros(len(self._moves), dtype=np.int64)
-        self._others: list[list[_Other]] = [[] for _ in self._moves]
+        self._sizes = np.array([len(part.nodes) for part in self._parts])
+        self._seen = np.full(len(self._parts), np.inf)
+        self._tried = np.zeros(len(self._parts), dtype=np.int64)
+        self._others: list[_Other] = []
 
     def improve(
         self,
@@ -128,8 +121,7 @@ class NeighbourhoodSearch:
                 worth[parts:] = False
             chosen = int(np.argmax(np.where(worth, errors / self._sizes, -1.0)))
             self._tried[chosen] += 1
-            erring = bool(errors[chosen] >= least)
-            better, better_J = self._try(parameters, J, chosen, erring)
+            better, better_J = self._try(parameters, J, chosen, bool(errors[chosen] >= least))
             if better_J < J:
                 parameters, J = better, better_J
                 errors = self._errors_near(parameters, J)
@@ -148,59 +140,52 @@ class NeighbourhoodSearch:
         known, kept = [parameters], []
         spare = _SPARE * problem.border_length
         everything = problem.body.freedom()
-        found = [other for others in self._others for other in others]
-        found.sort(key=lambda other: other.J)
-        for _, freedom, values in found:
+
+        def is_known(pose: np.ndarray, poses: Sequence[np.ndarray]) -> bool:
+            # A pose is not another one for a full turn.
+            gaps = [problem.body.nearest_turns(pose, other) - other for other in poses]
+            return any(float(np.abs(gap).max()) <= same for gap in gaps)
+
+        for other in sorted(self._others, key=lambda one: one.J):
             start = parameters.copy()
-            start[freedom.columns] = values
-            if self._is_known(start, known, same):
+            start[other.freedom.columns] = other.values
+            if is_known(start, known):
                 continue
-            known.append(start)
-            refined, _, _ = descend(problem, start, freedom, _END_PASSES)
+            refined, _, _ = descend(problem, start, other.freedom, _END_PASSES)
             J = float(problem.J(refined))
-            if limit < J <= limit + spare and not self._is_known(refined, known[:-1], same):
+            if limit < J <= limit + spare and not is_known(refined, known):
                 refined, _, _ = descend(problem, refined, everything, _END_PASSES)
                 J = float(problem.J(refined))
-            if J <= limit and not self._is_known(refined, known[:-1], same):
+            if J <= limit and not is_known(refined, known):
                 kept.append((J, refined))
                 known.append(refined)
+            known.append(start)
         kept.sort(key=lambda pair: pair[0])
         return [pose for _, pose in kept]
 
-    def _is_known(self, parameters: np.ndarray, known: Sequence[np.ndarray], same: float) -> bool:
-        """Whether a pose is one of those known; it is not another one for a full turn."""
-        near = (self.problem.body.nearest_turns(parameters, other) - other for other in known)
-        return any(float(np.abs(apart).max()) <= same for apart in near)
-
     def _errors_near(self, parameters: np.ndarray, J: float) -> np.ndarray:
-        """For each move the area (moves,) wrong within its reach [pixel]."""
+        """For each part the area (parts,) wrong within its reach [pixel]."""
         errors = self.search.errors_near(self.problem, parameters)
-        return np.append(errors, np.full(len(self._moves) - len(errors), J))
+        return np.append(errors, np.full(len(self._parts) - len(errors), J))
 
-    def _starts(
-        self, parameters: np.ndarray, move: Part | Reflection, still: Sequence[Border], erring: bool
-    ) -> list[np.ndarray]:
+    def _starts(self, parameters: np.ndarray, part: Part, erring: bool) -> list[np.ndarray]:
         """Poses to refine from; where no error is near, a part is only mirrored."""
-        problem, search = self.problem, self.search
-        if isinstance(move, Reflection):
-            return [search.reflect(parameters, move, problem.views[0])]
-        starts = [search.mirror(parameters, move, view) for view in problem.views]
-        if not erring:
+        search = self.search
+        starts = [search.mirror(parameters, part, view) for view in self.problem.views]
+        if part.exchanged or not erring:
             return starts
-        alone = None if move.held else still
-        return starts + search.propose(problem, parameters, move, _PROPOSALS, alone)
+        return starts + search.propose(self.problem, parameters, part, _PROPOSALS)
 
     def _try(
         self, parameters: np.ndarray, J: float, chosen: int, erring: bool
     ) -> tuple[np.ndarray, float]:
-        """The best pose that a move leads to, and its J; what is nearly as good is kept."""
+        """The best pose that a part leads to, and its J; what is nearly as good is kept."""
         problem, length = self.problem, self.problem.border_length
-        freedom = self._freedoms[chosen]
+        part, freedom = self._parts[chosen], self._freedoms[chosen]
         still = problem.still(parameters, freedom.moved)
-        starts = self._starts(parameters, self._moves[chosen], still, erring)
         rough = []
-        for start in starts:
-            if isinstance(self._moves[chosen], Reflection):
+        for start in self._starts(parameters, part, erring):
+            if part.exchanged:
                 refined, apart = self._settle_reflected(start, J, freedom)
             else:
                 refined, apart, _ = descend(problem, start, freedom, _FAR_PASSES, still)
@@ -213,22 +198,21 @@ class NeighbourhoodSearch:
             if apart <= J + _NEAR * length:
                 refined, _, _ = descend(problem, refined, freedom, _FINE_PASSES, still)
                 found.append((float(problem.J(refined)), refined))
-        found.sort(key=lambda pair: pair[0])
         columns = freedom.columns
-        self._others[chosen] += [
+        self._others += [
             _Other(other_J, freedom, other[columns])
             for other_J, other in found
             if other_J <= J + _KEPT * length
         ]
-        if not found or found[0][0] > J + _EQUAL * length:
+        least, best = min(found, key=lambda pair: pair[0], default=(np.inf, parameters))
+        if least > J + _EQUAL * length:
             return parameters, np.inf
-        best, least = found[0][1], found[0][0]
         whole, _, _ = descend(problem, best, problem.body.freedom(), _WHOLE_PASSES)
         whole_J = float(problem.J(whole))
         best, least = (whole, whole_J) if whole_J < least else (best, least)
         if least > J - _BETTER * length:
             return parameters, np.inf
-        self._others[chosen].append(_Other(J, freedom, parameters[columns]))
+        self._others.append(_Other(J, freedom, parameters[columns]))
         return best, least
 
     def _settle_reflected(
@@ -243,7 +227,7 @@ class NeighbourhoodSearch:
         refined, apart, _ = descend(problem, start, freedom, _REFLECTED_PASSES)
         near = J + _NEAR * length
         if near < apart <= J + _MENDED * length:
-            refined, _, _ = descend(problem, refined, problem.body.freedom(), _WHOLE_PASSES)
+            refined, _, _ = descend(problem, refined, freedom, _WHOLE_PASSES)
             mending = NeighbourhoodSearch(problem, self.search, reflections=False)
             refined, apart = mending.improve(refined, near, tries=_MENDINGS)
         return refined, apart

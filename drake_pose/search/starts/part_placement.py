@@ -1,35 +1,34 @@
-"""Ways out of a bad match: parts of the body placed anew, the rest as it is.
+"""Ways out of a bad match: parts of the body placed anew or mirrored in depth, the rest as it is.
 
 A local refinement cannot turn a hand round or take a leg from behind the other. So parts of the
 body - ends of limbs, whole limbs, single inner nodes - are searched again on their sampling grids,
-hung on the continuous pose of the rest and scored by what they cover newly, rightly or wrongly;
-what looks best is refined.
+hung on the continuous pose of the rest and scored by what they cover newly, rightly or wrongly.
+Seen by one camera, a part mirrored in depth looks nearly the same, and so does half of the body if
+its left and its right are exchanged: the mirror image of a body is a body again then.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
-import fast_simplification
 import numpy as np
 
-from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.fit.parameters import Placement
 from drake_pose.fit.raster_lines import Border
+from drake_pose.fit.surfaces import few_rigid_triangles
 from drake_pose.search.estimates import View
 from drake_pose.search.refinement import RefinementBody, RefinementProblem
-from drake_pose.search.starts.depth_reflections import Reflection, find_reflections
-from drake_pose.silhouette.areas.outline import Outline, outline_from_mesh, pack
+from drake_pose.silhouette.areas.outline import pack
 from drake_pose.silhouette.areas.scoring import prefix_sums
 from drake_pose.silhouette.areas.span_kernel import score
 
 _TRIANGLES = 200
 # One row and column in so many is looked at that silhouettes have about this many pixels.
 _COARSE_PIXELS = 3000
+# Every so many rows are looked at where areas are only compared.
+_NEAR_STRIDE = 2
 # Hypotheses kept for the first, second, ... node of a part, and this many times more are scored
 # with what the part itself hides taken into account.
 _WIDTHS = (40, 12, 8)
@@ -37,57 +36,87 @@ _SPARE = 4
 # Placements whose nodes' middles are all nearer than this are one [node radii].
 _ALIKE = 0.35
 _LONGEST_PART = 3
-# Every so many rows are looked at where areas are only compared.
-_NEAR_STRIDE = 2
-# Steps of Gauss and Newton's method that bring nodes to given places.
-_MOVES = 12
+# Steps of Gauss and Newton's method that bring nodes to given places, and that hold a node; each no
+# longer than so much, and damped by a share of a square metre.
+_MOVES, _HOLDS, _LONGEST, _DAMPING = 8, 4, 0.5, 1e-4
 # Steps smaller than this end it [rad or m].
 _STANDSTILL = 2e-3
 
 
 @dataclass(frozen=True)
 class Part:
-    """Nodes that are placed anew together.
+    """Nodes that are placed anew or mirrored together.
 
     Attributes:
-        nodes: each the child of the one before.
-        held: whether what hangs on the last one stays where it is; else nothing hangs on it.
+        nodes: parents before children; the first one's joint stays.
+        sources: for each the node whose mirror image it becomes.
+        held: nodes that hang on these but stay as they are.
     """
 
     nodes: tuple[int, ...]
-    held: bool
+    sources: tuple[int, ...]
+    held: tuple[int, ...] = ()
+
+    @property
+    def exchanged(self) -> bool:
+        """Whether it is much of the body, left and right exchanged, which is only mirrored."""
+        return self.nodes != self.sources
 
 
 def find_parts(tree: PoseTree) -> tuple[Part, ...]:
     """The ends of all limbs, one to three nodes long, and the nodes of the trunk one by one."""
-    parts = []
+    chains = []
     for leaf in tree.leaves:
         chain = [leaf]
         while len(chain) <= _LONGEST_PART:
-            parts.append(Part(tuple(reversed(chain)), held=False))
+            chains.append(tuple(reversed(chain)))
             parent = tree.nodes[chain[-1]].parent
             if parent < 0 or len(tree.nodes[parent].children) > 1:
                 break
             chain.append(parent)
-    moved = {node for part in parts for node in part.nodes}
-    parts += [Part((i,), held=True) for i in range(len(tree.nodes)) if i not in moved]
-    return tuple(parts)
+    moved = {node for chain in chains for node in chain}
+    trunk = [i for i in range(len(tree.nodes)) if i not in moved]
+    parts = [Part(chain, chain) for chain in chains]
+    return (*parts, *(Part((i,), (i,), tuple(tree.nodes[i].children)) for i in trunk))
 
 
-@dataclass(frozen=True, eq=False)
-class _Regions:
-    """One view without the part, coarse: its camera and prefix sums of what the part may cover."""
-
-    X_CW: np.ndarray
-    camera: np.ndarray
-    sets: np.ndarray
+def find_reflections(tree: PoseTree) -> tuple[Part, ...]:
+    """What may be mirrored: all that hangs on a node with pairs of limbs, and these limbs alone."""
+    partners = dict(enumerate(range(len(tree.nodes))))
+    limbs: dict[tuple[int, int], list[int]] = {}
+    owners: set[int] = set()
+    for leaf in tree.leaves:
+        limb = [leaf]
+        while (parent := tree.nodes[limb[0]].parent) >= 0 and len(tree.nodes[parent].children) == 1:
+            limb.insert(0, parent)
+        other = limbs.pop((parent, len(limb)), None)
+        if other is None:
+            limbs[parent, len(limb)] = limb
+        elif parent >= 0:
+            owners.add(parent)
+            partners |= dict(zip(limb, other, strict=True)) | dict(zip(other, limb, strict=True))
+    below: list[list[int]] = [[i] for i in range(len(tree.nodes))]
+    for i in range(len(tree.nodes) - 1, -1, -1):
+        below[i] += [j for child in tree.nodes[i].children for j in below[child]]
+    reflections: list[tuple[list[int], tuple[int, ...]]] = []
+    for i in range(len(tree.nodes)):
+        if owners & set(below[i]):
+            reflections.append((sorted(below[i]), ()))
+        if i in owners:
+            held = tuple(child for child in tree.nodes[i].children if partners[child] == child)
+            left = set(below[i]).difference(*(below[child] for child in held))
+            if held:
+                reflections.append((sorted(left), held))
+    return tuple(
+        Part(tuple(nodes), tuple(partners[j] for j in nodes), held) for nodes, held in reflections
+    )
 
 
 class PartSearch:
     """Searches parts of a body again.
 
     Attributes:
-        parts: the parts.
+        parts: the parts that are placed anew.
         reflections: what may be mirrored in depth together.
 
     Args:
@@ -97,27 +126,14 @@ class PartSearch:
 
     def __init__(self, body: RefinementBody, grids: Sequence[np.ndarray]) -> None:
         self.body = body
-        self.parts = find_parts(body.tree)
-        self.reflections = find_reflections(body.tree)
+        self.parts, self.reflections = find_parts(body.tree), find_reflections(body.tree)
         self._grids = list(grids)
         self._X_PN = [body.tree.relative_transforms(i, grid) for i, grid in enumerate(grids)]
         # Bands of skin are small, and where they are depends on the sample.
-        rigid = body.surfaces.rigid
-        self._outlines = tuple(_coarsen(outline) for outline in rigid)
+        self._outlines = few_rigid_triangles(body.surfaces, _TRIANGLES).rigid
         nodes = body.kinematics.value_nodes
         self._columns = [np.flatnonzero(nodes == i) for i in range(len(grids))]
-        self._balls = np.array([outline.ball for outline in rigid])
-        self._firsts = [part.nodes[0] for part in self.parts]
-        # How far a part reaches: from joint to joint, and from the last one to the surface's end.
-        reaches = np.linalg.norm(self._balls[:, :3], axis=1) + self._balls[:, 3]
-        self._ends = reaches[[part.nodes[-1] for part in self.parts]]
-        pairs = [
-            (i, *pair)
-            for i, part in enumerate(self.parts)
-            for pair in zip(part.nodes, part.nodes[1:], strict=False)
-        ]
-        steps = np.array(pairs, dtype=np.int64).reshape(-1, 3)
-        self._owners, self._chains = steps[:, 0], steps[:, 1:]
+        self._balls = np.array([outline.ball for outline in body.surfaces.rigid])
 
     def propose(
         self,
@@ -125,25 +141,18 @@ class PartSearch:
         parameters: np.ndarray,
         part: Part,
         count: int,
-        still: Sequence[Border] | None = None,
     ) -> list[np.ndarray]:
-        """Other placements of a part that suit the silhouettes, the best first.
+        """The parameters of at most so many other placements of a part, the best first.
 
         Args:
             problem: the silhouettes.
             parameters: (m + 4,) the pose.
             part: the part.
             count: at most this many.
-            still: of ``RefinementProblem.still`` for all nodes but the part's; None: made here.
-
-        Returns:
-            The parameters of each.
         """
         X_WN = self.body.poses(parameters)
-        if still is None:
-            moved = np.isin(np.arange(len(X_WN)), part.nodes)
-            still = problem.still(parameters, moved)
-        regions = _find_regions(problem, still)
+        others = problem.still(parameters, np.isin(np.arange(len(X_WN)), part.nodes))
+        regions = _find_regions(problem, others)
         samples = np.zeros((1, 0), dtype=np.int64)
         X_part, gains = np.zeros((1, 0, 4, 4)), np.zeros(1)
         parent = self.body.tree.nodes[part.nodes[0]].parent
@@ -165,8 +174,13 @@ class PartSearch:
                 scores = self._score(regions, part.nodes[: place + 1], X_part)
             best = np.argsort(-scores, kind="stable")[:width]
             samples, X_part, gains = samples[best], X_part[best], scores[best]
-        chosen = self._different(part, X_part, count)
-        return [self._placed(parameters, X_WN, part, samples[i]) for i in chosen]
+        proposed = []
+        for i in self._different(part, X_part, count):
+            placed = parameters.copy()
+            for node, sample in zip(part.nodes, samples[i], strict=True):
+                placed[self._columns[node]] = self._grids[node][sample]
+            proposed.append(self._hold(placed, X_WN, part.held))
+        return proposed
 
     def errors_near(self, problem: RefinementProblem, parameters: np.ndarray) -> np.ndarray:
         """For each part the area (parts,) wrong in any view within the part's reach [pixel]."""
@@ -181,12 +195,13 @@ class PartSearch:
 
     def reaches(self, problem: RefinementProblem, parameters: np.ndarray) -> np.ndarray:
         """For each view a disc in the picture that each part stays in (views, parts, 3) [pixel]."""
-        X_WN = self.body.poses(parameters)
-        origins = X_WN[self._firsts, :3, 3]
-        steps = np.linalg.norm(
-            X_WN[self._chains[:, 1], :3, 3] - X_WN[self._chains[:, 0], :3, 3], axis=1
-        )
-        radii = self._ends + np.bincount(self._owners, steps, len(self.parts))
+        p_WN = self.body.poses(parameters)[:, :3, 3]
+        origins = p_WN[[part.nodes[0] for part in self.parts]]
+        # From joint to joint, and from the last one to the surface's end.
+        ends = np.linalg.norm(self._balls[:, :3], axis=1) + self._balls[:, 3]
+        radii = np.array([ends[part.nodes[-1]] for part in self.parts])
+        for k, part in enumerate(self.parts):
+            radii[k] += np.linalg.norm(np.diff(p_WN[list(part.nodes)], axis=0), axis=1).sum()
         discs = np.empty((len(problem.views), len(self.parts), 3))
         for view, disc in zip(problem.views, discs, strict=True):
             disc[:, :2], _ = view.camera.project(origins)
@@ -195,132 +210,83 @@ class PartSearch:
         return discs
 
     def _score(
-        self, regions: Sequence[_Regions], nodes: Sequence[int], X_WN: np.ndarray
+        self, regions: Sequence[_Region], nodes: Sequence[int], X_WN: np.ndarray
     ) -> np.ndarray:
         """The area that nodes at poses X_WN (n, k, 4, 4) cover rightly less that wrongly, (n,)."""
         packed = pack(tuple(self._outlines[i] for i in nodes))
         total = np.zeros(len(X_WN))
         no_parts, no_bands = np.zeros((0, 4), dtype=np.int64), np.zeros((0, 0, 3))
-        for region in regions:
-            X_CN = np.ascontiguousarray((region.X_CW @ X_WN)[:, :, :3])
-            areas = score(packed, no_parts, no_bands, X_CN, region.camera, region.sets)
+        for X_CW, camera, sets in regions:
+            X_CN = np.ascontiguousarray((X_CW @ X_WN)[:, :, :3])
+            areas = score(packed, no_parts, no_bands, X_CN, camera, sets)
             total += areas[:, 1] - areas[:, 2]
         return total
 
     def _different(self, part: Part, X_part: np.ndarray, count: int) -> list[int]:
         """Placements (n, k, 4, 4) that differ in where some node is or how it is turned."""
-        balls = self._balls[list(part.nodes)]
-        middles = np.einsum("nkij,kj->nki", X_part[..., :3, :3], balls[:, :3])
-        middles += X_part[..., :3, 3]
+        middles = self._middles(X_part, part.nodes)
         left = np.ones(len(X_part), dtype=np.bool_)
         chosen: list[int] = []
         while left.any() and len(chosen) < count:
             i = int(np.argmax(left))
             chosen.append(i)
             turned = np.abs(X_part[:, :, :3, :3] - X_part[i, :, :3, :3]).max(axis=(2, 3))
-            far = np.linalg.norm(middles - middles[i], axis=2) > _ALIKE * balls[:, 3]
+            far = np.linalg.norm(middles - middles[i], axis=2)
+            far = far > _ALIKE * self._balls[list(part.nodes), 3]
             left &= np.any(far | (turned > 2.0 * _ALIKE), axis=1)
         return chosen
 
-    def _placed(
-        self, parameters: np.ndarray, X_WN: np.ndarray, part: Part, samples: np.ndarray
-    ) -> np.ndarray:
-        """The parameters with the part at samples (k,) of its grids."""
-        placed = parameters.copy()
-        for node, sample in zip(part.nodes, samples, strict=True):
-            placed[self._columns[node]] = self._grids[node][sample]
-        return self._hold_children(placed, X_WN, part)
-
-    def moving(self, part: Part) -> tuple[int, ...]:
-        """The part's nodes and those that are held by their own values."""
-        children = self.body.tree.nodes[part.nodes[-1]].children
-        return (*part.nodes, *(children if part.held else ()))
-
-    def _hold_children(self, parameters: np.ndarray, X_WN: np.ndarray, part: Part) -> np.ndarray:
-        """The parameters with what hangs on a part held about where it is in X_WN."""
-        for child in self.moving(part)[len(part.nodes) :]:
-            parameters = self._hold(parameters, X_WN, child)
-        return parameters
-
     def mirror(self, parameters: np.ndarray, part: Part, view: View) -> np.ndarray:
-        """The parameters with a part mirrored in depth about its first joint, nearly.
+        """The parameters with a part mirrored in a view's depth about its first joint, nearly.
 
-        Seen by parallel rays, the middle of each node stays where it is seen. What the part holds
-        stays as it is.
-
-        Args:
-            parameters: (m + 4,) the pose.
-            part: the part.
-            view: in whose depth it is mirrored.
+        Seen by parallel rays, the middle of each node stays where it is seen.
         """
         X_WN = self.body.poses(parameters)
-        middles, depth = self._middles(X_WN, part.nodes), view.camera.X_WC[:3, 2]
+        depth = view.camera.X_WC[:3, 2]
+        middles = self._middles(X_WN[list(part.sources)], part.sources)
         away = (middles - X_WN[part.nodes[0], :3, 3]) @ depth
-        wanted = middles - 2.0 * np.outer(away, depth)
-        return self._hold_children(self._move(parameters, part.nodes, wanted), X_WN, part)
-
-    def reflect(self, parameters: np.ndarray, reflection: Reflection, view: View) -> np.ndarray:
-        """The parameters with much of the body mirrored in depth, nearly.
-
-        Args:
-            parameters: (m + 4,) the pose.
-            reflection: one of ``reflections``.
-            view: in whose depth.
-        """
-        X_WN = self.body.poses(parameters)
-        middles, depth = self._middles(X_WN, reflection.sources), view.camera.X_WC[:3, 2]
-        away = (middles - X_WN[reflection.nodes[0], :3, 3]) @ depth
-        reflected = self._move(parameters, reflection.nodes, middles - 2.0 * np.outer(away, depth))
-        for node in reflection.held:
-            reflected = self._hold(reflected, X_WN, node)
-        return reflected
-
-    def _middles(self, X_WN: np.ndarray, nodes: Sequence[int]) -> np.ndarray:
-        """The middles (k, 3) of some nodes in the world [m]."""
-        X = X_WN[list(nodes)]
-        return np.asarray(
-            np.einsum("kij,kj->ki", X[:, :3, :3], self._balls[list(nodes), :3]) + X[:, :3, 3]
-        )
-
-    def _move(self, parameters: np.ndarray, nodes: Sequence[int], wanted: np.ndarray) -> np.ndarray:
-        """The parameters with nodes' middles moved towards places (k, 3) by their own values."""
-        body = self.body
+        wanted, nodes = middles - 2.0 * np.outer(away, depth), list(part.nodes)
         columns = np.concatenate([self._columns[node] for node in nodes])
-        lower, upper = body.lower[columns], body.upper[columns]
         moved = parameters.copy()
         for _ in range(_MOVES):
-            placed = body.place(moved, bent=False)
-            p_W = self._middles(placed.X_WN, nodes)
+            placed = self.body.place(moved, bent=False)
+            p_W = self._middles(placed.X_WN[nodes], nodes)
             A = _velocities(placed, nodes, columns, p_W)
-            step = np.linalg.solve(
-                A.T @ A + 1e-4 * np.eye(len(columns)), A.T @ (wanted - p_W).ravel()
-            )
-            before = moved[columns]
-            after = np.clip(before + np.clip(step, -0.5, 0.5), lower, upper)
-            moved[columns] = after
-            if np.abs(after - before).max() < _STANDSTILL:
+            square = A.T @ A + _DAMPING * np.eye(len(columns))
+            step = np.linalg.solve(square, A.T @ (wanted - p_W).ravel())
+            if self._stand_still(moved, columns, np.clip(step, -_LONGEST, _LONGEST)):
                 break
-        return moved
+        return self._hold(moved, X_WN, part.held)
 
-    def _hold(self, parameters: np.ndarray, X_WN: np.ndarray, node: int) -> np.ndarray:
-        """The parameters with a node brought back to about X_WN by its own values."""
-        columns = self._columns[node]
-        lower, upper = self.body.lower[columns], self.body.upper[columns]
-        radius = max(float(self._balls[node, 3]), 1e-6)
-        p_N = radius * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
-        wanted = p_N @ X_WN[node, :3, :3].T + X_WN[node, :3, 3]
+    def _hold(self, parameters: np.ndarray, X_WN: np.ndarray, nodes: Sequence[int]) -> np.ndarray:
+        """The parameters with nodes brought back to about X_WN by their own values."""
         held = parameters.copy()
-        for _ in range(4):
-            placed = self.body.place(held, bent=False)
-            X = placed.X_WN[node]
-            p_W = p_N @ X[:3, :3].T + X[:3, 3]
-            A = _velocities(placed, [node] * len(p_N), columns, p_W)
-            step = np.linalg.lstsq(A, (wanted - p_W).ravel(), rcond=1e-6)[0]
-            before = held[columns]
-            held[columns] = np.clip(before + np.clip(step, -1.0, 1.0), lower, upper)
-            if np.abs(held[columns] - before).max() < _STANDSTILL:
-                break
+        for node in nodes:
+            columns = self._columns[node]
+            radius = max(float(self._balls[node, 3]), 1e-6)
+            p_N = radius * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
+            wanted = p_N @ X_WN[node, :3, :3].T + X_WN[node, :3, 3]
+            for _ in range(_HOLDS):
+                placed = self.body.place(held, bent=False)
+                X = placed.X_WN[node]
+                p_W = p_N @ X[:3, :3].T + X[:3, 3]
+                A = _velocities(placed, [node] * len(p_N), columns, p_W)
+                step = np.linalg.lstsq(A, (wanted - p_W).ravel(), rcond=1e-6)[0]
+                if self._stand_still(held, columns, np.clip(step, -1.0, 1.0)):
+                    break
         return held
+
+    def _stand_still(self, parameters: np.ndarray, columns: np.ndarray, step: np.ndarray) -> bool:
+        """Whether parameters, which are changed, hardly move by a step inside their limits."""
+        before = parameters[columns]
+        lower, upper = self.body.lower[columns], self.body.upper[columns]
+        parameters[columns] = np.clip(before + step, lower, upper)
+        return bool(np.abs(parameters[columns] - before).max(initial=0.0) < _STANDSTILL)
+
+    def _middles(self, X_WN: np.ndarray, nodes: Sequence[int]) -> np.ndarray:
+        """The middles (..., k, 3) of some nodes at X_WN (..., k, 4, 4) in the world [m]."""
+        p_N = self._balls[list(nodes), :3]
+        return np.asarray(np.einsum("...kij,kj->...ki", X_WN[..., :3, :3], p_N) + X_WN[..., :3, 3])
 
 
 def _velocities(
@@ -330,38 +296,30 @@ def _velocities(
     dense = placed.dense(len(placed.motions))
     motions = dense[list(nodes)][:, columns].reshape(len(p_W), -1, 3, 4)
     moved = np.einsum("nkij,nj->nik", motions[..., :3], p_W) + motions[..., 3].transpose(0, 2, 1)
-    return moved.reshape(3 * len(p_W), -1)
+    return np.asarray(moved.reshape(3 * len(p_W), -1))
 
 
-def _find_regions(problem: RefinementProblem, still: Sequence[Border]) -> list[_Regions]:
-    """What a part may cover in each view: silhouette and outside, less what others cover.
+_Region = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def _find_regions(problem: RefinementProblem, others: Sequence[Border]) -> list[_Region]:
+    """What a part may cover in each coarse view: silhouette and outside, less what others cover.
 
     Args:
         problem: the silhouettes.
-        still: the border of all that is not of the part in each view.
+        others: the border of all that is not of the part in each view.
+
+    Returns:
+        X_CW and kernel parameters of the camera, and prefix sums of both sets.
     """
     regions = []
-    pixels = problem.area / (_COARSE_PIXELS * len(problem.views))
-    step = max(1, round(math.sqrt(pixels)))
-    for view, border in zip(problem.views, still, strict=True):
-        mask = np.ascontiguousarray(view.mask[::step, ::step])
+    step = max(1, round((problem.area / (_COARSE_PIXELS * len(problem.views))) ** 0.5))
+    for view, border in zip(problem.views, others, strict=True):
+        mask = view.mask[::step, ::step]
         camera = view.camera.kernel_parameters()
         camera[1:5] /= step
         camera[6:] = mask.shape[1], mask.shape[0]
         free = ~border.covered(step, mask.shape)
-        sets = np.empty((2, mask.shape[0], mask.shape[1] + 1), dtype=np.int32)
-        for index, region in enumerate((mask & free, ~mask & free)):
-            sets[index] = prefix_sums(region)
-        regions.append(_Regions(np.asarray(view.camera.X_CW), camera, sets))
+        sets = np.array([prefix_sums(mask & free), prefix_sums(~mask & free)], dtype=np.int32)
+        regions.append((np.asarray(view.camera.X_CW), camera, sets))
     return regions
-
-
-@lru_cache(maxsize=256)
-def _coarsen(outline: Outline) -> Outline:
-    """The surface with fewer triangles (Garland and Heckbert's quadric error metric)."""
-    if len(outline.triangles) <= _TRIANGLES:
-        return outline
-    points, triangles = fast_simplification.simplify(
-        np.array(outline.vertices), np.array(outline.triangles), target_count=_TRIANGLES
-    )
-    return outline_from_mesh(TriangleMesh(np.asarray(points, dtype=np.float64), triangles))

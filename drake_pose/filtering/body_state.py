@@ -55,6 +55,7 @@ class BodyState:
         moves: whether the root may be elsewhere than where the tree holds it.
         grows: whether the scale of the one parallel camera is unknown.
         constant: names of values that never change, such as shape joints.
+        rest: with so much weight each measurement also says that joints are held as usual.
 
     Attributes:
         layout: the state: the tree's values that are free to move, then ROOT_SHIFT and GROWTH,
@@ -76,6 +77,7 @@ class BodyState:
         moves: bool = False,
         grows: bool = False,
         constant: Sequence[str] = (),
+        rest: float = 0.0,
     ) -> None:
         if not cameras:
             raise SettingsError("a contour needs one camera or more")
@@ -100,12 +102,14 @@ class BodyState:
             raise SettingsError(f"{tree.model.path}: all values of its tree are held")
         self._moves = moves
         known = [*self._kinematics.names, *_ROOT]
-        seen = [*self.layout.moving, *self.layout.constant]
-        self._state_index = self.layout.indices(seen)
-        self._parameter_index = np.array([known.index(name) for name in seen], dtype=np.intp)
+        self._seen_names = [*self.layout.moving, *self.layout.constant]
+        self._state_index = self.layout.indices(self._seen_names)
+        self._parameter_index = np.array([known.index(name) for name in self._seen_names], np.intp)
         self._values = self._kinematics.flatten(tree.default_values())
         self._known_shift = np.zeros(3)
         self.usual = self._find_usual()
+        phi, information = self.usual.phi, rest / self.usual.deviation**2
+        self._rest = phi.T @ (information[:, None] * phi), phi.T @ (information * self.usual.mean)
 
     def _find_usual(self) -> UsualPose:
         kinematics = self._kinematics
@@ -114,7 +118,7 @@ class BodyState:
         if self.tree.placements[0].rotation is not None:
             # How the root is turned is no joint's.
             limited &= kinematics.value_nodes > 0
-        names, index = [*self.layout.moving, *self.layout.constant], self._parameter_index
+        names, index = self._seen_names, self._parameter_index
         file = couplings_file(self.tree.model.path)
         told = UsualPose(np.zeros((0, len(names))), np.zeros(0), np.zeros(0))
         if file.is_file():
@@ -142,15 +146,13 @@ class BodyState:
         Raises:
             ModelError: the couplings file cannot be read.
         """
-        lower = np.r_[self._kinematics.lower, np.full(len(_ROOT), -np.inf)]
-        upper = np.r_[self._kinematics.upper, np.full(len(_ROOT), np.inf)]
-        turns = np.r_[self._kinematics.is_angle, np.zeros(len(_ROOT), dtype=bool)]
-        free = turns & (upper - lower >= 2 * np.pi - 1e-9)
-        lower[free], upper[free] = -np.inf, np.inf
-        index = self._parameter_index
-        names = [*self.layout.moving, *self.layout.constant]
-        model = self.tree.model
-        parts = [from_bounds(names, lower[index], upper[index])]
+        kinematics, names, model = self._kinematics, self._seen_names, self.tree.model
+        free = kinematics.is_angle & (kinematics.upper - kinematics.lower >= 2 * np.pi - 1e-9)
+        lower, upper = (
+            np.r_[np.where(free, end, limits), np.full(len(_ROOT), end)][self._parameter_index]
+            for end, limits in ((-np.inf, kinematics.lower), (np.inf, kinematics.upper))
+        )
+        parts = [from_bounds(names, lower, upper)]
         file = couplings_file(model.path)
         if file.is_file():
             parts.append(load_couplings(file, model.position_names).only_of(names))
@@ -211,19 +213,16 @@ class BodyState:
     def state(self, q: Array, X_WB: Array | None = None, scale: float = 1.0) -> Array:
         """(n,) a state at rest of positions (nq,), the plant's world at X_WB (4, 4) and a scale."""
         values = self._kinematics.flatten(self.tree.values_from_positions(q, X_WB))
-        root = np.append(np.zeros(3), math.log(scale))
+        root = np.append(self._known_shift, math.log(scale))
         if self._moves:
             model = self.tree.model
-            p_BR = PlantKinematics(model).pose_at(model.link_index(self.tree.nodes[0].name), q)[
-                :, 3
-            ]
-            p_WR = p_BR[:3] if X_WB is None else (X_WB @ p_BR)[:3]
+            link = model.link_index(self.tree.nodes[0].name)
+            X_BR = PlantKinematics(model).pose_at(link, q)
+            p_WR = (X_BR if X_WB is None else X_WB @ X_BR)[:3, 3]
             if scale != 1.0:
                 p_WR = slide_root(self._parallel(), p_WR, scale)
-            root[:3] = p_WR - self._root(values) - self._known_shift
-        x = np.zeros(len(self.layout))
-        x[self._state_index] = np.r_[values, root][self._parameter_index]
-        return x
+            root[:3] = p_WR - self._root(values)
+        return self.state_of(np.r_[values, root])
 
     def turned(self, x: Array, rotation: Array) -> Array:
         """(n,) the state whose root is turned about its origin by (3, 3) in the world.
@@ -234,15 +233,12 @@ class BodyState:
         placed = self.tree.placements[0]
         if placed.rotation is None or not self.tree.turns_root_freely:
             raise SettingsError("only a pose tree whose root turns freely can be turned")
-        values = self._split(x)[0]
-        R_WR = rotation @ self._kinematics.poses(values)[0, :3, :3]
-        other = x.copy()
-        changed = values.copy()
-        changed[:3] = placed.rotation.values_from(placed.X_PA[:3, :3].T @ R_WR)
-        count = len(values)
-        inside = self._parameter_index < count
-        other[self._state_index[inside]] = changed[self._parameter_index[inside]]
-        return other
+        parameters = self.parameters(x)
+        R_WR = rotation @ self._kinematics.poses(self._split(x)[0])[0, :3, :3]
+        parameters[:3] = placed.rotation.values_from(placed.X_PA[:3, :3].T @ R_WR)
+        turned = x.copy()
+        turned[self._state_index] = self.state_of(parameters)[self._state_index]
+        return turned
 
     def prior_distance(self, x: Array) -> float:
         """The squared Mahalanobis distance of a state (n,) to how joints are usually held."""

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,45 +35,22 @@ _CLOSE, _TELLING = 0.7, 20.0
 _NOISIEST = 2.0
 
 
-@dataclass(frozen=True)
-class ColourSettings:
-    """How pictures are compared with a body.
+# From offset to offset of lines, in one round after the other [pixel]; the last is that of all
+# further rounds.
+_STEPS = (4, 2, 1)
+COLOUR_SPACING, COLOUR_CORRELATION = 2.0, 5.0
+"""Of lines along the contour, so many pixels where the step is one; and how much of a contour errs
+together [pixel]: its lines count as one."""
+# Colours are counted so far inside of the contour, and outside of it [pixel].
+_WIDTHS = (16.0, 30.0)
+# The share of a frame's colours in what is known after it. Lines on which the edge seems to be
+# further from the contour [pixel] teach nothing: something else is there.
+_RATE, _AGREEING = 0.1, 2.5
 
-    Args:
-        steps: from offset to offset of lines, in one round after the other [pixel]; the last is
-            that of all further rounds.
-        spacing: of lines along the contour, so many pixels where the step is one.
-        correlation: how much of a contour [pixel] errs together: its lines count as one.
-        inside: colours are counted so far inside of the contour [pixel].
-        outside: and so far outside of it [pixel].
-        rate: the share of a frame's colours in what is known after it, 0 to 1.
-        agreeing: lines on which the edge seems to be further from the contour than this teach
-            nothing [pixel]: something else is there.
 
-    Raises:
-        SettingsError: a number that is not positive, or a rate above 1.
-    """
-
-    steps: tuple[int, ...] = (4, 2, 1)
-    spacing: float = 2.0
-    correlation: float = 5.0
-    inside: float = 16.0
-    outside: float = 30.0
-    rate: float = 0.1
-    agreeing: float = 2.5
-
-    def __post_init__(self) -> None:
-        if not self.steps or min(self.steps) < 1:
-            raise SettingsError(f"steps must be whole pixels, not {self.steps}")
-        for name in ("spacing", "correlation", "inside", "outside", "rate", "agreeing"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise SettingsError(f"{name} must be positive, not {getattr(self, name)}")
-        if self.rate > 1.0:
-            raise SettingsError(f"the rate of colours must be at most 1, not {self.rate}")
-
-    def step(self, number: int) -> int:
-        """From offset to offset of lines in a round, counted from 0 [pixel]."""
-        return self.steps[min(number, len(self.steps) - 1)]
+def step_of_lines(number: int) -> int:
+    """From offset to offset of lines in a round, counted from 0 [pixel]."""
+    return _STEPS[min(number, len(_STEPS) - 1)]
 
 
 def no_colours(cameras: int, nodes: int) -> Histograms:
@@ -174,7 +150,6 @@ def learned(
     cameras: Sequence[Camera],
     pictures: Sequence[Picture | None],
     histograms: Histograms,
-    settings: ColourSettings,
     surely: bool = False,
 ) -> Histograms:
     """What is known of the colours after a frame.
@@ -184,17 +159,15 @@ def learned(
         cameras: the cameras.
         pictures: of each; None: it teaches nothing.
         histograms: what was known before.
-        settings: how colours are counted.
         surely: whether the pose is known, so that all lines teach and old colours are forgotten.
     """
     known = histograms.copy()
     packed = pack_cameras(cameras)
-    widths = np.array([settings.inside, settings.outside])
-    rate, agreeing = (1.0, math.inf) if surely else (settings.rate, settings.agreeing)
+    rate, agreeing = (1.0, math.inf) if surely else (_RATE, _AGREEING)
     for c, picture in enumerate(pictures):
         if picture is not None:
             learn_colours(
                 placed.packed, placed.X_WN, (packed[0][c], packed[1][c]), picture, known[c],
-                settings.spacing, widths, rate, agreeing, 0, NO_REGION,
+                COLOUR_SPACING, np.array(_WIDTHS), rate, agreeing, 0, NO_REGION,
             )  # fmt: skip
     return known

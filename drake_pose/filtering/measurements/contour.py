@@ -8,14 +8,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.body.tree.pose_tree import PoseTree
-from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.body_state import BodyState, Mask
 from drake_pose.filtering.kalman.update import LinearObservation
 from drake_pose.fit.camera_sums import Views
 from drake_pose.fit.colours import (
-    ColourSettings,
+    COLOUR_CORRELATION,
+    COLOUR_SPACING,
     Histograms,
     Picture,
     add_pictures,
@@ -23,6 +22,7 @@ from drake_pose.fit.colours import (
     learned,
     no_colours,
     part_distances,
+    step_of_lines,
     weigh_parts,
 )
 from drake_pose.fit.contour_fit import (
@@ -38,38 +38,16 @@ from drake_pose.fit.levenberg_marquardt import AnnealingStage
 
 Array = NDArray[np.float64]
 
+# How a contour is measured [pixel]: the spacing of its points; how far a mask's edge is from the
+# body's own contour at least; how much of it errs together: its points count as one; how far from
+# the model's contour the mask's edge is looked for.
+SPACING, DEVIATION, CORRELATION, FARTHEST = 3.0, 0.7, 12.0, 40.0
 # Geman and McClure's weight has half its influence at about this many deviations.
 _ROBUST_WIDTH = 2.5
 # A pixel of contour has weight one.
 _PLAIN = Noise(deviation=1.0, correlation=0.5)
 # Directions about which so small a share of the most is told are not told about.
 _NOTHING = 1e-12
-
-
-@dataclass(frozen=True)
-class ContourSettings:
-    """How a contour is measured.
-
-    Args:
-        spacing: of the contour's points [pixel].
-        deviation: how far a mask's edge is from the body's own contour at least [pixel]; where
-            the mask and the model agree less than that, their disagreement is taken.
-        correlation: how much of a contour [pixel] errs together: its points count as one.
-        reach: how far from the model's contour the mask's edge is looked for [pixel].
-
-    Raises:
-        SettingsError: a number that is not positive.
-    """
-
-    spacing: float = 3.0
-    deviation: float = 0.7
-    correlation: float = 12.0
-    reach: float = 40.0
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not 0 < value < math.inf:
-                raise SettingsError(f"{name} must be positive, not {value}")
 
 
 class Seen(NamedTuple):
@@ -110,34 +88,7 @@ class ContourMeasurement(LinearObservation):
 
 
 class ContourObservation(BodyState):
-    """Turns masks into measurements of a pose tree's values.
-
-    Args:
-        tree, cameras, moves, grows, constant: as of ``BodyState``.
-        settings: how the contour is measured.
-        rest: each measurement also says, with so much weight, that joints are held as usual; 0:
-            nothing is said.
-
-    Raises:
-        SettingsError, UnknownNameError: as of ``BodyState``.
-    """
-
-    def __init__(
-        self,
-        tree: PoseTree,
-        cameras: Sequence[Camera],
-        moves: bool = False,
-        grows: bool = False,
-        constant: Sequence[str] = (),
-        settings: ContourSettings | None = None,
-        rest: float = 0.0,
-        colours: ColourSettings | None = None,
-    ) -> None:
-        super().__init__(tree, cameras, moves, grows, constant)
-        self.settings = settings or ContourSettings()
-        self.colours = colours or ColourSettings()
-        phi, information = self.usual.phi, rest / self.usual.deviation**2
-        self._rest = phi.T @ (information[:, None] * phi), phi.T @ (information * self.usual.mean)
+    """Turns masks and pictures into measurements of a pose tree's values."""
 
     def look(
         self,
@@ -156,31 +107,25 @@ class ContourObservation(BodyState):
         Raises:
             SettingsError: masks or pictures that do not fit the cameras.
         """
-        if len(masks) != len(self.cameras):
-            raise SettingsError(f"{len(self.cameras)} masks expected, got {len(masks)}")
-        if pictures is not None and len(pictures) != len(self.cameras):
-            raise SettingsError(f"{len(self.cameras)} pictures expected, got {len(pictures)}")
-        edges = []
-        for camera, mask in zip(self.cameras, masks, strict=True):
+        pictures = [None] * len(masks) if pictures is None else pictures
+        for what, given in (("masks", masks), ("pictures", pictures)):
+            if len(given) != len(self.cameras):
+                raise SettingsError(f"{len(self.cameras)} {what} expected, got {len(given)}")
+        edges, compared = [], []
+        for camera, mask, picture in zip(self.cameras, masks, pictures, strict=True):
             if mask is not None and mask.shape != (camera.height, camera.width):
                 raise SettingsError(
                     f"camera '{camera.name}': mask of {mask.shape[1]} x {mask.shape[0]} pixels, "
                     f"{camera.width} x {camera.height} expected"
                 )
-            edges.append(
-                NO_EDGE if mask is None else find_edge_points(mask, 0.5 * self.settings.spacing)
-            )
-        compared = [
-            None if picture is None or mask is not None else check_picture(camera, picture)
-            for camera, mask, picture in zip(
-                self.cameras, masks, pictures or [None] * len(masks), strict=True
-            )
-        ]
+            edges.append(NO_EDGE if mask is None else find_edge_points(mask, 0.5 * SPACING))
+            is_compared = picture is not None and mask is None
+            compared.append(check_picture(camera, picture) if is_compared else None)
         return Seen(pack_views(self.cameras, edges), tuple(compared), colours)
 
     def is_finest(self, number: int) -> bool:
         """Whether no later measurement of a frame looks at pictures more closely than this one."""
-        return self.colours.step(number) == self.colours.steps[-1]
+        return step_of_lines(number) == step_of_lines(number + 9)
 
     def no_colours(self) -> Histograms:
         """What is known of a body's colours that was never seen."""
@@ -210,7 +155,7 @@ class ContourObservation(BodyState):
             for camera, picture in zip(self.cameras, pictures, strict=True)
         ]
         placed = self._body.place(self.parameters(x))
-        known = learned(placed, self.cameras, checked, colours, self.colours, surely)
+        known = learned(placed, self.cameras, checked, colours, surely)
         if without is not None:
             known[:, without] = colours[:, without]
         return known
@@ -235,9 +180,9 @@ class ContourObservation(BodyState):
         Returns:
             The measurement; None where no edge is near the contour in any mask or picture.
         """
-        width = self.settings.reach / REACH
+        width = FARTHEST / REACH
         if distance is not None:
-            width = min(width, _ROBUST_WIDTH * max(self.settings.deviation, distance))
+            width = min(width, _ROBUST_WIDTH * max(DEVIATION, distance))
         found = self._compare(seen, x, width, number)
         if found is None:
             return None
@@ -251,16 +196,16 @@ class ContourObservation(BodyState):
         self, seen: Seen, x: Array, width: float, number: int
     ) -> tuple[Comparison, float] | None:
         """Contours compared with so wide a scale [pixel], and how far they are apart [pixel]."""
-        step = AnnealingStage(width, self.settings.spacing)
+        step = AnnealingStage(width, SPACING)
         compared = compare_views(self._body, seen.views, self.parameters(x), step, _PLAIN, 1.0)
         if seen.colours is not None and seen.has_pictures:
-            pixels = self.colours.step(number)
+            pixels = step_of_lines(number)
             # Coarse lines are so wide that they would say the same.
-            lines = AnnealingStage(width, self.colours.spacing * min(pixels, 2))
-            correlation = _PLAIN.correlation * self.colours.correlation / self.settings.correlation
+            lines = AnnealingStage(width, COLOUR_SPACING * min(pixels, 2))
+            correlation = _PLAIN.correlation * COLOUR_CORRELATION / CORRELATION
             noise = replace(_PLAIN, correlation=correlation)
             add_pictures(compared, self.cameras, seen.pictures, seen.colours, lines, noise, pixels)
-            weigh_parts(compared, self.settings.deviation, seen.pictures)
+            weigh_parts(compared, DEVIATION, seen.pictures)
         squares, weight = compared.sums[:, :, [SQUARES, WEIGHT]].sum(axis=(0, 1))
         return None if weight <= 0.0 else (compared, math.sqrt(squares / weight))
 
@@ -268,12 +213,11 @@ class ContourObservation(BodyState):
         self, x: Array, compared: Comparison, distance: float, parts: Array
     ) -> ContourMeasurement:
         """What the contours say as no more numbers than the state has elements, with noise 1."""
-        settings = self.settings
         H, g = normal_equations(compared.total, compared.placement, len(self._body.names))
         index = self._parameter_index
-        scale = max(settings.deviation, distance)
+        scale = max(DEVIATION, distance)
         # Both contours say the same: together they count as one.
-        worth = 0.5 / (scale**2 * settings.correlation)
+        worth = 0.5 / (scale**2 * CORRELATION)
         rest_curvature, rest_slope = self._rest
         slopes = worth * g[index] + rest_curvature @ x[self._state_index] - rest_slope
         curvature = worth * H[np.ix_(index, index)] + rest_curvature

@@ -109,8 +109,7 @@ class ContourTracker:
         self.observation, self.settings = observation, settings or TrackingSettings()
         layout = observation.layout
         scale = {name: period**2 * self.acceleration(name) for name in layout.moving}
-        size = len(layout)
-        none = np.zeros(0)
+        size, none = len(layout), np.zeros(0)
         # Frames bring their own measurements.
         nothing = LinearObservation((), none, none > 0, np.zeros(size), none, np.zeros((0, size)))
         self.filter = TruncatedFilter(
@@ -126,17 +125,16 @@ class ContourTracker:
 
     def acceleration(self, name: str) -> float:
         """Of what moves [rad/s^2, m/s^2 or 1/s^2]."""
-        if name == GROWTH:
-            return self.settings.growth_acceleration
-        angle = self.observation.is_angle(name)
-        return self.settings.angle_acceleration if angle else self.settings.length_acceleration
+        s = self.settings
+        return self._of_kind(
+            name, s.growth_acceleration, s.angle_acceleration, s.length_acceleration
+        )
 
-    def _start_deviation(self, name: str) -> float:
-        """Of what moves at the start [rad, m or 1]."""
+    def _of_kind(self, name: str, growth: float, angle: float, length: float) -> float:
+        """One of three numbers: that of what a moving element is."""
         if name == GROWTH:
-            return _START_GROWTH
-        angle = self.observation.is_angle(name)
-        return _START_ANGLE if angle else _START_LENGTH
+            return growth
+        return angle if self.observation.is_angle(name) else length
 
     def start(self, x: Array) -> Track:
         """Begin at a state (n,), for example the matcher's, as sure of it as the settings say."""
@@ -144,19 +142,16 @@ class ContourTracker:
 
     def start_belief(self, x: Array) -> Belief:
         """What is believed of a state (n,) before inequalities and pictures: what settings say."""
-        layout, settings = self.observation.layout, self.settings
-        deviations = np.zeros(len(layout))
-        for name in layout.names:
-            index = layout.index(name)
-            if name in layout.constant:
-                deviations[index] = _CONSTANT_LENGTH
-            elif name in layout.moving:
-                deviations[index] = self._start_deviation(name)
-            else:
-                acceleration = self.acceleration(name.removeprefix("rate_"))
-                # What a limb picks up while its rate is remembered.
-                deviations[index] = acceleration * settings.memory * self._period
-        return Belief(x, np.diag(deviations**2))
+        layout = self.observation.layout
+        starts = (_START_GROWTH, _START_ANGLE, _START_LENGTH)
+        # What a limb picks up while its rate is remembered.
+        picked_up = self.settings.memory * self._period
+        deviations = [
+            *(self._of_kind(name, *starts) for name in layout.moving),
+            *(picked_up * self.acceleration(name) for name in layout.moving),
+            *(_CONSTANT_LENGTH for _ in layout.constant),
+        ]
+        return Belief(x, np.diag(np.square(deviations)))
 
     def follow(
         self,
@@ -210,17 +205,16 @@ class ContourTracker:
         for k in range(self.settings.rounds):
             if measurement is None:
                 break
-            before, last = state.best.mean, measurement
+            before = state.best.mean
             state = self.filter.update(prediction, measurement.y, measurement)
             still = k > 0 and np.abs((state.best.mean - before)[:moving]).max() < _STANDSTILL
             # The contour is compared where the state is, or as good as that: lines in pictures are
             # compared no more often than there are rounds.
             if seen.has_pictures:
-                if k + 1 == self.settings.rounds or (still and observation.is_finest(k)):
-                    return state, last
-            elif still:
-                return state, last
-            measurement = observation.measure(seen, state.best.mean, last.distance, k + 1)
+                still = k + 1 == self.settings.rounds or (still and observation.is_finest(k))
+            if still:
+                break
+            measurement = observation.measure(seen, state.best.mean, measurement.distance, k + 1)
         return state, measurement
 
     def _astray(self, measurement: ContourMeasurement) -> Mask:

@@ -18,8 +18,14 @@ from drake_pose.camera.models import ParallelCamera
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.tracking.contour_tracker import ContourTracker, TrackingSettings
 from drake_pose.filtering.tracking.match_and_track import make_tracker
-from drake_pose.filtering.tracking.sequence_fit import FittedSequence, fit_sequence, pose_set
-from drake_pose.filtering.tracking.start_poses import FollowedStart, StartSettings, find_start
+from drake_pose.filtering.tracking.sequence_fit import (
+    FittedSequence,
+    FollowedStart,
+    StartSettings,
+    find_start,
+    fit_sequence,
+    pose_set,
+)
 from drake_pose.jobs.estimate.inputs import Inputs
 from drake_pose.jobs.estimate.matching import sequence_tracking
 from drake_pose.jobs.estimate.searches import leave_out_links, make_placement_search

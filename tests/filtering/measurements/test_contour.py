@@ -6,10 +6,8 @@ from drake_pose.body.model import load_model
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.filtering.body_state import ROOT_SHIFT
-from drake_pose.filtering.measurements.contour import (
-    ContourObservation,
-    ContourSettings,
-)
+from drake_pose.filtering.measurements import contour
+from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.search.bodies import forked_body, front_camera
 
@@ -112,13 +110,13 @@ def test_a_root_that_is_known_elsewhere_and_one_that_is_estimated_there(tmp_path
     np.testing.assert_allclose(found[moves.layout.indices(ROOT_SHIFT)][1:], there[1:], atol=0.004)
 
 
-def test_slopes_agree_with_finite_differences_of_the_contour(tmp_path):
+def test_slopes_agree_with_finite_differences_of_the_contour(tmp_path, monkeypatch):
     """The measured distances change with the state as H says, where nothing is robust."""
     model = forked_body(tmp_path)
     camera = front_camera(400, shift=0.2)
-    observation = ContourObservation(
-        model.pose_tree(), [camera], settings=ContourSettings(spacing=1.0, deviation=30.0)
-    )
+    monkeypatch.setattr(contour, "SPACING", 1.0)
+    monkeypatch.setattr(contour, "DEVIATION", 30.0)
+    observation = ContourObservation(model.pose_tree(), [camera])
     truth = observation.state(np.array([0.2, 0.9, -0.6]))
     mask = observation.draw(truth, camera)
     for element in range(3):
@@ -145,5 +143,3 @@ def test_nothing_seen_and_bad_arguments(tmp_path):
         ContourObservation(model.pose_tree(), [])
     with pytest.raises(UnknownNameError, match="tail"):
         ContourObservation(model.pose_tree(), [camera], constant=("tail",))
-    with pytest.raises(SettingsError, match="spacing"):
-        ContourSettings(spacing=0.0)

@@ -6,8 +6,9 @@ import pytest
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.tracking.contour_tracker import LOST_COLOUR_DISTANCE, ContourTracker
+from drake_pose.fit import colours
 from drake_pose.fit.colour_lines import BESIDE, COLOURS, ON
-from drake_pose.fit.colours import ColourSettings, part_distances, weigh_parts
+from drake_pose.fit.colours import part_distances, weigh_parts
 from drake_pose.fit.contour_fit import Comparison
 from drake_pose.fit.kernel import COMPARED, SQUARES, WEIGHT
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
@@ -100,9 +101,9 @@ def test_learned_colours_are_those_on_both_sides(observation, renderer):
         np.testing.assert_allclose(seen[:, side].sum(axis=-1), 1.0, rtol=1e-4)
 
 
-def test_old_colours_fade_at_the_rate(body, camera, renderer):
-    settings = ColourSettings(rate=0.25, agreeing=100.0)
-    observation = ContourObservation(body.pose_tree(), [camera], colours=settings)
+def test_old_colours_fade_at_the_rate(observation, renderer, monkeypatch):
+    monkeypatch.setattr(colours, "_RATE", 0.25)
+    monkeypatch.setattr(colours, "_AGREEING", 100.0)
     truth = np.array([0.1, 1.2, -1.0])
     mask, x = renderer.mask(truth), observation.state(truth)
     known = observation.no_colours()
@@ -227,9 +228,3 @@ def test_a_part_whose_lines_scatter_counts_less():
 def test_pictures_that_do_not_fit_are_named(observation, picture, said):
     with pytest.raises(SettingsError, match=f"front.*{said}"):
         observation.look([None], [picture], observation.no_colours())
-
-
-@pytest.mark.parametrize("bad", [{"steps": ()}, {"rate": 1.5}, {"spacing": 0.0}])
-def test_bad_settings_are_named(bad):
-    with pytest.raises(SettingsError, match=next(iter(bad))):
-        ColourSettings(**bad)

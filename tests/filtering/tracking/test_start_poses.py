@@ -7,7 +7,7 @@ from drake_pose.body.tree.root import RootRotation
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.tracking.contour_tracker import ContourTracker
-from drake_pose.filtering.tracking.start_poses import (
+from drake_pose.filtering.tracking.sequence_fit import (
     StartSettings,
     find_start,
     tilted,

@@ -82,6 +82,8 @@ def find_figures(mask: Mask) -> tuple[Figure, ...]:
 
 def cut_figures(mask: Mask, unwanted: Sequence[Figure]) -> Mask:
     """A mask (H, W) without some of its figures."""
+    if not unwanted:
+        return mask
     step = _step(mask)
     count, labels, _, middles = cv2.connectedComponentsWithStats(_small(mask, step))
     middles = step * middles

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +24,6 @@ from drake_pose.person.views import FrameViews, edge_spacing, see_silhouette
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Figures = Sequence[Sequence[Figure]]
-"""Of each camera's mask."""
 ReadFrame = Callable[[int], Mapping[str, Mask]]
 """Gives the masks (H, W) of a frame, counted from 0, by camera; one may be missing."""
 
@@ -34,6 +33,8 @@ _STEP, _STEP_MORE = 0.4, 0.1
 _FAR, _LARGE = 0.7, 0.25
 # In this many frames, or somewhat more, the person is measured.
 _MEASURED = 20
+# A mask whose figures are all the person's.
+_ALONE: tuple[tuple[Figure, ...], bool] = ((), False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +54,46 @@ class ViewFaults:
     merged: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
 
+class Look(NamedTuple):
+    """What cameras see in a frame: by name those with a mask, its figures, and the persons."""
+
+    cameras: Mapping[str, Camera]
+    figures: Mapping[str, tuple[Figure, ...]]
+    persons: tuple[Person, ...]
+
+    def sort(self, person: Person | None) -> dict[str, tuple[tuple[Figure, ...], bool]]:
+        """By camera the figures of others, and whether the person and another are one figure.
+
+        The person is None where he is away.
+        """
+        others = [one for one in self.persons if one is not person]
+        found = {}
+        for k, (name, own) in enumerate(self.figures.items()):
+            if person is None:
+                found[name] = own, False
+                continue
+            camera, merged = self.cameras[name], False
+            taken = {one.figures[k] for one in others if k in one.figures}
+            away: list[Figure] = []
+            for i, figure in enumerate(own):
+                if person.figures.get(k) == i:
+                    hidden = [one for one in others if k not in one.figures]
+                    merged |= any(_covers(camera, figure, one) for one in hidden)
+                elif i in taken and k not in person.figures and _covers(camera, figure, person):
+                    merged = True
+                elif i in taken or _is_strangers(camera, figure, person, others, k, own):
+                    away.append(figure)
+            found[name] = tuple(away), merged
+        return found
+
+
+def look_for_persons(cameras: Mapping[str, Camera], masks: Mapping[str, Mask]) -> Look:
+    """Who is seen in a frame's masks (H, W)."""
+    figures = {name: find_figures(mask) for name, mask in masks.items()}
+    used = {name: cameras[name] for name in masks}
+    return Look(used, figures, find_persons(list(used.values()), list(figures.values())))
+
+
 class PersonRecording:
     """The masks of one person, without those of cameras that see nobody or are left out.
 
@@ -70,28 +111,19 @@ class PersonRecording:
     ) -> None:
         self._read, self._count = read, count
         self._left_out: dict[str, int] = {}
-        figures: list[dict[str, tuple[Figure, ...]]] = []
-        persons: list[tuple[Person, ...]] = []
-        for frame in range(count):
-            figures.append({name: find_figures(mask) for name, mask in read(frame).items()})
-            used = [cameras[name] for name in figures[-1]]
-            persons.append(find_persons(used, list(figures[-1].values())))
-        followed = follow_one(persons, middle_of_view(list(cameras.values())), is_sequence)
+        looks = [look_for_persons(cameras, read(frame)) for frame in range(count)]
+        middle = middle_of_view(list(cameras.values()))
+        followed = follow_one([one.persons for one in looks], middle, is_sequence)
         # By frame and camera: the figures of others, and whether the person is one with them.
-        self._others: list[dict[str, tuple[tuple[Figure, ...], bool]]] = []
-        self._seeing: list[set[str]] = []
-        for own, person, present in zip(figures, followed, persons, strict=True):
-            sorted_: list[tuple[tuple[Figure, ...], bool]] = [((), False)] * len(own)
-            if present:
-                others = [one for one in present if one is not person]
-                used = [cameras[name] for name in own]
-                sorted_ = sort_figures(used, list(own.values()), person, others)
-            self._others.append(dict(zip(own, sorted_, strict=True)))
-            self._seeing.append(
-                {k for k, all_ in own.items() if len(all_) > len(self._others[-1][k][0])}
-            )
-        self.height = _height(cameras, figures)
-        self.covering = _covering(cameras, figures)
+        self._others = [
+            one.sort(person) if one.persons else dict.fromkeys(one.figures, _ALONE)
+            for one, person in zip(looks, followed, strict=True)
+        ]
+        self._seeing = [
+            {name for name, own in one.figures.items() if len(own) > len(others[name][0])}
+            for one, others in zip(looks, self._others, strict=True)
+        ]
+        self.height, self.covering = _measure(looks)
 
     @property
     def seen(self) -> list[int]:
@@ -112,58 +144,48 @@ class PersonRecording:
         """The masks of a frame by camera, those of cameras that were left out if wanted."""
         wanted = self._seeing[frame] if with_all else self.cameras_at(frame)
         return {
-            name: cut_figures(mask, others) if (others := self._others[frame][name][0]) else mask
+            name: cut_figures(mask, self._others[frame][name][0])
             for name, mask in self._read(frame).items()
             if name in wanted
         }
 
     def faults(self) -> ViewFaults:
         """What was in view or was not."""
-        seen = self.seen
-        blind: dict[str, list[int]] = {}
-        others: dict[str, list[int]] = {}
-        merged: dict[str, list[int]] = {}
-        for frame in range(self._count):
-            for name, (strangers, is_merged) in self._others[frame].items():
-                if name not in self._seeing[frame] and frame in seen:
-                    blind.setdefault(name, []).append(frame)
-                if strangers or is_merged:
-                    others.setdefault(name, []).append(frame)
-                if is_merged:
-                    merged.setdefault(name, []).append(frame)
-        nobody = set(range(self._count)) - set(seen)
-        found = [{k: tuple(v) for k, v in one.items()} for one in (blind, others, merged)]
-        return ViewFaults(tuple(sorted(nobody)), *found)
+        seen = set(self.seen)
+        found: list[dict[str, list[int]]] = [{}, {}, {}]
+        for frame, own in enumerate(self._others):
+            for name, (strangers, is_merged) in own.items():
+                is_blind = name not in self._seeing[frame] and frame in seen
+                for told, kind in zip(
+                    (is_blind, bool(strangers) or is_merged, is_merged), found, strict=True
+                ):
+                    if told:
+                        kind.setdefault(name, []).append(frame)
+        nobody = sorted(set(range(self._count)) - seen)
+        return ViewFaults(tuple(nobody), *({k: tuple(v) for k, v in one.items()} for one in found))
 
 
-def _height(
-    cameras: Mapping[str, Camera], frames: Sequence[Mapping[str, tuple[Figure, ...]]]
-) -> float:
-    """How high the largest figures are where their rays come nearest to each other [m]."""
-    heights = []
-    for figures in frames[:: max(1, len(frames) // _MEASURED)]:
-        seen = {cameras[name]: own[0] for name, own in figures.items() if own}
-        if len(seen) < 2:
-            continue
-        place = triangulate(list(seen), [figure.middle for figure in seen.values()])
+def _measure(looks: Sequence[Look]) -> tuple[float, float]:
+    """How high the largest figures are by the calibration [m]; what share of all fill the picture.
+
+    Those fill it that reach all four sides, as backgrounds do.
+    """
+    heights: list[float] = []
+    covering = []
+    for k, look in enumerate(looks):
+        seen = {look.cameras[name]: own[0] for name, own in look.figures.items() if own}
         for camera, figure in seen.items():
-            _, top, _, bottom = figure.box
-            heights.append(float(bottom - top) / pixels_per_metre(camera, place))
-    return float(np.median(heights)) if heights else float("nan")
-
-
-def _covering(
-    cameras: Mapping[str, Camera], frames: Sequence[Mapping[str, tuple[Figure, ...]]]
-) -> float:
-    """In what share of the masks the largest figure reaches all four sides, as backgrounds do."""
-    found = []
-    for figures in frames:
-        for name, own in figures.items():
-            if own:
-                width, height = own[0].box[2:] - own[0].box[:2]
-                camera = cameras[name]
-                found.append(width > 0.98 * camera.width and height > 0.98 * camera.height)
-    return float(np.mean(found)) if found else 0.0
+            width, height = figure.box[2:] - figure.box[:2]
+            covering.append(width > 0.98 * camera.width and height > 0.98 * camera.height)
+        if k % max(1, len(looks) // _MEASURED) == 0 and len(seen) >= 2:
+            place = triangulate(list(seen), [figure.middle for figure in seen.values()])
+            for camera, figure in seen.items():
+                height = float(figure.box[3] - figure.box[1])
+                heights.append(height / pixels_per_metre(camera, place))
+    return (
+        float(np.median(heights)) if heights else float("nan"),
+        float(np.mean(covering)) if covering else 0.0,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,23 +211,22 @@ def keep_person(
 
     None: the one whose figures are the largest, of two alike nearer to where the cameras look.
     """
-    used = [cameras[name] for name in masks]
-    figures = [find_figures(mask) for mask in masks.values()]
-    persons = find_persons(used, figures)
+    look = look_for_persons(cameras, masks)
+    persons = look.persons
     if not persons:
         return KeptPerson(masks, None)
     if place is None:
-        person = max(persons, key=lambda one: _standing(one, middle_of_view(used)))
+        middle = middle_of_view([cameras[name] for name in masks])
+        person = max(persons, key=lambda one: _standing(one, middle))
     else:
         person = min(persons, key=lambda one: float(np.linalg.norm(one.place - place)))
-    others = [one for one in persons if one is not person]
-    found = dict(zip(masks, sort_figures(used, figures, person, others), strict=True))
-    kept = {
-        name: cut_figures(mask, found[name][0]) if found[name][0] else mask
-        for name, mask in masks.items()
-    }
-    cut = tuple(name for name, (unwanted, _) in found.items() if unwanted)
-    return KeptPerson(kept, person, cut, tuple(k for k, (_, merged) in found.items() if merged))
+    found = look.sort(person)
+    return KeptPerson(
+        {name: cut_figures(mask, found[name][0]) for name, mask in masks.items()},
+        person,
+        tuple(name for name, (unwanted, _) in found.items() if unwanted),
+        tuple(name for name, (_, is_merged) in found.items() if is_merged),
+    )
 
 
 def keep_views(frame: FrameViews, place: Array | None = None) -> tuple[FrameViews, KeptPerson]:
@@ -229,35 +250,6 @@ def middle_of_view(cameras: Sequence[Camera]) -> Array:
     """(3,) the point nearest to where all cameras look [m]."""
     middles = [np.array([0.5 * (c.width - 1), 0.5 * (c.height - 1)]) for c in cameras]
     return triangulate(cameras, middles)
-
-
-def sort_figures(
-    cameras: Sequence[Camera], figures: Figures, person: Person | None, others: Sequence[Person]
-) -> list[tuple[tuple[Figure, ...], bool]]:
-    """For each camera the figures of others, and whether the person and another are one figure.
-
-    The person is None where he is away.
-    """
-    if person is None:
-        return [(tuple(own), False) for own in figures]
-    found = []
-    for k, (camera, own) in enumerate(zip(cameras, figures, strict=True)):
-        taken = {one.figures[k] for one in others if k in one.figures}
-        merged = False
-        away: list[Figure] = []
-        for i, figure in enumerate(own):
-            if person.figures.get(k) == i:
-                hidden = [one for one in others if k not in one.figures]
-                merged |= any(_covers(camera, figure, one) for one in hidden)
-            elif i in taken:
-                if k not in person.figures and _covers(camera, figure, person):
-                    merged = True
-                else:
-                    away.append(figure)
-            elif _is_strangers(camera, figure, person, others, k, own):
-                away.append(figure)
-        found.append((tuple(away), merged))
-    return found
 
 
 def follow_one(

@@ -23,9 +23,8 @@ from drake_pose.errors import SettingsError
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.date.capture import CaptureSetup, PersonView, see_person
 from drake_pose.person.date.faces import FACE_HEIGHT, FACE_WIDTH, cut_face, face_direction
-from drake_pose.person.date.features import Features
+from drake_pose.person.date.features import Features, SkinColour
 from drake_pose.person.date.skeleton import LIMBS, Skeleton, load_skeleton
-from drake_pose.person.date.skin_blobs import SkinColour
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
 from drake_pose.silhouette.segmentation.background import Background, learn_background
 from drake_pose.systems.colour_images import colour_image_to_picture

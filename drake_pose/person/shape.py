@@ -21,8 +21,7 @@ from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import GIRTH_PREFIX, BodyParameters
 from drake_pose.fit.surfaces import with_girths
 from drake_pose.fit.unknowns import Unknowns, choose, join
-from drake_pose.person.pose_tracker import PersonPoseTracker
-from drake_pose.person.pose_uncertainty import pose_uncertainty
+from drake_pose.person.pose_tracker import PersonPoseTracker, pose_uncertainty
 from drake_pose.person.search import LENIENT
 from drake_pose.silhouette.areas.outline import Outline
 

@@ -48,9 +48,14 @@ from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.tracking.contour_tracker import ContourTracker
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.jobs.estimate.searches import make_tree
-from drake_pose.person.colour_views import ColourViews, KnownColours
 from drake_pose.person.pose_tracker import PersonPoseTracker
-from drake_pose.person.views import FrameViews, edge_spacing, see_silhouette
+from drake_pose.person.views import (
+    ColourViews,
+    FrameViews,
+    KnownColours,
+    edge_spacing,
+    see_silhouette,
+)
 from drake_pose.results.settings import EstimateSettings
 from tests.benchmarks.scenes import print_table
 

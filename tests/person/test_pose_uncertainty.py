@@ -10,7 +10,7 @@ from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.fit.contour_fit import ContourFit, pack_views
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
-from drake_pose.person.pose_uncertainty import pose_uncertainty
+from drake_pose.person.pose_tracker import pose_uncertainty
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask
 

@@ -12,15 +12,13 @@ from drake_pose.errors import SettingsError
 from drake_pose.filtering.kalman.hypotheses import (
     Hypothesis,
     Rejection,
-    merge_twins,
-    normalise,
-    prune,
-)
-from drake_pose.filtering.kalman.repeated_views import (
     View,
     anchored,
     begin_repeated_view,
+    merge_twins,
     next_view,
+    normalise,
+    prune,
 )
 from drake_pose.filtering.kalman.update import (
     Evidence,

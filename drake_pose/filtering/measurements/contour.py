@@ -119,8 +119,9 @@ class ContourObservation(BodyState):
                     f"{camera.width} x {camera.height} expected"
                 )
             edges.append(NO_EDGE if mask is None else find_edge_points(mask, 0.5 * SPACING))
-            is_compared = picture is not None and mask is None
-            compared.append(check_picture(camera, picture) if is_compared else None)
+            compared.append(
+                None if picture is None or mask is not None else check_picture(camera, picture)
+            )
         return Seen(pack_views(self.cameras, edges), tuple(compared), colours)
 
     def is_finest(self, number: int) -> bool:

@@ -18,10 +18,9 @@ from drake_pose.person.recordings.checked_capture import (
     MovedCamera,
     capture_checked,
 )
-from drake_pose.person.recordings.colour_capture import capture_by_colour
-from drake_pose.person.recordings.person_capture import PersonCapture
+from drake_pose.person.recordings.figures import RigFault
+from drake_pose.person.recordings.person_capture import PersonCapture, capture_by_colour
 from drake_pose.person.recordings.persons_in_view import ReadFrame, ViewFaults
-from drake_pose.person.recordings.rig_faults import RigFault
 from drake_pose.results.records import record_deviations
 from drake_pose.results.writer import Drawn, FinishedFrame, OnFrame, OnStage, ResultWriter
 from drake_pose.search.estimates import PoseEstimate
@@ -107,26 +106,30 @@ def _follow_masks(inputs: Inputs, reader: _Reader, track: bool) -> _Followed:
 def _follow_colours(inputs: Inputs, reader: _Reader, _track: bool) -> _Followed:
     """A sequence of pictures of which few have masks."""
     scene, frames = inputs.scene, inputs.frames
-    masked = tuple(k for k, frame in enumerate(frames) if len(scene.cameras_of(frame)) > 1)
+    masked = [k for k, frame in enumerate(frames) if len(scene.cameras_of(frame)) > 1]
     if frames[0] not in inputs.starts and 0 not in masked:
         raise SceneError(
             f"{scene.path}: a person is found by the masks of two cameras or more, but the first "
             f"frame, '{frames[0]}', has fewer: add them (drake-pose masks), or --start FILE.csv"
         )
-    found = capture_by_colour(
-        inputs.model.pose_tree(),
+    tree = inputs.model.pose_tree()
+    masked = [k for k in masked if len(reader(k)) > 1]
+    checked: CheckedCapture | None = None
+    faults: tuple[str, ...] = ()
+    if masked:
+        checked = capture_checked(tree, scene.cameras, lambda k: reader(masked[k]), len(masked))
+        faults = describe_faults(checked, [frames[k] for k in masked])
+    captured, distances = capture_by_colour(
+        tree,
         scene.cameras,
         len(frames),
-        masked,
-        reader,
         lambda index: read_pictures(scene, frames[index]),
         {frames.index(frame): q for frame, q in inputs.starts.items()},
+        {} if checked is None else {k: checked.read(place) for place, k in enumerate(masked)},
+        None if checked is None else checked.captured,
         reader.count_followed,
     )
-    faults: tuple[str, ...] = ()
-    if found.checked is not None:
-        faults = describe_faults(found.checked, [frames[k] for k in found.masked])
-    lost = [frame for frame, q in zip(frames, found.captured.q, strict=True) if np.isnan(q).any()]
+    lost = [frame for frame, q in zip(frames, captured.q, strict=True) if np.isnan(q).any()]
     if lost:
         text = (
             f"frame {frame_ranges(lost, frames)}: the person is lost, too little of the contour "
@@ -134,7 +137,7 @@ def _follow_colours(inputs: Inputs, reader: _Reader, _track: bool) -> _Followed:
             "FILE.csv, say where the person is"
         )
         faults += (text,)
-    return _Followed(found.captured, reader, faults, found.distances)
+    return _Followed(captured, reader, faults, distances)
 
 
 class _Reader:

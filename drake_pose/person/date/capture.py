@@ -12,11 +12,10 @@ from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.person.date.body_pose import Waist
 from drake_pose.person.date.faces import FaceTemplates
-from drake_pose.person.date.features import FeatureSettings
+from drake_pose.person.date.features import Blobs, FeatureSettings, SkinColour, skin_blobs
 from drake_pose.person.date.limb_search import Search
 from drake_pose.person.date.recognition import Contour, RegisteredPose, measure_contour
 from drake_pose.person.date.skeleton import Skeleton
-from drake_pose.person.date.skin_blobs import Blobs, SkinColour, skin_blobs
 from drake_pose.silhouette.segmentation.background import Background
 
 Picture = NDArray[np.uint8]

@@ -18,7 +18,7 @@ from drake_pose.camera.models import Camera
 from drake_pose.camera.picture_files import SUFFIXES, read_picture
 from drake_pose.csv_files import read_csv
 from drake_pose.errors import SceneError, SettingsError
-from drake_pose.person.date.skin_blobs import Blobs, SkinColour, skin_blobs
+from drake_pose.person.date.features import Blobs, SkinColour, skin_blobs
 from drake_pose.silhouette.segmentation.background import (
     Background,
     learn_background,

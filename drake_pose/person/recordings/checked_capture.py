@@ -27,9 +27,9 @@ from drake_pose.person.recordings.camera_faults import (
     moved_since,
     share_of,
 )
+from drake_pose.person.recordings.figures import RigFault, find_rig_fault
 from drake_pose.person.recordings.person_capture import PersonCapture, capture_person
 from drake_pose.person.recordings.persons_in_view import PersonRecording, ReadFrame, ViewFaults
-from drake_pose.person.recordings.rig_faults import RigFault, find_rig_fault
 from drake_pose.person.shape import NOISE, shape_values
 from drake_pose.person.views import edge_spacing
 

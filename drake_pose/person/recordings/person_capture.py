@@ -1,12 +1,13 @@
-"""A whole recording of one person, whose proportions need not be known: masks in, poses out.
+"""A whole recording of one person, whose proportions need not be known: poses out.
 
-Found in a few frames, followed both ways from the best; shape joints are fitted, then all again.
+By masks: found in a few frames, followed both ways from the best; shape joints are fitted, then all
+again. Where only a few frames have masks the person's colours in pictures say the rest.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,15 +15,23 @@ from numpy.typing import NDArray
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
+from drake_pose.fit.colours import Picture
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
 from drake_pose.person.recordings.persons_in_view import ReadFrame
 from drake_pose.person.search import LENIENT
 from drake_pose.person.shape import NOISE, PersonShape, fit_shape, shape_values
-from drake_pose.person.views import FrameViews, edge_spacing, see_silhouette
+from drake_pose.person.views import (
+    ColourViews,
+    FrameViews,
+    KnownColours,
+    edge_spacing,
+    see_silhouette,
+)
 from drake_pose.silhouette.areas.outline import Outline
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 # In how many of the frames a sequence is begun, for the best to be taken, and of what more fits
 # needs no other to be compared with.
@@ -185,3 +194,93 @@ class _Capture:
                 f"in none of {_STARTS} frames two cameras saw a person: give masks that show one"
             )
         return best
+
+
+ReadPictures = Callable[[int], Mapping[str, Picture]]
+
+# Silhouettes of fewer cameras do not tell where a person is.
+_FEWEST = 2
+
+
+def capture_by_colour(
+    tree: PoseTree,
+    cameras: Mapping[str, Camera],
+    count: int,
+    pictures: ReadPictures,
+    starts: Mapping[int, Array],
+    masked: Mapping[int, Mapping[str, Mask]],
+    known: PersonCapture | None,
+    on_frame: Callable[[int], None] | None = None,
+) -> tuple[PersonCapture, Array]:
+    """Captures a recording of few masks: these or given positions start it, also after a loss.
+
+    Args:
+        tree: of a model with the landmarks of a person.
+        count: how many frames there are.
+        pictures: gives a frame's (H, W, 3), by camera.
+        starts: the plant's positions (nq,) by frame, where they are about known.
+        masked: the masks by camera of the frames that have some.
+        known: what these say, which also gives shape joints; None: there are none, and shape
+            joints stay where the first start has them.
+        on_frame: called after each frame.
+
+    Returns:
+        The capture, nan where the person is lost; and (frames,) the root mean square distance
+        between the person's contour and the colours' over all cameras [pixel], nan in frames that
+        were not followed by colour.
+
+    Raises:
+        ModelError: the model has no landmarks of trunk, arms and legs.
+    """
+    shape = None if known is None else known.shape
+    fit = ContourFit(tree, None if known is None else known.outlines, NOISE)
+    rest = None if shape is None else shape.values
+    tracker = PersonPoseTracker(fit, LENIENT, shape_values(tree), rest)
+    lengths = None if shape is None else shape.covariance
+    q = np.full((count, len(tree.model.position_names)), np.nan)
+    captured = PersonCapture(q, np.zeros(count), shape, fit.outlines, tree, q.copy())
+    distances = np.full(count, np.nan)
+    places = {frame: k for k, frame in enumerate(masked)}
+    state: TrackState | None = None
+    colours: KnownColours = {}
+    for frame in range(count):
+        seen = pictures(frame)
+        views = ColourViews([cameras[name] for name in seen], list(seen.values()), colours)
+        place = places.get(frame)
+        if known is not None and place is not None and np.isfinite(known.q[place]).all():
+            values, last = tracker.values(known.q[place]), state
+            state = tracker.start(values)
+            if last is not None and not last.is_lost:
+                state = replace(state, step=values - last.values)
+            captured.q[frame], captured.shares[frame] = known.q[place], known.shares[place]
+            captured.deviations[frame] = known.deviations[place]
+            colours = views.learned(fit, values, masked[frame])
+        else:
+            state, views = _followed(tracker, state, views, starts.get(frame))
+            if state is not None:
+                captured.shares[frame] = state.share
+            if state is not None and state.is_lost:
+                state = replace(state, step=np.zeros(len(state.values)))
+            elif state is not None:
+                colours = views.learned(fit, state.values)
+                captured.q[frame] = tracker.positions(state.values)
+                captured.deviations[frame] = tracker.deviations(state.values, views, lengths)
+                distances[frame] = tracker.distance_by_colour(state.values, views)
+        if on_frame is not None:
+            on_frame(frame)
+    return captured, distances
+
+
+def _followed(
+    tracker: PersonPoseTracker, state: TrackState | None, views: ColourViews, start: Array | None
+) -> tuple[TrackState | None, ColourViews]:
+    """The next frame by its pictures, or from a start (nq,) where the person is lost."""
+    if state is not None:
+        state = tracker.follow_by_colour(state, views)
+    if start is not None and (state is None or state.is_lost):
+        began = tracker.start(tracker.values(start))
+        if not views.known:
+            learned = views.learned(tracker.fit, began.values)
+            views = ColourViews(views.cameras, views.pictures, learned)
+        state = tracker.follow_by_colour(began, views)
+    return state, views

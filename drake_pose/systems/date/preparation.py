@@ -16,10 +16,9 @@ from drake_pose.errors import UnknownNameError
 from drake_pose.person.date.body_pose import waist_of
 from drake_pose.person.date.capture import CaptureSettings, CaptureSetup, see_person
 from drake_pose.person.date.faces import FaceTemplates, cut_face, learn_faces
-from drake_pose.person.date.features import find_features
+from drake_pose.person.date.features import SkinColour, find_features
 from drake_pose.person.date.recognition import register_pose
 from drake_pose.person.date.skeleton import Skeleton, load_skeleton
-from drake_pose.person.date.skin_blobs import SkinColour
 from drake_pose.silhouette.segmentation.background import Background, person_region
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
 

@@ -13,10 +13,9 @@ from drake_pose.camera.models import Camera
 from drake_pose.errors import CameraError, SettingsError
 from drake_pose.person.date.capture import Mask, PersonView, Picture, see_person
 from drake_pose.person.date.faces import FaceTemplates, find_face
-from drake_pose.person.date.features import Features, FeatureSettings, find_features
+from drake_pose.person.date.features import Features, FeatureSettings, SkinColour, find_features
 from drake_pose.person.date.recognition import Recognition, RegisteredPose, recognise
 from drake_pose.person.date.skeleton import FEATURES, Skeleton
-from drake_pose.person.date.skin_blobs import SkinColour
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 from drake_pose.silhouette.segmentation.background import Background, person_region
 from drake_pose.systems.colour_images import colour_image_to_picture

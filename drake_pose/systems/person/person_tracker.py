@@ -15,10 +15,9 @@ from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.fit.colour_lines import COLOURS
 from drake_pose.fit.contour_fit import inlier_ratio_of
-from drake_pose.person.colour_views import ColourViews
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
 from drake_pose.person.recordings.persons_in_view import keep_views
-from drake_pose.person.views import FrameViews, SilhouetteView, shows_somebody
+from drake_pose.person.views import ColourViews, FrameViews, SilhouetteView, shows_somebody
 from drake_pose.systems.bodies.posed_geometry import body_poses
 from drake_pose.systems.colour_images import ColourPorts
 from drake_pose.systems.ports import MemorySystem, require_period

@@ -3,7 +3,7 @@ import pytest
 
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.hand import HAND_STATE
-from drake_pose.filtering.kalman.repeated_views import (
+from drake_pose.filtering.kalman.hypotheses import (
     RepeatedView,
     anchored,
     begin_repeated_view,

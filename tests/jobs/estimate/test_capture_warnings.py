@@ -11,8 +11,8 @@ from drake_pose.jobs.estimate.person import (
 )
 from drake_pose.person.recordings.camera_faults import CameraFault, CameraMotion
 from drake_pose.person.recordings.checked_capture import MovedCamera
+from drake_pose.person.recordings.figures import RigFault
 from drake_pose.person.recordings.persons_in_view import ViewFaults
-from drake_pose.person.recordings.rig_faults import RigFault
 
 FRAMES = ("0", "1", "2", "3")
 

@@ -9,13 +9,14 @@ from drake_pose.camera.rigs import circle_of_cameras, look_at
 from drake_pose.errors import SettingsError
 from drake_pose.person.date.features import (
     FeatureSettings,
+    SkinColour,
     assign,
     dense_mean,
     expect_features,
     find_features,
     inside_silhouettes,
+    skin_blobs,
 )
-from drake_pose.person.date.skin_blobs import SkinColour, skin_blobs
 from drake_pose.person.rays import meeting_points, nearest_points, viewing_rays
 from drake_pose.silhouette.segmentation.background import (
     Background,

@@ -11,8 +11,14 @@ from drake_pose.body.landmarks import landmark_positions, load_landmarks
 from drake_pose.body.model import load_model
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.errors import ModelError
-from drake_pose.person.date.body_pose import Waist, estimate_pose, waist_of
-from drake_pose.person.date.inverse_kinematics import move_limb, reach, upper_body
+from drake_pose.person.date.body_pose import (
+    Waist,
+    estimate_pose,
+    move_limb,
+    reach,
+    upper_body,
+    waist_of,
+)
 from drake_pose.person.date.limb_search import (
     correlation,
     joint_circle,

@@ -14,10 +14,9 @@ from drake_pose.person.date.faces import (
     head_angles,
     learn_faces,
 )
-from drake_pose.person.date.features import find_features
+from drake_pose.person.date.features import SkinColour, find_features, skin_blobs
 from drake_pose.person.date.recognition import measure_contour, recognise, similarity
 from drake_pose.person.date.skeleton import FEATURES, rotation
-from drake_pose.person.date.skin_blobs import SkinColour, skin_blobs
 from tests.person.studio import shared_studio
 
 

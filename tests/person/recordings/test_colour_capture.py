@@ -9,10 +9,10 @@ from drake_pose.body.model import load_model
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.fit.colour_lines import BESIDE, ON
 from drake_pose.fit.contour_fit import ContourFit
-from drake_pose.person.colour_views import ColourViews
 from drake_pose.person.pose_tracker import PersonPoseTracker
-from drake_pose.person.recordings.colour_capture import capture_by_colour
+from drake_pose.person.recordings.person_capture import capture_by_colour
 from drake_pose.person.shape import NOISE
+from drake_pose.person.views import ColourViews
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.person.persons_in_view import stepping
 
@@ -68,15 +68,13 @@ def joint_errors(person, found, truth):
 
 def given(cameras, recording, starts, pictures=None):
     pictures = recording[0] if pictures is None else pictures
-    return cameras, FRAMES, (), lambda _: {}, lambda k: pictures[k], starts
+    return cameras, FRAMES, lambda k: pictures[k], starts, {}, None
 
 
 def test_followed_from_a_start_without_any_mask(person, cameras, recording):
     heard = []
-    captured = capture_by_colour(
-        person.pose_tree(), *given(cameras, recording, {0: recording[2][0]}),
-        on_frame=heard.append,
-    ).captured  # fmt: skip
+    start = given(cameras, recording, {0: recording[2][0]})
+    captured, _ = capture_by_colour(person.pose_tree(), *start, heard.append)
     assert heard == list(range(FRAMES))
     errors = np.array(
         [joint_errors(person, *pair) for pair in zip(captured.q, recording[2], strict=True)]
@@ -93,9 +91,8 @@ def test_a_loss_is_said_and_a_start_goes_on(person, cameras, recording):
     grey = {name: np.full((240, 320, 3), 128, np.uint8) for name in cameras}
     pictures = [*recording[0][:3], grey, grey, *recording[0][5:]]
     starts = {0: recording[2][0], 5: recording[2][5]}
-    found = capture_by_colour(
-        person.pose_tree(), *given(cameras, recording, starts, pictures=pictures)
-    ).captured
+    given_ = given(cameras, recording, starts, pictures=pictures)
+    found, _ = capture_by_colour(person.pose_tree(), *given_)
     lost = np.isnan(found.q).any(axis=1)
     assert lost.tolist() == [False] * 3 + [True] * 2 + [False] * 3
     assert np.isnan(found.deviations[lost]).all()

@@ -21,9 +21,13 @@ from drake_pose.person.recordings.camera_faults import (
     find_fault,
     moved_since,
 )
-from drake_pose.person.recordings.figures import cut_figures, find_figures, find_persons
+from drake_pose.person.recordings.figures import (
+    cut_figures,
+    find_figures,
+    find_persons,
+    find_rig_fault,
+)
 from drake_pose.person.recordings.persons_in_view import PersonRecording, keep_person, keep_views
-from drake_pose.person.recordings.rig_faults import find_rig_fault
 from drake_pose.person.views import FrameViews, see_silhouette
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.person.persons_in_view import see, stepping

@@ -7,7 +7,7 @@ from pydrake.common.value import AbstractValue
 from drake_pose.camera.rigs import FACE_CAMERA
 from drake_pose.errors import CameraError, SettingsError, UnknownNameError
 from drake_pose.person.date.capture import see_person
-from drake_pose.person.date.skin_blobs import SkinColour
+from drake_pose.person.date.features import SkinColour
 from drake_pose.silhouette.pictures.label_images import mask_to_label_image
 from drake_pose.silhouette.segmentation.background import learn_background, person_region
 from drake_pose.systems.colour_images import (

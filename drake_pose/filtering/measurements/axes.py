@@ -20,33 +20,13 @@ Labels = NDArray[np.int16]
 Ends = tuple[Array, Array]
 
 _FEWEST_PIXELS = 12
+# How far a segment's edge in the image is from where it belongs, and how much of an edge errs
+# together [pixel]. A segment of whose area less than the last share is seen, in the picture or at
+# the rough pose, is occluded: it is left out.
+_EDGE_DEVIATION, _CORRELATION, _SMALLEST_SHARE = 0.7, 3.0, 0.7
 # A segment that points at the camera shows no axis [pixel].
 _SHORTEST = 5.0
 _STEP = 1e-5
-
-
-@dataclass(frozen=True)
-class AxisSettings:
-    """How axes are measured.
-
-    Args:
-        edge_deviation: how far a segment's edge in the image is from where it belongs [pixel].
-        correlation: how much of an edge [pixel] errs together.
-        smallest_share: a segment of whose area less than this is seen, in the picture or at the
-            rough pose, is occluded: it is left out.
-
-    Raises:
-        SettingsError: a number that is not positive.
-    """
-
-    edge_deviation: float = 0.7
-    correlation: float = 3.0
-    smallest_share: float = 0.7
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not 0 < value < math.inf:
-                raise SettingsError(f"{name} must be positive, not {value}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +106,6 @@ class AxisObservation:
         camera: Camera,
         axes: Mapping[str, Ends],
         origin: tuple[float, float] = (0.0, 0.0),
-        settings: AxisSettings | None = None,
     ) -> None:
         if not axes:
             raise SettingsError("an observation of axes needs one segment or more")
@@ -135,7 +114,6 @@ class AxisObservation:
         if not np.allclose(X_WB, np.eye(4), atol=1e-9):
             raise SettingsError(f"{tree.model.path}: the root moves beside the plant's positions")
         self.body, self._renderer = body, LabelRenderer(tree.model, camera)
-        self._settings = settings or AxisSettings()
         self._camera, self._origin = camera, np.array(origin, dtype=np.float64)
         self._kinematics = TreeKinematics(tree)
         self._nodes = [tree.node_index(name) for name in axes]
@@ -208,10 +186,10 @@ class AxisObservation:
             if seen is None or drawn is None:
                 continue
             share = seen.count / drawn.count
-            if not self._settings.smallest_share < share < 1 / self._settings.smallest_share:
+            if not _SMALLEST_SHARE < share < 1 / _SMALLEST_SHARE:
                 continue
             # A segment that another covers at the rough pose is much shorter than its axis.
-            if drawn.length < self._settings.smallest_share * float(np.linalg.norm(uv[1] - uv[0])):
+            if drawn.length < _SMALLEST_SHARE * float(np.linalg.norm(uv[1] - uv[0])):
                 continue
             found[name] = _correct(uv, seen, drawn)
         return found
@@ -228,8 +206,7 @@ class AxisObservation:
         if length < 1.3 * width:
             return None
         # The middle between two edges, at length / correlation independent places.
-        settings = self._settings
-        sideways = 0.5 * settings.edge_deviation**2 * settings.correlation / length
+        sideways = 0.5 * _EDGE_DEVIATION**2 * _CORRELATION / length
         return _Fit(centre, vectors[:, 1], length, 12 * sideways / length**2, sideways, len(u))
 
     def _axes_at(self, x: Array) -> Array:

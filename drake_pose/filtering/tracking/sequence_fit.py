@@ -48,32 +48,16 @@ _MEMORY = 0.15
 # How far the body's contour is from a mask's edge, where its proportions are fitted and its flesh
 # is still not that of who is seen, and how much of it errs together: that of a finger's bone [px].
 _DEVIATION, _CORRELATION = 2.0, 75.0
+START_FRAMES = 90
+"""Through so many frames starts are followed."""
+# They are tilted by so much about both axes of the picture, either way [rad], and compared with the
+# first frame so often. Tracks closer than _APART are one [rad]; given up is whose E_total in the
+# first frame is so much larger than the best one's, and who is beyond the number of the best.
+_TILT, _SETTLING, _APART, _LESS, _MOST_STARTS = 0.7, 4, 0.2, 0.03, 6
 # A joint at its limits (three deviations squared) counts as so much E_total of a start.
 _PRIOR_WEIGHT = 0.0003
 # So many starts are fitted at most, and fits whose cost is so many times the best one's given up.
 _STARTS, _WORSE = 3, 1.1
-
-
-@dataclass(frozen=True)
-class StartSettings:
-    """How a track's start is chosen.
-
-    Args:
-        tilt: the body is tilted by so much about both axes of the picture, either way [rad].
-        settling: so often the first frame is compared with each.
-        apart: tracks closer than this are one [rad].
-        worse: starts whose E_total in the first frame is larger than the best one's by more are
-            given up.
-        cap: so many are followed at most.
-        frames: through so many frames.
-    """
-
-    tilt: float = 0.7
-    settling: int = 4
-    apart: float = 0.2
-    worse: float = 0.03
-    cap: int = 6
-    frames: int = 90
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,27 +102,25 @@ def find_start(
     tracker: ContourTracker,
     x: Array,
     masks: Sequence[Sequence[Mask | None]],
-    settings: StartSettings | None = None,
 ) -> list[FollowedStart]:
     """The poses to be followed in frames of all cameras' masks, best first, from a state (n,)."""
-    settings = settings or StartSettings()
     observation = tracker.observation
-    steps = (0.0, settings.tilt, -settings.tilt)
+    steps = (0.0, _TILT, -_TILT)
     candidates = []
     for tilt in [(a, b) for a in steps for b in steps]:
         track = tracker.start(tilted(observation, x, tilt))
-        for _ in range(settings.settling):
+        for _ in range(_SETTLING):
             track = tracker.follow(tracker.start(track.state.best.mean), masks[0], first=True)
         candidates.append(_judged(observation, track, masks[0]))
     candidates.sort(key=lambda one: one.cost)
     kept: list[FollowedStart] = []
     for one in candidates:
-        if one.errors[0] > candidates[0].errors[0] + settings.worse or len(kept) >= settings.cap:
+        if one.errors[0] > candidates[0].errors[0] + _LESS or len(kept) >= _MOST_STARTS:
             continue
         moving = len(observation.layout.moving)
-        if all(np.abs(one.x - other.x)[:moving].max() > settings.apart for other in kept):
+        if all(np.abs(one.x - other.x)[:moving].max() > _APART for other in kept):
             kept.append(one)
-    for frame in masks[1 : settings.frames]:
+    for frame in masks[1:START_FRAMES]:
         kept = [_judged(observation, tracker.follow(one.track, frame), frame, one) for one in kept]
     return sorted(kept, key=lambda one: one.cost)
 

@@ -19,9 +19,9 @@ from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.tracking.contour_tracker import ContourTracker, TrackingSettings
 from drake_pose.filtering.tracking.match_and_track import make_tracker
 from drake_pose.filtering.tracking.sequence_fit import (
+    START_FRAMES,
     FittedSequence,
     FollowedStart,
-    StartSettings,
     find_start,
     fit_sequence,
     pose_set,
@@ -115,7 +115,7 @@ class _BodyFit:
     ) -> None:
         self._inputs, self._settings, self._tracking = inputs, settings, tracking
         self._camera = next(iter(inputs.scene.cameras.values()))
-        frames = inputs.frames[: StartSettings().frames]
+        frames = inputs.frames[:START_FRAMES]
         self._masks = [inputs.scene.read(self._camera.name, frame) for frame in frames]
         self._more: dict[str, Any] = {}
         self._period = 1.0 / (inputs.scene.frame_rate_hz or USUAL_RATE_HZ)

@@ -12,7 +12,7 @@ from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.person.date.body_pose import Waist
 from drake_pose.person.date.faces import FaceTemplates
-from drake_pose.person.date.features import Blobs, FeatureSettings, SkinColour, skin_blobs
+from drake_pose.person.date.features import Blobs, SkinColour, skin_blobs
 from drake_pose.person.date.limb_search import Search
 from drake_pose.person.date.recognition import Contour, RegisteredPose, measure_contour
 from drake_pose.person.date.skeleton import Skeleton
@@ -33,7 +33,6 @@ class CaptureSettings:
     """
 
     skin: SkinColour = field(default_factory=SkinColour)
-    features: FeatureSettings = field(default_factory=FeatureSettings)
     search: Search = "surfaces"
     recognition: float = 0.93
     waist: Waist = field(default_factory=Waist)

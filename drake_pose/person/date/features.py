@@ -96,23 +96,9 @@ def _bounds(region: Mask) -> tuple[int, int, int, int]:
 
 
 _FIRST_FOOT = FEATURES.index("left_foot")
-
-
-@dataclass(frozen=True)
-class FeatureSettings:
-    """How features are found.
-
-    Args:
-        threshold: largest distance of two rays that show the same skin [m].
-        reach: points farther than this from all expected features are dropped [m].
-        dense: radius of the dense part of a feature's points [m].
-        margin: how far outside a silhouette a point may be seen [pixel].
-    """
-
-    threshold: float = 0.05
-    reach: float = float("inf")
-    dense: float = 0.08
-    margin: int = 2
+# Two rays show the same skin where they pass each other by less than the first; the radius of the
+# dense part of a feature's points [m]; how far outside a silhouette a point may be seen [pixel].
+_THRESHOLD, _DENSE, _MARGIN = 0.05, 0.08, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,14 +168,10 @@ def expect_features(
     return np.asarray(places + step)
 
 
-def assign(points: Array, expected: Array, reach: float) -> NDArray[np.int64]:
-    """The nearest of the expected features (k, 3) for each point (m, 3); -1 beyond `reach`."""
-    if not len(points):
-        return np.empty(0, dtype=np.int64)
+def assign(points: Array, expected: Array) -> NDArray[np.int64]:
+    """The nearest of the expected features (k, 3) for each point (m, 3)."""
     distances = np.linalg.norm(points[:, None] - expected[None], axis=2)
-    owners = distances.argmin(axis=1)
-    owners[distances[np.arange(len(points)), owners] > reach] = -1
-    return owners.astype(np.int64)
+    return distances.argmin(axis=1).astype(np.int64)
 
 
 def dense_mean(points: Array, radius: float) -> tuple[Array, int]:
@@ -208,7 +190,6 @@ def find_features(
     centroids: Sequence[Array],
     regions: Sequence[Mask],
     last: Array,
-    settings: FeatureSettings | None = None,
     expected: Array | None = None,
 ) -> Features:
     """The features' places in a frame.
@@ -219,13 +200,12 @@ def find_features(
         last: (k, 3) the last frame's features [m].
         expected: (k, 3) where they are expected in this frame [m]; None, as in the paper: `last`.
     """
-    settings = settings or FeatureSettings()
-    points = meeting_points(cameras, centroids, settings.threshold)
-    points = points[inside_silhouettes(points, cameras, regions, settings.margin)]
-    owners = assign(points, last if expected is None else expected, settings.reach)
+    points = meeting_points(cameras, centroids, _THRESHOLD)
+    points = points[inside_silhouettes(points, cameras, regions, _MARGIN)]
+    owners = assign(points, last if expected is None else expected)
     places, support = np.array(last, dtype=np.float64), np.zeros(len(last), dtype=np.int64)
     for k in range(len(last)):
         mine = points[owners == k]
         if len(mine):
-            places[k], support[k] = dense_mean(mine, settings.dense)
+            places[k], support[k] = dense_mean(mine, _DENSE)
     return Features(places, support, points, owners)

@@ -246,7 +246,7 @@ def _spread(captured: PersonCapture, seen: Sequence[int], count: int) -> PersonC
     """A capture of some frames as one of all: nan, and a share of 0, in the others."""
     if len(seen) == count:
         return captured
-    q = np.full((count, captured.q.shape[1]), np.nan)
-    deviations, shares = q.copy(), np.zeros(count)
-    q[seen], deviations[seen], shares[seen] = captured.q, captured.deviations, captured.shares
-    return replace(captured, q=q, shares=shares, deviations=deviations)
+    unknown = np.full((count, captured.q.shape[1]), np.nan)
+    whole = replace(captured, q=unknown, shares=np.zeros(count), deviations=unknown.copy())
+    whole.take(seen, captured, slice(None))
+    return whole

@@ -59,6 +59,11 @@ class PersonCapture:
     tree: PoseTree
     deviations: Array
 
+    def take(self, frame: int | list[int], other: PersonCapture, place: int | slice) -> None:
+        """Takes what another capture says of frames."""
+        self.q[frame], self.shares[frame] = other.q[place], other.shares[place]
+        self.deviations[frame] = other.deviations[place]
+
 
 def capture_person(
     tree: PoseTree,
@@ -215,27 +220,21 @@ def capture_by_colour(
     """Captures a recording of few masks: these or given positions start it, also after a loss.
 
     Args:
-        tree: of a model with the landmarks of a person.
-        count: how many frames there are.
-        pictures: gives a frame's (H, W, 3), by camera.
+        pictures: gives a frame's (H, W, 3), by camera, of `count` frames.
         starts: the plant's positions (nq,) by frame, where they are about known.
         masked: the masks by camera of the frames that have some.
         known: what these say, which also gives shape joints; None: there are none, and shape
             joints stay where the first start has them.
-        on_frame: called after each frame.
 
     Returns:
-        The capture, nan where the person is lost; and (frames,) the root mean square distance
-        between the person's contour and the colours' over all cameras [pixel], nan in frames that
-        were not followed by colour.
-
-    Raises:
-        ModelError: the model has no landmarks of trunk, arms and legs.
+        The capture, nan where the person is lost; and (frames,) the distance of the contours, root
+        mean square over cameras [pixel], nan in frames that were not followed by colour.
     """
     shape = None if known is None else known.shape
     fit = ContourFit(tree, None if known is None else known.outlines, NOISE)
-    rest = None if shape is None else shape.values
-    tracker = PersonPoseTracker(fit, LENIENT, shape_values(tree), rest)
+    tracker = PersonPoseTracker(
+        fit, LENIENT, shape_values(tree), None if shape is None else shape.values
+    )
     lengths = None if shape is None else shape.covariance
     q = np.full((count, len(tree.model.position_names)), np.nan)
     captured = PersonCapture(q, np.zeros(count), shape, fit.outlines, tree, q.copy())
@@ -252,8 +251,7 @@ def capture_by_colour(
             state = tracker.start(values)
             if last is not None and not last.is_lost:
                 state = replace(state, step=values - last.values)
-            captured.q[frame], captured.shares[frame] = known.q[place], known.shares[place]
-            captured.deviations[frame] = known.deviations[place]
+            captured.take(frame, known, place)
             colours = views.learned(fit, values, masked[frame])
         else:
             state, views = _followed(tracker, state, views, starts.get(frame))

@@ -236,7 +236,7 @@ def _parts(setup: CaptureSetup) -> dict[str, tuple[System, tuple[str, ...]]]:
     if setup.registered is not None:
         recogniser = PoseRecogniser(setup.skeleton, setup.registered, cameras, settings.recognition)
         parts["recognition"] = recogniser, ("recognised_positions", "similarity")
-    parts["features"] = FeatureFinder(cameras, settings.features), ("features",)
+    parts["features"] = FeatureFinder(cameras), ("features",)
     if setup.face_camera is not None and setup.faces is not None:
         face = FaceDirectionFinder(setup.face_camera, setup.faces, settings.farthest_face)
         parts["face"] = face, ("face_direction",)

@@ -106,7 +106,6 @@ def _features_of(
         [view.blobs.centroids for view in views],
         [view.region for view in views],
         skeleton.features(q),
-        settings.features,
     )
     return np.where(seen.support[:, None] > 0, seen.places, np.nan)
 

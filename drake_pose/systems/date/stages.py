@@ -13,7 +13,7 @@ from drake_pose.camera.models import Camera
 from drake_pose.errors import CameraError, SettingsError
 from drake_pose.person.date.capture import Mask, PersonView, Picture, see_person
 from drake_pose.person.date.faces import FaceTemplates, find_face
-from drake_pose.person.date.features import Features, FeatureSettings, SkinColour, find_features
+from drake_pose.person.date.features import Features, SkinColour, find_features
 from drake_pose.person.date.recognition import Recognition, RegisteredPose, recognise
 from drake_pose.person.date.skeleton import FEATURES, Skeleton
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
@@ -149,9 +149,9 @@ class FeatureFinder(PortedSystem):
         SettingsError: fewer than two cameras, or two of one name.
     """
 
-    def __init__(self, cameras: Sequence[Camera], settings: FeatureSettings | None = None) -> None:
+    def __init__(self, cameras: Sequence[Camera]) -> None:
         super().__init__()
-        self._settings, size = settings or FeatureSettings(), 3 * len(FEATURES)
+        size = 3 * len(FEATURES)
         self._views = ViewPorts(self, cameras)
         self.add_input("last_features", size)
         self.add_input("expected_features", size)
@@ -179,7 +179,6 @@ class FeatureFinder(PortedSystem):
             [view.blobs.centroids for view in views],
             [view.region for view in views],
             last,
-            self._settings,
             None if expected is None else expected.reshape(-1, 3),
         )
 

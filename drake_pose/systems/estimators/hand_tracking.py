@@ -20,7 +20,7 @@ from pydrake.trajectories import Trajectory
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.kalman.truncated_filter import FilterSettings, TruncatedFilter
-from drake_pose.filtering.measurements.axes import AxisObservation, AxisSettings, Ends
+from drake_pose.filtering.measurements.axes import AxisObservation, Ends
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.state import Belief
 from drake_pose.filtering.tracking.contour_tracker import ContourTracker, TrackingSettings
@@ -182,7 +182,6 @@ def add_hand_tracking(
     label_image: OutputPort,
     period: float,
     tracking: TrackingSettings | None = None,
-    settings: AxisSettings | None = None,
 ) -> HandTracking:
     """Wire label images to a filter of all free positions, inside the model's limits and couplings.
 
@@ -199,7 +198,7 @@ def add_hand_tracking(
     """
     body = ContourObservation(search.tree, [camera])
     middle = (0.5 * (camera.width - 1), 0.5 * (camera.height - 1))
-    observation = AxisObservation(body, camera, axes, middle, settings)
+    observation = AxisObservation(body, camera, axes, middle)
     belief_filter, transition, start = _axis_filter(
         observation, period, tracking or TrackingSettings()
     )
@@ -253,7 +252,6 @@ def build_hand_tracking(
     period: float,
     meshcat: Meshcat | None = None,
     tracking: TrackingSettings | None = None,
-    settings: AxisSettings | None = None,
 ) -> tuple[Diagram, HandTracking]:
     """A simulated hand, or any body, and its camera, tracked by ``add_hand_tracking``.
 
@@ -266,7 +264,7 @@ def build_hand_tracking(
     builder, model = DiagramBuilder(), search.tree.model
     scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
     _, images = add_simulated_cameras(builder, scene_graph, model, [camera], true_positions)
-    parts = add_hand_tracking(builder, search, camera, axes, images[0], period, tracking, settings)
+    parts = add_hand_tracking(builder, search, camera, axes, images[0], period, tracking)
     if meshcat is not None:
         estimate = parts.sensor.GetOutputPort("estimated_positions")
         show_estimate(builder, scene_graph, model, estimate, meshcat, ESTIMATE_COLOUR)

@@ -21,7 +21,6 @@ from drake_pose.filtering.kalman.update import make_evidence, update
 from drake_pose.filtering.measurements.axes import (
     Axis,
     AxisObservation,
-    AxisSettings,
     _independent,
 )
 from drake_pose.filtering.measurements.contour import ContourObservation
@@ -193,8 +192,6 @@ def test_bad_arguments_are_named(hand, camera, observation):
     q = hand.default_positions
     with pytest.raises(MaskError, match="'top'"):
         observation.measure_labels(np.zeros((3, 3), dtype=np.int16), q)
-    with pytest.raises(SettingsError, match="correlation"):
-        AxisSettings(correlation=0.0)
     body = observation.body
     with pytest.raises(SettingsError, match="one segment or more"):
         AxisObservation(body, camera, {})

@@ -8,7 +8,6 @@ from drake_pose.errors import SettingsError
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.tracking.contour_tracker import ContourTracker
 from drake_pose.filtering.tracking.sequence_fit import (
-    StartSettings,
     find_start,
     tilted,
 )
@@ -54,8 +53,7 @@ def test_the_true_start_is_among_those_followed_and_not_worse_than_what_was_give
     given = truth[0].copy()
     given[:moving] += 0.05
     tracker = ContourTracker(observation, PERIOD, SETTINGS)
-    settings = StartSettings(frames=12, settling=2)
-    found = find_start(tracker, given, masks, settings)
+    found = find_start(tracker, given, masks)
     assert [one.cost for one in found] == sorted(one.cost for one in found)
     assert len(found[0].states) == len(found[0].errors) == 12
 

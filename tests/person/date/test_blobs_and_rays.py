@@ -8,9 +8,7 @@ from drake_pose.camera.models import ParallelCamera
 from drake_pose.camera.rigs import circle_of_cameras, look_at
 from drake_pose.errors import SettingsError
 from drake_pose.person.date.features import (
-    FeatureSettings,
     SkinColour,
-    assign,
     dense_mean,
     expect_features,
     find_features,
@@ -196,7 +194,7 @@ class TestFeatures:
     def test_feature_that_nobody_sees_stays_where_it_was(self):
         cameras, centroids, regions = self.seen(np.delete(self.places, 2, axis=0))
         last = self.places + 0.01
-        found = find_features(cameras, centroids, regions, last, FeatureSettings(reach=0.3))
+        found = find_features(cameras, centroids, regions, last)
         assert found.support[2] == 0
         assert np.array_equal(found.places[2], last[2])
         assert (np.delete(found.support, 2) > 0).all()
@@ -260,8 +258,3 @@ class TestFeatures:
         mean, count = dense_mean(points, 0.08)
         assert count == 12
         np.testing.assert_allclose(mean, points[:12].mean(axis=0))
-
-    def test_assignment_respects_reach(self):
-        last = np.array([[0.0, 0, 0], [1, 0, 0]])
-        owners = assign(np.array([[0.1, 0, 0], [0.9, 0, 0], [5, 0, 0]]), last, 1.0)
-        assert owners.tolist() == [0, 1, -1]

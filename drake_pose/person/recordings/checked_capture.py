@@ -248,5 +248,5 @@ def _spread(captured: PersonCapture, seen: Sequence[int], count: int) -> PersonC
         return captured
     unknown = np.full((count, captured.q.shape[1]), np.nan)
     whole = replace(captured, q=unknown, shares=np.zeros(count), deviations=unknown.copy())
-    whole.take(seen, captured, slice(None))
+    whole.take(list(seen), captured, slice(None))
     return whole

@@ -228,7 +228,7 @@ class TestFeatures:
                 last = expected = true
             cameras, centroids, regions = self.seen(true)
             given = expected if is_expecting else None
-            found = find_features(cameras, centroids, regions, last, None, given)
+            found = find_features(cameras, centroids, regions, last, given)
             expected = expect_features(found.places, found.support, last, support)
             last, support = found.places, found.support
             off.append(np.linalg.norm(found.places - true, axis=1))

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from drake_pose.jobs.registration.audit import SceneAudit, audit_scene
     from drake_pose.jobs.registration.register import SceneRegistration, register_scene
     from drake_pose.jobs.registration.settings import RegistrationSettings
+    from drake_pose.results.records import SceneEstimate
     from drake_pose.results.settings import EstimateSettings
-    from drake_pose.results.writer import SceneEstimate
     from drake_pose.search.continuous.multi_start import MultiStartSearch
     from drake_pose.search.estimates import View
     from drake_pose.search.grid.beam.search import BeamSearch
@@ -55,7 +55,7 @@ _HOMES = {
     "RegistrationSettings": "jobs.registration.settings",
     "Scene": "silhouette.pictures.scenes",
     "SceneAudit": "jobs.registration.audit",
-    "SceneEstimate": "results.writer",
+    "SceneEstimate": "results.records",
     "SceneMasks": "jobs.masks.masks",
     "SceneRegistration": "jobs.registration.register",
     "SilhouetteCamera": "systems.pictures.silhouette_camera",

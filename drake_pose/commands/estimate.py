@@ -27,7 +27,7 @@ from drake_pose.results.settings import EstimateSettings
 from drake_pose.results.texts import percent
 
 if TYPE_CHECKING:
-    from drake_pose.results.writer import SceneEstimate
+    from drake_pose.results.records import SceneEstimate
 
 
 def estimate(

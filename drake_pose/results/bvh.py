@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,14 +28,11 @@ R_YW = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 _CENTIMETRES = 100.0
 # A part stays where it is in the part before it if it moves by less [m].
 _STAYS = 1e-5
-# How a link hangs on the one before it: by nothing that moves, by a length that stays, or else.
-_WELD, _LENGTH, _MOTION = "weld", "length", "motion"
 _POSITIONS = ("Xposition", "Yposition", "Zposition")
 _ROTATIONS = ("Zrotation", "Xrotation", "Yrotation")
 
 
-@dataclass(frozen=True, eq=False)
-class SkeletonJoint:
+class SkeletonJoint(NamedTuple):
     """A joint: its link ("world": where several parts stand), its parent's index (-1: root)."""
 
     link: str
@@ -44,41 +41,32 @@ class SkeletonJoint:
 
 def skeleton_of(model: ArticulatedModel, q: Array) -> tuple[SkeletonJoint, ...]:
     """The joints, parents before children; q (frames, nq) tells the lengths that stay the same."""
-    names, children = model.link_names, _children(model, q)
-    branches = [0] * len(names)
-
-    def count_branches(body: int) -> bool:
-        branches[body] = sum([count_branches(child) for child, _ in children[body]])
-        return branches[body] > 0 or names[body] in model.link_meshes
-
-    count_branches(0)
+    plant, names, seen = model.plant, model.link_names, model.link_meshes
+    # By body those that hang on it, by a length that stays, or by something that moves.
+    children: list[list[tuple[int, bool, bool]]] = [[] for _ in names]
+    for index in plant.GetJointIndices():
+        joint = plant.get_joint(index)
+        is_length = joint.type_name() == PrismaticJoint.kTypeName
+        stays = is_length and bool(np.ptp(q[:, joint.position_start()]) < _STAYS)
+        moves = joint.num_positions() > 0 and not stays
+        child = int(joint.child_body().index())
+        children[int(joint.parent_body().index())].append((child, stays, moves))
     found: list[SkeletonJoint] = []
 
-    def walk(body: int, parent: int, steps: tuple[str, ...]) -> None:
-        is_half = parent >= 0 and branches[body] > 0 and _LENGTH in steps and _MOTION not in steps
-        if (names[body] in model.link_meshes or branches[body] > 1) and not is_half:
+    def branches(body: int) -> int:
+        """How many bodies hang on it that are seen or carry one that is."""
+        return sum(names[k] in seen or branches(k) > 0 for k, *_ in children[body])
+
+    def walk(body: int, parent: int, length: bool, motion: bool) -> None:
+        is_half = parent >= 0 and length and not motion and branches(body) > 0
+        if (names[body] in seen or branches(body) > 1) and not is_half:
             found.append(SkeletonJoint(names[body], parent))
-            parent, steps = len(found) - 1, ()
-        for child, step in children[body]:
-            walk(child, parent, (*steps, step))
+            parent, length, motion = len(found) - 1, False, False
+        for child, stays, moves in children[body]:
+            walk(child, parent, length or stays, motion or moves)
 
-    walk(0, -1, ())
+    walk(0, -1, False, False)
     return tuple(found)
-
-
-def _children(model: ArticulatedModel, q: Array) -> list[list[tuple[int, str]]]:
-    """By body: the bodies that hang on it, and by what kind of joint."""
-    plant = model.plant
-    children: list[list[tuple[int, str]]] = [[] for _ in range(plant.num_bodies())]
-    for index in plant.GetJointIndices():
-        joint, step = plant.get_joint(index), _WELD
-        if joint.num_positions():
-            step = _MOTION
-            if joint.type_name() == PrismaticJoint.kTypeName:
-                stays = np.ptp(q[:, joint.position_start()]) < _STAYS
-                step = _LENGTH if stays else _MOTION
-        children[int(joint.parent_body().index())].append((int(joint.child_body().index()), step))
-    return children
 
 
 def motion_as_bvh(
@@ -102,24 +90,20 @@ def motion_as_bvh(
     X_YL, X_Y0 = _link_poses(model, skeleton, q[known], None if X_WB is None else X_WB[known])
     # What turns a joint's own axes into its link's is what its link shows at rest.
     R_YJ = X_YL[..., :3, :3] @ np.swapaxes(X_Y0[:, :3, :3], 1, 2)
-    p_PJ = np.empty((len(known), len(skeleton), 3))
-    R_PJ = np.empty((len(known), len(skeleton), 3, 3))
-    for k, joint in enumerate(skeleton):
-        if joint.parent < 0:
-            p_PJ[:, k], R_PJ[:, k] = X_YL[:, k, :3, 3], R_YJ[:, k]
-            continue
-        R_JY = np.swapaxes(R_YJ[:, joint.parent], 1, 2)
-        step = X_YL[:, k, :3, 3] - X_YL[:, joint.parent, :3, 3]
-        p_PJ[:, k], R_PJ[:, k] = (R_JY @ step[..., None])[..., 0], R_JY @ R_YJ[:, k]
+    parents = [max(joint.parent, 0) for joint in skeleton]
+    R_PY = np.swapaxes(R_YJ[:, parents], 2, 3)
+    p_YL = X_YL[..., :3, 3]
+    p_PJ = (R_PY @ (p_YL - p_YL[:, parents])[..., None])[..., 0]
+    R_PJ = R_PY @ R_YJ
+    p_PJ[:, 0], R_PJ[:, 0] = p_YL[:, 0], R_YJ[:, 0]
     offsets = p_PJ.mean(axis=0)
     slides = np.abs(p_PJ - offsets).max(axis=(0, 2)) > _STAYS
     slides[0] = True
     offsets[slides] = 0.0
-    columns = []
-    for k in range(len(skeleton)):
-        if slides[k]:
-            columns.append(_CENTIMETRES * p_PJ[:, k])
-        columns.append(_smooth_angles(R_PJ[:, k]))
+    columns = [
+        np.hstack([*([_CENTIMETRES * p_PJ[:, k]] if slides[k] else []), _smooth_angles(R_PJ[:, k])])
+        for k in range(len(skeleton))
+    ]
     rows = np.hstack(columns)
     # The last known frame at or before each; the first known for those before it.
     source = np.maximum(np.searchsorted(known, np.arange(len(q)), side="right") - 1, 0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,11 +35,6 @@ class JointRecord:
     low: float
     high: float
     value: float | None = None
-
-    @property
-    def interval(self) -> tuple[float, float, bool]:
-        """``low``, ``high`` and ``determined``."""
-        return self.low, self.high, self.determined
 
 
 @dataclass(frozen=True)
@@ -104,6 +100,27 @@ class FrameRecord:
     def as_json(self) -> dict[str, Any]:
         """Returns plain JSON values."""
         return asdict(self)
+
+
+@dataclass(frozen=True)
+class SceneEstimate:
+    """The estimate of a scene: poses, the search's records, summary.json, folder and warnings.
+
+    Position kinds are "angle" [rad], "length" [m] or "quaternion", in the plant's order.
+    """
+
+    position_names: tuple[str, ...]
+    position_kinds: tuple[str, ...]
+    rows: tuple[PoseRow, ...]
+    records: Mapping[str, FrameRecord]
+    summary: Mapping[str, Any]
+    folder: Path | None
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def found_count(self) -> int:
+        """In how many frames a pose was found."""
+        return sum(record.found for record in self.records.values())
 
 
 def user_units(model: ArticulatedModel) -> np.ndarray:

@@ -8,12 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatParams, MeshcatVisualizer, Rgba, SceneGraph
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
 from drake_pose.body.model import ArticulatedModel
+from drake_pose.body.tree.link_graph import PlantKinematics
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.systems.bodies.posed_geometry import add_posed_plant
 from drake_pose.systems.bodies.skin import add_meshcat_skin
@@ -49,14 +48,14 @@ def make_replay(
     builder = DiagramBuilder()
     scene_graph = builder.AddNamedSystem("scene_graph", SceneGraph())
     source = builder.AddNamedSystem("positions", ConstantVectorSource(positions[0]))
-    plant = add_posed_plant(builder, scene_graph, model, source.get_output_port(), "geometry_pose")
+    add_posed_plant(builder, scene_graph, model, source.get_output_port(), "geometry_pose")
     MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
     add_meshcat_skin(
         builder, meshcat, model, source.get_output_port(), "body", prefix=_BODY_PATH, recorded=True
     )
     for camera in cameras:
         _draw_camera(meshcat, camera)
-    _look_from(meshcat, cameras[0], _middle_of(plant, positions[0], X_WB[0]))
+    _look_from(meshcat, cameras[0], _middle_of(model, positions[0], X_WB[0]))
     _record(meshcat, builder.Build(), source, positions, X_WB, period)
     return meshcat.StaticHtml()
 
@@ -86,13 +85,11 @@ def _record(
     meshcat.PublishRecording()
 
 
-def _middle_of(plant: MultibodyPlant, q: np.ndarray, X_WB: np.ndarray) -> np.ndarray:
+def _middle_of(model: ArticulatedModel, q: np.ndarray, X_WB: np.ndarray) -> np.ndarray:
     """Returns the mean position (3,) of the body's links in the scene's world."""
-    context = plant.CreateDefaultContext()
-    plant.SetPositions(context, q)
-    bodies = [plant.get_body(BodyIndex(index)) for index in range(1, plant.num_bodies())]
-    p_BL = np.array([body.EvalPoseInWorld(context).translation() for body in bodies])
-    return np.asarray(X_WB[:3, :3] @ p_BL.mean(axis=0) + X_WB[:3, 3])
+    kinematics = PlantKinematics(model)
+    poses = [kinematics.pose_at(body, q) for body in range(1, model.plant.num_bodies())]
+    return np.asarray((X_WB @ np.mean(poses, axis=0))[:3, 3])
 
 
 def _draw_camera(meshcat: Meshcat, camera: Camera) -> None:

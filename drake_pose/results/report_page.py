@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Collection, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,9 +16,9 @@ from markupsafe import Markup
 
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.results.folder import OVERLAY
-from drake_pose.results.poses import PoseRow
-from drake_pose.results.records import FrameRecord, user_units
+from drake_pose.results.records import JointRecord, SceneEstimate, user_units
 from drake_pose.results.report_plots import BOX, Plot, draw_grid, plot_curves
+from drake_pose.silhouette.pictures.scenes import Scene
 
 # A position that changes by less is said in a table.
 _STAYS = 1e-9
@@ -45,26 +44,6 @@ _ABOUT = {
 }
 
 
-class ReportContent(NamedTuple):
-    """What a report tells of.
-
-    Attributes:
-        folder: the result's folder, whose files are linked.
-        seen: (camera, frame) of every picture that there is.
-        rows, records: the finished frames in order, and what is known of each, by name.
-        joined: whether frames follow each other in time.
-    """
-
-    folder: Path
-    model: ArticulatedModel
-    cameras: tuple[str, ...]
-    seen: Collection[tuple[str, str]]
-    rows: tuple[PoseRow, ...]
-    records: Mapping[str, FrameRecord]
-    summary: Mapping[str, Any]
-    joined: bool
-
-
 class JointPlot(NamedTuple):
     """A joint's plot. unit: of its values; low, high, lower, upper: its range and its limits."""
 
@@ -87,36 +66,38 @@ class Picture(NamedTuple):
     link: str
 
 
-def make_report(content: ReportContent) -> str:
-    """The page."""
+def make_report(
+    folder: Path, model: ArticulatedModel, scene: Scene, estimate: SceneEstimate
+) -> str:
+    """The page of an estimate; files and overlays that lie in its folder are linked."""
     template = page_template("drake_pose.results", "report_template.html.j2")
-    frames = [row.frame for row in content.rows]
-    records = [content.records[frame] for frame in frames]
+    frames = [row.frame for row in estimate.rows]
+    records, joined = list(estimate.records.values()), scene.sequence
     found = ["found" if record.found else "not-found" for record in records]
-    use = [(name, _use(content, name)) for name in content.cameras]
-    errors = np.array([100.0 * row.error for row in content.rows])
+    use = [(name, _use(scene, estimate, name)) for name in scene.cameras]
+    errors = np.array([100.0 * row.error for row in estimate.rows])
     ious = [
         (name, np.array([100.0 * record.ious.get(name, np.nan) for record in records]))
-        for name in content.cameras
+        for name in scene.cameras
     ]
-    joints = _joint_plots(content, frames)
+    joints = _joint_plots(model, estimate, joined)
     stay = {one.name for one in joints if one.unit != "deg" and one.high - one.low < _STAYS}
     return template.render(
-        summary=content.summary,
-        title=Path(str(content.summary["scene"])).name or str(content.summary["scene"]),
-        model=content.model.path.name,
-        method=_METHODS[str(content.summary["method"])],
+        summary=estimate.summary,
+        title=Path(str(estimate.summary["scene"])).name or str(estimate.summary["scene"]),
+        model=model.path.name,
+        method=_METHODS[str(estimate.summary["method"])],
         rows=list(zip(frames, records, strict=True)),
         box=BOX,
-        errors=plot_curves(frames, [("E_total", errors)], joined=content.joined, least=0.0),
-        ious=plot_curves(frames, ious, joined=content.joined),
-        cameras=[_camera_row(content, name) for name in content.cameras],
+        errors=plot_curves(frames, [("E_total", errors)], joined=joined, least=0.0),
+        ious=plot_curves(frames, ious, joined=joined),
+        cameras=[_camera_row(scene, estimate, name) for name in scene.cameras],
         grid=draw_grid(frames, [*use, ("pose", found)]),
-        lost=[row.frame for row in content.rows if not row.found],
+        lost=[row.frame for row in estimate.rows if not row.found],
         moving=[one for one in joints if one.name not in stay],
         still=[one for one in joints if one.name in stay],
-        pictures=_pick_pictures(content),
-        files=[(name, text) for name, text in _ABOUT.items() if (content.folder / name).is_file()],
+        pictures=_pick_pictures(folder, scene, estimate),
+        files=[(name, text) for name, text in _ABOUT.items() if (folder / name).is_file()],
     )
 
 
@@ -132,27 +113,28 @@ def page_template(package: str, name: str) -> Template:
     return environment.from_string(source.read_text(encoding="utf-8"))
 
 
-def _joint_plots(content: ReportContent, frames: Sequence[str]) -> list[JointPlot]:
+def _joint_plots(model: ArticulatedModel, estimate: SceneEstimate, joined: bool) -> list[JointPlot]:
     """The plots of all positions that are known in a frame."""
-    model, units = content.model, user_units(content.model)
+    frames, units = list(estimate.records), user_units(model)
     of_kind = {"angle": "deg", "length": "m", "quaternion": ""}
-    q = np.array([row.q for row in content.rows]).reshape(len(frames), -1)
+    q = np.array([row.q for row in estimate.rows]).reshape(len(frames), -1)
     plots = []
     for k, (name, kind) in enumerate(zip(model.position_names, model.position_kinds, strict=True)):
         values = units[k] * q[:, k]
         if not np.isfinite(values).any():
             continue
         lower, upper = float(units[k] * model.lower[k]), float(units[k] * model.upper[k])
-        known = [content.records[frame].joints.get(name) for frame in frames]
+        known = [record.joints.get(name) for record in estimate.records.values()]
         intervals = None
         if any(known):
-            ends = [(np.nan, np.nan, False) if n is None else n.interval for n in known]
+            nothing = JointRecord(False, np.nan, np.nan)
+            ends = [(one.low, one.high, one.determined) for one in (n or nothing for n in known)]
             low, high, determined = np.array(ends).T
             intervals = low, high, determined > 0.0
         plot = plot_curves(
             frames,
             [(name, values)],
-            joined=content.joined,
+            joined=joined,
             limits=(lower, upper),
             intervals=intervals,
         )
@@ -161,44 +143,43 @@ def _joint_plots(content: ReportContent, frames: Sequence[str]) -> list[JointPlo
     return plots
 
 
-def _camera_row(content: ReportContent, camera: str) -> dict[str, Any]:
+def _camera_row(scene: Scene, estimate: SceneEstimate, camera: str) -> dict[str, Any]:
     """What the table of cameras says: pictures, those used, IoU, and whether it is suspicious."""
-    records = content.records
+    records = estimate.records
     ious = {f: one.ious[camera] for f, one in records.items() if camera in one.ious}
     worst = min(ious, key=lambda frame: ious[frame], default=None)
     return {
         "name": camera,
-        "pictures": sum((camera, frame) in content.seen for frame in records),
+        "pictures": sum((camera, frame) in scene.masks for frame in records),
         "used": len(ious),
         "mean": float(np.mean(list(ious.values()))) if ious else None,
         "least": None if worst is None else ious[worst],
         "worst": worst,
-        "bad": any(f"'{camera}'" in text for text in content.summary["warnings"]),
+        "bad": any(f"'{camera}'" in text for text in estimate.summary["warnings"]),
     }
 
 
-def _use(content: ReportContent, camera: str) -> list[str]:
+def _use(scene: Scene, estimate: SceneEstimate, camera: str) -> list[str]:
     """In which frames a camera was used, or was there."""
     states = []
-    for row in content.rows:
-        is_used = camera in content.records[row.frame].ious
-        is_there = (camera, row.frame) in content.seen
+    for frame, record in estimate.records.items():
+        is_used, is_there = camera in record.ious, (camera, frame) in scene.masks
         states.append("used" if is_used else "left-out" if is_there else "no-picture")
     return states
 
 
-def _pick_pictures(content: ReportContent) -> list[Picture]:
+def _pick_pictures(folder: Path, scene: Scene, estimate: SceneEstimate) -> list[Picture]:
     """Overlays of the frames that fit worst, as usual and best, as far as they were written."""
-    known = [row for row in content.rows if row.found] or list(content.rows)
+    known = [row for row in estimate.rows if row.found] or list(estimate.rows)
     in_order = sorted(known, key=lambda row: -row.error if row.found else 0.0)
     last = len(in_order) - 1
     chosen = list(dict.fromkeys([0, (last + 1) // 2, last])) if in_order else []
     pictures = []
     for row in (in_order[place] for place in chosen):
-        ious = content.records[row.frame].ious
-        cameras = sorted(content.cameras, key=lambda name: ious.get(name, 1.0))
+        ious = estimate.records[row.frame].ious
+        cameras = sorted(scene.cameras, key=lambda name: ious.get(name, 1.0))
         shown = [
-            overlay_picture(content.folder, name, row.frame, row.error if row.found else None)
+            overlay_picture(folder, name, row.frame, row.error if row.found else None)
             for name in cameras
         ]
         pictures += [one for one in shown if one is not None][: max(1, _PICTURES // len(chosen))]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,9 +25,14 @@ from drake_pose.results.folder import (
 from drake_pose.results.motion_files import write_motion
 from drake_pose.results.overlay import draw_overlay, encode_png
 from drake_pose.results.poses import PoseRow, PoseTable, base_pose
-from drake_pose.results.records import FrameRecord, family_table, joint_table
+from drake_pose.results.records import (
+    FrameRecord,
+    SceneEstimate,
+    family_table,
+    joint_table,
+)
 from drake_pose.results.replay import make_replay
-from drake_pose.results.report_page import ReportContent, make_report
+from drake_pose.results.report_page import make_report
 from drake_pose.results.summary import (
     camera_warnings,
     mask_digests,
@@ -69,27 +74,6 @@ class FinishedFrame(NamedTuple):
     row: PoseRow
     record: FrameRecord
     drawn: Mapping[str, Drawn]
-
-
-@dataclass(frozen=True)
-class SceneEstimate:
-    """The estimate of a scene: poses, the search's records, summary.json, folder and warnings.
-
-    Position kinds are "angle" [rad], "length" [m] or "quaternion", in the plant's order.
-    """
-
-    position_names: tuple[str, ...]
-    position_kinds: tuple[str, ...]
-    rows: tuple[PoseRow, ...]
-    records: Mapping[str, FrameRecord]
-    summary: Mapping[str, Any]
-    folder: Path | None
-    warnings: tuple[str, ...] = ()
-
-    @property
-    def found_count(self) -> int:
-        """In how many frames a pose was found."""
-        return sum(record.found for record in self.records.values())
 
 
 class ResultWriter:
@@ -219,7 +203,8 @@ class ResultWriter:
                 q = np.array([row.q for row in found])
                 X_WB = np.array([base_pose(row.base) for row in found])
                 self.write(REPLAY, make_replay(self.model, q, X_WB, cameras, period))
-            self.write(REPORT, make_report(self._report(self.folder)))
+            page = make_report(self.folder, self.model, self.scene, self.result())
+            self.write(REPORT, page)
         self._complete = True
 
     def result(self) -> SceneEstimate:
@@ -238,13 +223,6 @@ class ResultWriter:
             folder=self.folder,
             warnings=tuple(self.warnings),
         )
-
-    def _report(self, folder: Path) -> ReportContent:
-        done, scene = self.result(), self.scene
-        return ReportContent(
-            folder, self.model, tuple(scene.cameras), scene.masks, done.rows, done.records,
-            done.summary, scene.sequence,
-        )  # fmt: skip
 
     def write_summary(self) -> None:
         """Write summary.json and the tables of joints, whatever there is by now."""

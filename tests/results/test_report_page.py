@@ -1,4 +1,5 @@
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -6,15 +7,16 @@ import numpy as np
 import pytest
 
 from drake_pose.body.files.packages import bundled_model
-from drake_pose.body.model import load_model
+from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.results.poses import PoseRow
-from drake_pose.results.records import FrameRecord, JointRecord
-from drake_pose.results.report_page import ReportContent, make_report
+from drake_pose.results.records import FrameRecord, JointRecord, SceneEstimate
+from drake_pose.results.report_page import make_report
 from drake_pose.results.report_plots import BOX, HEIGHT, WIDTH, draw_grid, plot_curves
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.results.summary import summarize
-from tests.jobs.scenes import NAMES, TinyScene, read_rows
+from drake_pose.silhouette.pictures.scenes import Scene
+from tests.jobs.scenes import NAMES, TinyScene, camera, read_rows
 
 VOID = {"meta", "img", "br", "link", "hr"}
 
@@ -119,11 +121,11 @@ def test_page_needs_nothing_but_itself_and_its_links_lead_somewhere(result: Path
         assert link.removeprefix("#") in page.by_id or (result / link).is_file(), link
 
 
-def long_content(frames: int) -> ReportContent:
+def long_report(frames: int) -> tuple[ArticulatedModel, Scene, SceneEstimate]:
     """A person in many frames: two cameras, gaps, frames not found, names that are no HTML."""
     model = load_model(bundled_model("person").with_name("person_shape.urdf"), check=False)
     rng = np.random.default_rng(2)
-    rows, records, seen = [], {}, set()
+    rows, records, masks = [], {}, {}
     walk = np.cumsum(rng.normal(0.0, 0.02, (frames, len(model.position_names))), axis=0)
     unit = np.where(np.array(model.position_kinds) == "angle", np.degrees(1.0), 1.0)
     for k in range(frames):
@@ -142,35 +144,34 @@ def long_content(frames: int) -> ReportContent:
             found, 0.1 if found else None, 0.1, joints=joints if found else {},
             ious=ious if found else {},
         )  # fmt: skip
-        seen |= {("<b>left</b>", frame)} | ({("right & low", frame)} if k % 80 else set())
+        masks["<b>left</b>", frame] = Path()
+        if k % 80:
+            masks["right & low", frame] = Path()
     more = {"method": "person", "warnings": ["camera '<b>left</b>' agrees badly"]}
     job = {"scene": "/data/<script>", "model": "person.urdf"}
-    summary = summarize(job, records, True, more)
-    return ReportContent(
-        Path("nowhere"), model, ("<b>left</b>", "right & low"), frozenset(seen), tuple(rows),
-        records, summary, True,
+    cameras = {name: camera(name) for name in ("<b>left</b>", "right & low")}
+    scene = Scene(Path("nowhere"), cameras, tuple(records), masks, True)
+    estimate = SceneEstimate(
+        model.position_names, model.position_kinds, tuple(rows), records,
+        summarize(job, records, True, more), None,
     )  # fmt: skip
+    return model, scene, estimate
 
 
 @pytest.fixture(scope="module")
-def content() -> ReportContent:
-    return long_content(1000)
+def report() -> tuple[ArticulatedModel, Scene, SceneEstimate]:
+    return long_report(1000)
 
 
-def test_a_thousand_frames_stay_small(content: ReportContent) -> None:
-    text = make_report(content)
+def test_a_thousand_frames_stay_small_and_names_are_shown_as_they_are(report) -> None:
+    text = make_report(Path("nowhere"), *report)
     assert len(text) < 2_500_000
     page = Page(text)
     assert page.by_id["found"] == "980 of 1000"
     assert "20 of 1000 frames have no pose: 0100, 0101" in page.by_id["warnings"]
     still = next(table for table in page.tables if table[0][0] == "joint")
     assert still[1][:2] == ["left_thigh_stretch", "0.0200"]
-
-
-def test_names_are_shown_as_they_are(content: ReportContent) -> None:
-    page = Page(make_report(content))
-    assert "b" not in page.tags
-    assert "script" not in page.tags
+    assert not {"b", "script"} & set(page.tags)
     cameras = next(table for table in page.tables if table[0][0] == "camera")
     assert [row[0] for row in cameras[1:]] == ["<b>left</b>", "right & low"]
     assert cameras[1][6] == "see the warnings"
@@ -178,11 +179,12 @@ def test_names_are_shown_as_they_are(content: ReportContent) -> None:
     assert "camera '<b>left</b>' agrees badly" in page.by_id["warnings"]
 
 
-def test_a_frame_or_none_is_enough(content: ReportContent) -> None:
-    one = content._replace(rows=content.rows[:1], records={"0000": content.records["0000"]})
-    assert Page(make_report(one)).joints
-    lost = content._replace(rows=content.rows[100:101], records={"0100": content.records["0100"]})
-    assert Page(make_report(lost)).joints == {}
+@pytest.mark.parametrize("k", [0, 100])
+def test_a_frame_or_none_is_enough(report, k: int) -> None:
+    model, scene, whole = report
+    records = {f"{k:04d}": whole.records[f"{k:04d}"]}
+    one = replace(whole, rows=whole.rows[k : k + 1], records=records)
+    assert bool(Page(make_report(Path("nowhere"), model, scene, one)).joints) is (k == 0)
 
 
 def coordinates(path: str) -> np.ndarray:

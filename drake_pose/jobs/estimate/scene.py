@@ -10,9 +10,10 @@ from drake_pose.jobs.estimate.matching import compare_cameras, match_frames
 from drake_pose.jobs.estimate.person import follow_person
 from drake_pose.results.folder import SHAPES
 from drake_pose.results.overlay import encode_png
+from drake_pose.results.records import SceneEstimate
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.results.summary import describe_job, open_job
-from drake_pose.results.writer import OnFrame, OnStage, ResultWriter, SceneEstimate
+from drake_pose.results.writer import OnFrame, OnStage, ResultWriter
 
 
 def estimate_scene(

@@ -17,10 +17,10 @@ from drake_pose.jobs.live.scene import LiveScene
 from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.recordings.persons_in_view import keep_person
 from drake_pose.results.poses import PoseRow
-from drake_pose.results.records import FrameRecord, record_deviations
+from drake_pose.results.records import FrameRecord, SceneEstimate, record_deviations
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.results.summary import describe_job
-from drake_pose.results.writer import ResultWriter, SceneEstimate
+from drake_pose.results.writer import ResultWriter
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.mask_agreement import compare_masks
 from drake_pose.silhouette.pictures.scenes import Scene

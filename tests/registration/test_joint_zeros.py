@@ -1,14 +1,16 @@
 """Zeros of encoders are found where they are off, and none where they are right."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from drake_pose.body.model import ArticulatedModel
+from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError, UnknownNameError
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.registration.joint_zeros import calibrate_joints
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
-from drake_pose.registration.register import CameraSearch, RegistrationBody
+from drake_pose.registration.register import CameraSearch
 from drake_pose.registration.shared_fit import SharedFit
 from tests.registration.arm_pictures import errors, looking_at, see
 
@@ -21,13 +23,15 @@ def misread(frames: list[PosedFrame], zeros: np.ndarray) -> list[PosedFrame]:
     return [PosedFrame(one.name, one.values - zeros, one.mask) for one in frames]
 
 
+@pytest.fixture(scope="module")
+def camera() -> PinholeCamera:
+    return looking_at(np.array([1.6, 0.4, 0.5]), MIDDLE, 0.1)
+
+
 class TestCalibrateJoints:
     @pytest.mark.slow
     @pytest.mark.parametrize("off", [np.radians([2.0, 0.0, -2.0]), np.zeros(3)])
-    def test_finds_zeros(
-        self, model: ArticulatedModel, body: RegistrationBody, off: np.ndarray
-    ) -> None:
-        camera = looking_at(np.array([1.6, 0.4, 0.5]), MIDDLE, 0.1)
+    def test_finds_zeros(self, model, body, camera, off: np.ndarray) -> None:
         zeros = np.zeros(len(body.kinematics.names))
         zeros[[body.kinematics.names.index(name) for name in NAMES]] = off
         frames = misread(see(model, body, camera, 8, 4), zeros)
@@ -43,19 +47,16 @@ class TestCalibrateJoints:
         assert turn < np.radians(0.15)
 
     @pytest.mark.slow
-    def test_focal_length(self, model: ArticulatedModel, body: RegistrationBody) -> None:
-        camera = looking_at(np.array([1.6, 0.4, 0.5]), MIDDLE, 0.1)
+    def test_focal_length(self, model, body, camera) -> None:
         frames = see(model, body, camera, 8, 4)
-        wrong = type(camera)("eye", 640, 480, 612.0, 612.0, 319.5, 239.5, np.eye(4))
+        wrong = replace(camera, focal_x=612.0, focal_y=612.0, X_WC=np.eye(4))
         registered = CameraSearch(body).register(wrong, frames)
         found = calibrate_joints(body, [registered], [frames], [], focal=True)
         assert found.cameras[0].focal_x == pytest.approx(600.0, rel=0.004)
         assert abs(found.cameras[0].focal_x - 600.0) < 4.0 * 600.0 * found.focal_deviations[0]
 
     @pytest.mark.slow
-    def test_cameras_share_zeros_and_lengths(
-        self, model: ArticulatedModel, body: RegistrationBody
-    ) -> None:
+    def test_cameras_share_zeros_and_lengths(self, model, body) -> None:
         """What two cameras see is one robot: they tell its zero together, better than each."""
         places = (np.array([1.6, 0.4, 0.5]), np.array([0.3, -1.6, 0.7]))
         off = np.zeros(len(body.kinematics.names))
@@ -82,11 +83,8 @@ class TestCalibrateJoints:
             assert turn < np.radians(0.15)
 
     @pytest.mark.slow
-    def test_names_what_a_zero_cannot_be_told_from(
-        self, model: ArticulatedModel, body: RegistrationBody
-    ) -> None:
+    def test_names_what_a_zero_cannot_be_told_from(self, model, body, camera) -> None:
         """All that is seen of this arm hangs on its first joint."""
-        camera = looking_at(np.array([1.6, 0.4, 0.5]), MIDDLE, 0.1)
         frames = see(model, body, camera, 5, 4)
         registered = CameraSearch(body).refine(camera, frames)
         found = calibrate_joints(body, [registered], [frames], ["turret_turn"])
@@ -94,8 +92,7 @@ class TestCalibrateJoints:
         assert not found.zeros[0].significant
         assert any("turn" in name or "shift" in name for name in found.zeros[0].gauge)
 
-    def test_refuses(self, model: ArticulatedModel, body: RegistrationBody) -> None:
-        camera = looking_at(np.array([1.6, 0.4, 0.5]), MIDDLE, 0.1)
+    def test_refuses(self, model, body, camera) -> None:
         frames = see(model, body, camera, 1, 4)
         registered = CameraSearch(body).refine(camera, frames)
         with pytest.raises(UnknownNameError, match="knee"):
@@ -106,10 +103,7 @@ class TestCalibrateJoints:
             calibrate_joints(body, [registered], [frames], NAMES)
 
 
-def test_the_cost_bends_as_the_normal_equations_say(
-    model: ArticulatedModel, body: RegistrationBody
-) -> None:
-    camera = looking_at(np.array([1.6, 0.4, 0.5]), MIDDLE, 0.1)
+def test_the_cost_bends_as_the_normal_equations_say(model, body, camera) -> None:
     frames = see(model, body, camera, 4, 4)
     seen = PosedFrames(body.kinematics, body.all, camera, frames)
     fit = SharedFit([seen], [camera.X_CW], ["elbow_turn"])

@@ -99,33 +99,36 @@ def follow(
     return state, statuses
 
 
+def registered_at(state: OnlineState, x: float) -> bool:
+    """Whether the camera is known to stand where ``camera_at`` puts it."""
+    return state.registered is not None and np.allclose(
+        state.registered.camera.X_WC, camera_at(x).X_WC
+    )
+
+
+def names(state: OnlineState) -> set[str]:
+    return {one.name for one in state.keyframes}
+
+
 class TestKeyframes:
-    def test_searches_once_there_are_enough(
-        self, online: OnlineRegistration, search: ScriptedSearch
-    ) -> None:
-        state, statuses = follow(online, OnlineState(), [frame("here", t) for t in TURNS[:3]])
-        assert statuses == [NOT_REGISTERED] * 3
-        assert search.searches == 0
-        # The same again is no new evidence.
-        state, _ = follow(online, state, [frame("here", TURNS[1] + 0.01)] * 5)
-        assert len(state.keyframes) == 3
-        assert search.searches == 0
-        state, statuses = follow(online, state, [frame("here", TURNS[3])])
-        assert statuses == [REGISTERED]
-        assert search.searches == 1
-        assert state.registered is not None
-        np.testing.assert_allclose(state.registered.camera.X_WC, camera_at(1.6).X_WC)
-
-    def test_keeps_the_newest(self, online: OnlineRegistration) -> None:
+    def test_searches_once_there_are_enough_and_keeps_the_newest(self, online, search) -> None:
         frames = [frame("here", t) for t in TURNS]
-        state, _ = follow(online, OnlineState(), frames)
+        state, statuses = follow(online, OnlineState(), frames[:3])
+        assert statuses == [NOT_REGISTERED] * 3
+        # The same again is no new evidence, and an empty mask none at all.
+        state, _ = follow(online, state, [frame("here", TURNS[1] + 0.01)] * 5)
+        empty = PosedFrame("empty", np.zeros(5), np.zeros((480, 640), dtype=bool))
+        assert online.next(state, empty) is state
+        assert (len(state.keyframes), search.searches) == (3, 0)
+        state, statuses = follow(online, state, frames[3:])
+        assert set(statuses) == {REGISTERED}
+        assert search.searches == 1
+        assert registered_at(state, 1.6)
         assert state.keyframes == tuple(frames[2:])
-        assert state.registered is not None
         assert len(state.registered.frames) == 6
+        assert copy.deepcopy(state) is state
 
-    def test_an_ambiguous_camera_is_not_registered(
-        self, online: OnlineRegistration, search: ScriptedSearch
-    ) -> None:
+    def test_an_ambiguous_camera_is_not_registered(self, online, search) -> None:
         search.alternatives = 1
         state, statuses = follow(online, OnlineState(), [frame("here", t) for t in TURNS[:5]])
         assert statuses[-1] == NOT_REGISTERED
@@ -133,38 +136,28 @@ class TestKeyframes:
         _, statuses = follow(online, state, [frame("here", TURNS[5])])
         assert statuses == [REGISTERED]
 
-    def test_frames_that_nothing_explains_register_nothing(
-        self, online: OnlineRegistration
-    ) -> None:
-        frames = [frame("nowhere", t) for t in TURNS]
-        state, statuses = follow(online, OnlineState(), frames)
+    def test_frames_that_nothing_explains_register_nothing_and_are_not_kept(self, online) -> None:
+        state, statuses = follow(online, OnlineState(), [frame("nowhere", t) for t in TURNS])
         assert set(statuses) == {NOT_REGISTERED}
         # So that good ones find room.
         assert len(state.keyframes) == 6
-
-    def test_wrong_frames_are_not_kept(self, online: OnlineRegistration) -> None:
         frames = [frame("here", t) for t in TURNS[:4]]
         frames.insert(1, frame("nowhere", TURNS[5]))
         state, statuses = follow(online, OnlineState(), frames)
         assert statuses[-1] == REGISTERED
-        assert {one.name for one in state.keyframes} == {"here"}
+        assert names(state) == {"here"}
 
-    def test_an_empty_mask_says_nothing(self, online: OnlineRegistration) -> None:
-        state, _ = follow(online, OnlineState(), [frame("here", t) for t in TURNS[:4]])
-        empty = PosedFrame("empty", np.zeros(5), np.zeros((480, 640), dtype=bool))
-        assert online.next(state, empty) is state
-
-    def test_copies_share_what_is_known(self, online: OnlineRegistration) -> None:
-        state = online.next(OnlineState(), frame("here", 0.0))
-        assert copy.deepcopy(state) is state
-
-    def test_settings(self) -> None:
-        with pytest.raises(SettingsError, match="newest <= least_frames"):
-            OnlineSettings(least_frames=2)
-        with pytest.raises(SettingsError, match="novelty"):
-            OnlineSettings(novelty=-1.0)
-        with pytest.raises(SettingsError, match="false_alarm"):
-            OnlineSettings(false_alarm=0.0)
+    @pytest.mark.parametrize(
+        ("settings", "said"),
+        [
+            ({"least_frames": 2}, "newest <= least_frames"),
+            ({"novelty": -1.0}, "novelty"),
+            ({"false_alarm": 0.0}, "false_alarm"),
+        ],
+    )
+    def test_settings_out_of_range_are_refused(self, settings, said) -> None:
+        with pytest.raises(SettingsError, match=said):
+            OnlineSettings(**settings)
 
 
 class TestMovedCamera:
@@ -172,67 +165,51 @@ class TestMovedCamera:
     def known(self, online: OnlineRegistration) -> OnlineState:
         return follow(online, OnlineState(), [frame("here", t) for t in TURNS[:5]])[0]
 
-    def test_is_found_where_frames_contradict_and_agree(
-        self, online: OnlineRegistration, search: ScriptedSearch, known: OnlineState
-    ) -> None:
+    def test_is_found_where_frames_contradict_and_agree(self, online, search, known) -> None:
         state, statuses = follow(online, known, [frame("there", t) for t in TURNS[4:]])
         # Three tell that the pose is wrong, four that the camera is there.
         assert statuses == [REGISTERED, REGISTERED, CONTRADICTED, REGISTERED]
-        assert search.searches == 2
-        assert state.moves == 1
-        assert state.registered is not None
-        np.testing.assert_allclose(state.registered.camera.X_WC, camera_at(2.0).X_WC)
-        assert {one.name for one in state.keyframes} == {"there"}
+        assert (search.searches, state.moves) == (2, 1)
+        assert registered_at(state, 2.0)
+        assert names(state) == {"there"}
 
-    def test_is_noticed_while_the_body_stands_still(
-        self, online: OnlineRegistration, search: ScriptedSearch, known: OnlineState
-    ) -> None:
+    def test_is_noticed_while_the_body_stands_still(self, online, search, known) -> None:
         _, statuses = follow(online, known, [frame("there", TURNS[4])] * 6)
         assert statuses == [REGISTERED] * 2 + [CONTRADICTED] * 4
         # One pose of the body, however often it is seen, does not tell where the camera is.
         assert search.searches == 1
 
-    def test_hidden_frames_do_not_move_it(
-        self, online: OnlineRegistration, known: OnlineState
-    ) -> None:
+    def test_hidden_frames_do_not_move_it(self, online, known) -> None:
         state, statuses = follow(online, known, [frame("nowhere", t) for t in TURNS])
         assert statuses == [REGISTERED] * 2 + [CONTRADICTED] * 6
         assert state.registered is known.registered
         state, statuses = follow(online, state, [frame("here", TURNS[6])])
         assert statuses == [REGISTERED]
-        assert state.moves == 0
-        assert state.contradicting == ()
+        assert (state.moves, state.contradicting) == (0, ())
 
     def test_a_pose_that_is_not_known_well_is_corrected_and_has_not_moved(
-        self, online: OnlineRegistration, search: ScriptedSearch, known: OnlineState
+        self, online, search, known
     ) -> None:
         search.deviation = 0.3
         state, statuses = follow(online, known, [frame("there", t) for t in TURNS[4:]])
-        assert statuses[-1] == REGISTERED
-        assert state.moves == 0
-        assert state.registered is not None
-        np.testing.assert_allclose(state.registered.camera.X_WC, camera_at(2.0).X_WC)
+        assert (statuses[-1], state.moves) == (REGISTERED, 0)
+        assert registered_at(state, 2.0)
 
-    def test_a_few_wrong_frames_are_left_out(
-        self, online: OnlineRegistration, known: OnlineState
-    ) -> None:
+    def test_a_few_wrong_frames_are_left_out(self, online, known) -> None:
         places = ["here", "nowhere", "here", "nowhere", "nowhere", "here"]
         turns = np.resize(TURNS[5:], len(places))
         frames = [frame(place, t) for place, t in zip(places, turns, strict=True)]
         state, statuses = follow(online, known, frames)
         assert set(statuses) == {REGISTERED}
         assert state.moves == 0
-        assert "nowhere" not in {one.name for one in state.keyframes}
+        assert "nowhere" not in names(state)
 
-    def test_a_small_move_is_found_by_the_newest_frames_alone(
-        self, online: OnlineRegistration, known: OnlineState
-    ) -> None:
+    def test_a_small_move_is_found_by_the_newest_frames_alone(self, online, known) -> None:
         state, statuses = follow(online, known, [frame("a little off", t) for t in TURNS[5:]])
         assert set(statuses) == {REGISTERED}
         assert state.moves == 1
         assert [one.name for one in state.keyframes] == ["a little off"] * 3
-        assert state.registered is not None
-        np.testing.assert_allclose(state.registered.camera.X_WC, camera_at(1.62).X_WC)
+        assert registered_at(state, 1.62)
 
 
 def bumped(camera: PinholeCamera, degrees: float, metres: float) -> PinholeCamera:

@@ -1,7 +1,6 @@
 """`drake-pose register`: a camera file with poses, from masks and joint positions."""
 
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -42,35 +41,31 @@ def registered(
 
 class TestRegister:
     def test_the_camera_is_found_and_the_other_one_held(self, arm_scene, registered) -> None:
-        written = load_cameras(registered[0] / "cameras.yaml")
+        out, found, result = registered
+        assert result.stderr == ""
+        assert found["warnings"] == []
+        written = load_scene_cameras(arm_scene, out)
         assert list(written) == ["left", "right"]
         millimetres, degrees = pose_errors(written["left"].X_WC, arm_scene.cameras["left"].X_WC)
         # Two metres before a camera of 320 x 240 pixels.
-        assert millimetres < 8.0
-        assert degrees < 0.2
+        assert millimetres < min(8.0, 4.0 * np.sqrt(3.0) * found["translation_sd_mm"])
+        assert degrees < min(0.2, 4.0 * np.sqrt(3.0) * found["rotation_sd_deg"])
         np.testing.assert_array_equal(written["right"].X_WC, arm_scene.cameras["right"].X_WC)
         for name in ("width", "focal_x", "focal_y", "center_x", "center_y", "near"):
             assert getattr(written["left"], name) == getattr(arm_scene.cameras["left"], name)
 
-    def test_nothing_is_warned_of(self, registered) -> None:
-        assert registered[2].stderr == ""
-        assert registered[1]["warnings"] == []
-
-    def test_json(self, arm_scene, registered) -> None:
+    def test_json(self, registered) -> None:
         out, found, _ = registered
         assert found == json.loads((out / "summary.json").read_text())
         assert list(found["cameras"]) == ["left"]
         for name in ("X_WC", "translation_sd_mm", "rotation_sd_deg", "families", "mean_iou"):
             assert found[name] == found["cameras"]["left"][name]
-        off = pose_errors(np.array(found["X_WC"]), arm_scene.cameras["left"].X_WC)
-        assert off[0] < 4.0 * np.sqrt(3.0) * found["translation_sd_mm"] < 50.0
-        assert off[1] < 4.0 * np.sqrt(3.0) * found["rotation_sd_deg"] < 1.5
         assert found["families"] == [{"X_WC": found["X_WC"]}]
         assert found["mean_iou"] > 0.98
-        assert found["zeros"] == {}
-        assert found["seconds"] > 0.0
+        assert (found["zeros"], found["lengths"], found["contradictions"]) == ({}, {}, [])
+        assert 0.0 < found["rotation_sd_deg"] < 1.5
+        assert 0.0 < found["seconds"]
         assert list(found["frames"]) == [f"{k:04d}" for k in range(5)]
-        assert found["contradictions"] == []
 
     def test_covariance(self, registered) -> None:
         out, found, _ = registered
@@ -82,12 +77,10 @@ class TestRegister:
         assert found["rotation_sd_deg"] == pytest.approx(turn)
         assert one["X_WC"] == found["X_WC"]
 
-    def test_overlays(self, registered) -> None:
+    def test_overlays_and_report(self, registered) -> None:
         pictures = sorted((registered[0] / "overlay" / "left").glob("*.png"))
         assert [path.stem for path in pictures] == [f"{k:04d}" for k in range(5)]
         assert cv2.imread(str(pictures[0])).shape[1] >= 560
-
-    def test_report(self, registered) -> None:
         page = (registered[0] / "report.html").read_text()
         assert page.count("data:image/jpeg;base64,") == 5
         assert page.count("<tr><td>000") == 5
@@ -97,10 +90,11 @@ class TestRegister:
             assert f'href="{name}"' in page
             assert (registered[0] / name).is_file()
 
-    def test_estimate_reads_the_camera_file(self, arm_scene, registered, tmp_path) -> None:
-        shutil.copytree(arm_scene.folder, tmp_path / "scene")
-        shutil.copy(registered[0] / "cameras.yaml", tmp_path / "scene" / "cameras.yaml")
-        assert list(load_scene(tmp_path / "scene").cameras) == ["left", "right"]
+
+def load_scene_cameras(scene: ArmScene, out: Path) -> dict[str, Any]:
+    """The cameras as an estimate of the scene reads them from a result's camera file."""
+    cameras = load_cameras(out / "cameras.yaml")
+    return dict(load_scene(scene.folder, cameras).cameras)
 
 
 def test_estimate_says_how_a_missing_pose_is_found(arm_scene: ArmScene, tmp_path: Path) -> None:
@@ -129,20 +123,16 @@ class TestOnTheTerminal:
         assert "5 of 5" in result.stdout
         assert "cameras.yaml" in result.stdout
 
-    def test_a_held_camera_that_looks_elsewhere_is_named(
+    def test_one_pose_and_a_held_camera_that_looks_elsewhere_are_warned_of(
         self, own_arm: ArmScene, tmp_path: Path
     ) -> None:
         elsewhere = np.array(own_arm.cameras["right"].X_WC)
         elsewhere[:3, 3] += [0.0, 0.8, 0.0]
         own_arm.edit_cameras("right", X_WC=elsewhere.tolist())
-        result = run(own_arm, tmp_path / "out")
+        result = run(own_arm, tmp_path / "out", "--frame", "2", "--json")
         assert result.exit_code == 0, result.output
         assert "camera 'right' is held at its X_WC, but the robot is not seen" in result.stderr
         assert "--camera right" in result.stderr
-
-    def test_one_pose_is_warned_of(self, own_arm: ArmScene, tmp_path: Path) -> None:
-        result = run(own_arm, tmp_path / "out", "--frame", "2", "--json")
-        assert result.exit_code == 0, result.output
         assert "camera 'left': there is one frame, '0002'" in result.stderr
         assert list(json.loads(result.stdout)["frames"]) == ["0002"]
 
@@ -226,89 +216,65 @@ def test_cameras_tell_together_whose_fault_a_frame_is() -> None:
     assert say_common([left]) == []
 
 
-class TestZeros:
-    @pytest.mark.slow
-    def test_zeros_are_found_and_written_to_a_urdf(self, own_arm: ArmScene, tmp_path: Path) -> None:
-        off = np.radians(3.0)
-        rows = own_arm.rows()
-        column = rows[0].index("elbow_turn")
-        for row in rows[1:]:
-            row[column] = str(float(row[column]) - off)
-        own_arm.write_rows(rows)
-        out = tmp_path / "out"
-        given = ["--zeros", "shoulder_turn", "--zeros", "elbow_turn", "--json"]
-        result = run(own_arm, out, *given)
-        assert result.exit_code == 0, result.output
-        zeros = json.loads(result.stdout)["zeros"]
-        assert zeros["elbow_turn"]["value_deg"] == pytest.approx(3.0, abs=0.3)
-        assert zeros["elbow_turn"]["significant"]
-        assert not zeros["shoulder_turn"]["significant"]
-        assert "<td>elbow_turn</td><td>3." in (out / "report.html").read_text()
-        # Drake poses the corrected robot at the encoders' readings as the right one at the truth.
-        right, corrected = load_model(own_arm.model), load_model(out / "arm_calibrated.urdf")
-        read = np.array([float(one) for one in rows[1][1:]])
-        true = read.copy()
-        for name in ("shoulder_turn", "elbow_turn"):
-            true[rows[0].index(name) - 1] += np.radians(zeros[name]["value_deg"])
-        places = []
-        for model, q in ((right, true), (corrected, read)):
-            context = model.plant.CreateDefaultContext()
-            model.plant.SetPositions(context, q)
-            hand = model.plant.GetBodyByName("hand").EvalPoseInWorld(context)
-            places.append(hand.GetAsMatrix4())
-        np.testing.assert_allclose(places[1], places[0], atol=1e-9)
-        np.testing.assert_allclose(corrected.lower + _zeros(zeros, rows[0][1:]), right.lower)
-
-    def test_too_few_frames(self, own_arm: ArmScene, tmp_path: Path) -> None:
-        out = tmp_path / "out"
-        result = run(own_arm, out, "--zeros", "all", "--frame", "0000")
-        assert result.exit_code == 1
-        assert "more frames" in result.stderr
-        assert not out.exists()
-
-
-class TestLengths:
-    @pytest.mark.slow
-    def test_lengths_are_found_and_written_to_a_urdf(
-        self, own_arm: ArmScene, tmp_path: Path
-    ) -> None:
-        right, out = load_model(own_arm.model), tmp_path / "out"
-        short = own_arm.model.read_text().replace('"0 0 0.35"', '"0 0 0.34"')
-        (tmp_path / "short.urdf").write_text(short)
-        given = ["--lengths", "shoulder", "--lengths", "turret", "--json"]
-        result = run(replace(own_arm, model=tmp_path / "short.urdf"), out, *given)
-        assert result.exit_code == 0, result.output
-        summary = json.loads(result.stdout)
-        found = summary["lengths"]
-        off = 100.0 * (0.35 / 0.34 - 1.0)
-        assert list(found) == ["shoulder", "turret"]
-        assert found["shoulder"]["low_percent"] < off < found["shoulder"]["high_percent"]
-        assert found["shoulder"]["value_percent"] == pytest.approx(off, abs=0.7)
-        assert found["shoulder"]["significant"]
-        assert not found["turret"]["significant"]
-        assert summary["mean_iou"] > 0.98
-        assert yaml.safe_load((out / "registration.yaml").read_text())["left"]["lengths"] == found
-        one = found["shoulder"]
-        row = (
-            f"<td>shoulder</td><td>{one['value_percent']:.3f} %</td>"
-            f"<td>{one['low_percent']:.3f} to {one['high_percent']:.3f}</td><td>significant</td>"
-        )
-        page = (out / "report.html").read_text()
-        assert row in page
-        assert "as good as 0" in page
-        # Drake has the elbow where the right arm has it, but for what the two lengths are off.
-        places = []
-        for model in (right, load_model(out / "short_calibrated.urdf")):
-            context = model.plant.CreateDefaultContext()
-            elbow = model.plant.GetBodyByName("elbow").EvalPoseInWorld(context)
-            places.append(elbow.translation())
-        longer = 0.2 * found["turret"]["value_percent"] + 0.34 * (
-            found["shoulder"]["value_percent"] - off
-        )
-        np.testing.assert_allclose(places[1] - places[0], [0.0, 0.0, 0.01 * longer], atol=1e-9)
+@pytest.mark.slow
+def test_zeros_and_lengths_are_found_and_written_to_a_urdf(
+    own_arm: ArmScene, tmp_path: Path
+) -> None:
+    """Drake poses the corrected robot at the encoders' readings as the right one at the truth."""
+    header, *rows = own_arm.rows()
+    column = header.index("elbow_turn")
+    for row in rows:
+        row[column] = str(float(row[column]) - np.radians(3.0))
+    own_arm.write_rows([header, *rows])
+    short, out = tmp_path / "short.urdf", tmp_path / "out"
+    short.write_text(own_arm.model.read_text().replace('"0 0 0.35"', '"0 0 0.34"'))
+    given = ["--zeros", "shoulder_turn", "--zeros", "elbow_turn"]
+    given += ["--lengths", "shoulder", "--lengths", "turret", "--json"]
+    result = run(replace(own_arm, model=short), out, *given)
+    assert result.exit_code == 0, result.output
+    summary = json.loads(result.stdout)
+    zeros, lengths, off = summary["zeros"], summary["lengths"], 100.0 * (0.35 / 0.34 - 1.0)
+    assert zeros["elbow_turn"]["value_deg"] == pytest.approx(3.0, abs=0.3)
+    assert lengths["shoulder"]["value_percent"] == pytest.approx(off, abs=0.7)
+    assert lengths["shoulder"]["low_percent"] < off < lengths["shoulder"]["high_percent"]
+    for found, other in ((zeros["elbow_turn"], zeros["shoulder_turn"]), lengths.values()):
+        assert found["significant"]
+        assert not other["significant"]
+    assert summary["mean_iou"] > 0.98
+    one = yaml.safe_load((out / "registration.yaml").read_text())["left"]
+    assert (one["zeros"], one["lengths"]) == (zeros, lengths)
+    page = (out / "report.html").read_text()
+    value, low, high = (lengths["shoulder"][f"{key}_percent"] for key in ("value", "low", "high"))
+    row = f"<td>shoulder</td><td>{value:.3f} %</td><td>{low:.3f} to {high:.3f}</td>"
+    assert f"{row}<td>significant</td>" in page
+    assert "<td>elbow_turn</td><td>3." in page or "<td>elbow_turn</td><td>2.9" in page
+    assert "as good as 0" in page
+    # The shorter robot at the truth, its joints shifted by the lengths that were found.
+    right, corrected = load_model(short), load_model(out / "short_calibrated.urdf")
+    read = np.array([float(one) for one in rows[0][1:]])
+    shifts = np.radians([zeros[name]["value_deg"] if name in zeros else 0.0 for name in header[1:]])
+    longer = {name: 0.01 * found["value_percent"] for name, found in lengths.items()}
+    np.testing.assert_allclose(corrected.lower + shifts, right.lower)
+    places = []
+    for model, q in ((right, read + shifts), (corrected, read)):
+        context = model.plant.CreateDefaultContext()
+        model.plant.SetPositions(context, q)
+        frames = {
+            name: model.plant.GetBodyByName(name).EvalPoseInWorld(context).GetAsMatrix4()
+            for name in ("turret", "shoulder", "roll", "hand")
+        }
+        places.append(frames)
+    moved = {
+        "shoulder": 0.2 * longer["turret"] * places[0]["turret"][:3, 2],
+        "roll": 0.34 * longer["shoulder"] * places[0]["shoulder"][:3, 2],
+    }
+    np.testing.assert_allclose(places[1]["hand"][:3, :3], places[0]["hand"][:3, :3], atol=1e-9)
+    shift = places[1]["hand"][:3, 3] - places[0]["hand"][:3, 3]
+    np.testing.assert_allclose(shift, moved["shoulder"] + moved["roll"], atol=1e-9)
 
 
-def _zeros(zeros: dict[str, Any], names: list[str]) -> np.ndarray:
-    """The zeros in the order of names [rad]."""
-    found = [zeros[name]["value_deg"] if name in zeros else 0.0 for name in names]
-    return np.radians(found)
+def test_too_few_frames_for_all_zeros(own_arm: ArmScene, tmp_path: Path) -> None:
+    result = run(own_arm, tmp_path / "out", "--zeros", "all", "--frame", "0000")
+    assert result.exit_code == 1
+    assert "more frames" in result.stderr
+    assert not (tmp_path / "out").exists()

@@ -1,9 +1,9 @@
 """`drake-pose register` of a body whose joint positions nobody measured."""
 
-import csv
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,13 +27,20 @@ def run(scene: Path, model: Path, out: Path, *more: str) -> Result:
     return run_command(["register", str(scene), *given, *more])
 
 
-def errors_in_deviations(out: Path, name: str, true: np.ndarray) -> np.ndarray:
-    """(6,) how far a camera is off, over the standard deviations that it gives itself."""
+def register_near(
+    words: tuple[Any, ...], name: str, true: np.ndarray, *limits: float
+) -> dict[str, Any]:
+    """Runs register; a camera is off by less than limits: mm, degrees and standard deviations."""
+    out, result = words[2], run(*words, "--json")
+    assert result.exit_code == 0, result.output
     found = yaml.safe_load((out / "registration.yaml").read_text())[name]
-    X_WC = np.array(found["X_WC"])
+    X_WC = load_cameras(out / "cameras.yaml")[name].X_WC
+    np.testing.assert_allclose(X_WC, found["X_WC"], atol=1e-9)
     turn = Rotation.from_matrix(X_WC[:3, :3] @ true[:3, :3].T).as_rotvec()
     off = np.concatenate([turn, X_WC[:3, 3] - true[:3, 3]])
-    return off / np.sqrt(np.diag(found["covariance"]))
+    deviations = np.abs(off / np.sqrt(np.diag(found["covariance"]))).max()
+    assert np.all(np.array([*pose_errors(X_WC, true), deviations]) < limits)
+    return json.loads(result.stdout)
 
 
 def write_free_arm(scene: ArmScene, seed: int = 7) -> None:
@@ -57,63 +64,41 @@ def write_free_arm(scene: ArmScene, seed: int = 7) -> None:
 
 
 @pytest.mark.slow
-class TestArm:
-    def test_positions_are_estimated_by_the_other_camera(
-        self, arm_scene: ArmScene, tmp_path: Path
-    ) -> None:
-        out = tmp_path / "out"
-        result = run(arm_scene.folder, arm_scene.model, out, "--json")
-        assert result.exit_code == 0, result.output
-        true = arm_scene.cameras["left"].X_WC
-        X_WC = load_cameras(out / "cameras.yaml")["left"].X_WC
-        millimetres, degrees = pose_errors(X_WC, true)
-        assert millimetres < 25.0
-        assert degrees < 0.8
-        assert np.abs(errors_in_deviations(out, "left", true)).max() < 4.0
-        assert json.loads(result.stdout)["joints"] is None
+class TestFound:
+    def test_positions_are_estimated_by_the_other_camera(self, arm_scene, tmp_path) -> None:
+        words = (arm_scene.folder, arm_scene.model, tmp_path / "out")
+        found = register_near(words, "left", arm_scene.cameras["left"].X_WC, 25.0, 0.8, 4.0)
+        assert found["joints"] is None
 
-    def test_the_base_moves_and_the_table_is_an_estimate_s(
-        self, own_arm: ArmScene, tmp_path: Path
-    ) -> None:
+    def test_the_base_moves_and_the_table_is_an_estimate_s(self, own_arm, tmp_path) -> None:
         write_free_arm(own_arm)
-        out, given = tmp_path / "out", ["--joints", str(own_arm.joints), "--json"]
-        result = run(own_arm.folder, own_arm.model, out, *given)
-        assert result.exit_code == 0, result.output
-        true = own_arm.cameras["left"].X_WC
-        millimetres, degrees = pose_errors(load_cameras(out / "cameras.yaml")["left"].X_WC, true)
+        words = (own_arm.folder, own_arm.model, tmp_path / "out", "--joints", str(own_arm.joints))
         # Held at the table, which is off by a degree and 5 mm, it is 10 mm and more.
-        assert millimetres < 15.0
-        assert degrees < 0.5
-        assert np.abs(errors_in_deviations(out, "left", true)).max() < 4.0
-        assert "0006" not in json.loads(result.stdout)["frames"]
+        found = register_near(words, "left", own_arm.cameras["left"].X_WC, 15.0, 0.5, 4.0)
+        assert "0006" not in found["frames"]
 
-
-@pytest.mark.slow
-class TestRealData:
-    def test_an_arm_without_encoders(self, shared_data: Path, tmp_path: Path) -> None:
-        source, out = shared_data / "arm_two_views", tmp_path / "out"
-        model = source / "med7" / "med7.urdf"
-        result = run(source, model, out, "--camera", "right", "--json")
-        assert result.exit_code == 0, result.output
+    def test_a_recorded_arm_without_encoders(self, shared_data: Path, tmp_path: Path) -> None:
+        source = shared_data / "arm_two_views"
+        words = (source, source / "med7" / "med7.urdf", tmp_path / "out", "--camera", "right")
         true = load_cameras(source / "cameras.yaml")["right"].X_WC
-        millimetres, degrees = pose_errors(load_cameras(out / "cameras.yaml")["right"].X_WC, true)
         # The reference is good to about as much.
-        assert millimetres < 20.0
-        assert degrees < 0.7
-        assert np.abs(errors_in_deviations(out, "right", true)).max() < 3.0
+        register_near(words, "right", true, 20.0, 0.7, 3.0)
 
-    def test_a_person(self, shared_data: Path, tmp_path: Path) -> None:
-        source, out = shared_data / "human_four_views", tmp_path / "out"
+    def test_a_recorded_person(self, shared_data: Path, tmp_path: Path) -> None:
+        source = shared_data / "human_four_views"
         model = bundled_model("person").with_name("person_shape.urdf")
-        given = ["--camera", "cam03", "--frame", "0:19", "--json"]
-        result = run(source, model, out, *given)
-        assert result.exit_code == 0, result.output
+        words = (source, model, tmp_path / "out", "--camera", "cam03", "--frame", "0:19")
         true = load_cameras(source / "cameras.yaml")["cam03"].X_WC
-        millimetres, degrees = pose_errors(load_cameras(out / "cameras.yaml")["cam03"].X_WC, true)
         # Four metres away, the person's surface known to a centimetre or two.
-        assert millimetres < 100.0
-        assert degrees < 2.5
-        assert np.abs(errors_in_deviations(out, "cam03", true)).max() < 5.0
+        register_near(words, "cam03", true, 100.0, 2.5, 5.0)
+
+    def test_a_body_that_stands_still_is_warned_of(self, own_arm, tmp_path: Path) -> None:
+        header, row, *_ = own_arm.rows()
+        own_arm.write_rows([[*header, "error", "seconds"], [*row, 0.1, 1.0]])
+        given = ["--joints", str(own_arm.joints)]
+        result = run(own_arm.folder, own_arm.model, tmp_path / "out", *given)
+        assert result.exit_code == 0, result.output
+        assert "camera 'left': there is one frame, '0000'" in " ".join(result.stderr.split())
 
 
 class TestRefused:
@@ -153,14 +138,3 @@ class TestRefused:
         given = ["--joints", str(own_arm.joints)]
         result = run(own_arm.folder, own_arm.model, tmp_path / "out", *given)
         assert_refused(result, "no camera with an X_WC has a mask of those frames")
-
-
-@pytest.mark.slow
-def test_a_body_that_stands_still_is_warned_of(own_arm: ArmScene, tmp_path: Path) -> None:
-    with own_arm.joints.open(newline="") as file:
-        rows = list(csv.reader(file))
-    own_arm.write_rows([[*rows[0], "error", "seconds"], [*rows[1], 0.1, 1.0]])
-    given = ["--joints", str(own_arm.joints)]
-    result = run(own_arm.folder, own_arm.model, tmp_path / "out", *given)
-    assert result.exit_code == 0, result.output
-    assert "camera 'left': there is one frame, '0000'" in " ".join(result.stderr.split())

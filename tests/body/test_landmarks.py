@@ -39,29 +39,23 @@ LENGTHS = {
 }
 
 
-def by_drake(path: Path, q: np.ndarray) -> dict[str, np.ndarray]:
-    """Each landmark by Drake's own CalcPointsPositions."""
-    plant = load_model(path, check=False).plant
-    context = plant.CreateDefaultContext()
-    plant.SetPositions(context, q)
-    return {
-        name: plant.CalcPointsPositions(
-            context, plant.GetBodyByName(link).body_frame(), point, plant.world_frame()
-        ).ravel()
-        for name, (link, point) in load_landmarks(path).items()
-    }
-
-
 @pytest.mark.parametrize("path", BODIES, ids=lambda path: path.stem)
 def test_bundled_landmarks_are_where_drake_puts_them(path: Path) -> None:
     model = load_model(path, check=False)
-    landmarks = load_landmarks(path)
+    landmarks, plant = load_landmarks(path), model.plant
     assert set(landmarks) == JOINT_CENTRES
+    context = plant.CreateDefaultContext()
     rng = np.random.default_rng(1)
     for _ in range(3):
         q = rng.uniform(model.lower, model.upper)
-        found = landmark_positions(model, landmarks, q)
-        np.testing.assert_allclose(found, list(by_drake(path, q).values()), atol=1e-12)
+        plant.SetPositions(context, q)
+        expected = [
+            plant.CalcPointsPositions(
+                context, plant.GetBodyByName(link).body_frame(), point, plant.world_frame()
+            ).ravel()
+            for link, point in landmarks.values()
+        ]
+        np.testing.assert_allclose(landmark_positions(model, landmarks, q), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("path", BODIES, ids=lambda path: path.stem)
@@ -151,11 +145,7 @@ def test_unknown_links_and_bad_positions_are_named(tmp_path: Path) -> None:
         ("landmarks: {a: {link: b, point: [0, 0, true]}}", "'a': point"),
         ("landmarks: {a: {link: b, point: 3}}", "'a': point"),
         ("landmarks: {a: {link: b, point: [0, 0, 0]}, a: 3}", "given twice"),
-        ("landmarks: {a: !!python/object:os.system x}", "not a YAML file"),
         ("landmarks: [", "not a YAML file"),
-        ("\x00", "not a YAML file"),
-        ("[" * 5000, "YAML file|nested too deeply"),
-        ("#" * (1 << 20) + "\n", "larger than"),
     ],
 )
 def test_bad_files_are_named(text: str, complaint: str, tmp_path: Path) -> None:

@@ -125,24 +125,24 @@ def test_bundled_models_are_found_through_drakes_package_map():
         package_map({"mine": "/nowhere"})
 
 
-def bad_models() -> dict[str, tuple[str, str]]:
-    def one(limits: str) -> str:
-        return urdf(link("a"), link("b"), joint("elbow", "revolute", "a", "b", limits=limits))
-
-    return {
-        "crossed": (one('lower="1" upper="-1"'), "joint 'elbow': lower limit 1"),
-        "nan": (one('lower="nan" upper="1"'), "joint 'elbow'"),
-        "word": (one('lower="low" upper="1"'), "joint 'elbow'"),
-        "no visual": (urdf(link("a", "")), "no visual geometry"),
-        "no xml": ("<robot", "thing.urdf"),
-        "nothing": ("", "thing.urdf"),
-        "no link": ("<robot name='r'/>", "thing.urdf"),
-    }
+def elbow(limits: str) -> str:
+    return urdf(link("a"), link("b"), joint("elbow", "revolute", "a", "b", limits=limits))
 
 
-@pytest.mark.parametrize("name", bad_models())
-def test_bad_models_name_the_culprit(tmp_path, name):
-    text, message = bad_models()[name]
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (elbow('lower="1" upper="-1"'), "joint 'elbow': lower limit 1"),
+        (elbow('lower="nan" upper="1"'), "joint 'elbow'"),
+        (elbow('lower="low" upper="1"'), "joint 'elbow'"),
+        (urdf(link("a", "")), "no visual geometry"),
+        ("<robot", "thing.urdf"),
+        ("", "thing.urdf"),
+        ("<robot name='r'/>", "thing.urdf"),
+    ],
+    ids=["crossed", "nan", "word", "no visual", "no xml", "nothing", "no link"],
+)
+def test_bad_models_name_the_culprit(tmp_path, text, message):
     path = write(tmp_path, text)
     with pytest.raises(ModelError, match=message) as caught:
         load_model(path, check=False).pose_tree()
@@ -153,69 +153,64 @@ def test_bad_models_name_the_culprit(tmp_path, name):
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "message"),
+    ("name", "content"),
     [
-        ("a.obj", b"hello\n", "a.obj"),
-        ("a.obj", b"", "a.obj"),
-        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 0 0 1\n", "a.obj"),
-        ("a.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "a.obj"),
-        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "a.obj"),
-        ("a.stl", b"solid nothing\nendsolid nothing\n", "a.stl"),
-        ("a.stl", b"\x00\x01", "a.stl"),
-        ("a.dae", b"<COLLADA", "a.dae"),
-        ("a.gltf", b"{}", "a.gltf"),
-        ("a.glb", b"glTF", "a.glb"),
-        ("a.ply", b"ply\n", "a.ply"),
+        ("a.obj", b"hello\n"),
+        ("a.obj", b""),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 0 0 1\n"),
+        ("a.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n"),
+        ("a.dae", b"<COLLADA"),
+        ("a.gltf", b"{}"),
+        ("a.glb", b"glTF"),
+        ("a.ply", b"ply\n"),
     ],
 )
-def test_broken_meshes_name_the_file_and_the_link(tmp_path, name, content, message):
+def test_broken_meshes_name_the_file_and_the_link(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(ModelError, match=message) as caught:
+    with pytest.raises(ModelError, match=rf"thing\.urdf.*{name}"):
         load_model(write(tmp_path, mesh_urdf(name)), check=True)
-    assert "thing.urdf" in str(caught.value)
 
 
 def test_missing_and_foreign_files(tmp_path):
-    with pytest.raises(ModelError, match="does not exist"):
-        load_model(tmp_path / "gone.urdf")
-    with pytest.raises(ModelError, match="is not a file"):
-        load_model(tmp_path)
-    with pytest.raises(ModelError, match="not a kind of file"):
-        load_model(write(tmp_path, "x", "model.txt"))
+    write(tmp_path, "x", "model.txt")
+    reasons = {
+        "gone.urdf": "does not exist",
+        ".": "is not a file",
+        "model.txt": "not a kind of file",
+    }
+    for name, reason in reasons.items():
+        with pytest.raises(ModelError, match=reason):
+            load_model(tmp_path / name)
+
+
+def alias_bomb() -> str:
+    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
+    for level in range(1, 10):
+        lines.append(f"a{level}: &a{level} [{', '.join([f'*a{level - 1}'] * 10)}]")
+    return "\n".join(lines) + "\ndirectives: []\n"
 
 
 @pytest.mark.slow
-def test_files_that_crash_drake_do_not_crash_us(tmp_path):
-    loop = '<sdf version="1.9"><model name="m"><include><uri>package://mine/loop.sdf</uri>'
-    path = write(tmp_path, loop + "</include></model></sdf>", "loop.sdf")
-    with pytest.raises(ModelError, match=r"loop\.sdf"):
-        load_model(path, package_paths={"mine": tmp_path})
-    text = "directives:\n- add_directives:\n    file: package://mine/loop.dmd.yaml\n"
-    path = write(tmp_path, text, "loop.dmd.yaml")
-    with pytest.raises(ModelError, match=r"loop\.dmd\.yaml"):
-        load_model(path, package_paths={"mine": tmp_path})
-
-
-@pytest.mark.slow
-def test_gltf_with_an_accessor_out_of_bounds(tmp_path):
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("loop.sdf", '<sdf version="1.9"><model name="m"><include><uri>package://mine/loop.sdf</uri>'
+         "</include></model></sdf>"),
+        ("loop.dmd.yaml", "directives:\n- add_directives:\n    file: package://mine/loop.dmd.yaml\n"),
+        ("bomb.dmd.yaml", alias_bomb()),
+        ("thing.urdf", mesh_urdf("cube.gltf")),
+    ],
+    ids=["SDFormat", "directives", "aliases", "accessor out of bounds"],
+)  # fmt: skip
+def test_files_that_crash_drake_do_not_crash_us(tmp_path, name, text):
     trimesh.creation.box().export(tmp_path / "cube.gltf")
     document = json.loads((tmp_path / "cube.gltf").read_text())
     for accessor in document["accessors"]:
         accessor["count"] = 100_000_000
     (tmp_path / "cube.gltf").write_text(json.dumps(document))
-    with pytest.raises(ModelError, match=r"thing\.urdf"):
-        load_model(write(tmp_path, mesh_urdf("cube.gltf")))
-
-
-@pytest.mark.slow
-def test_a_yaml_alias_bomb_is_stopped(tmp_path):
-    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
-    for level in range(1, 10):
-        aliases = ", ".join([f"*a{level - 1}"] * 10)
-        lines.append(f"a{level}: &a{level} [{aliases}]")
-    path = write(tmp_path, "\n".join(lines) + "\ndirectives: []\n", "bomb.dmd.yaml")
-    with pytest.raises(ModelError, match=r"bomb\.dmd\.yaml"):
-        load_model(path)
+    with pytest.raises(ModelError, match=name):
+        load_model(write(tmp_path, text, name), package_paths={"mine": tmp_path})
 
 
 def test_report_says_what_may_surprise(tmp_path):

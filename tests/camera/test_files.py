@@ -62,16 +62,9 @@ def test_projection_may_be_spelled_out(tmp_path: Path) -> None:
         ("cam: {projection: fisheye}", "'cam'.*projection"),
         ("cam: {projection: [1]}", "'cam'.*projection"),
         (f"cam: {GOOD}".replace("width: 64", "width: .nan"), "'cam'.*width"),
-        (f"cam: {GOOD}".replace("width: 64", "width: true"), "'cam'.*width"),
-        (f"cam: {GOOD}".replace("height: 48", "height: 4.5"), "'cam'.*height"),
-        (f"cam: {GOOD}".replace("focal_x: 60", "focal_x: -60"), "'cam'.*focal_x"),
         (f"cam: {GOOD}".replace("focal_y: 61", "focal_y: [61]"), "'cam'.*focal_y"),
-        (f"cam: {GOOD}".replace("center_x: 31.5", "center_x: .inf"), "'cam'.*center_x"),
-        (f"cam: {GOOD}".replace("[0, 1, 0, 0]", "[0, 2, 0, 0]"), "'cam'.*X_WC.*not a rotation"),
         (f"cam: {GOOD}".replace("[0, 1, 0, 0]", "[0, -1, 0, 0]"), "'cam'.*X_WC.*reflection"),
-        (f"cam: {GOOD}".replace("[0, 0, 0, 1]", "[0, 0, 1, 1]"), "'cam'.*last row of X_WC"),
         (f"cam: {GOOD}".replace("[0, 0, 0, 1]", "[0, 0, 1]"), "'cam'.*X_WC.*4 x 4"),
-        (f"cam: {GOOD}".replace("[0, 1, 0, 0]", "[0, .nan, 0, 0]"), "'cam'.*X_WC"),
         ("[" * 5000, "YAML|deeply"),
     ],
 )
@@ -83,33 +76,29 @@ def test_bad_files_are_refused(tmp_path: Path, text: str, message: str) -> None:
     assert len(str(caught.value)) < 1000
 
 
-def test_unreadable_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(CameraError, match=r"missing\.yaml"):
-        load_cameras(tmp_path / "missing.yaml")
-    with pytest.raises(CameraError, match=str(tmp_path)):
-        load_cameras(tmp_path)
+def test_files_that_cannot_be_read_or_written(tmp_path: Path) -> None:
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00\x80")
-    with pytest.raises(CameraError, match=r"binary\.yaml"):
-        load_cameras(tmp_path / "binary.yaml")
-
-
-def test_alias_bombs_are_refused_quickly(tmp_path: Path) -> None:
-    lines = ["a0: &a0 [x, x, x, x]"]
-    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 40)]
-    with pytest.raises(CameraError, match="a0"):
-        load_cameras(write(tmp_path, "\n".join(lines)))
-    bomb = f"cam: {{{SIDES}, focal_x: 1, focal_y: 1, X_WC: *b}}"
-    head = "\n".join(
-        ["b0: &b0 [[1]]", *[f"b{i}: &b{i} [*b{i - 1}, *b{i - 1}]" for i in range(1, 40)]]
-    )
-    text = head.replace("&b39", "&b") + "\n" + bomb
-    with pytest.raises(CameraError):
-        load_cameras(write(tmp_path, text))
-    with pytest.raises(CameraError, match="larger than"):
-        load_cameras(write(tmp_path, "# " + "x" * (1 << 21)))
-
-
-def test_a_folder_that_does_not_exist_cannot_be_written_to(tmp_path: Path) -> None:
+    (tmp_path / "large.yaml").write_text("# " + "x" * (1 << 21))
+    files = {
+        "missing.yaml": "missing",
+        ".": "folder",
+        "binary.yaml": "mapping",
+        "large.yaml": "larger",
+    }
+    for name, reason in files.items():
+        with pytest.raises(CameraError, match=reason) as caught:
+            load_cameras(tmp_path / name)
+        assert str(tmp_path / name) in str(caught.value)
     camera = PinholeCamera("a", 64, 48, 60.0, 60.0, 31.0, 23.0, np.eye(4))
     with pytest.raises(CameraError, match="nowhere"):
         save_cameras(tmp_path / "nowhere" / "c.yaml", [camera])
+
+
+def test_alias_bombs_are_refused_quickly(tmp_path: Path) -> None:
+    lines = ["a0: &a0 [[1]]"]
+    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 40)]
+    with pytest.raises(CameraError, match="a0"):
+        load_cameras(write(tmp_path, "\n".join(lines)))
+    lines = [f"cam: {{{SIDES}, focal_x: 1, focal_y: 1, X_WC: *a39}}", *lines]
+    with pytest.raises(CameraError):
+        load_cameras(write(tmp_path, "\n".join([*lines[1:], lines[0]])))

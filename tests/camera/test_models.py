@@ -58,17 +58,15 @@ def test_resized_pictures_show_the_same() -> None:
     np.testing.assert_allclose((after + 0.5) * [4.0, 2.0], before + 0.5)
 
 
-def test_points_behind_a_pinhole_have_no_pixel() -> None:
-    uv, depth = pinhole(X_WC=np.eye(4)).project(np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 2.0]]))
-    assert np.isnan(uv[0]).all()
+def test_what_depth_means() -> None:
+    points = np.array([[0.5, 0.5, -7.0], [0.0, 0.0, 2.0], [0.5, 0.5, 9.0]])
+    uv, depth = pinhole(X_WC=np.eye(4)).project(points)
+    assert np.isnan(uv[0]).all(), "behind the camera there is no pixel"
     np.testing.assert_allclose(uv[1], [300.0, 250.0])
-    np.testing.assert_allclose(depth, [-1.0, 2.0])
-
-
-def test_parallel_scale_does_not_depend_on_depth() -> None:
-    uv, depth = parallel(X_WC=np.eye(4)).project(np.array([[1.0, 0.5, -7.0], [1.0, 0.5, 9.0]]))
-    np.testing.assert_allclose(uv, [[576.0, 313.0]] * 2)
-    np.testing.assert_allclose(depth, [-7.0, 9.0])
+    np.testing.assert_array_equal(depth, points[:, 2])
+    uv, depth = parallel(X_WC=np.eye(4)).project(points)
+    np.testing.assert_allclose(uv[[0, 2]], [[463.0, 313.0]] * 2)
+    np.testing.assert_array_equal(depth, points[:, 2])
 
 
 @pytest.mark.parametrize("camera", [pinhole(), parallel()])

@@ -30,8 +30,8 @@ def write_folder(folder, names, suffix=".png"):
 
 
 def specify(folder, kind="folder", **more):
-    given = {"rate_hz": 10.0, "background": "empty", **more}
-    return SourceSpecification("front", kind, str(folder), WIDTH, HEIGHT, **given)
+    given = {"width": WIDTH, "height": HEIGHT, "rate_hz": 10.0, "background": "empty", **more}
+    return SourceSpecification("front", kind, str(folder), **given)
 
 
 def read_all(source):
@@ -103,26 +103,25 @@ class TestFolder:
         assert "full" in source.problems[1]
 
     @pytest.mark.parametrize(
-        ("names", "more", "why"),
+        ("names", "more", "stamps", "why"),
         [
-            ([], {}, "no picture"),
-            (["0"], {"rate_hz": None}, "rate_hz"),
-            (["9", "10"], {}, "different lengths"),
-            (["0"], {"beside": ("nowhere",)}, "nowhere"),
+            ([], {}, None, "no picture"),
+            (["0"], {"rate_hz": None}, None, "rate_hz"),
+            (["9", "10"], {}, None, "different lengths"),
+            (["0"], {"beside": ("nowhere",)}, None, "nowhere"),
+            (["0"], {"width": 7, "height": 5}, None, r"32 x 24.*calibrated for 7 x 5"),
+            (["0"], {}, "frame\n0\n", "columns"),
+            (["0"], {}, "frame,time\n0,soon\n", "line 2"),
+            (["0"], {}, "frame,time\n0,1\n0,2\n", "frame 0 twice"),
+            (["0"], {}, "frame,time\n1,1\n", "no time of any picture"),
         ],
     )
-    def test_what_cannot_be_read_says_why(self, tmp_path, names, more, why):
+    def test_what_cannot_be_read_says_why(self, tmp_path, names, more, stamps, why):
+        folder = write_folder(tmp_path, names)
+        if stamps is not None:
+            (folder / "timestamps.csv").write_text(stamps)
         with pytest.raises(SceneError, match=why):
-            open_source(specify(write_folder(tmp_path, names), **more))
-
-    def test_wrong_size_and_broken_times_are_refused_at_once(self, tmp_path):
-        cv2.imwrite(str(tmp_path / "0.png"), np.zeros((5, 7, 3), np.uint8))
-        with pytest.raises(SceneError, match=r"7 x 5.*calibrated for 32 x 24"):
-            open_source(specify(tmp_path))
-        for text, why in (("frame\n0\n", "columns"), ("frame,time\n0,soon\n", "line 2")):
-            (tmp_path / "timestamps.csv").write_text(text)
-            with pytest.raises(SceneError, match=why):
-                open_source(specify(tmp_path))
+            open_source(specify(folder, **more))
 
 
 def write_video(path, count, size=(WIDTH, HEIGHT), rate=12.5):
@@ -152,13 +151,11 @@ class TestVideo:
 
     def test_what_is_no_video_or_of_another_size_is_refused(self, tmp_path):
         (tmp_path / "text.avi").write_text("no video")
-        with pytest.raises(SceneError, match="not a video"):
-            open_source(specify(tmp_path / "text.avi", "video"))
-        with pytest.raises(SceneError, match="no such video"):
-            open_source(specify(tmp_path / "none.avi", "video"))
-        large = write_video(tmp_path / "large.avi", 2, (64, 48))
-        with pytest.raises(SceneError, match="64 x 48"):
-            open_source(specify(large, "video"))
+        write_video(tmp_path / "large.avi", 2, (64, 48))
+        reasons = {"text": "not a video", "none": "no such video", "large": "64 x 48"}
+        for name, why in reasons.items():
+            with pytest.raises(SceneError, match=why):
+                open_source(specify(tmp_path / f"{name}.avi", "video"))
 
 
 class FakeCamera:
@@ -218,8 +215,7 @@ class TestDevice:
     def test_wrong_size_ends_it(self, monkeypatch):
         FakeCamera.opened = 1
         monkeypatch.setattr(cv2, "VideoCapture", FakeCamera)
-        given = SourceSpecification("front", "device", "7", 640, 480, background="empty")
-        source = open_source(given)
+        source = open_source(specify("7", "device", width=640, height=480))
         wait_for(lambda: source.ended)
         assert source.read() is None
         assert "32 x 24" in source.problems[0]
@@ -305,9 +301,9 @@ class TestSourcesFile:
 
 
 @pytest.mark.parametrize(
-    ("kind", "width", "rate_hz", "why"),
-    [("film", 1, 1.0, "kind"), ("video", 1, 0.0, "rate_hz"), ("video", 0, 1.0, "cannot be")],
+    ("more", "why"),
+    [({"kind": "film"}, "kind"), ({"rate_hz": 0.0}, "rate_hz"), ({"width": 0}, "be")],
 )
-def test_specification_checks_itself(kind, width, rate_hz, why):
+def test_specification_checks_itself(more, why):
     with pytest.raises(SettingsError, match=why):
-        SourceSpecification("a", kind, "x", width, 1, rate_hz)
+        specify("x", **more)

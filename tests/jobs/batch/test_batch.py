@@ -18,7 +18,7 @@ import pytest
 import yaml
 
 from drake_pose.commands.main import app
-from drake_pose.errors import ClusterError, OutputError, SettingsError
+from drake_pose.errors import ClusterError, SettingsError
 from drake_pose.jobs.batch.batch import run_batch
 from drake_pose.jobs.batch.job import SceneJob, read_job
 from drake_pose.jobs.batch.tasks import WORK, Outcome, Task, perform
@@ -237,18 +237,6 @@ def test_workers_must_be_like_this_program(cluster, tmp_path, monkeypatch):
         require_fit_workers(cluster, tmp_path)
 
 
-def test_unreachable_scheduler_is_refused(jobs, scenes, tmp_path, monkeypatch):
-    monkeypatch.setattr("drake_pose.jobs.cluster.scheduler._TIMEOUT", 0.5)
-    result = CliRunner().invoke(
-        app,
-        ["batch", str(scenes / "jobs.yaml"), "--out", str(tmp_path / "out"),
-         "--scheduler", "tcp://127.0.0.1:9"],
-    )  # fmt: skip
-    assert result.exit_code == 1
-    assert "no scheduler answers at tcp://127.0.0.1:9" in result.stderr
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.mark.parametrize("words", [b"", b"HTTP/1.0 400 Bad request\r\n\r\n" * 8])
 def test_who_listens_but_is_no_scheduler_is_named_in_time(words, monkeypatch, caplog, capfd):
     monkeypatch.setattr("drake_pose.jobs.cluster.scheduler._TIMEOUT", 0.5)
@@ -292,14 +280,6 @@ def test_missing_extra_is_named(missing, jobs, scenes, tmp_path, monkeypatch):
     )
     assert result.exit_code == 1
     assert 'pip install "drake_pose[cluster]"' in result.stderr
-
-
-def test_job_of_other_chunks_is_not_resumed(jobs, tmp_path):
-    gone = [dataclasses.replace(job, scene=tmp_path / "gone") for job in jobs]
-    assert run_batch(gone, tmp_path / "out").failed == ("stills", "motion")
-    other = [dataclasses.replace(job, chunk=3) for job in gone]
-    with pytest.raises(OutputError, match="chunk = 2, not 3"):
-        run_batch(other, tmp_path / "out", resume=True)
 
 
 def test_job_file_gives_the_settings(tmp_path):

@@ -78,10 +78,6 @@ class Run:
     def output(self, name):
         return np.array(self.diagram.GetOutputPort(name).Eval(self.context))
 
-    def set_person(self, q):
-        context = self.estimator.GetMyMutableContextFromRoot(self.context)
-        self.estimator.set_person(context, q)
-
 
 class Core:
     """The same by the plain functions alone, one after the other."""
@@ -146,50 +142,24 @@ class TestPaperCapture:
         capture = build_paper_capture(setup, period=PERIOD)
         run, core = Run(capture), Core(setup)
         path, pictures = film
-        for k, shots in enumerate(pictures):
+        last = len(pictures)
+        # In the end the registered pose is shown again, which overwrites whatever was believed.
+        for k, shots in enumerate([*pictures, pictures[0]]):
+            if k == last:
+                limbs = run.output("limb_points").reshape(4, 3, 3)
+                assert (run.output("last_support") > 0).all()
             shots = dict(shots)
             if k in (4, 5):
                 # Two cameras stop, and return.
                 shots["camera_2"] = shots[FACE_CAMERA] = None
             np.testing.assert_array_equal(run.step(shots), core.step(shots))
             np.testing.assert_array_equal(run.output("last_features"), core.features.ravel())
-            assert (run.output("similarity")[0] > 0) == (k < 2)
+            assert (run.output("similarity")[0] > 0) == (k < 2 or k == last)
             assert np.isnan(run.output("face_direction")).all() == (k in (4, 5))
-        limbs = run.output("limb_points").reshape(4, 3, 3)
+        assert np.isnan(run.output("limb_points")).all()
         true = np.array([setup.skeleton.limb_points(path[-1], name) for name in LIMBS])
         errors = np.linalg.norm(limbs - true, axis=2).max(axis=0)
         assert (errors < [0.06, 0.10, 0.04]).all()
-        assert (run.output("last_support") > 0).all()
-
-    def test_contexts_do_not_know_of_each_other(self, setup, film):
-        capture = build_paper_capture(setup, period=PERIOD)
-        _, pictures = film
-        alone = [run.step(shots) for run in [Run(capture)] for shots in pictures[1:5]]
-        first, second = Run(capture), Run(capture)
-        for k, shots in enumerate(pictures[1:5]):
-            np.testing.assert_array_equal(first.step(shots), alone[k])
-            second.step(pictures[0] if k == 0 else pictures[-k])
-        assert np.abs(first.output("last_features") - second.output("last_features")).max() > 0.01
-
-    def test_lost_track_is_mended_without_a_reset(self, studio, setup, film):
-        run = Run(build_paper_capture(setup, period=PERIOD))
-        path, pictures = film
-        run.set_person(studio.posed(head_y=150, left_thigh_x=-90))
-        lost = run.step(pictures[-1])
-        names = [studio.model.position_index(n) for n in ("left_thigh_x", "right_thigh_x")]
-        assert np.degrees(np.abs(lost - path[-1]))[names].max() > 20.0
-        mended = run.step(pictures[0])
-        assert run.output("similarity")[0] > 0.93
-        assert np.isnan(run.output("limb_points")).all()
-        np.testing.assert_allclose(mended[:3], path[0][:3], atol=0.06)
-        for shots in pictures[2:5]:
-            found = run.step(shots)
-        ends = [
-            setup.skeleton.limb_points(found, name)[2]
-            - setup.skeleton.limb_points(path[4], name)[2]
-            for name in LIMBS
-        ]
-        assert np.linalg.norm(ends, axis=1).max() < 0.06
 
     def test_nobody_known_yet_and_all_cameras_gone(self, studio, setup, film):
         run = Run(build_paper_capture(setup, period=PERIOD))

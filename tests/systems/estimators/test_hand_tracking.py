@@ -216,22 +216,6 @@ def test_a_loss_is_said_and_the_matcher_asked(hand, camera, renderer, search):
         assert inside[frames].mean() > 0.85
 
 
-@pytest.mark.slow
-def test_what_is_hidden_is_left_out(hand, camera, renderer, search):
-    """A finger's tip behind something: the other segments are measured, and it grows unsure."""
-    truth = positions(search, true_angles(12))
-    images = [renderer.label_image(q) for q in truth]
-    for image in images[6:]:
-        image[image == hand.link_index("segment_23")] = EMPTY
-    _, deviations, statistics, _ = play(images, search, camera)
-    count = statistics[:, STATISTICS.index("count")]
-    assert (count[6:] <= 10).all()
-    assert (count >= 8).all()
-    tip = hand.position_index("flexion_23")
-    assert deviations[-1, tip] > 2 * deviations[5, tip]
-    assert deviations[-1, tip] > 2 * deviations[-1, hand.position_index("flexion_21")]
-
-
 def test_meshcat_shows_both_hands(camera, search):
     meshcat = StartMeshcat()
     truth = positions(search, true_angles(1))[0]

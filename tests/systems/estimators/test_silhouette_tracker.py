@@ -205,11 +205,3 @@ def test_a_covered_lens_loses_the_track_and_a_measured_position_brings_it_back(b
 def test_a_color_camera_that_is_none_is_named(search):
     with pytest.raises(UnknownNameError, match=r"side.*front"):
         SilhouetteTracker(search, [front_camera()], PERIOD, color_cameras=["side"])
-
-
-def test_without_pictures_nothing_is_estimated(body, search):
-    tracker = SilhouetteTracker(search, [front_camera(200)], PERIOD)
-    context = tracker.CreateDefaultContext()
-    tracker.ExecuteForcedEvents(context)
-    np.testing.assert_array_equal(tracker.GetOutputPort("track").Eval(context), 0.0)
-    assert tracker.GetOutputPort("pose_estimate").Eval(context) is None

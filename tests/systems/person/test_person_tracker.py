@@ -55,19 +55,6 @@ def test_moving_person_is_followed_and_shown(person, cameras):
     assert meshcat.HasPath("/drake/avatar") or meshcat.HasPath("avatar")
 
 
-def test_without_pictures_nobody_is_found(person, cameras):
-    tracker = PersonPoseTracker(ContourFit(person.pose_tree()))
-    system = PersonTracker(tracker, list(cameras.values()), 0.1)
-    simulator = Simulator(system)
-    simulator.AdvanceTo(0.25)
-    context = simulator.get_context()
-    found = system.GetOutputPort("estimated_positions").Eval(context)
-    assert len(found) == len(person.default_positions)
-    assert np.isnan(found).all()
-    assert system.GetOutputPort("share").Eval(context)[0] == 0.0
-    assert not system.GetOutputPort("seen").Eval(context).any()
-
-
 @pytest.mark.slow
 def test_person_is_lost_kept_in_mind_and_found_again(person, cameras):
     tracker = PersonPoseTracker(ContourFit(person.pose_tree()))
@@ -91,7 +78,10 @@ def test_person_is_lost_kept_in_mind_and_found_again(person, cameras):
         return [system.GetOutputPort(name).Eval(context).copy() for name in names]
 
     none = tuple(cameras)
-    show(0.0, np.nan)
+    unknown, _, share, seen = show(0.0, np.nan, none)
+    assert np.isnan(unknown).all()
+    assert not share[0]
+    assert not seen.any()
     assert np.isnan(system.GetOutputPort("time").Eval(context)[0])
     found, last, share, seen = show(0.0, 1.0)
     assert found[0] == pytest.approx(0.0, abs=0.02)

@@ -19,7 +19,7 @@ from drake_pose.fit.camera_sums import (
     unpack_sum,
     unpack_surfaces,
 )
-from drake_pose.fit.contour_fit import ContourFit, Prior, pack_cameras, pack_views
+from drake_pose.fit.contour_fit import ContourFit, pack_cameras, pack_views
 from drake_pose.fit.evidence import NO_EDGE, find_edge_points, pack_evidence
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.silhouette.areas.scoring import draw_mask
@@ -69,15 +69,6 @@ def test_groups_say_what_all_cameras_say(world):
         scale = np.abs(all_at_once).max()
         np.testing.assert_allclose(of_groups, all_at_once, rtol=0.0, atol=1e-13 * scale)
     assert scale > 0.0
-
-
-def test_the_fit_of_groups_is_that_of_all_cameras(world):
-    prior = Prior(world.start, np.full(len(world.start), 10.0))
-    together = world.fit.fit(pack_views(world.cameras, world.edges), world.start, STEPS, prior)
-    apart = world.fit.fit_sums(world.grouped, world.start, STEPS, prior)
-    assert np.abs(together.values - world.start).max() > 0.05
-    np.testing.assert_allclose(apart.values, together.values, rtol=0.0, atol=1e-9)
-    assert apart.inlier_ratio == pytest.approx(together.inlier_ratio, abs=1e-12)
 
 
 def test_nothing_is_lost_on_the_way(world):

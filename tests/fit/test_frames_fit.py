@@ -11,13 +11,11 @@ from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.errors import SettingsError, UnknownNameError
-from drake_pose.fit.evidence import find_edge_points, pack_evidence
+from drake_pose.fit.evidence import NO_EDGE, find_edge_points, pack_evidence
 from drake_pose.fit.frames_fit import FittedFrames, FramesFit
 from drake_pose.fit.levenberg_marquardt import AnnealingStage, Coupling, Equations
 from drake_pose.fit.parameters import (
     CAMERA_NAMES,
-    GIRTH_PREFIX,
-    ROOT_NAMES,
     BodyParameters,
     CameraParameters,
 )
@@ -117,31 +115,6 @@ def names_of(camera, count=7):
 
 
 class TestKnownAnswers:
-    def test_joint_positions_and_root_pose_of_each_frame(self, body, rig):
-        truth = poses(body, 2, 11)
-        names = [*BENT, *ROOT_NAMES[:3]]
-        fit = FramesFit(body, rig, choose(body.names, names))
-        wanted = np.array([[0.25, -0.2, 0.15, 0.2, 0.03, -0.04, 0.02]] * 2)
-        held = truth.copy()
-        index = [list(body.names).index(name) for name in names]
-        held[:, index] -= wanted
-        frames = [draw(body, rig, theta) for theta in truth]
-        found = fit.fit(frames, held, np.zeros((2, 7)), np.zeros(0), ROUNDS)
-        np.testing.assert_allclose(found.own[:, :4], wanted[:, :4], atol=0.06)
-        np.testing.assert_allclose(found.own[:, 4:], wanted[:, 4:], atol=0.004)
-        assert found.inlier_ratios.min() > 0.9
-
-    def test_camera_pose_where_the_poses_are_known(self, body, rig):
-        truth = poses(body, 4, 2)
-        moved = np.array([0.06, -0.05, 0.04, 0.05, -0.04, 0.08, 0.0])
-        names = names_of(rig[0], 6)
-        all_names = [*body.names, *names_of(rig[0])]
-        fit = FramesFit(body, rig[:1], choose(all_names, names, shared=True))
-        frames = [draw(body, rig[:1], theta, moved) for theta in truth]
-        found = fit.fit(frames, truth, np.zeros((4, 0)), np.zeros(6), ROUNDS)
-        np.testing.assert_allclose(found.shared[:3], moved[:3], atol=0.01)
-        np.testing.assert_allclose(found.shared[3:], moved[3:6], atol=0.02)
-
     def test_focal_length_and_scale(self, body, rig):
         truth = poses(body, 3, 3)
         for camera in (rig[0], parallel(rig[0])):
@@ -164,54 +137,6 @@ class TestKnownAnswers:
         frames = [draw(body, rig, theta) for theta in truth]
         found = fit.fit(frames, readings, np.zeros((4, 0)), np.zeros(4), ROUNDS)
         np.testing.assert_allclose(found.shared, zeros, atol=0.012)
-
-    def test_growth_and_girths_of_all_frames_beside_their_poses(self, body, rig):
-        truth = poses(body, 3, 5)
-        girths = [name for name in body.names if name.startswith(GIRTH_PREFIX)]
-        shared = [ROOT_NAMES[3], *girths]
-        index = [list(body.names).index(name) for name in shared]
-        truth[:, index] = [0.05, 0.1, -0.08]
-        held = truth.copy()
-        held[:, index] = 0.0
-        bent = [list(body.names).index(name) for name in BENT]
-        held[:, bent] -= 0.1
-        unknowns = join(choose(body.names, shared, shared=True), choose(body.names, BENT))
-        frames = [draw(body, rig, theta) for theta in truth]
-        found = FramesFit(body, rig, unknowns).fit(
-            frames, held, np.zeros((3, 4)), np.zeros(3), ROUNDS
-        )
-        np.testing.assert_allclose(found.shared[0], 0.05, atol=0.01)
-        np.testing.assert_allclose(found.shared[1:], [0.1, -0.08], atol=0.04)
-        np.testing.assert_allclose(found.own, 0.1, atol=0.05)
-
-    def test_segment_lengths_of_all_frames_beside_their_poses(self):
-        tree = load_model(
-            bundled_model("person").parent / "person_shape.urdf", check=False
-        ).pose_tree()
-        kinematics = TreeKinematics(tree)
-        body = BodyParameters(kinematics, few_triangles(TreeSurfaces(tree), VERY_FEW))
-        rig = list(circle_of_cameras(4, face_camera=False, size=(480, 360)).values())
-        root = {"position_x", "position_y", "position_z"}
-        kinds = tree.model.position_kinds
-        lengths = [
-            name
-            for name in kinematics.names
-            if name not in root and kinds[tree.model.position_index(name)] == "length"
-        ]
-        truth = poses(body, 3, 6)
-        index = [list(body.names).index(name) for name in lengths]
-        truth[:, index] = 0.03
-        held = truth.copy()
-        held[:, index] = 0.0
-        unknowns = join(
-            choose(body.names, lengths, shared=True, deviation=0.1), choose(body.names, BENT)
-        )
-        frames = [draw(body, rig, theta) for theta in truth]
-        found = FramesFit(body, rig, unknowns).fit(
-            frames, held, np.zeros((3, 4)), np.zeros(len(lengths)), ROUNDS
-        )
-        np.testing.assert_allclose(found.shared, 0.03, atol=0.015)
-        assert np.abs(found.own).max() < 0.1
 
 
 def test_equations_are_the_slope_of_the_cost(body, rig):
@@ -242,6 +167,31 @@ def test_equations_are_the_slope_of_the_cost(body, rig):
     cosine = slopes @ expected / np.linalg.norm(slopes) / np.linalg.norm(expected)
     assert cosine > 0.93
     assert np.linalg.norm(slopes) == pytest.approx(np.linalg.norm(expected), rel=0.2)
+
+
+def test_what_is_known_without_pictures_counts_once(body, rig):
+    """Of each frame's own unknowns in each, of the shared ones in all together."""
+    names, girths = BENT[:2], body.names[-2:]
+    known = join(
+        choose(body.names, names, deviation=0.5),
+        choose(body.names, girths, shared=True, deviation=0.25),
+    )
+    told = join(choose(body.names, names), choose(body.names, girths, shared=True))
+    frames, held = [pack_evidence([NO_EDGE] * len(rig))] * 3, poses(body, 3, 8)
+    own, shared = np.arange(6.0).reshape(3, 2), np.array([1.0, -2.0])
+    about = np.ones((3, 2)), np.zeros(2)
+    with_it, without = (
+        FramesFit(body, rig, one).equations(frames, held, own, shared, ROUNDS[0], about)
+        for one in (known, told)
+    )
+    off, own_information, information = own - about[0], np.full(2, 4.0), np.full(2, 16.0)
+    H, g = np.zeros((3, 4, 4)), np.zeros((3, 4))
+    H[:, :2, :2], g[:, :2] = np.diag(own_information), own_information * off
+    H[0, 2:, 2:], g[0, 2:] = np.diag(information), information * shared
+    np.testing.assert_allclose(with_it.H - without.H, H, atol=1e-12)
+    np.testing.assert_allclose(with_it.g - without.g, g, atol=1e-12)
+    cost = (own_information * off**2).sum() + information @ shared**2
+    assert with_it.cost - without.cost == pytest.approx(cost)
 
 
 def test_what_does_not_fit_is_refused(body, rig):

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.files.packages import bundled_model
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
 from drake_pose.silhouette.areas.bending import BendingOutline, TreeSurfaces
@@ -171,14 +170,6 @@ def test_a_band_cut_by_the_near_plane(tmp_path: Path) -> None:
     assert score_bodies(whole, X_CN[None], camera, prefixes, bands)[0, 0] == drawn.sum()
 
 
-def test_without_a_band_nothing_is_new(tmp_path: Path) -> None:
-    model = load_limb(tmp_path, "")
-    surfaces = TreeSurfaces(model.pose_tree())
-    assert not surfaces.bends
-    values = [np.zeros(1), np.zeros(1), np.zeros(3)]
-    assert all(a is b for a, b in zip(surfaces.at(values), surfaces.rigid, strict=True))
-
-
 def test_wrong_bands_are_refused() -> None:
     tetrahedron = TriangleMesh(
         np.vstack([np.zeros(3), np.eye(3)]), np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
@@ -193,20 +184,3 @@ def test_wrong_bands_are_refused() -> None:
             score_bodies([bending], X_CN, camera, prefixes, bands)
     with pytest.raises(ValueError, match="finite"):
         score_bodies([bending], X_CN, camera, prefixes, [np.full((1, 4, 3), np.nan)])
-
-
-def woman_with_skin() -> ArticulatedModel:
-    model = load_model(bundled_model("woman"), check=False)
-    assert len(model.skin) == 14
-    return model
-
-
-def test_drake_draws_the_same_woman() -> None:
-    model = woman_with_skin()
-    held = {f"position_{axis}": 0.0 for axis in "xyz"}
-    for direction in ((-1.0, 0.0, 0.0), (-0.6, 0.7, 0.2)):
-        camera = ParallelCamera(
-            "woman", 700, 700, 226.0, 350.2, 350.3, looking_along(np.array(direction), 5.0)
-        )
-        share, _, _ = measure_agreement(model, camera, 10, 6, held)
-        assert share <= LARGEST_SHARE, share

@@ -10,7 +10,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drake_pose.body.model import ArticulatedModel
 from drake_pose.errors import SettingsError, UnknownNameError
 
 Array = NDArray[np.float64]
@@ -74,18 +73,6 @@ class StateLayout:
         repeated = [name for name in self.names if self.names.count(name) > 1]
         if repeated:
             raise SettingsError(f"the state's element '{repeated[0]}' is given twice")
-
-    @staticmethod
-    def from_model(model: ArticulatedModel, constant: Sequence[str] = ()) -> "StateLayout":
-        """All positions of a model in the plant's order, those of its shape joints constant.
-
-        Raises:
-            UnknownNameError: a constant is no position of the model.
-        """
-        for name in constant:
-            model.position_index(name)
-        moving = tuple(name for name in model.position_names if name not in constant)
-        return StateLayout(moving, tuple(constant))
 
     @cached_property
     def names(self) -> tuple[str, ...]:

@@ -98,13 +98,6 @@ class TestUncertainty:
         else:
             assert np.median(surfaces) < 0.002
 
-    def test_fewer_cameras_are_less_sure(self, world):
-        values = world.values(**POSE)
-        edges = world.edges(values)
-        many = world.deviations(values, edges)
-        few = world.deviations(values, edges[:2], world.cameras[:2])
-        assert np.median([few[name] / many[name] for name in world.names]) > 1.3
-
     def test_what_silhouettes_do_not_tell_is_as_unsure_as_the_limits_allow(self, world):
         values = world.values(**POSE)
         nobody = [find_edge_points(np.zeros((240, 320), dtype=bool), 4.0) for _ in world.cameras]

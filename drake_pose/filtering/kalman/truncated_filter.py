@@ -129,7 +129,6 @@ class TruncatedFilter:
 
     Attributes:
         novelty: of the settings, or 0 where the truncation keeps no views.
-        site_count: how many sites a truncated hypothesis has.
 
     Raises:
         SettingsError: contradictory rows, named; or a process noise that is indefinite.
@@ -154,7 +153,6 @@ class TruncatedFilter:
         self._U = noise.covariance
         self._A = layout.transition() if transition is None else transition
         self._rows = join_rows(self.inequalities)
-        self.site_count = len(self._rows.directions) if self.settings.truncation == "joint" else 0
         # What is truncated and fed back has no offsets to keep.
         feeds_back = self.settings.truncation in ("sequential", "clip")
         self.novelty = 0.0 if feeds_back else self.settings.novelty

@@ -1,8 +1,6 @@
 import numpy as np
 import pytest
 
-from drake_pose.body.files.packages import bundled_model
-from drake_pose.body.model import load_model
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.filtering.kalman.truncated_filter import FilterSettings, TruncatedFilter
 from drake_pose.filtering.kalman.update import make_evidence, update
@@ -160,6 +158,20 @@ def test_weights_add_up_and_the_cap_holds():
     assert make_filter(hypothesis_cap=1).update(state, np.full(2, np.nan)).hypotheses
 
 
+def test_a_mirrored_prediction_beyond_a_limit_dies_of_it():
+    """Section 5: what looks the same at the negative angle lies far beyond the stop at zero."""
+    rows = from_bounds(["angle", "length"], [0.0, 0.9], [1.5, 1.1])
+    paper = {"truncation": "sequential", "iterations": 1}
+    f = make_filter(Segment(depth_only=True, deviation=0.002), rows, **paper)
+    state = f.start(Belief(np.array([0.4, 0.0, 1.0]), np.diag([0.02, 1e-3, 1e-6])))
+    state = f.update(f.predict(state), np.array([np.cos(0.4)]))
+    (gone,) = state.rejections
+    assert (gone.reason, gone.row, gone.hypothesis.born) == ("constraint", "angle >= 0", 1)
+    assert gone.c < f.settings.reject_below
+    assert gone.hypothesis.belief.mean[0] == pytest.approx(-0.4, abs=0.05)
+    assert state.best.mean[0] == pytest.approx(0.4, abs=0.05)
+
+
 def test_what_limits_say_of_a_constant_is_counted_once():
     """Nothing is measured: however many steps, the belief about the length stays as it was."""
     f = make_filter(rows=from_bounds(["length"], [0.9], [1.1]))
@@ -187,17 +199,6 @@ def test_transition_and_noise():
     np.testing.assert_allclose(U, 4 * np.outer(g, g))
 
 
-def test_a_layout_from_a_model():
-    model = load_model(bundled_model("two_finger_hand"), check=False)
-    layout = StateLayout.from_model(model, constant=["length_11", "palm_width"])
-    assert layout.constant == ("length_11", "palm_width")
-    assert "rate_flexion_11" in layout.names
-    assert "rate_length_11" not in layout.names
-    assert len(layout) == 2 * (len(model.position_names) - 2) + 2
-    with pytest.raises(UnknownNameError, match="length_99"):
-        StateLayout.from_model(model, constant=["length_99"])
-
-
 @pytest.mark.parametrize(
     ("make", "word"),
     [
@@ -219,6 +220,7 @@ def test_a_layout_from_a_model():
         (lambda: make_filter(truncation="x"), "truncation"),
         (lambda: make_filter(iterations=0), "iterations"),
         (lambda: make_filter(reject_below=1.0), "reject_below"),
+        (lambda: make_filter(novelty=1.0), "novelty"),
         (lambda: LAYOUT.process_noise({"angle": -1.0}), "'angle'"),
         (lambda: LAYOUT.process_noise({}), "'angle'"),
         (lambda: LAYOUT.process_noise({"length": 1.0}), "length"),

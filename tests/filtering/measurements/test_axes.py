@@ -104,21 +104,6 @@ def observation(hand, camera):
     return AxisObservation(body, camera, SEGMENTS, (CENTRE, CENTRE))
 
 
-def test_axes_from_a_rendered_label_image(hand, camera, observation):
-    x, rough = state(TRUE), state(ROUGH)
-    q, q_rough = (plant_positions(s, hand.position_names, 1000.0) for s in (x, rough))
-    labels = LabelRenderer(hand, camera).segments(q)
-    axes = observation.measure_labels(labels, q_rough)
-    assert set(axes) == set(SEGMENTS)
-    errors, distances = compare(axes, x)
-    assert errors.max() < 1.0
-    # Chi-squared with two degrees of freedom.
-    assert distances.mean() < 3.0
-    before, _ = compare(axes, rough)
-    assert before.max(axis=0).min() > 4.0
-    assert all(0.7 < axis.share < 1.4 for axis in axes.values())
-
-
 def test_what_is_occluded_is_left_out(hand, camera, observation):
     x = state(TRUE)
     q = plant_positions(x, hand.position_names, 1000.0)

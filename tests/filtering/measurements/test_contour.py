@@ -1,8 +1,6 @@
 import numpy as np
 import pytest
 
-from drake_pose.body.files.packages import bundled_model
-from drake_pose.body.model import load_model
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.filtering.body_state import ROOT_SHIFT
@@ -53,45 +51,6 @@ def test_it_leads_back_to_the_truth_that_drake_rendered(tmp_path):
     assert measured.share > 0.95
     drawn = observation.draw(x, camera)
     assert np.count_nonzero(drawn != masks[0]) < 0.02 * np.count_nonzero(masks[0])
-
-
-def test_an_occluder_pulls_little(tmp_path):
-    model = forked_body(tmp_path)
-    camera = front_camera(200, shift=0.2)
-    observation = ContourObservation(model.pose_tree(), [camera])
-    truth = np.array([0.1, 1.2, -1.0])
-    mask = LabelRenderer(model, camera).mask(truth).copy()
-    rows, columns = np.nonzero(mask)
-    at = int(np.argmax(columns))
-    # A blob beside the outermost arm.
-    mask[rows[at] - 5 : rows[at] + 6, columns[at] : columns[at] + 8] = True
-    x, _ = descend(observation, observation.look([mask]), observation.state(truth))
-    np.testing.assert_allclose(observation.positions(x)[0], truth, atol=np.radians(2.5))
-
-
-def test_a_body_with_skin():
-    """The bundled man, in two of Drake's cameras."""
-    model = load_model(bundled_model("man"), check=False)
-    q = model.default_positions.copy()
-    tree = model.pose_tree()
-    cameras = [pinhole("a", 15.0, height=-0.6), pinhole("b", 105.0, height=-0.6)]
-    generator = np.random.default_rng(4)
-    observation = ContourObservation(tree, cameras)
-    x_true = observation.state(q)
-    moving = len(observation.layout.moving)
-    x_true[:moving] += generator.uniform(-0.1, 0.1, moving)
-    q_true = np.clip(observation.positions(x_true)[0], model.lower, model.upper)
-    x_true = observation.state(q_true)
-    masks = [LabelRenderer(model, camera).mask(q_true) for camera in cameras]
-    drawn = [observation.draw(x_true, camera) for camera in cameras]
-    for mask, own in zip(masks, drawn, strict=True):
-        assert np.count_nonzero(mask != own) < 0.03 * np.count_nonzero(mask)
-    start = x_true.copy()
-    start[:moving] += generator.uniform(-0.04, 0.04, moving)
-    before = observation.measure(observation.look(masks), start)
-    x, after = descend(observation, observation.look(masks), start)
-    assert after.distance < 0.7 < before.distance
-    assert np.median(np.abs(x - x_true)[:moving]) < np.median(np.abs(start - x_true)[:moving])
 
 
 def test_a_root_that_is_known_elsewhere_and_one_that_is_estimated_there(tmp_path):

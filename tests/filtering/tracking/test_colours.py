@@ -68,25 +68,6 @@ def test_colours_lead_back_to_the_truth(observation, renderer):
     assert measured.share > 0.9
 
 
-def test_what_covers_the_body_pulls_little(observation, renderer):
-    generator = np.random.default_rng(4)
-    background, truth = room(generator), np.array([0.1, 1.2, -1.0])
-    mask = renderer.mask(truth)
-    x = observation.state(truth)
-    colours = observation.learn(
-        [painted(mask, background, generator)], x, observation.no_colours(), True
-    )
-    columns = np.nonzero(mask)[1]
-    at = int(np.argmax(columns))
-    # A green post over the end of the outermost arm.
-    covered = background.copy()
-    covered[:, columns[at] - 10 : columns[at] + 25] = GREEN
-    shown = mask & ~np.all(covered == GREEN, axis=-1)
-    seen = observation.look([None], [painted(shown, covered, generator)], colours)
-    found, _ = descend(observation, seen, x, steps=6)
-    np.testing.assert_allclose(observation.positions(found)[0], truth, atol=np.radians(4.0))
-
-
 def test_learned_colours_are_those_on_both_sides(observation, renderer):
     truth = np.array([0.1, 1.2, -1.0])
     picture = np.where(renderer.mask(truth)[..., None], ORANGE, GREEN).astype(np.uint8)

@@ -8,7 +8,6 @@ from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.errors import ModelError, SettingsError, UnknownNameError
 from drake_pose.filtering.truncation.couplings import (
-    couplings_file,
     load_couplings,
     load_usual_pose,
     model_inequalities,
@@ -201,14 +200,6 @@ def test_bad_rows_of_how_joints_are_held_are_named(tmp_path, row, word):
     with pytest.raises(ModelError, match=word) as caught:
         load_usual_pose(file, ["a", "b"])
     assert "bad.couplings.yaml" in str(caught.value)
-
-
-def test_crossed_couplings_of_a_model_are_refused(tmp_path):
-    file = tmp_path / "r.urdf"
-    file.write_text(FREE_AND_LIMITED)
-    couplings_file(file).write_text("rows: [{name: far, terms: {bends: 1}, lower: 3}]")
-    with pytest.raises(SettingsError, match=r"bends <= 2; far >= 3|far >= 3; bends <= 2"):
-        model_inequalities(load_model(file))
 
 
 def test_bad_arrays_are_refused():

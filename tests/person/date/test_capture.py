@@ -14,25 +14,15 @@ from drake_pose.person.date.faces import (
     head_angles,
     learn_faces,
 )
-from drake_pose.person.date.features import SkinColour, find_features, skin_blobs
+from drake_pose.person.date.features import SkinColour, skin_blobs
 from drake_pose.person.date.recognition import measure_contour, recognise, similarity
-from drake_pose.person.date.skeleton import FEATURES, rotation
+from drake_pose.person.date.skeleton import rotation
 from tests.person.studio import shared_studio
 
 
 @pytest.fixture(scope="module")
 def studio():
     return shared_studio()
-
-
-@pytest.fixture(scope="module")
-def registered(studio):
-    return studio.registered
-
-
-@pytest.fixture(scope="module")
-def calibrated(studio):
-    return studio.calibrated
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +60,8 @@ class TestContours:
 
 
 class TestRecognition:
-    def test_registered_pose_is_found_wherever_it_stands(self, studio, registered):
+    def test_registered_pose_is_found_wherever_it_stands(self, studio):
+        registered = studio.registered
         generator = np.random.default_rng(0)
         cameras = list(studio.ring.values())
         for _ in range(4):
@@ -88,13 +79,15 @@ class TestRecognition:
     @pytest.mark.parametrize(
         "other", [{}, {"left_upper_arm_z": 80}, {"left_upper_arm_x": -90, "right_upper_arm_x": -90}]
     )
-    def test_other_poses_are_not_taken_for_it(self, studio, registered, other):
+    def test_other_poses_are_not_taken_for_it(self, studio, other):
+        registered = studio.registered
         q = studio.posed(**other)
         contours = [view.contour for view in studio.views(q).values()]
         cameras = list(studio.ring.values())
         assert recognise(studio.skeleton, registered, cameras, contours, 0.93) is None
 
-    def test_one_camera_is_not_enough(self, studio, registered):
+    def test_one_camera_is_not_enough(self, studio):
+        registered = studio.registered
         view = studio.view(registered.q, "camera_0")
         cameras = list(studio.ring.values())
         contours = [view.contour] + [None] * 7
@@ -173,25 +166,11 @@ class TestFaces:
 
 
 class TestCapture:
-    def test_features_are_measured_where_they_are(self, studio, calibrated):
-        q = studio.posed(left_upper_arm_x=-60, left_upper_arm_z=20, right_upper_arm_z=-40)
-        views = studio.views(q)
-        last = calibrated.features(q) + np.random.default_rng(4).normal(0, 0.03, (5, 3))
-        found = find_features(
-            list(studio.ring.values()),
-            [view.blobs.centroids for view in views.values()],
-            [view.region for view in views.values()],
-            last,
-        )
-        errors = np.linalg.norm(found.places - calibrated.features(q), axis=1)
-        assert (found.support > 0).all()
-        assert errors.max() < 0.03, dict(zip(FEATURES, errors, strict=True))
-
-    def test_too_few_cameras(self, studio, calibrated):
+    def test_too_few_cameras(self, studio):
         with pytest.raises(SettingsError, match="two cameras"):
-            CaptureSetup(calibrated, dict(list(studio.ring.items())[:1]))
+            CaptureSetup(studio.skeleton, dict(list(studio.ring.items())[:1]))
         with pytest.raises(SettingsError, match="face camera 'camera_3'"):
-            CaptureSetup(calibrated, studio.ring, studio.ring["camera_3"])
+            CaptureSetup(studio.skeleton, studio.ring, studio.ring["camera_3"])
 
     def test_features_of_a_known_pose_change_the_skeleton_a_little_only(self, studio):
         skeleton = studio.skeleton

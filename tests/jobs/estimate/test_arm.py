@@ -43,12 +43,6 @@ def view_errors(inputs: Inputs, views: list[View], values: np.ndarray) -> np.nda
     )
 
 
-def test_flips_are_eight_and_all_different() -> None:
-    values = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7])
-    found = [tuple(np.round(one % (2.0 * np.pi), 6)) for one in flipped_arms(values)]
-    assert len(set(found)) == 8
-
-
 @pytest.mark.slow
 def test_the_recorded_arm(shared_data: Path) -> None:
     scene = shared_data / "arm_two_views"

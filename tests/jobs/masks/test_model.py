@@ -17,14 +17,16 @@ from tests.jobs.scenes import NAMES
 OFF = 5.0
 
 
-def write_start(path, scene, off=OFF, seed=0):
-    """The truth, each angle off by so much [deg]."""
+def write_start(path, names, truth, off=OFF, turned=slice(None), seed=0):
+    """A table of the truth, angles of some columns off by so much [deg]."""
     rng = np.random.default_rng(seed)
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(["frame", *NAMES])
-        for frame, q in scene.truth.items():
-            writer.writerow([frame, *(q + np.radians(off) * rng.choice([-1, 1], len(q)))])
+        writer.writerow(["frame", *names])
+        for frame, q in truth.items():
+            values = np.array(q, dtype=float)
+            values[turned] += np.radians(off) * rng.choice([-1, 1], len(values[turned]))
+            writer.writerow([frame, *values])
     return path
 
 
@@ -41,7 +43,7 @@ def filmed(tmp_path):
 @pytest.mark.slow
 def test_single_still_is_cut_in_the_band_of_its_rough_pose(tmp_path):
     scene = write_pictures(tmp_path / "scene", [(20.0, -60.0)], seed=4)
-    start = write_start(tmp_path / "start.csv", scene, off=2.0)
+    start = write_start(tmp_path / "start.csv", NAMES, scene.truth, off=2.0)
     settings = MaskSettings(model=scene.model, start=start, start_error=2.0)
     make_masks(scene.folder, tmp_path / "out", settings)
     assert agreements(tmp_path / "out", scene).min() > 0.9
@@ -49,7 +51,7 @@ def test_single_still_is_cut_in_the_band_of_its_rough_pose(tmp_path):
 
 @pytest.mark.slow
 def test_masks_are_found_from_poses_five_degrees_off_and_empty_rooms_named(filmed, tmp_path):
-    start = write_start(tmp_path / "start.csv", filmed)
+    start = write_start(tmp_path / "start.csv", NAMES, filmed.truth)
     for camera in ("front", "side"):
         room = cv2.imread(str(filmed.folder / "background" / f"{camera}.png"))
         cv2.imwrite(str(filmed.folder / "images" / camera / "0004.png"), room)
@@ -67,7 +69,7 @@ def test_masks_are_found_from_poses_five_degrees_off_and_empty_rooms_named(filme
 @pytest.mark.slow
 def test_starts_far_off_are_refused_or_named(filmed, tmp_path):
     """Whatever is written without a word is right."""
-    start = write_start(tmp_path / "start.csv", filmed, off=35.0)
+    start = write_start(tmp_path / "start.csv", NAMES, filmed.truth, off=35.0)
     settings = MaskSettings(model=filmed.model, start=start)
     result = make_masks(filmed.folder, tmp_path / "out", settings)
     true, made = load_scene(filmed.folder), load_scene(tmp_path / "out")
@@ -77,7 +79,7 @@ def test_starts_far_off_are_refused_or_named(filmed, tmp_path):
 
 
 def test_what_is_missing_is_named(filmed, tmp_path, runner: CliRunner):
-    start = write_start(tmp_path / "start.csv", filmed)
+    start = write_start(tmp_path / "start.csv", NAMES, filmed.truth)
     with pytest.raises(SettingsError, match="--model and --start"):
         MaskSettings(model=filmed.model)
     with pytest.raises(CameraError, match="needs to know the cameras"):
@@ -123,18 +125,11 @@ def test_background_is_told_from_pictures_of_another_exposure():
 def test_real_arm_from_five_degrees_off(shared_data, tmp_path):
     """Of the ten masks that are given two have a part of the table, others lack the fingers."""
     scene = shared_data / "franka_one_view"
-    start = tmp_path / "start.csv"
     with (scene / "joint_angles_fitted.csv").open() as file:
         header, *rows = csv.reader(file)
-    rng = np.random.default_rng(1)
-    angles = [i for i, name in enumerate(header) if name.startswith("panda_joint")]
-    with start.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(header)
-        for row in rows:
-            for i in angles:
-                row[i] = float(row[i]) + np.radians(OFF) * rng.choice([-1, 1])
-            writer.writerow(row)
+    angles = [i for i, name in enumerate(header[1:]) if name.startswith("panda_joint")]
+    truth = {frame: row for frame, *row in rows}
+    start = write_start(tmp_path / "start.csv", header[1:], truth, turned=angles, seed=1)
     settings = MaskSettings(
         model=scene / "panda" / "panda.urdf", start=start, cameras=scene / "cameras_reference.yaml"
     )

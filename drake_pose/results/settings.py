@@ -20,11 +20,6 @@ from drake_pose.results.options import (
     parse_root_rotation,
 )
 
-# What a search for the pose heeds, and one who is followed by all silhouettes at once does not.
-_OF_THE_SEARCH = (
-    "root", "root_position", "root_rotation", "interval", "length_interval", "joint_intervals",
-    "outside_limit", "candidates", "run_limit", "time_limit", "hold", "unseen", "angles",
-)  # fmt: skip
 RootTurns = Literal["fixed", "free"] | Mapping[Axis, tuple[float, float]]
 Names = Annotated[tuple[str, ...], Parameter(metavar="NAME")]
 Positions = Annotated[
@@ -141,7 +136,8 @@ class EstimateSettings(CaptureSettings):
     @property
     def search_settings(self) -> tuple[str, ...]:
         """The names of those that only a search heeds and that are not at their defaults."""
-        return tuple(name for name in changed(self) if name in _OF_THE_SEARCH)
+        own = set(EstimateSettings.__annotations__) - {"method"}
+        return tuple(name for name in changed(self) if name in own)
 
     def as_json(self) -> dict[str, Any]:
         """Returns the settings as plain JSON values."""

@@ -27,7 +27,6 @@ from drake_pose.filtering.tracking.sequence_fit import (
     pose_set,
 )
 from drake_pose.jobs.estimate.inputs import Inputs
-from drake_pose.jobs.estimate.matching import sequence_tracking
 from drake_pose.jobs.estimate.searches import leave_out_links, make_placement_search
 from drake_pose.results.overlay import draw_shapes
 from drake_pose.results.records import user_units
@@ -91,8 +90,7 @@ def fit_body(inputs: Inputs, settings: EstimateSettings, on_stage: OnStage | Non
 
     Raises DrakePoseError as for an estimate.
     """
-    scene, search = inputs.scene, inputs.search
-    tracking = None if search is None else sequence_tracking(scene, search, settings.track)
+    search, tracking = inputs.search, inputs.tracking
     if (
         tracking is None
         or not tracking.scale_unknown
@@ -183,24 +181,18 @@ class _BodyFit:
 
     def _tell(self, explanations: Sequence[FittedSequence]) -> None:
         """What the summary says of the fitted body, and of explanations that look alike."""
-        body, theta = explanations[0].body, explanations[0].fitted.parameters[0]
-        nodes = body.kinematics.tree.nodes
-        self._more["proportions"] = {
-            node.name: [round(one, 4) for one in row]
-            for node, row in zip(nodes, body.factors(theta).tolist(), strict=True)
-        }
-        X_WN = body.place(theta).X_WN
+        best, *_ = explanations
+        body, theta = best.body, best.fitted.parameters[0]
+        nodes, X_WN = body.kinematics.tree.nodes, body.place(theta).X_WN
         apart = np.linalg.norm(X_WN[:, :3, 3] - X_WN[[n.parent for n in nodes], :3, 3], axis=1)
-        apart /= np.linalg.norm(X_WN[0, :3, 0])
-        self._more["lengths"] = {
-            node.name: round(length, 5)
-            for node, length in zip(nodes, apart.tolist(), strict=True)
-            if node.parent >= 0
+        lengths = (apart / np.linalg.norm(X_WN[0, :3, 0])).round(5).tolist()
+        factors, places = body.factors(theta).round(4).tolist(), body.joint_places(theta)
+        self._more |= {
+            "proportions": {node.name: row for node, row in zip(nodes, factors, strict=True)},
+            "lengths": {n.name: k for n, k in zip(nodes, lengths, strict=True) if n.parent >= 0},
+            "joint_places": {nodes[i].name: round(places[i], 4) for i in body.placed},
+            "explanations": [round(one.fitted.cost / best.fitted.cost, 4) for one in explanations],
         }
-        places = body.joint_places(theta)
-        self._more["joint_places"] = {nodes[i].name: round(places[i], 4) for i in body.placed}
-        costs = [one.fitted.cost / explanations[0].fitted.cost for one in explanations]
-        self._more["explanations"] = [round(cost, 4) for cost in costs]
 
     def _draw_shapes(self, *bodies: _Fitted) -> np.ndarray:
         """The file's body and the corrected one, each where it is in the first frame."""

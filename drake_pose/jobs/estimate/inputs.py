@@ -12,6 +12,7 @@ import numpy as np
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.body.report import model_warnings
 from drake_pose.errors import SceneError, SettingsError, UnknownNameError
+from drake_pose.filtering.tracking.contour_tracker import TrackingSettings
 from drake_pose.jobs.estimate.measurements import TrueAngles, read_joint_centres, read_true_angles
 from drake_pose.jobs.estimate.person_choice import follows_person
 from drake_pose.jobs.estimate.searches import leave_out_links, make_placement_search, make_search
@@ -29,6 +30,7 @@ from drake_pose.silhouette.pictures.scene_checks import (
 from drake_pose.silhouette.pictures.scenes import Scene
 
 TRUTH_FILE = "joint_angles.csv"
+_REST_TIME = 1.0
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,7 @@ class Inputs:
     Args:
         scene: what those cameras see that are matched together.
         frames: those that are asked for.
+        tracked: whether they follow each other, and the body is followed.
         search: made for the body's pose tree; None where a person is followed by all silhouettes.
         truth: measured joint positions, where there are some.
         root_positions: the root's position (3,) by frame [m], where it differs.
@@ -48,6 +51,7 @@ class Inputs:
     scene: Scene
     model: ArticulatedModel
     frames: tuple[str, ...]
+    tracked: bool
     search: PoseSearch | None
     truth: TrueAngles | None
     warnings: tuple[str, ...] = ()
@@ -66,6 +70,22 @@ class Inputs:
         errors = np.where(self.model.periodic[places], turned, errors)
         errors *= user_units(self.model)[places]
         return dict(zip(self.truth.names, errors.tolist(), strict=True))
+
+    @property
+    def tracking(self) -> TrackingSettings | None:
+        """How the body is tracked; None where every frame is matched on its own.
+
+        A searched root position or scale is tracked, too.
+        """
+        if not self.tracked:
+            return None
+        scale_unknown = self.scene.scale_unknown
+        return TrackingSettings(
+            root_moves=isinstance(self.search, RootPlacementSearch),
+            scale_unknown=scale_unknown,
+            # A single parallel view is the same for poses mirrored in depth.
+            rest_time=_REST_TIME if scale_unknown else None,
+        )
 
     @property
     def base_moves(self) -> bool:
@@ -90,10 +110,11 @@ def read_inputs(
         model, settings = leave_out_links(model, settings)
     truth = _read_truth(scene_path, truth_path, model.position_names)
     starts = _read_starts(settings.start, frames, model)
+    tracked = scene.sequence and settings.track
     _check_start(scene, frames, starts, settings.track)
     if (scene.images or not starts) and follows_person(scene, model, settings):
         warnings = (*scene.warnings, *check_upright(scene.cameras.values()), *model.warnings)
-        return Inputs(scene, model, frames, None, truth, warnings, None, starts)
+        return Inputs(scene, model, frames, tracked, None, truth, warnings, None, starts)
     centres: Mapping[str, np.ndarray] | None = None
     position: np.ndarray | None = None
     search: PoseSearch
@@ -113,7 +134,7 @@ def read_inputs(
         for camera in scene.cameras.values():
             require_visible(search.sampled.outlines, camera.X_CW @ X_WN, camera)
     warnings = (*scene.warnings, *model_warnings(model, search.tree, settings.hold))
-    return Inputs(scene, model, frames, search, truth, warnings, centres, starts)
+    return Inputs(scene, model, frames, tracked, search, truth, warnings, centres, starts)
 
 
 def _read_truth(scene: Path, given: Path | None, names: Sequence[str]) -> TrueAngles | None:

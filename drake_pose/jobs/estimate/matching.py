@@ -12,14 +12,12 @@ from pydrake.systems.analysis import Simulator
 
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import SettingsError
-from drake_pose.filtering.tracking.contour_tracker import TrackingSettings
 from drake_pose.jobs.estimate.contradictions import find_contradiction
 from drake_pose.jobs.estimate.inputs import Inputs
 from drake_pose.results.poses import PoseRow, base_cells
 from drake_pose.results.records import FrameRecord, record_pose_set
 from drake_pose.results.writer import USUAL_RATE_HZ, Drawn, FinishedFrame, OnStage
 from drake_pose.search.continuous.multi_start import MultiStartSearch
-from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
 from drake_pose.search.estimates import PoseEstimate, View
 from drake_pose.search.grid.beam.search import BeamSearch
 from drake_pose.search.scoring import PoseSearch
@@ -29,28 +27,9 @@ from drake_pose.silhouette.pictures.mask_agreement import compare_masks
 from drake_pose.silhouette.pictures.scenes import Scene
 from drake_pose.systems.estimators.diagrams import build_recorded_matching
 
-_REST_TIME = 1.0
-
-
-def sequence_tracking(
-    scene: Scene, search: PoseSearch, track: bool = True
-) -> TrackingSettings | None:
-    """How the body of a scene is tracked; None where every frame is matched on its own.
-
-    A searched root position or scale is tracked, too.
-    """
-    if not track or not scene.sequence:
-        return None
-    return TrackingSettings(
-        root_moves=isinstance(search, RootPlacementSearch),
-        scale_unknown=scene.scale_unknown,
-        # A single parallel view is the same for poses mirrored in depth.
-        rest_time=_REST_TIME if scene.scale_unknown else None,
-    )
-
 
 def estimate_frames(
-    inputs: Inputs, search: PoseSearch, track: bool, missing: Sequence[str]
+    inputs: Inputs, search: PoseSearch, missing: Sequence[str]
 ) -> Iterator[tuple[str, PoseEstimate]]:
     """The missing frames' poses: those that are known, then those of the matching diagram.
 
@@ -71,7 +50,7 @@ def estimate_frames(
         tuple(inputs.scene.cameras.values()),
         played,
         inputs.root_positions,
-        tracking=sequence_tracking(inputs.scene, search, track),
+        tracking=inputs.tracking,
         starts=inputs.starts,
     )
     simulator = Simulator(matching.diagram)
@@ -86,12 +65,12 @@ def estimate_frames(
 
 
 def match_frames(
-    inputs: Inputs, search: PoseSearch, track: bool, overlay: bool, missing: Sequence[str]
+    inputs: Inputs, search: PoseSearch, overlay: bool, missing: Sequence[str]
 ) -> Iterator[FinishedFrame]:
     """The missing frames, matched or tracked, compared with their masks and drawn."""
     scene, model = inputs.scene, inputs.model
     renderers: dict[str, LabelRenderer] = {}
-    for frame, pose in estimate_frames(inputs, search, track, missing):
+    for frame, pose in estimate_frames(inputs, search, missing):
         shown = {name: scene.read(name, frame) for name in scene.cameras_of(frame)}
         if overlay:
             shown = {**read_pictures(scene, frame), **shown}

@@ -52,7 +52,6 @@ class _Followed(NamedTuple):
 def follow_person(
     inputs: Inputs,
     result: ResultWriter,
-    track: bool,
     overlay: bool,
     on_frame: OnFrame | None,
     on_stage: OnStage | None,
@@ -62,7 +61,6 @@ def follow_person(
     A resumed recording is followed as a whole again.
 
     Args:
-        track: whether the frames of a sequence follow each other.
         overlay: whether overlays are written.
 
     Raises:
@@ -76,7 +74,7 @@ def follow_person(
     reader = _Reader(inputs, on_stage)
     begin = time.perf_counter()
     follow = _follow_colours if inputs.scene.images else _follow_masks
-    followed = follow(inputs, reader, track)
+    followed = follow(inputs, reader)
     reader.on_stage = None
     seconds = (time.perf_counter() - begin) / len(frames)
     result.rows.clear()
@@ -91,19 +89,19 @@ def follow_person(
     result.warnings += (*unread, *followed.faults)
 
 
-def _follow_masks(inputs: Inputs, reader: _Reader, track: bool) -> _Followed:
+def _follow_masks(inputs: Inputs, reader: _Reader) -> _Followed:
     checked = capture_checked(
         inputs.model.pose_tree(),
         inputs.scene.cameras,
         reader,
         len(inputs.frames),
-        inputs.scene.sequence and track,
+        inputs.tracked,
         reader.count_followed,
     )
     return _Followed(checked.captured, checked.read, describe_faults(checked, inputs.frames))
 
 
-def _follow_colours(inputs: Inputs, reader: _Reader, _track: bool) -> _Followed:
+def _follow_colours(inputs: Inputs, reader: _Reader) -> _Followed:
     """A sequence of pictures of which few have masks."""
     scene, frames = inputs.scene, inputs.frames
     masked = [k for k, frame in enumerate(frames) if len(scene.cameras_of(frame)) > 1]

@@ -66,11 +66,11 @@ def estimate_scene(
         if shapes is not None:
             result.write(SHAPES, encode_png(shapes))
         if search is not None:
-            frames = match_frames(inputs, search, settings.track, overlay, missing)
+            frames = match_frames(inputs, search, overlay, missing)
             result.add_all(frames, inputs.frames, on_frame)
             result.warnings += compare_cameras(inputs, search, result.records, on_stage)
         elif missing:
-            follow_person(inputs, result, settings.track, overlay, on_frame, on_stage)
+            follow_person(inputs, result, overlay, on_frame, on_stage)
         result.finish(replay)
     finally:
         result.write_summary()

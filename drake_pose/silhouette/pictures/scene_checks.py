@@ -148,7 +148,7 @@ def _repeated_files(scene: Scene) -> set[tuple[str, str]]:
 
     Files are read only where sizes are equal; what cannot be read is like none.
     """
-    found = set()
+    found = []
     for name in scene.cameras:
         last: tuple[Path, int] | None = None
         for frame in scene.frames:
@@ -157,9 +157,9 @@ def _repeated_files(scene: Scene) -> set[tuple[str, str]]:
                 with suppress(OSError):
                     size = require_regular(path)
                     if last and last[1] == size and filecmp.cmp(last[0], path, shallow=False):
-                        found.add((name, frame))
+                        found.append((name, frame))
             last = None if path is None or size is None else (path, size)
-    return found
+    return set(found)
 
 
 def _has_changed(scene: Scene, names: Sequence[str], last: str, frame: str) -> bool:

@@ -87,7 +87,9 @@ def find_masks(folder: Path, cameras: Iterable[str]) -> MaskFiles:
     if not root.is_dir():
         raise SceneError(f"{folder}: has no folder masks/<camera>/<frame>.png")
     flat, foreign = _list_pictures(root)
-    found = {entry.name: _list_pictures(root / entry.name) for entry in _folders(root)}
+    found = {
+        entry.name: _list_pictures(root / entry.name) for entry in _visible(root) if entry.is_dir()
+    }
     known = {name: found[name][0] for name in names if name in found}
     strangers = {name: len(files) for name, (files, _) in found.items() if name not in names}
     if flat and not any(known.values()):
@@ -101,12 +103,20 @@ def find_masks(folder: Path, cameras: Iterable[str]) -> MaskFiles:
     if not any(known.values()):
         raise SceneError(_no_masks(root, names, strangers, others))
     beside = [name for name in foreign if not name.endswith("/")]
-    others = {"": [*beside, *(path.name for path in flat)], **others}
+    others[""] = [*beside, *(path.name for path in flat)]
     masks, doubled = _join_frames(known)
-    unused = [name for name in names if not known.get(name)]
-    return MaskFiles(
-        masks, tuple(strangers), (*_say_unused(strangers, unused), *doubled, *_say_foreign(others))
-    )
+    warnings = [
+        *_say_unused(strangers, [name for name in names if not known.get(name)]),
+        *doubled,
+        *(
+            f"{f'masks/{name}' if name else 'masks'}: {files[0]}"
+            f"{f' and {len(files) - 1} more' if len(files) > 1 else ''} left out: masks are PNG "
+            "pictures in masks/<camera>"
+            for name, files in others.items()
+            if files
+        ),
+    ]
+    return MaskFiles(masks, tuple(strangers), tuple(warnings))
 
 
 def find_images(
@@ -167,19 +177,6 @@ def _say_unused(strangers: Mapping[str, int], unused: Sequence[str]) -> list[str
     ]
 
 
-def _say_foreign(others: Mapping[str, Sequence[str]]) -> list[str]:
-    """Files that are no masks, by camera."""
-    found = []
-    for name, files in others.items():
-        if files:
-            more = f" and {len(files) - 1} more" if len(files) > 1 else ""
-            folder = f"masks/{name}" if name else "masks"
-            found.append(
-                f"{folder}: {files[0]}{more} left out: masks are PNG pictures in masks/<camera>"
-            )
-    return found
-
-
 def _visible(folder: Path) -> list[os.DirEntry[str]]:
     """A folder's entries by name, but for hidden ones, such as those that macOS leaves behind."""
     try:
@@ -188,10 +185,6 @@ def _visible(folder: Path) -> list[os.DirEntry[str]]:
     except OSError as error:
         raise SceneError(f"{folder}: cannot be read: {error.strerror}") from error
     return sorted(seen, key=lambda entry: entry.name)
-
-
-def _folders(folder: Path) -> list[os.DirEntry[str]]:
-    return [entry for entry in _visible(folder) if entry.is_dir()]
 
 
 def _list_pictures(folder: Path) -> tuple[list[Path], list[str]]:

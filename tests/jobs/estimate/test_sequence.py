@@ -1,16 +1,15 @@
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from drake_pose.body.model import load_model
 from drake_pose.jobs.estimate.body_fit import _StartedSearch
-from drake_pose.jobs.estimate.matching import sequence_tracking
+from drake_pose.jobs.estimate.inputs import Inputs
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
 from drake_pose.search.estimates import TRACKED
-from drake_pose.search.grid.beam.search import BeamSearch
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.jobs.scenes import TinyScene, write_scene
 
@@ -56,16 +55,13 @@ def test_a_sequence_need_not_be_tracked(tmp_path: Path) -> None:
 
 
 def test_how_a_scene_is_tracked(tiny_scene: TinyScene) -> None:
-    stills = load_scene(tiny_scene.folder)
-    video, search = replace(stills, sequence=True), RootPlacementSearch.__new__(RootPlacementSearch)
-    assert sequence_tracking(stills, search) is None
-    assert sequence_tracking(video, search, track=False) is None
-    known = sequence_tracking(video, BeamSearch.__new__(BeamSearch))
-    assert known is not None
-    assert not known.root_moves
-    moved = sequence_tracking(video, search)
-    assert moved is not None
-    assert moved.root_moves
+    model, scene = load_model(tiny_scene.model), load_scene(tiny_scene.folder)
+    for search in (None, RootPlacementSearch.__new__(RootPlacementSearch)):
+        assert Inputs(scene, model, scene.frames, False, search, None).tracking is None
+        tracking = Inputs(scene, model, scene.frames, True, search, None).tracking
+        assert tracking is not None
+        assert tracking.root_moves is (search is not None)
+        assert not tracking.scale_unknown
 
 
 def test_a_track_goes_on_from_what_is_known_and_searches_after_a_loss() -> None:

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from pydrake.geometry import Meshcat
 
     from drake_pose.jobs.live.scene import LiveScene
-    from drake_pose.person.date.walk_commands import WalkSettings
     from drake_pose.systems.person.live_capture import LiveSensors
 
 
@@ -101,11 +100,9 @@ def walk(
     if options.rate is not None and result is None:
         raise UsageError("--rate is for a result")
     from drake_pose.jobs.live import walk as walking
-    from drake_pose.person.date.walk_commands import WalkSettings
 
-    settings = WalkSettings(on_spot=options.method == "paper")
     if options.live is not None:
-        _print(_walk_live(options.live, options, settings), json)
+        _print(_walk_live(options.live, options), json)
         return
     if result is not None:
         player = walking.recorded_player(result, options.model, options.rate, options.package)
@@ -115,12 +112,17 @@ def walk(
     page = _open_page(options, waits)
     again = _asker(page) if waits and options.seconds is None else lambda: False
     walked = walking.walk(
-        player, page, options.seconds, options.speed, _say_command, again, settings
+        player, page, options.seconds, options.speed, _say_command, again, _on_spot(options)
     )
     _print(walked, json)
 
 
-def _walk_live(folder: Path, options: WalkOptions, settings: WalkSettings) -> dict[str, Any]:
+def _on_spot(options: WalkOptions) -> bool:
+    """Whether the paper's way is wanted: who stands ahead or behind also walks on the spot."""
+    return options.method == "paper"
+
+
+def _walk_live(folder: Path, options: WalkOptions) -> dict[str, Any]:
     """Walks with the cameras of a folder; what it is to walk with is read before the page opens."""
     from drake_pose.jobs.live.scene import hush_opencv, load_live_scene
     from drake_pose.jobs.live.walk import walk_live
@@ -132,7 +134,7 @@ def _walk_live(folder: Path, options: WalkOptions, settings: WalkSettings) -> di
         walked = walk_live(
             scene, _open_page(options), options.model, options.shape, options.seconds,
             _opener(client, scene), _say_command, lambda text: say(f"drake-pose: {text}"),
-            options.package, settings,
+            options.package, _on_spot(options),
         )  # fmt: skip
     for text in walked["warnings"]:
         warn(text)

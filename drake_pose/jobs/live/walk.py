@@ -26,7 +26,6 @@ from drake_pose.jobs.live.frame_results import camera_troubles
 from drake_pose.jobs.live.run import run_live
 from drake_pose.jobs.live.scene import LiveScene
 from drake_pose.person.date.skeleton import load_skeleton
-from drake_pose.person.date.walk_commands import WalkSettings
 from drake_pose.person.date.walking_motion import make_motion
 from drake_pose.person.shape import tracker_of_person
 from drake_pose.results.folder import POSES, read_summary
@@ -141,7 +140,7 @@ def walk(
     speed: float = 1.0,
     on_command: Callable[[str], None] = lambda _: None,
     again: Callable[[], bool] = lambda: False,
-    settings: WalkSettings | None = None,
+    on_spot: bool = False,
 ) -> dict[str, Any]:
     """Lets the avatar walk until its recording, the given time, or the user (Ctrl-C) ends it.
 
@@ -150,6 +149,7 @@ def walk(
         speed: seconds walked a second; 0: as fast as the machine can.
         on_command: called when the command changes, with its words, "" for none.
         again: asked at the end whether to walk once more from the start.
+        on_spot: as of Walker.
 
     Returns:
         Of the last walk: seconds walked; x, y [m] and heading_deg where it ended; and by command
@@ -170,7 +170,7 @@ def walk(
         )
         seconds = min(seconds or times[-1], times[-1])
     stride = stride_positions(player.model)
-    diagram = build_walk(player.model, meshcat, positions, stride, period, settings)
+    diagram = build_walk(player.model, meshcat, positions, stride, period, on_spot)
     while True:
         log = _WalkLog(diagram, on_command)
         interrupted = run_live(diagram, None, seconds, monitor=log.watch, speed=speed)
@@ -191,7 +191,7 @@ def walk_live(
     on_command: Callable[[str], None] = lambda _: None,
     on_report: Callable[[str], None] = lambda _: None,
     packages: Mapping[str, Path] | None = None,
-    settings: WalkSettings | None = None,
+    on_spot: bool = False,
 ) -> dict[str, Any]:
     """Lets the avatar walk as the person before the cameras commands, until Ctrl-C.
 
@@ -203,7 +203,7 @@ def walk_live(
             model's where not given.
         seconds: how long; without end, or until the recordings end, where not given.
         open_sensors: opens the sensors; those of the scene in this process where not given.
-        on_command: as for walk, like ``settings``.
+        on_command: as for walk, like ``on_spot``.
         on_report: told of cameras that stop and return, bad pictures, a person found or lost.
         packages: folders of packages that the model's ``package://`` names mean, by name.
 
@@ -227,7 +227,7 @@ def walk_live(
 
     try:
         stride = stride_positions(model)
-        diagram = build_walk(model, meshcat, add, stride, opened.period, settings, SETTLE)
+        diagram = build_walk(model, meshcat, add, stride, opened.period, on_spot, SETTLE)
         log = _PersonLog(diagram, on_command, on_report)
         run_live(diagram, opened, seconds, on_report, monitor=log.watch, speed=1.0)
         warnings = camera_troubles(opened.counts(), 0)

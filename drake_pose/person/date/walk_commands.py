@@ -6,58 +6,24 @@ Facing right or left turns the view, standing ahead of or behind the rest place 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-
-from drake_pose.errors import SettingsError
 
 Array = NDArray[np.float64]
 
 NO_COMMAND = (0, 0)
 
 
-@dataclass(frozen=True)
-class WalkSettings:
-    """When a stance is a command, and how fast it is followed.
-
-    A command begins at one threshold and ends at a lower one, so that noise does not toggle it.
-
-    Args:
-        turn_begin, turn_end: how far the face is turned away from the rest direction [rad].
-        step_begin, step_end: how far the person stands from the rest place [m].
-        turn_rate, speed: how fast the view turns [rad/s] and one walks [m/s].
-        body_radius: how near one comes to walls and objects [m].
-        on_spot: whether standing ahead or behind is a command only while the person also walks on
-            the spot, as in the paper.
-        lift: how much higher than the other a lifted foot is [m].
-        pause: without another step for so long the person no longer walks on the spot [s].
-
-    Raises:
-        SettingsError: something is not positive, or a command ends beyond where it begins.
-    """
-
-    turn_begin: float = math.radians(25.0)
-    turn_end: float = math.radians(15.0)
-    step_begin: float = 0.18
-    step_end: float = 0.10
-    turn_rate: float = math.radians(40.0)
-    speed: float = 0.9
-    body_radius: float = 0.3
-    on_spot: bool = False
-    lift: float = 0.05
-    pause: float = 1.0
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        for name, value in vars(self).items():
-            if name != "on_spot" and not (math.isfinite(value) and value > 0.0):
-                raise SettingsError(f"walking: {name} must be a positive number, not {value}")
-        for name in ("turn", "step"):
-            begin, end = getattr(self, f"{name}_begin"), getattr(self, f"{name}_end")
-            if end > begin:
-                raise SettingsError(f"walking: {name}_end {end} lies beyond {name}_begin {begin}")
+TURN_RATE, SPEED, BODY_RADIUS = math.radians(40.0), 0.9, 0.3
+"""How fast the view turns [rad/s] and one walks [m/s], and how near one comes to walls [m]."""
+# A command begins at one threshold and ends at a lower one, so that noise does not toggle it: how
+# far the face is turned away from the rest direction [rad], and how far one stands from the rest
+# place [m].
+_TURN, _STEP = (math.radians(25.0), math.radians(15.0)), (0.18, 0.10)
+# How much higher than the other a lifted foot is [m]; without another step for so long nobody walks
+# on the spot any more [s].
+_LIFT, _PAUSE = 0.05, 1.0
 
 
 def stance_of(left_W: Array, head_W: Array, feet_W: Array) -> Array:
@@ -84,14 +50,12 @@ def offsets_from_rest(stance: Array, rest: Array) -> tuple[float, float]:
     return turned, ahead
 
 
-def recognise_command(
-    stance: Array, rest: Array, last: tuple[int, int], settings: WalkSettings
-) -> tuple[int, int]:
+def recognise_command(stance: Array, rest: Array, last: tuple[int, int]) -> tuple[int, int]:
     """Table 1: the command that a stance gives; whoever is lost from sight stops.
 
     Args:
         stance, rest: (5,) from stance_of.
-        last: the command before; see WalkSettings.
+        last: the command before.
 
     Returns:
         Turning: 1 left, -1 right, 0 not; walking: 1 forward, -1 backward, 0 not.
@@ -99,16 +63,13 @@ def recognise_command(
     if not np.isfinite(stance).all():
         return NO_COMMAND
     turned, ahead = offsets_from_rest(stance, rest)
-    return (
-        _switch(turned, last[0], settings.turn_begin, settings.turn_end),
-        _switch(ahead, last[1], settings.step_begin, settings.step_end),
-    )
+    return _switch(turned, last[0], *_TURN), _switch(ahead, last[1], *_STEP)
 
 
 NO_STEPS = (0.0, 0.0, 0.0)
 
 
-def follow_steps(lift: float, steps: Array, seconds: float, settings: WalkSettings) -> Array:
+def follow_steps(lift: float, steps: Array, seconds: float) -> Array:
     """Counts the steps of somebody who may be walking on the spot; one foot held up is one step.
 
     Args:
@@ -118,9 +79,9 @@ def follow_steps(lift: float, steps: Array, seconds: float, settings: WalkSettin
         seconds: since the last frame.
     """
     foot, since, count = steps[0], steps[1] + seconds, steps[2]
-    if since > settings.pause:
+    if since > _PAUSE:
         count = 0.0
-    if abs(lift) >= settings.lift and math.copysign(1.0, lift) != foot:
+    if abs(lift) >= _LIFT and math.copysign(1.0, lift) != foot:
         return np.array([math.copysign(1.0, lift), 0.0, count + 1.0])
     return np.array([foot, since, count])
 
@@ -134,7 +95,6 @@ def follow_command(
     pose: Array,
     command: tuple[int, int],
     seconds: float,
-    settings: WalkSettings,
     half_size: float = math.inf,
     obstacles: Array | None = None,
 ) -> Array:
@@ -148,16 +108,16 @@ def follow_command(
         half_size: the place is a square about the origin; half its side [m].
         obstacles: (n, 3) x, y and radius of round obstacles [m].
     """
-    turn = command[0] * settings.turn_rate * seconds
+    turn = command[0] * TURN_RATE * seconds
     middle = pose[2] + 0.5 * turn
-    chord = command[1] * settings.speed * seconds * float(np.sinc(0.5 * turn / math.pi))
+    chord = command[1] * SPEED * seconds * float(np.sinc(0.5 * turn / math.pi))
     place = pose[:2] + chord * np.array([math.cos(middle), math.sin(middle)])
     for x, y, radius in np.empty((0, 3)) if obstacles is None else obstacles:
         away = place - (x, y)
-        distance, allowed = float(np.linalg.norm(away)), radius + settings.body_radius
+        distance, allowed = float(np.linalg.norm(away)), radius + BODY_RADIUS
         if 0.0 < distance < allowed:
             place = place + away * (allowed / distance - 1.0)
-    limit = half_size - settings.body_radius
+    limit = half_size - BODY_RADIUS
     heading = math.atan2(math.sin(pose[2] + turn), math.cos(pose[2] + turn))
     return np.array([*np.clip(place, -limit, limit), heading])
 

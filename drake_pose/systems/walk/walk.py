@@ -24,7 +24,6 @@ from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.person.date.walk_commands import (
     NO_COMMAND,
     NO_STEPS,
-    WalkSettings,
     follow_command,
     follow_steps,
     recognise_command,
@@ -78,6 +77,8 @@ class Walker(MemorySystem):
         model: the person, with the links head, left_foot and right_foot.
         standing: (nq,) avatar_positions until somebody was seen [rad or m].
         period: time between two frames [s].
+        on_spot: whether standing ahead or behind is a command only while the person also walks on
+            the spot, as in the paper.
         settle: how long the person must stand still at first [s]; 0: the first pose is the rest.
 
     Raises:
@@ -90,7 +91,7 @@ class Walker(MemorySystem):
         model: ArticulatedModel,
         standing: Array,
         period: float,
-        settings: WalkSettings | None = None,
+        on_spot: bool = False,
         settle: float = 0.0,
     ) -> None:
         super().__init__()
@@ -102,7 +103,7 @@ class Walker(MemorySystem):
                 raise UnknownNameError("link", part, model.link_names, str(model.path))
         self._plant, self._period, self._settle = model.plant, period, settle
         self._plant_context = model.plant.CreateDefaultContext()
-        self._settings = settings or WalkSettings()
+        self._on_spot = on_spot
         self._obstacles = garden_obstacles()
         self.add_input("positions", len(standing))
         self.add_input("keys", 2)
@@ -133,7 +134,7 @@ class Walker(MemorySystem):
             turn, walk = int(pressed[0]) or turn, int(pressed[1]) or walk
         known["command"] = np.array([turn, walk], dtype=float)
         known["walker_pose"] = follow_command(
-            known["walker_pose"], (turn, walk), self._period, self._settings, HALF_SIZE,
+            known["walker_pose"], (turn, walk), self._period, HALF_SIZE,
             self._obstacles,
         )  # fmt: skip
         return known
@@ -154,9 +155,9 @@ class Walker(MemorySystem):
                 return NO_COMMAND
             known["rest"] = stance
         last = known["command"].astype(int)
-        turn, walk = recognise_command(stance, known["rest"], (last[0], last[1]), self._settings)
-        known["steps"] = follow_steps(lift, known["steps"], self._period, self._settings)
-        is_walking = walks_on_spot(known["steps"]) or not self._settings.on_spot
+        turn, walk = recognise_command(stance, known["rest"], (last[0], last[1]))
+        known["steps"] = follow_steps(lift, known["steps"], self._period)
+        is_walking = walks_on_spot(known["steps"]) or not self._on_spot
         return turn, walk if is_walking else 0
 
     def _stance(self, q: Array) -> tuple[Array, float]:
@@ -258,7 +259,7 @@ def build_walk(
     positions: Trajectory | AddPositions | None,
     stride: Array,
     period: float = 1.0 / 30.0,
-    settings: WalkSettings | None = None,
+    on_spot: bool = False,
     settle: float = 0.0,
 ) -> Diagram:
     """A place in Meshcat and a person who walks through it by gestures or keys.
@@ -269,12 +270,12 @@ def build_walk(
         positions: the person's positions (nq,) over time, in a room with z upward, nan where not
             found; or what adds the systems that give them; None: the keys alone.
         stride: (n, nq) one stride on the spot that ends standing, for the keys.
-        period, settle: as of Walker [s].
+        period, on_spot, settle: as of Walker.
     """
     draw_garden(meshcat)
     builder = DiagramBuilder()
     keys = builder.AddNamedSystem("keys", WalkKeys(meshcat, stride, period))
-    walker = builder.AddNamedSystem("walker", Walker(model, stride[-1], period, settings, settle))
+    walker = builder.AddNamedSystem("walker", Walker(model, stride[-1], period, on_spot, settle))
     if positions is None:
         source = keys.GetOutputPort("positions")
     elif callable(positions):

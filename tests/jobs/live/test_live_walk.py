@@ -10,7 +10,7 @@ from drake_pose.jobs.live.local_proxy import open_page
 from drake_pose.jobs.live.run import run_live
 from drake_pose.jobs.live.scene import load_live_scene
 from drake_pose.jobs.live.walk import SETTLE, walk_live
-from drake_pose.person.date.walk_commands import WalkSettings
+from drake_pose.person.date.walk_commands import SPEED
 from drake_pose.systems.walk.garden import START
 from tests.cli import CliRunner
 from tests.jobs.live_scenes import RATE_HZ, absent, load_person, standing, write_studio
@@ -52,7 +52,7 @@ def test_person_before_the_cameras_walks_is_lost_and_found_again(studio, person)
     walked = found["commands"]["walk ahead"]
     assert walked == pytest.approx((2 * AHEAD + 2) / RATE_HZ, abs=0.4)
     # The walker goes at the walking pace, and neither loss nor return moves him otherwise.
-    assert found["x"] - START[0] == pytest.approx(walked * WalkSettings().speed, abs=0.1)
+    assert found["x"] - START[0] == pytest.approx(walked * SPEED, abs=0.1)
     assert abs(found["y"] - START[1]) < 0.05
     assert found["seconds"] > REST / RATE_HZ > SETTLE
     assert 0.6 < found["found_share"] < 0.95

@@ -25,7 +25,7 @@ from drake_pose.jobs.live.walk import (
     wait_for_replay,
     walk,
 )
-from drake_pose.person.date.walk_commands import WalkSettings
+from drake_pose.person.date.walk_commands import SPEED
 from drake_pose.results.folder import write_summary
 from drake_pose.results.poses import PoseRow, PoseTable
 from drake_pose.systems.walk.garden import START
@@ -60,7 +60,7 @@ def test_recorded_capture_is_walked(tmp_path):
     assert said == ["walk ahead", "", "walk ahead", ""]
     # 20 frames of a tenth of a second, less the six in which nobody is found.
     assert found["commands"]["walk ahead"] == pytest.approx(1.4, abs=0.05)
-    assert found["x"] - START[0] == pytest.approx(1.4 * WalkSettings().speed, abs=0.1)
+    assert found["x"] - START[0] == pytest.approx(1.4 * SPEED, abs=0.1)
 
 
 def test_results_that_cannot_be_played_say_why(tmp_path):

@@ -3,11 +3,12 @@ import math
 import numpy as np
 import pytest
 
-from drake_pose.errors import SettingsError
 from drake_pose.person.date.walk_commands import (
+    BODY_RADIUS,
     NO_COMMAND,
     NO_STEPS,
-    WalkSettings,
+    SPEED,
+    TURN_RATE,
     follow_command,
     follow_steps,
     offsets_from_rest,
@@ -15,8 +16,6 @@ from drake_pose.person.date.walk_commands import (
     stance_of,
     walks_on_spot,
 )
-
-SETTINGS = WalkSettings()
 
 
 def stance(heading_deg=0.0, ahead=0.0, left=0.0, feet_ahead=None, nod_deg=0.0):
@@ -40,7 +39,7 @@ REST = stance()
 def commands(stances):
     last, found = NO_COMMAND, []
     for one in stances:
-        last = recognise_command(one, REST, last, SETTINGS)
+        last = recognise_command(one, REST, last)
         found.append(last)
     return found
 
@@ -64,7 +63,7 @@ def test_table_1():
 def spot_walk(lifts, seconds=0.1):
     steps, found = np.array(NO_STEPS), []
     for lift in lifts:
-        steps = follow_steps(lift, steps, seconds, SETTINGS)
+        steps = follow_steps(lift, steps, seconds)
         found.append(walks_on_spot(steps))
     return found
 
@@ -115,29 +114,17 @@ def test_way_is_that_of_many_small_steps(command):
     pose, small, count = np.array([0.3, -0.2, 0.7]), np.array([0.3, -0.2, 0.7]), 20_000
     for _ in range(count):
         small[:2] += (
-            command[1]
-            * SETTINGS.speed
-            * 1.5
-            / count
-            * np.array([math.cos(small[2]), math.sin(small[2])])
+            command[1] * SPEED * 1.5 / count * np.array([math.cos(small[2]), math.sin(small[2])])
         )
-        small[2] += command[0] * SETTINGS.turn_rate * 1.5 / count
-    np.testing.assert_allclose(follow_command(pose, command, 1.5, SETTINGS), small, atol=1e-4)
+        small[2] += command[0] * TURN_RATE * 1.5 / count
+    np.testing.assert_allclose(follow_command(pose, command, 1.5), small, atol=1e-4)
 
 
 def test_walls_and_obstacles_are_not_walked_through():
     pose, obstacles = np.array([-4.0, 0.05, 0.0]), np.array([[0.0, 0.0, 0.5]])
     nearest = math.inf
     for _ in range(400):
-        pose = follow_command(pose, (0, 1), 1 / 30, SETTINGS, 5.0, obstacles)
+        pose = follow_command(pose, (0, 1), 1 / 30, 5.0, obstacles)
         nearest = min(nearest, float(np.hypot(*pose[:2])))
-    assert nearest == pytest.approx(0.5 + SETTINGS.body_radius, abs=1e-9)
-    assert pose[0] == pytest.approx(5.0 - SETTINGS.body_radius)
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"turn_begin": 0.1}, {"step_end": 0.5}, {"speed": 0.0}, {"turn_rate": math.nan}]
-)
-def test_settings_that_cannot_be_are_refused(wrong):
-    with pytest.raises(SettingsError, match=next(iter(wrong)).split("_")[0]):
-        WalkSettings(**wrong)
+    assert nearest == pytest.approx(0.5 + BODY_RADIUS, abs=1e-9)
+    assert pose[0] == pytest.approx(5.0 - BODY_RADIUS)

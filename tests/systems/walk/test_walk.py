@@ -10,7 +10,7 @@ from pydrake.trajectories import PiecewisePolynomial
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.errors import SettingsError, UnknownNameError
-from drake_pose.person.date.walk_commands import WalkSettings
+from drake_pose.person.date.walk_commands import BODY_RADIUS, SPEED, TURN_RATE
 from drake_pose.systems.walk.garden import (
     HALF_SIZE,
     START,
@@ -21,7 +21,6 @@ from drake_pose.systems.walk.garden import (
 from drake_pose.systems.walk.walk import KEYS, Walker, build_walk
 
 PERIOD = 1 / 30
-SETTINGS = WalkSettings()
 # How far the thigh is lifted on the way through three steps [rad], left positive.
 SPOT = [0.8 * math.sin(math.pi * k / 8) for k in range(1, 24)]
 
@@ -48,7 +47,7 @@ def run(person, page, stances, seconds_each=1.0):
     """Shows each stance for a while; the pose and the command after each."""
     times = seconds_each * np.arange(len(stances) + 1)
     path = PiecewisePolynomial.ZeroOrderHold(times, np.array([*stances, stances[-1]]).T)
-    diagram = build_walk(person, page, path, np.array([standing(person)]), PERIOD, SETTINGS)
+    diagram = build_walk(person, page, path, np.array([standing(person)]), PERIOD)
     simulator, found = Simulator(diagram), []
     for time in times[1:]:
         simulator.AdvanceTo(time - 0.5 * PERIOD)
@@ -61,7 +60,7 @@ def run(person, page, stances, seconds_each=1.0):
 
 def test_the_paper_asks_for_steps_on_the_spot(person):
     """Standing ahead is no command by itself, nor are steps at the place of rest."""
-    walker = Walker(person, standing(person), PERIOD, WalkSettings(on_spot=True))
+    walker = Walker(person, standing(person), PERIOD, on_spot=True)
     simulator = Simulator(walker)
     context = simulator.get_mutable_context()
     frames = [(0.0, 0.0), *[(0.3, 0.0)] * 20, *[(0.3, s) for s in SPOT], *[(0.0, s) for s in SPOT]]
@@ -97,11 +96,11 @@ def test_gestures_walk_and_turn(person, page):
     found = run(person, page, stances)
     assert [tuple(command) for _, command in found] == [(0, 0), (0, 1), (1, 0), (0, 0), (0, -1)]
     ways = np.diff([pose for pose, _ in found], axis=0)
-    np.testing.assert_allclose(ways[0], [SETTINGS.speed, 0.0, 0.0], atol=0.05)
-    np.testing.assert_allclose(ways[1], [0.0, 0.0, SETTINGS.turn_rate], atol=0.05)
+    np.testing.assert_allclose(ways[0], [SPEED, 0.0, 0.0], atol=0.05)
+    np.testing.assert_allclose(ways[1], [0.0, 0.0, TURN_RATE], atol=0.05)
     np.testing.assert_allclose(ways[2], 0.0, atol=0.05)
     heading = found[2][0][2]
-    back = -SETTINGS.speed * np.array([math.cos(heading), math.sin(heading), 0.0])
+    back = -SPEED * np.array([math.cos(heading), math.sin(heading), 0.0])
     np.testing.assert_allclose(ways[3], back, atol=0.06)
     assert page.HasPath("/drake/walker/avatar")
     assert page.HasPath("/drake/place/lawn")
@@ -124,7 +123,7 @@ def test_rest_is_where_the_person_stands_still(person, page):
     q = np.array([*ways, *[standing(person)] * 40, *[standing(person, 0.4)] * 30])
     path = PiecewisePolynomial.ZeroOrderHold(times, q.T)
     stride = np.array([standing(person)])
-    diagram = build_walk(person, page, path, stride, PERIOD, SETTINGS, settle=1.0)
+    diagram = build_walk(person, page, path, stride, PERIOD, settle=1.0)
     simulator = Simulator(diagram)
     rest = diagram.GetSubsystemByName("walker").GetOutputPort("rest")
     own = diagram.GetSubsystemByName("walker").GetMyContextFromRoot(simulator.get_context())
@@ -156,8 +155,8 @@ def test_keys_walk_where_nobody_is_captured(person):
     simulator.AdvanceTo(3.0)
     x, y, heading = pose.Eval(simulator.get_context())
     # A press counts for about half a second, on an arc to the left.
-    assert 0.5 < np.hypot(x - START[0], y - START[1]) / SETTINGS.speed < 0.7
-    assert 0.5 < heading / SETTINGS.turn_rate < 0.7
+    assert 0.5 < np.hypot(x - START[0], y - START[1]) / SPEED < 0.7
+    assert 0.5 < heading / TURN_RATE < 0.7
     assert y > 0.02
 
 
@@ -175,7 +174,7 @@ def test_place_lies_within_its_walls_and_the_start_is_free():
     obstacles = garden_obstacles()
     assert np.abs(obstacles[:, :2]).max() < HALF_SIZE
     distance = np.linalg.norm(obstacles[:, :2] - START[:2], axis=1) - obstacles[:, 2]
-    assert distance.min() > 2 * SETTINGS.body_radius
+    assert distance.min() > 2 * BODY_RADIUS
 
 
 def test_wrong_period_and_body_are_refused(person):

@@ -29,7 +29,6 @@ from drake_pose.person.recordings.figures import (
 )
 from drake_pose.person.recordings.persons_in_view import PersonRecording, keep_person, keep_views
 from drake_pose.person.views import FrameViews, see_silhouette
-from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.person.persons_in_view import see, stepping
 
 Masks = list[dict[str, np.ndarray]]
@@ -172,12 +171,6 @@ class TestRig:
     def test_moved_camera_is_not_taken_for_a_mirrored_one(self, four: Stage) -> None:
         fault = find_rig_fault(four.cameras, four.seen_by_moved("camera_2", 10.0, (0, 0, 0))[:2])
         assert fault is None or (fault.mirrored, fault.exchanged) == ((), ())
-
-    def test_real_rig_is_sound(self, shared_data: object) -> None:
-        scene = load_scene(f"{shared_data}/human_four_views")
-        frames = scene.frames[::25]
-        masks = [{name: scene.read(name, f) for name in scene.cameras} for f in frames]
-        assert find_rig_fault(scene.cameras, masks) is None
 
 
 class TestOthers:

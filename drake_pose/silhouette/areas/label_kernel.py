@@ -7,7 +7,6 @@ where two labels contend. Both see the same pixels, as they begin and end a row 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -18,20 +17,6 @@ from drake_pose.silhouette.areas.span_kernel import Rows, fill_rows, find_spans,
 
 # Contested pixels are noted by tiles of 8 x 8, too: most triangles are far from any.
 _TILE = 3
-
-
-class _Contest(NamedTuple):
-    """The pixels for which surfaces of different labels contend, until depths have decided.
-
-    In the image such a pixel is -1 - label. sums: (H / 8 + 2, W / 8 + 2) int32 how many tiles above
-    and left of each hold some; bounds: (4,) int64 the rows [first, end) and the columns
-    [first, end) that hold them; depths: (rows, columns) float32 of these, how near what is drawn so
-    far is, infinite where nothing contends.
-    """
-
-    sums: np.ndarray
-    bounds: np.ndarray
-    depths: np.ndarray
 
 
 @compiled
@@ -57,7 +42,9 @@ def paint_labels(
     for row in range(height):
         for column in range(width):
             image[row, column] = empty
-    # The first row and column stay zero, for sums.
+    # Of pixels for which surfaces of different labels contend, -1 - label in the image: by tiles,
+    # then how many tiles above and left of each (the first row and column stay zero), and the rows
+    # and columns [first, end) that hold them.
     sums = np.zeros(((height >> _TILE) + 2, (width >> _TILE) + 2), dtype=np.int32)
     bounds = np.array([height, 0, width, 0])
     rows, crossings = make_rows(packed, camera)
@@ -75,11 +62,12 @@ def paint_labels(
             along += sums[i, j]
             sums[i, j] = sums[i - 1, j] + along
     top, left = bounds[0], bounds[2]
+    # How near what is drawn so far is, infinite where nothing contends.
     depths = np.empty((bounds[1] - top, bounds[3] - left), dtype=np.float32)
     for i in range(depths.shape[0]):
         for j in range(depths.shape[1]):
             depths[i, j] = -np.inf if image[top + i, left + j] < 0 else np.inf
-    contest = _Contest(sums, bounds, depths)
+    contest = (sums, bounds, depths)
     for node in range(X_CN.shape[0]):
         _draw_node(packed, node, labels[node], closed[node], X_CN, camera, image, contest, rows)
     for row in range(bounds[0], bounds[1]):
@@ -128,11 +116,11 @@ def _draw_node(
     X_CN: np.ndarray,
     camera: np.ndarray,
     image: np.ndarray,
-    contest: _Contest,
+    contest: tuple[np.ndarray, np.ndarray, np.ndarray],
     rows: Rows,
 ) -> None:
     """Draws the triangles of one surface where pixels are contested."""
-    u, v, facings, X, sums = rows.u, rows.v, rows.facings, X_CN[node], contest.sums
+    u, v, facings, X, sums = rows.u, rows.v, rows.facings, X_CN[node], contest[0]
     project(packed, node, X_CN, camera, u, v)
     find_facings(packed, node, X_CN, camera, facings)
     begin = packed.starts[node, 0]
@@ -173,16 +161,21 @@ def _draw_node(
         else:
             size = clip_triangle(packed, node, t, X_CN, camera, corners)
         for k in range(2, size):
-            _draw_triangle(corners, k - 1, k, label, image, contest)
+            _draw_triangle(corners, k - 1, k, label, image, contest[1], contest[2])
 
 
 @compiled(inline="always")
 def _draw_triangle(
-    p: np.ndarray, b: int, c: int, label: int, image: np.ndarray, contest: _Contest
+    p: np.ndarray,
+    b: int,
+    c: int,
+    label: int,
+    image: np.ndarray,
+    bounds: np.ndarray,
+    depths: np.ndarray,
 ) -> None:
     """Draws the triangle 0, b, c of points p (n, 3) of pixel and nearness where it contends."""
     # Nearness grows towards the camera and is linear in the picture: 1 / z, or -z (parallel).
-    bounds, depths = contest.bounds, contest.depths
     ua, va, da = p[0, 0], p[0, 1], p[0, 2]
     ub, vb, db = p[b, 0], p[b, 1], p[b, 2]
     uc, vc, dc = p[c, 0], p[c, 1], p[c, 2]

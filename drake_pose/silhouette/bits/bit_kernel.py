@@ -6,7 +6,6 @@ Contour edges are looked for among the few that can be on the contour (direction
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -25,20 +24,6 @@ from drake_pose.silhouette.bits.bit_view import WORD, BitView
 from drake_pose.silhouette.contours.direction_cells import CelledOutline, find_cell
 
 _FULL = np.uint64(0xFFFFFFFFFFFFFFFF)
-
-
-class _Scratch(NamedTuple):
-    """Scratch arrays of one surface at one pose.
-
-    contour: (e,) contour edges; weights: (e,); lines: (e, 4) upper and lower end u, v [pixel] of
-    those that cross a row; firsts, lasts: (e,) first row crossed and the row after the last.
-    """
-
-    contour: np.ndarray
-    weights: np.ndarray
-    lines: np.ndarray
-    firsts: np.ndarray
-    lasts: np.ndarray
 
 
 @compiled
@@ -69,13 +54,9 @@ def draw_bits(
     """
     camera, packed, e = view.camera, celled.packed, celled.edges.shape[0] + 1
     rows, crossings = make_rows(packed, camera)
-    scratch = _Scratch(
-        np.empty(e, dtype=np.int32),
-        np.empty(e, dtype=np.int32),
-        np.empty((e, 4)),
-        np.empty(e, dtype=np.int32),
-        np.empty(e, dtype=np.int32),
-    )
+    # Of contour edges their number, weight, first row crossed and the row after the last, and of
+    # those that cross a row the upper and the lower end.
+    scratch = (np.empty((4, e), dtype=np.int32), np.empty((e, 4)))
     bends, part = celled.bands.shape[0] > 0, np.array([1, 0, 0, 0])
     X_WN, X_CN = np.zeros((4, 4)), np.empty((2, 3, 4))
     X_WN[3, 3] = 1.0
@@ -125,7 +106,7 @@ def _walk_cell(
     camera: np.ndarray,
     crossings: np.ndarray,
     rows: Rows,
-    scratch: _Scratch,
+    scratch: tuple[np.ndarray, np.ndarray],
 ) -> bool:
     """Walks the contour edges of the cell exactly as the span kernel does."""
     counts, reach = rows.counts, rows.reach
@@ -151,7 +132,9 @@ def _walk_cell(
     planes, edges, points, chosen = celled.planes, celled.edges, celled.points, celled.cell_edges
     # Three passes without unforeseeable branches in the first two: a mispredicted branch costs as
     # much as all the arithmetic of an edge.
-    contour, weights, number = scratch.contour, scratch.weights, 0
+    contour, weights = scratch[0][0], scratch[0][1]
+    firsts, lasts, lines = scratch[0][2], scratch[0][3], scratch[1]
+    number, crossing = 0, 0
     for k in range(begin, end):
         e = chosen[k]
         t = edges[e, 2]
@@ -162,7 +145,6 @@ def _walk_cell(
         weight += edges[e, 4] * (int(side > 0.0) - int(side < 0.0))
         contour[number], weights[number] = e, weight
         number += weight != 0
-    lines, firsts, lasts, crossing = scratch.lines, scratch.firsts, scratch.lasts, 0
     for k in range(number):
         e = contour[k]
         i, j = edges[e, 0], edges[e, 1]

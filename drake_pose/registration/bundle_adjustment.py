@@ -8,7 +8,7 @@ cameras whose places are known hold the whole.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,21 +51,6 @@ _TELLING_FRAMES, _MOST_DISTANCES, _UNCUT = 4, 1000, AnnealingStage(0.08, 0.015)
 
 
 @dataclass(frozen=True, eq=False)
-class CommonShape:
-    """What of a body is unknown, but the same in all frames.
-
-    Args:
-        lengths: (m,) which of the pose tree's values are lengths of its parts.
-        parts: names of the parts that have a girth: how wide they are across their y axes.
-        groups: (nodes,) which of these each node belongs to, or -1.
-    """
-
-    lengths: Mask
-    parts: Sequence[str] = ()
-    groups: Sequence[int] = field(default_factory=tuple)
-
-
-@dataclass(frozen=True, eq=False)
 class AdjustedBundle:
     """What was fitted together.
 
@@ -88,32 +73,37 @@ def adjust_bundle(
     cameras: Sequence[PinholeCamera],
     unknown: Collection[str],
     frames: Sequence[SeenFrame],
-    shape: CommonShape,
+    is_length: Mask,
+    parts: Sequence[str] = (),
+    groups: Sequence[int] | None = None,
 ) -> AdjustedBundle:
     """Fits poses and cameras together, in the end as finely as the model is like the body.
 
     Args:
         cameras: all cameras, those that are unknown near where they stand.
         frames: what they see, and about which values of the body.
+        is_length: (m,) which of the pose tree's values are lengths, the same in all frames.
+        parts: names of the parts that have a girth: how wide they are across their y axes.
+        groups: (nodes,) which of these each node belongs to, or -1; None: none.
 
     Raises:
         MaskError: a mask of another size than its camera's picture, or no mask shows the body.
     """
     values, size = np.array([frame.values for frame in frames]), common_size(cameras, frames)
-    body = BodyParameters(kinematics, outlines, shape.groups or None, shape.parts)
-    free = (kinematics.lower < kinematics.upper) & ~shape.lengths
+    body = BodyParameters(kinematics, outlines, groups, parts)
+    free = (kinematics.lower < kinematics.upper) & ~is_length
     looks = [k for k, camera in enumerate(cameras) if camera.name in unknown]
-    unknowns = _unknowns(body, free, shape.lengths, cameras, looks)
+    unknowns = _unknowns(body, free, is_length, cameras, looks)
     fit = FramesFit(
         body, cameras, unknowns, pivot=middle_of(kinematics, frames),
         noise=Noise.of_a_pixel(size), steps=STEPS, pixels=size,
     )  # fmt: skip
     edges = [frame.edges(cameras, _EDGE_SPACING * size) for frame in frames]
-    lengths = values[0, shape.lengths]
+    lengths = values[0, is_length]
     shared = np.zeros(len(unknowns.names) - unknowns.own_count)
     shared[: len(lengths)] = lengths
     start = own, now = values[:, free], shared
-    held = np.where(free | shape.lengths, 0.0, values)
+    held = np.where(free | is_length, 0.0, values)
     found, rounds = None, list(_FIRST)
     for scale in _SCALES:
         rounds.append(AnnealingStage(scale, _SPACING, _ITERATIONS))
@@ -122,7 +112,7 @@ def adjust_bundle(
             break
         found, own, now, rounds = tried, tried.own, tried.shared, []
     assert found is not None
-    girths = np.append(found.shared[len(lengths) : len(lengths) + len(shape.parts)], 0.0)
+    girths = np.append(found.shared[len(lengths) : len(lengths) + len(parts)], 0.0)
     X_CW, _, _ = fit.places(found.parameters[0])
     return AdjustedBundle(
         tuple(replace(cameras[k], X_WC=np.linalg.inv(X_CW[k])) for k in looks),

@@ -64,12 +64,10 @@ class PosedFrames:
         spacing: float = LAST_SPACING,
     ) -> None:
         for frame in frames:
-            if frame.mask.shape != (camera.height, camera.width) or not frame.mask.any():
+            require_size(camera, frame.name, frame.mask)
+            if not frame.mask.any():
                 raise MaskError(
-                    f"camera '{camera.name}', frame '{frame.name}': a mask of {camera.width} x "
-                    f"{camera.height} pixels that shows the body is expected, not "
-                    f"{frame.mask.shape[1]} x {frame.mask.shape[0]} with "
-                    f"{np.count_nonzero(frame.mask)} pixels of it"
+                    f"camera '{camera.name}', frame '{frame.name}': the mask does not show the body"
                 )
         self.kinematics, self.outlines = kinematics, tuple(outlines)
         self.camera, self.frames, self.spacing = camera, tuple(frames), spacing
@@ -154,22 +152,23 @@ class SeenFrame:
         Raises:
             MaskError: a mask of another size than its camera's picture.
         """
-        self.require_sizes(cameras)
         masks = [self.masks.get(camera.name) for camera in cameras]
+        for camera, mask in zip(cameras, masks, strict=True):
+            if mask is not None:
+                require_size(camera, self.name, mask)
         spacing = max(1.0, round(spacing))
         return pack_evidence(
             [NO_EDGE if mask is None else find_edge_points(mask, spacing) for mask in masks]
         )
 
-    def require_sizes(self, cameras: Sequence[Camera]) -> None:
-        """Refuses (MaskError) a mask of another size than its camera's picture."""
-        for camera in cameras:
-            mask = self.masks.get(camera.name)
-            if mask is not None and mask.shape != (camera.height, camera.width):
-                raise MaskError(
-                    f"camera '{camera.name}', frame '{self.name}': a mask of {camera.width} x "
-                    f"{camera.height} pixels is expected, not {mask.shape[1]} x {mask.shape[0]}"
-                )
+
+def require_size(camera: Camera, frame: str, mask: Mask) -> None:
+    """Refuses (MaskError) a mask of another size than its camera's picture."""
+    if mask.shape != (camera.height, camera.width):
+        raise MaskError(
+            f"camera '{camera.name}', frame '{frame}': a mask of {camera.width} x {camera.height} "
+            f"pixels is expected, not {mask.shape[1]} x {mask.shape[0]}"
+        )
 
 
 def common_size(cameras: Sequence[Camera], frames: Sequence[SeenFrame]) -> float:
@@ -178,9 +177,12 @@ def common_size(cameras: Sequence[Camera], frames: Sequence[SeenFrame]) -> float
     Raises:
         MaskError: a mask of another size than its camera's picture, or no mask shows the body.
     """
+    areas = []
     for frame in frames:
-        frame.require_sizes(cameras)
-    areas = [np.count_nonzero(mask) for frame in frames for mask in frame.masks.values()]
+        for camera in cameras:
+            if camera.name in frame.masks:
+                require_size(camera, frame.name, frame.masks[camera.name])
+                areas.append(np.count_nonzero(frame.masks[camera.name]))
     if not any(areas):
         raise MaskError("no mask shows the body; give masks in which it is white")
     return float(np.sqrt(np.median([area for area in areas if area])))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -21,24 +20,9 @@ _WIDTH = 160
 # A joint without limits is taken to turn once around.
 _TURN = np.pi
 
-
 Corner = tuple[float, float, float]
 Box = tuple[Corner, Corner]
 """The least and the largest corner along the world's axes [m]."""
-
-
-@dataclass(frozen=True, eq=False)
-class Suggestion:
-    """A pose that tells camera poses apart.
-
-    Args:
-        values: (m,) of the body's pose tree [rad or m].
-        difference: of the two camera poses that it tells apart least, the area in which their
-            silhouettes differ, over the mean area of both.
-    """
-
-    values: Array
-    difference: float
 
 
 def suggest_pose(
@@ -49,7 +33,7 @@ def suggest_pose(
     *,
     tried: int = 300,
     seed: int = 0,
-) -> Suggestion | None:
+) -> tuple[Array, float] | None:
     """The pose, of random ones inside the limits, whose silhouettes differ most.
 
     Args:
@@ -57,7 +41,9 @@ def suggest_pose(
         keep_out: what the body must not touch; points of its surfaces are asked.
 
     Returns:
-        None where no pose was found that is seen from all camera poses and touches nothing.
+        its values (m,) of the pose tree [rad or m], and of the two camera poses that it tells apart
+        least the area in which their silhouettes differ, over the mean area of both; None where no
+        pose was found that is seen from all camera poses and touches nothing.
     """
     generator, kinematics = np.random.default_rng(seed), body.kinematics
     lower = np.where(np.isfinite(kinematics.lower), kinematics.lower, -_TURN)
@@ -65,7 +51,7 @@ def suggest_pose(
     share = min(1.0, _WIDTH / camera.width)
     size = (max(1, round(share * camera.width)), max(1, round(share * camera.height)))
     cameras = [camera.with_pose(one).resized(*size) for one in X_WC]
-    best: Suggestion | None = None
+    best: tuple[Array, float] | None = None
     for _ in range(tried):
         values = generator.uniform(lower, upper)
         X_WN = kinematics.poses(values)
@@ -79,6 +65,6 @@ def suggest_pose(
             2.0 * np.count_nonzero(a != b) / (np.count_nonzero(a) + np.count_nonzero(b))
             for a, b in combinations(masks, 2)
         )
-        if best is None or difference > best.difference:
-            best = Suggestion(values, float(difference))
+        if best is None or difference > best[1]:
+            best = values, float(difference)
     return best

@@ -11,6 +11,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,7 @@ from drake_pose.jobs.estimate.person_choice import missing_for_person
 from drake_pose.jobs.registration.inputs import Inputs, make_registration_tree
 from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.person.shape import shape_parts, shape_values
-from drake_pose.registration.bundle_adjustment import CommonShape, adjust_bundle
+from drake_pose.registration.bundle_adjustment import adjust_bundle
 from drake_pose.registration.joint_zeros import (
     JointCalibration,
     calibrate_joints,
@@ -46,10 +47,10 @@ def refit_poses(
         for one in inputs.frames
     ]
     cameras = [*inputs.held, *(found.camera for found in registered.values())]
-    shape = CommonShape(np.zeros(len(body.kinematics.names), np.bool_))
+    shape: tuple[Any, ...] = (np.zeros(len(body.kinematics.names), np.bool_),)
     if not missing_for_person(inputs.model):
-        shape = CommonShape(shape_values(inputs.tree), *shape_parts(inputs.tree))
-    fitted = adjust_bundle(body.kinematics, body.few, cameras, registered, frames, shape)
+        shape = (shape_values(inputs.tree), *shape_parts(inputs.tree))
+    fitted = adjust_bundle(body.kinematics, body.few, cameras, registered, frames, *shape)
     values = {one.name: own for one, own in zip(frames, fitted.values, strict=True)}
     inputs = replace(inputs, frames=inputs.moved(values))
     known = inputs.positions.girths

@@ -207,11 +207,9 @@ class _Search:
         told = suggest_pose(self.body, found.camera, poses, self._settings.keep_out)
         if told is None:
             return None
-        values = zip(self.body.kinematics.names, told.values.tolist(), strict=True)
-        return {
-            "positions": {name: value for name, value in values if name not in OBJECT_POSITIONS},
-            "difference": told.difference,
-        }
+        values = zip(self.body.kinematics.names, told[0].tolist(), strict=True)
+        positions = {name: value for name, value in values if name not in OBJECT_POSITIONS}
+        return {"positions": positions, "difference": told[1]}
 
 
 def _say_zeros(found: JointCalibration) -> list[str]:

@@ -106,10 +106,15 @@ class FileFinder:
 def _folders_above(name: str, file: Path) -> Iterator[Path]:
     """Folders of a package on the way up from a file; only parents and their children are seen."""
     for parent in file.absolute().parents:
-        if parent.name == name or _package_name(parent) == name:
-            yield parent
-        if (parent / name).is_dir():
-            yield parent / name
+        yield from _folders_at(parent, name)
+
+
+def _folders_at(folder: Path, name: str) -> Iterator[Path]:
+    """A folder where it is the package, and the one of the package's name in it."""
+    if folder.name == name or _package_name(folder) == name:
+        yield folder
+    if (folder / name).is_dir():
+        yield folder / name
 
 
 def _folders_of_environment(name: str) -> Iterator[Path]:
@@ -117,12 +122,9 @@ def _folders_of_environment(name: str) -> Iterator[Path]:
     for variable, inside in _SEARCH_PATHS:
         for text in filter(None, os.environ.get(variable, "").split(os.pathsep)):
             folder = Path(text) / inside
-            if folder.name == name or _package_name(folder) == name:
-                yield folder
-            if (folder / name).is_dir():
-                yield folder / name
-                continue
-            yield from (one / name for one in _some_folders(folder) if (one / name).is_dir())
+            yield from _folders_at(folder, name)
+            if not (folder / name).is_dir():
+                yield from (one / name for one in _some_folders(folder) if (one / name).is_dir())
 
 
 def _some_folders(folder: Path) -> list[Path]:

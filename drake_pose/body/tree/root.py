@@ -39,7 +39,7 @@ class RootRotation:
     @staticmethod
     def fixed(rotation: ArrayLike | None = None) -> "RootRotation":
         """Always R_W0 (3, 3), by default the identity; SettingsError where that is no rotation."""
-        return RootRotation("fixed", _rotation_matrix(rotation), (), *_limits([]), None)
+        return _root_rotation("fixed", (), [], rotation, None)
 
     @staticmethod
     def free(
@@ -49,10 +49,7 @@ class RootRotation:
 
         Raises SettingsError for no rotation matrix, or an interval that is not positive.
         """
-        limits = _limits([(-math.pi, math.pi)] * 3)
-        return RootRotation(
-            "free", _rotation_matrix(rotation), (), *limits, _interval(interval_deg)
-        )
+        return _root_rotation("free", (), [(-180.0, 180.0)] * 3, rotation, interval_deg)
 
     @staticmethod
     def limited(
@@ -83,10 +80,8 @@ class RootRotation:
                     f"root rotation axis {axis}: limits {lower:g}, {upper:g}: give the lower first,"
                     " in degrees between -360 and 360"
                 )
-        limits = _limits([(math.radians(low), math.radians(high)) for _, low, high in ranges_deg])
-        return RootRotation(
-            "limited", _rotation_matrix(rotation), axes, *limits, _interval(interval_deg)
-        )
+        limits = [(low, high) for _, low, high in ranges_deg]
+        return _root_rotation("limited", axes, limits, rotation, interval_deg)
 
     @property
     def value_names(self) -> tuple[str, ...]:
@@ -97,11 +92,11 @@ class RootRotation:
 
     def rotations(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """R_WR (n, 3, 3) at values (n, k) [rad]."""
-        if self.kind == "fixed":
-            return np.broadcast_to(self.R_W0, (len(values), 3, 3)).copy()
         if self.kind == "free":
             return self.R_W0 @ Rotation.from_rotvec(values).as_matrix()
-        return self.R_W0 @ Rotation.from_euler("".join(self.axes).upper(), values).as_matrix()
+        if self.kind == "limited":
+            return self.R_W0 @ Rotation.from_euler("".join(self.axes).upper(), values).as_matrix()
+        return np.broadcast_to(self.R_W0, (len(values), 3, 3)).copy()
 
     def values_from(self, R_WR: NDArray[np.float64]) -> NDArray[np.float64]:
         """The values (k,) [rad] of a rotation (3, 3), the nearest there are where it is limited."""
@@ -117,6 +112,29 @@ class RootRotation:
         return nearest_turn(angles, middle, True)
 
 
+def _root_rotation(
+    kind: Literal["fixed", "free", "limited"],
+    axes: tuple[Axis, ...],
+    limits_deg: Sequence[tuple[float, float]],
+    rotation: ArrayLike | None,
+    interval_deg: float | None,
+) -> RootRotation:
+    """A RootRotation after checks, its arrays copied and read-only."""
+    R = np.eye(3) if rotation is None else np.array(rotation, dtype=np.float64)
+    orthonormal = R.shape == (3, 3) and np.allclose(R @ R.T, np.eye(3), atol=1e-6)
+    if not orthonormal or np.linalg.det(R) < 0.0:
+        raise SettingsError(f"root rotation {R.tolist()} is not a 3 x 3 rotation matrix")
+    if interval_deg is not None and not 0.0 < interval_deg <= 180.0:
+        raise SettingsError(
+            f"root rotation interval {interval_deg:g} deg: give 0 < interval <= 180"
+        )
+    limits = np.radians(np.array(limits_deg, dtype=np.float64).reshape(-1, 2))
+    for array in (R, limits):
+        array.setflags(write=False)
+    interval = None if interval_deg is None else math.radians(interval_deg)
+    return RootRotation(kind, R, axes, limits[:, 0], limits[:, 1], interval)
+
+
 def even_rotations(interval: float) -> NDArray[np.float64]:
     """Rotation vectors (n, 3) [rad] about ``interval`` [rad] apart, nearest to none first.
 
@@ -124,48 +142,17 @@ def even_rotations(interval: float) -> NDArray[np.float64]:
     are multiples of the interval; the samples hold the identity.
     """
     angles = []
-    turns = _full_turn(interval)
+    turns = _full_turn(2.0 * math.pi / interval)
     circles = max(1, round(math.pi / interval))
     for polar in np.linspace(0.0, math.pi, circles + 1):
-        count = max(1, round(2.0 * math.pi * math.sin(polar) / interval))
-        for azimuth in np.arange(count) * (2.0 * math.pi / count):
+        for azimuth in _full_turn(2.0 * math.pi * math.sin(polar) / interval):
             angles += [(azimuth, polar, turn - azimuth) for turn in turns]
     vectors = np.asarray(Rotation.from_euler("ZYZ", np.array(angles)).as_rotvec())
     order = np.argsort(np.round(np.linalg.norm(vectors, axis=1), 9), kind="stable")
     return vectors[order]
 
 
-def _full_turn(interval: float) -> NDArray[np.float64]:
-    """Angles [rad] of a full turn, evenly spaced by about the interval, zero first."""
-    count = max(1, round(2.0 * math.pi / interval))
-    return np.asarray(np.arange(count) * (2.0 * math.pi / count), dtype=np.float64)
-
-
-def _rotation_matrix(rotation: ArrayLike | None) -> NDArray[np.float64]:
-    """A checked, read-only copy of a rotation matrix; None is the identity."""
-    R = np.eye(3) if rotation is None else np.array(rotation, dtype=np.float64)
-    orthonormal = R.shape == (3, 3) and np.allclose(R @ R.T, np.eye(3), atol=1e-6)
-    if not orthonormal or np.linalg.det(R) < 0.0:
-        raise SettingsError(f"root rotation {R.tolist()} is not a 3 x 3 rotation matrix")
-    R.setflags(write=False)
-    return R
-
-
-def _limits(
-    ranges: Sequence[tuple[float, float]],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Read-only lower and upper limits."""
-    array = np.array(ranges, dtype=np.float64).reshape(-1, 2)
-    array.setflags(write=False)
-    return array[:, 0], array[:, 1]
-
-
-def _interval(interval_deg: float | None) -> float | None:
-    """A checked sampling interval [rad]."""
-    if interval_deg is None:
-        return None
-    if not 0.0 < interval_deg <= 180.0:
-        raise SettingsError(
-            f"root rotation interval {interval_deg:g} deg: give 0 < interval <= 180"
-        )
-    return math.radians(interval_deg)
+def _full_turn(count: float) -> NDArray[np.float64]:
+    """About so many angles [rad] of a full turn, evenly spaced, zero first; at least one."""
+    whole = max(1, round(count))
+    return np.asarray(np.arange(whole) * (2.0 * math.pi / whole), dtype=np.float64)

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from drake_pose.errors import MaskError, SceneError
 from drake_pose.jobs.estimate.inputs import Inputs
 from drake_pose.jobs.estimate.matching import finish_frame, read_pictures
+from drake_pose.person.recordings.camera_faults import CameraFault
 from drake_pose.person.recordings.checked_capture import (
     CheckedCapture,
-    MovedCamera,
     capture_checked,
 )
 from drake_pose.person.recordings.figures import RigFault
@@ -305,11 +305,11 @@ def describe_rig(rig: RigFault | None) -> tuple[str, ...]:
     return (f"no body fills all silhouettes ({filled}){what}",)
 
 
-def describe_camera(one: MovedCamera, frames: Sequence[str]) -> str:
+def describe_camera(fault: CameraFault, frames: Sequence[str]) -> str:
     """What is said of a camera that contradicts the others."""
-    fault, motion = one.fault, one.fault.motion
-    since = "" if one.first == 0 else f" since frame {frames[one.first]}"
-    action = f"left out{since}" if one.is_left_out else "used all the same"
+    motion = fault.motion
+    since = "" if fault.first == 0 else f" since frame {frames[fault.first]}"
+    action = f"left out{since}" if fault.is_left_out else "used all the same"
     whose = _cameras([fault.name, *fault.rivals], "or")
     if not fault.is_explained:
         return (

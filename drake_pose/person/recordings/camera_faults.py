@@ -7,7 +7,7 @@ explains many frames; poor masks are off in another way each time.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,6 +86,7 @@ class CameraFault:
             or another camera's.
         rivals: cameras that may be at fault in its stead: who it is, cannot be told.
         others_share: of the other cameras' contours, what fits without it.
+        first, is_left_out: since which frame (from 0) it is at fault; whether it was left out.
     """
 
     name: str
@@ -93,11 +94,8 @@ class CameraFault:
     is_explained: bool
     rivals: tuple[str, ...]
     others_share: float
-
-    def with_motion(self, motion: CameraMotion) -> CameraFault:
-        """The fault with a motion that was measured anew."""
-        explained = motion.share_after > _EXPLAINED * self.others_share
-        return replace(self, motion=motion, is_explained=explained)
+    first: int = 0
+    is_left_out: bool = False
 
 
 def fit_without(
@@ -255,8 +253,13 @@ def find_fault(
         for one in suspects
         if one != first and misfits[one] < alike and found[one][0].metres > _LEAST_METRES
     ]
-    explained = not few and motion.share_after > _EXPLAINED * share
+    explained = not few and is_explained(motion, share)
     return CameraFault(first, motion, explained, tuple(rivals), share)
+
+
+def is_explained(motion: CameraMotion, others_share: float) -> bool:
+    """Whether a camera's motion explains its silhouettes nearly as well as the others' fit."""
+    return motion.share_after > _EXPLAINED * others_share
 
 
 def moved_since(before: Sequence[float], after: Sequence[float]) -> int:

@@ -24,6 +24,7 @@ from drake_pose.person.recordings.camera_faults import (
     camera_motion,
     find_fault,
     fit_without,
+    is_explained,
     moved_since,
     share_of,
 )
@@ -49,21 +50,12 @@ _LEAST_LEFT = 3
 
 
 @dataclass(frozen=True, eq=False)
-class MovedCamera:
-    """A camera that contradicts the others from frame `first` (from 0) on; maybe left out."""
-
-    fault: CameraFault
-    first: int
-    is_left_out: bool
-
-
-@dataclass(frozen=True, eq=False)
 class CheckedCapture:
     """A captured recording.
 
     Args:
         captured: the capture of all frames; nan where fewer than two cameras see the person.
-        cameras: those that contradict the others.
+        cameras: those that contradict the others, measured at the end once more.
         rig: what the silhouettes say against the calibration as a whole, if no single camera
             explains it; undone where it can be.
         read: gives the masks that were used.
@@ -71,7 +63,7 @@ class CheckedCapture:
 
     captured: PersonCapture
     views: ViewFaults
-    cameras: tuple[MovedCamera, ...]
+    cameras: tuple[CameraFault, ...]
     rig: RigFault | None
     read: ReadFrame
 
@@ -98,22 +90,22 @@ def capture_checked(
     if rig is not None and rig.is_undone:
         undo = rig.undo
         recording = _record(cameras, lambda k: undo(read(k)), count, is_sequence)
-    found: list[MovedCamera] = []
+    found: list[CameraFault] = []
     while True:
         # All frames are finished once only, as those who count them are told of it.
         tell = None if found else on_frame
         captured = _capture_seen(tree, cameras, recording, is_sequence, tell)
         judge = _Judge(tree, cameras, recording, captured)
         found = [judge.dated(one) for one in found]
-        fault, first = judge.find()
+        fault = judge.find()
         if fault is None:
             break
-        left = len(recording.cameras_at(first)) - 1
-        is_left_out = left >= _LEAST_LEFT and not fault.rivals
-        found.append(MovedCamera(fault, first, is_left_out))
-        if not is_left_out:
+        left = len(recording.cameras_at(fault.first)) - 1
+        fault = replace(fault, is_left_out=left >= _LEAST_LEFT and not fault.rivals)
+        found.append(fault)
+        if not fault.is_left_out:
             break
-        recording.leave_out(fault.name, first)
+        recording.leave_out(fault.name, fault.first)
     if found and rig is not None and not rig.is_undone:
         rig = None
     whole = _spread(captured, recording.seen, count)
@@ -180,7 +172,7 @@ class _Judge:
         poses = zip(recording.seen, captured.q, strict=True)
         self._values = {k: tracker.values(q) for k, q in poses if np.isfinite(q).all()}
 
-    def find(self) -> tuple[CameraFault | None, int]:
+    def find(self) -> CameraFault | None:
         """The camera that contradicts the others in all frames or in the last, and since when."""
         picked = _spread_over(list(self._values), _COMPARED)
         views = []
@@ -194,37 +186,39 @@ class _Judge:
             late = views[-(len(views) + 2) // 3 :]
             fault = find_fault(self._fit, self._cameras, late, self._held) or fault
         if fault is None:
-            return None, 0
+            return None
         own = [k for k, view in enumerate(views) if fault.name in view.edges]
         poses = [
             fit_without(self._fit, self._cameras, views[k], fault.name, self._held)[0] for k in own
         ]
         since = self._since(fault, [views[k].edges[fault.name] for k in own], poses)
         # Between two compared frames it may have moved at any time.
-        return fault, 0 if since == 0 else picked[own[min(since, len(own)) - 1]] + 1
+        first = 0 if since == 0 else picked[own[min(since, len(own)) - 1]] + 1
+        return replace(fault, first=first)
 
-    def dated(self, moved: MovedCamera) -> MovedCamera:
+    def dated(self, fault: CameraFault) -> CameraFault:
         """A camera that was left out, measured once more by what the others captured without it."""
-        name = moved.fault.name
-        edges, poses, frames = [], [], []
-        for frame, values in self._values.items():
+        name = fault.name
+        edges, frames = [], []
+        for frame in self._values:
             mask = self._recording.read(frame, with_all=True).get(name)
             if mask is not None:
                 edges.append(self._edge(name, mask))
-                poses.append(values)
                 frames.append(frame)
-        first = moved.first
+        poses = [self._values[frame] for frame in frames]
         # The first guess may be some frames too early, which blurs the motion.
         for _ in range(2):
-            late = [k for k, frame in enumerate(frames) if frame >= first]
+            late = [k for k, frame in enumerate(frames) if frame >= fault.first]
             if not late:
-                return moved
+                break
             motion = camera_motion(
                 self._fit, self._cameras[name], [edges[k] for k in late], [poses[k] for k in late]
             )
-            fault = moved.fault.with_motion(motion)
-            first = frames[min(self._since(fault, edges, poses), len(frames) - 1)]
-        return replace(moved, fault=fault, first=first)
+            explained = is_explained(motion, fault.others_share)
+            fault = replace(fault, motion=motion, is_explained=explained)
+            since = min(self._since(fault, edges, poses), len(frames) - 1)
+            fault = replace(fault, first=frames[since])
+        return fault
 
     def _since(
         self, fault: CameraFault, edges: Sequence[EdgePoints], poses: Sequence[Array]

@@ -10,7 +10,6 @@ from drake_pose.jobs.estimate.person import (
     describe_views,
 )
 from drake_pose.person.recordings.camera_faults import CameraFault, CameraMotion
-from drake_pose.person.recordings.checked_capture import MovedCamera
 from drake_pose.person.recordings.figures import RigFault
 from drake_pose.person.recordings.persons_in_view import ViewFaults
 
@@ -42,8 +41,8 @@ def test_a_rig_at_fault(mirrored, exchanged, what):
 
 def test_a_camera_that_moved_or_contradicts():
     motion = CameraMotion(np.eye(4), np.array([3.0, -4.0]), 5.0, 0.07, 0.1, 0.5, 0.9)
-    moved = MovedCamera(CameraFault("a", motion, True, (), 0.95), 2, True)
-    unclear = MovedCamera(CameraFault("a", motion, False, ("b",), 0.95), 0, False)
+    moved = CameraFault("a", motion, True, (), 0.95, 2, True)
+    unclear = CameraFault("a", motion, False, ("b",), 0.95)
     first, second = (describe_camera(one, FRAMES) for one in (moved, unclear))
     assert first.startswith("camera 'a' has moved since frame 2 after it was calibrated")
     assert "5.0 pixels off in its pictures (3.0 to the right, 4.0 up" in first

@@ -75,14 +75,6 @@ class TestAudit:
         assert result.summary["contradictions"][0]["shift_mm"] == pytest.approx(20.0, abs=5.0)
         assert result.folder is None
 
-    def test_degrees_are_refused(self, audited, tmp_path: Path) -> None:
-        own = audited.copy(tmp_path)
-        header, *rows = own.rows()
-        turned = [[row[0], *np.degrees(np.array(row[1:], float))] for row in rows]
-        own.write_rows([header, *turned])
-        with pytest.raises(SceneError, match="in degrees"):
-            audit_scene(own.folder, own.model, own.joints)
-
     def test_a_joint_without_a_column_is_named(self, audited, tmp_path: Path) -> None:
         own = audited.copy(tmp_path)
         own.write_rows([row[:-1] for row in own.rows()])

@@ -24,16 +24,6 @@ def change_rows(change: Callable[[list[list[str]]], object]) -> Spoil:
     return spoil
 
 
-def drop_column(rows: list[list[str]]) -> None:
-    for row in rows:
-        del row[3]
-
-
-def to_degrees(rows: list[list[str]]) -> None:
-    for row in rows[1:]:
-        row[1:] = [str(np.degrees(float(cell))) for cell in row[1:]]
-
-
 def add_column(rows: list[list[str]]) -> None:
     for k, row in enumerate(rows):
         row.append("time" if k == 0 else str(k))
@@ -44,10 +34,6 @@ def to_next(rows: list[list[str]]) -> None:
     places = [row[1:] for row in rows[1:]]
     for row, place in zip(rows[1:], [*places[1:], places[0]], strict=True):
         row[1:] = place
-
-
-def name_twice(rows: list[list[str]]) -> None:
-    rows[0][2] = rows[0][1]
 
 
 def change_masks(change: Callable[[np.ndarray], np.ndarray], frames: str = "*") -> Spoil:
@@ -64,20 +50,10 @@ def edit(name: str, **fields: object) -> Spoil:
 
 BEFORE_WORK: dict[str, tuple[Spoil, list[str]]] = {
     "no table": (lambda s: s.joints.unlink(), ["joints.csv: cannot read it"]),
-    "a joint without column": (
-        change_rows(drop_column),
-        ["joints.csv: has no column for joint roll_turn of arm.urdf", "--hold roll_turn=VALUE"],
-    ),
-    "degrees": (
-        change_rows(to_degrees),
-        ["joints.csv: column '", "frame", "the file seems to be in degrees", "radians"],
-    ),
     "a column of no joint": (
         change_rows(add_column),
         ["joints.csv has a column that the model lacks", "'time'", "turret_turn"],
     ),
-    "a column twice": (change_rows(name_twice), ["has the column 'turret_turn' twice"]),
-    "a frame twice": (change_rows(lambda r: r.append(r[1])), ["line 7: frame '0' is given twice"]),
     "a frame without row": (
         change_rows(lambda r: r.pop(3)),
         ["joints.csv: has no row of frame '0002'", "camera 'left'", "--frame"],

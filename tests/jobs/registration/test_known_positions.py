@@ -91,10 +91,15 @@ def test_a_base_that_moves_becomes_joints(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("frame,swing,rail\n0,2,0\n1,-70,0.5\n", "'swing', frame 1: -70 rad.* in degrees"),
+        (
+            "frame,swing,rail\n0,2,0\n1,-70,0.5\n",
+            "'swing', frame 1: -70 rad.* in degrees; write .* in radians",
+        ),
         ("frame,swing,rail\n0,0.5,300\n1,1.5,700\n", "'rail', frame 1: 700 m.* in millimetres"),
         ("frame,swing\n0,0.5\n", "no column for joint rail of slide.urdf.*--hold rail=VALUE"),
         ("frame\n0\n", "first line must be frame"),
+        ("frame,swing,swing\n0,0.5,0.5\n", "has the column 'swing' twice"),
+        ("frame,swing,rail\n0,0.5,0\n0,0.5,0\n", "line 3: frame '0' is given twice"),
     ],
 )
 def test_what_is_refused(tmp_path: Path, text: str, message: str) -> None:

@@ -36,6 +36,15 @@ _BUMP = 0.2
 # Before anything differed, the covariance is trusted as if so many numbers had borne it out; sets
 # of the newest keyframes overlap, so that each new one adds fewer numbers than a pose has.
 _TRUST = 4.0
+# A frame is a keyframe where the body's points are this far from where they are in all keyframes,
+# root mean square [the body's own extent, root mean square].
+_NOVELTY = 0.15
+# A frame near a keyframe says nothing new where the area in which body and mask differ is larger by
+# no more than this [the mask's area].
+_TOLERANCE = 0.04
+# Mean intersection over union, below which no camera is believed to be found; and how improbable by
+# chance a difference is that counts as a moved camera.
+_LOWEST_IOU, _FALSE_ALARM = 0.5, 1e-6
 
 
 class CameraStatus(IntEnum):
@@ -54,24 +63,14 @@ class OnlineSettings:
         least_frames: the camera is searched for in so many keyframes or more.
         most_frames: so many keyframes are kept at most, the newest.
         newest: so many keyframes, or frames that contradict the pose, tell that it has changed.
-        novelty: a frame is a keyframe where the body's points are this far from where they are
-            in all keyframes, root mean square [the body's own extent, root mean square].
-        tolerance: a frame near a keyframe says nothing new where the area in which body and mask
-            differ is larger by no more than this [the mask's area].
-        lowest_iou: mean intersection over union, below which no camera is believed to be found.
-        false_alarm: how improbable by chance a difference is that counts as a moved camera.
 
     Raises:
-        SettingsError: a setting out of its range.
+        SettingsError: not 2 <= newest <= least_frames <= most_frames.
     """
 
     least_frames: int = 5
     most_frames: int = 12
     newest: int = 3
-    novelty: float = 0.15
-    tolerance: float = 0.04
-    lowest_iou: float = 0.5
-    false_alarm: float = 1e-6
 
     def __post_init__(self) -> None:
         if not 2 <= self.newest <= self.least_frames <= self.most_frames:
@@ -79,12 +78,6 @@ class OnlineSettings:
                 "2 <= newest <= least_frames <= most_frames is expected, not "
                 f"{self.newest}, {self.least_frames}, {self.most_frames}"
             )
-        for name in ("novelty", "tolerance"):
-            if not getattr(self, name) >= 0.0:
-                raise SettingsError(f"{name} must be 0 or more, not {getattr(self, name)}")
-        for name in ("lowest_iou", "false_alarm"):
-            if not 0.0 < getattr(self, name) < 1.0:
-                raise SettingsError(f"{name} must be between 0 and 1, not {getattr(self, name)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +162,7 @@ class OnlineRegistration:
             posed = PosedFrames(self.body.kinematics, self.body.few, registered.camera, [frame])
             found = areas(posed, registered.camera.X_CW[None], np.inf)
             usual = registered.frames[near].E_total
-            if float(E_total(found)[0, 0]) <= usual + self.settings.tolerance:
+            if float(E_total(found)[0, 0]) <= usual + _TOLERANCE:
                 return replace(state, contradicting=(), contradictions=0)
         keyframes = self._kept(state.keyframes, frame, near)
         again = self._search.refine(registered.camera, keyframes)
@@ -200,7 +193,7 @@ class OnlineRegistration:
         usual = state.distances[: max(0, len(state.distances) - newest + 1)]
         told = 6.0 / newest * len(usual)
         scale = (_TRUST + told / 6.0 * sum(usual) / max(1, len(usual))) / (_TRUST + told)
-        limit = 6.0 * float(fdtri(6.0, _TRUST + told, 1.0 - self.settings.false_alarm))
+        limit = 6.0 * float(fdtri(6.0, _TRUST + told, 1.0 - _FALSE_ALARM))
         return _distance(found, registered) > limit * max(1.0, scale)
 
     def _contradict(
@@ -250,7 +243,7 @@ class OnlineRegistration:
         return (
             not len(found.alternatives)
             and len(agreeing) >= max(count, len(found.frames) // 2 + 1)
-            and float(np.mean([frame.iou for frame in agreeing])) >= self.settings.lowest_iou
+            and float(np.mean([frame.iou for frame in agreeing])) >= _LOWEST_IOU
             and float(np.median([frame.inlier_ratio for frame in agreeing])) >= least
         )
 
@@ -267,7 +260,7 @@ class OnlineRegistration:
         extent = float(np.sqrt(((here - here.mean(axis=0)) ** 2).sum(axis=1).mean()))
         for k in reversed(range(len(frames))):
             off = np.sqrt(((self._points(frames[k]) - here) ** 2).sum(axis=1).mean())
-            if off < self.settings.novelty * extent:
+            if off < _NOVELTY * extent:
                 return k
         return None
 

@@ -147,17 +147,9 @@ class TestKeyframes:
         assert statuses[-1] == REGISTERED
         assert names(state) == {"here"}
 
-    @pytest.mark.parametrize(
-        ("settings", "said"),
-        [
-            ({"least_frames": 2}, "newest <= least_frames"),
-            ({"novelty": -1.0}, "novelty"),
-            ({"false_alarm": 0.0}, "false_alarm"),
-        ],
-    )
-    def test_settings_out_of_range_are_refused(self, settings, said) -> None:
-        with pytest.raises(SettingsError, match=said):
-            OnlineSettings(**settings)
+    def test_settings_out_of_range_are_refused(self) -> None:
+        with pytest.raises(SettingsError, match="newest <= least_frames"):
+            OnlineSettings(least_frames=2)
 
 
 class TestMovedCamera:

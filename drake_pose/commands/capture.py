@@ -79,7 +79,7 @@ def capture(
     on_workers = bool(workers or scheduler)
     _check(scene, method, of_masks, has_sources, live, on_workers)
     if method == "person" and not has_sources:
-        from drake_pose.jobs.estimate.person_choice import bundled_person
+        from drake_pose.jobs.estimate.inputs import bundled_person
 
         given = {one.name: getattr(settings, one.name) for one in fields(settings)}
         estimate(

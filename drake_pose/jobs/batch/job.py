@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 from cyclopts import Parameter
 
 from drake_pose.errors import SettingsError
-from drake_pose.jobs.estimate.person_choice import bundled_person
+from drake_pose.jobs.estimate.inputs import bundled_person
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.results.options import FromText
 from drake_pose.results.settings import EstimateSettings

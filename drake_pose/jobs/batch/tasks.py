@@ -23,7 +23,7 @@ from drake_pose.body.model import load_model
 from drake_pose.camera.files import load_cameras
 from drake_pose.errors import DrakePoseError, OutputError
 from drake_pose.jobs.batch.job import SceneJob
-from drake_pose.jobs.estimate.person_choice import follows_person
+from drake_pose.jobs.estimate.inputs import follows_person
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.jobs.registration.audit import audit_scene
 from drake_pose.jobs.registration.settings import AuditSettings

@@ -11,7 +11,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from drake_pose.body.model import load_model
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.errors import OutputError, SettingsError
-from drake_pose.jobs.estimate.person_choice import bundled_person
+from drake_pose.jobs.estimate.inputs import bundled_person
 from drake_pose.jobs.live.frame_results import LiveResult, LiveWriter
 from drake_pose.jobs.live.run import FrameWatch, Mask, look_until, run_live
 from drake_pose.jobs.live.scene import LiveScene

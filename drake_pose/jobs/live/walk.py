@@ -20,7 +20,7 @@ from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.csv_files import read_csv
 from drake_pose.errors import OutputError, SettingsError
-from drake_pose.jobs.estimate.person_choice import bundled_person
+from drake_pose.jobs.estimate.inputs import bundled_person
 from drake_pose.jobs.live.capture import shape_of_result
 from drake_pose.jobs.live.frame_results import camera_troubles
 from drake_pose.jobs.live.run import run_live

@@ -10,8 +10,8 @@ from pathlib import Path, PurePosixPath
 from drake_pose.camera.files import CameraFile, load_camera_file
 from drake_pose.camera.picture_files import SUFFIXES, Mask, Picture, list_pictures, read_picture
 from drake_pose.errors import SceneError
+from drake_pose.silhouette.pictures.scene_files import VIDEOS, VideoPictures
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
-from drake_pose.silhouette.pictures.video_pictures import VIDEOS, VideoPictures
 from drake_pose.silhouette.segmentation.coco import AnnotatedPicture, Annotations, read_coco
 
 UNNAMED = ""

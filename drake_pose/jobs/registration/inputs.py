@@ -22,8 +22,8 @@ from drake_pose.errors import (
     SettingsError,
     UnknownNameError,
 )
+from drake_pose.jobs.estimate.inputs import missing_for_person
 from drake_pose.jobs.estimate.measurements import read_true_angles
-from drake_pose.jobs.estimate.person_choice import missing_for_person
 from drake_pose.jobs.estimate.searches import make_tree
 from drake_pose.jobs.registration.positions import (
     KnownPositions,

@@ -17,8 +17,8 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SceneError
+from drake_pose.jobs.estimate.inputs import missing_for_person
 from drake_pose.jobs.estimate.measurements import TrueAngles, frame_key, read_true_angles
-from drake_pose.jobs.estimate.person_choice import missing_for_person
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.person.shape import shape_parts
 from drake_pose.results.poses import base_pose

@@ -20,7 +20,7 @@ from drake_pose.body.files.urdf_shape import reshaped
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera
-from drake_pose.jobs.estimate.person_choice import missing_for_person
+from drake_pose.jobs.estimate.inputs import missing_for_person
 from drake_pose.jobs.registration.inputs import Inputs, make_registration_tree
 from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.person.shape import shape_parts, shape_values

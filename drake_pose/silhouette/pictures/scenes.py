@@ -16,13 +16,14 @@ from drake_pose.camera.picture_files import read_picture
 from drake_pose.errors import SceneError, UnknownNameError
 from drake_pose.silhouette.pictures.masks import read_mask
 from drake_pose.silhouette.pictures.scene_files import (
+    VIDEOS,
     MaskFiles,
+    VideoPictures,
     find_images,
     find_masks,
     in_order,
     select_frames,
 )
-from drake_pose.silhouette.pictures.video_pictures import VIDEOS, VideoPictures
 from drake_pose.yaml_files import read_yaml
 
 _FIELDS = ("sequence", "frame_rate_hz")

@@ -9,7 +9,7 @@ import yaml
 
 from drake_pose.body.model import load_model
 from drake_pose.errors import OutputError
-from drake_pose.jobs.estimate.contradictions import find_contradiction
+from drake_pose.jobs.estimate.matching import find_contradiction
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.results.records import FrameRecord, SceneEstimate
 from drake_pose.results.settings import EstimateSettings
@@ -123,7 +123,7 @@ def test_who_contradicts_whom(errors, cameras, exchanged):
     record = FrameRecord(True, 0.4, 1.0, ious={"a": 0.1, "b": 0.2, "c": 0.9})
     seen = [(name, "0") for name in rig]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("drake_pose.jobs.estimate.contradictions.View", See)
+        patch.setattr("drake_pose.jobs.estimate.matching.View", See)
         found = find_contradiction(match, rig, lambda name, _: masks[name], seen, {"0": record})
     assert len(found) == (cameras is not None)
     if cameras is not None:

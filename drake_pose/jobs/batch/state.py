@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from drake_pose.csv_files import csv_text
 from drake_pose.errors import OutputError
 from drake_pose.jobs.batch.job import SceneJob
 from drake_pose.jobs.batch.tasks import Task
-from drake_pose.results.folder import without_nan
+from drake_pose.results.folder import without_nan, write_file
 from drake_pose.version import VERSION
 
 BATCH, CONTRADICTIONS = "batch.json", "contradictions.csv"
@@ -100,25 +98,15 @@ class BatchResult:
     def write(self) -> None:
         """Writes batch.json at once, and of audits contradictions.csv; or raises OutputError."""
         text = json.dumps(without_nan(self.as_json()), indent=2, ensure_ascii=False)
-        self._write(BATCH, text + "\n")
+        write_file(self.out, BATCH, text + "\n")
         if any(state.job.audit is not None for state in self.scenes.values()):
-            table = io.StringIO()
-            rows = csv.writer(table, lineterminator="\n")
-            rows.writerow(("scene", "what", "name", "text"))
-            for name, state in self.scenes.items():
-                for one in state.totals.get("contradictions", ()):
-                    rows.writerow((name, one["what"], one["name"], one["text"]))
-            self._write(CONTRADICTIONS, table.getvalue())
-
-    def _write(self, name: str, text: str) -> None:
-        path = self.out / name
-        part = path.with_name(path.name + ".part")
-        try:
-            self.out.mkdir(parents=True, exist_ok=True)
-            part.write_text(text, encoding="utf-8")
-            os.replace(part, path)
-        except OSError as error:
-            raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
+            rows = [
+                (name, one["what"], one["name"], one["text"])
+                for name, state in self.scenes.items()
+                for one in state.totals.get("contradictions", ())
+            ]
+            table = csv_text([("scene", "what", "name", "text"), *rows])
+            write_file(self.out, CONTRADICTIONS, table)
 
 
 def check_same_batch(jobs: Sequence[SceneJob], out: Path) -> None:

@@ -7,7 +7,6 @@ task done twice does no harm, and one that was done is not done again.
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import platform
 import shutil
@@ -27,7 +26,7 @@ from drake_pose.jobs.estimate.inputs import follows_person
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.jobs.registration.audit import audit_scene
 from drake_pose.jobs.registration.settings import AuditSettings
-from drake_pose.results.folder import OVERLAY, POSES, SUMMARY, read_summary, without_nan
+from drake_pose.results.folder import OVERLAY, POSES, read_summary, write_file, write_summary
 from drake_pose.results.records import FrameRecord
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.results.summary import describe_job, mask_digests, summarize
@@ -248,7 +247,6 @@ def _join_chunks(task: Task, part: Path) -> None:
     """Puts a scene together as a result that lacks no frame; resuming it makes the rest."""
     job = task.job
     header, rows, records = "", [], {}
-    part.mkdir(parents=True)
     for chunk in task.chunks:
         header, *lines = (chunk / POSES).read_text(encoding="utf-8").splitlines(keepends=True)
         rows += lines
@@ -257,11 +255,10 @@ def _join_chunks(task: Task, part: Path) -> None:
             shutil.copytree(
                 chunk / OVERLAY, part / OVERLAY, copy_function=_link, dirs_exist_ok=True
             )
-    (part / POSES).write_text("".join([header, *rows]), encoding="utf-8")
+    write_file(part, POSES, "".join([header, *rows]))
     described = describe_job(job.scene, job.model, job.settings)
     known = {name: FrameRecord.from_json(record) for name, record in records.items()}
-    summary = without_nan(summarize(described, known, False))
-    (part / SUMMARY).write_text(json.dumps(summary), encoding="utf-8")
+    write_summary(part, summarize(described, known, False))
     _estimate(job, part, job.settings, job.replay, resume=True)
 
 

@@ -22,6 +22,7 @@ from drake_pose.camera.sources.files import (
 )
 from drake_pose.camera.sources.frame_source import FrameSource, Picture, SourceSpecification
 from drake_pose.errors import OutputError, SceneError
+from drake_pose.results.folder import write_file
 from drake_pose.silhouette.segmentation.background import Background, learn_background
 from drake_pose.systems.person.live_capture import LiveSensors
 
@@ -127,13 +128,9 @@ def take_empty_room(folder: Path, count: int) -> dict[str, Path]:
     with ExitStack() as opened:
         pictures = _take(_open(specifications, opened), count)
     for name, place in places.items():
-        try:
-            place.mkdir(parents=True, exist_ok=True)
-            for k, picture in enumerate(pictures[name]):
-                _, data = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
-                (place / f"{k:03d}.png").write_bytes(data.tobytes())
-        except OSError as error:
-            raise OutputError(f"{place}: cannot be written: {error.strerror}") from error
+        for k, picture in enumerate(pictures[name]):
+            _, data = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+            write_file(place, f"{k:03d}.png", data.tobytes())
     return places
 
 

@@ -30,6 +30,7 @@ from drake_pose.person.date.walking_motion import make_motion
 from drake_pose.person.shape import tracker_of_person
 from drake_pose.results.folder import POSES, read_summary
 from drake_pose.systems.person.live_capture import LiveSensors, add_person_tracker
+from drake_pose.systems.ports import evaluate
 from drake_pose.systems.walk.walk import KEYS, build_walk
 
 Array = NDArray[np.float64]
@@ -228,7 +229,7 @@ def walk_live(
     try:
         stride = stride_positions(model)
         diagram = build_walk(model, meshcat, add, stride, opened.period, on_spot, SETTLE)
-        log = _PersonLog(diagram, on_command, on_report)
+        log = _WalkLog(diagram, on_command, on_report)
         run_live(diagram, opened, seconds, on_report, monitor=log.watch, speed=1.0)
         warnings = camera_troubles(opened.counts(), 0)
     finally:
@@ -242,19 +243,32 @@ def _require_length(seconds: float | None) -> None:
 
 
 class _WalkLog:
-    """Which commands of a diagram of build_walk were followed for how long, and where to."""
+    """Which commands of a diagram of build_walk were followed for how long, and where to.
 
-    def __init__(self, diagram: Diagram, on_command: Callable[[str], None]) -> None:
+    on_report: told when the person before the cameras is found or lost; None: there are none.
+    """
+
+    def __init__(
+        self,
+        diagram: Diagram,
+        on_command: Callable[[str], None],
+        on_report: Callable[[str], None] | None = None,
+    ) -> None:
         self._command, self._pose = (
             diagram.GetOutputPort(name) for name in ("command", "walker_pose")
         )
         self._seconds = dict.fromkeys(COMMANDS, 0.0)
-        self._on_command = on_command
+        self._on_command, self._on_report = on_command, on_report
+        self._person: OutputPort | None = None
+        if on_report is not None:
+            tracker = diagram.GetSubsystemByName("person_tracker")
+            self._person = tracker.GetOutputPort("estimated_positions")
         self._words: tuple[str, ...] = ()
         self._time, self._last = 0.0, self._pose.Eval(diagram.CreateDefaultContext())
+        self._count, self._found, self._is_known = 0, 0, False
 
     def watch(self, context: Context) -> None:
-        """Notes the command that holds from a time on."""
+        """Notes the command that holds from a time on, and whether the person is known."""
         elapsed, self._time = context.get_time() - self._time, context.get_time()
         for word in self._words:
             self._seconds[word] += elapsed
@@ -264,40 +278,20 @@ class _WalkLog:
         if words != self._words:
             self._on_command(" and ".join(words))
         self._words, self._last = words, self._pose.Eval(context)
+        if self._person is not None and self._on_report is not None:
+            known = math.isfinite(evaluate(self._person, context)[0])
+            if known != self._is_known:
+                self._on_report("the person is found" if known else "the person is lost")
+            self._count, self._found, self._is_known = self._count + 1, self._found + known, known
 
     def as_json(self) -> dict[str, Any]:
-        """How long the walk was, where it ended, and what was commanded."""
+        """How long the walk was, where it ended, what was commanded, and the person's share."""
         x, y, heading = (float(value) for value in self._last)
         place = {"x": x, "y": y, "heading_deg": math.degrees(heading)}
-        return {"seconds": self._time, **place, "commands": self._seconds}
-
-
-class _PersonLog(_WalkLog):
-    """Also notes whether the person before the cameras is known."""
-
-    def __init__(
-        self,
-        diagram: Diagram,
-        on_command: Callable[[str], None],
-        on_report: Callable[[str], None],
-    ) -> None:
-        super().__init__(diagram, on_command)
-        self._person = diagram.GetSubsystemByName("person_tracker")
-        self._on_report = on_report
-        self._count, self._found, self._is_known = 0, 0, False
-
-    def watch(self, context: Context) -> None:
-        """Notes a period."""
-        super().watch(context)
-        positions = self._person.GetOutputPort("estimated_positions")
-        is_known = math.isfinite(positions.Eval(self._person.GetMyContextFromRoot(context))[0])
-        if is_known != self._is_known:
-            self._on_report("the person is found" if is_known else "the person is lost")
-        self._count, self._found, self._is_known = self._count + 1, self._found + is_known, is_known
-
-    def as_json(self) -> dict[str, Any]:
-        """Also the share of the periods in which the person was known."""
-        return {**super().as_json(), "found_share": self._found / max(self._count, 1)}
+        walked = {"seconds": self._time, **place, "commands": self._seconds}
+        if self._person is not None:
+            walked["found_share"] = self._found / max(self._count, 1)
+        return walked
 
 
 def show(page: Meshcat, patience: float = 10.0) -> bool:

@@ -77,7 +77,6 @@ class PictureCapture(PortedSystem):
         live: whether the pictures come by the computer's clock; true where a source is live.
         tolerance: how far apart the pictures of one moment may be [s]; half a period where not
             given, 0.9 periods for live cameras, which are not triggered together.
-        patience: how long a moment waits for a camera [s]; four periods where not given.
         clock: the computer's [s]; the one that live sources use.
 
     Raises:
@@ -93,7 +92,6 @@ class PictureCapture(PortedSystem):
         *,
         live: bool | None = None,
         tolerance: float | None = None,
-        patience: float | None = None,
         clock: Clock = time.monotonic,
     ) -> None:
         super().__init__()
@@ -109,9 +107,9 @@ class PictureCapture(PortedSystem):
         require_period("capture", self.period)
         share = _LIVE_TOLERANCE if devices else 0.5
         tolerance = share * self.period if tolerance is None else tolerance
-        patience = _PERIODS_OF_PATIENCE * self.period if patience is None else patience
+        patience = max(_PERIODS_OF_PATIENCE * self.period, tolerance)
         self._synchroniser: Synchroniser[TimedPicture] = Synchroniser(
-            self._sources, tolerance, max(patience, tolerance)
+            self._sources, tolerance, patience
         )
         self._clock = clock
         self._since: float | None = None

@@ -1,9 +1,8 @@
 """Small models for the tests of drake_pose.body, as texts and as files."""
 
-import io
 from pathlib import Path
 
-import numpy as np
+import trimesh
 
 BOX = '<visual><geometry><box size="0.1 0.2 0.3"/></geometry></visual>'
 SPHERE = '<visual><geometry><sphere radius="0.1"/></geometry></visual>'
@@ -114,25 +113,7 @@ JOINTS_SDF = f"""<sdf version="1.9"><model name="m">
 
 
 def cube_obj(*, normals: bool) -> str:
-    """A cube of edge 1 whose every face has its own four vertices."""
-    text = io.StringIO()
-    faces = []
-    count = 0
-    for axis in range(3):
-        for side in (-0.5, 0.5):
-            u, v = np.eye(3)[(axis + 1) % 3], np.eye(3)[(axis + 2) % 3]
-            center = side * np.eye(3)[axis]
-            if side < 0:
-                u, v = v, u
-            for a, b in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)):
-                point = center + a * u + b * v
-                text.write("v {} {} {}\n".format(*point))
-            if normals:
-                text.write("vn {} {} {}\n".format(*(2.0 * center)))
-            face = [count + i for i in (1, 2, 3, 4)]
-            faces.append((face, len(faces) + 1))
-            count += 4
-    for face, normal in faces:
-        corners = [f"{i}//{normal}" if normals else str(i) for i in face]
-        text.write(f"f {' '.join(corners)}\n")
-    return text.getvalue()
+    """A cube of edge 1 whose every triangle has its own vertices."""
+    cube = trimesh.creation.box()
+    cube.unmerge_vertices()
+    return str(trimesh.exchange.obj.export_obj(cube, include_normals=normals))

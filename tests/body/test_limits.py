@@ -59,30 +59,24 @@ def test_limits_beyond_a_few_turns_are_none(tmp_path, limits, kind):
     assert np.isinf(tree.value_limits(node)).all()
 
 
-@pytest.mark.parametrize("turns", [1.0, 2.0, 4.0])
-def test_some_turns_are_limits_of_which_one_turn_is_searched(tmp_path, turns):
-    high = 0.5 * turns * FULL
+@pytest.mark.parametrize("high", [3.1, math.pi, FULL, 2.0 * FULL])
+def test_of_limits_of_some_turns_one_turn_is_searched(tmp_path, high):
     model = one_joint(tmp_path, f'lower="{-high}" upper="{high}"')
     assert not model.turns_freely[0]
     assert not model.warnings
     np.testing.assert_allclose([model.lower[0], model.upper[0]], [-high, high])
     tree = model.pose_tree()
-    node = node_of_joint(tree)
-    np.testing.assert_allclose(np.ravel(tree.value_bounds(node)), [-math.pi, math.pi])
+    node, around = node_of_joint(tree), high >= math.pi
     np.testing.assert_allclose(np.ravel(tree.value_limits(node)), [-high, high])
-    assert tree.turns_around(node).all()
-
-
-def test_less_than_a_turn_is_as_it_was(tmp_path):
-    tree = one_joint(tmp_path, 'lower="-3.1" upper="3.1"').pose_tree()
-    node = node_of_joint(tree)
-    assert not tree.turns_around(node).any()
-    np.testing.assert_allclose(np.ravel(tree.value_bounds(node)), [-3.1, 3.1])
+    searched = min(high, math.pi)
+    np.testing.assert_allclose(np.ravel(tree.value_bounds(node)), [-searched, searched])
+    assert tree.turns_around(node).all() == around
+    assert not model.pose_tree(held={"j": 0.3}).turns_around(node).any()
     kinematics = TreeKinematics(tree)
-    np.testing.assert_allclose([kinematics.lower[0], kinematics.upper[0]], [-3.1, 3.1])
-    np.testing.assert_allclose(kinematics.nearest_turns(np.array([9.0])), [9.0])
-    held = tree.model.pose_tree(held={"j": 0.3})
-    assert not held.turns_around(node).any()
+    reach = np.inf if around else high
+    assert (kinematics.lower[0], kinematics.upper[0]) == (-reach, reach)
+    turned = 9.0 - FULL if around else 9.0
+    np.testing.assert_allclose(kinematics.nearest_turns(np.array([9.0])), [turned])
 
 
 def test_the_turn_that_is_searched_lies_about_the_default_inside_the_limits(tmp_path):
@@ -113,6 +107,9 @@ def test_limits_given_by_hand_are_taken_likewise(tmp_path):
     model = one_joint(tmp_path, 'lower="-1e16" upper="1e16"', given={"j": (-0.5, 0.25)})
     assert not model.warnings
     np.testing.assert_allclose([model.lower[0], model.upper[0]], [-0.5, 0.25])
+    model = one_joint(tmp_path, 'lower="-1e16" upper="1e16"', "prismatic")
+    assert np.isinf([model.lower[0], model.upper[0]]).all(), "a slide of absurd length"
+    assert "joint 'j' has limits of -1e+16 and 1e+16 m" in model.warnings[0]
 
 
 @pytest.mark.parametrize(
@@ -129,12 +126,6 @@ def test_what_cannot_be_searched_is_refused_by_name(tmp_path, limits, kind, mess
         one_joint(tmp_path, limits, kind, mount="revolute").pose_tree()
     model = one_joint(tmp_path, limits, kind, {"j": (-0.5, 0.5)}, mount="revolute")
     assert model.pose_tree().model.upper[model.position_index("j")] == 0.5
-
-
-def test_slides_of_absurd_length_are_without_limits_and_it_is_said(tmp_path):
-    model = one_joint(tmp_path, 'lower="-1e16" upper="1e16"', "prismatic")
-    assert np.isinf([model.lower[0], model.upper[0]]).all()
-    assert "joint 'j' has limits of -1e+16 and 1e+16 m" in model.warnings[0]
 
 
 def test_a_screw_looks_different_after_a_turn(tmp_path):

@@ -8,6 +8,7 @@ from pydrake.systems.sensors import CameraInfo
 
 from drake_pose.camera.drake import camera_from_drake, camera_to_drake
 from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
+from drake_pose.camera.rigs import FACE_CAMERA, circle_of_cameras
 from drake_pose.errors import CameraError
 
 
@@ -158,3 +159,25 @@ def test_drake_needs_the_principal_point_inside() -> None:
         camera_to_drake(pinhole(center_x=-3.0), renderer_name="vtk")
     with pytest.raises(CameraError, match=r"'cam'.*depth range"):
         camera_to_drake(pinhole(), renderer_name="vtk", depth_range=(2.0, 1.0))
+
+
+def test_a_circle_of_cameras_looks_at_its_middle_and_one_at_the_face() -> None:
+    cameras = circle_of_cameras(8, radius=2.5, height=1.1, target=(0.1, 0.2, 0.9), size=(64, 48))
+    *circle, face = cameras.values()
+    assert face.name == FACE_CAMERA
+    places = np.array([camera.X_WC[:3, 3] for camera in circle])
+    angles = np.degrees(np.arctan2(places[:, 1], places[:, 0])) % 360.0
+    np.testing.assert_allclose(angles, 22.5 + 45.0 * np.arange(8))
+    np.testing.assert_allclose(np.hypot(places[:, 0], places[:, 1]), 2.5)
+    np.testing.assert_allclose(places[:, 2], 1.1)
+    for camera, target in [
+        *((camera, (0.1, 0.2, 0.9)) for camera in circle),
+        (face, (0.1, 0.2, 1.6)),
+    ]:
+        np.testing.assert_allclose(camera.project(np.array([target]))[0], [[31.5, 23.5]], atol=1e-9)
+        assert camera.X_WC[2, 1] < 0.0, "up is up"
+    np.testing.assert_allclose(face.X_WC[:3, 3], [2.6, 0.2, 1.6])
+    with pytest.raises(CameraError, match="at least one camera"):
+        circle_of_cameras(0, face_camera=False)
+    with pytest.raises(CameraError, match="radius must be positive"):
+        circle_of_cameras(radius=0.0)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from drake_pose.results.settings import EstimateSettings
     from drake_pose.search.continuous.multi_start import MultiStartSearch
     from drake_pose.search.estimates import View
-    from drake_pose.search.grid.beam.search import BeamSearch
+    from drake_pose.search.grid.beam_search import BeamSearch
     from drake_pose.silhouette.pictures.scenes import Scene, load_scene
     from drake_pose.systems.estimators.camera_registration import CameraRegistration
     from drake_pose.systems.estimators.silhouette_matcher import SilhouetteMatcher
@@ -44,7 +44,7 @@ __version__ = VERSION
 
 _HOMES = {
     "ArticulatedModel": "body.model",
-    "BeamSearch": "search.grid.beam.search",
+    "BeamSearch": "search.grid.beam_search",
     "CameraRegistration": "systems.estimators.camera_registration",
     "EstimateSettings": "results.settings",
     "MaskSettings": "jobs.masks.settings",

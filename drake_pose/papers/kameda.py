@@ -15,8 +15,8 @@ from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.papers.tables import Count, require_counts, uncounted
 from drake_pose.search.continuous.search import ContinuousSearch
 from drake_pose.search.estimates import PoseEstimate, View
-from drake_pose.search.grid.beam.search import BeamSearch
-from drake_pose.search.grid.families.examination import ExaminationSettings, examine
+from drake_pose.search.grid.beam_search import BeamSearch
+from drake_pose.search.grid.examination import ExaminationSettings, examine
 from drake_pose.search.kameda import PaperSearch
 from drake_pose.search.scoring import PoseSearch, SampledTree
 from drake_pose.search.settings import BeamSearchSettings, PaperSearchSettings

@@ -10,14 +10,14 @@ import numpy as np
 
 from drake_pose.papers.kameda import ExperimentResult, Trial
 from drake_pose.papers.tables import Count, uncounted
-from drake_pose.search.grid.families.inner_edges import (
+from drake_pose.search.grid.inner_edges import (
     EdgeErrors,
     InnerEdges,
     choose_by_edges,
     edges_of_labels,
     find_borders,
 )
-from drake_pose.search.grid.families.search import GridPoseSet, samples_at
+from drake_pose.search.grid.pose_families import GridPoseSet, samples_at
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
 _COUNTS = (

@@ -10,7 +10,7 @@ from rich.table import Table
 from drake_pose.papers.kameda import PAPER_IMAGES, ExperimentResult
 from drake_pose.papers.tables import figure_table, spread_over_seeds
 from drake_pose.search.continuous.search import ContinuousSearch
-from drake_pose.search.grid.families.search import GridPoseSet
+from drake_pose.search.grid.pose_families import GridPoseSet
 from drake_pose.search.kameda import PaperSearch
 
 PAPER = {

@@ -14,7 +14,7 @@ from drake_pose.papers.kameda import ExperimentResult, Trial, experiment_camera
 from drake_pose.papers.tables import save_figure
 from drake_pose.results.overlay import paint_agreement
 from drake_pose.search.estimates import PoseFamily, PoseSet, View
-from drake_pose.search.grid.families.search import samples_at
+from drake_pose.search.grid.pose_families import samples_at
 from drake_pose.search.kameda import PaperSearch
 from drake_pose.search.scoring import Scoring
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer

@@ -1,6 +1,7 @@
 """Settings of the searches on a grid: Kameda's and the beam search."""
 
 import math
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -144,3 +145,39 @@ class BeamSearchSettings(GridSettings):
             raise SettingsError("stages must hold at least one stage")
         self._require(1, "band", "coarse_pixels", "hypothesis_limit")
         self._require(0, "research_hypotheses", "time_limit")
+
+
+@dataclass(frozen=True)
+class BoundLimits:
+    """How much a branch and bound may look at.
+
+    Args:
+        states: how many partial poses are kept after each node.
+        pairs: how many pairs of a partial pose and a pose of the next node are looked at.
+        poses: after this many poses of nodes are drawn it stops.
+        memory: it stops before drawn poses and what they reach take more than this, and keeps fewer
+            partial poses where all would take more than a quarter of it [byte]. What it needs for a
+            moment comes on top, about as much again.
+        time_limit: it stops after this time [s]; None: no limit.
+
+    Raises:
+        SettingsError: if a value is out of its range.
+    """
+
+    states: int = 20_000
+    pairs: int = 1_000_000
+    poses: int = 1_000_000
+    memory: int = 400_000_000
+    time_limit: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("states", "pairs", "poses", "memory"):
+            if getattr(self, name) < 1:
+                raise SettingsError(f"{name} must be 1 or more, not {getattr(self, name)}")
+        if self.time_limit is not None and not 0.0 <= self.time_limit < math.inf:
+            raise SettingsError(f"time_limit must be 0 s or more, not {self.time_limit}")
+
+    @property
+    def deadline(self) -> float:
+        """The value of time.perf_counter() at which a search that begins now stops [s]."""
+        return math.inf if self.time_limit is None else time.perf_counter() + self.time_limit

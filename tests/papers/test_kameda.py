@@ -24,8 +24,8 @@ from drake_pose.papers.kameda_pictures import (
     save_families,
     save_pictures,
 )
-from drake_pose.search.grid.families.inner_edges import edges_of_labels
-from drake_pose.search.grid.families.search import find_families, samples_at
+from drake_pose.search.grid.inner_edges import edges_of_labels
+from drake_pose.search.grid.pose_families import find_families, samples_at
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.search.grid_problems import show_pose

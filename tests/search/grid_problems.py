@@ -9,7 +9,7 @@ import numpy as np
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.search.estimates import View
-from drake_pose.search.grid.families.search import samples_at
+from drake_pose.search.grid.pose_families import samples_at
 from drake_pose.search.grid.sampled_body import SampledBody
 from drake_pose.search.scoring import SampledTree, Scoring
 from drake_pose.search.settings import BeamSearchSettings

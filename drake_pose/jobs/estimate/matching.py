@@ -21,7 +21,7 @@ from drake_pose.results.texts import percent
 from drake_pose.results.writer import USUAL_RATE_HZ, Drawn, FinishedFrame, OnStage
 from drake_pose.search.continuous.multi_start import MultiStartSearch
 from drake_pose.search.estimates import PoseEstimate, View
-from drake_pose.search.grid.beam.search import BeamSearch
+from drake_pose.search.grid.beam_search import BeamSearch
 from drake_pose.search.scoring import PoseSearch
 from drake_pose.search.starts.root_placement import scale_camera
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer

@@ -17,8 +17,8 @@ from drake_pose.errors import SettingsError
 from drake_pose.results.settings import EstimateSettings, RootTurns
 from drake_pose.search.continuous.multi_start import MultiStartSearch, MultiStartSettings
 from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
-from drake_pose.search.grid.beam.search import BeamSearch
-from drake_pose.search.grid.families.examination import ExaminationSettings
+from drake_pose.search.grid.beam_search import BeamSearch
+from drake_pose.search.grid.examination import ExaminationSettings
 from drake_pose.search.kameda import PaperSearch
 from drake_pose.search.scoring import PoseSearch
 from drake_pose.search.settings import BeamSearchSettings, PaperSearchSettings

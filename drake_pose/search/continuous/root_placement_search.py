@@ -21,9 +21,10 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
-from drake_pose.search.grid.beam.hypotheses import Beam, Hypotheses
-from drake_pose.search.grid.beam.search import BeamSearch
+from drake_pose.search.grid.beam_search import BeamSearch
+from drake_pose.search.grid.beam_stages import grow
 from drake_pose.search.grid.node_poses import Pictures, PoseStore, coarsen
+from drake_pose.search.grid.partial_poses import Expansion, PartialPoses
 from drake_pose.search.refinement import (
     COARSE_PASSES,
     FINE_PASSES,
@@ -179,12 +180,13 @@ class RootPlacementSearch:
         body = place_body(self.body, layer.positions, chosen)
         pictures = Pictures(body, views, self.settings.band)
         store = PoseStore(body, pictures, outside_share)
-        last = self._grow(Beam(store), width, chosen // len(self.sampled.X_PN[0]))
+        expansion = Expansion(store)
+        last = self._grow(expansion, width, chosen // len(self.sampled.X_PN[0]))
         if last is None:
             return []
         # As many pixels as in the silhouettes themselves.
         finer = _area(layer.views) / pictures.area
-        Js = finer * (pictures.area - last.covered + last.outside)
+        Js = finer * expansion.objectives(last)
         samples = store.samples(last.poses)
         found: dict[int, _Placed] = {}
         for i in np.argsort(Js, kind="stable"):
@@ -202,27 +204,27 @@ class RootPlacementSearch:
     def _quota(self, width: int) -> int:
         return math.ceil(_QUOTA * width)
 
-    def _grow(self, beam: Beam, width: int, places: np.ndarray) -> Hypotheses | None:
+    def _grow(self, expansion: Expansion, width: int, places: np.ndarray) -> PartialPoses | None:
         """Whole poses, no root position having more than its quota at any time.
 
         Args:
-            beam: grows them.
+            expansion: grows them.
             width: how many.
             places: the position of each of the root's samples.
         """
         quota = self._quota(width)
-        hypotheses: Hypotheses | None = beam.start()
+        hypotheses: PartialPoses | None = expansion.start()
         for place, node in enumerate(self.body.order):
             if hypotheses is None:
                 break
             factor = _ROOT_FACTOR if place == 0 else 1
             spare = _SPARE * factor * width
-            grown, _ = beam.grow(hypotheses, node, spare, _OUTSIDE_WEIGHT, False)
+            grown, _ = grow(expansion, hypotheses, node, spare, _OUTSIDE_WEIGHT, False)
             hypotheses = None
             if grown is not None:
-                roots = beam.store.nodes[0].samples[grown.poses[:, 0]]
+                roots = expansion.store.nodes[0].samples[grown.poses[:, 0]]
                 kept = _within_quota(places[roots], factor * quota)[: factor * width]
-                hypotheses = _choose(grown, kept)
+                hypotheses = grown.chosen(kept)
         return hypotheses
 
     def _improve(self, starts: Sequence[_Placed], moves: bool, deadline: float) -> _Placed:
@@ -336,14 +338,3 @@ def _within_quota(groups: np.ndarray, quota: int) -> np.ndarray:
     rank = np.empty(len(groups), dtype=np.int64)
     rank[order] = np.arange(len(groups)) - first
     return np.flatnonzero(rank < quota)
-
-
-def _choose(hypotheses: Hypotheses, chosen: np.ndarray) -> Hypotheses:
-    """Some of the hypotheses."""
-    return Hypotheses(
-        hypotheses.masks[chosen],
-        hypotheses.poses[chosen],
-        hypotheses.hashes[chosen],
-        hypotheses.covered[chosen],
-        hypotheses.outside[chosen],
-    )

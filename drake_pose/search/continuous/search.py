@@ -14,7 +14,7 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.errors import SettingsError
 from drake_pose.search.continuous.intervals import IntervalSettings, find_intervals
 from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
-from drake_pose.search.grid.beam.search import BeamSearch
+from drake_pose.search.grid.beam_search import BeamSearch
 from drake_pose.search.refinement import (
     COARSE_PASSES,
     FINE_PASSES,

@@ -1,19 +1,28 @@
 """The poses that nodes take in one search, each drawn once and shared by all hypotheses."""
 
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from drake_pose.camera.models import Camera, ParallelCamera, PinholeCamera
 from drake_pose.search.estimates import View
-from drake_pose.search.grid.pair_kernel import Reaches, unite_masks
+from drake_pose.search.grid.pair_kernel import Reaches, unite_poses
 from drake_pose.search.grid.sampled_body import SampledBody
+from drake_pose.search.settings import BoundLimits
 from drake_pose.silhouette.bits.bit_kernel import draw_bits
 from drake_pose.silhouette.bits.bit_view import WORD, BitView, make_bit_view
 from drake_pose.silhouette.bits.bounding_balls import draw_discs, prune_by_balls
 
 _ONE, _ALL = 1, 2
+# How many poses of a node, and discs that hold what can be reached, are drawn before the limits are
+# looked at again.
+_TRIED_TOGETHER, _REACHES_TOGETHER = 100_000, 20_000
+
+
+class LimitReached(Exception):
+    """Raised to leave a search that has no time or no room left."""
 
 
 def coarsen(view: View, pixels: int) -> View:
@@ -104,7 +113,7 @@ class Pictures:
             drawn = draw_bits(celled, view, X_WN, in_place, pairs, np.inf, all_of_them)
             _, areas, runs, words = drawn
             runs[:, :, 0] += np.array([starts[index], starts[views + index]])
-            unite_masks(masks, runs, words)
+            unite_poses(masks, np.arange(len(masks)), runs, words)
             total += areas
         return total
 
@@ -116,9 +125,13 @@ def _ones(count: int) -> np.ndarray:
     return np.packbits(bits, bitorder="little").view(np.uint64)
 
 
-def _placed(poses: np.ndarray, node: int) -> set[int]:
-    """The nodes that poses (B, nodes) have placed, and one more."""
-    return {int(i) for i in np.flatnonzero(poses[:1].max(axis=0, initial=-1) >= 0)} | {node}
+def _with_rows(table: np.ndarray, rows: np.ndarray, value: int) -> np.ndarray:
+    """A table that has all these rows; new ones hold a value."""
+    size = int(rows.max(initial=0)) + 1
+    if len(table) >= size:
+        return table
+    more = np.full((size - len(table) + 64, *table.shape[1:]), value, dtype=np.int64)
+    return np.concatenate([table, more])
 
 
 @dataclass
@@ -131,20 +144,31 @@ class _Poses:
     runs: np.ndarray
     words: np.ndarray
 
-    @property
-    def nbytes(self) -> int:
-        """The memory that they take [byte]."""
-        return sum(array.nbytes for array in vars(self).values())
-
 
 class PoseStore:
-    """All poses of nodes with so large a share of their area outside at most, by parent."""
+    """All poses of nodes with so large a share of their area outside at most, by parent.
 
-    def __init__(self, body: SampledBody, pictures: Pictures, outside_share: float) -> None:
+    Args:
+        outside_share: of a node's mean projected area.
+        outside_limit: instead of a share of it, this area [pixel].
+        limits: on what is drawn; methods raise LimitReached where one is reached. None: none.
+    """
+
+    def __init__(
+        self,
+        body: SampledBody,
+        pictures: Pictures,
+        outside_share: float = np.inf,
+        outside_limit: float | None = None,
+        limits: BoundLimits | None = None,
+    ) -> None:
         self.body = body
         self.pictures = pictures
-        self._outside_share = outside_share
         self.tree_nodes = body.sampled.tree.nodes
+        self.limits = limits
+        self.deadline = np.inf if limits is None else limits.deadline
+        self._outside_share, self._outside_limit = outside_share, outside_limit
+        self._reserved = 0
         parts = len(pictures.part_starts) - 1
         self.nodes = [
             _Poses(
@@ -163,29 +187,43 @@ class PoseStore:
         self.reach_runs = np.empty((0, len(pictures.views), 3), dtype=np.int64)
         self.reach_words = np.empty(0, dtype=np.uint64)
 
-    @property
-    def nbytes(self) -> int:
-        """The memory that poses and what can be reached from them take [byte]."""
-        reaches = self.reach_runs.nbytes + self.reach_words.nbytes
-        return reaches + sum(poses.nbytes for poses in self.nodes)
+    def reserve(self, size: int = 0) -> None:
+        """Notes memory that what belongs to the poses takes [byte].
 
-    def groups(self, node: int, parents: np.ndarray, hidden: np.ndarray) -> np.ndarray:
+        Raises:
+            LimitReached: with it, there is too much, or the time is over.
+        """
+        self._reserved += size
+        if self.limits is None:
+            return
+        used = self.reach_runs.nbytes + self.reach_words.nbytes + self._reserved
+        used += sum(array.nbytes for poses in self.nodes for array in vars(poses).values())
+        drawn = sum(len(poses.samples) for poses in self.nodes)
+        late = time.perf_counter() >= self.deadline
+        if late or used > self.limits.memory or drawn > self.limits.poses:
+            raise LimitReached
+
+    def _in_turn(self, missing: np.ndarray, together: int) -> Iterator[np.ndarray]:
+        """Poses (n,) of a parent, so many at a time, within the limits."""
+        for begin in range(0, len(missing), together):
+            self.reserve()
+            yield missing[begin : begin + together]
+
+    def groups(
+        self, node: int, parents: np.ndarray, hidden: np.ndarray | None = None
+    ) -> np.ndarray:
         """Where the node's poses begin and end (n, 2), for poses (n,) of its parent; 0 for a root.
 
         What is missing is drawn. Where ``hidden`` (n,) one pose is enough.
         """
-        size = int(parents.max()) + 1
-        if len(self._groups[node]) < size:
-            more = np.zeros((size - len(self._groups[node]) + 64, 3), dtype=np.int64)
-            self._groups[node] = np.concatenate([self._groups[node], more])
-        known = self._groups[node]
-        if known[parents, 2].min() == _ALL:
+        known = self._groups[node] = _with_rows(self._groups[node], parents, 0)
+        if known[parents, 2].min(initial=_ALL) == _ALL:
             return known[parents, :2]
         wanted = np.zeros(len(known), dtype=np.int64)
         wanted[parents] = _ONE
-        wanted[parents[~hidden]] = _ALL
-        missing = np.flatnonzero(wanted > known[:, 2])
-        if len(missing):
+        wanted[parents if hidden is None else parents[~hidden]] = _ALL
+        together = max(1, _TRIED_TOGETHER // len(self.body.sampled.X_PN[node]))
+        for missing in self._in_turn(np.flatnonzero(wanted > known[:, 2]), together):
             counts = self._draw(node, missing, wanted[missing] == _ONE)
             ends = len(self.nodes[node].samples) - counts.sum() + np.cumsum(counts)
             known[missing, 0], known[missing, 1] = ends - counts, ends
@@ -203,24 +241,18 @@ class PoseStore:
 
         Only the rows of the poses (n,) asked for are sure to be there.
         """
-        size = int(parents.max()) + 1
-        if len(self._reach_rows[node]) < size:
-            more = np.full(size - len(self._reach_rows[node]) + 64, -1, dtype=np.int64)
-            self._reach_rows[node] = np.concatenate([self._reach_rows[node], more])
-        rows = self._reach_rows[node]
-        if rows[parents].min() >= 0:
+        rows = self._reach_rows[node] = _with_rows(self._reach_rows[node], parents, -1)
+        if rows[parents].min(initial=0) >= 0:
             return rows
         wanted = np.zeros(len(rows), dtype=np.bool_)
         wanted[parents] = True
-        missing = np.flatnonzero(wanted & (rows < 0))
-        if len(missing):
-            ball = self.body.reach_balls[node]
-            runs = np.empty((len(missing), len(self.pictures.bit_views), 3), dtype=np.int64)
+        ball, views = self.body.reach_balls[node], self.pictures.bit_views
+        for missing in self._in_turn(np.flatnonzero(wanted & (rows < 0)), _REACHES_TOGETHER):
+            runs = np.empty((len(missing), len(views), 3), dtype=np.int64)
             used, pieces = len(self.reach_words), [self.reach_words]
-            for index, view in enumerate(self.pictures.bit_views):
-                view_runs, words = draw_discs(
-                    view, self._parent_poses(node, missing), ball[:3], ball[3]
-                )
+            X_WP = self._parent_poses(node, missing)
+            for index, view in enumerate(views):
+                view_runs, words = draw_discs(view, X_WP, ball[:3], ball[3])
                 runs[:, index] = view_runs + np.array([self.pictures.part_starts[index], 0, used])
                 used += len(words)
                 pieces.append(words)
@@ -236,29 +268,23 @@ class PoseStore:
             return np.zeros(len(poses), dtype=np.int32)
         return np.asarray(poses[:, parent])
 
-    def reaches(self, poses: np.ndarray, node: int, taken: np.ndarray) -> Reaches:
-        """What later nodes can reach where ``node`` takes poses (p,); -1 in poses: not placed."""
-        placed = _placed(poses, node)
-        waiting = [
-            i
-            for i, other in enumerate(self.tree_nodes)
-            if i not in placed and (other.parent < 0 or other.parent in placed)
-        ]
-        rows = []
-        for i in waiting if len(taken) else ():
-            own = self.tree_nodes[i].parent == node
-            rows.append(self.reach_rows(i, taken if own else self.parents(poses, i)))
-        table = np.zeros((len(rows), max((len(row) for row in rows), default=0)), dtype=np.int64)
-        for i, row in enumerate(rows):
-            table[i, : len(row)] = row
-        parents = np.array([self.tree_nodes[i].parent for i in waiting], dtype=np.int64)
-        return Reaches(self.reach_runs, self.reach_words, parents, table)
+    def reaches(self, poses: np.ndarray, node: int, pairs: np.ndarray) -> Reaches:
+        """What later nodes can reach where pairs (p, 2) of poses (B, nodes) place ``node``."""
+        waiting = self._frontier(poses, node)[1]
+        rows = np.empty((len(waiting), len(pairs)), dtype=np.int64)
+        for i, other in enumerate(waiting if len(pairs) else ()):
+            own = self.tree_nodes[other].parent == node
+            parents = pairs[:, 1] if own else self.parents(poses, other)[pairs[:, 0]]
+            rows[i] = self.reach_rows(other, parents)[parents]
+        return Reaches(self.reach_runs, self.reach_words, rows)
 
     def open_nodes(self, poses: np.ndarray, node: int) -> np.ndarray:
         """Nodes that have children to come, once ``node`` is placed beside poses (B, nodes)."""
-        placed = _placed(poses, node)
-        is_open = [i for i in sorted(placed) if not placed.issuperset(self.tree_nodes[i].children)]
-        return np.array(is_open, dtype=np.int64)
+        return self._frontier(poses, node)[0]
+
+    def _frontier(self, poses: np.ndarray, node: int) -> tuple[np.ndarray, list[int]]:
+        placed = np.flatnonzero(poses[0] >= 0).tolist() if len(poses) else ()
+        return self.body.frontier(frozenset((*placed, node)))
 
     def _parent_poses(self, node: int, parents: np.ndarray) -> np.ndarray:
         """X_WP (n, 4, 4) of poses (n,) of the node's parent."""
@@ -299,6 +325,8 @@ class PoseStore:
 
     def _limit(self, node: int) -> float:
         """The area that may lie outside the silhouettes in all views together [pixel]."""
+        if self._outside_limit is not None:
+            return self._outside_limit
         if self._outside_share in (0.0, np.inf):
             return self._outside_share
         areas = [self.body.mean_area(node, view.camera) for view in self.pictures.views]

@@ -17,6 +17,7 @@ from drake_pose.compiled import compiled, copy_into
 
 _LOW_HALF = np.uint64(0xFFFFFFFF)
 _HALF = np.uint64(32)
+_MIX = np.uint64(0x9E3779B97F4A7C15)
 
 
 def _count_bits(typing_context: Any, word: types.Type) -> Any:
@@ -34,257 +35,249 @@ count_bits: Any = intrinsic(_count_bits)
 class Reaches(NamedTuple):
     """What the nodes that are still to come can cover at most.
 
-    runs: (r, V, 3) int64 and words: (n,) uint64 pixels of the silhouettes in their reach;
-    parents: (m,) int64 the parents of the nodes to come whose parent is placed; rows:
-    (m, poses) int64 the row of runs for each pose of the parent.
+    runs: (r, V, 3) int64 and words: (n,) uint64 pixels of the silhouettes in their reach; rows:
+    (m, p) int64 the row of runs, for each node to come whose parent is placed and each pair.
     """
 
     runs: np.ndarray
     words: np.ndarray
-    parents: np.ndarray
     rows: np.ndarray
 
 
-@compiled
-def score_pairs(
-    masks: np.ndarray,
-    first: np.ndarray,
-    end: np.ndarray,
-    runs: np.ndarray,
-    words: np.ndarray,
-    silhouettes: int,
-    drop_hidden: bool,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Areas that poses of the next node would add to hypotheses.
-
-    Args:
-        masks: (B, W) uint64 what the hypotheses cover.
-        first, end: (B,) int64 the poses that each hypothesis may take.
-        runs: (n, K, 3) int64 of each pose, for each part of a mask, the first word, the number of
-            words and where they begin in words.
-        words: (m,) uint64.
-        silhouettes: how many parts come first that are silhouettes; the others are bands.
-        drop_hidden: keep only the first pose of a hypothesis that adds nothing at all.
-
-    Returns:
-        pairs (p, 2) int32 hypothesis and pose, and (p,) int32 the silhouette and the band newly
-        covered [pixel].
-    """
-    total = 0
-    for h in range(masks.shape[0]):
-        total += end[h] - first[h]
-    pairs = np.empty((total, 2), dtype=np.int32)
-    gains, losses = np.empty(total, dtype=np.int32), np.empty(total, dtype=np.int32)
-    count = 0
-    for h in range(masks.shape[0]):
-        hidden = False
-        for c in range(first[h], end[h]):
-            gain, loss = 0, 0
-            for part in range(runs.shape[1]):
-                begin, length, place = runs[c, part, 0], runs[c, part, 1], runs[c, part, 2]
-                added = np.uint64(0)
-                for k in range(length):
-                    added += count_bits(words[place + k] & ~masks[h, begin + k])
-                if part < silhouettes:
-                    gain += int(added)
-                else:
-                    loss += int(added)
-            if drop_hidden and gain == 0 and loss == 0:
-                if hidden:
-                    continue
-                hidden = True
-            pairs[count, 0], pairs[count, 1] = h, c
-            gains[count], losses[count] = gain, loss
-            count += 1
-    return pairs[:count], gains[:count], losses[:count]
-
-
-def order_best(costs: np.ndarray, count: int) -> np.ndarray:
-    """The indices of the ``count`` smallest costs (n,), smallest first, equals in their order."""
-    if len(costs) <= count:
-        return np.argsort(costs, kind="stable")
-    near = np.flatnonzero(costs <= np.partition(costs, count - 1)[count - 1])
-    return np.asarray(near[np.argsort(costs[near], kind="stable")[:count]])
-
-
-def random_keys(words: int) -> np.ndarray:
-    """(2 words,) uint64 odd numbers for hashes; always the same, so that answers are."""
+def random_keys(count: int) -> np.ndarray:
+    """(count,) uint64 odd numbers for hashes; always the same, so that answers are."""
     generator = np.random.default_rng(2718)
-    return generator.integers(0, 2**64, 2 * words, dtype=np.uint64) | np.uint64(1)
+    return generator.integers(0, 2**64, count, dtype=np.uint64) | np.uint64(1)
 
 
 def hash_mask(mask: np.ndarray, keys: np.ndarray) -> np.uint64:
-    """The hash of a mask (W,)."""
+    """The hash of a mask (W,), with keys (2 W,)."""
     halves = np.column_stack([mask & _LOW_HALF, mask >> _HALF]).ravel()
     return np.uint64((halves * keys).sum(dtype=np.uint64))
 
 
 @compiled
-def add_hash(mask: np.ndarray, runs: np.ndarray, words: np.ndarray, keys: np.ndarray) -> np.uint64:
-    """What the pixels of a pose (runs (K, 3)) that are not in a mask (W,) add to its hash."""
-    code = np.uint64(0)
-    for part in range(runs.shape[0]):
-        begin, place = runs[part, 0], runs[part, 2]
-        for k in range(runs[part, 1]):
-            added = words[place + k] & ~mask[begin + k]
-            if added != np.uint64(0):
-                code += (added & _LOW_HALF) * keys[2 * (begin + k)]
-                code += (added >> _HALF) * keys[2 * (begin + k) + 1]
-    return code
-
-
-@compiled
-def hash_state(
-    poses: np.ndarray, code: np.uint64, node: int, pose: int, open_nodes: np.ndarray
-) -> np.uint64:
-    """An odd number that tells by a code and by the poses of the nodes with children to come."""
-    for j in range(-1, open_nodes.shape[0]):
-        if j >= 0:
-            i = open_nodes[j]
-            p = pose if i == node else poses[i]
-            code ^= np.uint64(p * poses.shape[0] + i)
-        # splitmix64
-        code += np.uint64(0x9E3779B97F4A7C15)
-        code = (code ^ (code >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-        code = (code ^ (code >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-        code ^= code >> np.uint64(31)
-    return code | np.uint64(1)
-
-
-@compiled
-def find_slot(table: np.ndarray, number: np.uint64) -> np.int64:
-    """Where an odd number is, or belongs, in a hash table of 2^k slots (0: an empty one)."""
-    last = table.shape[0] - 1
-    slot = np.int64((number >> np.uint64(1)) & np.uint64(last))
-    while table[slot] != np.uint64(0) and table[slot] != number:
-        slot = (slot + 1) & last
-    return slot
-
-
-@compiled
-def count_unreachable(
-    mask: np.ndarray, poses: np.ndarray, everything: np.ndarray, reaches: Reaches, rest: np.ndarray
-) -> np.int64:
-    """The silhouettes' pixels that a hypothesis can never cover.
-
-    Args:
-        mask: (W,) uint64; poses: (nodes,) int32.
-        everything: (w,) uint64 all pixels of the silhouettes.
-        reaches: of the nodes to come.
-        rest: (w,) uint64 written over: these pixels.
-    """
-    for k in range(everything.shape[0]):
-        rest[k] = everything[k] & ~mask[k]
-    for m in range(reaches.parents.shape[0]):
-        parent = reaches.parents[m]
-        row = reaches.rows[m, 0 if parent < 0 else poses[parent]]
-        for part in range(reaches.runs.shape[1]):
-            begin, place = reaches.runs[row, part, 0], reaches.runs[row, part, 2]
-            for k in range(reaches.runs[row, part, 1]):
-                rest[begin + k] &= ~reaches.words[place + k]
-    count = np.uint64(0)
-    for k in range(everything.shape[0]):
-        count += count_bits(rest[k])
-    return np.int64(count)
-
-
-@compiled
-def grow_hypotheses(
+def score_pairs(
     masks: np.ndarray,
-    poses: np.ndarray,
-    hashes: np.ndarray,
-    ordered: np.ndarray,
     pairs: np.ndarray,
     runs: np.ndarray,
     words: np.ndarray,
-    node: int,
-    open_nodes: np.ndarray,
+    silhouettes: int,
     keys: np.ndarray,
-    width: int,
-    everything: np.ndarray,
-    reaches: Reaches,
-    exact: bool,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, int]:
-    """Make the best pairs hypotheses; of those that are alike only the first.
-
-    Two are alike if they cover the same pixels and the nodes that still have children to come
-    have the same poses: then they can be completed in the same ways. If nothing may lie outside,
-    one that covers a part of what another covers is as good as alike.
+) -> tuple[np.ndarray, np.ndarray]:
+    """What poses of the next node would add to partial poses.
 
     Args:
-        masks: (B, W) uint64; poses: (B, nodes) int32; hashes: (B,) uint64 of the masks.
-        ordered: indices of pairs, best first.
-        pairs, runs, words: as in score_pairs.
-        node: the node that the poses are of.
-        open_nodes: nodes that have children to come, this one perhaps among them.
-        width: at most this many are made.
-        everything, reaches: as in count_unreachable.
-        exact: nothing may lie outside, and nothing be left that is out of reach.
+        masks: (B, W) uint64 what these cover.
+        pairs: (p, 2) int32 partial pose and pose.
+        runs: (n, K, 3) int64 of each pose, for each part of a mask, the first word, the number of
+            words and where they begin in words.
+        words: (m,) uint64.
+        silhouettes: how many parts come first that are silhouettes; the others are bands.
+        keys: (2 W,) uint64 of the hashes; or (0,): none are wanted.
 
     Returns:
-        masks, poses and hashes of the new hypotheses, the indices of their pairs, what they leave
-        out of reach, and how many of ``ordered`` were looked at.
+        (p, 2) int64 the silhouette and the band newly covered [pixel]; and (p,) uint64 what is
+        added to the masks' hashes.
     """
-    made = min(width, ordered.shape[0])
-    new_masks = np.empty((made, masks.shape[1]), dtype=np.uint64)
-    new_poses = np.empty((made, poses.shape[1]), dtype=np.int32)
-    new_hashes = np.empty(made, dtype=np.uint64)
-    chosen, left = np.empty(made, dtype=np.int64), np.empty(made, dtype=np.int64)
-    openings = np.empty(made, dtype=np.uint64)
-    rest = np.empty_like(everything)
-    size = 16
-    while size < 4 * ordered.shape[0]:
-        size *= 2
-    table = np.zeros(size, dtype=np.uint64)
-    count, seen = 0, 0
-    while seen < ordered.shape[0] and count < made:
-        index = ordered[seen]
-        seen += 1
-        h, c = pairs[index, 0], pairs[index, 1]
-        code = hashes[h] + add_hash(masks[h], runs[c], words, keys)
-        state = hash_state(poses[h], code, node, c, open_nodes)
-        slot = find_slot(table, state)
-        if table[slot] == state:
-            continue
-        table[slot] = state
-        copy_into(new_masks[count], masks[h])
-        unite_masks(new_masks[count : count + 1], runs[c : c + 1], words)
-        copy_into(new_poses[count], poses[h])
-        new_poses[count, node] = c
-        lost = count_unreachable(new_masks[count], new_poses[count], everything, reaches, rest)
-        if exact:
-            opening = hash_state(poses[h], np.uint64(0), node, c, open_nodes)
-            openings[count] = opening
-            useless = bool(lost > 0)
-            for other in range(count):
-                if useless:
-                    break
-                if openings[other] == opening:
-                    k = 0
-                    while k < masks.shape[1] and new_masks[count, k] & ~new_masks[
-                        other, k
-                    ] == np.uint64(0):
-                        k += 1
-                    useless = k == masks.shape[1]
-            if useless:
-                continue
-        new_hashes[count], chosen[count], left[count] = code, index, lost
-        count += 1
-    return (
-        new_masks[:count],
-        new_poses[:count],
-        new_hashes[:count],
-        chosen[:count],
-        left[:count],
-        seen,
-    )
+    areas = np.zeros((pairs.shape[0], 2), dtype=np.int64)
+    codes = np.zeros(pairs.shape[0], dtype=np.uint64)
+    hashed = keys.shape[0] > 0
+    for i in range(pairs.shape[0]):
+        h, c = pairs[i, 0], pairs[i, 1]
+        code = np.uint64(0)
+        for part in range(runs.shape[1]):
+            begin, place = runs[c, part, 0], runs[c, part, 2]
+            ones = np.uint64(0)
+            for k in range(runs[c, part, 1]):
+                added = words[place + k] & ~masks[h, begin + k]
+                if added != np.uint64(0):
+                    ones += count_bits(added)
+                    if hashed:
+                        code += (added & _LOW_HALF) * keys[2 * (begin + k)]
+                        code += (added >> _HALF) * keys[2 * (begin + k) + 1]
+            areas[i, 0 if part < silhouettes else 1] += np.int64(ones)
+        codes[i] = code
+    return areas, codes
 
 
 @compiled
-def unite_masks(masks: np.ndarray, runs: np.ndarray, words: np.ndarray) -> None:
-    """Add the pixels of poses, given by their runs (n, K, 3), to masks (n, W), in place."""
-    for c in range(runs.shape[0]):
+def choose_pairs(
+    masks: np.ndarray,
+    pairs: np.ndarray,
+    runs: np.ndarray,
+    words: np.ndarray,
+    everything: np.ndarray,
+    reaches: Reaches,
+    width: int,
+    codes: np.ndarray,
+    openings: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The first pairs that are not equal, and what no later node can cover after each.
+
+    Args:
+        masks, pairs, runs, words: as in score_pairs.
+        everything: (w,) uint64 all pixels of the silhouettes.
+        reaches: of the nodes to come.
+        width: at most so many are chosen.
+        codes: (p,) uint64 the same where pairs are equal in what matters later.
+        openings: (p,) uint64 equal where the nodes with children to come stand alike; then only
+            pairs that leave nothing are chosen, and of those alike none that covers a part of what
+            another before it covers. Or (0,): all are chosen.
+
+    Returns:
+        (n,) int64 the pairs chosen; (n,) int64 pixels of the silhouettes that each leaves; and of
+        each pair that was looked at the place among those chosen, -1 for none.
+    """
+    made = min(width, pairs.shape[0])
+    chosen, left = np.empty(made, dtype=np.int64), np.empty(made, dtype=np.int64)
+    exact = openings.shape[0] > 0
+    covered = np.empty((made if exact else 1, masks.shape[1]), dtype=np.uint64)
+    rest = np.empty_like(everything)
+    bits = 4
+    while 1 << bits < 2 * pairs.shape[0]:
+        bits += 1
+    last = (1 << bits) - 1
+    slots = np.full(last + 1, -1, dtype=np.int64)
+    numbers = np.empty(pairs.shape[0], dtype=np.int64)
+    count, seen = 0, 0
+    while seen < pairs.shape[0] and count < made:
+        i = seen
+        seen += 1
+        slot = np.int64((codes[i] * _MIX) >> np.uint64(64 - bits))
+        while slots[slot] >= 0 and codes[slots[slot]] != codes[i]:
+            slot = (slot + 1) & last
+        if slots[slot] >= 0:
+            numbers[i] = numbers[slots[slot]]
+            continue
+        slots[slot] = i
+        numbers[i] = -1
+        h, c = pairs[i, 0], pairs[i, 1]
+        own = covered[count if exact else 0]
+        copy_into(own, masks[h])
         for part in range(runs.shape[1]):
-            begin, length, place = runs[c, part]
-            for k in range(length):
-                masks[c, begin + k] |= words[place + k]
+            begin, place = runs[c, part, 0], runs[c, part, 2]
+            for k in range(runs[c, part, 1]):
+                own[begin + k] |= words[place + k]
+        for k in range(everything.shape[0]):
+            rest[k] = everything[k] & ~own[k]
+        for m in range(reaches.rows.shape[0]):
+            row = reaches.rows[m, i]
+            for part in range(reaches.runs.shape[1]):
+                begin, place = reaches.runs[row, part, 0], reaches.runs[row, part, 2]
+                for k in range(reaches.runs[row, part, 1]):
+                    rest[begin + k] &= ~reaches.words[place + k]
+        lost = np.uint64(0)
+        for k in range(everything.shape[0]):
+            lost += count_bits(rest[k])
+        useless = exact and lost > np.uint64(0)
+        for other in range(count if exact else 0):
+            if useless:
+                break
+            if openings[chosen[other]] == openings[i]:
+                k = 0
+                while k < own.shape[0] and own[k] & ~covered[other, k] == np.uint64(0):
+                    k += 1
+                useless = k == own.shape[0]
+        if not useless:
+            chosen[count], left[count], numbers[i] = i, np.int64(lost), count
+            count += 1
+    return chosen[:count], left[:count], numbers[:seen]
+
+
+@compiled
+def unite(
+    table: np.ndarray,
+    rows: np.ndarray,
+    groups: np.ndarray,
+    runs: np.ndarray,
+    words: np.ndarray,
+    parts: int,
+    child_rows: np.ndarray,
+) -> None:
+    """Add what poses of a node, and its descendants at these, cover to rows of a table.
+
+    Args:
+        table: (r, w) uint64 masks; rows: (n,) int64 those to write.
+        groups: (n, 2) int64 where the poses of each begin and end.
+        runs, words: as in score_pairs; the first ``parts`` of each pose are looked at.
+        child_rows: (children, poses) int64 the row of the table for each child and pose.
+    """
+    for g in range(groups.shape[0]):
+        union = table[rows[g]]
+        for c in range(groups[g, 0], groups[g, 1]):
+            for part in range(parts):
+                begin, place = runs[c, part, 0], runs[c, part, 2]
+                for k in range(runs[c, part, 1]):
+                    union[begin + k] |= words[place + k]
+            for child in range(child_rows.shape[0]):
+                below = table[child_rows[child, c]]
+                for k in range(union.shape[0]):
+                    union[k] |= below[k]
+
+
+NO_KEYS = np.zeros(0, dtype=np.uint64)
+"""The ``keys`` of who asks for areas alone."""
+
+NO_CHILDREN = np.zeros((0, 0), dtype=np.int64)
+"""The ``child_rows`` of who asks for the poses alone."""
+
+
+def unite_poses(masks: np.ndarray, poses: np.ndarray, runs: np.ndarray, words: np.ndarray) -> None:
+    """Add the pixels of one pose (n,) each to masks (n, W), in place."""
+    groups = np.column_stack([poses, poses + 1]).astype(np.int64)
+    unite(masks, np.arange(len(masks)), groups, runs, words, runs.shape[1], NO_CHILDREN)
+
+
+@compiled
+def prune_pairs(
+    uncovered: np.ndarray,
+    room: np.ndarray,
+    pairs: np.ndarray,
+    runs: np.ndarray,
+    words: np.ndarray,
+    silhouettes: int,
+    child_rows: np.ndarray,
+    table: np.ndarray,
+) -> np.ndarray:
+    """Find the pairs of a partial pose and a pose that can still cover enough.
+
+    Args:
+        uncovered: (B, w) uint64 what no other node can cover, for each partial pose.
+        room: (B,) int64 this many pixels of it may stay uncovered.
+        pairs, runs, words, silhouettes: as in score_pairs.
+        child_rows, table: as in unite.
+
+    Returns:
+        (p,) bool.
+    """
+    good = np.ones(pairs.shape[0], dtype=np.bool_)
+    places = np.empty(uncovered.shape[1], dtype=np.int64)
+    below = np.empty(uncovered.shape[1], dtype=np.uint64)
+    count, state = 0, -1
+    for i in range(pairs.shape[0]):
+        h, c = pairs[i, 0], pairs[i, 1]
+        if h != state:
+            state, count = h, 0
+            for k in range(uncovered.shape[1]):
+                if uncovered[h, k] != np.uint64(0):
+                    places[count] = k
+                    count += 1
+        for j in range(count):
+            below[places[j]] = np.uint64(0)
+        for part in range(silhouettes):
+            begin, place = runs[c, part, 0], runs[c, part, 2]
+            for k in range(runs[c, part, 1]):
+                below[begin + k] = words[place + k]
+        left = room[h]
+        for j in range(count):
+            k = places[j]
+            rest = uncovered[h, k] & ~below[k]
+            if rest != np.uint64(0):
+                for child in range(child_rows.shape[0]):
+                    rest &= ~table[child_rows[child, c], k]
+                left -= np.int64(count_bits(rest))
+                if left < 0:
+                    good[i] = False
+                    break
+    return good

@@ -58,6 +58,7 @@ class SampledBody:
         self.p_PB = [self._place_balls(node) for node in range(len(tree.nodes))]
         self.reach_balls = self._find_reaches()
         self._celled: dict[tuple[int, float, bool], CelledOutline] = {}
+        self._frontiers: dict[frozenset[int], tuple[np.ndarray, list[int]]] = {}
         given = named_order(tree, settings.node_order)
         self.order = given or self._find_order(limb_by_limb=False)
         self.limb_order = given or self._find_order(limb_by_limb=True)
@@ -72,6 +73,19 @@ class SampledBody:
                 moved.p_PB[i] = moved._place_balls(i)
         moved.reach_balls = moved._find_reaches()
         return moved
+
+    def frontier(self, placed: frozenset[int]) -> tuple[np.ndarray, list[int]]:
+        """Of placed nodes those with children to come; and the nodes to come whose parent is."""
+        if placed not in self._frontiers:
+            nodes = self.sampled.tree.nodes
+            is_open = [i for i in sorted(placed) if not placed.issuperset(nodes[i].children)]
+            waiting = [
+                i
+                for i, node in enumerate(nodes)
+                if i not in placed and (node.parent < 0 or node.parent in placed)
+            ]
+            self._frontiers[placed] = np.array(is_open, dtype=np.int64), waiting
+        return self._frontiers[placed]
 
     def celled_outline(self, node: int, camera: Camera, coarse: bool) -> CelledOutline:
         """The node's surface, or a coarse one, with contour tables that suit a camera."""

@@ -9,7 +9,7 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import SettingsError
-from drake_pose.search.grid.beam.search import BeamSearch
+from drake_pose.search.grid.beam_search import BeamSearch
 from drake_pose.search.scoring import Scoring
 from drake_pose.search.settings import BeamSearchSettings, Stage
 from tests.search.bodies import (

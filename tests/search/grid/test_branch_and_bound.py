@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drake_pose.search.grid.branch_and_bound.bounded_poses import BoundLimits
-from drake_pose.search.grid.branch_and_bound.partial_pose_graph import PartialPoseGraph
-from drake_pose.search.grid.branch_and_bound.search import branch_and_bound
+from drake_pose.search.grid.branch_and_bound import branch_and_bound
+from drake_pose.search.grid.pose_graph import PartialPoseGraph
+from drake_pose.search.settings import BoundLimits
 from tests.search.bodies import box_link, joint, load_body, swinging_chain
 from tests.search.grid_problems import GridProblem, ProblemMaker
 

@@ -8,8 +8,8 @@ import pytest
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import View
-from drake_pose.search.grid.beam.distinct_poses import GridPoses
-from drake_pose.search.grid.beam.search import BeamSearch
+from drake_pose.search.grid.beam_search import BeamSearch
+from drake_pose.search.grid.distinct_poses import GridPoses
 from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_mask

@@ -7,15 +7,14 @@ import numpy as np
 import pytest
 
 from drake_pose.errors import SettingsError
-from drake_pose.search.grid.beam.search import BeamSearch
-from drake_pose.search.grid.branch_and_bound.bounded_poses import BoundLimits
-from drake_pose.search.grid.families.examination import (
+from drake_pose.search.grid.beam_search import BeamSearch
+from drake_pose.search.grid.examination import (
     ExaminationSettings,
     examine,
     prove_optimal,
 )
-from drake_pose.search.grid.families.search import samples_at
-from drake_pose.search.settings import BeamSearchSettings
+from drake_pose.search.grid.pose_families import samples_at
+from drake_pose.search.settings import BeamSearchSettings, BoundLimits
 from tests.search.grid_problems import ProblemMaker
 
 INTERVAL = 0.4

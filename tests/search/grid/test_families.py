@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from drake_pose.search.estimates import View
-from drake_pose.search.grid.branch_and_bound.bounded_poses import BoundLimits
-from drake_pose.search.grid.families.search import (
+from drake_pose.search.grid.pose_families import (
     GridPoseSet,
     cluster_samples,
     contour_length,
@@ -17,6 +16,7 @@ from drake_pose.search.grid.families.search import (
     grid_steps,
     samples_at,
 )
+from drake_pose.search.settings import BoundLimits
 from tests.search.bodies import box_link, forked_body, joint, load_body, swinging_chain
 from tests.search.grid_problems import GridProblem, ProblemMaker
 

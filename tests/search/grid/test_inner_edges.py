@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from drake_pose.errors import SettingsError
-from drake_pose.search.grid.families.inner_edges import (
+from drake_pose.search.grid.inner_edges import (
     EdgeErrors,
     choose_by_edges,
     edges_of_labels,
     find_borders,
 )
-from drake_pose.search.grid.families.search import GridPoseSet, find_families, samples_at
+from drake_pose.search.grid.pose_families import GridPoseSet, find_families, samples_at
 from drake_pose.search.grid.sampled_body import SampledBody
 from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer

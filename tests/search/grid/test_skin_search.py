@@ -8,7 +8,7 @@ import pytest
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.search.estimates import View
-from drake_pose.search.grid.beam.search import BeamSearch
+from drake_pose.search.grid.beam_search import BeamSearch
 from drake_pose.search.kameda import PaperSearch
 from drake_pose.search.scoring import SampledTree, Scoring
 from drake_pose.search.settings import BeamSearchSettings, PaperSearchSettings

@@ -7,9 +7,9 @@ import pytest
 
 from drake_pose.search.continuous.multi_start import MultiStartSearch
 from drake_pose.search.continuous.search import ContinuousSearch
-from drake_pose.search.grid.beam.search import BeamSearch
-from drake_pose.search.grid.families.examination import ExaminationSettings
-from drake_pose.search.grid.families.search import _joined
+from drake_pose.search.grid.beam_search import BeamSearch
+from drake_pose.search.grid.examination import ExaminationSettings
+from drake_pose.search.grid.pose_families import _joined
 from tests.search.turning import crane, views_of
 
 

@@ -20,7 +20,7 @@ from drake_pose.errors import SettingsError
 from drake_pose.filtering.measurements.axes import AxisObservation
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.truncation.couplings import model_inequalities
-from drake_pose.search.grid.beam.search import BeamSearch
+from drake_pose.search.grid.beam_search import BeamSearch
 from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.silhouette.pictures.label_images import EMPTY
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer

@@ -14,15 +14,15 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from drake_pose.search.estimates import JointEstimate, PoseFamily, PoseSet, View
-from drake_pose.search.grid.branch_and_bound.bounded_poses import BoundLimits
-from drake_pose.search.grid.branch_and_bound.partial_pose_graph import (
+from drake_pose.search.grid.branch_and_bound import branch_and_bound
+from drake_pose.search.grid.pose_graph import (
     Layer,
     PartialPoseGraph,
     single_pose,
 )
-from drake_pose.search.grid.branch_and_bound.search import branch_and_bound
 from drake_pose.search.grid.sampled_body import SampledBody
 from drake_pose.search.scoring import SampledTree
+from drake_pose.search.settings import BoundLimits
 
 _ROUNDING = 1e-6
 

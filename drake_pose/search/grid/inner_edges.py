@@ -15,8 +15,8 @@ from scipy.special import logsumexp
 
 from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import JointEstimate
-from drake_pose.search.grid.branch_and_bound.partial_pose_graph import PartialPoseGraph
-from drake_pose.search.grid.families.search import GridPoseSet, estimate_joints
+from drake_pose.search.grid.pose_families import GridPoseSet, estimate_joints
+from drake_pose.search.grid.pose_graph import PartialPoseGraph
 
 RenderSegments = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Draws a pose, q (nq,) and X_WB (4, 4): (H, W) int the segment seen at each pixel, -1 for none.

@@ -14,15 +14,11 @@ import numpy as np
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
-from drake_pose.search.grid.beam.distinct_poses import Gathering, GridPoses, check_choice
-from drake_pose.search.grid.beam.hypotheses import (
-    Beam,
-    Hypotheses,
-    search_limbs_again,
-    turn_single_nodes,
-)
-from drake_pose.search.grid.families.examination import ExaminationSettings, examine
+from drake_pose.search.grid.beam_stages import run_stage, search_limbs_again, turn_single_nodes
+from drake_pose.search.grid.distinct_poses import Gathering, GridPoses, check_choice
+from drake_pose.search.grid.examination import ExaminationSettings, examine
 from drake_pose.search.grid.node_poses import Pictures, PoseStore, coarsen
+from drake_pose.search.grid.partial_poses import Expansion, PartialPoses
 from drake_pose.search.grid.sampled_body import SampledBody
 from drake_pose.search.scoring import Scoring
 from drake_pose.search.settings import BeamSearchSettings, Stage
@@ -138,7 +134,7 @@ class _Run:
         self.runs = 0
         self.hypotheses = 0
         self.stopped_by = ""
-        self._stores: dict[float, PoseStore] = {}
+        self._expansions: dict[float, Expansion] = {}
 
     def search(self) -> None:
         """Run stage after stage until J = 0 or a limit is reached; then polish the answer."""
@@ -147,11 +143,10 @@ class _Run:
             exact = stage.outside_share == 0.0
             if exact and skip_exact:
                 continue
-            if stage.outside_share not in self._stores:
-                self._stores[stage.outside_share] = PoseStore(
-                    self.body, self.pictures(exact), stage.outside_share
-                )
-            complete = self._run_stage(Beam(self._stores[stage.outside_share]), stage)
+            if stage.outside_share not in self._expansions:
+                store = PoseStore(self.body, self.pictures(exact), stage.outside_share)
+                self._expansions[stage.outside_share] = Expansion(store)
+            complete = self._run_stage(self._expansions[stage.outside_share], stage)
             if self.stopped_by or (self.J == 0 and (self.gathering is None or not exact)):
                 break
             skip_exact = skip_exact or complete or self.J == 0
@@ -185,48 +180,51 @@ class _Run:
             self.stopped_by = "time_limit"
         return not self.stopped_by
 
-    def _run_stage(self, beam: Beam, stage: Stage) -> bool:
+    def _run_stage(self, expansion: Expansion, stage: Stage) -> bool:
         """Returns whether the stage lost no hypothesis."""
         exact = stage.outside_share == 0.0
         order = self.body.limb_order if stage.limb_by_limb else self.body.order
-        last, complete = beam.run(
-            beam.start(), order, stage.hypotheses, stage.outside_weight, exact, self.proceed
-        )
+        last, complete = run_stage(
+            expansion, expansion.start(), order, stage.hypotheses, stage.outside_weight, exact,
+            self.proceed,
+        )  # fmt: skip
         if last is None:
             return complete
-        Js = self._gather(beam, last)
+        Js = self._gather(expansion, last)
         best = int(np.argmin(Js))
         poses = last.poses[best]
-        self._keep_if_better(beam.store.samples(poses))
+        self._keep_if_better(expansion.store.samples(poses))
         if self.settings.research_hypotheses and (self.J > 0 or (self.gathering and not exact)):
             better = search_limbs_again(
-                beam,
+                expansion,
                 order,
                 poses,
                 float(Js[best]),
                 self.settings.research_hypotheses,
                 self.proceed,
-                lambda hypotheses: self._gather(beam, hypotheses),
+                lambda whole: self._gather(expansion, whole),
             )
-            self._keep_if_better(beam.store.samples(better))
+            self._keep_if_better(expansion.store.samples(better))
         return complete
 
     def _answer_somehow(self) -> None:
         """A pose whatever lies outside; found by one hypothesis alone if a limit was reached."""
         width = 1 if self.stopped_by else self.settings.stages[-1].hypotheses
-        store = PoseStore(self.body, self.pictures(exact=False), np.inf)
-        beam = Beam(store)
-        last, _ = beam.run(beam.start(), self.body.order, width, 2, False, lambda made: True)
+        expansion = Expansion(PoseStore(self.body, self.pictures(exact=False)))
+        last, _ = run_stage(
+            expansion, expansion.start(), self.body.order, width, 2, False, lambda made: True
+        )
         if last is not None:
-            Js = self._gather(beam, last)
-            self._keep_if_better(store.samples(last.poses[int(np.argmin(Js))]))
+            best = int(np.argmin(self._gather(expansion, last)))
+            self._keep_if_better(expansion.store.samples(last.poses[best]))
 
-    def _gather(self, beam: Beam, hypotheses: Hypotheses) -> np.ndarray:
-        """What J is (n,) as the beam counts it; whole poses are gathered if that is wanted."""
-        Js = beam.store.pictures.area - hypotheses.covered + hypotheses.outside
+    def _gather(self, expansion: Expansion, whole: PartialPoses) -> np.ndarray:
+        """What J is (n,) as the pictures show it; poses are gathered if that is wanted."""
+        Js = expansion.objectives(whole)
         if self.gathering is not None:
-            self.gathering.add(beam.store.samples(hypotheses.poses), Js / beam.store.pictures.area)
-        return np.asarray(Js)
+            area = expansion.store.pictures.area
+            self.gathering.add(expansion.store.samples(whole.poses), Js / area)
+        return Js
 
     def _keep_if_better(self, samples: np.ndarray) -> None:
         """Keep samples (nodes,) if their J is the smallest so far."""

@@ -95,13 +95,14 @@ class Gathering:
 
 def _draw(pictures: Pictures, samples: np.ndarray, X_WN: np.ndarray) -> _Looks:
     """What all nodes look like at samples (n, nodes) and poses (n, nodes, 4, 4)."""
-    shape = X_WN.shape[:2]
-    masks = np.zeros((*shape, int(pictures.part_starts[-1])), dtype=np.uint64)
-    areas, far = np.zeros(shape, dtype=np.int64), np.zeros(shape, dtype=np.int64)
-    for node in range(shape[1]):
-        drawn = pictures.draw_node(node, samples[:, node], X_WN[:, node], masks[:, node])
-        areas[:, node], far[:, node] = drawn.sum(axis=1), drawn[:, 2]
-    return masks, areas, _find_hidden(masks, far)
+    poses, nodes = X_WN.shape[:2]
+    by_node = np.zeros((nodes, poses, int(pictures.part_starts[-1])), dtype=np.uint64)
+    drawn = [
+        pictures.draw_node(node, samples[:, node], X_WN[:, node], by_node[node])
+        for node in range(nodes)
+    ]
+    masks, areas = by_node.swapaxes(0, 1), np.stack(drawn, axis=1)
+    return masks, areas.sum(axis=2), _find_hidden(masks, areas[:, :, 2])
 
 
 def _find_hidden(masks: np.ndarray, far: np.ndarray) -> np.ndarray:

@@ -11,10 +11,10 @@ import numpy as np
 
 from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import PoseEstimate, View
-from drake_pose.search.grid.branch_and_bound.bounded_poses import BoundLimits
-from drake_pose.search.grid.branch_and_bound.search import branch_and_bound
-from drake_pose.search.grid.families.search import find_families, samples_at
+from drake_pose.search.grid.branch_and_bound import branch_and_bound
+from drake_pose.search.grid.pose_families import find_families, samples_at
 from drake_pose.search.grid.sampled_body import SampledBody
+from drake_pose.search.settings import BoundLimits
 
 _FIRST_LIMIT = 8.0
 

@@ -1,1 +1,0 @@
-"""Beam search: hypotheses grow node by node, the most promising are kept."""

@@ -1,0 +1,215 @@
+"""The beam: partial poses that grow node by node, and single limbs of a pose searched again."""
+
+import itertools
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from drake_pose.search.grid.node_poses import Pictures
+from drake_pose.search.grid.partial_poses import Expansion, PartialPoses, all_pairs
+from drake_pose.search.scoring import Scoring
+
+# How many times the width are looked at until enough are found that are not alike.
+_SPARE = 4
+# What is placed last need not spare the silhouette for what comes after it.
+_OUTSIDE_WEIGHT = 2
+# How many of a node's samples are judged in full.
+_JUDGED = 4
+
+
+def grow(
+    expansion: Expansion,
+    partial: PartialPoses,
+    node: int,
+    width: int,
+    outside_weight: int,
+    exact: bool,
+) -> tuple[PartialPoses | None, bool]:
+    """Place one more node in every partial pose and keep the best.
+
+    Args:
+        outside_weight: what a pixel outside counts; one newly covered counts one.
+        exact: drop what cannot cover the whole silhouettes any more.
+
+    Returns:
+        The new ones, best first, None where no pose stays inside the limit; and whether some were
+        lost because there were too many.
+    """
+    is_leaf = not expansion.nodes[node].children
+    hidden = None
+    if is_leaf and not expansion.store.pictures.has_bands:
+        hidden = expansion.hidden(partial, node)
+    pairs = all_pairs(expansion.groups(partial, node, hidden))
+    areas, added = expansion.score(partial, node, pairs)
+    if is_leaf:
+        # Of those that add nothing at all, the first of each partial pose is enough.
+        nothing = np.flatnonzero(~areas.any(axis=1))
+        if len(nothing) > 1:
+            more = nothing[1:][np.diff(pairs[nothing, 0]) == 0]
+            pairs, areas, added = (np.delete(one, more, axis=0) for one in (pairs, areas, added))
+    if len(pairs) == 0:
+        return None, False
+    beyond = expansion.store.nodes[node].areas[pairs[:, 1], 2]
+    outside = partial.outside[pairs[:, 0]] + areas[:, 1] + beyond
+    covered = partial.covered[pairs[:, 0]] + areas[:, 0]
+    ordered = order_best(outside_weight * outside - covered, _SPARE * width)
+    made = expansion.make(partial, node, pairs[ordered], (areas[ordered], added[ordered]))
+    pairs, lost = pairs[ordered], len(ordered) < len(pairs)
+    # What is out of reach is known after growing only: grow more and rank again.
+    grown = width if exact else 2 * width
+    chosen, made, looked_at = expansion.choose(partial, made, node, pairs, grown, exact)
+    lost = lost or len(looked_at) < len(pairs)
+    if not exact:
+        best = np.argsort(made.costs(outside_weight), kind="stable")[:width]
+        lost = lost or len(best) < len(made)
+        chosen, made = chosen[best], made.chosen(best)
+    if len(made) == 0:
+        return None, lost
+    return expansion.with_masks(partial, made, node, pairs[chosen]), lost
+
+
+def order_best(costs: np.ndarray, count: int) -> np.ndarray:
+    """The indices of the ``count`` smallest costs (n,), smallest first, equals in their order."""
+    if len(costs) <= count:
+        return np.argsort(costs, kind="stable")
+    near = np.flatnonzero(costs <= np.partition(costs, count - 1)[count - 1])
+    return np.asarray(near[np.argsort(costs[near], kind="stable")[:count]])
+
+
+def run_stage(
+    expansion: Expansion,
+    start: PartialPoses,
+    order: Sequence[int],
+    width: int,
+    outside_weight: int,
+    exact: bool,
+    proceed: Callable[[int], bool],
+) -> tuple[PartialPoses | None, bool]:
+    """Place nodes one after another.
+
+    Args:
+        proceed: asked after each node, with the number of partial poses made, whether to go on.
+
+    Returns:
+        The last ones (None: none was left, or told to stop), and whether all possible ones were
+        kept throughout.
+    """
+    partial: PartialPoses | None = start
+    complete = True
+    for node in order:
+        if partial is None:
+            break
+        partial, lost = grow(expansion, partial, node, width, outside_weight, exact)
+        complete = complete and not lost
+        if partial is not None and not proceed(len(partial)):
+            return None, False
+    return partial, complete
+
+
+def search_limbs_again(
+    expansion: Expansion,
+    order: Sequence[int],
+    poses: np.ndarray,
+    J: float,
+    width: int,
+    proceed: Callable[[int], bool],
+    found: Callable[[PartialPoses], np.ndarray],
+) -> np.ndarray:
+    """Search limbs again, one or two at a time, until that improves nothing any more.
+
+    Args:
+        poses: (nodes,) the pose of each node in the PoseStore.
+        found: gives the objectives (n,) of the last partial poses of every search.
+
+    Returns:
+        (nodes,) the better poses, or the same.
+    """
+    limbs = find_limbs(expansion)
+    choices = [*((limb,) for limb in limbs), *itertools.combinations(limbs, 2)]
+    unchanged = 0
+    for choice in itertools.cycle(choices):
+        nodes = frozenset().union(*choice)
+        start = expansion.without(poses, nodes)
+        part = [node for node in order if node in nodes]
+        last, _ = run_stage(expansion, start, part, width, _OUTSIDE_WEIGHT, False, proceed)
+        if last is None:
+            return poses
+        Js = found(last)
+        best = int(np.argmin(Js))
+        unchanged += 1
+        if Js[best] < J:
+            J, poses, unchanged = float(Js[best]), last.poses[best], 1
+        if unchanged >= len(choices):
+            return poses
+    return poses
+
+
+def find_limbs(expansion: Expansion) -> list[frozenset[int]]:
+    """The largest subtrees without a fork but the whole tree; of a chain, its outer half."""
+    nodes = expansion.nodes
+    subtrees: list[frozenset[int]] = [frozenset()] * len(nodes)
+    forked = [len(node.children) > 1 for node in nodes]
+    for i in reversed(range(len(nodes))):
+        below = [subtrees[child] for child in nodes[i].children]
+        subtrees[i] = frozenset({i}).union(*below)
+        forked[i] = forked[i] or any(forked[child] for child in nodes[i].children)
+    limbs = [
+        subtrees[i]
+        for i, node in enumerate(nodes)
+        if not forked[i] and node.parent >= 0 and forked[node.parent]
+    ]
+    if limbs:
+        return limbs
+    return [subtree for subtree in subtrees if 2 * len(subtree) <= len(nodes)][:1]
+
+
+def turn_single_nodes(
+    scoring: Scoring, pictures: Pictures, samples: np.ndarray, proceed: Callable[[], bool]
+) -> np.ndarray:
+    """Try all samples of one node after another, all that hangs on it moving along.
+
+    Args:
+        pictures: with bands.
+        proceed: asked before each node whether to go on.
+
+    Returns:
+        Samples (nodes,) that no single change improves in the pictures, as far as it got.
+    """
+    current = samples.copy()
+    J = float(scoring.J(scoring.sampled.poses(current[None]), current[None])[0])
+    unchanged = 0
+    for node in itertools.cycle(range(len(current))):
+        if not proceed():
+            break
+        tried = np.repeat(current[None], len(scoring.sampled.values[node]), axis=0)
+        tried[:, node] = np.arange(len(tried))
+        approximate = _J_by_bits(scoring, pictures, tried, node)
+        tried = tried[np.argsort(approximate, kind="stable")[:_JUDGED]]
+        Js = scoring.J(scoring.sampled.poses(tried), tried)
+        best = int(np.argmin(Js))
+        unchanged += 1
+        if Js[best] < J:
+            J, current, unchanged = float(Js[best]), tried[best], 1
+        if unchanged >= len(current):
+            break
+    return current
+
+
+def _J_by_bits(scoring: Scoring, pictures: Pictures, samples: np.ndarray, node: int) -> np.ndarray:
+    """J (n,) as the pictures show it of samples (n, nodes) that differ in one node's alone."""
+    X_WN = scoring.sampled.poses(samples)
+    silhouettes = int(pictures.part_starts[len(pictures.views)])
+    moving = {node}
+    still = np.zeros((1, int(pictures.part_starts[-1])), dtype=np.uint64)
+    far = np.zeros(len(samples), dtype=np.int64)
+    for i, other in enumerate(scoring.sampled.tree.nodes):
+        if i in moving or other.parent in moving:
+            moving.add(i)
+        else:
+            far += pictures.draw_node(i, samples[:1, i], X_WN[:1, i], still)[0, 2]
+    masks = np.repeat(still, len(samples), axis=0)
+    for i in sorted(moving):
+        far += pictures.draw_node(i, samples[:, i], X_WN[:, i], masks)[:, 2]
+    covered = np.bitwise_count(masks[:, :silhouettes]).sum(axis=1, dtype=np.int64)
+    outside = np.bitwise_count(masks[:, silhouettes:]).sum(axis=1, dtype=np.int64)
+    return np.asarray(pictures.area - covered + outside + far)

@@ -1,0 +1,275 @@
+"""All poses of the grid whose objective is no greater than a limit, found layer by layer.
+
+A partial pose is dropped only if no completion can be within the limit: what lies outside the
+silhouette stays outside, and what no later node can reach stays uncovered. The sum of the two
+bounds the objective of all completions from below. Nothing else is dropped unless there is too
+much of it, and the search then says so.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drake_pose.search.estimates import View
+from drake_pose.search.grid.node_poses import LimitReached, Pictures, PoseStore
+from drake_pose.search.grid.pair_kernel import prune_pairs
+from drake_pose.search.grid.partial_poses import Expansion, PartialPoses, all_pairs
+from drake_pose.search.grid.pose_graph import Layer, PartialPoseGraph, make_layer
+from drake_pose.search.grid.sampled_body import SampledBody
+from drake_pose.search.grid.subtree_reaches import SubtreeReaches
+from drake_pose.search.settings import BoundLimits
+
+# What lies outside counts so much where partial poses must be ranked: it stays outside, while what
+# is not covered yet may be covered by a later node.
+_OUTSIDE_WEIGHT = 2
+# More pairs than these are worth a look at what later nodes can really cover: quickly, or closely.
+_FEW_PAIRS, _MANY_PAIRS = 300, 2000
+# How many poses of a node are tried for a quick and for a close look.
+_QUICK_TRIES, _CLOSE_TRIES = 5000, 100_000
+# Masks of more words than these get narrower bands, but none narrower than this many pixels.
+_WORDS = 2000
+_LEAST_BAND = 8
+
+
+@dataclass(frozen=True)
+class PosesWithin:
+    """What a branch and bound found.
+
+    Attributes:
+        graph: the poses; every one is within the limit.
+        complete: whether it holds all poses within the limit.
+        limited: whether a limit of the search left some out.
+        lower_bound: no pose of the grid that is not in the graph has a smaller objective [pixel].
+    """
+
+    graph: PartialPoseGraph
+    complete: bool
+    limited: bool
+    lower_bound: float
+    states: int
+
+
+def branch_and_bound(
+    body: SampledBody,
+    views: Sequence[View],
+    J_limit: float,
+    limits: BoundLimits | None = None,
+    kept_samples: np.ndarray | None = None,
+    deadline: float | None = None,
+) -> PosesWithin:
+    """Find all poses of the grid whose objective is no greater than a limit.
+
+    Args:
+        kept_samples: (nodes,) of a pose that is never dropped for want of room.
+        deadline: the value of time.perf_counter() at which it stops [s].
+
+    Returns:
+        The poses; not all if a limit was reached, or if an area beyond the bands around the
+        silhouettes is counted twice.
+    """
+    search = _BranchAndBound(body, views, J_limit, limits or BoundLimits(), kept_samples)
+    if deadline is not None:
+        search.store.deadline = deadline
+    return search.run()
+
+
+class _BranchAndBound:
+    """One search; arguments as branch_and_bound."""
+
+    def __init__(
+        self,
+        body: SampledBody,
+        views: Sequence[View],
+        J_limit: float,
+        limits: BoundLimits,
+        kept_samples: np.ndarray | None,
+    ) -> None:
+        self.order = body.limb_order
+        self.J_limit = J_limit
+        self.limits = limits
+        self.kept_samples = kept_samples
+        self.pictures = _make_pictures(body, views, J_limit)
+        self.store = PoseStore(body, self.pictures, outside_limit=J_limit, limits=limits)
+        self.expansion = Expansion(self.store)
+        self.nodes = self.expansion.nodes
+        self.quick = SubtreeReaches(self.store, _QUICK_TRIES)
+        self.close = SubtreeReaches(self.store, _CLOSE_TRIES)
+        self._layers: list[Layer] = []
+        self._complete = True
+        self._limited = False
+        self._lower_bound = np.inf
+        self._visited = 0
+        # The partial pose that the pose to be kept is in; -1: none.
+        self._kept = -1 if kept_samples is None else 0
+
+    def run(self) -> PosesWithin:
+        """Place all nodes."""
+        partial = self.expansion.start()
+        while len(self._layers) < len(self.nodes):
+            try:
+                self.store.reserve()
+                partial, node, pairs = self._choose(partial)
+                partial = self._place(partial, node, pairs)
+            except LimitReached:
+                left = float(partial.bounds.min()) if len(partial) else np.inf
+                bound = min(self._lower_bound, left)
+                nothing = np.zeros(0, dtype=np.int64)
+                layers = [Layer(i, nothing, nothing, nothing) for i in range(len(self.nodes))]
+                graph = PartialPoseGraph(layers, np.zeros(0))
+                return PosesWithin(graph, False, True, bound, self._visited)
+        # All nodes are placed: the bounds are the objectives, but for what is beyond the bands.
+        highs = partial.bounds + partial.far[:, 1] - partial.far[:, 0]
+        graph = PartialPoseGraph(self._layers, highs).up_to(self.J_limit)
+        self._drop(partial.bounds[highs > self.J_limit])
+        bound = min(self._lower_bound, float(np.floor(self.J_limit)) + 1.0)
+        return PosesWithin(graph, self._complete, self._limited, bound, self._visited)
+
+    def _drop(self, bounds: np.ndarray, limited: bool = False) -> None:
+        """Note that partial poses with these bounds are dropped though they might lead to poses."""
+        if len(bounds):
+            self._complete = False
+            self._limited = self._limited or limited
+            self._lower_bound = min(self._lower_bound, float(bounds.min()))
+
+    def _choose(self, partial: PartialPoses) -> tuple[PartialPoses, int, np.ndarray]:
+        """The node to place next, and the pairs (p, 2) int32 to look at."""
+        placed = {layer.node for layer in self._layers}
+        waiting = [
+            i for i in self.order if i not in placed and self.nodes[i].parent in (-1, *placed)
+        ]
+        forks = [i for i in waiting if self._is_forked(i)]
+        if forks or len(partial) == 0:
+            node = (forks or waiting)[0]
+            partial = self._fit_pairs(partial, node)
+            return partial, node, self._pairs(partial, node)
+        totals = [int(np.diff(self.expansion.groups(partial, node)).sum()) for node in waiting]
+        node = waiting[int(np.argmin(totals))]
+        partial = self._fit_pairs(partial, node)
+        best = None
+        if min(totals) > _FEW_PAIRS:
+            best = self._prune(partial, waiting, self.quick)
+            if best is not None and len(best[1]) > _MANY_PAIRS:
+                best = self._prune(partial, waiting, self.close)
+        return (partial, *(best or (node, self._pairs(partial, node))))
+
+    def _pairs(self, partial: PartialPoses, node: int) -> np.ndarray:
+        return all_pairs(self.expansion.groups(partial, node))
+
+    def _prune(
+        self, partial: PartialPoses, waiting: Sequence[int], reaches: SubtreeReaches
+    ) -> tuple[int, np.ndarray] | None:
+        """The waiting node that leaves the fewest pairs, and these; None: all have too many."""
+        best: tuple[int, np.ndarray] | None = None
+        for node in waiting:
+            if np.diff(self.expansion.groups(partial, node)).sum() <= self.limits.pairs:
+                pairs = self._pruned_pairs(partial, node, waiting, reaches)
+                if best is None or len(pairs) < len(best[1]):
+                    best = node, pairs
+        return best
+
+    def _pruned_pairs(
+        self, partial: PartialPoses, node: int, waiting: Sequence[int], reaches: SubtreeReaches
+    ) -> np.ndarray:
+        """Those pairs that leave no more than what the waiting nodes can really cover."""
+        pairs = self._pairs(partial, node)
+        below = reaches.child_rows(node, pairs[:, 1])
+        others = []
+        for other in waiting:
+            if other != node:
+                parents = self.store.parents(partial.poses, other)
+                others.append(reaches.rows(other, parents)[parents])
+        everything = self.pictures.everything
+        uncovered = everything & ~partial.masks[:, : len(everything)]
+        for rows in others:
+            uncovered &= ~reaches.table[rows]
+        room = np.floor(self.J_limit - partial.least_outside).astype(np.int64)
+        stored = self.store.nodes[node]
+        good = prune_pairs(
+            uncovered, room, pairs, stored.runs, stored.words, len(self.pictures.views), below,
+            reaches.table,
+        )  # fmt: skip
+        return pairs[good]
+
+    def _is_forked(self, node: int) -> bool:
+        """Whether the node or one of its descendants has several children."""
+        children = self.nodes[node].children
+        return len(children) > 1 or any(self._is_forked(child) for child in children)
+
+    def _place(self, partial: PartialPoses, node: int, pairs: np.ndarray) -> PartialPoses:
+        """Place a node as pairs (p, 2) say, and note the edges."""
+        expansion = self.expansion
+        made = expansion.make(partial, node, pairs, expansion.score(partial, node, pairs))
+        firsts, made, numbers = expansion.choose(
+            partial, made, node, pairs, len(pairs), far_matters=True
+        )
+        self._visited += len(made)
+        samples = self.store.nodes[node].samples[pairs[:, 1]].astype(np.int64)
+        self._follow_kept(pairs[:, 0], samples, numbers, node)
+        kept = self._fit(made)
+        places = np.cumsum(kept) - 1
+        edges = kept[numbers]
+        origins = pairs[edges, 0].astype(np.int64)
+        self._layers.append(make_layer(node, origins, samples[edges], places[numbers[edges]]))
+        if self._kept >= 0:
+            self._kept = int(places[self._kept]) if kept[self._kept] else -1
+        return expansion.with_masks(partial, made.chosen(kept), node, pairs[firsts[kept]])
+
+    def _fit_pairs(self, partial: PartialPoses, node: int) -> PartialPoses:
+        """Keep as many of the best as make no more pairs than allowed."""
+        counts = np.diff(self.expansion.groups(partial, node)).ravel()
+        if counts.sum() <= self.limits.pairs or len(partial) == 1:
+            return partial
+        order = self._ranked(partial.costs(_OUTSIDE_WEIGHT))
+        count = max(1, int(np.searchsorted(np.cumsum(counts[order]), self.limits.pairs)))
+        kept = np.zeros(len(partial), dtype=np.bool_)
+        kept[order[:count]] = True
+        self._drop(partial.bounds[~kept], limited=True)
+        places = np.cumsum(kept) - 1
+        if self._layers:
+            last = self._layers[-1].chosen(kept[self._layers[-1].ends])
+            self._layers[-1] = replace(last, ends=places[last.ends])
+        if self._kept >= 0:
+            self._kept = int(places[self._kept])
+        return partial.chosen(kept)
+
+    def _fit(self, made: PartialPoses) -> np.ndarray:
+        """Which (B,) bool may be kept."""
+        alive = made.bounds <= self.J_limit
+        room = max(1, min(self.limits.states, self.limits.memory // (4 * 8 * self.expansion.words)))
+        if alive.sum() <= room:
+            return np.asarray(alive)
+        costs = np.where(alive, made.costs(_OUTSIDE_WEIGHT), np.iinfo(np.int64).max)
+        kept = np.zeros(len(alive), dtype=np.bool_)
+        kept[self._ranked(costs)[:room]] = True
+        self._drop(made.bounds[alive & ~kept], limited=True)
+        return kept
+
+    def _ranked(self, costs: np.ndarray) -> np.ndarray:
+        """The numbers of partial poses, best first; that of the pose to be kept before all."""
+        if self._kept >= 0:
+            costs = costs.copy()
+            costs[self._kept] = np.iinfo(np.int64).min
+        return np.argsort(costs, kind="stable")
+
+    def _follow_kept(
+        self, origins: np.ndarray, samples: np.ndarray, numbers: np.ndarray, node: int
+    ) -> None:
+        """Find the partial pose that the pose to be kept comes to."""
+        if self._kept < 0 or self.kept_samples is None:
+            return
+        found = (origins == self._kept) & (samples == self.kept_samples[node])
+        edges = np.flatnonzero(found)
+        self._kept = int(numbers[edges[0]]) if len(edges) else -1
+
+
+def _make_pictures(body: SampledBody, views: Sequence[View], J_limit: float) -> Pictures:
+    """The silhouettes with bands so wide that nothing within the limit lies beyond, if possible."""
+    if J_limit < 1.0:
+        return Pictures(body, views, 0, in_full=True)
+    band = int(min(J_limit, max(view.mask.shape[i] for view in views for i in (0, 1))))
+    while True:
+        pictures = Pictures(body, views, max(1, band), in_full=True)
+        if band <= _LEAST_BAND or pictures.part_starts[-1] <= _WORDS:
+            return pictures
+        band //= 2

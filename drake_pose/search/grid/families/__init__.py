@@ -1,1 +1,0 @@
-"""What silhouettes leave open on the grid: families of poses that look alike."""

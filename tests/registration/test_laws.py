@@ -7,12 +7,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.errors import MaskError
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
-from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
+from drake_pose.registration import bundle_adjustment
+from drake_pose.registration.object_search import hand_eye_starts
+from drake_pose.registration.online_registration import pose_difference
+from drake_pose.registration.posed_frames import PosedFrame, PosedFrames, SeenFrame
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.registration.shared_fit import (
     CONSTANT_DEVIATION,
@@ -22,7 +26,9 @@ from drake_pose.registration.shared_fit import (
 )
 from drake_pose.registration.standing_object import StandingObject
 from drake_pose.registration.start_poses import add_bound_equations, place_by_bounds
-from tests.registration.arm_pictures import looking_at, see
+from drake_pose.silhouette.areas.scoring import draw_mask
+from tests.registration.arm_pictures import errors, looking_at, see
+from tests.search.arms import arm_cameras
 
 MIDDLE = np.array([0.0, 0.0, 0.4])
 PLACE = np.array([1.6, 0.4, 0.5])
@@ -200,3 +206,61 @@ def test_masks_of_another_size_and_empty_ones_are_refused(
         frame = PosedFrame("0007", posed.frames[0].values, mask)
         with pytest.raises(MaskError, match="camera 'eye', frame '0007'"):
             PosedFrames(body.kinematics, body.few, posed.camera, [frame])
+
+
+def random_poses(rng: np.random.Generator, count: int, turn: float = 1.0) -> np.ndarray:
+    """(count, 4, 4)."""
+    X = np.tile(np.eye(4), (count, 1, 1))
+    X[:, :3, :3] = Rotation.from_rotvec(rng.normal(0.0, turn, (count, 3))).as_matrix()
+    X[:, :3, 3] = rng.normal(0.0, 0.5, (count, 3))
+    return X
+
+
+def test_three_pictures_tell_camera_and_object() -> None:
+    """A X = X B exactly, however the object looks alike, beside poses that are wrong."""
+    rng = np.random.default_rng(2)
+    X_WL, (X_LC, X_WT) = random_poses(rng, 4), random_poses(rng, 2)
+    half = np.diag([-1.0, -1.0, 1.0, 1.0])
+    true = np.linalg.inv(X_WL @ X_LC) @ X_WT
+    seen = [np.concatenate([X[None] @ half, random_poses(rng, 1)]) for X in true]
+    found = hand_eye_starts(X_WL, seen, np.array([np.eye(4), half]))
+    off = np.abs(found[:, 0] - X_LC).max(axis=(1, 2))
+    best = found[off.argmin()]
+    np.testing.assert_allclose(best[0], X_LC, atol=1e-9)
+    # Which of its looks the object has nobody knows.
+    assert min(np.abs(best[1] - X_WT @ turn).max() for turn in (np.eye(4), half)) < 1e-9
+
+
+def test_a_bundle_finds_poses_and_a_camera_together(
+    body: RegistrationBody, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From positions that are off, and a camera that stands elsewhere; another one holds both."""
+    monkeypatch.setattr(bundle_adjustment, "_TELLING_FRAMES", 1)
+    cameras = [replace(one, name=n) for one, n in zip(arm_cameras(), ("a", "b"), strict=True)]
+    rng, kinematics, frames = np.random.default_rng(3), body.kinematics, []
+    true = rng.uniform(-0.8, 0.8, (3, len(kinematics.names)))
+    for k, values in enumerate(true):
+        X_WN = kinematics.poses(values)
+        masks = {one.name: draw_mask(body.few, one.X_CW @ X_WN, one) for one in cameras}
+        frames.append(SeenFrame(f"{k}", values + rng.normal(0.0, 0.02, len(values)), masks))
+    X_WC = cameras[1].X_WC.copy()
+    X_WC[:3, 3] += [0.02, -0.02, 0.02]
+    given = [cameras[0], cameras[1].with_pose(X_WC)]
+    nothing = np.zeros(len(kinematics.names), bool)
+    found = bundle_adjustment.adjust_bundle(kinematics, body.few, given, ("b",), frames, nothing)
+    (camera,), (covariance,) = found.cameras, found.covariances
+    shift, turn = errors(camera.X_WC, cameras[1].X_WC)
+    assert shift < 0.012
+    assert turn < np.radians(0.4)
+    assert np.abs(found.values - true).max() < 0.03
+    np.testing.assert_array_equal(found.girths, 1.0)
+    off = pose_difference(camera.X_WC, cameras[1].X_WC)
+    assert off @ np.linalg.solve(covariance, off) < 22.5
+
+
+def test_edges_are_as_fine_as_they_are_asked_for_and_a_pixel_at_most(posed: PosedFrames) -> None:
+    mask, camera = posed.frames[0].mask, posed.camera
+    frame = SeenFrame("0", posed.frames[0].values, {camera.name: mask})
+    counts = [len(frame.edges([camera], spacing).uv) for spacing in (0.2, 1.0, 2.0, 6.0)]
+    assert counts[0] == counts[1]
+    np.testing.assert_allclose(np.divide(counts[1], counts[2:]), [2.0, 6.0], rtol=0.05)

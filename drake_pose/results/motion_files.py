@@ -1,13 +1,24 @@
-"""What people who capture motion read: joint centres as CSV and TRC, positions as MOT, BVH."""
+"""What people who capture motion read: joint centres as CSV and TRC, positions as MOT, BVH.
+
+Of a BVH's skeleton, joints are the links that are seen or carry several such; a limb's far half
+whose length stays is left out. Rotations zero is the default pose with the captured lengths.
+Offsets are in centimetres, rotations in degrees, Z, X, Y; x forward, y up, z right, as in TRC. The
+root has position channels, and so has a part whose place changes: its offset is zero, so that all
+readers agree.
+"""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from io import StringIO
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.multibody.tree import PrismaticJoint
+from scipy.spatial.transform import Rotation
 
 from drake_pose.body.landmarks import (
     Landmark,
@@ -16,13 +27,21 @@ from drake_pose.body.landmarks import (
     load_landmarks,
 )
 from drake_pose.body.model import ArticulatedModel
+from drake_pose.body.tree.link_graph import PlantKinematics
 from drake_pose.csv_files import csv_text
-from drake_pose.results.bvh import motion_as_bvh
+from drake_pose.errors import SettingsError
 from drake_pose.results.folder import BVH, JOINT_CENTRES, MOT, TRC, write_file
-from drake_pose.results.poses import BASE_COLUMNS, PoseRow, base_cells, base_pose
-from drake_pose.results.records import user_units
+from drake_pose.results.records import BASE_COLUMNS, PoseRow, base_cells, base_pose, user_units
 
 Array = NDArray[np.float64]
+
+# Turns the scene's world, z up, into that of the file, y up; nothing is mirrored.
+R_YW = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+_CENTIMETRES = 100.0
+# A part stays where it is in the part before it if it moves by less [m].
+_STAYS = 1e-5
+_POSITIONS = ("Xposition", "Yposition", "Zposition")
+_ROTATIONS = ("Zrotation", "Xrotation", "Yrotation")
 
 
 def write_motion(
@@ -156,3 +175,156 @@ def positions_as_mot(
     text = StringIO()
     np.savetxt(text, np.column_stack(columns), "%.6f", "\t", header="\n".join(head), comments="")
     return text.getvalue()
+
+
+class SkeletonJoint(NamedTuple):
+    """A joint: its link ("world": where several parts stand), its parent's index (-1: root)."""
+
+    link: str
+    parent: int
+
+
+def skeleton_of(model: ArticulatedModel, q: Array) -> tuple[SkeletonJoint, ...]:
+    """The joints, parents before children; q (frames, nq) tells the lengths that stay the same."""
+    plant, names, seen = model.plant, model.link_names, model.link_meshes
+    # By body those that hang on it, by a length that stays, or by something that moves.
+    children: list[list[tuple[int, bool, bool]]] = [[] for _ in names]
+    for index in plant.GetJointIndices():
+        joint = plant.get_joint(index)
+        is_length = joint.type_name() == PrismaticJoint.kTypeName
+        stays = is_length and bool(np.ptp(q[:, joint.position_start()]) < _STAYS)
+        moves = joint.num_positions() > 0 and not stays
+        child = int(joint.child_body().index())
+        children[int(joint.parent_body().index())].append((child, stays, moves))
+    found: list[SkeletonJoint] = []
+
+    def branches(body: int) -> int:
+        """How many bodies hang on it that are seen or carry one that is."""
+        return sum(names[k] in seen or branches(k) > 0 for k, *_ in children[body])
+
+    def walk(body: int, parent: int, length: bool, motion: bool) -> None:
+        is_half = parent >= 0 and length and not motion and branches(body) > 0
+        if (names[body] in seen or branches(body) > 1) and not is_half:
+            found.append(SkeletonJoint(names[body], parent))
+            parent, length, motion = len(found) - 1, False, False
+        for child, stays, moves in children[body]:
+            walk(child, parent, length or stays, motion or moves)
+
+    walk(0, -1, False, False)
+    return tuple(found)
+
+
+def motion_as_bvh(
+    model: ArticulatedModel, q: Array, X_WB: Array | None, rate_hz: float
+) -> tuple[str, int]:
+    """The text of a BVH file of a motion, and how many of its frames were filled.
+
+    Args:
+        q: (frames, nq) positions [rad or m]; a frame of nan is filled by the last one known before
+            it, or by the first one known.
+        X_WB: (frames, 4, 4) poses of the plant's world in the scene's; None: the same world.
+        rate_hz: frames a second.
+
+    Raises:
+        SettingsError: no frame has a pose.
+    """
+    known = np.flatnonzero(np.isfinite(q).all(axis=1))
+    if not len(known):
+        raise SettingsError("a BVH file needs a frame with a pose; none has one")
+    skeleton = skeleton_of(model, q[known])
+    X_YL, X_Y0 = _link_poses(model, skeleton, q[known], None if X_WB is None else X_WB[known])
+    # What turns a joint's own axes into its link's is what its link shows at rest.
+    R_YJ = X_YL[..., :3, :3] @ np.swapaxes(X_Y0[:, :3, :3], 1, 2)
+    parents = [max(joint.parent, 0) for joint in skeleton]
+    R_PY = np.swapaxes(R_YJ[:, parents], 2, 3)
+    p_YL = X_YL[..., :3, 3]
+    p_PJ = (R_PY @ (p_YL - p_YL[:, parents])[..., None])[..., 0]
+    R_PJ = R_PY @ R_YJ
+    p_PJ[:, 0], R_PJ[:, 0] = p_YL[:, 0], R_YJ[:, 0]
+    offsets = p_PJ.mean(axis=0)
+    slides = np.abs(p_PJ - offsets).max(axis=(0, 2)) > _STAYS
+    slides[0] = True
+    offsets[slides] = 0.0
+    columns = [
+        np.hstack([*([_CENTIMETRES * p_PJ[:, k]] if slides[k] else []), _smooth_angles(R_PJ[:, k])])
+        for k in range(len(skeleton))
+    ]
+    rows = np.hstack(columns)
+    # The last known frame at or before each; the first known for those before it.
+    source = np.maximum(np.searchsorted(known, np.arange(len(q)), side="right") - 1, 0)
+    text = [
+        "HIERARCHY",
+        *_hierarchy(skeleton, offsets, slides, _tips(model, skeleton, X_Y0)),
+        "MOTION",
+        f"Frames: {len(q)}",
+        f"Frame Time: {1.0 / rate_hz:.8f}",
+        *(" ".join(f"{number:.6f}" for number in rows[k]) for k in source),
+    ]
+    return "\n".join(text) + "\n", len(q) - len(known)
+
+
+def _link_poses(
+    model: ArticulatedModel, skeleton: Sequence[SkeletonJoint], q: Array, X_WB: Array | None
+) -> tuple[Array, Array]:
+    """The joints' links in the file's world: (frames, n, 4, 4), and (n, 4, 4) at the defaults."""
+    kinematics = PlantKinematics(model)
+    bodies = [model.link_index(joint.link) for joint in skeleton]
+    X_YW = np.eye(4)
+    X_YW[:3, :3] = R_YW
+    X_BL = np.array([[kinematics.pose_at(body, row) for body in bodies] for row in q])
+    X_YB = X_YW if X_WB is None else (X_YW @ X_WB)[:, None]
+    return X_YB @ X_BL, X_YW @ np.array([kinematics.pose(body) for body in bodies])
+
+
+def _smooth_angles(R: Array) -> Array:
+    """(n, 3) rotations about Z, X, Y [deg] without jumps, of rotation matrices (n, 3, 3)."""
+    with warnings.catch_warnings():
+        # At 90 degrees about X one of the others is free: any choice is right.
+        warnings.filterwarnings("ignore", message="Gimbal lock", category=UserWarning)
+        angles = Rotation.from_matrix(R).as_euler("ZXY", degrees=True)
+    for k in range(1, len(angles)):
+        z, x, y = angles[k]
+        ways = np.array([(z, x, y), (z + 180.0, 180.0 - x, y + 180.0)])
+        ways -= 360.0 * np.round((ways - angles[k - 1]) / 360.0)
+        angles[k] = ways[np.argmin(np.abs(ways - angles[k - 1]).sum(axis=1))]
+    return np.asarray(angles)
+
+
+def _tips(model: ArticulatedModel, skeleton: Sequence[SkeletonJoint], X_Y0: Array) -> Array:
+    """(n, 3) the farthest point of each joint's link, along the file's axes at rest [m]."""
+    tips = np.zeros((len(skeleton), 3))
+    for k, joint in enumerate(skeleton):
+        mesh = model.link_meshes.get(joint.link)
+        if mesh is not None:
+            farthest = np.argmax(np.linalg.norm(mesh.vertices, axis=1))
+            tips[k] = X_Y0[k, :3, :3] @ mesh.vertices[farthest]
+    return tips
+
+
+def _hierarchy(
+    skeleton: Sequence[SkeletonJoint], offsets: Array, slides: NDArray[np.bool_], tips: Array
+) -> list[str]:
+    """The lines of the hierarchy."""
+    lines: list[str] = []
+
+    def write(k: int, depth: int) -> None:
+        name = "".join("_" if c.isspace() or c in "{}" else c for c in skeleton[k].link)
+        channels = (*(_POSITIONS if slides[k] else ()), *_ROTATIONS)
+        lines.append("\t" * depth + f"{'JOINT' if depth else 'ROOT'} {name}")
+        lines.append("\t" * depth + "{")
+        lines.append("\t" * (depth + 1) + _offset(offsets[k]))
+        lines.append("\t" * (depth + 1) + " ".join(["CHANNELS", str(len(channels)), *channels]))
+        below = [n for n, joint in enumerate(skeleton) if joint.parent == k]
+        for n in below:
+            write(n, depth + 1)
+        if not below:
+            ends = ("End Site", "{", "\t" + _offset(tips[k]), "}")
+            lines.extend("\t" * (depth + 1) + line for line in ends)
+        lines.append("\t" * depth + "}")
+
+    write(0, 0)
+    return lines
+
+
+def _offset(place: Array) -> str:
+    return " ".join(["OFFSET", *(f"{_CENTIMETRES * number:.6f}" for number in place)])

@@ -16,8 +16,7 @@ from drake_pose.body.model import ArticulatedModel
 from drake_pose.errors import OutputError, SettingsError
 from drake_pose.regular_files import digest, read_regular
 from drake_pose.results.folder import read_summary, require_empty
-from drake_pose.results.poses import PoseRow
-from drake_pose.results.records import FrameRecord
+from drake_pose.results.records import FrameRecord, PoseRow
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.results.texts import percent
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges

@@ -24,10 +24,12 @@ from drake_pose.results.folder import (
 )
 from drake_pose.results.motion_files import write_motion
 from drake_pose.results.overlay import draw_overlay, encode_png
-from drake_pose.results.poses import PoseRow, PoseTable, base_pose
 from drake_pose.results.records import (
     FrameRecord,
+    PoseRow,
+    PoseTable,
     SceneEstimate,
+    base_pose,
     family_table,
     joint_table,
 )

@@ -6,7 +6,7 @@ import pytest
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.errors import SettingsError
-from drake_pose.results.bvh import motion_as_bvh, skeleton_of
+from drake_pose.results.motion_files import motion_as_bvh, skeleton_of
 from tests.jobs.bvh_reader import read_bvh
 
 FRAMES = 6

@@ -6,7 +6,7 @@ import pytest
 
 from drake_pose.errors import OutputError
 from drake_pose.results.folder import read_summary, require_empty, write_file, write_summary
-from drake_pose.results.poses import PoseRow, PoseTable
+from drake_pose.results.records import PoseRow, PoseTable
 
 NAMES = ("a", "b")
 

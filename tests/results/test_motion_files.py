@@ -14,7 +14,7 @@ from drake_pose.results.motion_files import (
     positions_as_mot,
     write_motion,
 )
-from drake_pose.results.poses import BASE_COLUMNS, PoseRow
+from drake_pose.results.records import BASE_COLUMNS, PoseRow
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.jobs.bvh_reader import read_bvh
 from tests.jobs.scenes import write_scene

@@ -16,8 +16,7 @@ from drake_pose.jobs.live.run import LiveFrame, Mask
 from drake_pose.jobs.live.scene import LiveScene
 from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.recordings.persons_in_view import keep_person
-from drake_pose.results.poses import PoseRow
-from drake_pose.results.records import FrameRecord, SceneEstimate, record_deviations
+from drake_pose.results.records import FrameRecord, PoseRow, SceneEstimate, record_deviations
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.results.summary import describe_job
 from drake_pose.results.writer import ResultWriter

@@ -21,7 +21,7 @@ from drake_pose.jobs.estimate.inputs import missing_for_person
 from drake_pose.jobs.estimate.measurements import TrueAngles, frame_key, read_true_angles
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.person.shape import shape_parts
-from drake_pose.results.poses import base_pose
+from drake_pose.results.records import base_pose
 from drake_pose.results.settings import EstimateSettings
 
 Array = NDArray[np.float64]

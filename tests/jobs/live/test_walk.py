@@ -27,7 +27,7 @@ from drake_pose.jobs.live.walk import (
 )
 from drake_pose.person.date.walk_commands import SPEED
 from drake_pose.results.folder import write_summary
-from drake_pose.results.poses import PoseRow, PoseTable
+from drake_pose.results.records import PoseRow, PoseTable
 from drake_pose.systems.walk.garden import START
 from tests.cli import CliRunner
 

@@ -32,7 +32,7 @@ from drake_pose.systems.date.capture import PaperCapture, build_paper_capture
 from drake_pose.systems.date.preparation import prepare_paper_capture
 from drake_pose.systems.person.live_capture import SilhouetteCapture, build_silhouette_capture
 from drake_pose.systems.pictures.camera_rig import CameraRig, build_camera_rig
-from drake_pose.systems.staged_diagram import StagedDiagram
+from drake_pose.systems.ports import StagedDiagram
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]

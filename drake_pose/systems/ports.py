@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -13,6 +14,7 @@ from pydrake.systems.framework import (
     CacheEntry,
     Context,
     DependencyTicket,
+    Diagram,
     DiagramBuilder,
     DiscreteValues,
     EventStatus,
@@ -64,6 +66,24 @@ def export_outputs(builder: DiagramBuilder, system: System) -> None:
 def evaluate(port: OutputPort, context: Context) -> Any:
     """What an output port of a system inside a diagram gives; context: the diagram's."""
     return port.Eval(port.get_system().GetMyContextFromRoot(context))
+
+
+@dataclass(frozen=True, eq=False)
+class StagedDiagram:
+    """A diagram, and what is computed in it before its state is updated.
+
+    Args:
+        stages: the output ports of each stage, in their order: whoever evaluates one after the
+            other sees what each costs.
+    """
+
+    diagram: Diagram
+    stages: Mapping[str, tuple[OutputPort, ...]]
+
+    def evaluate(self, context: Context, stage: str) -> None:
+        """Have a stage, one of stages, compute what it has not computed yet."""
+        for port in self.stages[stage]:
+            evaluate(port, context)
 
 
 class PortedSystem(LeafSystem):

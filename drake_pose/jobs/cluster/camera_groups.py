@@ -17,8 +17,7 @@ from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecificat
 from drake_pose.errors import ClusterError, DrakePoseError
 from drake_pose.jobs.cluster import camera_worker
 from drake_pose.jobs.cluster.camera_worker import WatchReply, host_of
-from drake_pose.jobs.cluster.lines import Line, Listening
-from drake_pose.jobs.cluster.remote_keeper import RemoteKeeper
+from drake_pose.jobs.cluster.lines import Line, Listening, RemoteKeeper
 from drake_pose.jobs.cluster.worker import worker_resources
 
 if TYPE_CHECKING:

@@ -26,8 +26,7 @@ from drake_pose.fit.camera_sums import (
     unpack_surfaces,
 )
 from drake_pose.fit.evidence import NO_EDGE, EdgePoints, pack_evidence
-from drake_pose.jobs.cluster.lines import Listening, serve
-from drake_pose.jobs.cluster.remote_keeper import SURFACES
+from drake_pose.jobs.cluster.lines import SURFACES, Listening, serve
 from drake_pose.person.views import pack_view, see_silhouette
 from drake_pose.silhouette.areas.outline import PackedOutlines
 from drake_pose.silhouette.segmentation.background import (

@@ -31,8 +31,13 @@ from drake_pose.systems.date.stages import (
     PoseRecogniser,
     ViewPorts,
 )
-from drake_pose.systems.ports import MemorySystem, connect_same, export_outputs, require_period
-from drake_pose.systems.staged_diagram import StagedDiagram
+from drake_pose.systems.ports import (
+    MemorySystem,
+    StagedDiagram,
+    connect_same,
+    export_outputs,
+    require_period,
+)
 
 Array = NDArray[np.float64]
 

@@ -15,8 +15,7 @@ from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.errors import ClusterError
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.jobs.cluster.camera_worker import EdgeServer
-from drake_pose.jobs.cluster.lines import Line, serve
-from drake_pose.jobs.cluster.remote_keeper import RemoteKeeper
+from drake_pose.jobs.cluster.lines import Line, RemoteKeeper, serve
 from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.views import FrameViews, KeptEdge, pack_view, see_silhouette, unpack_view
 from drake_pose.silhouette.areas.scoring import draw_mask
@@ -164,7 +163,7 @@ def test_nobody_waits_for_the_silent(world, closed):
 
 
 def test_who_does_not_know_the_key_is_not_answered(world, closed, monkeypatch):
-    monkeypatch.setattr("drake_pose.jobs.cluster.remote_keeper._CONNECTING", 0.3)
+    monkeypatch.setattr("drake_pose.jobs.cluster.lines._CONNECTING", 0.3)
     asked, reports = [], []
     listening = serve(HOST, [asked.append], closed)
     keeper = RemoteKeeper(world.names[:2], reports.append)

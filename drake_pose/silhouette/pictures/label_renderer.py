@@ -8,11 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from pydrake.geometry import (
-    FrameId,
-    FramePoseVector,
     MakeRenderEngineVtk,
     RenderEngineVtkParams,
-    Role,
     SceneGraph,
 )
 from pydrake.math import RigidTransform, RotationMatrix
@@ -54,7 +51,8 @@ class LabelRenderer:
         self._plant.Finalize()
         self._plant_context = self._plant.CreateDefaultContext()
         self._context = self._scene_graph.CreateDefaultContext()
-        self._corners = self._find_corners()
+        meshes = model.link_meshes.items()
+        self._vertices = [(labels[name], mesh.vertices) for name, mesh in meshes]
         self._world = self._scene_graph.world_frame_id()
 
     @property
@@ -81,7 +79,7 @@ class LabelRenderer:
         port.FixValue(self._context, self._skin.configuration(p_B))
         depths = None
         if isinstance(self.camera, ParallelCamera):
-            depths = self._depths(poses, p_B, X_BW.inverse().GetAsMatrix4())
+            depths = self._depths(q, p_B, self.camera.X_CW @ X_BW.inverse().GetAsMatrix4())
         color, _, X_WC = camera_to_drake(self.camera, renderer_name=_RENDERER, depth_range=depths)
         query = self._scene_graph.get_query_output_port().Eval(self._context)
         image = query.RenderLabelImage(color, self._world, X_BW @ X_WC)
@@ -116,34 +114,14 @@ class LabelRenderer:
             raise ValueError(f"q must be ({self._plant.num_positions()},) finite numbers")
         self._plant.SetPositions(self._plant_context, positions)
 
-    def _find_corners(self) -> list[tuple[FrameId, np.ndarray]]:
-        """Returns the corners (8, 3) of a box around every drawn shape, in its frame."""
-        inspector = self._scene_graph.model_inspector()
-        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-        corners = []
-        for shape in inspector.GetAllGeometryIds(Role.kPerception):
-            box = inspector.GetObbInGeometryFrame(shape)
-            X_FG = inspector.GetPoseInFrame(shape)
-            if box is None:
-                continue
-            points = (X_FG @ box.pose()).multiply((signs * box.half_width()).T).T
-            corners.append((inspector.GetFrameId(shape), points))
-        return corners
-
     def _depths(
-        self, poses: FramePoseVector, bands: Sequence[np.ndarray], X_WB: np.ndarray
+        self, q: np.ndarray, bands: Sequence[np.ndarray], X_CB: np.ndarray
     ) -> tuple[float, float]:
         """Returns the least and greatest depth of the body in the camera [m], with a margin."""
-        nearest, farthest = np.inf, -np.inf
-        X_CB = self.camera.X_CW @ X_WB
-        for frame, p_F in self._corners:
-            X_BF = np.eye(4) if frame == self._world else poses.value(frame).GetAsMatrix4()
-            row = (X_CB @ X_BF)[2]
-            depth = p_F @ row[:3] + row[3]
-            nearest, farthest = min(nearest, depth.min()), max(farthest, depth.max())
-        for p_B in bands:
-            depth = p_B @ X_CB[2, :3] + X_CB[2, 3]
-            nearest, farthest = min(nearest, depth.min()), max(farthest, depth.max())
-        if nearest > farthest:
+        X_BL = self.link_poses(q)
+        placed = [(X_CB @ X_BL[label], p_L) for label, p_L in self._vertices]
+        placed += [(X_CB, p_B) for p_B in bands]
+        if not placed:
             return -1.0, 1.0
-        return nearest - _DEPTH_MARGIN, farthest + _DEPTH_MARGIN
+        depths = np.concatenate([p @ X[2, :3] + X[2, 3] for X, p in placed])
+        return float(depths.min()) - _DEPTH_MARGIN, float(depths.max()) + _DEPTH_MARGIN

@@ -124,16 +124,12 @@ class Frame(NamedTuple):
     masks: list[Mask]
 
 
-@dataclass(frozen=True, eq=False)
-class Outcome:
+class Outcome(NamedTuple):
     """How one sequence was followed.
 
-    Args:
-        errors: (frames, joints) of joints [degrees], or of a person's joint centres [mm].
-        deviations: (frames, joints) as the tracker says [degrees]; nan of a person.
-        lost: (frames,) whether the track was said to be.
-        milliseconds: of the processor, for a frame.
-        limit: what is wrong is off by more.
+    errors: (frames, joints) of joints [degrees], or of a person's joint centres [mm]; deviations:
+    the same as the tracker says, nan of a person; lost: (frames,) whether the track was said to be;
+    milliseconds: of the processor, a frame; limit: what is wrong is off by more.
     """
 
     errors: Array
@@ -208,29 +204,27 @@ class ColourScene:
                 4, radius=2.6, field_of_view=field, face_camera=False, size=size
             )
         else:
-            focal, centre = _FOCAL * size[1], (size[0] / 2 - 0.5, size[1] / 2 - 0.5)
-            self.cameras = {
-                f"camera{k}": PinholeCamera(
-                    f"camera{k}", *size, focal, focal, *centre, look_at(eye, (0.0, 0.0, 0.5))
-                )
-                for k, eye in enumerate(_EYES)
-            }
+            lens = (_FOCAL * size[1],) * 2 + (size[0] / 2 - 0.5, size[1] / 2 - 0.5)
+            poses = {f"camera{k}": look_at(eye, (0.0, 0.0, 0.5)) for k, eye in enumerate(_EYES)}
+            self.cameras = {n: PinholeCamera(n, *size, *lens, X) for n, X in poses.items()}
         builder = DiagramBuilder()
         self._plant, self._scene = AddMultibodyPlantSceneGraph(builder, 0.0)
         model.add_to(self._plant, self._scene)
         self._paint(model)
         self._add_walls()
-        self._boxes = [self._add_box(k) for k in range(room.boxes)]
-        self._post = self._add_post() if room.post else None
+        self._boxes = []
+        for k in range(room.boxes):
+            shape, colour = Box(*self._rng.uniform(0.3, 0.9, 3)), self._rng.random(3)
+            self._boxes.append(self._add_body(f"box{k}", shape, colour))
+        self._post = None
+        if room.post:
+            self._post = self._add_body("post", Cylinder(0.05, 1.5), (0.2, 0.5, 0.25))
         lights = [
-            LightParameter(
-                type="directional", frame="world", direction=list(direction), intensity=strength
-            )
-            for direction, strength in _LIGHTS
+            LightParameter(type="directional", frame="world", direction=list(way), intensity=much)
+            for way, much in _LIGHTS
         ]
-        self._scene.AddRenderer(
-            _RENDERER, MakeRenderEngineVtk(RenderEngineVtkParams(lights=lights))
-        )
+        engine = MakeRenderEngineVtk(RenderEngineVtkParams(lights=lights))
+        self._scene.AddRenderer(_RENDERER, engine)
         self._plant.Finalize()
         # An arm that stands on a floating base stays there.
         bases = [self._plant.get_body(k) for k in self._plant.GetFloatingBaseBodies()]
@@ -242,7 +236,9 @@ class ColourScene:
         """The frames of the motion, drawn one by one."""
         draw_swing = person_swing if is_person(self._model) else arm_swing
         middle, amplitude, speed, phase = draw_swing(self._model, self._rng)
-        paths = self._draw_paths()
+        # Of each box: the middle and the amplitude [m], speed [rad/s] and phase [rad].
+        ends = ((-2.5, 2.5), (0.5, 1.5), (1.0, 2.5), (0.0, 6.0))
+        paths = [[self._rng.uniform(*end, 3) for end in ends] for _ in self._boxes]
         context = self._diagram.CreateDefaultContext()
         own = self._plant.GetMyMutableContextFromRoot(context)
         query = self._scene.get_query_output_port()
@@ -273,19 +269,6 @@ class ColourScene:
             pictures.append(picture)
             masks.append((labels < int(_OTHERS) // 2) & (labels >= 0))
         return Frame(q, pictures, masks)
-
-    def _draw_paths(self) -> list[Swing]:
-        """Of each box: the middle and the amplitude [m], speed [rad/s] and phase [rad]."""
-        rng = self._rng
-        return [
-            (
-                rng.uniform(-2.5, 2.5, 3) + np.array([0.0, 0.0, 1.0]),
-                rng.uniform(0.5, 1.5, 3),
-                rng.uniform(1.0, 2.5, 3),
-                rng.uniform(0.0, 6.0, 3),
-            )
-            for _ in self._boxes
-        ]
 
     def _paint(self, model: ArticulatedModel) -> None:
         """Gives the arm's links colours in turn."""
@@ -321,31 +304,20 @@ class ColourScene:
         for k, (sides, place) in enumerate(_WALLS):
             path = self._folder / f"wall{k}.png"
             _write_texture(path, self._rng, self._room.grey)
-            self._show(
-                self._plant.world_body(), RigidTransform(place), Box(*sides), (1.0,) * 3, path
-            )
+            world = self._plant.world_body()
+            self._show(world, RigidTransform(place), Box(*sides), (1.0,) * 3, path)
 
-    def _add_body(self, name: str) -> RigidBody:
+    def _add_body(self, name: str, shape: Shape, colour: Sequence[float]) -> RigidBody:
         inertia = SpatialInertia.SolidBoxWithDensity(1.0, 0.1, 0.1, 0.1)
-        return self._plant.AddRigidBody(name, self._plant.AddModelInstance(name), inertia)
-
-    def _add_box(self, number: int) -> RigidBody:
-        body = self._add_body(f"box{number}")
-        shape = Box(*self._rng.uniform(0.3, 0.9, 3))
-        colour = self._rng.random(3)
-        self._show(body, RigidTransform(), shape, tuple(colour))
-        return body
-
-    def _add_post(self) -> RigidBody:
-        body = self._add_body("post")
-        self._show(body, RigidTransform(), Cylinder(0.05, 1.5), (0.2, 0.5, 0.25))
+        body = self._plant.AddRigidBody(name, self._plant.AddModelInstance(name), inertia)
+        self._show(body, RigidTransform(), shape, colour)
         return body
 
 
-def _behind(path: Swing, moment: float) -> Array:
+def _behind(path: Sequence[Array], moment: float) -> Array:
     """(3,) where a box is at a moment [s]: on the far side of the arm [m]."""
     middle, amplitude, speed, phase = path
-    p_W = middle + amplitude * np.sin(speed * moment + phase)
+    p_W = middle + [0.0, 0.0, 1.0] + amplitude * np.sin(speed * moment + phase)
     angle = np.pi + 0.8 * (np.arctan2(p_W[1], p_W[0]) % np.pi - np.pi / 2)
     return np.array([2.2 * np.cos(angle), 2.2 * np.sin(angle), p_W[2]])
 

@@ -151,12 +151,7 @@ class ContourFit:
     """Fits the values of a body's pose tree to the silhouettes of several cameras.
 
     Attributes:
-        tree: the pose tree.
-        kinematics: its kinematics; `names` are the values'.
-        outlines: a surface for each node.
         lower, upper: (m,) limits; infinite for angles that turn freely.
-        noise: what a point of contour is worth.
-        steps: how steps are made.
 
     Args:
         tree: the body's pose tree, or its kinematics.
@@ -207,7 +202,7 @@ class ContourFit:
 
         def add_up(placement: Placement, step: AnnealingStage) -> CameraSum:
             weights = self.weights(views.cameras, placement, step)
-            return add_cameras(*compare_placed(placement.packed, placement.X_WN, views, weights))
+            return compare_views(views, placement, weights).total
 
         return self.fit_sums(add_up, values, rounds, prior, held)
 
@@ -248,7 +243,9 @@ class ContourFit:
 
     def compare(self, views: Views, theta: Array, step: AnnealingStage) -> Comparison:
         """The contours at values (m,), or at all parameters, compared with all cameras' edges."""
-        return compare_views(self.body, views, theta, step, self.noise, self._pixels)
+        placement = self.body.place(theta)
+        weights = self.weights(views.cameras, placement, step)
+        return compare_views(views, placement, weights)
 
     def piece_costs(self, views: Views, theta: Array, step: AnnealingStage, side: float) -> Array:
         """(cameras, k, k) the cost at values (m,) by squares of the pictures of a side [pixel]."""
@@ -264,26 +261,8 @@ class ContourFit:
         return camera_weights(cameras, placement, step, self.noise, self._pixels)
 
 
-def compare_views(
-    body: BodyParameters,
-    views: Views,
-    theta: Array,
-    step: AnnealingStage,
-    noise: Noise,
-    pixels: float | Array | None = None,
-) -> Comparison:
-    """A body's contours compared with all cameras' edges.
-
-    Args:
-        body: the body.
-        views: what all cameras say.
-        theta: (m,) its tree's values, or all its parameters (n,).
-        step: scale and spacing.
-        noise: what a point of contour is worth.
-        pixels: of the unit of length, of all cameras or (c,); None: the metre's at the root.
-    """
-    placement = body.place(theta)
-    weights = camera_weights(views.cameras, placement, step, noise, pixels)
+def compare_views(views: Views, placement: Placement, weights: Array) -> Comparison:
+    """A body's contours, where it stands, compared with all cameras' edges."""
     return Comparison(*compare_placed(placement.packed, placement.X_WN, views, weights), placement)
 
 
@@ -294,7 +273,10 @@ def camera_weights(
     noise: Noise,
     pixels: float | Array | None = None,
 ) -> Array:
-    """(c, 4) of cameras, as `compare_contours` takes them; arguments as of compare_views."""
+    """(c, 4) of cameras, as `compare_contours` takes them.
+
+    ``pixels``: of the unit of length, of all cameras or (c,); None: the metre's at the root.
+    """
     if pixels is None:
         size = pixels_per_metre(cameras, placement.X_WN[0, :3, 3])
     else:

@@ -28,6 +28,7 @@ from drake_pose.fit.colours import (
 from drake_pose.fit.contour_fit import (
     Comparison,
     Noise,
+    camera_weights,
     compare_views,
     normal_equations,
     pack_views,
@@ -198,7 +199,9 @@ class ContourObservation(BodyState):
     ) -> tuple[Comparison, float] | None:
         """Contours compared with so wide a scale [pixel], and how far they are apart [pixel]."""
         step = AnnealingStage(width, SPACING)
-        compared = compare_views(self._body, seen.views, self.parameters(x), step, _PLAIN, 1.0)
+        placed = self._body.place(self.parameters(x))
+        weights = camera_weights(seen.views.cameras, placed, step, _PLAIN, 1.0)
+        compared = compare_views(seen.views, placed, weights)
         if seen.colours is not None and seen.has_pictures:
             pixels = step_of_lines(number)
             # Coarse lines are so wide that they would say the same.

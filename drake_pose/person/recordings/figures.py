@@ -7,7 +7,7 @@ exchanged picture mends is faulty.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from typing import NamedTuple
@@ -77,8 +77,13 @@ def find_rig_fault(
     if unfilled < _UNFILLED:
         return None
     best, least = RigFault((), (), filled), unfilled
-    for mirrored, exchanged in _guesses(cameras, list(filled)):
-        guess = RigFault(mirrored, exchanged, filled)
+    sizes = {name: (cameras[name].width, cameras[name].height) for name in filled}
+    pairs = [pair for pair in combinations(filled, 2) if sizes[pair[0]] == sizes[pair[1]]]
+    mirrored = [tuple(filled), *((name,) for name in filled)]
+    for guess in (
+        *(RigFault(names, (), filled) for names in mirrored),
+        *(RigFault((), pair, filled) for pair in pairs),
+    ):
         left = 1.0 - float(np.mean(list(hulls.filled(frames, guess).values())))
         if left < least:
             best, least = guess, left
@@ -87,17 +92,21 @@ def find_rig_fault(
     return RigFault((), (), filled) if unfilled > _CONTRADICTING else None
 
 
-def _guesses(
-    cameras: Mapping[str, Camera], names: Sequence[str]
-) -> Iterator[tuple[tuple[str, ...], tuple[str, ...]]]:
-    """Which cameras may be mirrored, or exchanged."""
-    yield tuple(names), ()
-    for name in names:
-        yield (name,), ()
-    for one, other in combinations(names, 2):
-        a, b = cameras[one], cameras[other]
-        if (a.width, a.height) == (b.width, b.height):
-            yield (), (one, other)
+class _Seen(NamedTuple):
+    """Where a camera sees a grid's points (n,), in cells (h, w) of so many pixels; -1: nowhere."""
+
+    cells: NDArray[np.int64]
+    shape: tuple[int, int]
+    pixels: float
+
+    def touched(self, mask: Mask) -> Mask:
+        """Which cells (h, w) a mask (H, W) touches."""
+        height, width = self.shape
+        size = int(np.ceil(height * self.pixels)), int(np.ceil(width * self.pixels))
+        padded = np.zeros(size, np.float32)
+        padded[: mask.shape[0], : mask.shape[1]] = mask
+        small = cv2.resize(padded, (width, height), interpolation=cv2.INTER_AREA)
+        return np.asarray(small > 0.25)
 
 
 class _Hulls:
@@ -105,7 +114,7 @@ class _Hulls:
 
     def __init__(self, cameras: Mapping[str, Camera]) -> None:
         self._cameras = cameras
-        self._views: dict[tuple[str, tuple[int, ...]], _HullView] = {}
+        self._seen: dict[tuple[str, tuple[int, ...]], _Seen] = {}
 
     def filled(self, frames: Sequence[Mapping[str, Mask]], guess: RigFault) -> dict[str, float]:
         """What share of the silhouettes the hull can fill, by camera, if a guess is undone."""
@@ -115,60 +124,42 @@ class _Hulls:
             used = [self._cameras[name] for name in masks]
             middles = [find_figures(mask)[0].middle for mask in masks.values()]
             cell = tuple(int(k) for k in np.rint(triangulate(used, middles) / _LATTICE))
-            views = [self._view(name, cell) for name in masks]
-            seen = [view.cells(mask) for view, mask in zip(views, masks.values(), strict=True)]
-            allowed = [view.inside(cells) for view, cells in zip(views, seen, strict=True)]
-            inside = np.logical_and.reduce(allowed)
-            for name, view, cells in zip(masks, views, seen, strict=True):
-                shares.setdefault(name, []).append(view.filled(cells, inside))
+            views = [self._look(name, cell) for name in masks]
+            touched = [one.touched(mask) for one, mask in zip(views, masks.values(), strict=True)]
+            # What touched cells and those beside them allow, and all that is not seen.
+            inside = np.logical_and.reduce(
+                [
+                    (one.cells < 0) | _grown(own).ravel()[one.cells]
+                    for one, own in zip(views, touched, strict=True)
+                ]
+            )
+            for name, one, own in zip(masks, views, touched, strict=True):
+                hull = np.zeros(own.size, dtype=np.bool_)
+                chosen = one.cells[inside]
+                hull[chosen[chosen >= 0]] = True
+                fills = _grown(hull.reshape(own.shape)) & own
+                shares.setdefault(name, []).append(fills.sum() / own.sum() if own.any() else 1.0)
         return {name: float(np.mean(own)) for name, own in shares.items()}
 
-    def _view(self, name: str, cell: tuple[int, ...]) -> _HullView:
-        if (name, cell) not in self._views:
+    def _look(self, name: str, cell: tuple[int, ...]) -> _Seen:
+        """What a camera sees of the grid about a cell of the lattice."""
+        if (name, cell) not in self._seen:
+            camera = self._cameras[name]
             side, height = (np.arange(-end, end, _SPACING) for end in (_SIDE, _HEIGHT))
-            grid = np.stack(np.meshgrid(side, side, height, indexing="ij"), axis=-1)
-            points = grid.reshape(-1, 3) + _LATTICE * np.array(cell, dtype=np.float64)
-            self._views[name, cell] = _HullView(self._cameras[name], points)
-        return self._views[name, cell]
-
-
-class _HullView:
-    """A camera's share in the hull of a grid's points (n, 3) [m]; a cell is a point's size."""
-
-    def __init__(self, camera: Camera, points: Array) -> None:
-        uv, depth = camera.project(points)
-        self._reach = max(1.0, _SPACING * pixels_per_metre(camera, points.mean(axis=0)))
-        self._shape = (
-            int(np.ceil(camera.height / self._reach)),
-            int(np.ceil(camera.width / self._reach)),
-        )
-        with np.errstate(invalid="ignore"):
-            cells = np.floor((uv + 0.5) / self._reach)
-            seen = (depth > 0.0) & (cells >= 0).all(axis=1)
-            seen &= (cells[:, 0] < self._shape[1]) & (cells[:, 1] < self._shape[0])
-        column, row = np.nan_to_num(cells).T
-        self._cells = np.where(seen, row * self._shape[1] + column, -1).astype(np.int64)
-
-    def cells(self, mask: Mask) -> Mask:
-        """Which cells (h, w) a mask (H, W) touches."""
-        height, width = self._shape
-        size = int(np.ceil(height * self._reach)), int(np.ceil(width * self._reach))
-        padded = np.zeros(size, np.float32)
-        padded[: mask.shape[0], : mask.shape[1]] = mask
-        small = cv2.resize(padded, (width, height), interpolation=cv2.INTER_AREA)
-        return np.asarray(small > 0.25)
-
-    def inside(self, cells: Mask) -> Mask:
-        """Which points (n,) cells (h, w) and those beside them allow; all that are not seen."""
-        return np.asarray(np.where(self._cells < 0, True, _grown(cells).ravel()[self._cells]))
-
-    def filled(self, cells: Mask, inside: Mask) -> float:
-        """What share of the cells (h, w) the points that are inside (n,) fill."""
-        found = np.zeros(cells.size, dtype=np.bool_)
-        chosen = self._cells[inside]
-        found[chosen[chosen >= 0]] = True
-        total = int(cells.sum())
-        return float((_grown(found.reshape(cells.shape)) & cells).sum()) / total if total else 1.0
+            grid = np.stack(np.meshgrid(side, side, height, indexing="ij"), axis=-1).reshape(-1, 3)
+            points = grid + _LATTICE * np.array(cell, dtype=np.float64)
+            uv, depth = camera.project(points)
+            # A cell is as large as the grid is fine.
+            pixels = max(1.0, _SPACING * pixels_per_metre(camera, points.mean(axis=0)))
+            shape = int(np.ceil(camera.height / pixels)), int(np.ceil(camera.width / pixels))
+            with np.errstate(invalid="ignore"):
+                place = np.floor((uv + 0.5) / pixels)
+                seen = (depth > 0.0) & (place >= 0).all(axis=1)
+                seen &= (place < shape[::-1]).all(axis=1)
+            column, row = np.nan_to_num(place).T
+            cells = np.where(seen, row * shape[1] + column, -1).astype(np.int64)
+            self._seen[name, cell] = _Seen(cells, shape, pixels)
+        return self._seen[name, cell]
 
 
 def _grown(cells: Mask) -> Mask:

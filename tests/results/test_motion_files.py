@@ -1,17 +1,21 @@
 import csv
 import io
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.landmarks import load_landmarks
-from drake_pose.body.model import load_model
+from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.errors import SettingsError
 from drake_pose.results.motion_files import (
     centres_as_csv,
     centres_as_trc,
     joint_centres,
+    motion_as_bvh,
     positions_as_mot,
+    skeleton_of,
     write_motion,
 )
 from drake_pose.results.records import BASE_COLUMNS, PoseRow
@@ -108,3 +112,159 @@ def test_mot_is_in_degrees(person, q):
     assert float(row["left_forearm_x"]) == pytest.approx(-90.0)
     assert float(row["position_z"]) == pytest.approx(1.5)
     assert float(row["time"]) == pytest.approx(0.02)
+
+
+FRAMES = 6
+RATE_HZ = 50.0
+
+
+def open_model(name: str) -> ArticulatedModel:
+    folder, file = name.split("/")
+    return load_model(bundled_model(folder).with_name(file), check=False)
+
+
+def random_positions(model: ArticulatedModel, rng: np.random.Generator) -> np.ndarray:
+    """Anywhere within the limits; lengths but the root's are the same in every frame."""
+    lower = np.clip(model.lower, -3.0, 3.0)
+    upper = np.clip(model.upper, -3.0, 3.0)
+    q = rng.uniform(lower, upper, (FRAMES, len(lower)))
+    for k, (name, kind) in enumerate(zip(model.position_names, model.position_kinds, strict=True)):
+        if kind == "length" and not name.startswith("position_"):
+            q[:, k] = q[0, k]
+    return q
+
+
+def link_places(model: ArticulatedModel, link: str, q: np.ndarray) -> np.ndarray:
+    """(frames, 3) where the plant has a link's origin, in the file's axes [cm]."""
+    context = model.plant.CreateDefaultContext()
+    found = []
+    for row in q:
+        model.plant.SetPositions(context, row)
+        pose = model.plant.GetBodyByName(link).EvalPoseInWorld(context)
+        x, y, z = pose.translation()
+        found.append([100.0 * x, 100.0 * z, -100.0 * y])
+    return np.array(found)
+
+
+@pytest.mark.parametrize(
+    "name", ["person/person.urdf", "person/person_shape.urdf", "hand/hand.urdf"]
+)
+def test_the_file_has_every_link_where_the_plant_has_it(name: str) -> None:
+    model = open_model(name)
+    q = random_positions(model, np.random.default_rng(5))
+    text, filled = motion_as_bvh(model, q, None, RATE_HZ)
+    motion = read_bvh(text)
+    places = motion.places()
+    assert filled == 0
+    assert motion.frame_time == pytest.approx(1.0 / RATE_HZ)
+    links = [joint.link for joint in skeleton_of(model, q)]
+    # Every part that is seen, but for the lower half of a limb, whose place is the upper half's.
+    assert set(links) == {link for link in model.link_meshes if not link.endswith("_end")}
+    for link in links:
+        error = places[link] - link_places(model, link, q)
+        assert np.linalg.norm(error, axis=1).max() < 0.01, link
+    root, *others = [joint for joint in motion.joints if joint.channels]
+    assert root.channels == [
+        "Xposition", "Yposition", "Zposition", "Zrotation", "Xrotation", "Yrotation"
+    ]  # fmt: skip
+    assert all(joint.channels == ["Zrotation", "Xrotation", "Yrotation"] for joint in others)
+
+
+def test_the_skeleton_at_rest_stands_as_the_model_does_with_the_captured_lengths() -> None:
+    model = open_model("person/person_shape.urdf")
+    q = np.tile(model.default_positions, (2, 1))
+    q[:, model.position_index("left_thigh_stretch")] = 0.05
+    q[1, model.position_index("left_shin_x")] = 1.0
+    motion = read_bvh(motion_as_bvh(model, q, None, RATE_HZ)[0])
+    for joint in motion.joints:
+        if joint.name in model.link_names and joint.parent >= 0:
+            parent = motion.joints[joint.parent].name
+            rest = link_places(model, joint.name, q[:1]) - link_places(model, parent, q[:1])
+            np.testing.assert_allclose(joint.offset, rest[0], atol=1e-3)
+    # Up is y: the head above the feet, the toes before the heels.
+    places = motion.places()
+    assert places["head"][0, 1] - places["left_foot"][0, 1] > 100.0
+    assert places["left_foot_end"][0, 0] - places["left_foot"][0, 0] > 5.0
+
+
+def test_a_part_that_slides_in_time_has_position_channels_and_no_offset(tmp_path: Path) -> None:
+    path = tmp_path / "lift.urdf"
+    path.write_text(LIFT)
+    model = load_model(path, check=False)
+    q = np.array([[0.1, 0.5, 0.02], [0.3, -0.4, 0.02], [0.2, 0.1, 0.07]])
+    motion = read_bvh(motion_as_bvh(model, q, None, RATE_HZ)[0])
+    places = motion.places()
+    by_name = {joint.name: joint for joint in motion.joints}
+    assert len(by_name["carriage"].channels) == 6
+    assert not by_name["carriage"].offset.any()
+    assert len(by_name["left_finger"].channels) == 6
+    for link in ("mast", "carriage", "arm", "left_finger"):
+        np.testing.assert_allclose(places[link], link_places(model, link, q), atol=0.01)
+
+
+def test_several_parts_in_the_world_hang_on_it(tmp_path: Path) -> None:
+    path = tmp_path / "two.urdf"
+    parts = "".join(TWO.format(name=name, x=x) for name, x in (("a", 0.0), ("b", 1.0)))
+    path.write_text(f'<robot name="two"><link name="world"/>{parts}</robot>')
+    model = load_model(path, check=False)
+    q = np.array([[0.2, -0.3], [0.4, 0.1]])
+    motion = read_bvh(motion_as_bvh(model, q, None, RATE_HZ)[0])
+    assert [joint.name for joint in motion.joints if joint.channels] == ["world", "a", "b"]
+    np.testing.assert_allclose(motion.places()["b"], [[100.0, 100.0, 0.0]] * 2, atol=0.01)
+
+
+def test_the_base_pose_moves_the_file() -> None:
+    model = open_model("hand/hand.urdf")
+    q = np.tile(model.default_positions, (2, 1))
+    X_WB = np.tile(np.eye(4), (2, 1, 1))
+    X_WB[1, :3, 3] = [0.1, 0.2, 0.3]
+    X_WB[1, :3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    places = read_bvh(motion_as_bvh(model, q, X_WB, RATE_HZ)[0]).places()
+    x, y, z = places["palm"][0]
+    # 90 degrees about the vertical, and a step: x forward, z right, y up.
+    np.testing.assert_allclose(places["palm"][1], [z + 10.0, y + 30.0, -x - 20.0], atol=0.01)
+
+
+def test_frames_without_a_pose_are_filled_by_the_last_known_one() -> None:
+    model = open_model("person/person.urdf")
+    q = random_positions(model, np.random.default_rng(6))
+    whole = read_bvh(motion_as_bvh(model, q, None, RATE_HZ)[0])
+    q[[0, 3, 4]] = np.nan
+    text, filled = motion_as_bvh(model, q, None, RATE_HZ)
+    gaps = read_bvh(text)
+    assert filled == 3
+    for name, places in gaps.places().items():
+        expected = whole.places()[name][[1, 1, 2, 2, 2, 5]]
+        np.testing.assert_allclose(places, expected, atol=0.01)
+    with pytest.raises(SettingsError, match="a frame with a pose"):
+        motion_as_bvh(model, np.full_like(q, np.nan), None, RATE_HZ)
+
+
+def test_a_turn_past_half_a_circle_does_not_jump() -> None:
+    model = open_model("person/person.urdf")
+    q = np.tile(model.default_positions, (40, 1))
+    q[:, model.position_index("head_y")] = np.linspace(2.0, 4.5, 40)
+    q[:, model.position_index("head_x")] = np.linspace(-0.9, 0.9, 40)
+    motion = read_bvh(motion_as_bvh(model, q, None, RATE_HZ)[0])
+    assert np.abs(np.diff(motion.rows[:, 3:], axis=0)).max() < 15.0
+
+
+LIFT = """<robot name="lift">
+  <link name="mast"><visual><geometry><box size="0.1 0.1 1"/></geometry></visual></link>
+  <link name="carriage"><visual><geometry><box size="0.2 0.2 0.1"/></geometry></visual></link>
+  <link name="arm"><visual><geometry><box size="0.5 0.1 0.1"/></geometry></visual></link>
+  <link name="left_finger"><visual><geometry><box size="0.1 0.02 0.02"/></geometry></visual></link>
+  <link name="world"/>
+  <joint name="bolt" type="fixed"><parent link="world"/><child link="mast"/>
+    <origin xyz="1 0 0.5" rpy="0 0 0.3"/></joint>
+  <joint name="height" type="prismatic"><parent link="mast"/><child link="carriage"/>
+    <origin xyz="0.1 0 0"/><axis xyz="0 0 1"/><limit lower="0" upper="0.5"/></joint>
+  <joint name="swing" type="revolute"><parent link="carriage"/><child link="arm"/>
+    <origin xyz="0.2 0 0"/><axis xyz="0 0 1"/><limit lower="-1" upper="1"/></joint>
+  <joint name="grip" type="prismatic"><parent link="arm"/><child link="left_finger"/>
+    <origin xyz="0.3 0 0"/><axis xyz="0 1 0"/><limit lower="0" upper="0.1"/></joint>
+</robot>"""
+
+TWO = """<link name="{name}"><visual><geometry><box size="1 1 1"/></geometry></visual></link>
+  <joint name="turn_{name}" type="revolute"><parent link="world"/><child link="{name}"/>
+    <origin xyz="{x} 0 1"/><axis xyz="0 1 0"/><limit lower="-1" upper="1"/></joint>"""

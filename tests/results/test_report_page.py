@@ -10,8 +10,14 @@ from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.results.records import FrameRecord, JointRecord, PoseRow, SceneEstimate
-from drake_pose.results.report_page import make_report
-from drake_pose.results.report_plots import BOX, HEIGHT, WIDTH, draw_grid, plot_curves
+from drake_pose.results.report_page import (
+    BOX,
+    HEIGHT,
+    WIDTH,
+    draw_grid,
+    make_report,
+    plot_curves,
+)
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.results.summary import summarize
 from drake_pose.silhouette.pictures.scenes import Scene

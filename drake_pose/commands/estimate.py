@@ -23,8 +23,8 @@ from drake_pose.commands.options import (
 )
 from drake_pose.commands.terminal import FrameProgress, output_console, print_result
 from drake_pose.errors import SceneError
+from drake_pose.results.options import percent
 from drake_pose.results.settings import EstimateSettings
-from drake_pose.results.texts import percent
 
 if TYPE_CHECKING:
     from drake_pose.results.records import SceneEstimate

@@ -13,7 +13,7 @@ from rich.table import Table
 from drake_pose.commands.options import SPREAD, Json, Model, Out, Overlay
 from drake_pose.commands.terminal import count_progress, output_console, print_result, say
 from drake_pose.jobs.registration.settings import AuditSettings, RegistrationSettings
-from drake_pose.results.texts import percent
+from drake_pose.results.options import percent
 
 if TYPE_CHECKING:
     from drake_pose.jobs.registration.audit import SceneAudit

@@ -102,7 +102,7 @@ class FrameProgress:
 
     def __call__(self, finished: int, total: int, frame: str, record: FrameRecord | None) -> None:
         """Show that a frame is finished."""
-        from drake_pose.results.texts import percent
+        from drake_pose.results.options import percent
 
         self.show_stage("frames", finished, total)
         if record is None:

@@ -1,4 +1,7 @@
-"""Texts of options and of job files to plain values; other forms raise a SettingsError."""
+"""Texts of options and of job files to plain values, and a share as people read it.
+
+Other forms of a text raise a SettingsError.
+"""
 
 from __future__ import annotations
 
@@ -167,3 +170,8 @@ def parse_root_rotation(text: str) -> Literal["fixed", "free"] | RotationLimits:
             raise SettingsError(f"{axis}: the lower limit {lower:g} exceeds the upper {upper:g}")
         limits[axis] = (lower, upper)
     return limits
+
+
+def percent(share: float | None) -> str:
+    """Returns a share in percent, or a dash."""
+    return "-" if share is None else f"{100.0 * share:.2f} %"

@@ -25,9 +25,9 @@ from drake_pose.registration.per_frame_fit import PerFrameFit
 from drake_pose.registration.posed_frames import PosedFrame, SeenFrame
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.results.folder import require_empty, write_summary
+from drake_pose.results.options import percent
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.results.summary import mask_digests
-from drake_pose.results.texts import percent
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges, read_scene
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, Scene
 

@@ -20,8 +20,8 @@ from drake_pose.registration.register import (
     RegistrationBody,
     spread,
 )
+from drake_pose.results.options import percent
 from drake_pose.results.summary import BADLY_EXPLAINED
-from drake_pose.results.texts import percent
 
 # Of the contours in the two frames that fit best, this share fits at least. A robot that is the
 # masks' leaves 0.83 and more, with holes and tools; mirrored masks, another robot's or exchanged

@@ -39,8 +39,8 @@ from drake_pose.registration.register import (
 from drake_pose.registration.start_poses import E_total, areas
 from drake_pose.registration.suggestions import suggest_pose
 from drake_pose.results.folder import require_empty
+from drake_pose.results.options import percent
 from drake_pose.results.summary import BADLY_EXPLAINED
-from drake_pose.results.texts import percent
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 

@@ -27,10 +27,10 @@ from drake_pose.results.folder import (
     write_file,
     write_summary,
 )
+from drake_pose.results.options import percent
 from drake_pose.results.overlay import draw_overlay, encode_png
 from drake_pose.results.report_page import Picture, overlay_picture, page_template
 from drake_pose.results.summary import file_digest, versions
-from drake_pose.results.texts import percent
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_labels
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE

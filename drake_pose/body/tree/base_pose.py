@@ -27,10 +27,9 @@ class BasePose:
     """What takes up the pose of a pose tree that does not start at the plant's world.
 
     Attributes:
-        kind: "constant": the plant stands at X_WB; "world_node": the plant's world is part of the
-            tree and moves with it; "floating": a floating joint takes the pose; "joints": base
-            joints are solved for; "placed": base joints cannot reach every pose, so they keep
-            their values and X_WB moves.
+        kind: "constant": the plant stands at X_WB; "floating": a floating joint takes the pose;
+            "joints": base joints are solved for; "placed": X_WB moves, for the plant's world is
+            part of the tree, or base joints cannot reach every pose and keep their values.
         X_WB: (4, 4) for "constant".
         node: the tree's node that the base positions or the world are known from.
         body: the plant's body of that node.
@@ -40,7 +39,7 @@ class BasePose:
         joint: for "floating", the joint's index.
     """
 
-    kind: Literal["constant", "world_node", "floating", "joints", "placed"]
+    kind: Literal["constant", "floating", "joints", "placed"]
     X_WB: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
     node: int = -1
     body: int = 0

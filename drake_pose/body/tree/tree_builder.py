@@ -234,7 +234,7 @@ def _turned_over(
     roots: Roots = {0: (X_WA, rotation)}
     groups = [branch.group for branch in branches]
     if 0 in groups:
-        base = BasePose("world_node", node=groups.index(0), body=graph.groups[0].body)
+        base = BasePose("placed", node=groups.index(0), body=graph.groups[0].body)
     else:
         chain = _chain_from_world(graph, set(groups))
         base = base_of_chain(model, graph, chain, groups.index(chain[-1].outer), held)

@@ -163,7 +163,7 @@ class Board:
 def _top_left_is_white(grey: NDArray[np.uint8], grid: Array) -> bool:
     """Whether the square outside the first corner is white, judged by all inner squares."""
     middles = 0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])
-    u, v = np.rint(middles).astype(int).clip(0, np.array(grey.shape)[::-1] - 1).transpose(2, 0, 1)
+    u, v = np.rint(middles).astype(int).transpose(2, 0, 1)
     brightness = cv2.blur(grey, (3, 3))[v, u].astype(np.float64)
     like_top_left = np.indices(brightness.shape).sum(axis=0) % 2 == 0
     return bool(brightness[like_top_left].mean() > brightness[~like_top_left].mean())

@@ -52,7 +52,6 @@ class FittedFrames:
         own: (frames, p) each frame's own unknowns.
         shared: (q,) those of all frames.
         parameters: (frames, n) all parameters of the frames.
-        costs: (frames, cameras) what does not fit.
         inlier_ratios: (frames, cameras) of both contours' lengths, what fits.
         cost: of all frames at the end, with what is known without pictures.
         equations: the normal equations at the end, priors included but for the coupling.
@@ -62,7 +61,6 @@ class FittedFrames:
     own: Array
     shared: Array
     parameters: Array
-    costs: Array
     inlier_ratios: Array
     cost: float
     equations: Equations
@@ -179,7 +177,7 @@ class FramesFit:
 
         limits = self.unknowns.lower, self.unknowns.upper
         found = minimise(evaluate, own, shared, limits, rounds, self._contours.steps, coupling)
-        equations, costs, shares = self._equations(
+        equations, shares = self._equations(
             frames, base, (found.own, found.shared), about, rounds[-1], shared_information
         )
         parameters = [
@@ -190,7 +188,6 @@ class FramesFit:
             found.own,
             found.shared,
             np.array(parameters),
-            costs,
             shares,
             found.cost,
             equations,
@@ -220,16 +217,16 @@ class FramesFit:
         about: tuple[Array, Array],
         step: AnnealingStage,
         shared_information: Array | None,
-    ) -> tuple[Equations, Array, Array]:
+    ) -> tuple[Equations, Array]:
+        """The equations, and of both contours' lengths what fits (frames, cameras)."""
         unknowns = self.unknowns
         p, u = unknowns.own_count, len(unknowns.names)
         H, g, cost = np.zeros((len(frames), u, u)), np.zeros((len(frames), u)), 0.0
-        costs, shares = [], []
+        shares = []
         for k, evidence in enumerate(frames):
             theta = unknowns.parameters(base[k], at[0][k], at[1])
             H[k], g[k], sums = self._frame(evidence, theta, step)
             cost += float(sums[:, :, COST].sum())
-            costs.append(sums[:, :, COST].sum(axis=1))
             lengths = np.maximum(sums[:, :, COMPARED].sum(axis=1), 1e-9)
             shares.append(sums[:, :, FITTING].sum(axis=1) / lengths)
             off = at[0][k] - about[0][k]
@@ -244,11 +241,7 @@ class FramesFit:
         # The prior of what is shared counts once: with the first frame.
         H[0, p:, p:] += information
         g[0, p:] += information @ off
-        return (
-            Equations(H, g, cost + float(off @ information @ off)),
-            np.array(costs),
-            np.array(shares),
-        )
+        return Equations(H, g, cost + float(off @ information @ off)), np.array(shares)
 
     def _frame(
         self, evidence: Evidence, theta: Array, step: AnnealingStage

@@ -337,7 +337,7 @@ class TestPose:
         generator = np.random.default_rng(7)
         true = posed(person, left_upper_arm_z=40)
         regions = [renderer.mask(true) for renderer in renderers]
-        for _ in range(10):
+        for _ in range(5):
             features = skeleton.features(true) + generator.normal(0, 0.3, (5, 3))
             found = estimate_pose(
                 skeleton, true, features, generator.normal(0, 2, 2), cameras, regions

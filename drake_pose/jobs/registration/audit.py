@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,55 +11,34 @@ from typing import Any
 import numpy as np
 
 from drake_pose.body.model import load_model
-from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.files import load_cameras
-from drake_pose.camera.models import Camera
 from drake_pose.errors import MaskError, SceneError
 from drake_pose.jobs.estimate.searches import make_tree
-from drake_pose.jobs.registration.positions import KnownPositions, read_known_positions
+from drake_pose.jobs.registration.inputs import KnownScene
+from drake_pose.jobs.registration.positions import read_known_positions
 from drake_pose.jobs.registration.result import describe_run, write_overlays
 from drake_pose.jobs.registration.settings import AuditSettings
 from drake_pose.registration.contradictions import Audit, Finding, FrameAudit, audit_frames
 from drake_pose.registration.per_frame_fit import PerFrameFit
-from drake_pose.registration.posed_frames import PosedFrame, SeenFrame
+from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import RegistrationBody
 from drake_pose.results.folder import require_empty, write_summary
 from drake_pose.results.options import percent
 from drake_pose.results.settings import EstimateSettings
 from drake_pose.results.summary import mask_digests
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges, read_scene
-from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, Scene
+from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 
 OnFrame = Callable[[int], None]
 """Called with the number of frames that are done."""
 
 # So many frames tell how large silhouettes are, and where the body is.
 _SAMPLE = 20
+# Sizes of errors that are told.
+_SIZES = ("surface", "mask", "camera")
 # As many joints are named in words.
 _NAMED = 3
-
-
-@dataclass(frozen=True)
-class _Inputs:
-    """What is audited; frames are names, whose masks are read one after another."""
-
-    scene: Scene
-    tree: PoseTree
-    cameras: tuple[Camera, ...]
-    frames: tuple[str, ...]
-    positions: KnownPositions
-    warnings: tuple[str, ...]
-
-    def read(self, frame: str) -> SeenFrame:
-        """A frame's positions, and its masks by camera, but for those that show nothing."""
-        masks = {
-            camera.name: self.scene.read(camera.name, frame, may_be_empty=True)
-            for camera in self.cameras
-            if (camera.name, frame) in self.scene.masks
-        }
-        seen = {name: mask for name, mask in masks.items() if mask.any()}
-        return SeenFrame(frame, self.positions.of(frame, self.cameras[0].name), seen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,9 +83,9 @@ def audit_scene(
         "cameras": Path(cameras or Path(scene) / CAMERA_FILE),
         "joints": Path(joints),
     }
-    inputs = _read_inputs(Path(scene), files, None if cameras is None else Path(cameras), settings)
+    inputs, frames = _read_inputs(Path(scene), files, cameras is not None, settings)
     begin = time.perf_counter()
-    found, unseen = _audit(inputs, on_frame)
+    found, unseen = _audit(inputs, frames, on_frame)
     seconds = time.perf_counter() - begin
     warnings = list(inputs.warnings)
     if unseen:
@@ -123,9 +102,7 @@ def audit_scene(
         "frame_count": count,
         "agreeing_count": agreeing,
         "frames": {one.frame: _describe_frame(inputs, one) for one in found.frames},
-        "error_sizes_px": {
-            name: float(getattr(found.sizes, name)) for name in ("surface", "mask", "camera")
-        },
+        "error_sizes_px": {name: float(getattr(found.sizes, name)) for name in _SIZES},
         **describe_run(Path(scene), files, settings, warnings, seconds),
         "unseen": unseen,
     }
@@ -134,9 +111,9 @@ def audit_scene(
     return SceneAudit(found, summary, tuple(warnings), folder)
 
 
-def _describe_frame(inputs: _Inputs, one: FrameAudit) -> dict[str, Any]:
+def _describe_frame(inputs: KnownScene, one: FrameAudit) -> dict[str, Any]:
     """A frame's part of summary.json."""
-    names = [camera.name for camera in inputs.cameras]
+    names = [camera.name for camera in inputs.held]
     return {
         "agrees": one.finding is None,
         "fits": dict(one.given),
@@ -147,10 +124,10 @@ def _describe_frame(inputs: _Inputs, one: FrameAudit) -> dict[str, Any]:
 
 
 def _read_inputs(
-    scene_path: Path, files: Mapping[str, Path], own: Path | None, settings: AuditSettings
-) -> _Inputs:
-    """Reads and checks everything; own: a camera file in place of the scene's."""
-    given = None if own is None else load_cameras(own)
+    scene_path: Path, files: Mapping[str, Path], own: bool, settings: AuditSettings
+) -> tuple[KnownScene, tuple[str, ...]]:
+    """What is audited, and its frames, checked; own: whether it has a camera file of its own."""
+    given = load_cameras(files["cameras"]) if own else None
     scene, frames = read_scene(scene_path, settings.cameras, settings.frames, given)
     if scene.scale_unknown:
         raise SceneError(
@@ -167,17 +144,19 @@ def _read_inputs(
             "all frames show the robot in one pose, to a degree: errors of a joint's zero and of a "
             "camera that are the same in all frames can hardly be told apart"
         )
-    return _Inputs(scene, tree, chosen, frames, positions, tuple(warnings))
+    return KnownScene(scene, tree, positions, chosen, tuple(warnings)), frames
 
 
-def _audit(inputs: _Inputs, on_frame: OnFrame | None) -> tuple[Audit, list[str]]:
+def _audit(
+    inputs: KnownScene, frames: Sequence[str], on_frame: OnFrame | None
+) -> tuple[Audit, list[str]]:
     """What was found, and the frames of which no mask shows anything."""
     body = RegistrationBody(inputs.tree)
-    picks = np.linspace(0, len(inputs.frames) - 1, min(len(inputs.frames), _SAMPLE)).round()
-    sample = [inputs.read(inputs.frames[int(k)]) for k in picks]
-    fit = PerFrameFit(body.kinematics, (body.few, body.all), inputs.cameras, sample)
+    picks = np.linspace(0, len(frames) - 1, min(len(frames), _SAMPLE)).round()
+    sample = [inputs.read(frames[int(k)]) for k in picks]
+    fit = PerFrameFit(body.kinematics, (body.few, body.all), inputs.held, sample)
     fitted, unseen = [], []
-    for done, frame in enumerate(inputs.frames):
+    for done, frame in enumerate(frames):
         seen = inputs.read(frame)
         if seen.masks:
             fitted.append(fit.fit(seen))
@@ -202,11 +181,11 @@ def describe_contradictions(found: Audit) -> list[dict[str, Any]]:
 
 
 def _write_result(
-    path: Path, inputs: _Inputs, named: tuple[str, ...], summary: Mapping[str, Any]
+    path: Path, inputs: KnownScene, named: tuple[str, ...], summary: Mapping[str, Any]
 ) -> None:
     """The summary, and the robot at its encoders' positions over the masks of some frames."""
     frames = summary["frames"]
-    for camera in inputs.cameras if named else ():
+    for camera in inputs.held if named else ():
         name = camera.name
         posed = [
             PosedFrame(one.name, one.values, one.masks[name])

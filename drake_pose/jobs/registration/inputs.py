@@ -14,7 +14,7 @@ from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.files import CameraFile, load_camera_file
-from drake_pose.camera.models import PinholeCamera
+from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import (
     CameraError,
     MaskError,
@@ -54,15 +54,40 @@ _OF_A_PERSON = (
 
 
 @dataclass(frozen=True)
-class Inputs:
-    """What is registered, from what.
+class KnownScene:
+    """A scene of a robot at known joint positions.
 
     Args:
         scene: the recorded scene; cameras whose X_WC is missing stand at the world's origin.
         tree: the robot's pose tree in the world, or in the frame of the link on which cameras ride.
         positions: of the joints in each frame.
+        held: the cameras whose place is known.
+    """
+
+    scene: Scene
+    tree: PoseTree
+    positions: KnownPositions
+    held: tuple[Camera, ...]
+    warnings: tuple[str, ...]
+
+    def read(self, frame: str) -> SeenFrame:
+        """A frame's positions, and the held cameras' masks but for those that show nothing."""
+        masks = {
+            one.name: self.scene.read(one.name, frame, may_be_empty=True)
+            for one in self.held
+            if (one.name, frame) in self.scene.masks
+        }
+        seen = {name: mask for name, mask in masks.items() if mask.any()}
+        return SeenFrame(frame, self.positions.of(frame, next(iter(masks), "")), seen)
+
+
+@dataclass(frozen=True)
+class Inputs(KnownScene):
+    """What is registered, from what.
+
+    Args:
         frames: what the cameras see.
-        searched, held: the cameras that are to be found, and the others that have an X_WC.
+        searched: the cameras that are to be found.
         seen: the tree's nodes that the masks show; None: all.
         standing: the object that the cameras see from their link, if it is not the robot. Until it
             is found it is at the world's origin in the tree.
@@ -70,19 +95,15 @@ class Inputs:
         left_out: cameras without X_WC that are not to be found.
     """
 
-    scene: Scene
+    held: tuple[PinholeCamera, ...]
     model: ArticulatedModel
-    tree: PoseTree
-    positions: KnownPositions
     frames: tuple[SeenFrame, ...]
     searched: tuple[PinholeCamera, ...]
-    held: tuple[PinholeCamera, ...]
     seen: tuple[str, ...] | None
     standing: StandingObject | None
     zeros: tuple[str, ...]
     lengths: tuple[str, ...]
     left_out: tuple[str, ...]
-    warnings: tuple[str, ...]
 
     def of(self, camera: str) -> list[PosedFrame]:
         """What a camera sees."""
@@ -133,15 +154,17 @@ def read_inputs(
     else:
         on_link = settings.on is not None
         positions = read_known_positions(joints_path, kinematics, on_link, table)
-    frames = _read_frames(scene, searched, held, positions, settings.frames)
+    warnings = (*scene.warnings, *model.warnings, *positions.warnings)
+    known = KnownScene(scene, tree, positions, held, warnings)
+    frames = _read_frames(known, searched, settings.frames)
     left_out = tuple(
         name
         for name in (*file.unplaced, *file.links)
         if name not in [camera.name for camera in searched]
     )
     inputs = Inputs(
-        scene, model, tree, positions, frames, searched, held, seen, standing, zeros,
-        lengths, left_out, (*scene.warnings, *model.warnings, *positions.warnings),
+        scene, tree, positions, held, warnings, model, frames, searched, seen, standing, zeros,
+        lengths, left_out,
     )  # fmt: skip
     return replace(inputs, warnings=(*inputs.warnings, *_look_at(inputs)))
 
@@ -260,16 +283,13 @@ def _select_parameters(
 
 
 def _read_frames(
-    scene: Scene,
-    searched: Sequence[PinholeCamera],
-    held: Sequence[PinholeCamera],
-    positions: KnownPositions,
-    wanted: Sequence[str],
+    known: KnownScene, searched: Sequence[PinholeCamera], wanted: Sequence[str]
 ) -> tuple[SeenFrame, ...]:
     """What cameras see; a bad mask of one that is to be found is refused.
 
     Of cameras that are held there is what can be compared with them.
     """
+    scene, positions = known.scene, known.positions
     if positions.is_estimate:
         wanted = _spread_frames(scene, searched, positions, wanted)
     asked = {one.name: scene.of_cameras([one.name]).seen_frames(wanted) for one in searched}
@@ -280,10 +300,9 @@ def _read_frames(
             if frame in asked[camera]:
                 positions.of(frame, camera)
                 masks[camera] = _read_mask(scene, camera, frame, positions.is_estimate)
-        for one in held:
-            if (one.name, frame) in scene.masks and positions.has(frame):
-                masks[one.name] = scene.read(one.name, frame, may_be_empty=True)
         masks = {camera: mask for camera, mask in masks.items() if mask.any()}
+        if positions.has(frame):
+            masks |= known.read(frame).masks
         if masks:
             found.append(SeenFrame(frame, positions.of(frame, next(iter(masks))), masks))
     for camera in asked:
@@ -292,7 +311,7 @@ def _read_frames(
                 f"camera '{camera}': no mask shows the body in the frames in which its pose was "
                 f"estimated: {', '.join(wanted)}"
             )
-    if positions.is_estimate and not any(c.name in one.masks for c in held for one in found):
+    if positions.is_estimate and not any(c.name in one.masks for c in known.held for one in found):
         raise SceneError(
             f"{scene.path}: the joint positions were estimated, so they are fitted together with "
             "the cameras, but no camera with an X_WC has a mask of those frames: leave X_WC of the "

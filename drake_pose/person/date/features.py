@@ -47,14 +47,6 @@ class Blobs:
     mask: Mask
 
 
-def skin_mask(picture: Picture, region: Mask, colour: SkinColour) -> Mask:
-    """Where the region (H, W) of a picture (H, W, 3) in red, green, blue has the colour of skin."""
-    chroma = _chroma(picture)
-    low = (colour.darkest, colour.red[0], colour.blue[0])
-    high = (255.0, colour.red[1], colour.blue[1])
-    return np.asarray((cv2.inRange(chroma, low, high) > 0) & region)
-
-
 def skin_blobs(
     picture: Picture, region: Mask, colour: SkinColour, smallest: int = 12, most: int = 12
 ) -> Blobs:
@@ -62,8 +54,12 @@ def skin_blobs(
 
     None has an area of less than `smallest` pixels.
     """
-    top, bottom, left, right = _bounds(region)
-    inner = skin_mask(picture[top:bottom, left:right], region[top:bottom, left:right], colour)
+    # Where nobody is seen one pixel is looked at.
+    left, top, width, height = cv2.boundingRect(np.ascontiguousarray(region).view(np.uint8))
+    part = slice(top, top + max(height, 1)), slice(left, left + max(width, 1))
+    chroma = cv2.cvtColor(np.ascontiguousarray(picture[part]), cv2.COLOR_RGB2YCrCb)
+    low = (colour.darkest, colour.red[0], colour.blue[0])
+    inner = (cv2.inRange(chroma, low, (255.0, colour.red[1], colour.blue[1])) > 0) & region[part]
     joined = cv2.morphologyEx(inner.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     count, labels, statistics, middles = cv2.connectedComponentsWithStats(joined, connectivity=8)
     order = np.argsort(-statistics[1:, cv2.CC_STAT_AREA], kind="stable")[:most] + 1
@@ -71,7 +67,7 @@ def skin_blobs(
     mask = np.zeros(region.shape, dtype=bool)
     kept = np.zeros(count, dtype=bool)
     kept[order] = True
-    mask[top:bottom, left:right] = kept[labels]
+    mask[part] = kept[labels]
     boxes = statistics[order, :4].astype(np.int64)
     boxes[:, :2] += [left, top]
     return Blobs(
@@ -80,19 +76,6 @@ def skin_blobs(
         boxes=boxes,
         mask=mask,
     )
-
-
-def _chroma(picture: Picture) -> Picture:
-    """Brightness, red and blue chroma of a picture in red, green, blue."""
-    return np.asarray(cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_RGB2YCrCb))
-
-
-def _bounds(region: Mask) -> tuple[int, int, int, int]:
-    """Top, bottom, left, right of a region; one pixel where it is empty."""
-    rows, columns = np.flatnonzero(region.any(axis=1)), np.flatnonzero(region.any(axis=0))
-    if not len(rows):
-        return 0, 1, 0, 1
-    return int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
 
 
 _FIRST_FOOT = FEATURES.index("left_foot")

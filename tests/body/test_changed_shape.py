@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
+from drake_pose.body.files.urdf_shape import reshaped
 from drake_pose.body.model import load_model
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import ModelError, UnknownNameError
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from tests.body.models import JOINTED_BASE_URDF, write
 from tests.search.bodies import forked_body, front_camera
 
 
@@ -40,6 +42,45 @@ def test_a_body_stretched_alike_everywhere_is_seen_larger(tmp_path):
     tree, larger = model.pose_tree(), double.pose_tree()
     before, after = (t.node_poses(t.values_from_positions(q)) for t in (tree, larger))
     np.testing.assert_allclose(after[:, :3, 3], 2.0 * before[:, :3, 3], atol=1e-12)
+
+
+def link_poses(model, q):
+    context = model.plant.CreateDefaultContext()
+    model.plant.SetPositions(context, q)
+    bodies = {name: model.plant.GetBodyByName(name) for name in model.link_names[1:]}
+    pose = model.plant.EvalBodyPoseInWorld
+    return {name: pose(context, body).GetAsMatrix4() for name, body in bodies.items()}
+
+
+def test_joints_stand_further_by_their_zeros_and_keep_their_limits(tmp_path):
+    zeros = {"x": 0.3, "head_y": 0.2, "neck": -0.4}
+    model = load_model(write(tmp_path, JOINTED_BASE_URDF), check=False)
+    text = reshaped(JOINTED_BASE_URDF, zeros=zeros)
+    other = load_model(write(tmp_path, text, "other.urdf"), check=False)
+    offsets = np.array([zeros.get(name, 0.0) for name in model.position_names])
+    np.testing.assert_allclose([other.lower, other.upper], [model.lower, model.upper] - offsets)
+    q = np.random.default_rng(1).uniform(-0.5, 0.5, len(offsets))
+    expected = link_poses(model, q + offsets)
+    for name, X in link_poses(other, q).items():
+        np.testing.assert_allclose(X, expected[name], atol=1e-12)
+
+
+def test_joints_and_looks_lie_elsewhere_on_their_links(tmp_path):
+    model = load_model(write(tmp_path, JOINTED_BASE_URDF), check=False)
+    shift, move = np.array([0.1, -0.2, 0.3]), np.array([-0.3, 0.1, 0.2])
+    other = model.reshaped(shifts={"neck": shift}, moves={"chest": move})
+    q = np.random.default_rng(2).uniform(-0.5, 0.5, len(model.position_names))
+    X, Y = link_poses(model, q), link_poses(other, q)
+    np.testing.assert_allclose(Y["head"], X["head"])
+    chest = Y["chest"][:3, 3] - X["chest"][:3, 3]
+    np.testing.assert_allclose(chest, X["head"][:3, :3] @ shift, atol=1e-12)
+    arm = Y["arm"][:3, 3] - X["arm"][:3, 3] - chest
+    np.testing.assert_allclose(arm, X["chest"][:3, :3] @ move, atol=1e-12)
+    for name, by in (("head", 0.0), ("chest", move), ("arm", 0.0)):
+        before, after = model.link_meshes[name], other.link_meshes[name]
+        np.testing.assert_allclose(after.vertices, before.vertices + by, atol=1e-12)
+    with pytest.raises(UnknownNameError, match="tail"):
+        model.reshaped(moves={"tail": move})
 
 
 def test_only_urdf_models_change_their_shape(tmp_path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -20,14 +19,12 @@ from drake_pose.commands.options import (
 )
 from drake_pose.commands.terminal import UsageError, print_json, say, warn
 from drake_pose.errors import SettingsError
-from drake_pose.jobs.live.settings import Seconds, Shape
+from drake_pose.jobs.live.settings import LiveSettings, Seconds, Shape
 from drake_pose.results.settings import Packages
 
 if TYPE_CHECKING:
-    from distributed import Client
     from pydrake.geometry import Meshcat
 
-    from drake_pose.jobs.live.scene import LiveScene
     from drake_pose.systems.person.live_capture import LiveSensors
 
 
@@ -64,6 +61,11 @@ class WalkOptions:
     """Start a result or --simulate when a browser shows the page, and again when its button is
     pressed, until Ctrl-C or --seconds; or start at once and play once. Default: --wait with
     --browser, else --no-wait."""
+
+    @property
+    def on_spot(self) -> bool:
+        """Whether the paper's way is wanted: who stands ahead or behind also walks on the spot."""
+        return self.method == "paper"
 
     def __post_init__(self) -> None:
         if self.live is None and (self.workers or self.scheduler or self.shape):
@@ -110,16 +112,16 @@ def walk(
         player = walking.simulated_player() if options.simulate else walking.key_player()
     waits = player.q is not None and (options.browser if options.wait is None else options.wait)
     page = _open_page(options, waits)
-    again = _asker(page) if waits and options.seconds is None else lambda: False
+
+    def ask() -> bool:
+        say("drake-pose: the end; space or the page's button plays it again, Ctrl-C ends")
+        return walking.wait_for_replay(page)
+
+    again = ask if waits and options.seconds is None else lambda: False
     walked = walking.walk(
-        player, page, options.seconds, options.speed, _say_command, again, _on_spot(options)
+        player, page, options.seconds, options.speed, _say_command, again, options.on_spot
     )
     _print(walked, json)
-
-
-def _on_spot(options: WalkOptions) -> bool:
-    """Whether the paper's way is wanted: who stands ahead or behind also walks on the spot."""
-    return options.method == "paper"
 
 
 def _walk_live(folder: Path, options: WalkOptions) -> dict[str, Any]:
@@ -128,38 +130,26 @@ def _walk_live(folder: Path, options: WalkOptions) -> dict[str, Any]:
     from drake_pose.jobs.live.walk import walk_live
 
     hush_opencv()
+    settings = LiveSettings(seconds=options.seconds, shape=options.shape, packages=options.package)
     with workers_of(options.workers, options.scheduler) as client:
         # Workers may have another working folder.
         scene = load_live_scene(folder if client is None else folder.absolute())
+
+        def sensors() -> LiveSensors:
+            if client is None:
+                return scene.open_sensors(live=True)
+            from drake_pose.jobs.cluster.remote_views import ClusterSensors
+
+            # A recording cannot be skipped from afar as fast as its moments pass: it is waited for.
+            return ClusterSensors(client, scene)
+
         walked = walk_live(
-            scene, _open_page(options), options.model, options.shape, options.seconds,
-            _opener(client, scene), _say_command, lambda text: say(f"drake-pose: {text}"),
-            options.package, _on_spot(options),
+            scene, _open_page(options), options.model, settings, sensors, _say_command,
+            lambda text: say(f"drake-pose: {text}"), options.on_spot,
         )  # fmt: skip
     for text in walked["warnings"]:
         warn(text)
     return walked
-
-
-def _asker(page: Meshcat) -> Callable[[], bool]:
-    """What waits at the end of a recording until it is to be played again."""
-    from drake_pose.jobs.live.walk import wait_for_replay
-
-    def ask() -> bool:
-        say("drake-pose: the end; space or the page's button plays it again, Ctrl-C ends")
-        return wait_for_replay(page)
-
-    return ask
-
-
-def _opener(client: Client | None, scene: LiveScene) -> Callable[[], LiveSensors] | None:
-    """What opens the sensors on the workers; None: they are opened here."""
-    if client is None:
-        return None
-    from drake_pose.jobs.cluster.remote_views import ClusterSensors
-
-    # A recording cannot be skipped from afar as fast as its moments pass, so that it is waited for.
-    return lambda: ClusterSensors(client, scene)
 
 
 def _open_page(options: WalkOptions, waits: bool = False) -> Meshcat:

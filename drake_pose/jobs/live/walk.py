@@ -25,6 +25,7 @@ from drake_pose.jobs.live.capture import shape_of_result
 from drake_pose.jobs.live.frame_results import camera_troubles
 from drake_pose.jobs.live.run import run_live
 from drake_pose.jobs.live.scene import LiveScene
+from drake_pose.jobs.live.settings import LiveSettings
 from drake_pose.person.date.skeleton import load_skeleton
 from drake_pose.person.date.walking_motion import make_motion
 from drake_pose.person.shape import tracker_of_person
@@ -159,7 +160,8 @@ def walk(
     Raises:
         SettingsError: a time or a speed that cannot be.
     """
-    _require_length(seconds)
+    if seconds is not None and not 0.0 < seconds < math.inf:
+        raise SettingsError(f"the walk's length must be a positive number, not {seconds} s")
     if not (math.isfinite(speed) and speed >= 0):
         raise SettingsError(f"the speed must be 0 or a positive number, not {speed}")
     period = 1.0 / player.rate_hz
@@ -186,12 +188,10 @@ def walk_live(
     scene: LiveScene,
     meshcat: Meshcat,
     model_path: Path | None = None,
-    shape: Path | None = None,
-    seconds: float | None = None,
+    settings: LiveSettings | None = None,
     open_sensors: Callable[[], LiveSensors] | None = None,
     on_command: Callable[[str], None] = lambda _: None,
     on_report: Callable[[str], None] = lambda _: None,
-    packages: Mapping[str, Path] | None = None,
     on_spot: bool = False,
 ) -> dict[str, Any]:
     """Lets the avatar walk as the person before the cameras commands, until Ctrl-C.
@@ -200,13 +200,10 @@ def walk_live(
 
     Args:
         model_path: a person with landmarks.yaml beside it; the bundled one where not given.
-        shape: a result of capture with the same person, whose lengths and girths are taken; the
-            model's where not given.
-        seconds: how long; without end, or until the recordings end, where not given.
+        settings: how long, and whose shape; the model's where not given.
         open_sensors: opens the sensors; those of the scene in this process where not given.
         on_command: as for walk, like ``on_spot``.
         on_report: told of cameras that stop and return, bad pictures, a person found or lost.
-        packages: folders of packages that the model's ``package://`` names mean, by name.
 
     Returns:
         As walk; found_share of the periods in which the person was known; and warnings.
@@ -215,9 +212,9 @@ def walk_live(
         SceneError, ModelError, SettingsError: what was given cannot be walked with.
         OutputError: the shape's result is none.
     """
-    _require_length(seconds)
-    model = load_model(model_path or bundled_person(), package_paths=packages)
-    known = None if shape is None else shape_of_result(shape)
+    settings = settings or LiveSettings()
+    model = load_model(model_path or bundled_person(), package_paths=settings.packages)
+    known = None if settings.shape is None else shape_of_result(settings.shape)
     tracker = tracker_of_person(model.pose_tree(), known)
     opened: LiveSensors = scene.open_sensors(live=True) if open_sensors is None else open_sensors()
 
@@ -230,16 +227,11 @@ def walk_live(
         stride = stride_positions(model)
         diagram = build_walk(model, meshcat, add, stride, opened.period, on_spot, SETTLE)
         log = _WalkLog(diagram, on_command, on_report)
-        run_live(diagram, opened, seconds, on_report, monitor=log.watch, speed=1.0)
+        run_live(diagram, opened, settings.seconds, on_report, monitor=log.watch, speed=1.0)
         warnings = camera_troubles(opened.counts(), 0)
     finally:
         opened.close()
     return {**log.as_json(), "warnings": warnings}
-
-
-def _require_length(seconds: float | None) -> None:
-    if seconds is not None and not 0.0 < seconds < math.inf:
-        raise SettingsError(f"the walk's length must be a positive number, not {seconds} s")
 
 
 class _WalkLog:

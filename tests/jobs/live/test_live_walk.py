@@ -9,6 +9,7 @@ from drake_pose.errors import SettingsError
 from drake_pose.jobs.live.local_proxy import open_page
 from drake_pose.jobs.live.run import run_live
 from drake_pose.jobs.live.scene import load_live_scene
+from drake_pose.jobs.live.settings import LiveSettings
 from drake_pose.jobs.live.walk import SETTLE, walk_live
 from drake_pose.person.date.walk_commands import SPEED
 from drake_pose.systems.walk.garden import START
@@ -91,7 +92,7 @@ def test_wrong_usage_is_refused(studio, tmp_path):
     assert done.exit_code == 1
     assert "sources.yaml" in done.stderr
     with pytest.raises(SettingsError, match="positive"):
-        walk_live(load_live_scene(studio), open_page(), seconds=math.inf)
+        LiveSettings(seconds=math.inf)
 
 
 def test_a_slow_computer_does_not_make_up_for_lost_time(studio, monkeypatch):

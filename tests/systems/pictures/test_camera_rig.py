@@ -8,7 +8,7 @@ from pydrake.trajectories import PiecewisePolynomial
 from drake_pose.body.files.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.camera.files import load_cameras, save_cameras
-from drake_pose.camera.rigs import FACE_CAMERA, circle_of_cameras, look_at
+from drake_pose.camera.rigs import circle_of_cameras, look_at
 from drake_pose.errors import CameraError, UnknownNameError
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
@@ -27,28 +27,6 @@ def standing(person):
     q[person.position_index("position_z")] = 1.5
     q[person.position_index("left_upper_arm_z")] = 1.3
     return q
-
-
-def test_circle_of_cameras():
-    cameras = circle_of_cameras(8, radius=3.0)
-    assert len(cameras) == 9
-    eyes = np.array([camera.X_WC[:3, 3] for name, camera in cameras.items() if name != FACE_CAMERA])
-    angles = np.unwrap(np.arctan2(eyes[:, 1], eyes[:, 0]))
-    np.testing.assert_allclose(np.diff(np.degrees(angles)), 45.0)
-    for camera in cameras.values():
-        middle = [camera.center_x, camera.center_y]
-        target = [0, 0, camera.X_WC[2, 3] if camera.name == FACE_CAMERA else 0.95]
-        np.testing.assert_allclose(camera.project(np.array([target]))[0][0], middle, atol=1e-9)
-        above = camera.project(np.array([[0, 0, 1.9]]))[0][0]
-        assert above[1] < middle[1]
-
-
-@pytest.mark.parametrize("wrong", [{"count": 0, "face_camera": False}, {"radius": -1.0}])
-def test_rigs_that_cannot_be(wrong):
-    with pytest.raises(CameraError):
-        circle_of_cameras(**wrong)
-    with pytest.raises(CameraError, match="cannot look"):
-        look_at([0, 0, 2], [0, 0, 1])
 
 
 def test_masks_are_those_of_the_label_renderer(person, standing, tmp_path):
@@ -85,3 +63,5 @@ def test_unknown_camera_and_no_camera(person):
         rig.picture(rig.diagram.CreateDefaultContext(), "camera_9")
     with pytest.raises(CameraError, match="at least one"):
         build_camera_rig(person, {})
+    with pytest.raises(CameraError, match="cannot look"):
+        look_at([0, 0, 2], [0, 0, 1])

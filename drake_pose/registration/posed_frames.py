@@ -49,6 +49,7 @@ class PosedFrames:
 
     Attributes:
         X_WN: (frames, nodes, 4, 4) the nodes' poses.
+        intrinsics: focal lengths (2,) and principal point (2,) [pixel].
         size: the root of the silhouettes' median area [pixel].
 
     Raises:
@@ -71,6 +72,10 @@ class PosedFrames:
                 )
         self.kinematics, self.outlines = kinematics, tuple(outlines)
         self.camera, self.frames, self.spacing = camera, tuple(frames), spacing
+        self.intrinsics = (
+            np.array([camera.focal_x, camera.focal_y]),
+            np.array([camera.center_x, camera.center_y]),
+        )
         self.X_WN = np.array([kinematics.poses(frame.values) for frame in frames])
         areas = [np.count_nonzero(frame.mask) for frame in frames]
         self.size = float(np.sqrt(np.median(areas)))

@@ -86,17 +86,11 @@ class StandingObject:
         self, robot: ArticulatedModel, link: str, held: Mapping[str, float], tree: PoseTree
     ) -> None:
         path, kinematics = tree.model.path, TreeKinematics(tree)
-        moving = [
-            name
-            for name, free in zip(
-                kinematics.names, kinematics.lower < kinematics.upper, strict=True
-            )
-            if free
-        ]
-        if moving:
+        moving = np.flatnonzero(kinematics.lower < kinematics.upper)
+        if len(moving):
             raise SettingsError(
-                f"{path}: joint '{moving[0]}' moves, but what a camera on a link sees must be "
-                "rigid: make the joint fixed at its value, or take another object"
+                f"{path}: joint '{kinematics.names[moving[0]]}' moves, but what a camera on a link "
+                "sees must be rigid: make the joint fixed at its value, or take another object"
             )
         self._robot, self._link, self._held = robot, link, dict(held)
         # An object in several pieces is not itself any more with very few triangles.

@@ -75,7 +75,7 @@ def place_by_bounds(frames: PosedFrames, R_CW: Array) -> Array:
 
 def _place_by_sizes(frames: PosedFrames, bodies: Sequence[Array], bounds: Sequence[Array]) -> Array:
     """(n, 3) where the bodies' middle is in the camera, as if all of it were equally far."""
-    f, c = _intrinsics(frames)
+    f, c = frames.intrinsics
     spans = np.mean([np.ptp(body[:, :, :2], axis=1) for body in bodies], axis=0)
     size = np.mean([bound[1] - bound[0] for bound in bounds], axis=0)
     depth = np.linalg.norm(spans * f, axis=1) / max(float(np.linalg.norm(size)), 1.0)
@@ -98,7 +98,7 @@ def add_bound_equations(
         bound: the silhouette's bounds, and which of them count.
         robust: whether what is far off says little.
     """
-    f, c = _intrinsics(frames)
+    f, c = frames.intrinsics
     rows = np.arange(len(p_C))
     z = np.maximum(p_C[..., 2], _NEAREST * frames.extent)
     uv = p_C[..., :2] / z[..., None] * f + c
@@ -114,15 +114,6 @@ def add_bound_equations(
             weight = np.ones(len(p_C))
         H += weight[:, None, None] * J[:, :, None] * J[:, None, :]
         g += (weight * off)[:, None] * J
-
-
-def _intrinsics(frames: PosedFrames) -> tuple[Array, Array]:
-    """Focal lengths (2,) and principal point (2,) [pixel]."""
-    camera = frames.camera
-    return (
-        np.array([camera.focal_x, camera.focal_y]),
-        np.array([camera.center_x, camera.center_y]),
-    )
 
 
 def _bounds(mask: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_]]:

@@ -24,7 +24,7 @@ from drake_pose.registration.shared_fit import (
     Shared,
     SharedFit,
 )
-from drake_pose.registration.standing_object import StandingObject
+from drake_pose.registration.standing_object import StandingObject, Symmetry
 from drake_pose.registration.start_poses import add_bound_equations, place_by_bounds
 from drake_pose.silhouette.areas.scoring import draw_mask
 from tests.registration.arm_pictures import errors, looking_at, see
@@ -168,6 +168,14 @@ def test_turns_after_which_an_object_looks_alike(
         turned = points @ X[:3, :3].T + X[:3, 3] - thing.middle
         # About its middle, and no corner leaves the box around it.
         assert (np.abs(turned) < corners + 0.02 * thing.radius).all()
+
+
+def test_turns_of_a_round_object_differ_where_its_axis_points_elsewhere() -> None:
+    rotvecs = np.radians([[0, 0, 0], [0, 0, 15], [30, 0, 0], [30, 0, 0], [0, 8, 0], [180, 0, 0]])
+    turns = np.tile(np.eye(4), (6, 1, 1))
+    turns[:, :3, :3] = Rotation.from_rotvec(rotvecs).as_matrix()
+    round_about_z = Symmetry(turns, np.array([[0.0, 0.0, 1.0]]))
+    np.testing.assert_array_equal(round_about_z.told_apart, turns[[0, 2, 4, 5]])
 
 
 def test_an_object_that_is_round_may_be_turned_about_its_axis_by_anything(

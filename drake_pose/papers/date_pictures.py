@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from drake_pose.papers.date import SHOWN_CAMERA, TITLES, DateResult, Moment
-from drake_pose.papers.tables import save_figure, save_picture
+from drake_pose.papers.tables import draw_panels, save_figure, save_picture
 from drake_pose.person.date.skeleton import FEATURES
 from drake_pose.person.rays import viewing_rays
 
@@ -28,15 +28,8 @@ def save_pictures(result: DateResult, folder: Path) -> list[Path]:
         files.append(save_figure(_draw_points(result, moment), folder / f"figure_03_{motion}.png"))
     faces = {name: one.faces for name, one in result.moments.items() if one.faces}
     if faces:
-        figure = Figure(figsize=(4.0, 2.1 * len(faces)))
-        panels = figure.subplots(len(faces), 3, squeeze=False)
-        for line, (motion, pictures) in zip(panels, faces.items(), strict=True):
-            for axes, picture in zip(line, pictures, strict=True):
-                axes.imshow(picture)
-                axes.set(xticks=[], yticks=[])
-            line[0].set_ylabel(motion)
-        for axes, title in zip(panels[0], ("input", "template", "avatar"), strict=True):
-            axes.set_title(title)
+        columns = list(zip(*faces.values(), strict=True))
+        figure = draw_panels(columns, ("input", "template", "avatar"), list(faces))
         files.append(save_figure(figure, folder / "figure_04.png"))
     return [*files, save_figure(_draw_errors(result), folder / "errors.png")]
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.papers.kameda import ExperimentResult, Trial, experiment_camera
-from drake_pose.papers.tables import save_figure
+from drake_pose.papers.tables import draw_panels, save_figure
 from drake_pose.results.overlay import paint_agreement
 from drake_pose.search.estimates import PoseFamily, PoseSet, View
 from drake_pose.search.grid.pose_families import samples_at
@@ -77,33 +78,30 @@ def save_pictures(result: ExperimentResult, folder: Path) -> list[Path]:
 def _draw_examples(title: str, trials: list[Trial], result: ExperimentResult) -> Figure:
     """True poses and estimates as the camera sees them, their silhouettes, and the side."""
     tree = result.search.tree
-    renderers = [
+    front, side = (
         LabelRenderer(tree.model, camera)
         for camera in (result.cameras[0], experiment_camera(0.5 * np.pi))
-    ]
+    )
     names = [node.name for node in tree.nodes]
     # Links without a surface would use up colours.
-    order = [names.index(name) if name in names else 0 for name in renderers[0].link_names.values()]
+    order = [names.index(name) if name in names else 0 for name in front.link_names.values()]
+    columns = []
+    for trial in trials:
+        both = tree.positions_from(trial.true_values)[0], trial.result.q
+        true, found = _crop([front.segments(q) for q in both])
+        aside = _crop([side.segments(q) for q in both])
+        drawn = [_coloured(one, order) for one in (true, found, *aside)]
+        drawn.insert(2, paint_agreement(true >= 0, found >= 0))
+        columns.append(drawn)
+    results = [trial.result for trial in trials]
+    titles = [f"E_total {one.E_total:.2%}, {one.statistics.runs} runs" for one in results]
+    return draw_panels(columns, titles, _PANELS, title=f"{title}\n{_COLOURS}")
+
+
+def _coloured(segments: NDArray[Any], order: Sequence[int]) -> NDArray[np.float64]:
+    """Segments (H, W), -1 for none, in colours (H, W, 3) by their places in an order."""
     colours = matplotlib.colormaps["tab20"](np.array(order) % 20)[:, :3]
-    figure = Figure(figsize=(3 * len(trials), 15))
-    axes = figure.subplots(5, len(trials), squeeze=False)
-    for column, trial in zip(axes.T, trials, strict=True):
-        q_true, _ = tree.positions_from(trial.true_values)
-        pictures, side = (
-            _crop([renderer.segments(q) for q in (q_true, trial.result.q)])
-            for renderer in renderers
-        )
-        for axis, segments in zip(column[[0, 1, 3, 4]], [*pictures, *side], strict=True):
-            axis.imshow(np.where(segments[..., None] >= 0, colours[segments], _BACKGROUND))
-        column[2].imshow(paint_agreement(pictures[0] >= 0, pictures[1] >= 0))
-        title_of_one = f"E_total {trial.result.E_total:.2%}, {trial.result.statistics.runs} runs"
-        column[0].set_title(title_of_one, fontsize=9)
-    for axis, label in zip(axes[:, 0], _PANELS, strict=True):
-        axis.set_ylabel(label)
-    for axis in axes.ravel():
-        axis.set(xticks=[], yticks=[])
-    figure.suptitle(f"{title}\n{_COLOURS}", fontsize=10)
-    return figure
+    return np.where(segments[..., None] >= 0, colours[segments], _BACKGROUND)
 
 
 def _crop(pictures: list[np.ndarray]) -> list[np.ndarray]:
@@ -204,33 +202,28 @@ def save_families(
     """
     families = answer.families[:most]
     renderers = [LabelRenderer(model, view.camera) for view in views]
-    figure = Figure(figsize=(3.2 * len(families), 3.2 * 2 * len(views) + 1.4))
-    axes = figure.subplots(2 * len(views), len(families), squeeze=False)
-    for column, family in zip(axes.T, families, strict=True):
-        for i, (view, renderer) in enumerate(zip(views, renderers, strict=True)):
+    columns, titles = [], []
+    for family in families:
+        column = []
+        for view, renderer in zip(views, renderers, strict=True):
             segments = renderer.segments(family.q, family.X_WB)
-            rows, columns = np.nonzero(view.mask | (segments >= 0))
+            places = np.nonzero(view.mask | (segments >= 0))
             window = tuple(
-                slice(max(0, one.min() - _MARGIN), one.max() + 1 + _MARGIN)
-                for one in (rows, columns)
+                slice(max(0, one.min() - _MARGIN), one.max() + 1 + _MARGIN) for one in places
             )
             mask, segments = view.mask[window], segments[window]
-            colours = matplotlib.colormaps["tab20"](np.arange(segments.max() + 2) % 20)[:, :3]
-            coloured = np.where(segments[..., None] >= 0, colours[segments], _BACKGROUND)
-            column[2 * i].imshow(coloured)
-            column[2 * i + 1].imshow(paint_agreement(mask, segments >= 0, segments))
+            column.append(_coloured(segments, range(segments.max() + 2)))
+            column.append(paint_agreement(mask, segments >= 0, segments))
+        columns.append(column)
         poses = "1 pose" if family.size == 1 else f"{family.size:,.0f} poses"
-        column[0].set_title(f"J = {family.J:.0f} pixels, {poses}", fontsize=9)
-        column[-1].set_xlabel(_free_names(family), fontsize=8)
-    for axis in axes.ravel():
-        axis.set(xticks=[], yticks=[])
+        titles.append(f"J = {family.J:.0f} pixels, {poses}")
     found = "all found" if answer.complete else "the search left some out"
-    figure.suptitle(
+    title = (
         f"{len(families)} of {answer.family_count} families within {answer.tolerance:.0f} pixels "
-        f"of the best ({found})\n{_COLOURS}",
-        fontsize=10,
+        f"of the best ({found})\n{_COLOURS}"
     )
-    return save_figure(figure, path)
+    below = [_free_names(family) for family in families]
+    return save_figure(draw_panels(columns, titles, below=below, title=title), path)
 
 
 def _free_names(family: PoseFamily) -> str:

@@ -98,6 +98,31 @@ def _cell(values: Sequence[Any], form: str) -> str:
     return f"{mean} ({form.format(min(values))} to {form.format(max(values))})"
 
 
+def draw_panels(
+    columns: Sequence[Sequence[NDArray[Any]]],
+    titles: Sequence[str],
+    labels: Sequence[str] = (),
+    below: Sequence[str] = (),
+    title: str = "",
+) -> Figure:
+    """Pictures (H, W, 3) in columns: titles above, texts below them, and labels of the rows."""
+    figure = Figure(figsize=(3.1 * len(columns), 3.1 * len(columns[0])))
+    axes = figure.subplots(len(columns[0]), len(columns), squeeze=False)
+    for line, pictures in zip(axes.T, columns, strict=True):
+        for axis, picture in zip(line, pictures, strict=True):
+            axis.imshow(picture)
+            axis.set(xticks=[], yticks=[])
+    for axis, text in zip(axes[0], titles, strict=True):
+        axis.set_title(text, fontsize=9)
+    for axis, text in zip(axes[-1], below, strict=False):
+        axis.set_xlabel(text, fontsize=8)
+    for axis, text in zip(axes[:, 0], labels, strict=False):
+        axis.set_ylabel(text)
+    if title:
+        figure.suptitle(title, fontsize=10)
+    return figure
+
+
 def save_figure(figure: Figure, path: Path) -> Path:
     """Writes a drawing as a PNG file, in a folder that is made if it is not there."""
     path.parent.mkdir(parents=True, exist_ok=True)

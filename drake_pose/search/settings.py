@@ -117,33 +117,21 @@ class BeamSearchSettings(GridSettings):
 
     Args:
         stages: the passes, one after another until J = 0.
-        node_order: the names of all nodes in the order in which they are placed, parents before
-            children; empty: derived from the tree.
-        band: how far around the silhouette the union of what lies outside is told from its sum
-            [pixel].
-        coarse_pixels: stages that let something lie outside see the silhouettes no finer than with
-            about this many pixels; the best pose is then judged in full.
         research_hypotheses: kept while limbs of the winner are searched again; 0: they are not.
         time_limit: the search returns its best pose so far after this time [s]; None: no limit.
-        hypothesis_limit: the same after this many hypotheses; None: no limit.
 
     Raises:
         SettingsError: if a value is out of its range.
     """
 
     stages: tuple[Stage, ...] = EXACT_STAGES + TOLERANT_STAGES
-    node_order: tuple[str, ...] = ()
-    band: int = 24
-    coarse_pixels: int = 6000
     research_hypotheses: int = 30
     time_limit: float | None = None
-    hypothesis_limit: int | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.stages:
             raise SettingsError("stages must hold at least one stage")
-        self._require(1, "band", "coarse_pixels", "hypothesis_limit")
         self._require(0, "research_hypotheses", "time_limit")
 
 

@@ -65,8 +65,7 @@ class MultiStartSettings:
     """Parameters of the multi-start search.
 
     Args:
-        beam: of the coarse search, but for the sampling intervals, the nodes' order and the time
-            limit.
+        beam: of these, the coarse search heeds the time limit alone.
         rounds: how often other explanations are sought about the best poses.
         families: of the answer as a set; None: only the best pose is wanted.
 

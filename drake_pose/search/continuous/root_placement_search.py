@@ -23,7 +23,7 @@ from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
 from drake_pose.search.grid.beam_search import BeamSearch
 from drake_pose.search.grid.beam_stages import grow
-from drake_pose.search.grid.node_poses import Pictures, PoseStore, coarsen
+from drake_pose.search.grid.node_poses import BAND, Pictures, PoseStore, coarsen
 from drake_pose.search.grid.partial_poses import Expansion, PartialPoses
 from drake_pose.search.refinement import (
     COARSE_PASSES,
@@ -178,7 +178,7 @@ class RootPlacementSearch:
         turns = _ROOT_SPARE * _ROOT_FACTOR * self._quota(width)
         chosen = choose_root_samples(self.body, views, layer.positions, turns, _OUTSIDE_WEIGHT)
         body = place_body(self.body, layer.positions, chosen)
-        pictures = Pictures(body, views, self.settings.band)
+        pictures = Pictures(body, views, BAND)
         store = PoseStore(body, pictures, outside_share)
         expansion = Expansion(store)
         last = self._grow(expansion, width, chosen // len(self.sampled.X_PN[0]))

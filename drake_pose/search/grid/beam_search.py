@@ -17,11 +17,15 @@ from drake_pose.search.estimates import PoseEstimate, SearchStatistics, View
 from drake_pose.search.grid.beam_stages import run_stage, search_limbs_again, turn_single_nodes
 from drake_pose.search.grid.distinct_poses import Gathering, GridPoses, check_choice
 from drake_pose.search.grid.examination import ExaminationSettings, examine
-from drake_pose.search.grid.node_poses import Pictures, PoseStore, coarsen
+from drake_pose.search.grid.node_poses import BAND, Pictures, PoseStore, coarsen
 from drake_pose.search.grid.partial_poses import Expansion, PartialPoses
 from drake_pose.search.grid.sampled_body import SampledBody
 from drake_pose.search.scoring import Scoring
 from drake_pose.search.settings import BeamSearchSettings, Stage
+
+# Stages that let something lie outside see the silhouettes no finer than with about so many pixels;
+# the best pose is then judged in full.
+_COARSE_PIXELS = 6000
 
 
 class BeamSearch:
@@ -47,8 +51,7 @@ class BeamSearch:
         """Estimate the pose that the views show; see ``PoseSearch``.
 
         Returns:
-            The best pose found; ``stopped_by`` is "exact" (J = 0), "end", "time_limit" or
-            "hypothesis_limit".
+            The best pose found; ``stopped_by`` is "exact" (J = 0), "end" or "time_limit".
 
         Raises:
             SettingsError: if there is no view.
@@ -132,7 +135,6 @@ class _Run:
         self.J = np.inf
         self.first_J = np.nan
         self.runs = 0
-        self.hypotheses = 0
         self.stopped_by = ""
         self._expansions: dict[float, Expansion] = {}
 
@@ -154,7 +156,7 @@ class _Run:
             self._answer_somehow()
         elif self.J > 0 and self.settings.research_hypotheses and not self.stopped_by:
             turned = turn_single_nodes(
-                self.scoring, self.pictures(exact=False), self.samples, lambda: self.proceed(0)
+                self.scoring, self.pictures(exact=False), self.samples, self.proceed
             )
             self._keep_if_better(turned)
         self.stopped_by = "exact" if self.J == 0 else self.stopped_by or "end"
@@ -164,19 +166,15 @@ class _Run:
         if exact not in self._pictures:
             views, band = self.views, 0
             if not exact:
-                views = tuple(coarsen(view, self.settings.coarse_pixels) for view in views)
-                band = self.settings.band
+                views = tuple(coarsen(view, _COARSE_PIXELS) for view in views)
+                band = BAND
             self._pictures[exact] = Pictures(self.body, views, band)
         return self._pictures[exact]
 
-    def proceed(self, made: int) -> bool:
-        """Whether the limits allow to go on, after one more node with this many hypotheses."""
+    def proceed(self) -> bool:
+        """Whether the time allows to go on, after one more node."""
         self.runs += 1
-        self.hypotheses += made
-        limit = self.settings.hypothesis_limit
-        if limit is not None and self.hypotheses >= limit:
-            self.stopped_by = "hypothesis_limit"
-        elif time.perf_counter() >= self.deadline:
+        if time.perf_counter() >= self.deadline:
             self.stopped_by = "time_limit"
         return not self.stopped_by
 
@@ -212,7 +210,7 @@ class _Run:
         width = 1 if self.stopped_by else self.settings.stages[-1].hypotheses
         expansion = Expansion(PoseStore(self.body, self.pictures(exact=False)))
         last, _ = run_stage(
-            expansion, expansion.start(), self.body.order, width, 2, False, lambda made: True
+            expansion, expansion.start(), self.body.order, width, 2, False, lambda: True
         )
         if last is not None:
             best = int(np.argmin(self._gather(expansion, last)))

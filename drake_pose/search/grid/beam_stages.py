@@ -83,12 +83,12 @@ def run_stage(
     width: int,
     outside_weight: int,
     exact: bool,
-    proceed: Callable[[int], bool],
+    proceed: Callable[[], bool],
 ) -> tuple[PartialPoses | None, bool]:
     """Place nodes one after another.
 
     Args:
-        proceed: asked after each node, with the number of partial poses made, whether to go on.
+        proceed: asked after each node whether to go on.
 
     Returns:
         The last ones (None: none was left, or told to stop), and whether all possible ones were
@@ -101,7 +101,7 @@ def run_stage(
             break
         partial, lost = grow(expansion, partial, node, width, outside_weight, exact)
         complete = complete and not lost
-        if partial is not None and not proceed(len(partial)):
+        if partial is not None and not proceed():
             return None, False
     return partial, complete
 
@@ -112,7 +112,7 @@ def search_limbs_again(
     poses: np.ndarray,
     J: float,
     width: int,
-    proceed: Callable[[int], bool],
+    proceed: Callable[[], bool],
     found: Callable[[PartialPoses], np.ndarray],
 ) -> np.ndarray:
     """Search limbs again, one or two at a time, until that improves nothing any more.

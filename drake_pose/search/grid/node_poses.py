@@ -15,6 +15,9 @@ from drake_pose.silhouette.bits.bit_kernel import draw_bits
 from drake_pose.silhouette.bits.bit_view import WORD, BitView, make_bit_view
 from drake_pose.silhouette.bits.bounding_balls import draw_discs, prune_by_balls
 
+BAND = 24
+"""How far around a silhouette the union of what lies outside is told from its sum [pixel]."""
+
 _ONE, _ALL = 1, 2
 # How many poses of a node, and discs that hold what can be reached, are drawn before the limits are
 # looked at again.

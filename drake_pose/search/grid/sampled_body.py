@@ -8,7 +8,6 @@ import numpy as np
 from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import Camera, ParallelCamera
-from drake_pose.errors import SettingsError
 from drake_pose.search.scoring import SampledTree
 from drake_pose.search.settings import BeamSearchSettings
 from drake_pose.silhouette.areas.inscribed_balls import VisualHull
@@ -38,9 +37,6 @@ class SampledBody:
         p_PB: for each node (n, k, 3) their centres in its parent's frame at each sample [m].
         reach_balls: (nodes, 4) centre in the parent's frame and radius [m] of a ball that holds the
             node and its descendants at all samples.
-
-    Raises:
-        SettingsError: if the order does not name every node once, parents before children.
     """
 
     def __init__(self, tree: PoseTree, settings: BeamSearchSettings) -> None:
@@ -59,9 +55,8 @@ class SampledBody:
         self.reach_balls = self._find_reaches()
         self._celled: dict[tuple[int, float, bool], CelledOutline] = {}
         self._frontiers: dict[frozenset[int], tuple[np.ndarray, list[int]]] = {}
-        given = named_order(tree, settings.node_order)
-        self.order = given or self._find_order(limb_by_limb=False)
-        self.limb_order = given or self._find_order(limb_by_limb=True)
+        self.order = self._find_order(limb_by_limb=False)
+        self.limb_order = self._find_order(limb_by_limb=True)
 
     def with_root_position(self, root_position: np.ndarray) -> "SampledBody":
         """The same with the root at another position (3,) [m]; all but the root is shared."""
@@ -190,26 +185,6 @@ class SampledBody:
             ]
             placed.append(min(waiting, key=rank))
         return tuple(placed)
-
-
-def named_order(tree: PoseTree, names: tuple[str, ...]) -> tuple[int, ...]:
-    """The nodes of an order given by names; () for none.
-
-    Raises:
-        SettingsError: if it does not name every node once, parents before children.
-    """
-    if not names:
-        return ()
-    order = tuple(tree.node_index(name) for name in names)
-    if sorted(order) != list(range(len(tree.nodes))):
-        raise SettingsError("node_order must name every node of the tree once")
-    for place, node in enumerate(order):
-        if tree.nodes[node].parent not in (-1, *order[:place]):
-            raise SettingsError(
-                f"node_order names '{tree.nodes[node].name}' before its parent "
-                f"'{tree.nodes[tree.nodes[node].parent].name}'"
-            )
-    return order
 
 
 def _fixed_points(X_PN: np.ndarray, ball: np.ndarray) -> np.ndarray:

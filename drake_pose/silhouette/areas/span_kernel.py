@@ -135,7 +135,8 @@ def _clip_near(
         lost = 0
         for k in range(3):
             lost += hidden[packed.triangles[first + t, k]]
-        weight = int(rows.facings[t])
+        # As a plain integer, or the kernel that walks is compiled once more.
+        weight = np.int64(rows.facings[t])
         if lost == 0 or weight == 0:
             continue
         rows.facings[t] = 0

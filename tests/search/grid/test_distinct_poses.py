@@ -100,11 +100,6 @@ def test_alternatives_to_an_exact_pose_are_listed_too(maker: ProblemMaker) -> No
     assert len(poses) == 6
 
 
-def test_a_limit_leaves_a_list_that_may_be_short(maker: ProblemMaker, problem: GridProblem) -> None:
-    poses = BeamSearch(maker.tree, settings(time_limit=0.0)).best_poses(problem.views)
-    assert len(poses) == len(poses.node_values) >= 1
-
-
 @pytest.mark.parametrize(("count", "alike"), [(0, 0.5), (1, 0.0)])
 def test_settings_out_of_range_are_refused(
     maker: ProblemMaker, problem: GridProblem, count: int, alike: float

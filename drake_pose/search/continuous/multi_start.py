@@ -7,6 +7,7 @@ limb searched again, joints that turn against each other (``self_motions``).
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -102,8 +103,9 @@ class MultiStartSearch:
 
     def without_alternatives(self) -> MultiStartSearch:
         """The same search where only E_total is wanted: one round, and no set of poses."""
-        settings = replace(self.settings, rounds=0, families=None)
-        return MultiStartSearch(self.tree, settings)
+        other = copy.copy(self)
+        other.settings = replace(self.settings, rounds=0, families=None)
+        return other
 
     def match(self, views: Sequence[View], root_position: np.ndarray | None = None) -> PoseEstimate:
         """Estimate the pose that the views show.

@@ -4,6 +4,7 @@ Its first stages let nothing lie outside the silhouette and end at J = 0, which 
 later ones let more and more, weighed against what is covered newly (5).
 """
 
+import copy
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -67,7 +68,9 @@ class BeamSearch:
 
     def without_alternatives(self) -> "BeamSearch":
         """The same search where only E_total is wanted: no examination."""
-        return BeamSearch(self.tree, self.settings)
+        other = copy.copy(self)
+        other.examination = None
+        return other
 
     def best_poses(
         self,

@@ -136,7 +136,7 @@ def _clip_near(
         for k in range(3):
             lost += hidden[packed.triangles[first + t, k]]
         # As a plain integer, or the kernel that walks is compiled once more.
-        weight = np.int64(rows.facings[t])
+        weight = int(np.int64(rows.facings[t]))
         if lost == 0 or weight == 0:
             continue
         rows.facings[t] = 0

@@ -35,9 +35,9 @@ from drake_pose.registration.register import (
     ObjectPose,
     RegisteredCamera,
     RegistrationBody,
+    suggest_pose,
 )
 from drake_pose.registration.start_poses import E_total, areas
-from drake_pose.registration.suggestions import suggest_pose
 from drake_pose.results.folder import require_empty
 from drake_pose.results.options import percent
 from drake_pose.results.summary import BADLY_EXPLAINED

@@ -15,9 +15,8 @@ from drake_pose.silhouette.areas.span_kernel import paint, score
 
 def prefix_sums(mask: np.ndarray) -> np.ndarray:
     """Returns (H, W + 1) int32: how many pixels of a mask (H, W) lie left of each pixel."""
-    pixels = _as_bytes(mask)
-    prefix = np.zeros((pixels.shape[0], pixels.shape[1] + 1), dtype=np.int32)
-    np.cumsum(pixels != 0, axis=1, out=prefix[:, 1:])
+    prefix = np.zeros((mask.shape[0], mask.shape[1] + 1), dtype=np.int32)
+    np.cumsum(mask != 0, axis=1, out=prefix[:, 1:])
     return prefix
 
 
@@ -102,32 +101,19 @@ def draw_labels(
 def subtract_body(
     mask: np.ndarray,
     prefix: np.ndarray,
-    outlines: Outline | Sequence[Outline],
+    outlines: Sequence[Outline],
     X_CN: np.ndarray,
     camera: Camera,
 ) -> None:
     """Takes a body's picture out of a mask and brings the mask's prefix sums up to date.
 
     Args:
-        mask: (H, W) bool or uint8, C-contiguous; changed in place.
-        prefix: (H, W + 1) int32 its prefix sums, C-contiguous; changed in place.
-        X_CN: (nodes, 4, 4) the surfaces' poses in the camera (one surface: (4, 4) will do).
-
-    Raises:
-        ValueError: when an array has the wrong shape or type, or cannot be changed in place.
+        mask: (H, W) bool; changed in place.
+        prefix: (H, W + 1) int32 its prefix sums; changed in place.
+        X_CN: (nodes, 4, 4) the surfaces' poses in the camera.
     """
-    surfaces = [outlines] if isinstance(outlines, Outline) else outlines
-    poses = np.asarray(X_CN)
-    packed, poses = _check_body(surfaces, poses.reshape(1, len(surfaces), *poses.shape[-2:]))
-    size = (camera.height, camera.width)
-    for name, array, shape in (("mask", mask, size), ("prefix", prefix, (size[0], size[1] + 1))):
-        if array.shape != shape or not (array.flags.c_contiguous and array.flags.writeable):
-            raise ValueError(
-                f"{name} of camera '{camera.name}' must be {shape}, C-contiguous and writeable"
-            )
-    if prefix.dtype != np.int32:
-        raise ValueError(f"prefix of camera '{camera.name}' must be int32, not {prefix.dtype}")
-    first, end = paint(packed, poses[0], camera.kernel_parameters(), _as_bytes(mask), 0)
+    packed, poses = _check_body(outlines, np.asarray(X_CN)[None])
+    first, end = paint(packed, poses[0], camera.kernel_parameters(), mask.view(np.uint8), 0)
     prefix[first:end] = prefix_sums(mask[first:end])
 
 
@@ -142,10 +128,3 @@ def _check_body(
         raise ValueError("poses must be finite")
     outlines = tuple(s.rest if isinstance(s, BendingOutline) else s for s in surfaces)
     return pack(outlines), np.array(poses[:, :, :3], dtype=np.float64, order="C")
-
-
-def _as_bytes(mask: np.ndarray) -> np.ndarray:
-    """Returns a mask (H, W) of bool or uint8 as uint8, without a copy where it can be."""
-    if mask.ndim != 2 or mask.dtype not in (np.bool_, np.uint8):
-        raise ValueError(f"a mask must be (H, W) bool or uint8, not {mask.shape} {mask.dtype}")
-    return np.require(mask, requirements=["C", "W"]).view(np.uint8)

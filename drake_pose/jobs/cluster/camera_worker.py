@@ -111,12 +111,7 @@ def _load_kernels(surfaces: PackedOutlines) -> None:
 
 
 class CameraWatch:
-    """Some cameras' sources, open until they are closed or nobody asks.
-
-    Raises:
-        SceneError: a source cannot be opened.
-        ClusterError: this worker's own address cannot be listened at.
-    """
+    """Some cameras' sources, open until they are closed or nobody asks; see open_watch."""
 
     def __init__(
         self, specifications: Sequence[SourceSpecification], spacings: Mapping[str, float]

@@ -89,7 +89,7 @@ def capture_paper(
     model = load_model(model_path or bundled_model("person"), package_paths=settings.packages)
     require_empty(out)
     faces = None if settings.faces is None else learn_recorded_faces(settings.faces)
-    search = RegisteredPoseSearch(scene, model, settings.face_camera, faces)
+    search = _RegisteredPoseSearch(scene, model, settings.face_camera, faces)
     setup = search.run(opener(), on_report)
     sensors = opener()
     try:
@@ -104,20 +104,8 @@ def capture_paper(
         sensors.close()
 
 
-class RegisteredPoseSearch:
-    """Looks for the registered pose in a scene's pictures: upright, both arms spread.
-
-    Args:
-        face_camera: which camera sees the face; None: there is none.
-        faces: templates of the person's face; needed where there is a face camera.
-
-    Raises:
-        SceneError: a camera delivers masks.
-        CameraError: a camera of parallel rays.
-        UnknownNameError: there is no such face camera.
-        SettingsError: fewer than two other cameras, or a face camera without templates.
-        ModelError: the model is not made like the bundled person.
-    """
+class _RegisteredPoseSearch:
+    """Looks for the registered pose in a scene's pictures: upright, both arms spread."""
 
     def __init__(
         self,
@@ -126,11 +114,9 @@ class RegisteredPoseSearch:
         face_camera: str | None = None,
         faces: FaceTemplates | None = None,
     ) -> None:
-        self._cameras = require_colour(scene)
+        self._cameras = _require_colour(scene)
         if face_camera is not None and face_camera not in scene.cameras:
             raise UnknownNameError("camera", face_camera, scene.cameras, str(scene.path))
-        if (face_camera is None) != (faces is None):
-            raise SettingsError("a face camera needs templates of the face, and these a camera")
         self._scene, self._model = scene, model
         self._face_camera, self._faces = face_camera, faces
         ring = {name: one for name, one in self._cameras.items() if name != face_camera}
@@ -144,12 +130,7 @@ class RegisteredPoseSearch:
         self._since = 0
 
     def run(self, sensors: LiveSensors, on_report: Callable[[str], None]) -> CaptureSetup:
-        """What the capture needs, from the pictures of the registered pose; uses the sensors up.
-
-        Raises:
-            SettingsError: nobody showed the registered pose.
-            KeyboardInterrupt: the user gave up.
-        """
+        """What the capture needs, from the pictures of the registered pose; uses the sensors up."""
         builder = DiagramBuilder()
         builder.AddNamedSystem("picture_capture", sensors)
         images = {name: sensors.GetOutputPort(f"color_image_{name}") for name in self._cameras}
@@ -229,13 +210,8 @@ class RegisteredPoseSearch:
         )  # fmt: skip
 
 
-def require_colour(scene: LiveScene) -> dict[str, PinholeCamera]:
-    """The cameras of a scene whose colour pictures show skin.
-
-    Raises:
-        SceneError: a camera delivers masks.
-        CameraError: a camera of parallel rays.
-    """
+def _require_colour(scene: LiveScene) -> dict[str, PinholeCamera]:
+    """The cameras of a scene, whose colour pictures show skin."""
     cameras = {}
     for name, camera in scene.cameras.items():
         if scene.specifications[name].gives_masks:

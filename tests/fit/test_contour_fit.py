@@ -8,7 +8,6 @@ from drake_pose.fit.contour_fit import ContourFit, Prior, pack_views
 from drake_pose.fit.evidence import find_edge_points
 from drake_pose.fit.kernel import collect, nearest_alike
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
-from drake_pose.fit.parameters import affine_motions
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
 STEPS = (
@@ -95,23 +94,6 @@ def test_nearest_points_against_brute_force():
     for found, expected in ((of_point, distance), (of_edge, distance.T)):
         wanted = np.where(np.isinf(expected.min(axis=1)), -1, expected.argmin(axis=1))
         np.testing.assert_array_equal(found, wanted)
-
-
-def test_affine_motions_against_finite_differences(fit, person):
-    values = fit.kinematics.flatten(
-        person.pose_tree().values_from_positions(standing(person, left_forearm_x=-40, head_y=30))
-    )
-    motions = fit.kinematics.motions(values)
-    affine = affine_motions(motions.twists).reshape(-1, 3, 4)
-    p_N = np.array([0.1, -0.2, 0.05])
-    for node in range(len(motions.X_WN)):
-        place = motions.X_WN[node, :3, :3] @ p_N + motions.X_WN[node, :3, 3]
-        for index in np.flatnonzero(motions.moves[node]):
-            moved = values.copy()
-            moved[index] += 1e-6
-            X = fit.kinematics.poses(moved)[node]
-            speed = (X[:3, :3] @ p_N + X[:3, 3] - place) / 1e-6
-            np.testing.assert_allclose(affine[index] @ [*place, 1.0], speed, atol=1e-5)
 
 
 def test_equations_are_collected_as_dense_products():

@@ -73,18 +73,6 @@ def test_values_alone_are_all_parameters_at_rest(body, theta):
     np.testing.assert_allclose(alone.motions, whole.motions[:count], atol=1e-12)
 
 
-def test_widened_surfaces_keep_their_planes(body, theta):
-    packed = body.place(theta).packed
-    for node in range(len(body.outlines)):
-        first, end = packed.starts[node, :2], packed.starts[node + 1, :2]
-        points = packed.points[:, first[0] : end[0]].T
-        for t in range(first[1], end[1]):
-            a, b, c = points[packed.triangles[t]]
-            normal = np.cross(b - a, c - a)
-            expected = [*normal, normal @ a]
-            np.testing.assert_allclose(packed.planes[:, t], expected, rtol=1e-6, atol=1e-12)
-
-
 def picture(X_CW, kernel, p_W):
     """(2,) where a point (3,) is seen."""
     x, y, z = X_CW[:3, :3] @ p_W + X_CW[:3, 3]

@@ -9,7 +9,6 @@ from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.surfaces import few_triangles
 from drake_pose.search.continuous.views_fit import FittedPose, ViewsFit, distinct
 from drake_pose.search.estimates import View
-from drake_pose.search.starts.coarse_search import signed_distances
 from drake_pose.silhouette.areas.bending import TreeSurfaces
 from tests.search.arms import arm_cameras, arm_tree, draw_pose, draw_view
 
@@ -65,17 +64,6 @@ def test_limits_and_held_values(kinematics: TreeKinematics) -> None:
     free = [0, 2, 3, 4]
     assert (found.values[free] <= kinematics.upper[free]).all()
     assert (found.values[free] >= kinematics.lower[free]).all()
-
-
-def test_signed_distances_are_those_to_the_nearest_pixel_of_the_other_kind() -> None:
-    mask = np.random.default_rng(4).random((14, 17)) < 0.6
-    found = signed_distances(mask)
-    inside, outside = np.argwhere(mask), np.argwhere(~mask)
-    for row, column in np.ndindex(mask.shape):
-        others = outside if mask[row, column] else inside
-        nearest = np.linalg.norm(others - [row, column], axis=1).min() - 0.5
-        expected = -nearest if mask[row, column] else nearest
-        assert found[row, column] == pytest.approx(expected, abs=1e-4)
 
 
 def test_distinct_keeps_the_best_of_those_alike() -> None:

@@ -37,17 +37,11 @@ class LiveResult:
 
 
 class LiveWriter:
-    """The result of a capture under way.
+    """The result of a capture under way; arguments and errors are those of capture_live.
 
     Args:
         tracker: made for the person's pose tree; gives its surfaces.
-        out: the result's folder, empty or not there.
         period: time between two frames [s].
-        packages: folders of packages that the model's ``package://`` names mean, by name.
-        on_frame: called with each frame: how many there are, and whether a person was found.
-
-    Raises:
-        OutputError: the folder is not empty, or cannot be written.
     """
 
     def __init__(

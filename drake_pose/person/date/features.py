@@ -17,6 +17,11 @@ Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
+_FIRST_FOOT = FEATURES.index("left_foot")
+# Two rays show the same skin where they pass each other by less than the first; the radius of the
+# dense part of a feature's points [m]; how far outside a silhouette a point may be seen [pixel].
+_THRESHOLD, _DENSE, _MARGIN = 0.05, 0.08, 2
+
 
 @dataclass(frozen=True)
 class SkinColour:
@@ -76,12 +81,6 @@ def skin_blobs(
         boxes=boxes,
         mask=mask,
     )
-
-
-_FIRST_FOOT = FEATURES.index("left_foot")
-# Two rays show the same skin where they pass each other by less than the first; the radius of the
-# dense part of a feature's points [m]; how far outside a silhouette a point may be seen [pixel].
-_THRESHOLD, _DENSE, _MARGIN = 0.05, 0.08, 2
 
 
 @dataclass(frozen=True, eq=False)

@@ -203,9 +203,6 @@ class _Capture:
 
 ReadPictures = Callable[[int], Mapping[str, Picture]]
 
-# Silhouettes of fewer cameras do not tell where a person is.
-_FEWEST = 2
-
 
 def capture_by_colour(
     tree: PoseTree,

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from drake_pose.camera.calibration.board import Board, Detection, load_board
+from drake_pose.camera.calibration.board import Board, Detection, find_boards, load_board
 from drake_pose.camera.calibration.calibrate import CalibrationSettings, calibrate
 from drake_pose.camera.calibration.lens import Lens, load_lenses, save_lenses
 from drake_pose.camera.calibration.rig import _vector, corner_residuals
@@ -266,6 +266,16 @@ class TestPictures:
         assert CHARUCO.find(picture[:, ::-1]) is None
         noise = np.random.default_rng(0).integers(0, 255, (240, 320)).astype(np.uint8)
         assert CHECKERBOARD.find(noise) is None
+
+    def test_pictures_of_one_camera_are_of_one_size(self, tmp_path):
+        files = {frame: tmp_path / f"{frame}.png" for frame in ("1", "2")}
+        for path, shape in zip(files.values(), ((20, 30), (30, 20)), strict=True):
+            cv2.imwrite(str(path), np.zeros(shape, np.uint8))
+        with pytest.raises(CameraError, match=r"2\.png: 20 x 30 pixels.*began with 30 x 20"):
+            find_boards({"c": files}, CHECKERBOARD)
+        seen = find_boards({"c": {"1": files["1"], "3": tmp_path / "3.png"}}, CHECKERBOARD)
+        assert seen.sizes == {"c": (30, 20)}
+        assert (seen.not_found, set(seen.unreadable)) == ((("c", "1"),), {("c", "3")})
 
 
 class TestLens:

@@ -138,7 +138,7 @@ def calibrate_joints(
     """The zeros of some joints and lengths of links, fitted together with the cameras' poses.
 
     Args:
-        cameras: as they were registered with the model's zeros and lengths.
+        cameras: as they were registered with the model's zeros and lengths; no two of one name.
         frames: what each of them sees.
         names: of the positions whose zeros are asked for.
         focal: whether the cameras' focal lengths are asked for, too.

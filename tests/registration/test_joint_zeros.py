@@ -63,7 +63,7 @@ class TestCalibrateJoints:
         off[body.kinematics.names.index("elbow_turn")] = np.radians(2.0)
         registered, frames, alone = [], [], []
         for seed, place in enumerate(places):
-            camera = looking_at(place, MIDDLE, 0.1)
+            camera = replace(looking_at(place, MIDDLE, 0.1), name=f"eye {seed}")
             frames.append(misread(see(model, body, camera, 4, seed), off))
             registered.append(CameraSearch(body).refine(camera, frames[-1]))
             alone.append(calibrate_joints(body, registered[-1:], frames[-1:], ["elbow_turn"]))

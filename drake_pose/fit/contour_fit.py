@@ -300,15 +300,7 @@ def normal_equations(total: CameraSum, placement: Placement, size: int) -> tuple
         placement: of the body.
         size: how many parameters it has.
     """
-    return collect(
-        total.A,
-        total.b,
-        placement.motions,
-        placement.starts,
-        placement.owners,
-        placement.parameters,
-        size,
-    )
+    return collect(total.A, total.b, *placement[2:], size)
 
 
 def symmetric(A: Array) -> Array:

@@ -152,6 +152,9 @@ def test_tele_camera_projects_as_the_parallel_one() -> None:
         clipping = color.core().clipping()
         assert clipping.near() <= depth.min()
         assert depth.max() <= clipping.far()
+    color, _, _ = camera_to_drake(parallel(), renderer_name="vtk", depth_range=(-1e4, 1e4))
+    clipping = color.core().clipping()
+    assert clipping.near() > 0.8 * clipping.far(), "far enough away for deep scenes, too"
 
 
 def test_drake_needs_the_principal_point_inside() -> None:

@@ -270,6 +270,6 @@ def write_overlays(
     outlines = [outline_from_mesh(tree.nodes[k].mesh) for k in shown]
     for frame, title in titled:
         X_CN = camera.X_CW @ kinematics.poses(frame.values)[shown]
-        segments = draw_labels(outlines, shown, X_CN, camera, empty=-1)
+        segments = draw_labels(outlines, np.arange(1, len(shown) + 1), X_CN, camera) - 1
         picture = draw_overlay(frame.mask, segments >= 0, segments, title)
         write_file(folder, f"{OVERLAY}/{camera.name}/{frame.name}.png", encode_png(picture))

@@ -16,6 +16,7 @@ from drake_pose.camera.files import load_cameras
 from drake_pose.jobs.registration.register import register_scene, say_common
 from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.registration.register import FrameMisfit, RegisteredCamera
+from drake_pose.results.overlay import EXCESS_RGB, MISSING_RGB
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.cli import Result, run_command
@@ -80,7 +81,11 @@ class TestRegister:
     def test_overlays_and_report(self, registered) -> None:
         pictures = sorted((registered[0] / "overlay" / "left").glob("*.png"))
         assert [path.stem for path in pictures] == [f"{k:04d}" for k in range(5)]
-        assert cv2.imread(str(pictures[0])).shape[1] >= 560
+        picture = cv2.imread(str(pictures[0]))[:, :, ::-1]
+        assert picture.shape[1] >= 560
+        # But for the legend's squares, body and mask are one.
+        wrong = [(picture == rgb).all(axis=2).mean() for rgb in (MISSING_RGB, EXCESS_RGB)]
+        assert max(wrong) < 0.005
         page = (registered[0] / "report.html").read_text()
         assert page.count("data:image/jpeg;base64,") == 5
         assert page.count("<tr><td>000") == 5

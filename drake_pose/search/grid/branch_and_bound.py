@@ -47,7 +47,6 @@ class PosesWithin:
     complete: bool
     limited: bool
     lower_bound: float
-    states: int
 
 
 def branch_and_bound(
@@ -99,7 +98,6 @@ class _BranchAndBound:
         self._complete = True
         self._limited = False
         self._lower_bound = np.inf
-        self._visited = 0
         # The partial pose that the pose to be kept is in; -1: none.
         self._kept = -1 if kept_samples is None else 0
 
@@ -117,13 +115,13 @@ class _BranchAndBound:
                 nothing = np.zeros(0, dtype=np.int64)
                 layers = [Layer(i, nothing, nothing, nothing) for i in range(len(self.nodes))]
                 graph = PartialPoseGraph(layers, np.zeros(0))
-                return PosesWithin(graph, False, True, bound, self._visited)
+                return PosesWithin(graph, False, True, bound)
         # All nodes are placed: the bounds are the objectives, but for what is beyond the bands.
         highs = partial.bounds + partial.far[:, 1] - partial.far[:, 0]
         graph = PartialPoseGraph(self._layers, highs).up_to(self.J_limit)
         self._drop(partial.bounds[highs > self.J_limit])
         bound = min(self._lower_bound, float(np.floor(self.J_limit)) + 1.0)
-        return PosesWithin(graph, self._complete, self._limited, bound, self._visited)
+        return PosesWithin(graph, self._complete, self._limited, bound)
 
     def _drop(self, bounds: np.ndarray, limited: bool = False) -> None:
         """Note that partial poses with these bounds are dropped though they might lead to poses."""
@@ -203,7 +201,6 @@ class _BranchAndBound:
         firsts, made, numbers = expansion.choose(
             partial, made, node, pairs, len(pairs), far_matters=True
         )
-        self._visited += len(made)
         samples = self.store.nodes[node].samples[pairs[:, 1]].astype(np.int64)
         self._follow_kept(pairs[:, 0], samples, numbers, node)
         kept = self._fit(made)

@@ -129,7 +129,6 @@ class Proof:
     J: float
     samples: np.ndarray
     lower_bound: float
-    states: int
 
 
 def prove_optimal(
@@ -142,11 +141,10 @@ def prove_optimal(
     """Prove a pose, samples (nodes,) with objective J [pixel], the best of the grid; or find it."""
     limits = limits or BoundLimits()
     deadline = limits.deadline
-    best, bound, visited, J_limit, spent = samples, 0.0, 0, 0.0, False
+    best, bound, J_limit, spent = samples, 0.0, 0.0, False
     while bound < J:
         J_limit = min(J_limit, J - 1.0)
         found = branch_and_bound(body, views, J_limit, limits, deadline=deadline)
-        visited += found.states
         if found.graph.best_J < J:
             J, best = found.graph.best_J, found.graph.central()
         bound = max(bound, min(J, found.lower_bound))
@@ -155,4 +153,4 @@ def prove_optimal(
             break
         J_limit = max(_FIRST_LIMIT, 2.0 * J_limit)
     proved = bound >= J
-    return Proof(proved, spent and not proved, J, best, bound, visited)
+    return Proof(proved, spent and not proved, J, best, bound)

@@ -18,6 +18,7 @@ from drake_pose.search.grid.pair_kernel import (
     score_pairs,
     unite_poses,
 )
+from drake_pose.search.grid.pose_graph import spread
 
 
 @dataclass(frozen=True)
@@ -202,9 +203,4 @@ class Expansion:
 
 def all_pairs(groups: np.ndarray) -> np.ndarray:
     """(p, 2) int32 each partial pose with each pose that it may take, by groups (B, 2)."""
-    counts = groups[:, 1] - groups[:, 0]
-    ends = np.cumsum(counts)
-    pairs = np.empty((int(ends[-1]) if len(ends) else 0, 2), dtype=np.int32)
-    pairs[:, 0] = origins = np.repeat(np.arange(len(groups)), counts)
-    pairs[:, 1] = np.arange(len(pairs)) + (groups[:, 0] - ends + counts)[origins]
-    return pairs
+    return np.column_stack(spread(groups[:, 0], groups[:, 1])).astype(np.int32)

@@ -19,6 +19,7 @@ from drake_pose.search.grid.pose_graph import (
     Layer,
     PartialPoseGraph,
     single_pose,
+    spread,
 )
 from drake_pose.search.grid.sampled_body import SampledBody
 from drake_pose.search.scoring import SampledTree
@@ -141,10 +142,8 @@ def split_into_families(graph: PartialPoseGraph, labels: list[np.ndarray]) -> li
         several = found.max(initial=0) > 0 and len(states) < _MOST_PAIRS
         ends, codes, weights = _bundle(layer, found if several else np.zeros_like(found))
         origins, bundle_starts = codes
-        first = np.searchsorted(origins, states, side="left")
-        count = np.searchsorted(origins, states, side="right") - first
-        source = np.repeat(np.arange(len(states)), count)
-        edge = np.repeat(first - np.cumsum(count) + count, count) + np.arange(count.sum())
+        begins = np.searchsorted(origins, states)
+        source, edge = spread(begins, np.searchsorted(origins, states, side="right"))
         pairs = np.column_stack([families[source], bundle_starts[edge]])
         known, families = np.unique(pairs, axis=0, return_inverse=True)
         clusters = clusters[known[:, 0]]
@@ -153,7 +152,12 @@ def split_into_families(graph: PartialPoseGraph, labels: list[np.ndarray]) -> li
         merged, places = np.unique(keys, axis=0, return_inverse=True)
         sizes = np.bincount(places.ravel(), sizes[source] * weights[edge], minlength=len(merged))
         states, families = merged[:, 0], merged[:, 1]
-    return _collect(graph, states, families, sizes, clusters)
+    found = []
+    for family in np.unique(families):
+        own = families == family
+        J = float(graph.Js[states[own]].min())
+        found.append(GraphFamily(clusters[family], float(sizes[own].sum()), J))
+    return sorted(found, key=lambda family: (family.J, -family.size))
 
 
 def _bundle(
@@ -163,22 +167,6 @@ def _bundle(
     keys = np.column_stack([layer.origins, labels, layer.ends])
     bundles, counts = np.unique(keys, axis=0, return_counts=True)
     return bundles[:, 2], (bundles[:, 0], bundles[:, 1]), counts.astype(np.float64)
-
-
-def _collect(
-    graph: PartialPoseGraph,
-    states: np.ndarray,
-    families: np.ndarray,
-    sizes: np.ndarray,
-    clusters: np.ndarray,
-) -> list[GraphFamily]:
-    """The families from pairs of a last state and a family."""
-    found = []
-    for family in np.unique(families):
-        own = families == family
-        J = float(graph.Js[states[own]].min())
-        found.append(GraphFamily(clusters[family], float(sizes[own].sum()), J))
-    return sorted(found, key=lambda family: (family.J, -family.size))
 
 
 # The share of the contours' pixels that noise may turn.
@@ -202,11 +190,6 @@ class GridPoseSet(PoseSet):
         """Whether a pose of the grid, the values of each node, is in the set."""
         samples = samples_at(self.sampled, node_values)
         return samples is not None and self.graph.contains(samples)
-
-    def draw(self, count: int, generator: np.random.Generator) -> list[list[np.ndarray]]:
-        """Draw members at random, each as likely as any other: for each the nodes' values."""
-        drawn = self.graph.draw(count, generator)
-        return [self.sampled.values_at(samples) for samples in drawn]
 
 
 def find_families(

@@ -30,6 +30,13 @@ class Layer:
         return Layer(self.node, self.origins[edges], self.samples[edges], self.ends[edges])
 
 
+def spread(begins: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The places of groups, given by where they begin and end (n,), and before them the groups."""
+    counts = ends - begins
+    groups = np.repeat(np.arange(len(counts)), counts)
+    return groups, np.arange(len(groups)) + (begins - np.cumsum(counts) + counts)[groups]
+
+
 def make_layer(node: int, origins: np.ndarray, samples: np.ndarray, ends: np.ndarray) -> Layer:
     """A layer of edges in any order."""
     order = np.lexsort((samples, origins))
@@ -137,10 +144,8 @@ class PartialPoseGraph:
         """All poses, samples (size, nodes); mind the size."""
         partial, states = np.zeros((1, len(self.layers)), dtype=np.int64), np.zeros(1, dtype=int)
         for layer in self.layers:
-            first = np.searchsorted(layer.origins, states, side="left")
-            counts = np.searchsorted(layer.origins, states, side="right") - first
-            source = np.repeat(np.arange(len(states)), counts)
-            edges = np.repeat(first - np.cumsum(counts) + counts, counts) + np.arange(len(source))
+            begins = np.searchsorted(layer.origins, states)
+            source, edges = spread(begins, np.searchsorted(layer.origins, states, side="right"))
             partial, states = partial[source], layer.ends[edges]
             partial[:, layer.node] = layer.samples[edges]
         return partial

@@ -4,6 +4,7 @@ import numpy as np
 
 from drake_pose.search.grid.node_poses import PoseStore
 from drake_pose.search.grid.pair_kernel import NO_CHILDREN, unite
+from drake_pose.search.grid.pose_graph import spread
 
 
 class SubtreeReaches:
@@ -58,9 +59,7 @@ class SubtreeReaches:
             runs, words, below = store.reach_runs, store.reach_words, NO_CHILDREN
         else:
             groups = store.groups(node, parents)
-            counts = groups[:, 1] - groups[:, 0]
-            offsets = np.repeat(groups[:, 0] - np.cumsum(counts) + counts, counts)
-            below = self.child_rows(node, offsets + np.arange(len(offsets)))
+            below = self.child_rows(node, spread(groups[:, 0], groups[:, 1])[1])
             runs, words = store.nodes[node].runs, store.nodes[node].words
         rows = np.arange(self._used, self._used + len(parents))
         self._used += len(parents)

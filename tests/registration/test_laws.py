@@ -14,7 +14,7 @@ from drake_pose.body.tree.root import RootRotation
 from drake_pose.errors import MaskError
 from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.registration import bundle_adjustment
-from drake_pose.registration.object_search import hand_eye_starts
+from drake_pose.registration.object_search import ObjectSearch, hand_eye_starts
 from drake_pose.registration.online_registration import pose_difference
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames, SeenFrame
 from drake_pose.registration.register import RegistrationBody
@@ -214,6 +214,20 @@ def test_masks_of_another_size_and_empty_ones_are_refused(
         frame = PosedFrame("0007", posed.frames[0].values, mask)
         with pytest.raises(MaskError, match="camera 'eye', frame '0007'"):
             PosedFrames(body.kinematics, body.few, posed.camera, [frame])
+
+
+def test_poses_of_an_object_are_one_that_show_it_alike(
+    standing: Callable[[str], StandingObject],
+) -> None:
+    """Nearer to each other than a share of its radius, or turned as its looks repeat."""
+    thing = standing(LOOKS["box"][0])
+    search, X = ObjectSearch(thing), looking_at(PLACE, MIDDLE, 0.4).X_WC
+    near, far = X.copy(), X.copy()
+    near[0, 3] += 0.1 * thing.radius
+    far[0, 3] += 0.3 * thing.radius
+    poses = [one[None] for one in (X, X, near, X @ thing.symmetry.turns[2], far)]
+    kept = search._apart(poses, thing.symmetry.turns)
+    np.testing.assert_array_equal(kept, [X[None], far[None]])
 
 
 def random_poses(rng: np.random.Generator, count: int, turn: float = 1.0) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 The names that programs need are here; each is loaded when it is first used. Everything else is in
 the rooms, in the order in which they build on each other: ``body``, ``camera``, ``silhouette``,
-``fit``, ``search``, ``registration``, ``filtering``, ``person``, ``systems``, ``results``,
+``fit``, ``search``, ``registration``, ``filtering``, ``person``, ``systems``, ``files``,
 ``jobs``, ``papers`` and ``commands``.
 """
 
@@ -15,20 +15,20 @@ from typing import TYPE_CHECKING, Any
 from drake_pose.version import VERSION
 
 if TYPE_CHECKING:
-    from drake_pose.body.files.packages import bundled_model
+    from drake_pose.body.formats.packages import bundled_model
     from drake_pose.body.model import ArticulatedModel, load_model
     from drake_pose.body.tree.tree_builder import build_pose_tree
+    from drake_pose.camera.camera_files import load_cameras, save_cameras
     from drake_pose.camera.drake import camera_from_drake
-    from drake_pose.camera.files import load_cameras, save_cameras
     from drake_pose.camera.models import ParallelCamera, PinholeCamera
+    from drake_pose.files.records import SceneEstimate
+    from drake_pose.files.settings import EstimateSettings
     from drake_pose.jobs.estimate.scene import estimate_scene
     from drake_pose.jobs.masks.masks import SceneMasks, make_masks
     from drake_pose.jobs.masks.settings import MaskSettings
     from drake_pose.jobs.registration.audit import SceneAudit, audit_scene
     from drake_pose.jobs.registration.register import SceneRegistration, register_scene
     from drake_pose.jobs.registration.settings import RegistrationSettings
-    from drake_pose.results.records import SceneEstimate
-    from drake_pose.results.settings import EstimateSettings
     from drake_pose.search.continuous.multi_start import MultiStartSearch
     from drake_pose.search.estimates import View
     from drake_pose.search.grid.beam_search import BeamSearch
@@ -46,7 +46,7 @@ _HOMES = {
     "ArticulatedModel": "body.model",
     "BeamSearch": "search.grid.beam_search",
     "CameraRegistration": "systems.estimators.camera_registration",
-    "EstimateSettings": "results.settings",
+    "EstimateSettings": "files.settings",
     "MaskSettings": "jobs.masks.settings",
     "MultiStartSearch": "search.continuous.multi_start",
     "ParallelCamera": "camera.models",
@@ -55,7 +55,7 @@ _HOMES = {
     "RegistrationSettings": "jobs.registration.settings",
     "Scene": "silhouette.pictures.scenes",
     "SceneAudit": "jobs.registration.audit",
-    "SceneEstimate": "results.records",
+    "SceneEstimate": "files.records",
     "SceneMasks": "jobs.masks.masks",
     "SceneRegistration": "jobs.registration.register",
     "SilhouetteCamera": "systems.pictures.silhouette_camera",
@@ -65,15 +65,15 @@ _HOMES = {
     "View": "search.estimates",
     "audit_scene": "jobs.registration.audit",
     "build_pose_tree": "body.tree.tree_builder",
-    "bundled_model": "body.files.packages",
+    "bundled_model": "body.formats.packages",
     "camera_from_drake": "camera.drake",
     "estimate_scene": "jobs.estimate.scene",
-    "load_cameras": "camera.files",
+    "load_cameras": "camera.camera_files",
     "load_model": "body.model",
     "load_scene": "silhouette.pictures.scenes",
     "make_masks": "jobs.masks.masks",
     "register_scene": "jobs.registration.register",
-    "save_cameras": "camera.files",
+    "save_cameras": "camera.camera_files",
 }
 
 __all__ = list(_HOMES)

@@ -19,13 +19,13 @@ ROOMS = (
     "filtering",
     "person",
     "systems",
-    "results",
+    "files",
     "jobs",
     "papers",
     "commands",
 )
 APART = {("camera", "body"), ("filtering", "registration"), ("person", "registration")}
-WITH_SYSTEMS = {"systems", "results", "jobs", "papers", "commands"}
+WITH_SYSTEMS = {"systems", "files", "jobs", "papers", "commands"}
 # Drake keeps three plain value types, ImageLabel16I, CameraInfo and CameraConfig, in
 # pydrake.systems.sensors.
 VALUE_TYPES = {

@@ -17,8 +17,8 @@ from typing import Any, NoReturn
 from pydrake.geometry import MakeRenderEngineVtk, RenderEngineVtkParams, SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_pose.body.files.parsing import captured_warnings
-from drake_pose.body.files.safety import MEMORY_LIMIT_BYTES
+from drake_pose.body.formats.parsing import captured_warnings
+from drake_pose.body.formats.safety import MEMORY_LIMIT_BYTES
 from drake_pose.body.model import read_model
 from drake_pose.errors import DrakePoseError
 

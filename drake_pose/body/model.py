@@ -22,9 +22,9 @@ from pydrake.multibody.tree import (
 )
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.files.parsing import ModelSource, limit_kinds
-from drake_pose.body.files.safety import check_in_child
-from drake_pose.body.files.urdf_shape import Vectors, reshaped, with_base_joints
+from drake_pose.body.formats.parsing import ModelSource, limit_kinds
+from drake_pose.body.formats.safety import check_in_child
+from drake_pose.body.formats.urdf_shape import Vectors, reshaped, with_base_joints
 from drake_pose.body.limits import describe_positions
 from drake_pose.body.parsed_model import ParsedModel, link_names
 from drake_pose.body.surfaces.mesh import TriangleMesh

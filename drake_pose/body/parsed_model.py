@@ -8,7 +8,7 @@ from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex
 
-from drake_pose.body.files.parsing import ModelSource
+from drake_pose.body.formats.parsing import ModelSource
 from drake_pose.body.limits import Positions
 from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.body.surfaces.skin_file import SkinBand

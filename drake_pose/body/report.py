@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.files.parsing import limit_kinds
+from drake_pose.body.formats.parsing import limit_kinds
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.body.surfaces.mesh import TriangleMesh, is_watertight
 from drake_pose.body.tree.link_graph import build_link_graph

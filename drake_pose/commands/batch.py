@@ -13,7 +13,7 @@ from rich.table import Table
 from drake_pose.commands.options import Json, Out, Resume, Scheduler, within, workers_of
 from drake_pose.commands.terminal import output_console, print_json, progress_bar, say, warn
 from drake_pose.errors import SceneError
-from drake_pose.results.options import percent
+from drake_pose.files.options import percent
 
 if TYPE_CHECKING:
     from drake_pose.jobs.batch.state import BatchResult, SceneState

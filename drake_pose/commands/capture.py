@@ -30,8 +30,8 @@ from drake_pose.commands.terminal import (
     warn,
 )
 from drake_pose.errors import SceneError
+from drake_pose.files.settings import CaptureSettings, EstimateSettings, changed
 from drake_pose.jobs.live.settings import LiveSettings
-from drake_pose.results.settings import CaptureSettings, EstimateSettings, changed
 
 if TYPE_CHECKING:
     from distributed import Client

@@ -23,11 +23,11 @@ from drake_pose.commands.options import (
 )
 from drake_pose.commands.terminal import FrameProgress, output_console, print_result
 from drake_pose.errors import SceneError
-from drake_pose.results.options import percent
-from drake_pose.results.settings import EstimateSettings
+from drake_pose.files.options import percent
+from drake_pose.files.settings import EstimateSettings
 
 if TYPE_CHECKING:
-    from drake_pose.results.records import SceneEstimate
+    from drake_pose.files.records import SceneEstimate
 
 
 def estimate(
@@ -144,7 +144,7 @@ def _frame_table(result: SceneEstimate) -> Table:
 
 def _print_demo(result: SceneEstimate) -> None:
     """The only frame's joint angles, the error, the seconds and where the picture is."""
-    from drake_pose.results.folder import OVERLAY
+    from drake_pose.files.folder import OVERLAY
 
     console = output_console()
     table = Table("joint", "value", title="Joint angles of the man in the picture")
@@ -166,7 +166,7 @@ def _print_demo(result: SceneEstimate) -> None:
 
 
 def _print_totals(console: Console, result: SceneEstimate) -> None:
-    from drake_pose.results.folder import POSES, REPLAY, REPORT
+    from drake_pose.files.folder import POSES, REPLAY, REPORT
 
     summary = result.summary
     console.print(f"found          {result.found_count} of {len(result.records)} frames")

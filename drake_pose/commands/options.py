@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from drake_pose.commands.terminal import UsageError
-from drake_pose.results.options import within
+from drake_pose.files.options import within
 
 if TYPE_CHECKING:
     from distributed import Client

@@ -296,7 +296,7 @@ def reproduce_all(*, out: Out, short: bool = False, resume: Resume = False) -> N
 @contextmanager
 def _experiment(out: Path | None) -> Iterator[Count]:
     """Requires an empty folder for results; the value begins a progress bar, ending the last."""
-    from drake_pose.results.folder import require_empty
+    from drake_pose.files.folder import require_empty
 
     if out is not None:
         require_empty(out)

@@ -13,7 +13,7 @@ from rich.table import Table
 from drake_pose.commands.options import Json
 from drake_pose.commands.terminal import output_console, print_json, say, warn
 from drake_pose.errors import ModelError
-from drake_pose.results.settings import Packages
+from drake_pose.files.settings import Packages
 
 if TYPE_CHECKING:
     from drake_pose.body.report import ModelReport

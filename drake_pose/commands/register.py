@@ -12,8 +12,8 @@ from rich.table import Table
 
 from drake_pose.commands.options import SPREAD, Json, Model, Out, Overlay
 from drake_pose.commands.terminal import count_progress, output_console, print_result, say
+from drake_pose.files.options import percent
 from drake_pose.jobs.registration.settings import AuditSettings, RegistrationSettings
-from drake_pose.results.options import percent
 
 if TYPE_CHECKING:
     from drake_pose.jobs.registration.audit import SceneAudit
@@ -115,8 +115,8 @@ def audit(
 
 def _print_registration(result: SceneRegistration) -> None:
     """A row a frame and camera, then where each camera stands and how sure that is."""
+    from drake_pose.files.folder import REPORT
     from drake_pose.jobs.registration.result import PARAMETERS, parameter_rows
-    from drake_pose.results.folder import REPORT
     from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 
     console = output_console()

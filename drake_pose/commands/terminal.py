@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 if TYPE_CHECKING:
-    from drake_pose.results.records import FrameRecord
+    from drake_pose.files.records import FrameRecord
 
 _LIMITS = {"run_limit": "run limit", "time_limit": "time limit"}
 
@@ -33,7 +33,7 @@ def warn(message: str) -> None:
 
 def print_json(value: Mapping[str, Any]) -> None:
     """Writes JSON to stdout; numbers that are not finite become null."""
-    from drake_pose.results.folder import without_nan
+    from drake_pose.files.folder import without_nan
 
     print(json.dumps(without_nan(value), indent=2, ensure_ascii=False, allow_nan=False))
 
@@ -102,7 +102,7 @@ class FrameProgress:
 
     def __call__(self, finished: int, total: int, frame: str, record: FrameRecord | None) -> None:
         """Show that a frame is finished."""
-        from drake_pose.results.options import percent
+        from drake_pose.files.options import percent
 
         self.show_stage("frames", finished, total)
         if record is None:

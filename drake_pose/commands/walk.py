@@ -19,8 +19,8 @@ from drake_pose.commands.options import (
 )
 from drake_pose.commands.terminal import UsageError, print_json, say, warn
 from drake_pose.errors import SettingsError
+from drake_pose.files.settings import Packages
 from drake_pose.jobs.live.settings import LiveSettings, Seconds, Shape
-from drake_pose.results.settings import Packages
 
 if TYPE_CHECKING:
     from pydrake.geometry import Meshcat

@@ -22,7 +22,7 @@ from drake_pose.camera.calibration.board import (
 )
 from drake_pose.camera.calibration.calibrate import Calibration, CalibrationSettings, calibrate
 from drake_pose.camera.calibration.lens import Lens, save_lenses
-from drake_pose.camera.files import save_cameras
+from drake_pose.camera.camera_files import save_cameras
 from drake_pose.errors import CameraError, OutputError
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.formats.packages import bundled_model
 from drake_pose.errors import OutputError, SceneError
+from drake_pose.files.folder import OVERLAY, RESULT_FILES, SUMMARY, require_empty
+from drake_pose.files.records import SceneEstimate
+from drake_pose.files.settings import EstimateSettings
+from drake_pose.files.writer import OnFrame
 from drake_pose.jobs.estimate.scene import estimate_scene
-from drake_pose.results.folder import OVERLAY, RESULT_FILES, SUMMARY, require_empty
-from drake_pose.results.records import SceneEstimate
-from drake_pose.results.settings import EstimateSettings
-from drake_pose.results.writer import OnFrame
 
 MODEL = "man"
 ROOT = "right_foot"

@@ -16,6 +16,8 @@ from typing import Any, NamedTuple
 from rich.console import Console, RenderableType
 
 from drake_pose.errors import OutputError
+from drake_pose.files.folder import without_nan
+from drake_pose.files.report_page import page_template
 from drake_pose.filtering.kalman.truncated_filter import FilterSettings
 from drake_pose.papers.date import run_experiment as run_date
 from drake_pose.papers.date_pictures import save_pictures as save_date
@@ -36,8 +38,6 @@ from drake_pose.papers.shimada_hypotheses import run_hypotheses_experiment
 from drake_pose.papers.shimada_pictures import save_hypotheses
 from drake_pose.papers.shimada_pictures import save_pictures as save_shimada
 from drake_pose.papers.tables import Count, Figures
-from drake_pose.results.folder import without_nan
-from drake_pose.results.report_page import page_template
 from drake_pose.search.scoring import PoseSearch
 from drake_pose.version import VERSION
 

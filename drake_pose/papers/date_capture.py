@@ -15,7 +15,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 from pydrake.systems.sensors import ImageRgba8U
 
-from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.camera.rigs import FACE_CAMERA, circle_of_cameras

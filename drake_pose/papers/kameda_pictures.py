@@ -11,9 +11,9 @@ from matplotlib.ticker import PercentFormatter
 from numpy.typing import NDArray
 
 from drake_pose.body.parsed_model import ParsedModel
+from drake_pose.files.overlay import paint_agreement
 from drake_pose.papers.kameda import ExperimentResult, Trial, experiment_camera
 from drake_pose.papers.tables import draw_panels, save_figure
-from drake_pose.results.overlay import paint_agreement
 from drake_pose.search.estimates import PoseFamily, PoseSet, View
 from drake_pose.search.grid.pose_families import samples_at
 from drake_pose.search.kameda import PaperSearch

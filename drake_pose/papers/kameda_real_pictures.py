@@ -9,11 +9,11 @@ from typing import Any, Literal, NamedTuple
 
 from rich.table import Table
 
-from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.formats.packages import bundled_model
+from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.demo import demo_settings, stored_scene
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.papers.tables import Count, Figures, figure_table, uncounted
-from drake_pose.results.settings import EstimateSettings
 from drake_pose.silhouette.pictures.scenes import load_scene
 
 Method = Literal["paper", "beam"]

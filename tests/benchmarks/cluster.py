@@ -17,10 +17,11 @@ import cv2
 import numpy as np
 import yaml
 
-from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
-from drake_pose.camera.files import save_cameras
+from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.rigs import FACE_CAMERA
+from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.batch.batch import run_batch
 from drake_pose.jobs.batch.job import SceneJob
 from drake_pose.jobs.cluster.remote_views import ClusterSensors
@@ -31,7 +32,6 @@ from drake_pose.papers.date_capture import Studio
 from drake_pose.papers.kameda import experiment_camera
 from drake_pose.person.date.walking_motion import make_motion
 from drake_pose.person.shape import tracker_of_person
-from drake_pose.results.settings import EstimateSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.systems.person.live_capture import LiveSensors, build_live_capture

@@ -38,12 +38,13 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.multibody.tree import RigidBody, SpatialInertia
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
-from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.landmarks import landmark_positions, load_landmarks
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.camera.drake import camera_to_drake
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.camera.rigs import circle_of_cameras, look_at
+from drake_pose.files.settings import EstimateSettings
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.tracking.contour_tracker import ContourTracker
 from drake_pose.fit.contour_fit import ContourFit
@@ -56,7 +57,6 @@ from drake_pose.person.views import (
     edge_spacing,
     see_silhouette,
 )
-from drake_pose.results.settings import EstimateSettings
 from tests.benchmarks.scenes import print_table
 
 Array = NDArray[np.float64]

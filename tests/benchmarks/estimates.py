@@ -17,14 +17,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
+from drake_pose.files.records import PoseRow
+from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.demo import demo_scene, demo_settings
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.papers.kameda import continuous_search, run_experiment
 from drake_pose.papers.kameda_figures import continuous_figures
-from drake_pose.results.records import PoseRow
-from drake_pose.results.settings import EstimateSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.silhouette.pictures.scenes import load_scene

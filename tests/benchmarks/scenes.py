@@ -15,10 +15,10 @@ from rich.table import Table
 
 from drake_pose.body.model import load_model
 from drake_pose.camera.models import PinholeCamera
+from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.searches import make_tree
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import RegistrationBody
-from drake_pose.results.settings import EstimateSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
 Array = NDArray[np.float64]

@@ -27,7 +27,7 @@ from pydrake.math import RigidTransform
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.camera.drake import camera_to_drake

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drake_pose.body.files.urdf_shape import reshaped
+from drake_pose.body.formats.urdf_shape import reshaped
 from drake_pose.body.model import load_model
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import ModelError, UnknownNameError

@@ -6,7 +6,7 @@ import trimesh
 from pydrake.geometry import MakeRenderEngineVtk, RenderEngineVtkParams, Role, SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_pose.body.files.packages import bundled_model, package_map
+from drake_pose.body.formats.packages import bundled_model, package_map
 from drake_pose.body.model import load_model
 from drake_pose.body.report import describe_model
 from drake_pose.body.surfaces.mesh import TriangleMesh, is_watertight, merge_duplicate_vertices

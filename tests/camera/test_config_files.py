@@ -7,13 +7,13 @@ import pytest
 from pydrake.common.yaml import yaml_load_typed
 from pydrake.systems.sensors import CameraConfig
 
+from drake_pose.camera.camera_files import load_cameras
 from drake_pose.camera.drake import (
     camera_from_drake,
     camera_to_config,
     dump_scenario,
     save_scenario,
 )
-from drake_pose.camera.files import load_cameras
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.errors import CameraError

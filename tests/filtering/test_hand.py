@@ -4,7 +4,7 @@ from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoD
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.formats.packages import bundled_model
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.hand import HAND_STATE, HandObservation, plant_positions, scaled_rotation
 from drake_pose.filtering.state import Belief

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.body.tree.tree_kinematics import TreeKinematics

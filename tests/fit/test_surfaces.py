@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.fit.surfaces import FEW, VERY_FEW, few_triangles, surface_distance

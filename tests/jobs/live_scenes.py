@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import yaml
 
-from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
-from drake_pose.camera.files import save_cameras
+from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
 

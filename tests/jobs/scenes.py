@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from drake_pose.body.model import load_model
-from drake_pose.camera.files import save_cameras
+from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask

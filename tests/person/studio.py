@@ -4,7 +4,7 @@ from functools import cache, cached_property
 
 import numpy as np
 
-from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.camera.rigs import FACE_CAMERA, circle_of_cameras
 from drake_pose.person.date.capture import see_person

@@ -12,12 +12,12 @@ import numpy as np
 from pydrake.geometry import LightParameter, MakeRenderEngineVtk, RenderEngineVtkParams, SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.camera.drake import camera_to_drake
 from drake_pose.camera.models import PinholeCamera
+from drake_pose.files.overlay import paint_agreement
 from drake_pose.jobs.demo import run_demo
-from drake_pose.results.overlay import paint_agreement
 from drake_pose.search.estimates import View
 from drake_pose.search.kameda import PaperSearch
 from drake_pose.search.settings import PaperSearchSettings

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drake_pose.errors import ClusterError, DrakePoseError
+from drake_pose.files.folder import require_empty
 from drake_pose.jobs.batch.job import SceneJob
 from drake_pose.jobs.batch.state import (
     FAILED,
@@ -33,7 +34,6 @@ from drake_pose.jobs.batch.tasks import (
 )
 from drake_pose.jobs.cluster.scheduler import TRIES, address_of
 from drake_pose.jobs.cluster.worker import call_in_child
-from drake_pose.results.folder import require_empty
 
 if TYPE_CHECKING:
     from distributed import Client, Future

@@ -11,11 +11,11 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 from cyclopts import Parameter
 
 from drake_pose.errors import SettingsError
+from drake_pose.files.options import FromText
+from drake_pose.files.settings import EstimateSettings
+from drake_pose.files.summary import describe_job, file_digest
 from drake_pose.jobs.estimate.inputs import bundled_person
 from drake_pose.jobs.registration.settings import AuditSettings
-from drake_pose.results.options import FromText
-from drake_pose.results.settings import EstimateSettings
-from drake_pose.results.summary import describe_job, file_digest
 from drake_pose.yaml_files import read_yaml
 
 CHUNK = 100

@@ -10,9 +10,9 @@ from typing import Any
 
 from drake_pose.csv_files import csv_text
 from drake_pose.errors import OutputError
+from drake_pose.files.folder import without_nan, write_file
 from drake_pose.jobs.batch.job import SceneJob
 from drake_pose.jobs.batch.tasks import Task
-from drake_pose.results.folder import without_nan, write_file
 from drake_pose.version import VERSION
 
 BATCH, CONTRADICTIONS = "batch.json", "contradictions.csv"

@@ -19,17 +19,17 @@ from typing import Any
 
 from drake_pose.body.landmarks import landmarks_file
 from drake_pose.body.model import load_model
-from drake_pose.camera.files import load_cameras
+from drake_pose.camera.camera_files import load_cameras
 from drake_pose.errors import DrakePoseError, OutputError
+from drake_pose.files.folder import OVERLAY, POSES, read_summary, write_file, write_summary
+from drake_pose.files.records import FrameRecord
+from drake_pose.files.settings import EstimateSettings
+from drake_pose.files.summary import describe_job, mask_digests, summarize
 from drake_pose.jobs.batch.job import SceneJob
 from drake_pose.jobs.estimate.inputs import follows_person
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.jobs.registration.audit import audit_scene
 from drake_pose.jobs.registration.settings import AuditSettings
-from drake_pose.results.folder import OVERLAY, POSES, read_summary, write_file, write_summary
-from drake_pose.results.records import FrameRecord
-from drake_pose.results.settings import EstimateSettings
-from drake_pose.results.summary import describe_job, mask_digests, summarize
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import Scene, load_scene
 

@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 from distributed import get_worker
 
-from drake_pose.camera.sources.files import load_background_pictures, open_source
 from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecification
+from drake_pose.camera.sources.source_files import load_background_pictures, open_source
 from drake_pose.fit.camera_sums import (
     Views,
     answer_request,

@@ -15,6 +15,10 @@ import numpy as np
 
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.camera.models import ParallelCamera
+from drake_pose.files.overlay import draw_shapes
+from drake_pose.files.records import user_units
+from drake_pose.files.settings import EstimateSettings
+from drake_pose.files.writer import USUAL_RATE_HZ, OnStage
 from drake_pose.filtering.measurements.contour import ContourObservation
 from drake_pose.filtering.tracking.contour_tracker import ContourTracker, TrackingSettings
 from drake_pose.filtering.tracking.match_and_track import make_tracker
@@ -28,10 +32,6 @@ from drake_pose.filtering.tracking.sequence_fit import (
 )
 from drake_pose.jobs.estimate.inputs import Inputs
 from drake_pose.jobs.estimate.searches import leave_out_links, make_placement_search
-from drake_pose.results.overlay import draw_shapes
-from drake_pose.results.records import user_units
-from drake_pose.results.settings import EstimateSettings
-from drake_pose.results.writer import USUAL_RATE_HZ, OnStage
 from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
 from drake_pose.search.estimates import TRACKED, PoseEstimate, View
 from drake_pose.silhouette.areas.bending import TreeSurfaces

@@ -9,17 +9,17 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.landmarks import landmarks_file, load_landmarks
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.body.report import model_warnings
 from drake_pose.errors import ModelError, SceneError, SettingsError, UnknownNameError
+from drake_pose.files.records import user_units
+from drake_pose.files.settings import EstimateSettings
 from drake_pose.filtering.tracking.contour_tracker import TrackingSettings
 from drake_pose.jobs.estimate.measurements import TrueAngles, read_joint_centres, read_true_angles
 from drake_pose.jobs.estimate.searches import leave_out_links, make_placement_search, make_search
 from drake_pose.person.body_plan import PERSON_LANDMARKS
-from drake_pose.results.records import user_units
-from drake_pose.results.settings import EstimateSettings
 from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
 from drake_pose.search.estimates import PoseEstimate
 from drake_pose.search.scoring import PoseSearch

@@ -13,11 +13,11 @@ from pydrake.systems.analysis import Simulator
 
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.errors import SettingsError
+from drake_pose.files.options import percent
+from drake_pose.files.records import FrameRecord, PoseRow, base_cells, record_pose_set
+from drake_pose.files.summary import BADLY_EXPLAINED
+from drake_pose.files.writer import USUAL_RATE_HZ, Drawn, FinishedFrame, OnStage
 from drake_pose.jobs.estimate.inputs import Inputs
-from drake_pose.results.options import percent
-from drake_pose.results.records import FrameRecord, PoseRow, base_cells, record_pose_set
-from drake_pose.results.summary import BADLY_EXPLAINED
-from drake_pose.results.writer import USUAL_RATE_HZ, Drawn, FinishedFrame, OnStage
 from drake_pose.search.continuous.multi_start import MultiStartSearch
 from drake_pose.search.estimates import PoseEstimate, View
 from drake_pose.search.grid.beam_search import BeamSearch

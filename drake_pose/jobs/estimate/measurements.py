@@ -10,7 +10,7 @@ import numpy as np
 
 from drake_pose.csv_files import read_csv
 from drake_pose.errors import SceneError, UnknownNameError
-from drake_pose.results.records import BASE_COLUMNS, FIT_COLUMNS
+from drake_pose.files.records import BASE_COLUMNS, FIT_COLUMNS
 from drake_pose.silhouette.pictures.scene_files import frame_number
 
 _CENTRE_COLUMNS = ("frame", "joint", "x", "y", "z")

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_pose.errors import MaskError, SceneError
+from drake_pose.files.records import record_deviations
+from drake_pose.files.writer import Drawn, FinishedFrame, OnFrame, OnStage, ResultWriter
 from drake_pose.jobs.estimate.inputs import Inputs
 from drake_pose.jobs.estimate.matching import finish_frame, read_pictures
 from drake_pose.person.recordings.camera_faults import CameraFault
@@ -21,8 +23,6 @@ from drake_pose.person.recordings.checked_capture import (
 from drake_pose.person.recordings.figures import RigFault
 from drake_pose.person.recordings.person_capture import PersonCapture, capture_by_colour
 from drake_pose.person.recordings.persons_in_view import ReadFrame, ViewFaults
-from drake_pose.results.records import record_deviations
-from drake_pose.results.writer import Drawn, FinishedFrame, OnFrame, OnStage, ResultWriter
 from drake_pose.search.estimates import PoseEstimate
 from drake_pose.silhouette.areas.scoring import draw_labels
 from drake_pose.silhouette.pictures.mask_agreement import edge_area

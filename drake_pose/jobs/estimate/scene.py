@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from drake_pose.files.folder import SHAPES
+from drake_pose.files.overlay import encode_png
+from drake_pose.files.records import SceneEstimate
+from drake_pose.files.settings import EstimateSettings
+from drake_pose.files.summary import describe_job, open_job
+from drake_pose.files.writer import OnFrame, OnStage, ResultWriter
 from drake_pose.jobs.estimate.body_fit import fit_body
 from drake_pose.jobs.estimate.inputs import read_inputs
 from drake_pose.jobs.estimate.matching import compare_cameras, match_frames
 from drake_pose.jobs.estimate.person import follow_person
-from drake_pose.results.folder import SHAPES
-from drake_pose.results.overlay import encode_png
-from drake_pose.results.records import SceneEstimate
-from drake_pose.results.settings import EstimateSettings
-from drake_pose.results.summary import describe_job, open_job
-from drake_pose.results.writer import OnFrame, OnStage, ResultWriter
 
 
 def estimate_scene(

@@ -14,7 +14,7 @@ from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.errors import SettingsError
-from drake_pose.results.settings import EstimateSettings, RootTurns
+from drake_pose.files.settings import EstimateSettings, RootTurns
 from drake_pose.search.continuous.multi_start import MultiStartSearch, MultiStartSettings
 from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
 from drake_pose.search.grid.beam_search import BeamSearch

@@ -11,6 +11,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from drake_pose.body.model import load_model
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.errors import OutputError, SettingsError
+from drake_pose.files.folder import read_summary, require_empty
 from drake_pose.jobs.estimate.inputs import bundled_person
 from drake_pose.jobs.live.frame_results import LiveResult, LiveWriter
 from drake_pose.jobs.live.run import FrameWatch, Mask, look_until, run_live
@@ -20,7 +21,6 @@ from drake_pose.person.recordings.person_capture import capture_person
 from drake_pose.person.recordings.persons_in_view import PersonRecording
 from drake_pose.person.shape import KnownShape, shape_values, tracker_of_person
 from drake_pose.person.views import shows_somebody
-from drake_pose.results.folder import read_summary, require_empty
 from drake_pose.systems.person.live_capture import LiveSensors, build_live_capture
 from drake_pose.systems.ports import evaluate
 

@@ -11,15 +11,15 @@ import numpy as np
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.camera.sources.recorded import TIME_STAMPS
 from drake_pose.csv_files import csv_text
+from drake_pose.files.records import FrameRecord, PoseRow, SceneEstimate, record_deviations
+from drake_pose.files.settings import EstimateSettings
+from drake_pose.files.summary import describe_job
+from drake_pose.files.writer import ResultWriter
 from drake_pose.jobs.estimate.person import FOLLOWED
 from drake_pose.jobs.live.run import LiveFrame, Mask
 from drake_pose.jobs.live.scene import LiveScene
 from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.recordings.persons_in_view import keep_person
-from drake_pose.results.records import FrameRecord, PoseRow, SceneEstimate, record_deviations
-from drake_pose.results.settings import EstimateSettings
-from drake_pose.results.summary import describe_job
-from drake_pose.results.writer import ResultWriter
 from drake_pose.silhouette.areas.scoring import draw_mask
 from drake_pose.silhouette.pictures.mask_agreement import compare_masks
 from drake_pose.silhouette.pictures.scenes import Scene

@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
-from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError, SceneError, SettingsError, UnknownNameError
+from drake_pose.files.folder import require_empty
 from drake_pose.jobs.live.capture import record_frames
 from drake_pose.jobs.live.frame_results import LiveResult, LiveWriter
 from drake_pose.jobs.live.run import FrameWatch, LiveFrame, look_until
@@ -32,7 +33,6 @@ from drake_pose.person.date.recognition import (
 )
 from drake_pose.person.date.skeleton import FEATURES, load_skeleton
 from drake_pose.person.shape import tracker_of_person
-from drake_pose.results.folder import require_empty
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.systems.colour_images import colour_image_to_picture
 from drake_pose.systems.date.capture import build_paper_capture

@@ -11,18 +11,18 @@ from pathlib import Path
 
 import cv2
 
-from drake_pose.camera.files import load_cameras
+from drake_pose.camera.camera_files import load_cameras
 from drake_pose.camera.models import Camera
-from drake_pose.camera.sources.files import (
+from drake_pose.camera.sources.frame_source import FrameSource, Picture, SourceSpecification
+from drake_pose.camera.sources.source_files import (
     CAMERAS,
     SOURCES,
     load_background_pictures,
     load_sources,
     open_source,
 )
-from drake_pose.camera.sources.frame_source import FrameSource, Picture, SourceSpecification
 from drake_pose.errors import OutputError, SceneError
-from drake_pose.results.folder import write_file
+from drake_pose.files.folder import write_file
 from drake_pose.silhouette.segmentation.background import Background, learn_background
 from drake_pose.systems.person.live_capture import LiveSensors
 

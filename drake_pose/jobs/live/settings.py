@@ -9,7 +9,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from drake_pose.errors import SettingsError
-from drake_pose.results.options import within
+from drake_pose.files.options import within
 
 Seconds = Annotated[float | None, within(0.01)]
 Shape = Annotated[

@@ -16,10 +16,11 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.csv_files import read_csv
 from drake_pose.errors import OutputError, SettingsError
+from drake_pose.files.folder import POSES, read_summary
 from drake_pose.jobs.estimate.inputs import bundled_person
 from drake_pose.jobs.live.capture import shape_of_result
 from drake_pose.jobs.live.frame_results import camera_troubles
@@ -29,7 +30,6 @@ from drake_pose.jobs.live.settings import LiveSettings
 from drake_pose.person.date.skeleton import load_skeleton
 from drake_pose.person.date.walking_motion import make_motion
 from drake_pose.person.shape import tracker_of_person
-from drake_pose.results.folder import POSES, read_summary
 from drake_pose.systems.person.live_capture import LiveSensors, add_person_tracker
 from drake_pose.systems.ports import evaluate
 from drake_pose.systems.walk.walk import KEYS, build_walk

@@ -20,11 +20,11 @@ from drake_pose.errors import (
     SettingsError,
     UnknownNameError,
 )
+from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.searches import make_tree
 from drake_pose.jobs.masks.settings import MEDIAN, MaskSettings
 from drake_pose.jobs.masks.sources import FoundMask, Source
 from drake_pose.jobs.registration.positions import read_known_positions
-from drake_pose.results.settings import EstimateSettings
 from drake_pose.search.pose_and_mask import (
     FoundPose,
     PoseAndMask,

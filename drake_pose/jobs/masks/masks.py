@@ -14,10 +14,10 @@ import yaml
 
 from drake_pose.camera.picture_files import Picture
 from drake_pose.errors import DrakePoseError, MaskError, OutputError
+from drake_pose.files.folder import OVERLAY, require_empty, write_file, write_summary
 from drake_pose.jobs.masks.finding import find_masks
 from drake_pose.jobs.masks.settings import MaskSettings
 from drake_pose.jobs.masks.sources import UNNAMED, Source, open_source
-from drake_pose.results.folder import OVERLAY, require_empty, write_file, write_summary
 from drake_pose.silhouette.pictures.masks import encode_mask
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, SCENE_FILE
 

@@ -10,8 +10,8 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from drake_pose.errors import SettingsError
-from drake_pose.results.options import from_text, parse_numbers, parse_size
-from drake_pose.results.settings import Packages, Positions, changed, plain, require_choices
+from drake_pose.files.options import from_text, parse_numbers, parse_size
+from drake_pose.files.settings import Packages, Positions, changed, plain, require_choices
 
 MEDIAN = "median"
 

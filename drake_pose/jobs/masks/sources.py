@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
-from drake_pose.camera.files import CameraFile, load_camera_file
+from drake_pose.camera.camera_files import CameraFile, load_camera_file
 from drake_pose.camera.picture_files import SUFFIXES, Mask, Picture, list_pictures, read_picture
 from drake_pose.errors import SceneError
 from drake_pose.silhouette.pictures.scene_files import VIDEOS, VideoPictures

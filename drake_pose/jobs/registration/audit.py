@@ -12,8 +12,12 @@ import numpy as np
 
 from drake_pose.body.model import load_model
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.camera.files import load_cameras
+from drake_pose.camera.camera_files import load_cameras
 from drake_pose.errors import MaskError, SceneError
+from drake_pose.files.folder import require_empty, write_summary
+from drake_pose.files.options import percent
+from drake_pose.files.settings import EstimateSettings
+from drake_pose.files.summary import mask_digests
 from drake_pose.jobs.estimate.searches import make_tree
 from drake_pose.jobs.registration.inputs import KnownScene
 from drake_pose.jobs.registration.positions import read_known_positions
@@ -23,10 +27,6 @@ from drake_pose.registration.contradictions import Audit, Finding, FrameAudit, a
 from drake_pose.registration.per_frame_fit import PerFrameFit
 from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import RegistrationBody
-from drake_pose.results.folder import require_empty, write_summary
-from drake_pose.results.options import percent
-from drake_pose.results.settings import EstimateSettings
-from drake_pose.results.summary import mask_digests
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges, read_scene
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 

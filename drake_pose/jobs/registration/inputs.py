@@ -13,7 +13,7 @@ from drake_pose.body.model import OBJECT, ArticulatedModel, load_model
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.camera.files import CameraFile, load_camera_file
+from drake_pose.camera.camera_files import CameraFile, load_camera_file
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import (
     CameraError,
@@ -22,6 +22,7 @@ from drake_pose.errors import (
     SettingsError,
     UnknownNameError,
 )
+from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.inputs import missing_for_person
 from drake_pose.jobs.estimate.measurements import read_true_angles
 from drake_pose.jobs.estimate.searches import make_tree
@@ -35,7 +36,6 @@ from drake_pose.jobs.registration.settings import ALL, RegistrationSettings
 from drake_pose.registration.joint_zeros import links_with_length, require_known
 from drake_pose.registration.posed_frames import PosedFrame, SeenFrame
 from drake_pose.registration.standing_object import StandingObject, require_turns
-from drake_pose.results.settings import EstimateSettings
 from drake_pose.silhouette.pictures.scene_checks import check_scene
 from drake_pose.silhouette.pictures.scene_files import select_frames
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE, Scene, load_scene

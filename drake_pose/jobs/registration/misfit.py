@@ -11,6 +11,8 @@ import numpy as np
 
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
+from drake_pose.files.options import percent
+from drake_pose.files.summary import BADLY_EXPLAINED
 from drake_pose.registration.joint_zeros import calibrate_joints
 from drake_pose.registration.object_search import ObjectSearch
 from drake_pose.registration.posed_frames import PosedFrame
@@ -20,8 +22,6 @@ from drake_pose.registration.register import (
     RegistrationBody,
     spread,
 )
-from drake_pose.results.options import percent
-from drake_pose.results.summary import BADLY_EXPLAINED
 
 # Of the contours in the two frames that fit best, this share fits at least. A robot that is the
 # masks' leaves 0.83 and more, with holes and tools; mirrored masks, another robot's or exchanged

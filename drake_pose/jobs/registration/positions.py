@@ -11,18 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.files.urdf_shape import BASE_JOINTS
+from drake_pose.body.formats.urdf_shape import BASE_JOINTS
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SceneError
+from drake_pose.files.records import base_pose
+from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.inputs import missing_for_person
 from drake_pose.jobs.estimate.measurements import TrueAngles, frame_key, read_true_angles
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.person.shape import shape_parts
-from drake_pose.results.records import base_pose
-from drake_pose.results.settings import EstimateSettings
 
 Array = NDArray[np.float64]
 

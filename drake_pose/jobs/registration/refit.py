@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_pose.body.files.urdf_shape import reshaped
+from drake_pose.body.formats.urdf_shape import reshaped
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import PinholeCamera

@@ -12,6 +12,9 @@ import numpy as np
 
 from drake_pose.body.model import OBJECT_POSITIONS
 from drake_pose.camera.models import Camera
+from drake_pose.files.folder import require_empty
+from drake_pose.files.options import percent
+from drake_pose.files.summary import BADLY_EXPLAINED
 from drake_pose.jobs.registration.inputs import Inputs, read_inputs
 from drake_pose.jobs.registration.misfit import (
     Search,
@@ -38,9 +41,6 @@ from drake_pose.registration.register import (
     suggest_pose,
 )
 from drake_pose.registration.start_poses import E_total, areas
-from drake_pose.results.folder import require_empty
-from drake_pose.results.options import percent
-from drake_pose.results.summary import BADLY_EXPLAINED
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE
 

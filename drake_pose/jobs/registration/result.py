@@ -12,14 +12,9 @@ from numpy.typing import NDArray
 
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
-from drake_pose.camera.files import dump_cameras
+from drake_pose.camera.camera_files import dump_cameras
 from drake_pose.camera.models import Camera
-from drake_pose.jobs.registration.inputs import Inputs
-from drake_pose.jobs.registration.settings import AuditSettings
-from drake_pose.registration.joint_zeros import JointCalibration
-from drake_pose.registration.posed_frames import PosedFrame
-from drake_pose.registration.register import ObjectPose, RegisteredCamera
-from drake_pose.results.folder import (
+from drake_pose.files.folder import (
     OVERLAY,
     REPORT,
     require_empty,
@@ -27,10 +22,15 @@ from drake_pose.results.folder import (
     write_file,
     write_summary,
 )
-from drake_pose.results.options import percent
-from drake_pose.results.overlay import draw_overlay, encode_png
-from drake_pose.results.report_page import Picture, overlay_picture, page_template
-from drake_pose.results.summary import file_digest, versions
+from drake_pose.files.options import percent
+from drake_pose.files.overlay import draw_overlay, encode_png
+from drake_pose.files.report_page import Picture, overlay_picture, page_template
+from drake_pose.files.summary import file_digest, versions
+from drake_pose.jobs.registration.inputs import Inputs
+from drake_pose.jobs.registration.settings import AuditSettings
+from drake_pose.registration.joint_zeros import JointCalibration
+from drake_pose.registration.posed_frames import PosedFrame
+from drake_pose.registration.register import ObjectPose, RegisteredCamera
 from drake_pose.silhouette.areas.outline import outline_from_mesh
 from drake_pose.silhouette.areas.scoring import draw_labels
 from drake_pose.silhouette.pictures.scenes import CAMERA_FILE

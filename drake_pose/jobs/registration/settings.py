@@ -6,8 +6,8 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from drake_pose.results.options import Corner, from_text, parse_boxes
-from drake_pose.results.settings import Names, Positions, SceneSettings
+from drake_pose.files.options import Corner, from_text, parse_boxes
+from drake_pose.files.settings import Names, Positions, SceneSettings
 
 ALL = "all"
 """In place of names: of every joint, or of every link."""

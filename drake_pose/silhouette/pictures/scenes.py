@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_pose.camera.files import load_camera_file, load_cameras
+from drake_pose.camera.camera_files import load_camera_file, load_cameras
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.camera.picture_files import read_picture
 from drake_pose.errors import SceneError, UnknownNameError

@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 import yaml
 
-from drake_pose.camera.files import save_cameras
+from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.rigs import circle_of_cameras
-from drake_pose.camera.sources.files import load_background_pictures, load_sources, open_source
 from drake_pose.camera.sources.frame_source import SourceSpecification
+from drake_pose.camera.sources.source_files import (
+    load_background_pictures,
+    load_sources,
+    open_source,
+)
 from drake_pose.errors import SceneError, SettingsError
 
 WIDTH, HEIGHT = 32, 24

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.camera.models import ParallelCamera

@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import multivariate_normal, truncnorm
 
-from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.state import make_belief

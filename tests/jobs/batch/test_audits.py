@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from drake_pose.camera.files import save_cameras
+from drake_pose.camera.camera_files import save_cameras
 from drake_pose.commands.main import app
 from tests.cli import CliRunner, Result
 from tests.jobs.registration.arm_scenes import ArmScene, write_arm_scene

@@ -19,12 +19,12 @@ import yaml
 
 from drake_pose.commands.main import app
 from drake_pose.errors import ClusterError, SettingsError
+from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.batch.batch import run_batch
 from drake_pose.jobs.batch.job import SceneJob, read_job
 from drake_pose.jobs.batch.tasks import WORK, Outcome, Task, perform
 from drake_pose.jobs.cluster.scheduler import open_cluster, require_fit_workers
 from drake_pose.jobs.estimate.scene import estimate_scene
-from drake_pose.results.settings import EstimateSettings
 from tests.cli import CliRunner
 from tests.jobs.scenes import write_scene
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.inputs import Inputs, read_inputs
-from drake_pose.results.settings import EstimateSettings
 from drake_pose.search.estimates import View
 from drake_pose.search.scoring import Scoring
 

@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.formats.packages import bundled_model
 from drake_pose.commands.main import app
 from drake_pose.errors import ModelError, SceneError, SettingsError
+from drake_pose.files.settings import EstimateSettings
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.person.recordings.checked_capture import CheckedCapture
 from drake_pose.person.recordings.person_capture import PersonCapture
 from drake_pose.person.recordings.persons_in_view import ViewFaults
-from drake_pose.results.settings import EstimateSettings
 from tests.cli import CliRunner, Result
 from tests.jobs.persons import PersonScene, record_person
 from tests.jobs.scenes import read_rows

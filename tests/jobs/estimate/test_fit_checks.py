@@ -9,10 +9,10 @@ import yaml
 
 from drake_pose.body.model import load_model
 from drake_pose.errors import OutputError
+from drake_pose.files.records import FrameRecord, SceneEstimate
+from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.matching import find_contradiction
 from drake_pose.jobs.estimate.scene import estimate_scene
-from drake_pose.results.records import FrameRecord, SceneEstimate
-from drake_pose.results.settings import EstimateSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.silhouette.pictures.scenes import load_scene

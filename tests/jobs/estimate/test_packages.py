@@ -9,7 +9,7 @@ import trimesh
 
 from drake_pose.commands.main import app
 from drake_pose.errors import SettingsError
-from drake_pose.results.options import parse_packages
+from drake_pose.files.options import parse_packages
 from tests.cli import CliRunner, Result
 from tests.jobs.scenes import LINK, TinyScene
 

@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 import pytest
 
-from drake_pose.body.files.packages import bundled_model
-from drake_pose.camera.files import load_cameras
+from drake_pose.body.formats.packages import bundled_model
+from drake_pose.camera.camera_files import load_cameras
 from drake_pose.commands.main import app
 from drake_pose.errors import SceneError
+from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.scene import estimate_scene
-from drake_pose.results.settings import EstimateSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from tests.cli import CliRunner
 from tests.jobs.persons import record_person

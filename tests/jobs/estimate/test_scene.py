@@ -12,9 +12,9 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drake_pose.body.model import load_model
 from drake_pose.commands.main import app
+from drake_pose.files.overlay import AGREEMENT_RGB, EXCESS_RGB, MISSING_RGB
+from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.scene import estimate_scene
-from drake_pose.results.overlay import AGREEMENT_RGB, EXCESS_RGB, MISSING_RGB
-from drake_pose.results.settings import EstimateSettings
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.cli import CliRunner, Result

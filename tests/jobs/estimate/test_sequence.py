@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from drake_pose.body.model import load_model
+from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.body_fit import _StartedSearch
 from drake_pose.jobs.estimate.inputs import Inputs
 from drake_pose.jobs.estimate.scene import estimate_scene
-from drake_pose.results.settings import EstimateSettings
 from drake_pose.search.continuous.root_placement_search import RootPlacementSearch
 from drake_pose.search.estimates import TRACKED
 from drake_pose.silhouette.pictures.scenes import load_scene

@@ -5,7 +5,7 @@ import csv
 import numpy as np
 import pytest
 
-from drake_pose.camera.files import save_cameras
+from drake_pose.camera.camera_files import save_cameras
 from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.silhouette.pictures.masks import write_mask
 from tests.jobs.scenes import read_rows

@@ -10,8 +10,8 @@ import pytest
 
 from drake_pose.commands.main import app
 from drake_pose.errors import SettingsError
+from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.estimate.scene import estimate_scene
-from drake_pose.results.settings import EstimateSettings
 from tests.cli import CliRunner
 from tests.jobs.scenes import NAMES, TinyScene, camera, read_rows
 

@@ -164,7 +164,7 @@ def test_persons_own_shape_is_found_in_a_video_and_taken_from_its_result(person,
 
 
 def test_known_shape_is_worn(person):
-    from drake_pose.body.files.packages import bundled_model
+    from drake_pose.body.formats.packages import bundled_model
     from drake_pose.body.model import load_model
     from drake_pose.errors import UnknownNameError
 

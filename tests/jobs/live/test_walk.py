@@ -8,10 +8,12 @@ import time
 import numpy as np
 import pytest
 
-from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.commands.main import app
 from drake_pose.errors import OutputError, SettingsError
+from drake_pose.files.folder import write_summary
+from drake_pose.files.records import PoseRow, PoseTable
 from drake_pose.jobs.live.local_proxy import open_page
 from drake_pose.jobs.live.run import run_live
 from drake_pose.jobs.live.walk import (
@@ -26,8 +28,6 @@ from drake_pose.jobs.live.walk import (
     walk,
 )
 from drake_pose.person.date.walk_commands import SPEED
-from drake_pose.results.folder import write_summary
-from drake_pose.results.records import PoseRow, PoseTable
 from drake_pose.systems.walk.garden import START
 from tests.cli import CliRunner
 

@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 
 from drake_pose.body.model import load_model
-from drake_pose.camera.files import load_cameras, save_cameras
+from drake_pose.camera.camera_files import load_cameras, save_cameras
 from drake_pose.camera.models import Camera
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drake_pose.camera.files import save_cameras
+from drake_pose.camera.camera_files import save_cameras
 from drake_pose.errors import CameraError, MaskError, SceneError
 from drake_pose.jobs.registration.audit import audit_scene
 from drake_pose.silhouette.pictures.masks import write_mask

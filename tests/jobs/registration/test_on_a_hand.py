@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from drake_pose.body.model import load_model
-from drake_pose.camera.files import load_camera_file, load_cameras
+from drake_pose.camera.camera_files import load_camera_file, load_cameras
 from drake_pose.errors import CameraError
 from tests.cli import run_command
 from tests.jobs.estimate.test_bad_input import assert_refused

@@ -12,11 +12,11 @@ import yaml
 
 from drake_pose.body.model import load_model
 from drake_pose.body.tree.root import RootRotation
-from drake_pose.camera.files import load_cameras
+from drake_pose.camera.camera_files import load_cameras
+from drake_pose.files.overlay import EXCESS_RGB, MISSING_RGB
 from drake_pose.jobs.registration.register import register_scene, say_common
 from drake_pose.jobs.registration.settings import RegistrationSettings
 from drake_pose.registration.register import FrameMisfit, RegisteredCamera
-from drake_pose.results.overlay import EXCESS_RGB, MISSING_RGB
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.cli import Result, run_command

@@ -3,7 +3,7 @@ import csv
 import numpy as np
 import pytest
 
-from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.landmarks import landmark_positions, load_landmarks
 from drake_pose.body.model import load_model
 from drake_pose.camera.rigs import circle_of_cameras

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drake_pose.camera.files import save_cameras
+from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.errors import MaskError

@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drake_pose.camera.files import save_cameras
+from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.models import ParallelCamera
 from drake_pose.errors import CameraError, MaskError, SceneError, UnknownNameError
 from drake_pose.silhouette.pictures.masks import write_mask

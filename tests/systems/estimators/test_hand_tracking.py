@@ -12,7 +12,7 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.sensors import ImageLabel16I
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.body.tree.root import RootRotation
 from drake_pose.camera.models import ParallelCamera

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
-from drake_pose.camera.files import load_cameras, save_cameras
+from drake_pose.camera.camera_files import load_cameras, save_cameras
 from drake_pose.camera.rigs import circle_of_cameras, look_at
 from drake_pose.errors import CameraError, UnknownNameError
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer

@@ -3,7 +3,7 @@ import pytest
 from pydrake.systems.analysis import Simulator, SimulatorStatus
 from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 
-from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecification, TimedPicture

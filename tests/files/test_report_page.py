@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import ArticulatedModel, load_model
-from drake_pose.jobs.estimate.scene import estimate_scene
-from drake_pose.results.records import FrameRecord, JointRecord, PoseRow, SceneEstimate
-from drake_pose.results.report_page import (
+from drake_pose.files.records import FrameRecord, JointRecord, PoseRow, SceneEstimate
+from drake_pose.files.report_page import (
     BOX,
     HEIGHT,
     WIDTH,
@@ -18,8 +17,9 @@ from drake_pose.results.report_page import (
     make_report,
     plot_curves,
 )
-from drake_pose.results.settings import EstimateSettings
-from drake_pose.results.summary import summarize
+from drake_pose.files.settings import EstimateSettings
+from drake_pose.files.summary import summarize
+from drake_pose.jobs.estimate.scene import estimate_scene
 from drake_pose.silhouette.pictures.scenes import Scene
 from tests.jobs.scenes import NAMES, TinyScene, camera, read_rows
 

@@ -21,8 +21,8 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
 from drake_pose.body.model import ArticulatedModel
-from drake_pose.results.folder import OVERLAY
-from drake_pose.results.records import JointRecord, SceneEstimate, user_units
+from drake_pose.files.folder import OVERLAY
+from drake_pose.files.records import JointRecord, SceneEstimate, user_units
 from drake_pose.silhouette.pictures.scenes import Scene
 
 Array = NDArray[np.float64]
@@ -92,7 +92,7 @@ def make_report(
     folder: Path, model: ArticulatedModel, scene: Scene, estimate: SceneEstimate
 ) -> str:
     """The page of an estimate; files and overlays that lie in its folder are linked."""
-    template = page_template("drake_pose.results", "report_template.html.j2")
+    template = page_template("drake_pose.files", "report_template.html.j2")
     frames = [row.frame for row in estimate.rows]
     records, joined = list(estimate.records.values()), scene.sequence
     found = ["found" if record.found else "not-found" for record in records]
@@ -129,7 +129,7 @@ def page_template(package: str, name: str) -> Template:
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.tests["infinite"] = math.isinf
-    style = files("drake_pose.results").joinpath("report_style.css")
+    style = files("drake_pose.files").joinpath("report_style.css")
     environment.globals["style"] = Markup(style.read_text(encoding="utf-8").rstrip())
     source = files(package).joinpath(name)
     return environment.from_string(source.read_text(encoding="utf-8"))

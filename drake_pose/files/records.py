@@ -18,7 +18,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.csv_files import csv_text, read_csv
 from drake_pose.errors import OutputError
-from drake_pose.results.folder import POSES, cannot_write, write_file
+from drake_pose.files.folder import POSES, cannot_write, write_file
 from drake_pose.search.estimates import JointEstimate, PoseSet
 
 BASE_COLUMNS = ("base_x", "base_y", "base_z", "base_qw", "base_qx", "base_qy", "base_qz")

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.files.xml_files import xml_text
+from drake_pose.body.formats.xml_files import xml_text
 
 Vectors = Mapping[str, Sequence[float]]
 """(3,) by the name of a link or joint."""

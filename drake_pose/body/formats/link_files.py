@@ -10,8 +10,8 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-from drake_pose.body.files.packages import FileFinder
-from drake_pose.body.files.xml_files import (
+from drake_pose.body.formats.packages import FileFinder
+from drake_pose.body.formats.xml_files import (
     OLD_XACRO_ELEMENTS,
     Warn,
     colour_text,

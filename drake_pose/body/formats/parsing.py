@@ -15,10 +15,10 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
-from drake_pose.body.files.link_files import Limits, cure_sdf, cure_urdf
-from drake_pose.body.files.mjcf import cure_mjcf
-from drake_pose.body.files.packages import FileFinder
-from drake_pose.body.files.xml_files import read_limits
+from drake_pose.body.formats.link_files import Limits, cure_sdf, cure_urdf
+from drake_pose.body.formats.mjcf import cure_mjcf
+from drake_pose.body.formats.packages import FileFinder
+from drake_pose.body.formats.xml_files import read_limits
 from drake_pose.body.surfaces.mesh_files import workspace
 from drake_pose.errors import ModelError
 

@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drake_pose.camera.files import load_cameras, save_cameras
+from drake_pose.camera.camera_files import load_cameras, save_cameras
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
 from drake_pose.errors import CameraError
 

@@ -30,8 +30,8 @@ from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.tree.link_graph import PlantKinematics
 from drake_pose.csv_files import csv_text
 from drake_pose.errors import SettingsError
-from drake_pose.results.folder import BVH, JOINT_CENTRES, MOT, TRC, write_file
-from drake_pose.results.records import BASE_COLUMNS, PoseRow, base_cells, base_pose, user_units
+from drake_pose.files.folder import BVH, JOINT_CENTRES, MOT, TRC, write_file
+from drake_pose.files.records import BASE_COLUMNS, PoseRow, base_cells, base_pose, user_units
 
 Array = NDArray[np.float64]
 

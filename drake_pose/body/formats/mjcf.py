@@ -14,13 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_pose.body.files.mjcf_geometry import (
+from drake_pose.body.formats.mjcf_geometry import (
     ORIENTATIONS,
     numbers,
     write_out_meshes,
     write_out_poses,
 )
-from drake_pose.body.files.xml_files import read_xml, xml_text
+from drake_pose.body.formats.xml_files import read_xml, xml_text
 from drake_pose.errors import ModelError
 
 # Elements that make bodies, joints or shapes and that Drake ignores.

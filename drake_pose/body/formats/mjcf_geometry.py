@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
-from drake_pose.body.files.xml_files import read_numbers
+from drake_pose.body.formats.xml_files import read_numbers
 from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.body.surfaces.mesh_files import drawable_file, read_mesh_file, write_obj
 from drake_pose.errors import ModelError

@@ -12,7 +12,7 @@ import numpy as np
 
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.errors import OutputError
-from drake_pose.results.folder import (
+from drake_pose.files.folder import (
     FAMILIES,
     JOINTS,
     OVERLAY,
@@ -22,9 +22,9 @@ from drake_pose.results.folder import (
     write_file,
     write_summary,
 )
-from drake_pose.results.motion_files import write_motion
-from drake_pose.results.overlay import draw_overlay, encode_png
-from drake_pose.results.records import (
+from drake_pose.files.motion_files import write_motion
+from drake_pose.files.overlay import draw_overlay, encode_png
+from drake_pose.files.records import (
     FrameRecord,
     PoseRow,
     PoseTable,
@@ -33,9 +33,9 @@ from drake_pose.results.records import (
     family_table,
     joint_table,
 )
-from drake_pose.results.replay import make_replay
-from drake_pose.results.report_page import make_report
-from drake_pose.results.summary import (
+from drake_pose.files.replay import make_replay
+from drake_pose.files.report_page import make_report
+from drake_pose.files.summary import (
     camera_warnings,
     mask_digests,
     poor_fit_warnings,

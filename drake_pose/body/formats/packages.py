@@ -8,7 +8,7 @@ from urllib.parse import unquote
 
 from pydrake.multibody.parsing import PackageMap
 
-from drake_pose.body.files.xml_files import read_xml
+from drake_pose.body.formats.xml_files import read_xml
 from drake_pose.errors import ModelError, UnknownNameError
 
 _URI = re.compile(r"(?P<scheme>[A-Za-z][\w+.-]*)://(?P<rest>.*)", re.DOTALL)

@@ -1,7 +1,7 @@
 import cv2
 import numpy as np
 
-from drake_pose.results.overlay import (
+from drake_pose.files.overlay import (
     AGREEMENT_RGB,
     BACKGROUND_RGB,
     EXCESS_RGB,

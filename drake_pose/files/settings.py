@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 from cyclopts import Parameter
 
 from drake_pose.errors import SettingsError
-from drake_pose.results.options import (
+from drake_pose.files.options import (
     Axis,
     from_text,
     parse_assignments,

@@ -14,11 +14,11 @@ import numpy as np
 
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.errors import OutputError, SettingsError
+from drake_pose.files.folder import read_summary, require_empty
+from drake_pose.files.options import percent
+from drake_pose.files.records import FrameRecord, PoseRow
+from drake_pose.files.settings import EstimateSettings
 from drake_pose.regular_files import digest, read_regular
-from drake_pose.results.folder import read_summary, require_empty
-from drake_pose.results.options import percent
-from drake_pose.results.records import FrameRecord, PoseRow
-from drake_pose.results.settings import EstimateSettings
 from drake_pose.silhouette.pictures.scene_checks import frame_ranges
 from drake_pose.silhouette.pictures.scenes import Scene
 from drake_pose.version import VERSION

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from drake_pose.errors import OutputError
-from drake_pose.results.folder import read_summary, require_empty, write_file, write_summary
-from drake_pose.results.records import PoseRow, PoseTable
+from drake_pose.files.folder import read_summary, require_empty, write_file, write_summary
+from drake_pose.files.records import PoseRow, PoseTable
 
 NAMES = ("a", "b")
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from drake_pose.camera.camera_files import load_cameras
 from drake_pose.camera.checks import check_number
-from drake_pose.camera.files import load_cameras
 from drake_pose.camera.models import Camera
 from drake_pose.camera.picture_files import Picture, read_picture
 from drake_pose.camera.sources.frame_source import Clock, FrameSource, SourceSpecification

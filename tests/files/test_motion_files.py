@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drake_pose.body.files.packages import bundled_model
+from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.landmarks import load_landmarks
 from drake_pose.body.model import ArticulatedModel, load_model
 from drake_pose.errors import SettingsError
-from drake_pose.results.motion_files import (
+from drake_pose.files.motion_files import (
     centres_as_csv,
     centres_as_trc,
     joint_centres,
@@ -18,7 +18,7 @@ from drake_pose.results.motion_files import (
     skeleton_of,
     write_motion,
 )
-from drake_pose.results.records import BASE_COLUMNS, PoseRow
+from drake_pose.files.records import BASE_COLUMNS, PoseRow
 from drake_pose.silhouette.pictures.scenes import load_scene
 from tests.jobs.bvh_reader import read_bvh
 from tests.jobs.scenes import write_scene

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 import re
 import sys
 from collections.abc import Callable, Sequence
@@ -101,6 +102,9 @@ def main(words: Sequence[str] | None = None) -> None:
     Raises:
         SystemExit: the exit status, if it is not 0.
     """
+    # Read when numpy is first imported: of small matrices, threads that wait for each other cost up
+    # to ten times the product where other processes want the cores, as a batch's do.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         command, bound, _ = app.parse_args(words, exit_on_error=False, print_error=False)
     except (CycloptsError, SettingsError) as error:

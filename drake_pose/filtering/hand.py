@@ -1,7 +1,7 @@
 """Observing Shimada's two-finger hand in weak perspective, with the Jacobian: (9) to (13).
 
-A point p of the hand's frame is seen at wrist + s (M(q) p)_xy, where M = |q|^2 R(q) is a polynomial
-of second degree: the quaternion's squared norm is the scale.
+A point p of the hand's frame is seen at wrist + s (M(q) p)_xy, where M = ``|q|^2`` R(q) is a
+polynomial of second degree: the quaternion's squared norm is the scale.
 """
 
 import math

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from drake_pose.body.formats.packages import bundled_model
+from drake_pose.body.model import ArticulatedModel, load_model
 from tests.cli import CliRunner
 from tests.jobs.scenes import TinyScene, write_scene
 
@@ -39,3 +41,9 @@ def own_scene(tiny_scene: TinyScene, tmp_path: Path) -> TinyScene:
 @pytest.fixture(scope="session")
 def runner() -> CliRunner:
     return CliRunner()
+
+
+@pytest.fixture(scope="session")
+def person() -> ArticulatedModel:
+    """The bundled person, whose links have any lengths; shared, so do not change it."""
+    return load_model(bundled_model("person"), check=False)

@@ -25,11 +25,6 @@ from tests.jobs.scenes import write_scene
 
 
 @pytest.fixture(scope="module")
-def person():
-    return load_model(bundled_model("person"), check=False)
-
-
-@pytest.fixture(scope="module")
 def q(person):
     rows = np.zeros((3, len(person.position_names)))
     rows[:, person.position_index("position_z")] = 1.5

@@ -1,8 +1,6 @@
 import numpy as np
 import pytest
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.fit.contour_fit import ContourFit, Prior, pack_views
 from drake_pose.fit.evidence import find_edge_points
@@ -16,11 +14,6 @@ STEPS = (
     AnnealingStage(0.02, 0.05),
     AnnealingStage(0.02, 0.05),
 )
-
-
-@pytest.fixture(scope="module")
-def person():
-    return load_model(bundled_model("person"), check=False)
 
 
 @pytest.fixture(scope="module")

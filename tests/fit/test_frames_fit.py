@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
 from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.camera.models import ParallelCamera, PinholeCamera
@@ -31,11 +29,6 @@ ROUNDS = (
     AnnealingStage(0.01, 0.02, 8),
 )
 BENT = ("left_forearm_x", "right_forearm_x", "left_shin_x", "right_shin_x")
-
-
-@pytest.fixture(scope="module")
-def person():
-    return load_model(bundled_model("person"), check=False)
 
 
 @pytest.fixture(scope="module")

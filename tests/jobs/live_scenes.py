@@ -8,18 +8,13 @@ import cv2
 import numpy as np
 import yaml
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import ArticulatedModel, load_model
+from drake_pose.body.model import ArticulatedModel
 from drake_pose.camera.camera_files import save_cameras
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
 
 SIZE = (240, 180)
 RATE_HZ = 15.0
-
-
-def load_person() -> ArticulatedModel:
-    return load_model(bundled_model("person"), check=False)
 
 
 def standing(person: ArticulatedModel, ahead: float = 0.0, arm_deg: float = 30.0) -> np.ndarray:

@@ -36,11 +36,6 @@ PARTS = (
 
 
 @pytest.fixture(scope="module")
-def person() -> ArticulatedModel:
-    return load_model(PERSON, check=False)
-
-
-@pytest.fixture(scope="module")
 def shape() -> ArticulatedModel:
     return load_model(SHAPE, check=False)
 

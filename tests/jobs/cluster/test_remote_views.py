@@ -19,15 +19,10 @@ from drake_pose.jobs.live.scene import load_live_scene
 from drake_pose.person.shape import tracker_of_person
 from drake_pose.systems.person.live_capture import build_live_capture
 from tests.cli import CliRunner
-from tests.jobs.live_scenes import RATE_HZ, load_person, standing, write_studio
+from tests.jobs.live_scenes import RATE_HZ, standing, write_studio
 
 FRAMES = 40
 GAP = range(9, 16)
-
-
-@pytest.fixture(scope="module")
-def person():
-    return load_person()
 
 
 @pytest.fixture(scope="module")

@@ -11,15 +11,10 @@ from drake_pose.jobs.live.scene import load_live_scene, take_empty_room
 from drake_pose.jobs.live.settings import LiveSettings
 from drake_pose.person.shape import KnownShape, tracker_of_person
 from tests.cli import CliRunner
-from tests.jobs.live_scenes import RATE_HZ, absent, load_person, standing, write_studio
+from tests.jobs.live_scenes import RATE_HZ, absent, standing, write_studio
 
 FRAMES = 12
 GAP = range(5, 10)
-
-
-@pytest.fixture(scope="module")
-def person():
-    return load_person()
 
 
 @pytest.fixture(scope="module")

@@ -14,14 +14,9 @@ from drake_pose.jobs.live.walk import SETTLE, walk_live
 from drake_pose.person.date.walk_commands import SPEED
 from drake_pose.systems.walk.garden import START
 from tests.cli import CliRunner
-from tests.jobs.live_scenes import RATE_HZ, absent, load_person, standing, write_studio
+from tests.jobs.live_scenes import RATE_HZ, absent, standing, write_studio
 
 REST, AHEAD, AWAY = round(1.4 * RATE_HZ), round(1.0 * RATE_HZ), round(0.6 * RATE_HZ)
-
-
-@pytest.fixture(scope="module")
-def person():
-    return load_person()
 
 
 @pytest.fixture(scope="module")

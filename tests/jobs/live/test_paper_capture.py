@@ -14,15 +14,10 @@ from drake_pose.jobs.live.settings import LiveSettings
 from drake_pose.person.date.recognition import registered_positions
 from drake_pose.person.date.skeleton import load_skeleton
 from tests.cli import CliRunner
-from tests.jobs.live_scenes import load_person, standing, write_studio
+from tests.jobs.live_scenes import standing, write_studio
 
 PLACE = (0.12, -0.1, 1.55)
 HEADING = 0.3
-
-
-@pytest.fixture(scope="module")
-def person():
-    return load_person()
 
 
 @pytest.fixture(scope="module")

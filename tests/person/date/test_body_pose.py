@@ -32,11 +32,6 @@ from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 
 
 @pytest.fixture(scope="module")
-def person():
-    return load_model(bundled_model("person"), check=False)
-
-
-@pytest.fixture(scope="module")
 def skeleton(person):
     return load_skeleton(person)
 

@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.landmarks import landmark_positions, load_landmarks
-from drake_pose.body.model import load_model
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.fit.colour_lines import BESIDE, ON
 from drake_pose.fit.contour_fit import ContourFit
@@ -18,11 +16,6 @@ from tests.person.persons_in_view import stepping
 
 FRAMES = 8
 CLOTHES = np.array([[230, 130, 40], [200, 40, 60], [240, 210, 60], [120, 20, 30], [250, 160, 150]])
-
-
-@pytest.fixture(scope="module")
-def person():
-    return load_model(bundled_model("person"), check=False)
 
 
 @pytest.fixture(scope="module")

@@ -4,8 +4,6 @@ from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.systems.analysis import Simulator
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
 from drake_pose.camera.rigs import circle_of_cameras
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.fit.contour_fit import ContourFit
@@ -19,11 +17,6 @@ from tests.person.persons_in_view import see, stepping
 
 # Who is followed walks; in this frame another one comes into view, and stays.
 OTHER_COMES = 5
-
-
-@pytest.fixture(scope="module")
-def person():
-    return load_model(bundled_model("person"), check=False)
 
 
 @pytest.fixture(scope="module")

@@ -5,8 +5,6 @@ import numpy as np
 import pytest
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_pose.body.formats.packages import bundled_model
-from drake_pose.body.model import load_model
 from drake_pose.camera.camera_files import load_cameras, save_cameras
 from drake_pose.camera.rigs import circle_of_cameras, look_at
 from drake_pose.errors import CameraError, UnknownNameError
@@ -14,11 +12,6 @@ from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
 
 SIZE = (160, 120)
-
-
-@pytest.fixture(scope="module")
-def person():
-    return load_model(bundled_model("person"), check=False)
 
 
 @pytest.fixture(scope="module")

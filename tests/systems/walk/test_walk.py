@@ -26,11 +26,6 @@ SPOT = [0.8 * math.sin(math.pi * k / 8) for k in range(1, 24)]
 
 
 @pytest.fixture(scope="module")
-def person():
-    return load_model(bundled_model("person"), check=False)
-
-
-@pytest.fixture(scope="module")
 def page():
     return Meshcat(MeshcatParams(host="localhost"))
 

@@ -1,7 +1,7 @@
 """Which frames, cameras or joints contradict the rest, where all of them are given.
 
-Each frame, fitted by itself (``per_frame_fit``), tells N x = h of by how much x what is given is
-off, with h's covariance Q by ``fit.covariance``. What all frames that agree are off alike is the
+Each frame, fitted by itself (``per_frame_fit``), gives N x = h for the error x of what is given,
+with h's covariance Q by ``fit.covariance``. What all frames that agree are off alike is the
 fault of a joint's zero, a camera or the base; a frame is at fault that is significantly off from
 the others: r^T Q^-1 r, r = h - N x_common, follows Fisher's distribution where nothing is wrong.
 """
@@ -33,24 +33,24 @@ Mask = NDArray[np.bool_]
 
 BASE = "base"
 
-# How large errors are is told by at most so many groups of so many frames.
-_GROUPS, _IN_GROUP = 5, 4
-# What is known to less than this share of how far it may be off is not asked for.
-_TOLD = 1.0
-# Contours of a frame fit that fit as well as this share of what fits in the best frames.
-_FITS, _FITS_AT_ALL = 0.75, 0.5
-# A cause explains what is off that leaves less than this share of it, or what would not be named.
-_EXPLAINED = 0.25
-# A frame that is wrong is as unlikely as this logarithm says, and what is given is usually off by
-# this share of how far it may be off.
-_WRONG, _USUAL = 3.0, 0.4
-_ROUNDS = 10
+# Sizes of errors are estimated from at most so many groups of so many frames.
+_SIZE_GROUPS, _FRAMES_PER_GROUP = 5, 4
+# Directions with less information than this, in units of the priors, are left out.
+_LEAST_INFORMATION = 1.0
+# A frame is explained whose inlier ratio is this share of the best frames', and at least this.
+_SHARE_OF_BEST, _LEAST_INLIER_RATIO = 0.75, 0.5
+# A cause suffices that leaves less than this share of the residual, or what would not be named.
+_SUFFICIENT_SHARE = 0.25
+# The log-likelihood that each outlying frame costs; what is given is usually off by this share of
+# its deviation.
+_OUTLIER_COST, _USUAL_DEVIATION = 3.0, 0.4
+_MAX_ITERATIONS = 10
 # A joint is named that is off by so many standard deviations.
-_SURE = 3.0
-# Where no frame tells it, contours err by about a pixel.
+_NAMED_DEVIATIONS = 3.0
+# Without a frame to estimate it from, contours err by about a pixel.
 _UNKNOWN_SIZES = ErrorSizes(1.0, 0.0, 1.0, 1.0, 1.0)
 # A silhouette's width was put right to within this [pixel].
-_WIDTH = 2.0
+_WIDTH_SD = 2.0
 # What is right is named by chance this often, and not where it moves outlines by less [pixel].
 _SIGNIFICANCE, _LEAST_PIXELS = 1e-4, 1.0
 # Joints, or sliding ones and the base, may be off by so much in each frame by itself [rad; m].
@@ -116,8 +116,8 @@ class Audit:
         return tuple(one.frame for one in self.frames if one.finding is not None)
 
 
-class _Told(NamedTuple):
-    """What frames tell of what was free, in units of its deviations: x^T N x - 2 h^T x.
+class _Information(NamedTuple):
+    """The information of frames on what was free, in units of its deviations: x^T N x - 2 h^T x.
 
     N: (p, p); h: (p,); of_surface: (p, 12 nodes) how h follows the surfaces, which are the same in
     all frames; outlines: (nodes, p, p) squares of how far x moves each part's outline, summed along
@@ -153,7 +153,7 @@ class _Cause(NamedTuple):
     units: Array
 
 
-class _Test(NamedTuple):
+class _CauseTest(NamedTuple):
     """Whether one cause is off: by how much, with covariance; with what chance; Akaike's gain."""
 
     cause: _Cause
@@ -168,41 +168,41 @@ class _Test(NamedTuple):
         return np.asarray(self.cause.moves @ self.amount)
 
 
-class _Left(NamedTuple):
-    """What is off, r (p,) of N x = r with r's covariance Q, in what frames tell."""
+class _Residual(NamedTuple):
+    """The residual r (p,) of N x = r, and its covariance Q."""
 
-    told: _Told
+    info: _Information
     N: Array
     r: Array
     Q: Array
 
     def solved(self, r: Array) -> Array:
-        """(p,) x of another r, as far as it is told."""
+        """(p,) x of another r, zero where there is no information."""
         return np.asarray(np.linalg.solve(self.N + np.eye(len(r)), r))
 
-    def test(self, cause: _Cause) -> _Test:
+    def test(self, cause: _Cause) -> _CauseTest:
         """Whether a cause is off."""
         M = cause.moves
         N, r, Q = M.T @ self.N @ M, M.T @ self.r, M.T @ self.Q @ M
         T, rank = _statistic(r, Q, N)
         inverse = np.linalg.inv(N + 1e-3 * np.eye(len(r)))
-        p_value = _p_value(T, rank, self.told.freedom)
+        p_value = _p_value(T, rank, self.info.freedom)
         # More numbers explain more by chance.
-        return _Test(cause, inverse @ r, inverse @ Q @ inverse, p_value, T - 2.0 * rank)
+        return _CauseTest(cause, inverse @ r, inverse @ Q @ inverse, p_value, T - 2.0 * rank)
 
-    def sufficing(self, tests: Sequence[_Test]) -> list[_Test]:
+    def sufficient(self, tests: Sequence[_CauseTest]) -> list[_CauseTest]:
         """Causes that leave little of what is off, those of fewer numbers first."""
-        most = max(_LEAST_PIXELS, _EXPLAINED * self.told.pixels(self.solved(self.r)))
-        left = [
-            one for one in tests if self.told.pixels(self.solved(self.r - self.N @ one.x)) < most
+        most = max(_LEAST_PIXELS, _SUFFICIENT_SHARE * self.info.pixels(self.solved(self.r)))
+        enough = [
+            one for one in tests if self.info.pixels(self.solved(self.r - self.N @ one.x)) < most
         ]
-        return sorted(left, key=lambda one: (len(one.amount), -one.gain))
+        return sorted(enough, key=lambda one: (len(one.amount), -one.gain))
 
-    def without(self, cause: _Cause) -> _Left:
-        """What is left once a cause was put right."""
+    def without(self, cause: _Cause) -> _Residual:
+        """The residual once a cause was put right."""
         M, N = cause.moves, self.N
         gain = np.eye(len(N)) - N @ M @ np.linalg.pinv(M.T @ N @ M) @ M.T
-        return _Left(self.told, gain @ N @ gain.T, gain @ self.r, gain @ self.Q @ gain.T)
+        return _Residual(self.info, gain @ N @ gain.T, gain @ self.r, gain @ self.Q @ gain.T)
 
 
 def audit_frames(fit: PerFrameFit, frames: Sequence[FrameFit]) -> Audit:
@@ -221,18 +221,18 @@ class _Auditor:
 
     def audit(self) -> Audit:
         """Does it."""
-        # As long as nobody knows which frames agree, each one by itself tells how large errors are.
+        # As long as nobody knows which frames agree, sizes of errors come from each by itself.
         agreeing, together = self._explained, 1
         for _ in range(2):
             sizes = self._pooled_sizes(np.flatnonzero(agreeing), together)
-            self._told = [self._tell(one, sizes) for one in self._frames]
+            self._info = [self._info_of(one, sizes) for one in self._frames]
             self._surface = sizes.surface
             # Contradicting frames no longer make errors seem large.
-            agreeing, together = self._agreeing(), _IN_GROUP
+            agreeing, together = self._agreeing(), _FRAMES_PER_GROUP
         total = self._sum(agreeing)
         frames = tuple(
-            self._audit_frame(k, _plus(total, told, -1.0) if agreeing[k] else total)
-            for k, told in enumerate(self._told)
+            self._audit_frame(k, _add(total, info, -1.0) if agreeing[k] else total)
+            for k, info in enumerate(self._info)
         )
         kept = np.array([one.finding is None for one in frames])
         return Audit(frames, self._common_findings(kept), sizes)
@@ -241,7 +241,7 @@ class _Auditor:
         """How large errors are, by groups of some frames, spread over all of them."""
         if not len(which):
             return _UNKNOWN_SIZES
-        groups = max(1, min(_GROUPS, len(which) // together))
+        groups = max(1, min(_SIZE_GROUPS, len(which) // together))
         count = min(len(which), groups * together)
         spread = which[np.linspace(0, len(which) - 1, count).round().astype(int)]
         sizes = []
@@ -257,93 +257,97 @@ class _Auditor:
         outlines = self._fit.outlines
         return distances_in_pictures(outlines, with_widths(outlines, pictures))
 
-    def _tell(self, fitted: FrameFit, sizes: ErrorSizes) -> _Told:
+    def _info_of(self, fitted: FrameFit, sizes: ErrorSizes) -> _Information:
         seen = self._distances(fitted.pictures)
         own, widths = np.split(seen.X, [len(self._fit.names)], axis=1)
         X = own * self._fit.deviations
-        V = distances_covariance(seen, sizes) + _WIDTH**2 * widths @ widths.T
+        V = distances_covariance(seen, sizes) + _WIDTH_SD**2 * widths @ widths.T
         PX, Py = np.split(np.linalg.solve(V, np.column_stack([X, seen.y])), [-1], axis=1)
         N, h = X.T @ PX, PX.T @ seen.y
         T, rank = _statistic(h, N)
-        left = max(float(seen.y @ Py[:, 0]) - T, 0.0)
+        residual = max(float(seen.y @ Py[:, 0]) - T, 0.0)
         freedom = float(KNOWN_BEFOREHAND + len(seen.y) - rank)
-        scale = max((KNOWN_BEFOREHAND + left) / freedom, 1.0)
+        scale = max((KNOWN_BEFOREHAND + residual) / freedom, 1.0)
         outlines = np.zeros((len(self._fit.outlines), *N.shape))
         for one in fitted.pictures:
             moves = one.moves * self._fit.deviations[:, None]
             outlines += moves @ one.A @ np.swapaxes(moves, 1, 2)
-        return _Told(N, h, PX.T @ seen.bends, outlines, fitted.weights, scale, freedom)
+        return _Information(N, h, PX.T @ seen.bends, outlines, fitted.weights, scale, freedom)
 
     def _agreeing(self) -> Mask:
         """(frames,) the frames that agree: the likeliest of the sets that some starts lead to."""
         best, least = self._explained & False, np.inf
-        starts = [np.zeros(len(self._told), bool), self._explained]
+        starts = [np.zeros(len(self._info), bool), self._explained]
         order = np.flatnonzero(self._explained)
-        for k in order[np.linspace(0, len(order) - 1, min(len(order), _ROUNDS)).astype(int)]:
-            starts.append(np.arange(len(self._told)) == k)
+        count = min(len(order), _MAX_ITERATIONS)
+        for k in order[np.linspace(0, len(order) - 1, count).astype(int)]:
+            starts.append(np.arange(len(self._info)) == k)
         for kept in starts:
-            for _ in range(_ROUNDS):
+            for _ in range(_MAX_ITERATIONS):
                 common = self._common(self._sum(kept))
-                left = [self._left(told, *common) for told in self._told]
-                now = self._explained & [_chance(one) > _SIGNIFICANCE for one in left]
+                residuals = [self._residual(info, *common) for info in self._info]
+                likely = [_residual_p_value(one) > _SIGNIFICANCE for one in residuals]
+                now = self._explained & likely
                 if (now == kept).all():
                     break
                 kept = now
-            off = self._common(self._sum(kept))[0] / _USUAL
-            unlikely = _WRONG * np.count_nonzero(~kept) + 0.5 * float(off @ off)
+            off = self._common(self._sum(kept))[0] / _USUAL_DEVIATION
+            unlikely = _OUTLIER_COST * np.count_nonzero(~kept) + 0.5 * float(off @ off)
             if unlikely < least:
                 best, least = kept, unlikely
         return best
 
-    def _sum(self, kept: Mask) -> _Told:
-        """What some frames tell together, each by the scale of its errors."""
-        first = self._told[0]
-        total = _plus(first._replace(scale=1.0), first._replace(scale=1.0), -1.0)
+    def _sum(self, kept: Mask) -> _Information:
+        """The information of some frames, each by the scale of its errors."""
+        first = self._info[0]
+        total = _add(first._replace(scale=1.0), first._replace(scale=1.0), -1.0)
         for k in np.flatnonzero(kept):
-            total = _plus(total, self._told[k], 1.0)
+            total = _add(total, self._info[k], 1.0)
         return total
 
-    def _covariance(self, total: _Told) -> Array:
+    def _covariance(self, total: _Information) -> Array:
         """(p, p) of a sum's h, the surfaces' errors included."""
         surface = self._surface * total.of_surface
         return np.asarray(total.N + surface @ surface.T)
 
-    def _common(self, total: _Told) -> tuple[Array, Array]:
+    def _common(self, total: _Information) -> tuple[Array, Array]:
         """What frames have in common, x (p,), and its covariance; without any, nothing is off."""
         # Without other frames what is given is right to within a tolerance.
         prior = np.eye(len(total.h)) if total.freedom else np.linalg.inv(self._tolerance)
         inverse = np.linalg.inv(total.N + prior)
         return inverse @ total.h, inverse @ (self._covariance(total) + prior) @ inverse
 
-    def _left(self, told: _Told, x: Array, covariance: Array) -> _Left:
-        """What a frame tells beside what is common, x (p,) with its covariance."""
-        Q = told.scale * told.N + told.N @ (covariance + self._tolerance) @ told.N
-        return _Left(told, told.N, told.h - told.N @ x, Q)
+    def _residual(self, info: _Information, x: Array, covariance: Array) -> _Residual:
+        """A frame's residual from what is common, x (p,) with its covariance."""
+        Q = info.scale * info.N + info.N @ (covariance + self._tolerance) @ info.N
+        return _Residual(info, info.N, info.h - info.N @ x, Q)
 
-    def _audit_frame(self, k: int, others: _Told) -> FrameAudit:
+    def _audit_frame(self, k: int, others: _Information) -> FrameAudit:
         """A frame beside the others."""
         fitted = self._frames[k]
-        left = self._left(self._told[k], *self._common(others))
-        pixels = left.told.pixels(left.solved(left.r))
-        finding = self._frame_finding(left, self._causes(fitted), pixels, bool(self._explained[k]))
+        residual = self._residual(self._info[k], *self._common(others))
+        pixels = residual.info.pixels(residual.solved(residual.r))
+        finding = self._frame_finding(
+            residual, self._causes(fitted), pixels, bool(self._explained[k])
+        )
         return FrameAudit(fitted.name, *fitted.inlier_ratios, pixels, finding)
 
     def _frame_finding(
-        self, left: _Left, causes: Sequence[_Cause], pixels: float, explained: bool
+        self, residual: _Residual, causes: Sequence[_Cause], pixels: float, explained: bool
     ) -> Finding | None:
         """What contradicts the other frames in one of them."""
-        p_value = _chance(left)
+        p_value = _residual_p_value(residual)
         if not explained:
-            return self._joints_finding("unexplained", left, p_value, pixels)
-        tests = [left.test(cause) for cause in causes]
+            return self._joints_finding("unexplained", residual, p_value, pixels)
+        tests = [residual.test(cause) for cause in causes]
         # Each of the tests may find something by chance.
         least = min(p_value, *(one.p_value for one in tests)) * (1 + len(tests))
         if least > _SIGNIFICANCE or pixels < _LEAST_PIXELS:
             return None
-        sufficing = left.sufficing(tests)
-        if not sufficing:
-            return self._joints_finding("joints", left, p_value, pixels)
-        return self._finding(sufficing, left.told.pixels(sufficing[0].x))
+        sufficient = residual.sufficient(tests)
+        if not sufficient:
+            return self._joints_finding("joints", residual, p_value, pixels)
+        return self._finding(sufficient, residual.info.pixels(sufficient[0].x))
 
     def _causes(self, fitted: FrameFit | None) -> list[_Cause]:
         """All that may be off by itself; of the cameras those that see a frame."""
@@ -362,12 +366,12 @@ class _Auditor:
             causes.append(_Cause(BASE, BASE, self._fit.base_moves(), np.ones(six)))
         return causes
 
-    def _finding(self, sufficing: Sequence[_Test], pixels: float) -> Finding:
+    def _finding(self, sufficient: Sequence[_CauseTest], pixels: float) -> Finding:
         """The first of the causes that suffice, and its rivals."""
-        best, *others = sufficing
+        best, *others = sufficient
         rivals = [one.cause.name for one in others]
         seen_by_one = len(self._fit.camera_names) == 1
-        if seen_by_one and any(one.cause.kind == "camera" for one in sufficing):
+        if seen_by_one and any(one.cause.kind == "camera" for one in sufficient):
             rivals.append(BASE)
         kind, name, _, units = best.cause
         x, sd = best.amount * units, np.sqrt(np.diag(best.covariance)) * units
@@ -382,15 +386,17 @@ class _Auditor:
         off = (turn, shift, turn_sd, shift_sd)
         return Finding(kind, name, *off, pixels, best.p_value, tuple(rivals))
 
-    def _joints_finding(self, kind: str, left: _Left, p_value: float, pixels: float) -> Finding:
+    def _joints_finding(
+        self, kind: str, residual: _Residual, p_value: float, pixels: float
+    ) -> Finding:
         """What is off in a frame where no cause by itself explains it."""
-        x, names = left.solved(left.r), self._fit.joints
-        sd = np.sqrt(left.told.scale * np.diag(np.linalg.inv(left.N + np.eye(len(x)))))
+        x, names = residual.solved(residual.r), self._fit.joints
+        sd = np.sqrt(residual.info.scale * np.diag(np.linalg.inv(residual.N + np.eye(len(x)))))
         joints = (x * self._fit.deviations)[: len(names)]
         turns = self._fit.is_angle[: len(names)]
         angle = float(np.abs(joints[turns]).max(initial=0.0))
         shift = float(np.abs(joints[~turns]).max(initial=0.0))
-        sure = np.flatnonzero((np.abs(x) > _SURE * sd)[: len(names)])
+        sure = np.flatnonzero((np.abs(x) > _NAMED_DEVIATIONS * sd)[: len(names)])
         named = {names[k]: float(joints[k]) for k in sure}
         return Finding(kind, "", angle, shift, 0.0, 0.0, pixels, p_value, (), named)
 
@@ -398,47 +404,48 @@ class _Auditor:
         """What is off in all frames that agree."""
         if not kept.any():
             return ()
-        told, count = self._sum(kept), np.count_nonzero(kept)
-        Q = self._covariance(told) + told.N @ self._tolerance @ told.N / count
-        left, causes, findings = _Left(told, told.N, told.h, Q), self._causes(None), list[Finding]()
+        info, count = self._sum(kept), np.count_nonzero(kept)
+        Q = self._covariance(info) + info.N @ self._tolerance @ info.N / count
+        residual = _Residual(info, info.N, info.h, Q)
+        causes, findings = self._causes(None), list[Finding]()
         while causes:
-            tests = [left.test(cause) for cause in causes]
-            sufficing = left.sufficing(tests) or [max(tests, key=lambda one: one.gain)]
-            best, pixels = sufficing[0], left.told.pixels(sufficing[0].x)
+            tests = [residual.test(cause) for cause in causes]
+            sufficient = residual.sufficient(tests) or [max(tests, key=lambda one: one.gain)]
+            best, pixels = sufficient[0], residual.info.pixels(sufficient[0].x)
             if best.p_value * len(tests) > _SIGNIFICANCE or pixels < _LEAST_PIXELS:
                 break
-            findings.append(self._finding(sufficing, pixels))
-            left = left.without(best.cause)
+            findings.append(self._finding(sufficient, pixels))
+            residual = residual.without(best.cause)
             causes = [one for one in causes if one is not best.cause]
         return tuple(findings)
 
 
-def _plus(total: _Told, told: _Told, sign: float) -> _Told:
+def _add(total: _Information, info: _Information, sign: float) -> _Information:
     """A sum with another frame, or without one of them: sign -1."""
-    weight = sign / told.scale
+    weight = sign / info.scale
     return total._replace(
-        N=total.N + weight * told.N,
-        h=total.h + weight * told.h,
-        of_surface=total.of_surface + weight * told.of_surface,
-        outlines=total.outlines + sign * told.outlines,
-        lengths=total.lengths + sign * told.lengths,
-        freedom=total.freedom + sign * told.freedom,
+        N=total.N + weight * info.N,
+        h=total.h + weight * info.h,
+        of_surface=total.of_surface + weight * info.of_surface,
+        outlines=total.outlines + sign * info.outlines,
+        lengths=total.lengths + sign * info.lengths,
+        freedom=total.freedom + sign * info.freedom,
     )
 
 
 def _statistic(r: Array, Q: Array, N: Array | None = None) -> tuple[float, int]:
-    """r^T Q^-1 r in the directions that are told, and how many these are."""
+    """r^T Q^-1 r in the directions with information, and how many these are."""
     known, turn = np.linalg.eigh(Q if N is None else N)
-    turn = turn[:, known > _TOLD]
+    turn = turn[:, known > _LEAST_INFORMATION]
     if not turn.shape[1]:
         return 0.0, 0
     along = turn.T @ r
     return float(along @ np.linalg.solve(turn.T @ Q @ turn, along)), turn.shape[1]
 
 
-def _chance(left: _Left) -> float:
-    """How often so much is left by chance."""
-    return _p_value(*_statistic(left.r, left.Q, left.N), left.told.freedom)
+def _residual_p_value(residual: _Residual) -> float:
+    """How often a residual is as large by chance."""
+    return _p_value(*_statistic(residual.r, residual.Q, residual.N), residual.info.freedom)
 
 
 def _p_value(T: float, rank: int, freedom: float) -> float:
@@ -453,5 +460,5 @@ def _explained(frames: Sequence[FrameFit]) -> Mask:
     for name in {name for one in fitted for name in one}:
         ratios = sorted(one[name] for one in fitted if name in one)
         best = float(np.mean(ratios[-max(2, len(ratios) // 4) :]))
-        least[name] = max(_FITS * best, _FITS_AT_ALL)
+        least[name] = max(_SHARE_OF_BEST * best, _LEAST_INLIER_RATIO)
     return np.array([all(ratio >= least[name] for name, ratio in one.items()) for one in fitted])

@@ -9,11 +9,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Array
 from drake_pose.body.landmarks import landmarks_of_nodes, load_landmarks
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.errors import ModelError
-
-Array = NDArray[np.float64]
 
 _LIMBS = {
     "left_arm": ("left_shoulder", "left_elbow", "left_wrist"),

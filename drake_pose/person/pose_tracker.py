@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask
 from drake_pose.fit.camera_sums import AddUp
 from drake_pose.fit.contour_fit import Comparison, ContourFit, PoseFit, Prior, pack_views
 from drake_pose.fit.covariance import surface_deformations
@@ -32,9 +33,6 @@ from drake_pose.person.search import (
     headings_of,
 )
 from drake_pose.person.views import ColourViews, FrameViews
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # How far parts' surfaces may be off the model's [m].
 _SURFACES = 0.0005 * np.sqrt(2.0) ** np.arange(13)

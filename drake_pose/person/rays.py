@@ -8,11 +8,9 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.compiled import compiled
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 def viewing_rays(camera: Camera, uv: Array) -> tuple[Array, Array]:

@@ -10,8 +10,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask
 from drake_pose.errors import SettingsError
 from drake_pose.fit.contour_fit import ContourFit, PoseFit, Prior
 from drake_pose.fit.kernel import COMPARED, FITTING
@@ -20,9 +20,6 @@ from drake_pose.person.body_plan import BodyPlan, PlannedLimb, crowding
 from drake_pose.person.rays import sum_at_points
 from drake_pose.person.views import FrameViews
 from drake_pose.silhouette.areas.scoring import draw_mask
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 HEADINGS = 12
 """Into how many directions a lost person is turned."""

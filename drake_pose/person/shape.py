@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import Camera
 from drake_pose.errors import ModelError, UnknownNameError
@@ -25,8 +25,6 @@ from drake_pose.person.pose_tracker import PersonPoseTracker, pose_uncertainty
 from drake_pose.person.search import LENIENT
 from drake_pose.silhouette.areas.outline import Outline
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Frames = Sequence[tuple[Sequence[Camera], Sequence[EdgePoints]]]
 """The cameras of each frame and their regions' edges."""
 

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.fit.camera_sums import (
     AddUp,
@@ -29,7 +30,7 @@ from drake_pose.fit.camera_sums import (
     compare_placed,
 )
 from drake_pose.fit.colour_lines import COLOURS, compare_lines, learn_colours
-from drake_pose.fit.colours import NO_REGION, Picture, check_picture
+from drake_pose.fit.colours import NO_REGION, check_picture
 from drake_pose.fit.contour_fit import (
     Comparison,
     ContourFit,
@@ -42,8 +43,6 @@ from drake_pose.fit.levenberg_marquardt import AnnealingStage
 from drake_pose.fit.parameters import Placement
 from drake_pose.person.rays import triangulate
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 # By camera (nodes, 3, COLOURS): what is known of the colours on a body's parts and beside them.
 KnownColours = Mapping[str, NDArray[np.float32]]
 

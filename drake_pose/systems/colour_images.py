@@ -9,15 +9,13 @@ from collections.abc import Callable, Collection, Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import Context
 from pydrake.systems.sensors import ImageRgba8U
 
+from drake_pose.arrays import Picture
 from drake_pose.camera.models import Camera
 from drake_pose.errors import UnknownNameError
 from drake_pose.systems.ports import PortedSystem
-
-Picture = NDArray[np.uint8]
 
 
 def picture_to_colour_image(picture: Picture | None) -> ImageRgba8U:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import (
     CacheEntry,
@@ -26,9 +25,9 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
+from drake_pose.arrays import Array
 from drake_pose.errors import SettingsError
 
-Array = NDArray[np.float64]
 T = TypeVar("T")
 
 

@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Integers, Mask
 from drake_pose.camera.models import Camera
 from drake_pose.compiled import compiled
 from drake_pose.person.date.limb_search import (
@@ -21,8 +21,6 @@ from drake_pose.person.date.limb_search import (
     search_limb,
 )
 from drake_pose.person.date.skeleton import LIMBS, Limb, Skeleton, rotation
-
-Array = NDArray[np.float64]
 
 _LARGEST_STEP = math.radians(2.0)
 _LEAST_BEND = math.radians(3.0)
@@ -135,13 +133,13 @@ def unlocked(limb: Limb, angles: Array) -> Array:
 def reach(
     R_start: Array,
     p_start: Array,
-    axes: NDArray[np.int64],
+    axes: Integers,
     offsets: Array,
     end: Array,
     angles: Array,
     lower: Array,
     upper: Array,
-    free: NDArray[np.bool_],
+    free: Mask,
     target: Array,
     steps: int,
 ) -> tuple[Array, float]:
@@ -207,9 +205,6 @@ def reach(
         if moved < _STALLED:
             break
     return angles, distance
-
-
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-import numpy as np
-from numpy.typing import NDArray
-
+from drake_pose.arrays import Mask, Picture
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.person.date.body_pose import Waist
@@ -17,9 +15,6 @@ from drake_pose.person.date.limb_search import Search
 from drake_pose.person.date.recognition import Contour, RegisteredPose, measure_contour
 from drake_pose.person.date.skeleton import Skeleton
 from drake_pose.silhouette.segmentation.background import Background
-
-Picture = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Picture
 from drake_pose.camera.models import Camera
 from drake_pose.camera.picture_files import SUFFIXES, read_picture
 from drake_pose.csv_files import read_csv
@@ -24,9 +25,6 @@ from drake_pose.silhouette.segmentation.background import (
     learn_background,
     person_region,
 )
-
-Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 
 FACE_WIDTH, FACE_HEIGHT = 80, 130
 """What a face is scaled to [pixel]."""

@@ -7,15 +7,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Integers, Mask, Picture
 from drake_pose.camera.models import Camera
 from drake_pose.person.date.skeleton import FEATURES
 from drake_pose.person.rays import meeting_points
-
-Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 _FIRST_FOOT = FEATURES.index("left_foot")
 # Two rays show the same skin where they pass each other by less than the first; the radius of the
@@ -47,8 +43,8 @@ class Blobs:
     """
 
     centroids: Array
-    areas: NDArray[np.int64]
-    boxes: NDArray[np.int64]
+    areas: Integers
+    boxes: Integers
     mask: Mask
 
 
@@ -94,9 +90,9 @@ class Features:
     """
 
     places: Array
-    support: NDArray[np.int64]
+    support: Integers
     points: Array
-    owners: NDArray[np.int64]
+    owners: Integers
 
 
 def inside_silhouettes(
@@ -120,9 +116,7 @@ def inside_silhouettes(
     return kept
 
 
-def _near_region(
-    region: Mask, row: NDArray[np.int64], column: NDArray[np.int64], margin: int
-) -> Mask:
+def _near_region(region: Mask, row: Integers, column: Integers, margin: int) -> Mask:
     """Whether the region holds a pixel within `margin` of each given one, along or across."""
     found = region[row, column].copy()
     height, width = region.shape
@@ -133,9 +127,7 @@ def _near_region(
     return found
 
 
-def expect_features(
-    places: Array, support: NDArray[np.int64], last: Array, last_support: NDArray[np.int64]
-) -> Array:
+def expect_features(places: Array, support: Integers, last: Array, last_support: Integers) -> Array:
     """Where FEATURES are expected in the next frame (5, 3) [m]: feet a step on, the others here.
 
     Else passing feet would be exchanged; hands that meet stop, and a step on would be exchanged.
@@ -150,7 +142,7 @@ def expect_features(
     return np.asarray(places + step)
 
 
-def assign(points: Array, expected: Array) -> NDArray[np.int64]:
+def assign(points: Array, expected: Array) -> Integers:
     """The nearest of the expected features (k, 3) for each point (m, 3)."""
     distances = np.linalg.norm(points[:, None] - expected[None], axis=2)
     return distances.argmin(axis=1).astype(np.int64)

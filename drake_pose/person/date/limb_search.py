@@ -8,15 +8,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from drake_pose.arrays import Array, Mask
 from drake_pose.camera.models import Camera
 from drake_pose.person.date.skeleton import Limb, rotation
 from drake_pose.person.rays import sum_at_points
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 ELBOW_RANGE = (0.0, 120.0)
 """Where an elbow may be on its circle [deg], from behind, over outwards, to a little in front."""

@@ -11,14 +11,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask
 from drake_pose.camera.models import Camera
 from drake_pose.person.date.skeleton import Skeleton
 from drake_pose.person.rays import triangulate
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 DIRECTIONS = 72
 """In how many directions a contour is measured."""

@@ -10,15 +10,13 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Integers
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.errors import ModelError
-
-Array = NDArray[np.float64]
 
 LIMBS = ("left_arm", "right_arm", "left_leg", "right_leg")
 """The limbs' names."""
@@ -50,8 +48,8 @@ class Limb:
     root_T: Array
     middle_U: Array
     end_L: Array
-    axes: NDArray[np.int64]
-    positions: NDArray[np.int64]
+    axes: Integers
+    positions: Integers
     lower: Array
     upper: Array
     half_widths: Array
@@ -85,11 +83,11 @@ class Skeleton:
     R_WA: Array
     face_H: Array
     neck_H: Array
-    head_positions: NDArray[np.int64]
-    head_axes: NDArray[np.int64]
-    head_angles: NDArray[np.int64]
-    neck_axes: NDArray[np.int64]
-    neck_angles: NDArray[np.int64]
+    head_positions: Integers
+    head_axes: Integers
+    head_angles: Integers
+    neck_axes: Integers
+    neck_angles: Integers
     limbs: Mapping[str, Limb]
     lower: Array
     upper: Array
@@ -179,7 +177,7 @@ def load_skeleton(model: ArticulatedModel) -> Skeleton:
     )
 
 
-def rotation(axes: NDArray[np.int64], angles: Array) -> Array:
+def rotation(axes: Integers, angles: Array) -> Array:
     """(3, 3) the product of rotations about coordinate axes (n,) by angles (n,) [rad], in order."""
     R = np.eye(3)
     for axis, angle in zip(axes, angles, strict=True):
@@ -228,9 +226,7 @@ def _limb(tree: PoseTree, nodes: Mapping[str, int], X_WN: Array, name: str) -> L
     )
 
 
-def _axes(
-    model: ParsedModel, positions: list[int] | tuple[int, ...], name: str
-) -> NDArray[np.int64]:
+def _axes(model: ParsedModel, positions: list[int] | tuple[int, ...], name: str) -> Integers:
     """The axes 0, 1, 2 that the positions' names end with."""
     letters = [model.position_names[i].rsplit("_", 1)[-1] for i in positions]
     if any(letter not in _AXES for letter in letters):

@@ -8,12 +8,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from drake_pose.arrays import Array
 
 NO_COMMAND = (0, 0)
-
 
 TURN_RATE, SPEED, BODY_RADIUS = math.radians(40.0), 0.9, 0.3
 """How fast the view turns [rad/s] and one walks [m/s], and how near one comes to walls [m]."""

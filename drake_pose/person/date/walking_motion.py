@@ -7,13 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array
 from drake_pose.errors import SettingsError
 from drake_pose.person.date.recognition import registered_positions
 from drake_pose.person.date.skeleton import Skeleton
 
-Array = NDArray[np.float64]
 KeyPose = Mapping[str, float]
 
 MOTIONS = ("walk", "reach", "lean", "crouch", "turn", "cross")

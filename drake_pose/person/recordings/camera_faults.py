@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask
 from drake_pose.camera.models import Camera
 from drake_pose.fit.contour_fit import ContourFit, Prior, pack_views
 from drake_pose.fit.evidence import EdgePoints, pack_evidence
@@ -21,9 +21,6 @@ from drake_pose.fit.parameters import CAMERA_NAMES, CameraParameters
 from drake_pose.fit.unknowns import choose
 from drake_pose.person.rays import viewing_rays
 from drake_pose.person.recordings.figures import pixels_per_metre
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # A camera that was pushed has turned and shifted by about this much [rad, m].
 _TURN, _SHIFT = 0.15, 0.3

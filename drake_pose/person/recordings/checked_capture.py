@@ -10,8 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import Camera
 from drake_pose.errors import CameraError, MaskError, SettingsError
@@ -33,9 +33,6 @@ from drake_pose.person.recordings.person_capture import PersonCapture, capture_p
 from drake_pose.person.recordings.persons_in_view import PersonRecording, ReadFrame, ViewFaults
 from drake_pose.person.shape import NOISE, shape_values
 from drake_pose.person.views import edge_spacing
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # Cameras are compared in this many frames, and carved out of their silhouettes in so many.
 _COMPARED, _CARVED = 10, 3

@@ -14,13 +14,10 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Integers, Mask, Picture
 from drake_pose.camera.models import Camera, ParallelCamera
 from drake_pose.person.rays import meeting_points, triangulate, viewing_rays
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # Silhouettes of a sound rig are filled but for this much.
 _UNFILLED = 0.01
@@ -95,7 +92,7 @@ def find_rig_fault(
 class _Seen(NamedTuple):
     """Where a camera sees a grid's points (n,), in cells (h, w) of so many pixels; -1: nowhere."""
 
-    cells: NDArray[np.int64]
+    cells: Integers
     shape: tuple[int, int]
     pixels: float
 
@@ -311,7 +308,7 @@ def _support(
     figures: Sequence[Sequence[Figure]],
     free: Sequence[set[int]],
     places: Array,
-) -> tuple[Array, NDArray[np.int64]]:
+) -> tuple[Array, Integers]:
     """What speaks (n,) for somebody at places (n, 3), and by camera (n, m) the figure, or -1."""
     scores = np.zeros(len(places))
     taken = np.full((len(places), len(cameras)), -1)
@@ -366,5 +363,5 @@ def _step(mask: Mask) -> int:
     return max(1, min(mask.shape) // _RASTER)
 
 
-def _small(mask: Mask, step: int) -> NDArray[np.uint8]:
+def _small(mask: Mask, step: int) -> Picture:
     return np.ascontiguousarray(mask[::step, ::step]).view(np.uint8)

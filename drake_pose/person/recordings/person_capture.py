@@ -10,12 +10,11 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.body.tree.pose_tree import PoseTree
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
-from drake_pose.fit.colours import Picture
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
 from drake_pose.person.recordings.persons_in_view import ReadFrame
@@ -29,9 +28,6 @@ from drake_pose.person.views import (
     see_silhouette,
 )
 from drake_pose.silhouette.areas.outline import Outline
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # In how many of the frames a sequence is begun, for the best to be taken, and of what more fits
 # needs no other to be compared with.

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask
 from drake_pose.camera.models import Camera
 from drake_pose.person.rays import triangulate
 from drake_pose.person.recordings.figures import (
@@ -22,8 +22,6 @@ from drake_pose.person.recordings.figures import (
 )
 from drake_pose.person.views import FrameViews, edge_spacing, see_silhouette
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 ReadFrame = Callable[[int], Mapping[str, Mask]]
 """Gives the masks (H, W) of a frame, counted from 0, by camera; one may be missing."""
 

@@ -1,17 +1,15 @@
 """Bodies in a diagram's SceneGraph that stand as given positions say, with no dynamics."""
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
+from drake_pose.arrays import Array
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.systems.ports import PortedSystem
-
-Array = NDArray[np.float64]
 
 
 class KnownPositions(PortedSystem):

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import (
     Context,
@@ -17,6 +16,7 @@ from pydrake.systems.framework import (
     System,
 )
 
+from drake_pose.arrays import Array
 from drake_pose.errors import SettingsError
 from drake_pose.person.date.body_pose import estimate_pose
 from drake_pose.person.date.capture import CaptureSetup
@@ -38,8 +38,6 @@ from drake_pose.systems.ports import (
     export_outputs,
     require_period,
 )
-
-Array = NDArray[np.float64]
 
 
 class PaperPoseEstimator(MemorySystem):

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.camera.rigs import circle_of_cameras
@@ -21,10 +21,6 @@ from drake_pose.person.date.recognition import register_pose
 from drake_pose.person.date.skeleton import Skeleton, load_skeleton
 from drake_pose.silhouette.segmentation.background import Background, person_region
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
-
-Array = NDArray[np.float64]
-Picture = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 _TURNS_DEG = np.linspace(-80.0, 80.0, 20)
 _NODS_DEG = np.linspace(-35.0, 50.0, 15)

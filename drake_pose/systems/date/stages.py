@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from pydrake.systems.framework import Context
 from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 
+from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.camera.models import Camera
 from drake_pose.errors import CameraError, SettingsError
-from drake_pose.person.date.capture import Mask, PersonView, Picture, see_person
+from drake_pose.person.date.capture import PersonView, see_person
 from drake_pose.person.date.faces import FaceTemplates, find_face
 from drake_pose.person.date.features import Features, SkinColour, find_features
 from drake_pose.person.date.recognition import Recognition, RegisteredPose, recognise
@@ -20,8 +21,6 @@ from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 from drake_pose.silhouette.segmentation.background import Background, person_region
 from drake_pose.systems.colour_images import colour_image_to_picture
 from drake_pose.systems.ports import PortedSystem
-
-Array = NDArray[np.float64]
 
 
 class ViewPorts:

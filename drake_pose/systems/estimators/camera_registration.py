@@ -3,11 +3,11 @@
 from collections.abc import Collection
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 from pydrake.systems.sensors import ImageLabel16I
 
+from drake_pose.arrays import Array
 from drake_pose.camera.models import PinholeCamera
 from drake_pose.registration.online_registration import (
     CameraStatus,
@@ -18,8 +18,6 @@ from drake_pose.registration.posed_frames import PosedFrame
 from drake_pose.registration.register import RegisteredCamera
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 from drake_pose.systems.ports import BeliefSystem, require_period
-
-Array = NDArray[np.float64]
 
 REGISTRATION = ("keyframes", "contradictions", "moves", "mean_iou")
 """What the elements of the output ``registration`` of CameraRegistration are."""

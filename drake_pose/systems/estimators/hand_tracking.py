@@ -17,6 +17,7 @@ from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
 from pydrake.systems.sensors import ImageLabel16I
 from pydrake.trajectories import Trajectory
 
+from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.kalman.truncated_filter import FilterSettings, TruncatedFilter
@@ -35,8 +36,6 @@ from drake_pose.systems.estimators.diagrams import (
 )
 from drake_pose.systems.estimators.truncated_ekf import STATISTICS, TruncatedEkf
 from drake_pose.systems.ports import PortedSystem, connect_same
-
-Array = NDArray[np.float64]
 
 # A segment of fewer pixels in the picture is not missed.
 _FEWEST_PIXELS = 30

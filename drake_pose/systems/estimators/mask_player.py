@@ -5,17 +5,15 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 
+from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera
 from drake_pose.silhouette.pictures.label_images import mask_to_label_image
 from drake_pose.silhouette.pictures.scenes import Scene
 from drake_pose.systems.colour_images import picture_to_colour_image
 from drake_pose.systems.estimators.silhouette_matcher import camera_port
 from drake_pose.systems.ports import PortedSystem
-
-Array = NDArray[np.float64]
 
 DEFAULT_FRAME_RATE_HZ = 1.0
 """Where a scene says nothing, as stills do."""

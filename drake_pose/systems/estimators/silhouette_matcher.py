@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context
 from pydrake.systems.sensors import ImageLabel16I
 
+from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.search.estimates import PoseEstimate, View
@@ -20,8 +20,6 @@ from drake_pose.search.scoring import PoseSearch
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 from drake_pose.systems.bodies.posed_geometry import body_poses
 from drake_pose.systems.ports import BeliefSystem, SharedValue, require_period
-
-Array = NDArray[np.float64]
 
 STATISTICS = ("found", "J", "E_total", "first_E_total", "runs", "outside_limit", "seconds")
 """What the elements of the output ``statistics`` are."""

@@ -4,9 +4,9 @@ from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import Context
 
+from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera
 from drake_pose.filtering.tracking.contour_tracker import TrackingSettings
 from drake_pose.filtering.tracking.match_and_track import Followed, MatchAndTrack
@@ -19,8 +19,6 @@ from drake_pose.systems.estimators.silhouette_matcher import (
     camera_port,
 )
 from drake_pose.systems.ports import require_time_forward
-
-Array = NDArray[np.float64]
 
 TRACK = ("tracked", "matches", "distance")
 """What the elements of the output ``track`` are."""

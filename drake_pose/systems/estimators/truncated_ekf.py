@@ -4,10 +4,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import Context
 from scipy.special import chdtri
 
+from drake_pose.arrays import Array
 from drake_pose.errors import SettingsError
 from drake_pose.filtering.kalman.truncated_filter import FilterState, TruncatedFilter
 from drake_pose.filtering.state import Belief, make_belief
@@ -17,8 +17,6 @@ from drake_pose.systems.ports import (
     require_period,
     require_time_forward,
 )
-
-Array = NDArray[np.float64]
 
 STATISTICS = ("step", "hypotheses", "distance", "count", "lost")
 """What the elements of the output ``statistics`` are."""

@@ -11,13 +11,14 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPo
 from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
 from pydrake.trajectories import Trajectory
 
+from drake_pose.arrays import Mask
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.camera.sources.frame_source import FrameSource
 from drake_pose.errors import SettingsError
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.pose_tracker import PersonPoseTracker
-from drake_pose.person.views import EDGE_POINTS, Mask, SilhouetteView, edge_spacing, see_silhouette
+from drake_pose.person.views import EDGE_POINTS, SilhouetteView, edge_spacing, see_silhouette
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 from drake_pose.silhouette.segmentation.background import Background, person_region
 from drake_pose.systems.bodies.posed_geometry import add_avatar

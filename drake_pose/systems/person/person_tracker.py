@@ -7,10 +7,10 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 
+from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
 from drake_pose.fit.colour_lines import COLOURS
@@ -21,8 +21,6 @@ from drake_pose.person.views import ColourViews, FrameViews, SilhouetteView, sho
 from drake_pose.systems.bodies.posed_geometry import body_poses
 from drake_pose.systems.colour_images import ColourPorts
 from drake_pose.systems.ports import MemorySystem, require_period
-
-Array = NDArray[np.float64]
 
 # Who was seen beside the person is looked for in this many more frames; to look takes long.
 _REMEMBERED = 15

@@ -6,13 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.geometry import MakeRenderEngineVtk, RenderEngineVtkParams, SceneGraph
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, System
 from pydrake.systems.primitives import PassThrough, TrajectorySource
 from pydrake.systems.sensors import RgbdSensor
 from pydrake.trajectories import Trajectory
 
+from drake_pose.arrays import Array, Mask, Picture
 from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.camera.drake import camera_to_drake
 from drake_pose.camera.models import Camera, PinholeCamera
@@ -40,15 +40,15 @@ class CameraRig:
     cameras: Mapping[str, PinholeCamera]
     sensors: Mapping[str, RgbdSensor]
 
-    def set_positions(self, context: Context, q: NDArray[np.float64]) -> None:
+    def set_positions(self, context: Context, q: Array) -> None:
         """Pose the body: (nq,) the plant's positions [rad or m]."""
         self.diagram.GetInputPort("positions").FixValue(context, q)
 
-    def picture(self, context: Context, camera: str) -> NDArray[np.uint8]:
+    def picture(self, context: Context, camera: str) -> Picture:
         """What a camera sees: (H, W, 3) red, green, blue; UnknownNameError: there is none such."""
         return colour_image_to_picture(self._port("color_image", camera).Eval(context))
 
-    def mask(self, context: Context, camera: str) -> NDArray[np.bool_]:
+    def mask(self, context: Context, camera: str) -> Mask:
         """Where a camera sees the body: (H, W); UnknownNameError: there is none such."""
         return label_image_to_mask(self._port("label_image", camera).Eval(context))
 

@@ -6,9 +6,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.geometry import Box, Cylinder, Ellipsoid, Meshcat, Rgba, Shape, Sphere
 from pydrake.math import RigidTransform, RollPitchYaw
+
+from drake_pose.arrays import Array
 
 HALF_SIZE = 12.0
 """Half the side of the garden [m]; the origin is its middle."""
@@ -80,7 +81,7 @@ def garden_objects() -> tuple[GardenObject, ...]:
     return tuple(found)
 
 
-def garden_obstacles() -> NDArray[np.float64]:
+def garden_obstacles() -> Array:
     """(n, 3) x, y and radius of what one cannot walk through [m]."""
     return np.array([(*one.position[:2], one.radius) for one in garden_objects() if one.radius])
 
@@ -99,7 +100,7 @@ def draw_garden(meshcat: Meshcat) -> None:
     meshcat.SetProperty("/Background", "bottom_color", [0.85, 0.92, 0.98])
 
 
-def look_over_shoulder(meshcat: Meshcat, pose: NDArray[np.float64]) -> None:
+def look_over_shoulder(meshcat: Meshcat, pose: Array) -> None:
     """Point the view as the walker at x, y [m] and heading [rad] looks, from behind and above."""
     forward = np.array([math.cos(pose[2]), math.sin(pose[2]), 0.0])
     ground = np.array([pose[0], pose[1], 0.0])
@@ -108,7 +109,7 @@ def look_over_shoulder(meshcat: Meshcat, pose: NDArray[np.float64]) -> None:
     meshcat.SetCameraPose(eye, target)
 
 
-def walker_transform(pose: NDArray[np.float64], rest: NDArray[np.float64]) -> RigidTransform:
+def walker_transform(pose: Array, rest: Array) -> RigidTransform:
     """X_PR: the room in the place, so that who stands at rest in it is where the walker is.
 
     Args:

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import (
     Context,
@@ -19,6 +18,7 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import Trajectory
 
+from drake_pose.arrays import Array
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.person.date.walk_commands import (
@@ -40,8 +40,6 @@ from drake_pose.systems.walk.garden import (
     look_over_shoulder,
     walker_transform,
 )
-
-Array = NDArray[np.float64]
 
 KEYS = {"ahead": "ArrowUp", "behind": "ArrowDown", "left": "ArrowLeft", "right": "ArrowRight"}
 """Meshcat's buttons and the keys that press them."""

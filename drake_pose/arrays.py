@@ -1,0 +1,9 @@
+"""Names of the arrays that the rooms pass on."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+Picture = NDArray[np.uint8]

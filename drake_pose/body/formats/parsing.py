@@ -4,7 +4,6 @@ import copy
 import logging
 import re
 import tempfile
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,7 +17,6 @@ from pydrake.multibody.tree import ModelInstanceIndex
 from drake_pose.body.formats.link_files import Limits, cure_sdf, cure_urdf
 from drake_pose.body.formats.mjcf import cure_mjcf
 from drake_pose.body.formats.packages import FileFinder
-from drake_pose.body.formats.xml_files import read_limits
 from drake_pose.body.surfaces.mesh_files import workspace
 from drake_pose.errors import ModelError
 
@@ -119,7 +117,7 @@ class ModelSource:
             if kind == "urdf":
                 text = cure_urdf(path, self._finder, self._warn)
             elif kind == "xml":
-                text = cure_mjcf(path)
+                text = cure_mjcf(path, self._warn)
             elif kind == "sdf":
                 text, limits = cure_sdf(path, self._finder, self._warn, self._stand_in)
                 if len(self._under_way) == 1:
@@ -158,15 +156,7 @@ class ModelSource:
         )
 
     def _explain(self, reason: str, warnings: list[str]) -> str:
-        """Why the file cannot be used, with the joint whose limits are at fault, if one is."""
-        if self.kind == "xml":
-            for joint in ElementTree.fromstring(self.text).iter("joint"):
-                values = joint.get("range", "").split()
-                try:
-                    if len(values) == 2:
-                        read_limits(values[0], values[1], joint.get("name", "(unnamed)"))
-                except ModelError as error:
-                    return f"{self.path}: {error}"
+        """Why the file cannot be used."""
         # SDFormat's reader says where in its error, and what in a warning before it.
         remarks = [text.split("Msg: ")[-1] for text in warnings if "Error" in text]
         text = "; ".join([*remarks, reason.strip()])[:_LONGEST_REASON]

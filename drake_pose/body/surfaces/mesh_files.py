@@ -21,14 +21,14 @@ from drake_pose.errors import ModelError
 
 # What a COLLADA file says of colours and textures.
 _DAE_LOOKS = ("library_images", "library_effects", "library_materials", "bind_material")
-READABLE_EXTENSIONS = (".obj", ".gltf", ".glb", ".stl", ".dae", ".msh")
+READABLE_EXTENSIONS = (".obj", ".gltf", ".glb", ".stl", ".dae")
 _STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 # glTF's vertical axis is y, Drake's is z: (x, y, z) becomes (x, -z, y).
 _R_DRAKE_GLTF = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 def read_mesh_file(path: Path, scale: NDArray[np.float64] | None = None) -> TriangleMesh:
-    """The triangles of an OBJ, glTF, GLB, STL, DAE or MuJoCo's MSH file, duplicate vertices merged.
+    """The triangles of an OBJ, glTF, GLB, STL or DAE file, duplicate vertices merged.
 
     ``scale``: (3,) factors along x, y and z.
 
@@ -120,23 +120,6 @@ def _read_stl(path: Path) -> TriangleMesh:
     return mesh
 
 
-def _read_msh(path: Path) -> TriangleMesh:
-    """A file of MuJoCo's own binary format: four counts, float32 vertices, ..., int32 faces."""
-    # Source: MuJoCo's XML reference, section "mesh".
-    data = path.read_bytes()
-    counts = np.frombuffer(data[:16].ljust(16, b"\0"), "<i4").astype(np.int64)
-    vertices, normals, coordinates, faces = counts
-    floats = 3 * vertices + 3 * normals + 2 * coordinates
-    if counts.min() < 0 or len(data) != 16 + 4 * (floats + 3 * faces):
-        raise ModelError(
-            f"mesh file {path} is no MSH file of MuJoCo's, or truncated: its length does not match "
-            "the counts at its beginning"
-        )
-    points = np.frombuffer(data, "<f4", 3 * vertices, 16)
-    triangles = np.frombuffer(data, "<i4", 3 * faces, 16 + 4 * floats)
-    return TriangleMesh(points, triangles)
-
-
 def _read_dae(path: Path) -> TriangleMesh:
     """A COLLADA file, all its parts at their places, in metres; textures are not looked at."""
     try:
@@ -193,7 +176,7 @@ _READER_ERRORS = (
     SyntaxError,
     struct.error,
 )
-_READERS = {".obj": _read_obj, ".stl": _read_stl, ".msh": _read_msh, ".dae": _read_dae}
+_READERS = {".obj": _read_obj, ".stl": _read_stl, ".dae": _read_dae}
 
 
 def is_drawn_by_drake(path: Path) -> bool:

@@ -103,17 +103,6 @@ def test_a_dae_file_needs_no_texture_and_is_in_metres(tmp_path):
     assert_tetrahedron(read_mesh_file(broken))
 
 
-def test_mujocos_own_mesh_files_are_read(tmp_path):
-    counts = struct.pack("<4i", 4, 1, 2, 4)
-    floats = np.concatenate([CORNERS.ravel(), np.zeros(3 + 4)]).astype("<f4").tobytes()
-    data = counts + floats + FACES.astype("<i4").tobytes()
-    (tmp_path / "t.msh").write_bytes(data)
-    assert_tetrahedron(read_mesh_file(tmp_path / "t.msh"))
-    (tmp_path / "short.msh").write_bytes(data[:-4])
-    with pytest.raises(ModelError, match=r"short\.msh.*truncated"):
-        read_mesh_file(tmp_path / "short.msh")
-
-
 def test_written_meshes_are_what_drake_reads(tmp_path):
     random = np.random.default_rng(2)
     points = random.normal(size=(70000, 3))

@@ -44,7 +44,7 @@ bench: $(VENV)/ready-cluster
 	$(PYTHON) -m tests.benchmarks.speed
 	$(PYTHON) -m tests.benchmarks.silhouette_camera
 	$(PYTHON) -m tests.benchmarks.estimates $(DATA)
-	$(PYTHON) -m tests.benchmarks.registration $(DATA) --cases 1 --zeros 0
+	$(PYTHON) -m tests.benchmarks.registration $(DATA) --cases 1
 	$(PYTHON) -m tests.benchmarks.memory
 	$(PYTHON) -m tests.benchmarks.cluster
 

@@ -35,7 +35,7 @@ from drake_pose.person.shape import tracker_of_person
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.systems.person.live_capture import LiveSensors, build_live_capture
-from tests.benchmarks.scenes import print_table
+from tests.benchmarks.tables import print_table
 
 if TYPE_CHECKING:
     from distributed import Client

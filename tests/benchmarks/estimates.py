@@ -1,14 +1,15 @@
 """Benchmark of whole estimates: CPU time a frame, as label images of the same process, and errors.
 
-Run as ``python -m tests.benchmarks.estimates [DATA]``; DATA is a folder with the scenes
+Run as ``python -m tests.benchmarks.estimates [DATA] [--hands]``; DATA is a folder with the scenes
 ``arm_two_views``, ``human_four_views``, ``hand_photos`` and ``hand_sequences``. Rows whose scene is
-not there are left out; the demonstration's always is.
+not there are left out; the demonstration's always is. ``--hands``: all sequences of hands before
+one camera that nobody knows, instead.
 """
 
 from __future__ import annotations
 
+import argparse
 import csv
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -19,7 +20,7 @@ import numpy as np
 
 from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
-from drake_pose.files.records import PoseRow
+from drake_pose.csv_files import csv_text
 from drake_pose.files.settings import EstimateSettings
 from drake_pose.jobs.demo import demo_scene, demo_settings
 from drake_pose.jobs.estimate.scene import estimate_scene
@@ -28,13 +29,16 @@ from drake_pose.papers.kameda_figures import continuous_figures
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.silhouette.pictures.scenes import load_scene
-from tests.benchmarks.scenes import print_table
 from tests.benchmarks.speed import measure_kernel
+from tests.benchmarks.tables import print_table
 
-_SEQUENCE_FRAMES = 24
-_RATE_HZ = 30.0
-_IMAGES = 20
+_FRAMES, _RATE_HZ, _IMAGES = 24, 30.0, 20
 _ARM_JOINTS = ("A1", "A2", "A3", "A4")
+_FLEXIONS = tuple(
+    f"{finger}_{joint}_flexion"
+    for finger in ("index", "middle", "ring", "little")
+    for joint in ("mcp", "pip", "dip")
+)
 
 
 class Work(NamedTuple):
@@ -52,9 +56,8 @@ class Work(NamedTuple):
 
 def works(data: Path | None, folder: Path) -> Iterator[Work]:
     """The rows whose scenes are there; what is drawn goes to a folder."""
-    yield Work(
-        "demo: man, one view", demo_scene(), bundled_model("man"), demo_settings(demo_scene())
-    )
+    man, demo = bundled_model("man"), demo_scene()
+    yield Work("demo: man, one view", demo, man, demo_settings(demo))
     if data is None:
         return
     arm, human = data / "arm_two_views", data / "human_four_views"
@@ -71,72 +74,67 @@ def works(data: Path | None, folder: Path) -> Iterator[Work]:
             root_rotation={"y": (-180.0, 180.0), "x": (-20.0, 20.0), "z": (-20.0, 20.0)},
             track=False,
         )
-        yield Work("man, four views, one frame", human, bundled_model("man"), settings)
+        yield Work("man, four views, one frame", human, man, settings)
     if (data / "hand_photos").is_dir():
         yield Work("hand photograph", data / "hand_photos", bundled_model("hand"))
     sequence = data / "hand_sequences" / "count"
     if sequence.is_dir():
-        right = bundled_model("hand").with_name("right_hand.urdf")
-        frames = EstimateSettings(frames=(f"0000:{_SEQUENCE_FRAMES - 1:04d}",))
-        yield Work("hand, sequence, no camera known", sequence, right, frames, uncounted=1)
+        frames = EstimateSettings(frames=(f"0000:{_FRAMES - 1:04d}",))
+        yield Work("hand, sequence, no camera known", sequence, _right_hand(), frames, uncounted=1)
 
 
-def draw_arm_sequence(arm: Path, out: Path, frames: int = _SEQUENCE_FRAMES) -> Path:
+def _right_hand() -> Path:
+    return bundled_model("hand").with_name("right_hand.urdf")
+
+
+def draw_arm_sequence(arm: Path, out: Path, frames: int = _FRAMES) -> Path:
     """A scene of the recorded arm on its way from its first pose to its second, drawn by Drake."""
     model, scene = load_model(arm / "med7" / "med7.urdf", check=False), load_scene(arm)
-    with (arm / "joint_angles.csv").open(encoding="utf-8", newline="") as file:
-        rows = list(csv.reader(file))
-    names, poses = rows[0][1:], np.array(rows[1:3], dtype=np.float64)[:, 1:]
+    truth = _truth(arm)
+    names, poses = list(truth[0]), np.array([list(truth[k].values()) for k in (0, 1)])
     share = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, frames))
     path = poses[0] + share[:, None] * (poses[1] - poses[0])
     out.mkdir()
     (out / "cameras.yaml").write_bytes((arm / "cameras.yaml").read_bytes())
     (out / "scene.yaml").write_text(f"sequence: true\nframe_rate_hz: {_RATE_HZ:.0f}\n")
-    index = [model.position_index(name) for name in names]
-    renderers = {name: LabelRenderer(model, camera) for name, camera in scene.cameras.items()}
-    with (out / "joint_angles.csv").open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["frame", *names])
+    rows = [["frame", *names], *([k, *values] for k, values in enumerate(path))]
+    (out / "joint_angles.csv").write_text(csv_text(rows))
+    for name, camera in scene.cameras.items():
+        renderer = LabelRenderer(model, camera)
+        (out / "masks" / name).mkdir(parents=True)
         for k, values in enumerate(path):
-            writer.writerow([k, *values])
             q = np.array(model.default_positions)
-            q[index] = values
-            for name, renderer in renderers.items():
-                (out / "masks" / name).mkdir(parents=True, exist_ok=True)
-                write_mask(out / "masks" / name / f"{k:04d}.png", renderer.mask(q))
+            q[[model.position_index(name) for name in names]] = values
+            write_mask(out / "masks" / name / f"{k:04d}.png", renderer.mask(q))
     return out
+
+
+def _truth(scene: Path) -> dict[int, dict[str, float]]:
+    """The joints' true positions, by the frame's number."""
+    with (scene / "joint_angles.csv").open(encoding="utf-8", newline="") as file:
+        rows = [{name: float(cell) for name, cell in row.items()} for row in csv.DictReader(file)]
+    return {int(row.pop("frame")): row for row in rows}
 
 
 def measure(work: Work) -> tuple[float, float, str]:
     """CPU seconds a frame, E_total in the mean, and the error in words; the first run warms up."""
     ends: list[float] = []
-
-    def note(*_: object) -> None:
-        ends.append(time.process_time())
-
     for _ in range(2 if work.uncounted == 0 else 1):
         ends.clear()
-        found = estimate_scene(work.scene, work.model, None, work.settings, on_frame=note)
-    seconds = np.diff(ends)[work.uncounted :]
-    rows = found.rows[work.uncounted :]
-    E_total = float(np.mean([row.error for row in rows]))
-    return float(np.median(seconds)), E_total, _error(work, rows, found.position_names)
-
-
-def _error(work: Work, rows: tuple[PoseRow, ...], names: tuple[str, ...]) -> str:
-    """The joints' errors where they are known."""
-    if not work.joints:
-        return ""
-    with (work.scene / "joint_angles.csv").open(encoding="utf-8", newline="") as file:
-        truth = {int(row["frame"]): row for row in csv.DictReader(file)}
-    off = [
-        abs(row.q[names.index(joint)] - float(truth[int(row.frame)][joint]))
-        for row in rows
-        for joint in work.joints
-    ]
-    # A flip of the chain looks the same: what is off by more is one.
-    near = np.degrees([one for one in off if one < 0.5])
-    return f"{work.joints[0]} to {work.joints[-1]}: {np.median(near):.2f} deg in the median"
+        found = estimate_scene(
+            work.scene, work.model, None, work.settings,
+            on_frame=lambda *_: ends.append(time.process_time()),
+        )  # fmt: skip
+    rows, error = found.rows[work.uncounted :], ""
+    if work.joints:
+        truth, names = _truth(work.scene), found.position_names
+        pairs = [(row, name) for row in rows for name in work.joints]
+        off = np.abs([r.q[names.index(n)] - truth[int(r.frame)][n] for r, n in pairs])
+        # A flip of the chain looks the same: what is off by more is one.
+        median = np.degrees(np.median(off[off < 0.5]))
+        error = f"{work.joints[0]} to {work.joints[-1]}: {median:.2f} deg in the median"
+    seconds = float(np.median(np.diff(ends)[work.uncounted :]))
+    return seconds, float(np.mean([row.error for row in rows])), error
 
 
 def _rows(data: Path | None, folder: Path) -> Iterator[tuple[str, ...]]:
@@ -155,13 +153,49 @@ def _rows(data: Path | None, folder: Path) -> Iterator[tuple[str, ...]]:
     )
 
 
+def _hand_rows(data: Path) -> Iterator[tuple[str, ...]]:
+    """Each sequence: flexions off, how many lie in their intervals and these' widths [deg]."""
+    for scene in sorted(path.parent for path in data.glob("*/scene.yaml")):
+        begin = time.process_time()
+        found = estimate_scene(scene, _right_hand(), None, EstimateSettings(), overlay=False)
+        seconds, truth = time.process_time() - begin, _truth(scene)
+        off, inside, widths = [], [], []
+        for row in found.rows:
+            known, true = found.records[row.frame].joints, truth[int(row.frame)]
+            for name in _FLEXIONS:
+                value = np.degrees(row.q[found.position_names.index(name)])
+                off.append(abs(value - true[name]))
+                inside.append(name in known and known[name].low <= true[name] <= known[name].high)
+                widths.append(known[name].high - known[name].low if name in known else np.nan)
+        counts = [one.family_count or 1 for one in found.records.values()]
+        yield (
+            scene.name,
+            f"{np.median(off):.1f} ({np.mean(off):.1f})",
+            f"{np.mean(inside):.0%}",
+            f"{np.nanmedian(widths):.0f}",
+            f"{np.mean([row.error for row in found.rows]):.1%}",
+            f"{np.median(counts):.0f}",
+            f"{seconds / len(found.rows):.2f} s",
+        )
+
+
 def main() -> None:
     """Print what estimates cost and reach here."""
-    data = Path(sys.argv[1]) if len(sys.argv) > 1 else None
+    parser = argparse.ArgumentParser(description="Whole estimates: times and errors.")
+    parser.add_argument("data", nargs="?", type=Path, help="a folder of recorded scenes")
+    parser.add_argument("--hands", action="store_true", help="sequences of hands alone")
+    asked = parser.parse_args()
+    if asked.hands:
+        headings: tuple[str, ...] = (
+            *("sequence", "flexions off, median (mean)", "inside", "intervals", "E_total"),
+            *("explanations", "CPU a frame"),
+        )
+        print_table("Hands, camera unknown", headings, _hand_rows(asked.data / "hand_sequences"))
+        return
     with tempfile.TemporaryDirectory() as folder:
         headings = ("work", "a frame", "label images", "E_total", "error")
         title = "Estimates: CPU time a frame, one core"
-        print_table(title, headings, _rows(data, Path(folder)))
+        print_table(title, headings, _rows(asked.data, Path(folder)))
 
 
 if __name__ == "__main__":

@@ -9,14 +9,26 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from tests.benchmarks.scenes import print_table
+from tests.benchmarks.tables import print_table
 
 LIMIT_MIB = 1536
 """No command takes more on the project's own data [MiB]."""
 
+COMMANDS = (
+    "demo --out demo",
+    "reproduce kameda --images 10",
+    "reproduce kameda --images 10 --method beam",
+    "reproduce kameda --images 3 --angles continuous",
+    "reproduce kameda --images 3 --angles continuous --views 4",
+    "reproduce shimada --runs 5",
+    "reproduce date --frames 60",
+    "walk --simulate --no-browser --seconds 20 --speed 0",
+)
+"""Command lines that need no data but the project's own, in a folder for their results."""
+
 
 def measure_memory(
-    words: Sequence[str], program: Sequence[str] = ("-m", "drake_pose.commands.main")
+    words: Sequence[str], folder: Path, program: Sequence[str] = ("-m", "drake_pose.commands.main")
 ) -> tuple[int, float, float]:
     """Runs a command in a process of its own: its exit status, peak memory [MiB], CPU seconds.
 
@@ -25,7 +37,7 @@ def measure_memory(
     """
     quiet = subprocess.DEVNULL
     process = subprocess.Popen(
-        [sys.executable, *program, *words], stdin=quiet, stdout=quiet, stderr=quiet
+        [sys.executable, *program, *words], stdin=quiet, stdout=quiet, stderr=quiet, cwd=folder
     )
     # Of this child alone, and of the workers that it waited for.
     _, status, usage = os.wait4(process.pid, 0)
@@ -35,27 +47,11 @@ def measure_memory(
     return process.returncode, usage.ru_maxrss / unit, usage.ru_utime + usage.ru_stime
 
 
-def benchmark_commands(folder: Path) -> list[list[str]]:
-    """Command lines that need no data but the project's own; a folder for their results."""
-    kameda = ["reproduce", "kameda", "--images"]
-    return [
-        ["demo", "--out", str(folder / "demo")],
-        [*kameda, "10"],
-        [*kameda, "10", "--method", "beam"],
-        [*kameda, "3", "--angles", "continuous"],
-        [*kameda, "3", "--angles", "continuous", "--views", "4"],
-        ["reproduce", "shimada", "--runs", "5"],
-        ["reproduce", "date", "--frames", "60"],
-        ["walk", "--simulate", "--no-browser", "--seconds", "20", "--speed", "0"],
-    ]
-
-
 def _rows(folder: Path) -> Iterator[tuple[str, ...]]:
-    for words in benchmark_commands(folder):
-        status, peak, seconds = measure_memory(words)
-        shown = " ".join(words).replace(f"{folder}{os.sep}", "")
+    for line in COMMANDS:
+        status, peak, seconds = measure_memory(line.split(), folder)
         beyond = " (too much)" if peak > LIMIT_MIB else ""
-        yield shown, f"{peak:.0f} MiB{beyond}", f"{seconds:.0f} s", str(status)
+        yield line, f"{peak:.0f} MiB{beyond}", f"{seconds:.0f} s", str(status)
 
 
 def main() -> None:

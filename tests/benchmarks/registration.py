@@ -1,8 +1,8 @@
 """Benchmark of registrations: whether cameras are found without a guess, how well, and how fast.
 
-Run as ``python -m tests.benchmarks.registration [DATA] [--cases N] [--zeros N]``; DATA is a folder
-with the scenes ``arm_two_views``, ``arm_one_view`` and ``franka_one_view``, N the number of
-simulated cases for each arm (scenes.arm_files), and of calibrations of joints' zeros.
+Run as ``python -m tests.benchmarks.registration [DATA] [--cases N]``; DATA is a folder with the
+scenes ``arm_two_views``, ``arm_one_view`` and ``franka_one_view``, N the number of simulated cases
+for each arm that is there; where none is, of an arm of boxes.
 """
 
 from __future__ import annotations
@@ -10,37 +10,61 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
+from importlib.metadata import PackageNotFoundError, distribution
 from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from drake_pose.body.model import load_model
+from drake_pose.camera.models import PinholeCamera
 from drake_pose.errors import RegistrationError
+from drake_pose.files.settings import EstimateSettings
+from drake_pose.jobs.estimate.searches import make_tree
 from drake_pose.jobs.registration.inputs import read_inputs
 from drake_pose.jobs.registration.settings import RegistrationSettings
-from drake_pose.registration.joint_zeros import calibrate_joints
 from drake_pose.registration.posed_frames import PosedFrame, PosedFrames
 from drake_pose.registration.register import CameraSearch, RegistrationBody
 from drake_pose.registration.start_poses import areas
-from tests.benchmarks.scenes import (
-    Array,
-    arm_files,
-    damaged,
-    draw_arm,
-    load_arm,
-    print_table,
-    random_values,
-)
+from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
+from tests.benchmarks.tables import print_table
 
-_SEED = 13_000
-_FRAMES, _ZERO_FRAMES = 5, 10
-_MOVED, _ZERO = 3, np.radians(2.0)
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_SEED, _FRAMES = 13_000, 5
 # A camera is found that is off by less [mm, deg].
 _FOUND = (20.0, 2.0)
+_WIDTH, _HEIGHT, _FOCAL, _DISTANCE = 640, 480, 600.0, (1.0, 1.7)
+_MIDDLE, _MIDDLE_SD = np.array([0.0, 0.0, 0.35]), 0.1
+# A silhouette of fewer pixels is of an arm that is hardly in the picture: another pose is drawn,
+# and after so many such poses another camera.
+_LEAST_PIXELS, _TRIES = 3000, 30
+_MOST_MORPHED, _HOLES, _HOLE_RADII = 2, 0.03, (3, 9)
+_LBR, _PANDA = "arm_two_views/med7/med7.urdf", "franka_one_view/panda/panda.urdf"
+_XARM = "cmeel.prefix/share/example-robot-data/robots/xarm_description/urdf/xarm7.urdf"
+# Recorded scenes, their arm, the table of their joints, and the cameras whose poses are withheld.
+_RECORDED = (
+    ("arm_two_views", _LBR, "joint_angles", ("left", "right")),
+    ("arm_one_view", _LBR, "joint_angles", ()),
+    ("franka_one_view", _PANDA, "joint_angles", ()),
+    ("franka_one_view", _PANDA, "joint_angles_fitted", ()),
+)
+# Of the arm of boxes each: its axis, the box's sides and length [m].
+_BOXES = (
+    ("0 0 1", 0.16, 0.11, 0.2),
+    ("0 1 0", 0.11, 0.1, 0.35),
+    ("0 0 1", 0.09, 0.13, 0.1),
+    ("0 1 0", 0.08, 0.07, 0.3),
+    ("0 1 0", 0.05, 0.1, 0.15),
+)
 
 
 class CameraOutcome(NamedTuple):
@@ -60,18 +84,84 @@ class CameraOutcome(NamedTuple):
         return self.millimetres < _FOUND[0] and self.degrees < _FOUND[1]
 
 
-class ZeroOutcome(NamedTuple):
-    """Of one calibration of zeros: errors [deg] of those determined of the joints that were moved,
-    how many of these are undetermined, how many of the right zeros are called significant, whether
-    determined intervals hold the truth, and the processor's seconds, the registration's among them.
-    """
+def load_arms(data: Path | None) -> dict[str, RegistrationBody]:
+    """Arms that are there: scenes', the xArm7's; else one of boxes."""
+    places = {} if data is None else {"LBR Med 7": data / _LBR, "Franka Panda": data / _PANDA}
+    with suppress(PackageNotFoundError):
+        places["xArm7"] = Path(str(distribution("example-robot-data").locate_file(_XARM)))
+    found = {name: load_arm(path) for name, path in places.items() if path.is_file()}
+    with tempfile.TemporaryDirectory() as folder:
+        return found or {"boxes": load_arm(write_box_arm(Path(folder) / "boxes.urdf"))}
 
-    off: Array
-    undetermined: int
-    false: int
-    right: int
-    inside: list[bool]
-    seconds: float
+
+def write_box_arm(path: Path) -> Path:
+    """Writes an arm of five boxes; returns its file."""
+    parts, parent, height = ['<robot name="boxes"><link name="world"/>'], "world", 0.0
+    for k, (axis, width, depth, length) in enumerate(_BOXES):
+        parts.append(
+            f'<link name="box{k}"><visual><origin xyz="0.01 0 {length / 2}"/><geometry>'
+            f'<box size="{width} {depth} {length}"/></geometry></visual></link>'
+            f'<joint name="joint{k}" type="revolute"><parent link="{parent}"/>'
+            f'<child link="box{k}"/><origin xyz="0 0 {height}"/><axis xyz="{axis}"/>'
+            '<limit lower="-2" upper="2" effort="1" velocity="1"/></joint>'
+        )
+        parent, height = f"box{k}", length
+    path.write_text("".join(parts) + "</robot>")
+    return path
+
+
+def load_arm(path: Path) -> RegistrationBody:
+    """An arm that stands in the world as its model file has it."""
+    return RegistrationBody(make_tree(load_model(path, check=False), EstimateSettings(), None))
+
+
+def draw_arm(
+    body: RegistrationBody, count: int, rng: np.random.Generator
+) -> tuple[PinholeCamera, list[PosedFrame]]:
+    """An arm in random poses, before a camera from any side, turned anyhow; masks are exact."""
+    while True:
+        camera = _random_camera(rng)
+        renderer, frames = LabelRenderer(body.tree.model, camera), []
+        for _ in range(count + _TRIES):
+            values = random_values(body, rng)
+            mask = renderer.mask(*body.tree.positions_from(body.kinematics.split(values)))
+            if np.count_nonzero(mask) >= _LEAST_PIXELS:
+                frames.append(PosedFrame(f"{len(frames):04d}", values, mask))
+            if len(frames) == count:
+                return camera, frames
+
+
+def random_values(body: RegistrationBody, rng: np.random.Generator) -> Array:
+    """Positions (m,) inside the joints' limits; those that have none turn all around."""
+    lower, upper = body.kinematics.lower, body.kinematics.upper
+    return rng.uniform(
+        np.where(np.isfinite(lower), lower, -np.pi), np.where(np.isfinite(upper), upper, np.pi)
+    )
+
+
+def _random_camera(rng: np.random.Generator) -> PinholeCamera:
+    away = rng.normal(size=3)
+    away /= np.linalg.norm(away)
+    right = np.cross(rng.normal(size=3), -away)
+    right /= np.linalg.norm(right)
+    X_WC = np.eye(4)
+    X_WC[:3, :3] = np.column_stack([right, np.cross(-away, right), -away])
+    X_WC[:3, 3] = _MIDDLE + rng.normal(0.0, _MIDDLE_SD, 3) + rng.uniform(*_DISTANCE) * away
+    centre = (_WIDTH / 2 - 0.5, _HEIGHT / 2 - 0.5)
+    return PinholeCamera("camera", _WIDTH, _HEIGHT, _FOCAL, _FOCAL, *centre, X_WC)
+
+
+def damaged(mask: Mask, rng: np.random.Generator) -> Mask:
+    """A mask eroded or dilated by up to two pixels, with holes of 3 % of its area."""
+    size = int(rng.integers(-_MOST_MORPHED, _MOST_MORPHED + 1))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(size) + 1,) * 2)
+    drawn = (cv2.dilate if size > 0 else cv2.erode)(mask.astype(np.uint8), disc)
+    rows, columns = np.nonzero(drawn)
+    left = (1.0 - _HOLES) * len(rows)
+    while np.count_nonzero(drawn) > left:
+        k = int(rng.integers(len(rows)))
+        cv2.circle(drawn, (int(columns[k]), int(rows[k])), int(rng.integers(*_HOLE_RADII)), 0, -1)
+    return drawn.astype(np.bool_)
 
 
 def measure_camera(body: RegistrationBody, seed: int, worn: bool) -> CameraOutcome:
@@ -96,34 +186,6 @@ def measure_camera(body: RegistrationBody, seed: int, worn: bool) -> CameraOutco
     return CameraOutcome(*_sizes(error), int(np.count_nonzero(inside)), named, seconds)
 
 
-def measure_zeros(body: RegistrationBody, seed: int, worn: bool) -> ZeroOutcome:
-    """Draws an arm, three of whose encoders are off by 2 degrees, and finds its joints' zeros."""
-    rng = np.random.default_rng(seed)
-    camera, frames = draw_arm(body, _ZERO_FRAMES, rng)
-    if worn:
-        frames = [replace(frame, mask=damaged(frame.mask, rng)) for frame in frames]
-    angles = np.flatnonzero(body.kinematics.is_angle)
-    moved = rng.choice(angles, _MOVED, replace=False)
-    true = np.zeros(len(body.kinematics.names))
-    true[moved] = _ZERO * rng.choice([-1.0, 1.0], _MOVED)
-    read = [replace(frame, values=frame.values - true) for frame in frames]
-    start = time.process_time()
-    registered = CameraSearch(body).register(camera, read)
-    names = [body.kinematics.names[k] for k in angles]
-    zeros = calibrate_joints(body, [registered], [read], names).zeros
-    seconds = time.process_time() - start
-    pairs = list(zip(zeros, true[angles], strict=True))
-    known = [(one, value) for one, value in pairs if one.determined]
-    return ZeroOutcome(
-        np.degrees([abs(one.value - value) for one, value in known if value != 0.0]),
-        sum(value != 0.0 and not one.determined for one, value in pairs),
-        sum(value == 0.0 and one.significant for one, value in pairs),
-        sum(value == 0.0 for _, value in pairs),
-        [one.low <= value <= one.high for one, value in known],
-        seconds,
-    )
-
-
 def pose_error(X_WC: Array, true: Array) -> Array:
     """(6,) by what rotation vector [rad] and shift [m] in the world a pose (4, 4) is off."""
     turn = Rotation.from_matrix(true[:3, :3] @ X_WC[:3, :3].T).as_rotvec()
@@ -135,14 +197,14 @@ def _sizes(error: Array) -> tuple[float, float]:
     return 1e3 * float(np.linalg.norm(error[3:])), float(np.degrees(np.linalg.norm(error[:3])))
 
 
-def _camera_rows(arms: Mapping[str, RegistrationBody], cases: int) -> Iterator[list[str]]:
+def _camera_rows(arms: dict[str, RegistrationBody], cases: int) -> Iterator[list[str]]:
     """Simulated cameras, for each arm and all together."""
     for worn, masks in ((False, "exact"), (True, "damaged, one frame wrong")):
         own = {
             name: [measure_camera(body, _SEED + k, worn) for k in range(cases)]
             for name, body in arms.items()
         }
-        for name, outcomes in {**own, "all": list(chain(*own.values()))}.items():
+        for name, outcomes in {**own, "all": [*chain(*own.values())]}.items():
             found = [one for one in outcomes if one.found]
             millimetres, degrees, inside = np.array([one[:3] for one in found]).reshape(-1, 3).T
             error = f"{np.median(millimetres):.2f} mm, {np.median(degrees):.3f} deg"
@@ -156,36 +218,10 @@ def _camera_rows(arms: Mapping[str, RegistrationBody], cases: int) -> Iterator[l
             ]
 
 
-def _zero_rows(arms: Mapping[str, RegistrationBody], cases: int) -> Iterator[list[str]]:
-    """Zeros of joints, three of which are off."""
-    for worn in (False, True):
-        runs = [
-            measure_zeros(body, _SEED + k, worn) for body in arms.values() for k in range(cases)
-        ]
-        off = np.concatenate([one.off for one in runs])
-        yield [
-            "damaged" if worn else "exact",
-            str(len(runs)),
-            f"{np.median(off):.3f} deg" if len(off) else "",
-            f"{sum(one.undetermined for one in runs)} of {_MOVED * len(runs)}",
-            f"{np.mean(list(chain(*(one.inside for one in runs)))):.1%}",
-            f"{sum(one.false for one in runs)} of {sum(one.right for one in runs)}",
-            f"{np.median([one.seconds for one in runs]):.1f} s",
-        ]
-
-
 def _recorded_rows(data: Path) -> Iterator[list[str]]:
     """Recorded arms that are there: all cameras' poses are withheld; some are in the file."""
-    lbr = data / "arm_two_views" / "med7" / "med7.urdf"
-    panda = data / "franka_one_view" / "panda" / "panda.urdf"
-    every: Sequence[tuple[str, Path, str, tuple[str, ...]]] = (
-        ("arm_two_views", lbr, "joint_angles", ("left", "right")),
-        ("arm_one_view", lbr, "joint_angles", ()),
-        ("franka_one_view", panda, "joint_angles", ()),
-        ("franka_one_view", panda, "joint_angles_fitted", ()),
-    )
-    for name, model, joints, cameras in every:
-        scene = data / name
+    for name, arm, joints, cameras in _RECORDED:
+        scene, model = data / name, data / arm
         if not (scene.is_dir() and model.is_file()):
             continue
         settings = RegistrationSettings(cameras=cameras)
@@ -212,18 +248,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Where cameras stand: errors and times.")
     parser.add_argument("data", nargs="?", type=Path, help="a folder of recorded scenes")
     parser.add_argument("--cases", type=int, default=2, help="simulated cases for each arm")
-    parser.add_argument("--zeros", type=int, default=1, help="calibrations of zeros for each arm")
     asked = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        files = arm_files(asked.data, Path(folder))
-        arms = {name: load_arm(path) for name, path in files.items()}
     headings = ("arm, masks", "found", "error, median", "95 % hold", "named", "CPU, median")
     title = f"Simulated arms, {_FRAMES} frames, no guess: where the camera is"
-    print_table(title, headings, _camera_rows(arms, asked.cases))
-    if asked.zeros > 0:
-        title = f"{_MOVED} encoders off by 2 degrees, {_ZERO_FRAMES} frames"
-        headings = ("masks", "runs", "error, median", "undetermined", "95 % hold", "false", "CPU")
-        print_table(title, headings, _zero_rows(arms, asked.zeros))
+    print_table(title, headings, _camera_rows(load_arms(asked.data), asked.cases))
     if asked.data is not None:
         headings = ("scene, camera", "from the file's", "IoU (at the file's)", "named", "CPU")
         print_table("Recorded arms, no guess", headings, _recorded_rows(asked.data))

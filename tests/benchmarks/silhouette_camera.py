@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,13 +22,11 @@ from drake_pose.camera.models import PinholeCamera
 from drake_pose.camera.rigs import look_at
 from drake_pose.silhouette.pictures.label_images import EMPTY, label_data
 from drake_pose.systems.pictures.silhouette_camera import SilhouetteCamera
-from tests.benchmarks.scenes import print_table
-from tests.benchmarks.speed import limb_mesh, obj_text
+from tests.benchmarks.speed import limb_mesh, write_limb
+from tests.benchmarks.tables import print_table
 
 _RENDERER = "benchmark"
-_BEND = 0.7
-_ROUNDS = 5
-ARM_LINKS = 15
+_BEND, _ROUNDS, ARM_LINKS = 0.7, 5, 15
 _LINK = """
 <link name="link_{k}"><visual><origin xyz="0 0 0.06"/><geometry>
   <mesh filename="{mesh}" scale="0.7 0.7 0.3"/></geometry></visual></link>
@@ -49,15 +48,11 @@ class CameraFigures(NamedTuple):
 
 def arm_model(folder: Path) -> ParsedModel:
     """An arm of 15 links of 480 triangles, 13 cm long, 12 cm apart; its files lie in a folder."""
-    mesh = folder / "link.obj"
-    mesh.write_text(obj_text(limb_mesh(16, 16)))
+    mesh = write_limb(folder, limb_mesh(16, 16))
+    parents = ["world", *(f"link_{k}" for k in range(ARM_LINKS))]
     links = [
         _LINK.format(
-            k=k,
-            mesh=mesh,
-            parent=f"link_{k - 1}" if k else "world",
-            length=0.12 if k else 0.0,
-            axis=("1 0 0", "0 1 0")[k % 2],
+            k=k, mesh=mesh, parent=parents[k], length=0.12 * (k > 0), axis=("1 0 0", "0 1 0")[k % 2]
         )
         for k in range(ARM_LINKS)
     ]
@@ -78,8 +73,7 @@ def measure_camera(model: ParsedModel, camera: PinholeCamera, poses: int = 100) 
     builder.Connect(scene_graph.get_query_output_port(), sensor.query_object_input_port())
     ours = builder.AddSystem(SilhouetteCamera(plant, scene_graph, camera))
     builder.Connect(plant.get_body_poses_output_port(), ours.GetInputPort("body_poses"))
-    diagram = builder.Build()
-    context = diagram.CreateDefaultContext()
+    context = builder.Build().CreateDefaultContext()
     rng = np.random.default_rng(0)
     low, high = np.maximum(model.lower, -_BEND), np.minimum(model.upper, _BEND)
     held = np.char.startswith(np.array(model.position_names), "position_")
@@ -106,28 +100,30 @@ def measure_camera(model: ParsedModel, camera: PinholeCamera, poses: int = 100) 
     return CameraFigures(*seconds, max(differing), float(np.mean(differing)))
 
 
+def _rows(folder: Path) -> Iterator[tuple[str, ...]]:
+    man = load_model(bundled_model("man"))
+    for name, model, eye, target in (
+        ("arm", arm_model(folder), (2.0, 0.0, 0.6), (0.0, 0.0, 0.6)),
+        ("man", man, (2.5, 0.0, 0.3), (0.0, 0.0, 0.0)),
+    ):
+        X_WC = look_at(eye, target)
+        camera = PinholeCamera("front", 640, 480, 540.0, 540.0, 319.5, 239.5, X_WC)
+        one = measure_camera(model, camera)
+        triangles = sum(len(mesh.triangles) for mesh in model.link_meshes.values())
+        times = f"{one.ours * 1e3:.2f} ms", f"{one.drakes * 1e3:.2f} ms"
+        ratio, differ = f"{one.drakes / one.ours:.1f}", (f"{one.worst:.3%}", f"{one.mean:.3%}")
+        yield name, str(len(model.link_meshes)), f"{triangles:,}", *times, ratio, *differ
+
+
 def main() -> None:
     """Print what a label image of 640 x 480 pixels costs with and without a renderer."""
-    rows = []
+    title = "A label image, 640 x 480 pixels, CPU time (least of 5, mean of 100 poses)"
+    headings = (
+        *("body", "links", "triangles", "SilhouetteCamera", "RgbdSensor", "ratio"),
+        *("labels differ, worst", "mean"),
+    )
     with tempfile.TemporaryDirectory() as folder:
-        for name, model, eye, target in (
-            ("arm", arm_model(Path(folder)), (2.0, 0.0, 0.6), (0.0, 0.0, 0.6)),
-            ("man", load_model(bundled_model("man")), (2.5, 0.0, 0.3), (0.0, 0.0, 0.0)),
-        ):
-            X_WC = look_at(eye, target)
-            camera = PinholeCamera("front", 640, 480, 540.0, 540.0, 319.5, 239.5, X_WC)
-            one = measure_camera(model, camera)
-            triangles = sum(len(mesh.triangles) for mesh in model.link_meshes.values())
-            times = f"{one.ours * 1e3:.2f} ms", f"{one.drakes * 1e3:.2f} ms"
-            ratio, differ = f"{one.drakes / one.ours:.1f}", f"{one.worst:.3%}"
-            links = str(len(model.link_meshes))
-            rows.append((name, links, f"{triangles:,}", *times, ratio, differ, f"{one.mean:.3%}"))
-    print_table(
-        "A label image, 640 x 480 pixels, CPU time (least of 5, mean of 100 poses)",
-        ("body", "links", "triangles", "SilhouetteCamera", "RgbdSensor", "ratio",
-         "labels differ, worst", "mean"),
-        rows,
-    )  # fmt: skip
+        print_table(title, headings, _rows(Path(folder)))
 
 
 if __name__ == "__main__":

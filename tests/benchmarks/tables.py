@@ -1,0 +1,16 @@
+"""How benchmarks show their figures."""
+
+from collections.abc import Iterable, Sequence
+
+from rich.console import Console
+from rich.table import Table
+
+
+def print_table(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Print a table whose first column is left-aligned, the others right."""
+    table = Table(title=title)
+    for k, heading in enumerate(headings):
+        table.add_column(heading, justify="right" if k else "left")
+    for row in rows:
+        table.add_row(*row)
+    Console(width=150).print(table)

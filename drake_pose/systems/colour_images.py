@@ -43,6 +43,9 @@ def colour_image_to_picture(image: ImageRgba8U) -> Picture:
 class ColourPorts:
     """The input ports for colour images of some of a system's cameras.
 
+    Attributes:
+        cameras: the names of the cameras that have a port.
+
     Args:
         wanted: the names of these cameras; UnknownNameError: one is no camera's.
         port: the name of a camera's port.
@@ -59,21 +62,13 @@ class ColourPorts:
         for name in wanted:
             if name not in known:
                 raise UnknownNameError("camera", name, known, "color_cameras")
-        self._system = system
-        self._ports = {name: port(one) for name, one in known.items() if name in wanted}
-        for name, own in self._ports.items():
-            system.add_input(own, ImageRgba8U(known[name].width, known[name].height))
-
-    @property
-    def cameras(self) -> tuple[str, ...]:
-        """The names of the cameras that have a port."""
-        return tuple(self._ports)
+        self.cameras = tuple(name for name in known if name in wanted)
+        self._given = system.add_camera_inputs(
+            {name: port(known[name]) for name in self.cameras},
+            lambda name: ImageRgba8U(known[name].width, known[name].height),
+        )
 
     def pictures(self, context: Context) -> dict[str, Picture]:
         """The pictures (H, W, 4) that are there, by camera."""
-        images = {name: self._system.given(context, port) for name, port in self._ports.items()}
-        return {
-            name: np.array(image.data)
-            for name, image in images.items()
-            if image is not None and image.size()
-        }
+        images = self._given(context).items()
+        return {name: np.array(image.data) for name, image in images if image.size()}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -26,6 +26,7 @@ from pydrake.systems.framework import (
 )
 
 from drake_pose.arrays import Array
+from drake_pose.camera.models import Camera
 from drake_pose.errors import SettingsError
 
 T = TypeVar("T")
@@ -35,6 +36,13 @@ def require_period(whose: str, period: float) -> None:
     """Refuse (SettingsError) a time between two updates that is not positive [s]."""
     if not 0.0 < period < math.inf:
         raise SettingsError(f"the {whose}'s period must be positive, not {period}")
+
+
+def require_different(cameras: Sequence[Camera], fewest: int, said: str) -> None:
+    """Refuse (SettingsError) fewer cameras, or two of one name; `said` of those that are given."""
+    names = [camera.name for camera in cameras]
+    if len(names) < fewest or len(set(names)) != len(names):
+        raise SettingsError(f"{said}: {names}")
 
 
 def require_time_forward(system: LeafSystem, context: Context, last: float) -> None:
@@ -124,6 +132,23 @@ class PortedSystem(LeafSystem):
             ),
             {self.all_input_ports_ticket()},
         )
+
+    def add_camera_inputs(
+        self, ports: Mapping[str, str], like: Callable[[str], Any] = lambda _: None
+    ) -> Callable[[Context], dict[str, Any]]:
+        """Input ports by camera, and what is like a camera's values.
+
+        Returns:
+            What gives, by camera, what comes in; without those that are not connected, or None.
+        """
+        for name, port in ports.items():
+            self.add_input(port, like(name))
+
+        def given(context: Context) -> dict[str, Any]:
+            found = {name: self.given(context, port) for name, port in ports.items()}
+            return {name: value for name, value in found.items() if value is not None}
+
+        return given
 
     def given(self, context: Context, name: str) -> Any:
         """What comes in at a port, a vector as a copy; None: it is not connected."""

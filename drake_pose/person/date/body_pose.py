@@ -12,15 +12,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_pose.arrays import Array, Integers, Mask
+from drake_pose.body.tree.tree_kinematics import PackedTree, find_motions
 from drake_pose.camera.models import Camera
 from drake_pose.compiled import compiled
+from drake_pose.fit.levenberg_marquardt import eliminate
 from drake_pose.person.date.limb_search import (
     FEATURE_ERROR,
     Search,
     limb_angles,
     search_limb,
 )
-from drake_pose.person.date.skeleton import LIMBS, Limb, Skeleton, rotation
+from drake_pose.person.date.skeleton import LIMBS, Limb, Skeleton
 
 _LARGEST_STEP = math.radians(2.0)
 _LEAST_BEND = math.radians(3.0)
@@ -37,174 +39,123 @@ def upper_body(skeleton: Skeleton, q: Array, features: Array, *, face_known: boo
     Each side's chain is head 2, neck base 2, shoulder 3, elbow 1. Both sides share head and neck
     base, so they take turns, a few small steps each. A known face's head angles stay; legs, too.
     """
-    q = np.array(q)
-    shared = np.concatenate([skeleton.head_angles, skeleton.neck_angles])
-    free = np.ones(8, dtype=np.bool_)
-    free[:2] = not face_known
-    offsets = np.zeros((8, 3))
-    offsets[2] = skeleton.neck_H
-    for name in ("left_arm", "right_arm"):
-        limb = skeleton.limbs[name]
-        q[limb.positions] = unlocked(limb, q[limb.positions])
+    shared = () if face_known else skeleton.head_angles
+    q = _unlocked(_unlocked(q, skeleton.limbs["left_arm"]), skeleton.limbs["right_arm"])
     for _ in range(_ROUNDS):
         farthest, moved = 0.0, 0.0
-        for k, name in enumerate(("left_arm", "right_arm")):
-            limb = skeleton.limbs[name]
-            index = np.concatenate([shared, limb.positions])
-            axes = np.concatenate([skeleton.head_axes, skeleton.neck_axes, limb.axes])
-            offsets[4], offsets[7] = limb.root_T, limb.middle_U
-            angles, distance = reach(
-                skeleton.R_WA,
-                q[skeleton.head_positions],
-                axes,
-                offsets,
-                limb.end_L,
-                q[index],
-                skeleton.lower[index],
-                skeleton.upper[index],
-                free,
-                features[1 + k],
-                _STEPS_A_ROUND,
-            )
+        for name, hand in zip(LIMBS[:2], features[1:3], strict=True):
+            limb, before = skeleton.limbs[name], q
+            index = np.array([*shared, *skeleton.neck_angles, *limb.positions])
+            part = limb.lower_node, limb.end_L
+            q, distance = reach(skeleton, q, index, part, hand, _STEPS_A_ROUND)
             farthest = max(farthest, distance)
-            moved = max(moved, float(np.abs(angles - q[index]).max()))
-            q[index] = angles
+            moved = max(moved, float(np.abs(q - before).max()))
         # One side's turn may have moved the other's hand: only a round without steps is the end.
         if moved < _STALLED or (farthest < _CLOSE_ENOUGH and moved < _CLOSE_ENOUGH):
             break
     return q
 
 
-def move_limb(limb: Limb, R_WT: Array, root: Array, angles: Array, target: Array) -> Array:
-    """Moves a limb's angles (4,) until its end is at a target (3,), its root (3,) held [m, rad]."""
-    offsets = np.zeros((4, 3))
-    offsets[3] = limb.middle_U
-    moved: Array
-    moved, _ = reach(
-        np.ascontiguousarray(R_WT),
-        root,
-        limb.axes,
-        offsets,
-        limb.end_L,
-        unlocked(limb, angles),
-        limb.lower,
-        limb.upper,
-        np.ones(4, dtype=np.bool_),
-        target,
-        _ROUNDS * _STEPS_A_ROUND,
-    )
-    return moved
+def move_limb(skeleton: Skeleton, q: Array, name: str, target: Array) -> Array:
+    """Moves a limb of q (nq,) until its end is at a target (3,) [m]; all else stays."""
+    limb = skeleton.limbs[name]
+    part = limb.lower_node, limb.end_L
+    return reach(skeleton, _unlocked(q, limb), limb.positions, part, target)[0]
 
 
 def aim_trunk(skeleton: Skeleton, q: Array, waist: Array) -> Array:
     """Turns the neck base of q (nq,) so that the trunk points from there to the waist (3,) [m]."""
-    index = skeleton.neck_angles
     _, neck = skeleton.trunk_pose(q)
-    across = waist - neck
-    length = float(np.linalg.norm(skeleton.waist_T))
+    across, length = waist - neck, float(np.linalg.norm(skeleton.waist_T))
     target = neck + across * (length / max(float(np.linalg.norm(across)), _CLOSE_ENOUGH))
-    angles, _ = reach(
-        skeleton.head_rotation(q),
-        neck,
-        skeleton.neck_axes,
-        np.zeros((2, 3)),
-        skeleton.waist_T,
-        q[index],
-        skeleton.lower[index],
-        skeleton.upper[index],
-        np.ones(2, dtype=np.bool_),
-        target,
-        _ROUNDS * _STEPS_A_ROUND,
-    )
-    aimed = np.array(q)
-    aimed[index] = angles
-    return aimed
+    part = skeleton.nodes["trunk"], skeleton.waist_T
+    return reach(skeleton, q, skeleton.neck_angles, part, target)[0]
 
 
-def unlocked(limb: Limb, angles: Array) -> Array:
-    """A limb's angles (4,), its middle joint bent by three degrees, lest no small step can help."""
-    bend = angles[3]
+def _unlocked(q: Array, limb: Limb) -> Array:
+    """Positions with a limb's middle joint bent by three degrees, lest no small step can help."""
+    q, bend = np.array(q), q[limb.positions[3]]
     if abs(bend) < _LEAST_BEND:
-        bend = _LEAST_BEND if limb.upper[3] > -limb.lower[3] else -_LEAST_BEND
-    return np.array([*angles[:3], bend])
+        is_up = limb.upper[3] > -limb.lower[3]
+        q[limb.positions[3]] = _LEAST_BEND if is_up else -_LEAST_BEND
+    return q
 
 
-@compiled(error_model="python")
 def reach(
-    R_start: Array,
-    p_start: Array,
-    axes: Integers,
-    offsets: Array,
-    end: Array,
-    angles: Array,
-    lower: Array,
-    upper: Array,
-    free: Mask,
+    skeleton: Skeleton,
+    q: Array,
+    index: Integers,
+    part: tuple[int, Array],
     target: Array,
-    steps: int,
+    steps: int = _ROUNDS * _STEPS_A_ROUND,
 ) -> tuple[Array, float]:
-    """Moves a chain's angles in small steps until its end is at the target (3,) [m].
+    """Moves some positions of q (nq,) in small steps until a point is at the target (3,) [m].
 
     A step is Levenberg and Marquardt's, J (J^T J + damping)^-1 gap, damped so that all joints take
     part, none by more than two degrees; then limits hold.
 
     Args:
-        R_start, p_start: (3, 3) and (3,) frame on which the chain hangs, in the world.
-        axes: (n,) 0, 1, 2: the joints' axes.
-        offsets: (n, 3) each joint's place in the frame of the one before [m].
-        end: (3,) the end's place in the last joint's frame [m].
-        angles, lower, upper, free: (n,) the start and limits [rad], and which may change.
+        index: (n,) which positions may change: angles that move the point.
+        part: a node, and the point (3,) in its frame [m].
         steps: how many at most.
 
     Returns:
-        (n,) angles, and the distance that is left [m].
+        (nq,) positions, and the distance that is left [m].
     """
-    n = len(axes)
-    angles, distance = angles.copy(), np.inf
-    turning, places, J = np.empty((n, 3)), np.empty((n, 3)), np.zeros((n, 3))
+    values = np.argsort(skeleton.order)[index]
+    limits = skeleton.lower[index], skeleton.upper[index]
+    packed = skeleton.kinematics.packed
+    moved, distance = np.array(q), np.inf
+    moved[skeleton.order], distance = _reach(
+        packed, q[skeleton.order], values, part[0], part[1], limits, target, steps
+    )
+    return moved, distance
+
+
+@compiled(error_model="python")
+def _reach(
+    packed: PackedTree,
+    values: Array,
+    index: Integers,
+    node: int,
+    point: Array,
+    limits: tuple[Array, Array],
+    target: Array,
+    steps: int,
+) -> tuple[Array, float]:
+    """As reach, of a pose tree's values (m,)."""
+    n, distance = len(index), np.inf
+    tip, J, M = np.empty(3), np.empty((n, 3)), np.empty((3, 4))
     for step in range(steps + 1):
-        R, tip = R_start.copy(), p_start.copy()
-        for k in range(n):
-            i, j = (axes[k] + 1) % 3, (axes[k] + 2) % 3
-            cosine, sine = math.cos(angles[k]), math.sin(angles[k])
-            for r in range(3):
-                for c in range(3):
-                    tip[r] += R[r, c] * offsets[k, c]
-                places[k, r], turning[k, r] = tip[r], R[r, axes[k]]
-                old_i, old_j = R[r, i], R[r, j]
-                R[r, i] = cosine * old_i + sine * old_j
-                R[r, j] = cosine * old_j - sine * old_i
-        gap = target - tip
+        X_WN, twists = find_motions(packed, values)
+        M[:] = 0.0
         for r in range(3):
+            tip[r] = X_WN[node, r, 3]
             for c in range(3):
-                gap[r] -= R[r, c] * end[c]
-        tip = target - gap
-        distance = math.sqrt(gap[0] ** 2 + gap[1] ** 2 + gap[2] ** 2)
+                tip[r] += X_WN[node, r, c] * point[c]
+            M[r, r], M[r, 3] = _DAMPING, target[r] - tip[r]
+        distance = math.sqrt(M[0, 3] ** 2 + M[1, 3] ** 2 + M[2, 3] ** 2)
         if distance < _CLOSE_ENOUGH or step == steps:
             break
-        A = _DAMPING * np.eye(3)
         for k in range(n):
-            if free[k]:
-                for r in range(3):
-                    u, v = (r + 1) % 3, (r + 2) % 3
-                    arm_u, arm_v = tip[u] - places[k, u], tip[v] - places[k, v]
-                    J[k, r] = turning[k, u] * arm_v - turning[k, v] * arm_u
-                for r in range(3):
-                    for c in range(3):
-                        A[r, c] += J[k, r] * J[k, c]
-        pull = np.linalg.solve(A, gap)
-        largest = 1e-12
+            twist = twists[index[k]]
+            for r in range(3):
+                u, v = (r + 1) % 3, (r + 2) % 3
+                J[k, r] = twist[3 + r] + twist[u] * tip[v] - twist[v] * tip[u]
+            for r in range(3):
+                for c in range(3):
+                    M[r, c] += J[k, r] * J[k, c]
+        eliminate(M)
+        changes = J[:, 0] * M[0, 3] + J[:, 1] * M[1, 3] + J[:, 2] * M[2, 3]
+        share = min(1.0, _LARGEST_STEP / max(1e-12, np.abs(changes).max()))
+        moved = 0.0
         for k in range(n):
-            largest = max(largest, abs(J[k, 0] * pull[0] + J[k, 1] * pull[1] + J[k, 2] * pull[2]))
-        share, moved = min(1.0, _LARGEST_STEP / largest), 0.0
-        for k in range(n):
-            change = J[k, 0] * pull[0] + J[k, 1] * pull[1] + J[k, 2] * pull[2]
-            new = min(max(angles[k] + share * change, lower[k]), upper[k])
-            moved = max(moved, abs(new - angles[k]))
-            angles[k] = new
+            old = values[index[k]]
+            new = min(max(old + share * changes[k], limits[0][k]), limits[1][k])
+            moved, values[index[k]] = max(moved, abs(new - old)), new
         if moved < _STALLED:
             break
-    return angles, distance
+    return values, distance
 
 
 @dataclass(frozen=True)
@@ -278,36 +229,33 @@ def estimate_pose(
             the paper, on one circle; "none": they stay where inverse kinematics puts them.
     """
     q = _head_and_arms(skeleton, last, features, head_angles)
-    R_WT, neck = skeleton.trunk_pose(q)
     waist = waist or Waist()
     place = waist.place(features, float(q[skeleton.head_angles[0]]))
     if waist.in_reach:
-        place = _lowered(skeleton, R_WT, place, features[3:])
+        place = _lowered(skeleton, skeleton.trunk_pose(q)[0], place, features[3:])
     # The model's trunk is one piece: it cannot hold shoulders and waist found apart. For its
     # positions the waist counts; so the neck's base cannot wander off from frame to frame either.
     aimed = aim_trunk(skeleton, q, place)
     R_aimed, _ = skeleton.trunk_pose(aimed)
     limbs = {}
-    for k, name in enumerate(LIMBS):
-        limb, end = skeleton.limbs[name], features[1 + k]
-        if name.endswith("arm"):
-            R, root, outward = R_WT, neck + R_WT @ limb.root_T, R_WT @ limb.root_T
-            found = np.array([root, _middle(limb, R_WT, root, q[limb.positions]), end])
-        else:
-            R, outward = R_aimed, R_aimed @ (limb.root_T - skeleton.waist_T)
-            root = place + outward
-            angles = move_limb(limb, R_aimed, root, q[limb.positions], end)
-            found = np.array([root, _middle(limb, R_aimed, root, angles), end])
+    for name, end in zip(LIMBS, features[1:], strict=True):
+        limb, posed, off = skeleton.limbs[name], q, np.zeros(3)
+        R_WT, own_root = skeleton.trunk_pose(q)[0], skeleton.limb_points(aimed, name)[0]
+        outward, last_angles = R_WT @ limb.root_T, q[limb.positions]
+        if name.endswith("leg"):
+            # It hangs on the waist that was found, not on the model's.
+            R_WT, outward = R_aimed, R_aimed @ (limb.root_T - skeleton.waist_T)
+            off = place + outward - own_root
+            posed = move_limb(skeleton, aimed, name, end - off)
+        found = skeleton.limb_points(posed, name) + off
+        found[2] = end
         if search != "none":
-            last_angles = q[limb.positions]
-            found[1], end = search_limb(
-                limb, R, root, end, outward, found[1], last_angles, cameras, regions, search
+            found[1:] = search_limb(
+                limb, R_WT, found[0], end, outward, found[1], last_angles, cameras, regions, search
             )
-            found[2] = end
-        own_root = neck + R_aimed @ limb.root_T
-        angles = limb_angles(limb, R_aimed, own_root, found[1], end, q[limb.positions])
+        aimed[limb.positions] = limb_angles(limb, R_aimed, own_root, *found[1:], last_angles)
         # Where limits forbid that, the hand or foot counts more than the elbow or knee.
-        aimed[limb.positions] = move_limb(limb, R_aimed, own_root, angles, end)
+        aimed = move_limb(skeleton, aimed, name, found[2])
         limbs[name] = found
     return PaperPose(skeleton.clip(aimed), limbs, place)
 
@@ -338,8 +286,3 @@ def _head_and_arms(
     # Where the head's angles moved, its middle must still be where it was measured.
     q[skeleton.head_positions] = features[0] - skeleton.head_rotation(q) @ skeleton.face_H
     return q
-
-
-def _middle(limb: Limb, R_WT: Array, root: Array, angles: Array) -> Array:
-    """(3,) the middle joint of a limb at angles (4,) [m]."""
-    return np.asarray(root + R_WT @ rotation(limb.axes[:3], angles[:3]) @ limb.middle_U)

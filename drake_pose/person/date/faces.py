@@ -60,13 +60,11 @@ class FaceDirection:
 
     Args:
         template: which template is nearest.
-        distance: in the eigenspace, over the square root of the pixels' number [grey levels].
         outside: how far the picture is from the eigenspace [grey levels]; large: it is no face.
     """
 
     direction: Array
     template: int
-    distance: float
     outside: float
 
 
@@ -132,16 +130,9 @@ def face_direction(face: Picture, templates: FaceTemplates) -> FaceDirection:
     """The direction of a face (130, 80, 3) by the nearest template."""
     off = face.reshape(-1).astype(np.float32) - templates.mean
     place = templates.basis @ off
-    distances = np.linalg.norm(templates.coordinates - place, axis=1)
-    nearest = int(np.argmin(distances))
-    scale = np.sqrt(len(off))
+    nearest = int(np.argmin(np.linalg.norm(templates.coordinates - place, axis=1)))
     left = max(0.0, float(off @ off) - float(place @ place))
-    return FaceDirection(
-        templates.directions[nearest].copy(),
-        nearest,
-        float(distances[nearest] / scale),
-        float(np.sqrt(left) / scale),
-    )
+    return FaceDirection(templates.directions[nearest].copy(), nearest, math.sqrt(left / len(off)))
 
 
 def find_face(picture: Picture, blobs: Blobs, templates: FaceTemplates, farthest: float) -> Array:

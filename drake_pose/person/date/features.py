@@ -103,6 +103,9 @@ def inside_silhouettes(
     A camera has no say about points outside its picture, nor where it sees nobody at all.
     """
     kept = np.ones(len(points), dtype=bool)
+    aside = np.arange(1, margin + 1)
+    # To all sides along or across, and not at all.
+    beside = np.concatenate([[0], aside, -aside])[:, None]
     for camera, region in zip(cameras, regions, strict=True):
         if not region.any():
             continue
@@ -110,21 +113,12 @@ def inside_silhouettes(
         with np.errstate(invalid="ignore"):
             pixels = np.rint(uv)
             visible = (depth > 0.0) & (pixels >= 0).all(axis=1)
-            visible &= (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
+            visible &= (pixels < [camera.width, camera.height]).all(axis=1)
         column, row = pixels[visible].astype(np.int64).T
-        kept[visible] &= _near_region(region, row, column, margin)
+        near = region[np.clip(row + beside, 0, len(region) - 1), column].any(axis=0)
+        near |= region[row, np.clip(column + beside, 0, region.shape[1] - 1)].any(axis=0)
+        kept[visible] &= near
     return kept
-
-
-def _near_region(region: Mask, row: Integers, column: Integers, margin: int) -> Mask:
-    """Whether the region holds a pixel within `margin` of each given one, along or across."""
-    found = region[row, column].copy()
-    height, width = region.shape
-    for step in range(1, margin + 1):
-        for down, right in ((step, 0), (-step, 0), (0, step), (0, -step)):
-            r, c = np.clip(row + down, 0, height - 1), np.clip(column + right, 0, width - 1)
-            found |= region[r, c]
-    return found
 
 
 def expect_features(places: Array, support: Integers, last: Array, last_support: Integers) -> Array:
@@ -140,12 +134,6 @@ def expect_features(places: Array, support: Integers, last: Array, last_support:
     step = np.where(measured[:, None], places - last, 0.0)
     step[:_FIRST_FOOT] = 0.0
     return np.asarray(places + step)
-
-
-def assign(points: Array, expected: Array) -> Integers:
-    """The nearest of the expected features (k, 3) for each point (m, 3)."""
-    distances = np.linalg.norm(points[:, None] - expected[None], axis=2)
-    return distances.argmin(axis=1).astype(np.int64)
 
 
 def dense_mean(points: Array, radius: float) -> tuple[Array, int]:
@@ -176,7 +164,8 @@ def find_features(
     """
     points = meeting_points(cameras, centroids, _THRESHOLD)
     points = points[inside_silhouettes(points, cameras, regions, _MARGIN)]
-    owners = assign(points, last if expected is None else expected)
+    near = last if expected is None else expected
+    owners = np.linalg.norm(points[:, None] - near[None], axis=2).argmin(axis=1)
     places, support = np.array(last, dtype=np.float64), np.zeros(len(last), dtype=np.int64)
     for k in range(len(last)):
         mine = points[owners == k]

@@ -72,9 +72,7 @@ def joint_circle(limb: Limb, root: Array, end: Array, outward: Array) -> Circle:
     hand (for the right arm and for legs mirrored, to point behind the arm and in front of the leg).
     """
     a, b = limb.lengths
-    across = end - root
-    distance = float(np.linalg.norm(across))
-    z = across / distance if distance > _STRAIGHT else np.array([0.0, 0.0, -1.0])
+    z, distance = _along(root, end)
     # Beyond the limb's reach it is stretched out (or folded), in proportion.
     reach = min(max(distance, abs(a - b)), a + b)
     along = (a * a - b * b + reach * reach) / (2.0 * reach) if reach > _STRAIGHT else 0.0
@@ -83,6 +81,15 @@ def joint_circle(limb: Limb, root: Array, end: Array, outward: Array) -> Circle:
     i = _unit_across(np.array([outward[0], outward[1], 0.0]), z)
     j = limb.side * np.cross(i, z)
     return Circle(center, radius, i, -j if limb.name.endswith("leg") else j)
+
+
+def _along(root: Array, end: Array) -> tuple[Array, float]:
+    """The direction (3,) from root to end, downwards where they are one, and their distance [m]."""
+    across = end - root
+    distance = float(np.linalg.norm(across))
+    if distance > _STRAIGHT:
+        return across / distance, distance
+    return np.array([0.0, 0.0, -1.0]), distance
 
 
 def search_limb(
@@ -123,9 +130,7 @@ def search_limb(
 
 def _possible_ends(limb: Limb, root: Array, end: Array) -> list[Array]:
     """Where the end may be in truth, (3,) each: on its line from the root, and in reach."""
-    across = end - root
-    distance = float(np.linalg.norm(across))
-    direction = across / distance if distance > _STRAIGHT else np.array([0.0, 0.0, -1.0])
+    direction, distance = _along(root, end)
     count = round(FEATURE_ERROR / _END_STEP)
     steps = _END_STEP * np.arange(-count, count + 1)
     distances = np.unique(np.clip(distance + steps, *_reach(limb)))
@@ -151,17 +156,17 @@ def _points_of_segments(
     limb: Limb, R_WT: Array, root: Array, middles: Array, angles: Array
 ) -> Array:
     """Points (n, m, 3) of both segments' surfaces for places (n, 3) and angles (n, 4)."""
-    letters = ["XYZ"[axis] for axis in limb.axes]
-    R_WU = R_WT @ Rotation.from_euler("".join(letters[:3]), angles[:, :3]).as_matrix()
-    R_WL = R_WU @ Rotation.from_euler(letters[3], angles[:, 3:]).as_matrix()
-    upper, lower = limb.surfaces
-    return np.concatenate(
-        [
-            root + upper @ R_WU.transpose(0, 2, 1),
-            middles[:, None] + lower @ R_WL.transpose(0, 2, 1),
-        ],
-        axis=1,
+    R_WU = R_WT @ Rotation.from_euler(_letters(limb)[:3], angles[:, :3]).as_matrix()
+    R_WL = R_WU @ Rotation.from_euler(_letters(limb)[3], angles[:, 3:]).as_matrix()
+    uppers, lowers = (
+        points @ R.transpose(0, 2, 1) for points, R in zip(limb.surfaces, (R_WU, R_WL), strict=True)
     )
+    return np.concatenate([root + uppers, middles[:, None] + lowers], axis=1)
+
+
+def _letters(limb: Limb) -> str:
+    """The axes of a limb's joints, each turned by those before it."""
+    return "".join("XYZ"[axis] for axis in limb.axes)
 
 
 def rectangles(root: Array, middles: Array, end: Array, half_widths: Array) -> Array:
@@ -218,37 +223,25 @@ def place_limb(
     Returns:
         (n, 4) angles, and (n,) by how much the worst of its root's lies beyond its limits [rad].
     """
-    towards, uppers = end - root, middles - root
-    frames = _triads(towards, uppers)
-    off_line = np.linalg.norm(np.cross(towards, uppers), axis=1)
-    stretched = off_line < _STRETCHED * (uppers**2).sum(axis=1)
+    towards, distance = _along(root, end)
+    frames, off_line = _triads(towards, middles - root)
+    # Stretched it does not tell how it is turned about itself: as in the last frame.
+    stretched = off_line * distance < _STRETCHED * ((middles - root) ** 2).sum(axis=1)
+    R_last = R_WT @ rotation(limb.axes[:3], last[:3])
     options = []
-    for bend in _middle_angles(limb, float(np.linalg.norm(end - root))):
+    for bend in _middle_angles(limb, distance):
         end_U = limb.middle_U + rotation(limb.axes[3:], np.array([bend])) @ limb.end_L
-        R_last = R_WT @ rotation(limb.axes[:3], last[:3])
-        # Stretched it does not tell how it is turned about itself: as in the last frame.
-        as_last = _shortest_turn(R_last @ end_U, towards) @ R_last
-        own = _triads(end_U, limb.middle_U[None])[0].T
-        R_TU = R_WT.T @ np.where(stretched[:, None, None], as_last, frames @ own)
-        angles, beyond = _root_angles(limb, R_TU, last[:3])
+        own = _triads(_along(np.zeros(3), end_U)[0], limb.middle_U[None])[0][0]
+        R_WU = frames @ own.T
+        if stretched.any():
+            as_last, _ = Rotation.align_vectors(towards, R_last @ end_U)
+            R_WU[stretched] = as_last.as_matrix() @ R_last
+        angles, beyond = _root_angles(limb, R_WT.T @ R_WU, last[:3])
         whole = np.column_stack([angles, np.full(len(middles), bend)])
         options.append((beyond + 1e-3 * abs(bend - last[3]), beyond, whole))
     costs, beyonds, wholes = (np.array(values) for values in zip(*options, strict=True))
     chosen, each = np.argmin(costs, axis=0), np.arange(len(middles))
     return wholes[chosen, each], beyonds[chosen, each]
-
-
-def _shortest_turn(old: Array, new: Array) -> Array:
-    """(3, 3) the smallest rotation that brings one direction (3,) to another."""
-    a = old / max(float(np.linalg.norm(old)), _STRAIGHT)
-    b = new / max(float(np.linalg.norm(new)), _STRAIGHT)
-    axis, cosine = np.cross(a, b), float(a @ b)
-    if cosine < -1.0 + 1e-9:
-        half_turn = _unit_across(np.zeros(3), a)
-        return np.asarray(2.0 * np.outer(half_turn, half_turn) - np.eye(3))
-    x, y, z = axis
-    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + skew + skew @ skew / (1.0 + cosine))
 
 
 def _middle_angles(limb: Limb, distance: float) -> list[float]:
@@ -286,11 +279,7 @@ def _bending(limb: Limb) -> tuple[float, float, float]:
 
 def _root_angles(limb: Limb, R_TU: Array, last: Array) -> tuple[Array, Array]:
     """Angles (n, 3) of rotations (n, 3, 3), and how far (n,) the worst is off limits [rad]."""
-    i, j, k = (int(axis) for axis in limb.axes[:3])
-    sign = 1.0 if (j - i) % 3 == 1 else -1.0
-    second = np.arcsin(np.clip(sign * R_TU[:, i, k], -1.0, 1.0))
-    first = np.arctan2(-sign * R_TU[:, j, k], R_TU[:, k, k])
-    third = np.arctan2(-sign * R_TU[:, i, j], R_TU[:, i, i])
+    first, second, third = Rotation.from_matrix(R_TU).as_euler(_letters(limb)[:3]).T
     options = np.array(
         [[first, second, third], [first + math.pi, math.pi - second, third + math.pi]]
     ).transpose(0, 2, 1)
@@ -301,15 +290,14 @@ def _root_angles(limb: Limb, R_TU: Array, last: Array) -> tuple[Array, Array]:
     return options[chosen, each], beyond[chosen, each].max(axis=1)
 
 
-def _triads(first: Array, others: Array) -> Array:
-    """(n, 3, 3) axes: along a vector (3,), then what of the others (n, 3) is across it."""
-    x = first / max(float(np.linalg.norm(first)), _STRAIGHT)
+def _triads(x: Array, others: Array) -> tuple[Array, Array]:
+    """(n, 3, 3) axes: x of length 1, then what of the others (n, 3) is across it; how much (n,)."""
     across = others - np.outer(others @ x, x)
-    length = np.linalg.norm(across, axis=1, keepdims=True)
-    y = np.where(
-        length < _STRAIGHT, _unit_across(np.zeros(3), x), across / np.maximum(length, _STRAIGHT)
-    )
-    return np.stack([np.broadcast_to(x, y.shape), y, np.cross(x, y)], axis=2)
+    length = np.linalg.norm(across, axis=1)
+    if (length < _STRAIGHT).any():
+        across[length < _STRAIGHT] = _unit_across(np.zeros(3), x)
+    y = across / np.linalg.norm(across, axis=1, keepdims=True)
+    return np.stack([np.broadcast_to(x, y.shape), y, y @ np.cross(x, np.eye(3))], axis=2), length
 
 
 def _unit_across(vector: Array, axis: Array) -> Array:

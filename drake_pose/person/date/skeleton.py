@@ -1,21 +1,19 @@
-"""The person of figure 5 as a skeleton: joint offsets, axes and limits, read from a model once.
+"""The person of figure 5 in the paper's terms: limbs, ends and limits, read from a model once.
 
 Head - neck base - trunk, and two arms and legs of 3 + 1 rotations: 23 degrees of freedom.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
 import numpy as np
 
 from drake_pose.arrays import Array, Integers
 from drake_pose.body.model import ArticulatedModel
-from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.body.surfaces.mesh import TriangleMesh
-from drake_pose.body.tree.pose_tree import PoseTree
+from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.errors import ModelError
 
 LIMBS = ("left_arm", "right_arm", "left_leg", "right_leg")
@@ -35,6 +33,7 @@ class Limb:
     """An arm or a leg, named as one of LIMBS.
 
     Args:
+        upper_node, lower_node: of the pose tree, its segments.
         root_T: (3,) shoulder or hip in the trunk's frame [m].
         middle_U: (3,) elbow or knee in the upper segment's frame [m].
         end_L: (3,) the hand's or foot's middle in the lower segment's frame [m].
@@ -45,6 +44,8 @@ class Limb:
     """
 
     name: str
+    upper_node: int
+    lower_node: int
     root_T: Array
     middle_U: Array
     end_L: Array
@@ -68,54 +69,52 @@ class Limb:
 
 @dataclass(frozen=True, eq=False)
 class Skeleton:
-    """Joint offsets, axes and limits of the person.
+    """The person's pose tree, its nodes by name, and what the paper's method needs beside it.
 
     Args:
-        R_WA: (3, 3) the head's axes when its angles are 0.
-        face_H, neck_H: (3,) middle of the head's skin, and neck's base, in the head's frame [m].
+        face_H: (3,) middle of the head's skin in the head's frame [m].
         head_positions: (3,) where the head's place stands in q.
-        head_axes, neck_axes: (2,) axes 0, 1, 2 in the order of rotation.
         head_angles, neck_angles: (2,) where they stand in q.
+        order: (m,) where the pose tree's values stand in q.
         lower, upper: (nq,) limits [rad or m].
     """
 
     model: ArticulatedModel
-    R_WA: Array
+    kinematics: TreeKinematics
+    nodes: Mapping[str, int]
     face_H: Array
-    neck_H: Array
     head_positions: Integers
-    head_axes: Integers
     head_angles: Integers
-    neck_axes: Integers
     neck_angles: Integers
+    order: Integers
     limbs: Mapping[str, Limb]
     lower: Array
     upper: Array
 
+    def poses(self, q: Array) -> Array:
+        """X_WN (nodes, 4, 4) at q (nq,)."""
+        return self.kinematics.poses(q[self.order])
+
     def head_rotation(self, q: Array) -> Array:
         """(3, 3) the head's axes in the world at q (nq,)."""
-        return self.R_WA @ rotation(self.head_axes, q[self.head_angles])
+        return self.poses(q)[self.nodes["head"], :3, :3]
 
     def trunk_pose(self, q: Array) -> tuple[Array, Array]:
         """The trunk's axes (3, 3) and origin, the neck's base (3,), in the world at q (nq,)."""
-        R_WH = self.head_rotation(q)
-        R_WT = R_WH @ rotation(self.neck_axes, q[self.neck_angles])
-        return R_WT, q[self.head_positions] + R_WH @ self.neck_H
+        X_WT = self.poses(q)[self.nodes["trunk"]]
+        return np.ascontiguousarray(X_WT[:3, :3]), X_WT[:3, 3]
 
     def limb_points(self, q: Array, name: str) -> Array:
         """(3, 3) root, middle joint and end of a limb in the world at q (nq,) [m]."""
-        limb = self.limbs[name]
-        R_WT, p_W = self.trunk_pose(q)
-        root = p_W + R_WT @ limb.root_T
-        R_WU = R_WT @ rotation(limb.axes[:3], q[limb.positions[:3]])
-        middle = root + R_WU @ limb.middle_U
-        R_WL = R_WU @ rotation(limb.axes[3:], q[limb.positions[3:]])
-        return np.array([root, middle, middle + R_WL @ limb.end_L])
+        limb, X_WN = self.limbs[name], self.poses(q)
+        X_WL = X_WN[limb.lower_node]
+        return np.array([X_WN[limb.upper_node, :3, 3], X_WL[:3, 3], _moved(X_WL, limb.end_L)])
 
     def features(self, q: Array) -> Array:
         """(5, 3) where FEATURES are in the world at q (nq,) [m]."""
-        face = q[self.head_positions] + self.head_rotation(q) @ self.face_H
-        return np.array([face, *(self.limb_points(q, name)[2] for name in LIMBS)])
+        X_WN = self.poses(q)
+        ends = [_moved(X_WN[limb.lower_node], limb.end_L) for limb in self.limbs.values()]
+        return np.array([_moved(X_WN[self.nodes["head"]], self.face_H), *ends])
 
     @property
     def waist_T(self) -> Array:
@@ -130,14 +129,13 @@ class Skeleton:
         off = np.nan_to_num(np.asarray(places) - self.features(q))
         length = np.linalg.norm(off, axis=1, keepdims=True)
         off *= np.minimum(1.0, _FARTHEST_FEATURE / np.maximum(length, 1e-12))
-        limbs = {}
-        R_WT = self.trunk_pose(q)[0]
-        for name, step in zip(LIMBS, off[1:], strict=True):
-            limb = self.limbs[name]
-            R_WL = R_WT @ rotation(limb.axes, q[limb.positions])
-            limbs[name] = replace(limb, end_L=limb.end_L + R_WL.T @ step)
-        face_H = self.face_H + self.head_rotation(q).T @ off[0]
-        return replace(self, face_H=face_H, limbs=MappingProxyType(limbs))
+        R_WN = self.poses(q)[:, :3, :3]
+        limbs = {
+            name: replace(limb, end_L=limb.end_L + R_WN[limb.lower_node].T @ step)
+            for (name, limb), step in zip(self.limbs.items(), off[1:], strict=True)
+        }
+        face_H = self.face_H + R_WN[self.nodes["head"]].T @ off[0]
+        return replace(self, face_H=face_H, limbs=limbs)
 
     def clip(self, q: Array) -> Array:
         """The positions q (nq,) moved inside their limits."""
@@ -149,29 +147,31 @@ def load_skeleton(model: ArticulatedModel) -> Skeleton:
 
     Raises ModelError where its segments do not hang together so, naming the segment.
     """
-    tree = model.pose_tree()
+    kinematics = TreeKinematics(model.pose_tree())
+    tree = kinematics.tree
     nodes = {node.name: index for index, node in enumerate(tree.nodes)}
-    X_WN = tree.node_poses(tree.values_from_positions(np.zeros(len(model.position_names))))
-    for name, parent in [("trunk", "head"), *_expected_parents()]:
+    parents = {"trunk": "head"}
+    for name in LIMBS:
+        upper, lower, _ = _segments(name)
+        parents |= {upper: "trunk", lower: upper}
+    for name, parent in parents.items():
         if name not in nodes or tree.nodes[tree.nodes[nodes[name]].parent].name != parent:
             raise ModelError(
                 f"{model.path}: Date's capture needs a body like urdf/person: '{name}' must hang "
                 f"on '{parent}'; it has {', '.join(nodes)}"
             )
-    head, trunk = tree.nodes[nodes["head"]], tree.nodes[nodes["trunk"]]
-    limbs = {name: _limb(tree, nodes, X_WN, name) for name in LIMBS}
-    head_angles = [i for i in head.positions if model.position_kinds[i] == "angle"]
+    head = tree.nodes[nodes["head"]]
+    is_angle = [model.position_kinds[i] == "angle" for i in head.positions]
     return Skeleton(
         model=model,
-        R_WA=X_WN[nodes["head"], :3, :3],
+        kinematics=kinematics,
+        nodes=nodes,
         face_H=_middle(head.mesh),
-        neck_H=_offset(X_WN[nodes["head"]], X_WN[nodes["trunk"]]),
-        head_positions=np.array([i for i in head.positions if model.position_kinds[i] == "length"]),
-        head_axes=_axes(model, head_angles, "head"),
-        head_angles=np.array(head_angles),
-        neck_axes=_axes(model, trunk.positions, "trunk"),
-        neck_angles=np.array(trunk.positions),
-        limbs=MappingProxyType(limbs),
+        head_positions=np.array(head.positions)[np.invert(is_angle)],
+        head_angles=np.array(head.positions)[is_angle],
+        neck_angles=np.array(tree.nodes[nodes["trunk"]].positions),
+        order=np.array([model.position_index(name) for name in kinematics.names]),
+        limbs={name: _limb(kinematics, nodes, name) for name in LIMBS},
         lower=model.lower,
         upper=model.upper,
     )
@@ -189,44 +189,41 @@ def rotation(axes: Integers, angles: Array) -> Array:
     return R
 
 
-def _expected_parents() -> list[tuple[str, str]]:
-    found = []
-    for name in LIMBS:
-        side, kind = name.split("_")
-        upper, lower, _ = (f"{side}_{part}" for part in _SEGMENTS[kind])
-        found += [(upper, "trunk"), (lower, upper)]
-    return found
-
-
-def _limb(tree: PoseTree, nodes: Mapping[str, int], X_WN: Array, name: str) -> Limb:
-    side, kind = name.split("_")
+def _segments(limb: str) -> tuple[str, str, str]:
+    """The links of a limb: upper and lower segment, and end."""
+    side, kind = limb.split("_")
     upper, lower, end = (f"{side}_{part}" for part in _SEGMENTS[kind])
-    positions = (*tree.nodes[nodes[upper]].positions, *tree.nodes[nodes[lower]].positions)
+    return upper, lower, end
+
+
+def _limb(kinematics: TreeKinematics, nodes: Mapping[str, int], name: str) -> Limb:
+    tree = kinematics.tree
+    model, (upper, lower, end) = tree.model, _segments(name)
+    positions = [*tree.nodes[nodes[upper]].positions, *tree.nodes[nodes[lower]].positions]
     if len(positions) != 4:
-        raise ModelError(f"{tree.model.path}: '{upper}' and '{lower}' must have 3 + 1 positions")
-    X_UL = np.linalg.inv(X_WN[nodes[upper]]) @ X_WN[nodes[lower]]
-    end_L = _end_middle(tree.model, lower, end)
-    meshes = [tree.model.link_meshes[segment] for segment in (upper, lower)]
+        raise ModelError(f"{model.path}: '{upper}' and '{lower}' must have 3 + 1 positions")
+    X_WN = kinematics.poses(np.zeros(len(kinematics.names)))
+    trunk, first, second = X_WN[[nodes["trunk"], nodes[upper], nodes[lower]]]
+    middle_U, end_L = _offset(first, second), _end_middle(model, lower, end)
+    meshes = [model.link_meshes[segment] for segment in (upper, lower)]
+    widths = zip(meshes, (middle_U, end_L), strict=True)
     return Limb(
         name=name,
-        root_T=_offset(X_WN[nodes["trunk"]], X_WN[nodes[upper]]),
-        middle_U=X_UL[:3, 3],
+        upper_node=nodes[upper],
+        lower_node=nodes[lower],
+        root_T=_offset(trunk, first),
+        middle_U=middle_U,
         end_L=end_L,
-        axes=_axes(tree.model, positions, upper),
+        axes=_axes(model, positions, upper),
         positions=np.array(positions),
-        lower=tree.model.lower[list(positions)],
-        upper=tree.model.upper[list(positions)],
-        half_widths=np.array(
-            [
-                _half_width(mesh.vertices, along)
-                for mesh, along in zip(meshes, (X_UL[:3, 3], end_L), strict=True)
-            ]
-        ),
+        lower=model.lower[positions],
+        upper=model.upper[positions],
+        half_widths=np.array([_half_width(mesh.vertices, along) for mesh, along in widths]),
         surfaces=(_surface_points(meshes[0]), _surface_points(meshes[1])),
     )
 
 
-def _axes(model: ParsedModel, positions: list[int] | tuple[int, ...], name: str) -> Integers:
+def _axes(model: ArticulatedModel, positions: Sequence[int], name: str) -> Integers:
     """The axes 0, 1, 2 that the positions' names end with."""
     letters = [model.position_names[i].rsplit("_", 1)[-1] for i in positions]
     if any(letter not in _AXES for letter in letters):
@@ -237,21 +234,25 @@ def _axes(model: ParsedModel, positions: list[int] | tuple[int, ...], name: str)
     return np.array([_AXES[letter] for letter in letters])
 
 
+def _moved(X_AB: Array, p_B: Array) -> Array:
+    """(3,) a point of B in A."""
+    return np.asarray(X_AB[:3, :3] @ p_B + X_AB[:3, 3])
+
+
 def _offset(X_WA: Array, X_WB: Array) -> Array:
     """(3,) the origin of B in A."""
     return np.asarray(X_WA[:3, :3].T @ (X_WB[:3, 3] - X_WA[:3, 3]))
 
 
-def _end_middle(model: ParsedModel, lower: str, end: str) -> Array:
+def _end_middle(model: ArticulatedModel, lower: str, end: str) -> Array:
     """(3,) the middle of a hand or foot in the frame of the segment before it."""
     if end not in model.link_meshes:
         raise ModelError(f"{model.path}: there must be a link '{end}' with visual geometry")
-    plant = model.plant
-    context = plant.CreateDefaultContext()
-    plant.SetPositions(context, np.zeros(len(model.position_names)))
-    frame = plant.GetBodyByName(lower).body_frame()
-    X_LE = plant.GetBodyByName(end).body_frame().CalcPose(context, frame).GetAsMatrix4()
-    return np.asarray(X_LE[:3, :3] @ _middle(model.link_meshes[end]) + X_LE[:3, 3])
+    context = model.plant.CreateDefaultContext()
+    model.plant.SetPositions(context, np.zeros(len(model.position_names)))
+    frame = model.plant.GetBodyByName(lower).body_frame()
+    X_LE = model.plant.GetBodyByName(end).body_frame().CalcPose(context, frame)
+    return _moved(X_LE.GetAsMatrix4(), _middle(model.link_meshes[end]))
 
 
 def _half_width(vertices: Array, along: Array) -> float:

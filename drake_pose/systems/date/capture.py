@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,8 +29,9 @@ from drake_pose.systems.date.stages import (
     FeatureFinder,
     HorizontalImage,
     PoseRecogniser,
-    ViewPorts,
+    add_views,
 )
+from drake_pose.systems.pictures.person_region import connect_images
 from drake_pose.systems.ports import (
     MemorySystem,
     StagedDiagram,
@@ -72,7 +73,7 @@ class PaperPoseEstimator(MemorySystem):
         require_period("estimator", period)
         self.setup = setup
         nq, places = len(setup.skeleton.lower), 3 * len(FEATURES)
-        self._views = ViewPorts(self, list(setup.cameras.values()))
+        self._seen = add_views(self, list(setup.cameras.values()))
         inputs = {
             "features": places, "support": len(FEATURES), "face_direction": 2,
             "recognised_positions": nq, "fresh": 1,
@@ -114,7 +115,7 @@ class PaperPoseEstimator(MemorySystem):
         if features is None or not np.isfinite(known["estimated_positions"]).all():
             return {}
         features = features.reshape(-1, 3)
-        cameras, views = self._views.evaluate(context)
+        cameras, views = self._seen(context)
         pose = estimate_pose(
             self.setup.skeleton,
             known["estimated_positions"],
@@ -204,8 +205,10 @@ def build_paper_capture(
             builder.ExportInput(port, port.get_name())
     images, wanted = _add_images(builder, setup)
     views = {name: image.GetOutputPort("person_view") for name, image in images.items()}
-    regions = tuple(image.GetOutputPort("region") for image in images.values())
-    stages: dict[str, tuple[OutputPort, ...]] = {"region": regions, "skin": tuple(views.values())}
+    stages: dict[str, tuple[OutputPort, ...]] = {
+        "region": tuple(image.region for image in images.values()),
+        "skin": tuple(views.values()),
+    }
     estimator = PaperPoseEstimator(setup, period)
     builder.AddNamedSystem("pose", estimator)
     _connect_views(builder, views, estimator)
@@ -220,11 +223,11 @@ def build_paper_capture(
         connect_same(builder, estimator, system)
         for name in results if stage != "features" else ():
             builder.ExportOutput(system.GetOutputPort(name), name)
-    _connect_images(builder, source, wanted)
-    if source is not None and source.HasOutputPort("fresh"):
-        builder.Connect(source.GetOutputPort("fresh"), estimator.GetInputPort("fresh"))
-    if source is not None and source.HasOutputPort("time"):
-        builder.ExportOutput(source.GetOutputPort("time"), "time")
+    connect_images(builder, source, wanted)
+    if source is not None:
+        connect_same(builder, source, estimator)
+        if source.HasOutputPort("time"):
+            builder.ExportOutput(source.GetOutputPort("time"), "time")
     export_outputs(builder, estimator)
     if meshcat is not None:
         positions = estimator.GetOutputPort("estimated_positions")
@@ -261,32 +264,9 @@ def _add_images(
     """One HorizontalImage a camera, the face camera's last, and the images that they want."""
     images, wanted, face = {}, {}, setup.face_camera
     for camera in [*setup.cameras.values(), *([] if face is None else [face])]:
-        name, background = camera.name, setup.backgrounds.get(camera.name)
-        image = HorizontalImage(camera, background, setup.settings.skin)
+        name = camera.name
+        image = HorizontalImage(camera, setup.backgrounds.get(name), setup.settings.skin)
         images[name] = builder.AddNamedSystem(f"horizontal_image_{name}", image)
         builder.ExportOutput(image.GetOutputPort("person_view"), f"person_view_{name}")
-        for kind in ("color_image",) if background is not None else ("color_image", "label_image"):
-            wanted[f"{kind}_{name}"] = [image.GetInputPort(kind)]
+        wanted |= {f"{kind}_{name}": [image.GetInputPort(kind)] for kind in image.wanted}
     return images, wanted
-
-
-def _connect_images(
-    builder: DiagramBuilder, source: System | None, wanted: Mapping[str, Sequence[InputPort]]
-) -> None:
-    """Connects images by the names of the source's outputs, or as inputs of the diagram."""
-    for name, (first, *more) in wanted.items():
-        if source is None:
-            builder.ExportInput(first, name)
-            for port in more:
-                builder.ConnectInput(name, port)
-            continue
-        if not source.HasOutputPort(name):
-            kind, camera = name[:11], name[12:]
-            background = " (or a background in the setup)" if kind == "label_image" else ""
-            ports = [source.get_output_port(k).get_name() for k in range(source.num_output_ports())]
-            raise SettingsError(
-                f"camera '{camera}': the source needs an output port {name}{background}; it has: "
-                + ", ".join(ports)
-            )
-        for port in (first, *more):
-            builder.Connect(source.GetOutputPort(name), port)

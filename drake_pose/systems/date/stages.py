@@ -2,49 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import Context
-from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
+from pydrake.systems.sensors import ImageRgba8U
 
-from drake_pose.arrays import Array, Mask, Picture
+from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera
-from drake_pose.errors import CameraError, SettingsError
 from drake_pose.person.date.capture import PersonView, see_person
 from drake_pose.person.date.faces import FaceTemplates, find_face
 from drake_pose.person.date.features import Features, SkinColour, find_features
 from drake_pose.person.date.recognition import Recognition, RegisteredPose, recognise
 from drake_pose.person.date.skeleton import FEATURES, Skeleton
-from drake_pose.silhouette.pictures.label_images import label_image_to_mask
-from drake_pose.silhouette.segmentation.background import Background, person_region
+from drake_pose.silhouette.segmentation.background import Background
 from drake_pose.systems.colour_images import colour_image_to_picture
-from drake_pose.systems.ports import PortedSystem
+from drake_pose.systems.pictures.person_region import PersonRegion
+from drake_pose.systems.ports import PortedSystem, require_different
+
+Seen = Callable[[Context], tuple[list[Camera], list[PersonView]]]
+"""The cameras that go, and what they saw; unconnected ones and None are left out."""
 
 
-class ViewPorts:
-    """The input ports ``person_view_<camera>`` of a system.
+def add_views(system: PortedSystem, cameras: Sequence[Camera]) -> Seen:
+    """The input ports ``person_view_<camera>`` of a system, and what comes in.
 
     Raises SettingsError for fewer than two cameras, or two of one name.
     """
+    require_different(cameras, 2, "two or more different cameras are needed, not")
+    given = system.add_camera_inputs({one.name: f"person_view_{one.name}" for one in cameras})
 
-    def __init__(self, system: PortedSystem, cameras: Sequence[Camera]) -> None:
-        names = [camera.name for camera in cameras]
-        if len(names) < 2 or len(set(names)) != len(names):
-            raise SettingsError(f"two or more different cameras are needed, not: {names}")
-        self._system, self._cameras = system, tuple(cameras)
-        for name in names:
-            system.add_input(f"person_view_{name}", None)
+    def seen(context: Context) -> tuple[list[Camera], list[PersonView]]:
+        views = given(context)
+        return [one for one in cameras if one.name in views], list(views.values())
 
-    def evaluate(self, context: Context) -> tuple[list[Camera], list[PersonView]]:
-        """The cameras that go, and what they saw; unconnected ones and None are left out."""
-        views = [self._system.given(context, f"person_view_{one.name}") for one in self._cameras]
-        cameras = [one for one, view in zip(self._cameras, views, strict=True) if view is not None]
-        return cameras, [view for view in views if view is not None]
+    return seen
 
 
-class HorizontalImage(PortedSystem):
+class HorizontalImage(PersonRegion):
     """Finds the person in one camera's picture: region, skin-coloured blobs in it, contour.
 
     .. pydrake_system::
@@ -53,78 +48,23 @@ class HorizontalImage(PortedSystem):
         input_ports: [color_image, label_image (optional)]
         output_ports: [region, person_view]
 
-    The paper's horizontal image processing module (3.1.1). The region is that of ``label_image``,
-    where not connected that of the background model. Outputs: ``region``, a mask (H, W), and
-    ``person_view``, a ``person.date.capture.PersonView``; both are None while the camera is lost:
-    ``color_image`` is unconnected, or an image of no pixels.
-
-    Args:
-        background: what it sees when nobody is there; None where ``label_image`` is connected.
-
-    Raises:
-        SettingsError: the background's size is not the camera's. When evaluated: there is neither a
-            background nor a label image.
-        CameraError: when evaluated: an image has another size than the camera's.
+    The paper's horizontal image processing module (3.1.1). Outputs: ``region``, see PersonRegion,
+    and ``person_view``, a ``person.date.capture.PersonView``, None where either image is lost.
     """
 
     def __init__(
         self, camera: Camera, background: Background | None = None, skin: SkinColour | None = None
     ) -> None:
-        super().__init__()
-        size = camera.width, camera.height
-        if background is not None and background.mean.shape[1::-1] != size:
-            width, height = background.mean.shape[1::-1]
-            raise SettingsError(
-                f"camera '{camera.name}' has {size[0]} x {size[1]} pixels (width x height), but "
-                f"its background {width} x {height}"
-            )
-        self._camera, self._background, skin = camera, background, skin or SkinColour()
-        self.add_input("color_image", ImageRgba8U(*size))
-        self.add_input("label_image", ImageLabel16I(*size))
-        shown = self.add_cache("picture", self._picture)
+        super().__init__(camera, background)
+        self.wanted = ("color_image",) if background is not None else ("color_image", "label_image")
 
         def see(context: Context) -> PersonView | None:
-            picture, mask = shown.Eval(context), region.Eval(context)
-            return None if picture is None else see_person(picture, mask, skin)
+            picture, region = self.picture.Eval(context), self.region.Eval(context)
+            if picture is None or region is None:
+                return None
+            return see_person(picture, region, skin or SkinColour())
 
-        region = self.add_output(
-            "region", None, lambda context: self._region(context, shown.Eval(context))
-        )
         self.add_output("person_view", None, see)
-
-    def _picture(self, context: Context) -> Picture | None:
-        """The picture (H, W, 3); None while the camera has stopped."""
-        image = self.given(context, "color_image")
-        if image is None or not image.size():
-            return None
-        picture = colour_image_to_picture(image)
-        self._require_size(picture, "color image")
-        return picture
-
-    def _region(self, context: Context, picture: Picture | None) -> Mask | None:
-        """Where the person is (H, W); None while the camera has stopped."""
-        if picture is None:
-            return None
-        image = self.given(context, "label_image")
-        if image is not None:
-            mask = label_image_to_mask(image)
-            self._require_size(mask, "label image")
-            return mask
-        if self._background is not None:
-            return person_region(picture, self._background)
-        raise SettingsError(
-            f"camera '{self._camera.name}': nothing tells the person from what is behind; give "
-            "a background model or connect label_image"
-        )
-
-    def _require_size(self, image: NDArray[np.generic], kind: str) -> None:
-        camera = self._camera
-        if image.shape[:2] != (camera.height, camera.width):
-            raise CameraError(
-                f"camera '{camera.name}': its {kind} has {image.shape[1]} x {image.shape[0]} "
-                f"pixels (width x height), but it was calibrated with {camera.width} x "
-                f"{camera.height}"
-            )
 
 
 class FeatureFinder(PortedSystem):
@@ -151,7 +91,7 @@ class FeatureFinder(PortedSystem):
     def __init__(self, cameras: Sequence[Camera]) -> None:
         super().__init__()
         size = 3 * len(FEATURES)
-        self._views = ViewPorts(self, cameras)
+        self._seen = add_views(self, cameras)
         self.add_input("last_features", size)
         self.add_input("expected_features", size)
         found = self.add_output("found", None, self._find)
@@ -171,7 +111,7 @@ class FeatureFinder(PortedSystem):
         last = self.GetInputPort("last_features").Eval(context).reshape(-1, 3)
         if not np.isfinite(last).all():
             return None
-        cameras, views = self._views.evaluate(context)
+        cameras, views = self._seen(context)
         expected = self.given(context, "expected_features")
         return find_features(
             cameras,
@@ -236,10 +176,10 @@ class PoseRecogniser(PortedSystem):
         threshold: float = 0.93,
     ) -> None:
         super().__init__()
-        views = ViewPorts(self, cameras)
+        seen_by = add_views(self, cameras)
 
         def see(context: Context) -> Recognition | None:
-            going, seen = views.evaluate(context)
+            going, seen = seen_by(context)
             contours = [view.contour for view in seen]
             return recognise(skeleton, registered, going, contours, threshold)
 

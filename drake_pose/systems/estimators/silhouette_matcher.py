@@ -19,7 +19,7 @@ from drake_pose.search.estimates import PoseEstimate, View
 from drake_pose.search.scoring import PoseSearch
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
 from drake_pose.systems.bodies.posed_geometry import body_poses
-from drake_pose.systems.ports import BeliefSystem, SharedValue, require_period
+from drake_pose.systems.ports import BeliefSystem, SharedValue, require_different, require_period
 
 STATISTICS = ("found", "J", "E_total", "first_E_total", "runs", "outside_limit", "seconds")
 """What the elements of the output ``statistics`` are."""
@@ -93,17 +93,17 @@ class SilhouetteMatcher(BeliefSystem[Matched]):
         family_limit: int = 4,
     ) -> None:
         super().__init__()
-        names = [camera.name for camera in cameras]
-        if not cameras or len(set(names)) != len(names):
-            raise SettingsError(f"a matcher needs one or more cameras of different names: {names}")
+        require_different(cameras, 1, "a matcher needs one or more cameras of different names")
         require_period("matcher", period)
         if family_limit < 1:
             raise SettingsError(f"the family limit must be 1 or more, not {family_limit}")
         self._search, self._cameras, self._family_limit = search, tuple(cameras), family_limit
         self._labels = None if labels is None else frozenset(labels)
-        for camera in cameras:
-            image = ImageLabel16I(camera.width, camera.height)
-            self.add_input(camera_port("label_image", camera, cameras), image)
+        known = {camera.name: camera for camera in cameras}
+        self._images = self.add_camera_inputs(
+            {one.name: camera_port("label_image", one, cameras) for one in cameras},
+            lambda name: ImageLabel16I(known[name].width, known[name].height),
+        )
         self.add_input("root_position", 3)
         q = search.tree.model.default_positions
         self.keep_belief(Matched(q, np.eye(4), None, self._first_memory()), period, offset)
@@ -129,12 +129,13 @@ class SilhouetteMatcher(BeliefSystem[Matched]):
 
     def next_belief(self, context: Context, last: Matched) -> Matched:
         """The match of what the cameras see now."""
-        views = []
-        for camera in self._cameras:
-            image = self.given(context, camera_port("label_image", camera, self._cameras))
-            mask = None if image is None else label_image_to_mask(image, self._labels)
-            if mask is not None and mask.any():
-                views.append(View(camera, mask))
+        images = self._images(context)
+        masks = {name: label_image_to_mask(image, self._labels) for name, image in images.items()}
+        views = [
+            View(camera, masks[camera.name])
+            for camera in self._cameras
+            if camera.name in masks and masks[camera.name].any()
+        ]
         estimate, memory = self._find(context, last.memory, views)
         if estimate is None or not estimate.found:
             return Matched(last.q, last.X_WB, estimate, memory)

@@ -7,11 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from pydrake.geometry import Meshcat
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
-from pydrake.systems.sensors import ImageLabel16I, ImageRgba8U
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, System
 from pydrake.trajectories import Trajectory
 
-from drake_pose.arrays import Mask
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.camera.sources.frame_source import FrameSource
@@ -19,31 +17,27 @@ from drake_pose.errors import SettingsError
 from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.views import EDGE_POINTS, SilhouetteView, edge_spacing, see_silhouette
-from drake_pose.silhouette.pictures.label_images import label_image_to_mask
-from drake_pose.silhouette.segmentation.background import Background, person_region
+from drake_pose.silhouette.segmentation.background import Background
 from drake_pose.systems.bodies.posed_geometry import add_avatar
-from drake_pose.systems.colour_images import colour_image_to_picture
 from drake_pose.systems.person.person_tracker import PersonTracker
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
+from drake_pose.systems.pictures.person_region import PersonRegion, connect_images
 from drake_pose.systems.pictures.picture_capture import PictureCapture
-from drake_pose.systems.ports import PortedSystem, StagedDiagram, export_outputs
+from drake_pose.systems.ports import StagedDiagram, export_outputs
 
 
-class SilhouetteSensor(PortedSystem):
+class SilhouetteSensor(PersonRegion):
     """What one camera's picture says of the person.
 
     .. pydrake_system::
 
         name: SilhouetteSensor
-        input_ports: [label_image]
+        input_ports: [color_image, label_image]
         output_ports: [region, silhouette]
 
-    With a background the input port is ``color_image`` instead. The outputs are abstract: the
-    person's region (H, W), and a SilhouetteView of it; None where the port is not connected or the
-    image has no pixels: then the camera gave no picture at that moment.
+    ``silhouette`` is a SilhouetteView of the region (see PersonRegion), or None.
 
     Args:
-        background: what it sees of the empty room; None: the input is a label image.
         edge_points: the picture's height over the spacing of the edge points.
     """
 
@@ -53,42 +47,33 @@ class SilhouetteSensor(PortedSystem):
         background: Background | None = None,
         edge_points: float = EDGE_POINTS,
     ) -> None:
-        super().__init__()
-        spacing, size = edge_spacing(camera, edge_points), (camera.width, camera.height)
-        if background is None:
-            port = self.add_input("label_image", ImageLabel16I(*size))
-        else:
-            port = self.add_input("color_image", ImageRgba8U(*size))
-
-        def see(context: Context) -> Mask | None:
-            image = self.given(context, port.get_name())
-            if image is None or image.size() == 0:
-                return None
-            if background is None:
-                return label_image_to_mask(image)
-            return person_region(colour_image_to_picture(image), background)
-
-        region = self.add_output("region", None, see)
+        super().__init__(camera, background)
+        spacing = edge_spacing(camera, edge_points)
 
         def view(context: Context) -> SilhouetteView | None:
-            seen = region.Eval(context)
+            seen = self.region.Eval(context)
             return None if seen is None else see_silhouette(seen, spacing)
 
-        self.add_output("silhouette", None, view)
+        self.silhouette = self.add_output("silhouette", None, view)
 
 
 def _add_sensors(
     builder: DiagramBuilder,
+    source: System | None,
     cameras: Mapping[str, Camera],
     backgrounds: Mapping[str, Background],
     edge_points: float = EDGE_POINTS,
 ) -> dict[str, SilhouetteSensor]:
-    return {
-        name: builder.AddNamedSystem(
-            f"sensor_{name}", SilhouetteSensor(camera, backgrounds.get(name), edge_points)
-        )
+    """A sensor a camera, which gets its images from a source, or from outside."""
+    sensors = {
+        name: SilhouetteSensor(camera, backgrounds.get(name), edge_points)
         for name, camera in cameras.items()
     }
+    for name, sensor in sensors.items():
+        builder.AddNamedSystem(f"sensor_{name}", sensor)
+        wanted = {f"{kind}_{name}": [sensor.GetInputPort(kind)] for kind in sensor.wanted}
+        connect_images(builder, source, wanted)
+    return sensors
 
 
 class LiveSensors(PictureCapture):
@@ -112,11 +97,8 @@ class LiveSensors(PictureCapture):
     def add(self, builder: DiagramBuilder) -> dict[str, OutputPort]:
         """Adds itself and the sensors to a diagram; by camera the port of a view or None."""
         builder.AddNamedSystem("picture_capture", self)
-        sensors = _add_sensors(builder, self._cameras, self._backgrounds)
-        for name, sensor in sensors.items():
-            image = f"{sensor.get_input_port().get_name()}_{name}"
-            builder.Connect(self.GetOutputPort(image), sensor.get_input_port())
-        return {name: sensor.GetOutputPort("silhouette") for name, sensor in sensors.items()}
+        sensors = _add_sensors(builder, self, self._cameras, self._backgrounds)
+        return {name: sensor.silhouette for name, sensor in sensors.items()}
 
 
 def add_person_tracker(
@@ -162,26 +144,18 @@ def build_live_capture(
     """Cameras' pictures, or what workers elsewhere make of them, to a person's poses.
 
     The diagram's outputs are those of PersonTracker, and ``silhouette_<camera>``, its inputs; the
-    arguments but the sensors are those of add_person_tracker.
-
-    Raises:
-        SettingsError: fewer than two cameras, or a period that is not positive.
+    arguments but the sensors are those of add_person_tracker, as are the errors.
     """
     builder = DiagramBuilder()
     silhouettes = sensors.add(builder)
     for name, port in silhouettes.items():
         builder.ExportOutput(port, f"silhouette_{name}")
-    return _build(
-        builder, tracker, cameras, silhouettes, sensors.period, sensors.GetOutputPort("time"),
-        meshcat, with_deviations,
-    )[0]  # fmt: skip
-
-
-def _build(builder: DiagramBuilder, *of_tracker: Any) -> tuple[Diagram, PersonTracker]:
-    """The diagram with a person tracker, whose outputs are its own."""
-    system = add_person_tracker(builder, *of_tracker)
-    export_outputs(builder, system)
-    return builder.Build(), system
+    period, time = sensors.period, sensors.GetOutputPort("time")
+    person = add_person_tracker(
+        builder, tracker, cameras, silhouettes, period, time, meshcat, with_deviations
+    )
+    export_outputs(builder, person)
+    return builder.Build()
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,6 +171,8 @@ def build_silhouette_capture(
     backgrounds: Mapping[str, Background],
     period: float = 1.0 / 30.0,
     edge_points: float = EDGE_POINTS,
+    source: System | None = None,
+    meshcat: Meshcat | None = None,
 ) -> SilhouetteCapture:
     """Wire the cameras' images to their sensors, and these to what follows the person.
 
@@ -204,28 +180,32 @@ def build_silhouette_capture(
     stages ``region`` and ``edge``.
 
     Args:
-        backgrounds: of all cameras, two or more.
+        backgrounds: of all cameras, two or more, unless a source gives label images.
         period: time between two frames [s].
         edge_points: a picture's height over the spacing of the edge points.
+        source: what has ``color_image_<camera>``, or ``label_image_<camera>`` of a camera without
+            background, in place of the inputs.
+        meshcat: where to show the person.
 
     Raises:
         SettingsError: fewer than two cameras, one without a background, or a period that is not
             positive.
     """
     for name in cameras:
-        if name not in backgrounds:
+        if source is None and name not in backgrounds:
             raise SettingsError(
                 f"camera '{name}' has no background: give one for each of {', '.join(cameras)}"
             )
     builder = DiagramBuilder()
-    sensors = _add_sensors(builder, cameras, backgrounds, edge_points)
-    for name, sensor in sensors.items():
-        builder.ExportInput(sensor.get_input_port(), f"color_image_{name}")
-    edges = {name: sensor.GetOutputPort("silhouette") for name, sensor in sensors.items()}
-    regions = tuple(sensor.GetOutputPort("region") for sensor in sensors.values())
-    diagram, person = _build(builder, tracker, cameras, edges, period)
+    if source is not None:
+        builder.AddNamedSystem("source", source)
+    sensors = _add_sensors(builder, source, cameras, backgrounds, edge_points)
+    edges = {name: sensor.silhouette for name, sensor in sensors.items()}
+    person = add_person_tracker(builder, tracker, cameras, edges, period, meshcat=meshcat)
+    export_outputs(builder, person)
+    regions = tuple(sensor.region for sensor in sensors.values())
     stages = {"region": regions, "edge": tuple(edges.values())}
-    return SilhouetteCapture(diagram, stages, person)
+    return SilhouetteCapture(builder.Build(), stages, person)
 
 
 def build_person_capture(
@@ -249,12 +229,8 @@ def build_person_capture(
         SettingsError: fewer than two cameras, or a period that is not positive.
         ModelError: the model has no landmarks of trunk, arms and legs.
     """
-    builder = DiagramBuilder()
     rig = build_camera_rig(model, cameras, true_positions).diagram
-    builder.AddNamedSystem("camera_rig", rig)
-    sensors = _add_sensors(builder, cameras, {})
-    for name, sensor in sensors.items():
-        builder.Connect(rig.GetOutputPort(f"label_image_{name}"), sensor.get_input_port())
-    edges = {name: sensor.GetOutputPort("silhouette") for name, sensor in sensors.items()}
     tracker = PersonPoseTracker(ContourFit(model.pose_tree()))
-    return _build(builder, tracker, cameras, edges, period, None, meshcat)[0]
+    return build_silhouette_capture(
+        tracker, cameras, {}, period, source=rig, meshcat=meshcat
+    ).diagram

@@ -12,7 +12,6 @@ from pydrake.systems.framework import Context
 
 from drake_pose.arrays import Array
 from drake_pose.camera.models import Camera
-from drake_pose.errors import SettingsError
 from drake_pose.fit.colour_lines import COLOURS
 from drake_pose.fit.contour_fit import inlier_ratio_of
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
@@ -20,7 +19,7 @@ from drake_pose.person.recordings.persons_in_view import keep_views
 from drake_pose.person.views import ColourViews, FrameViews, SilhouetteView, shows_somebody
 from drake_pose.systems.bodies.posed_geometry import body_poses
 from drake_pose.systems.colour_images import ColourPorts
-from drake_pose.systems.ports import MemorySystem, require_period
+from drake_pose.systems.ports import MemorySystem, require_different, require_period
 
 # Who was seen beside the person is looked for in this many more frames; to look takes long.
 _REMEMBERED = 15
@@ -82,14 +81,11 @@ class PersonTracker(MemorySystem):
         color_cameras: Collection[str] = (),
     ) -> None:
         super().__init__()
-        names = [camera.name for camera in cameras]
-        if len(names) < 2 or len(set(names)) != len(names):
-            raise SettingsError(f"a person is tracked by two or more different cameras: {names}")
+        require_different(cameras, 2, "a person is tracked by two or more different cameras")
         require_period("tracker", period)
         self._tracker, self._cameras = tracker, tuple(cameras)
         self._with_deviations = with_deviations
-        for name in names:
-            self.add_input(f"silhouette_{name}", None)
+        self._views = self.add_camera_inputs({c.name: f"silhouette_{c.name}" for c in cameras})
         self.add_input("time", 1)
         self._colours = ColourPorts(
             self, cameras, color_cameras, lambda one: f"color_image_{one.name}"
@@ -104,7 +100,7 @@ class PersonTracker(MemorySystem):
             "last_positions": tracker.positions(values),
             "share": np.zeros(1),
             "time": np.full(1, np.nan),
-            "seen": np.zeros(len(names)),
+            "seen": np.zeros(len(cameras)),
             "others": np.zeros(1),
         }
         if with_deviations:
@@ -236,9 +232,9 @@ class PersonTracker(MemorySystem):
 
     def _moment(self, context: Context) -> _Moment:
         """What those cameras see that have a picture."""
-        views = {one.name: self.given(context, f"silhouette_{one.name}") for one in self._cameras}
-        cameras = [camera for camera in self._cameras if views[camera.name] is not None]
-        return _Moment(FrameViews(cameras, [views[camera.name] for camera in cameras]))
+        views = self._views(context)
+        cameras = [camera for camera in self._cameras if camera.name in views]
+        return _Moment(FrameViews(cameras, list(views.values())))
 
     def _followed(
         self, last: TrackState | None, moment: _Moment, is_watching: bool

@@ -88,35 +88,24 @@ class TestSkeleton:
 
 
 class TestReach:
-    def test_jacobian_leads_to_the_target(self, skeleton):
-        generator = np.random.default_rng(2)
-        for name in LIMBS:
-            limb = skeleton.limbs[name]
-            for _ in range(10):
-                middle = 0.5 * (limb.lower + limb.upper)
-                true = middle + 0.3 * generator.uniform(-1, 1, 4) * (limb.upper - limb.lower)
-                q = np.zeros(len(skeleton.lower))
-                q[limb.positions] = true
-                root, _, end = skeleton.limb_points(q, name)
-                start = np.clip(true + generator.uniform(-0.3, 0.3, 4), limb.lower, limb.upper)
-                R_WT, _ = skeleton.trunk_pose(q)
-                found = move_limb(limb, R_WT, root, start, end)
-                q[limb.positions] = found
-                assert np.linalg.norm(skeleton.limb_points(q, name)[2] - end) < 2e-3
-                assert (found >= limb.lower).all()
-                assert (found <= limb.upper).all()
-
-    def test_steps_are_small(self, skeleton):
-        limb = skeleton.limbs["left_arm"]
-        offsets = np.zeros((4, 3))
-        offsets[3] = limb.middle_U
-        start = np.array([0.1, 0.3, 0.0, -0.5])
-        moved, distance = reach(
-            np.eye(3), np.zeros(3), limb.axes, offsets, limb.end_L, start, limb.lower, limb.upper,
-            np.ones(4, dtype=bool), np.array([0.3, 0.4, 0.3]), 5,
-        )  # fmt: skip
-        assert 0 < np.abs(moved - start).max() <= 5 * np.radians(2.0) + 1e-12
-        assert distance > 0.1
+    @pytest.mark.parametrize("name", LIMBS)
+    def test_an_end_is_reached_in_small_steps_inside_the_limits(self, skeleton, name):
+        generator, limb = np.random.default_rng(2), skeleton.limbs[name]
+        for _ in range(10):
+            true = drawn_pose(skeleton, generator, 0.6)
+            start, end = np.array(true), skeleton.limb_points(true, name)[2]
+            start[limb.positions] += generator.uniform(-0.3, 0.3, 4)
+            start = skeleton.clip(start)
+            found = move_limb(skeleton, start, name, end)
+            assert np.linalg.norm(skeleton.limb_points(found, name)[2] - end) < 2e-3
+            np.testing.assert_array_equal(found, skeleton.clip(found))
+            others = np.delete(np.arange(len(found)), limb.positions)
+            np.testing.assert_array_equal(found[others], start[others])
+            part = limb.lower_node, limb.end_L
+            some, distance = reach(skeleton, start, limb.positions, part, end + 0.2, 5)
+            assert 0 < np.abs(some - start).max() <= 5 * np.radians(2.0) + 1e-12
+            left = np.linalg.norm(skeleton.limb_points(some, name)[2] - end - 0.2)
+            assert distance == pytest.approx(left)
 
     @pytest.mark.parametrize("face_known", [True, False])
     def test_both_hands_are_reached(self, person, skeleton, face_known):

@@ -149,5 +149,5 @@ def _fit_first_frames(
             f"{scene.path}: two cameras never saw a person at the same time: stand before them, "
             "and compare the pictures with their backgrounds"
         )
-    found = capture_person(tree, scene.cameras, lambda k: alone.read(seen[k]), len(seen))
+    found = capture_person(tree, scene.cameras, alone.read, seen)
     return None if found.shape is None else found.shape.known

@@ -29,7 +29,7 @@ from drake_pose.person.recordings.camera_faults import (
     share_of,
 )
 from drake_pose.person.recordings.figures import RigFault, find_rig_fault
-from drake_pose.person.recordings.person_capture import PersonCapture, capture_person
+from drake_pose.person.recordings.person_capture import PersonCapture, capture_person, spread_over
 from drake_pose.person.recordings.persons_in_view import PersonRecording, ReadFrame, ViewFaults
 from drake_pose.person.shape import NOISE, shape_values
 from drake_pose.person.views import edge_spacing
@@ -82,7 +82,7 @@ def capture_checked(
         SettingsError: there is no frame in which two cameras see a person.
     """
     recording = _record(cameras, read, count, is_sequence)
-    carved = [recording.read(k) for k in _spread_over(recording.seen, _CARVED)]
+    carved = [recording.read(k) for k in spread_over(recording.seen, _CARVED)]
     rig = find_rig_fault(cameras, carved)
     if rig is not None and rig.is_undone:
         undo = rig.undo
@@ -91,7 +91,9 @@ def capture_checked(
     while True:
         # All frames are finished once only, as those who count them are told of it.
         tell = None if found else on_frame
-        captured = _capture_seen(tree, cameras, recording, is_sequence, tell)
+        captured = capture_person(
+            tree, cameras, recording.read, recording.seen, count, is_sequence, tell
+        )
         judge = _Judge(tree, cameras, recording, captured)
         found = [judge.dated(one) for one in found]
         fault = judge.find()
@@ -105,8 +107,7 @@ def capture_checked(
         recording.leave_out(fault.name, fault.first)
     if found and rig is not None and not rig.is_undone:
         rig = None
-    whole = _spread(captured, recording.seen, count)
-    return CheckedCapture(whole, recording.faults(), tuple(found), rig, recording.read)
+    return CheckedCapture(captured, recording.faults(), tuple(found), rig, recording.read)
 
 
 def _record(
@@ -131,27 +132,6 @@ def _record(
     return recording
 
 
-def _capture_seen(
-    tree: PoseTree,
-    cameras: Mapping[str, Camera],
-    recording: PersonRecording,
-    is_sequence: bool,
-    on_frame: Callable[[int], None] | None,
-) -> PersonCapture:
-    """The capture of those frames alone in which two cameras see the person."""
-    seen = recording.seen
-    pauses = [k for k in range(1, len(seen)) if seen[k] > seen[k - 1] + 1]
-    return capture_person(
-        tree, cameras, lambda k: recording.read(seen[k]), len(seen), is_sequence, on_frame, pauses
-    )
-
-
-def _spread_over(frames: Sequence[int], count: int) -> list[int]:
-    """This many frames of all, evenly."""
-    picked = np.linspace(0, len(frames) - 1, min(count, len(frames)))
-    return [frames[int(k)] for k in picked]
-
-
 class _Judge:
     """Compares the cameras with each other by what was captured."""
 
@@ -166,12 +146,12 @@ class _Judge:
         self._held = shape_values(tree)
         self._fit = ContourFit(tree, captured.outlines, None if captured.shape is None else NOISE)
         tracker = PersonPoseTracker(self._fit, held=self._held)
-        poses = zip(recording.seen, captured.q, strict=True)
-        self._values = {k: tracker.values(q) for k, q in poses if np.isfinite(q).all()}
+        found = np.flatnonzero(np.isfinite(captured.q).all(axis=1)).tolist()
+        self._values = {k: tracker.values(captured.q[k]) for k in found}
 
     def find(self) -> CameraFault | None:
         """The camera that contradicts the others in all frames or in the last, and since when."""
-        picked = _spread_over(list(self._values), _COMPARED)
+        picked = spread_over(list(self._values), _COMPARED)
         views = []
         for frame in picked:
             masks = self._recording.read(frame)
@@ -231,13 +211,3 @@ class _Judge:
 
     def _edge(self, name: str, mask: Mask) -> EdgePoints:
         return find_edge_points(mask, edge_spacing(self._cameras[name]))
-
-
-def _spread(captured: PersonCapture, seen: Sequence[int], count: int) -> PersonCapture:
-    """A capture of some frames as one of all: nan, and a share of 0, in the others."""
-    if len(seen) == count:
-        return captured
-    unknown = np.full((count, captured.q.shape[1]), np.nan)
-    whole = replace(captured, q=unknown, shares=np.zeros(count), deviations=unknown.copy())
-    whole.take(list(seen), captured, slice(None))
-    return whole

@@ -6,7 +6,7 @@ again. Where only a few frames have masks the person's colours in pictures say t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -55,68 +55,73 @@ class PersonCapture:
     tree: PoseTree
     deviations: Array
 
-    def take(self, frame: int | list[int], other: PersonCapture, place: int | slice) -> None:
-        """Takes what another capture says of frames."""
-        self.q[frame], self.shares[frame] = other.q[place], other.shares[place]
-        self.deviations[frame] = other.deviations[place]
+    @staticmethod
+    def begun(count: int, shape: PersonShape | None, fit: ContourFit) -> PersonCapture:
+        """Of so many frames, of which nothing is known yet."""
+        q = np.full((count, len(fit.tree.model.position_names)), np.nan)
+        return PersonCapture(q, np.zeros(count), shape, fit.outlines, fit.tree, q.copy())
+
+    def note(
+        self,
+        frame: int,
+        tracker: PersonPoseTracker,
+        state: TrackState,
+        seen: FrameViews | ColourViews,
+    ) -> None:
+        """Notes where the person is in a frame, and how sure that is by what was seen."""
+        lengths = None if self.shape is None else self.shape.covariance
+        self.q[frame], self.shares[frame] = tracker.positions(state.values), state.share
+        self.deviations[frame] = tracker.deviations(state.values, seen, lengths)
 
 
 def capture_person(
     tree: PoseTree,
     cameras: Mapping[str, Camera],
     read: ReadFrame,
-    count: int,
+    frames: Sequence[int],
+    count: int | None = None,
     is_sequence: bool = True,
     on_frame: Callable[[int], None] | None = None,
-    pauses: Collection[int] = (),
 ) -> PersonCapture:
     """Captures a recording.
 
     Args:
         tree: of a model with the landmarks of a person, best with shape joints:
             urdf/person/person_shape.urdf.
-        read: gives the masks of a frame, of `count` frames.
+        read: gives the masks of a frame.
+        frames: those in which the person is seen, of `count`; before one that does not follow the
+            last he may have gone anywhere.
         is_sequence: whether frames follow each other; else each is found afresh.
         on_frame: called after each frame.
-        pauses: the frames before which the person was out of sight, and may have gone anywhere.
 
     Raises:
         ModelError: the model has no landmarks of trunk, arms and legs.
         SettingsError: there is no frame, or in none of those looked at two cameras see a person.
     """
-    if count < 1:
+    if not len(frames):
         raise SettingsError("a recording needs one frame or more")
-    capture = _Capture(tree, cameras, read, is_sequence, frozenset(pauses))
-    shape, states = capture.measure(count)
+    capture = _Capture(tree, cameras, read, is_sequence)
+    shape, states = capture.measure(frames)
     tracker = capture.tracker
-    q = np.full((count, len(tree.model.position_names)), np.nan)
-    deviations, shares = q.copy(), np.zeros(count)
+    captured = PersonCapture.begun(count or len(frames), shape, tracker.fit)
 
     def finish(frame: int, state: TrackState | None, seen: FrameViews) -> None:
         if state is not None:
-            lengths = None if shape is None else shape.covariance
-            q[frame], shares[frame] = tracker.positions(state.values), state.share
-            deviations[frame] = tracker.deviations(state.values, seen, lengths)
+            captured.note(frame, tracker, state, seen)
         if on_frame is not None:
             on_frame(frame)
 
-    capture.follow_all(count, states, finish)
-    return PersonCapture(q, shares, shape, tracker.fit.outlines, tree, deviations)
+    capture.follow_all(frames, states, finish)
+    return captured
 
 
 class _Capture:
     """A recording, and what follows the person in it."""
 
     def __init__(
-        self,
-        tree: PoseTree,
-        cameras: Mapping[str, Camera],
-        read: ReadFrame,
-        is_sequence: bool,
-        pauses: frozenset[int],
+        self, tree: PoseTree, cameras: Mapping[str, Camera], read: ReadFrame, is_sequence: bool
     ) -> None:
-        self._cameras, self._read = cameras, read
-        self._is_sequence, self._pauses = is_sequence, pauses
+        self._cameras, self._read, self._is_sequence = cameras, read, is_sequence
         self.tracker = PersonPoseTracker(ContourFit(tree, noise=NOISE), LENIENT, shape_values(tree))
 
     def _see(self, frame: int) -> FrameViews:
@@ -125,19 +130,18 @@ class _Capture:
         pairs = zip(cameras, masks.values(), strict=True)
         return FrameViews(cameras, [see_silhouette(one, edge_spacing(c)) for c, one in pairs])
 
-    def measure(self, count: int) -> tuple[PersonShape | None, dict[int, TrackState]]:
+    def measure(self, frames: Sequence[int]) -> tuple[PersonShape | None, dict[int, TrackState]]:
         """The shape that the first frames give, which the tracker has from now on; and states."""
         fit = self.tracker.fit
         is_shape = shape_values(fit.tree)
         if not is_shape.any():
             return None, {}
-        span = min(count, _SHAPE_SPAN)
-        rough = self.follow_all(span, {})
-        wanted = np.unique(np.linspace(0, span - 1, _SHAPE_FRAMES).astype(int))
-        poses = {int(k): one.values for k in wanted if (one := rough[int(k)]) is not None}
+        first = frames[:_SHAPE_SPAN]
+        rough = self.follow_all(first, {})
+        poses = {k: one.values for k in spread_over(first, _SHAPE_FRAMES) if (one := rough[k])}
         seen = [self._see(k) for k in poses]
-        frames = [(one.cameras, [view.edge for view in one.views]) for one in seen]
-        shape = fit_shape(fit, frames, np.array(list(poses.values())))
+        views = [(one.cameras, [view.edge for view in one.views]) for one in seen]
+        shape = fit_shape(fit, views, np.array(list(poses.values())))
         worn = ContourFit(fit.tree, shape.outlines, NOISE)
         self.tracker = PersonPoseTracker(worn, LENIENT, is_shape, shape.values)
         states = zip(poses, shape.poses, strict=True)
@@ -145,19 +149,17 @@ class _Capture:
 
     def follow_all(
         self,
-        count: int,
+        frames: Sequence[int],
         known: Mapping[int, TrackState],
         finish: Callable[[int, TrackState | None, FrameViews], None] | None = None,
     ) -> dict[int, TrackState | None]:
         """The states of all frames, begun where the person is known or fits best."""
         found: dict[int, TrackState | None] = {}
 
-        def follow(
-            state: TrackState | None, frame: int, is_pause: bool = False
-        ) -> TrackState | None:
+        def follow(state: TrackState | None, frame: int, last: int) -> TrackState | None:
             seen = self._see(frame)
             found[frame] = self.tracker.follow(state, seen)
-            if is_pause and state is not None:
+            if state is not None and abs(frame - last) > 1:
                 anew = self.tracker.follow(None, seen)
                 found[frame] = max(found[frame], anew, key=lambda one: one.share if one else 0.0)
             if finish is not None:
@@ -165,29 +167,26 @@ class _Capture:
             return found[frame]
 
         if not self._is_sequence:
-            for frame in range(count):
-                follow(None, frame)
+            for frame in frames:
+                follow(None, frame, frame)
             return found
-        if known:
-            begin = min(known)
-            state = known[begin]
-        else:
-            begin, state = self._best_start(count)
-        forwards: TrackState | None = state
-        backwards: TrackState | None = state
-        for frame in range(begin, count):
-            forwards = follow(forwards, frame, frame > begin and frame in self._pauses)
-        for frame in range(begin - 1, -1, -1):
-            backwards = follow(backwards, frame, frame + 1 in self._pauses)
+        begin = min(known) if known else None
+        begin, start = self._best_start(frames) if begin is None else (begin, known[begin])
+        place = list(frames).index(begin)
+        for way in (frames[place:], frames[:place][::-1]):
+            state: TrackState | None = start
+            last = begin
+            for frame in way:
+                state, last = follow(state, frame, last), frame
         return found
 
-    def _best_start(self, count: int) -> tuple[int, TrackState]:
+    def _best_start(self, frames: Sequence[int]) -> tuple[int, TrackState]:
         """The frame in which a fresh start fits best, and the state there."""
         best: tuple[int, TrackState] | None = None
-        for frame in np.unique(np.linspace(0, count - 1, _STARTS).astype(int)):
-            state = self.tracker.follow(None, self._see(int(frame)))
+        for frame in spread_over(frames, _STARTS):
+            state = self.tracker.follow(None, self._see(frame))
             if state is not None and (best is None or state.share > best[1].share):
-                best = int(frame), state
+                best = frame, state
                 if state.share > _SURE:
                     break
         if best is None:
@@ -195,6 +194,12 @@ class _Capture:
                 f"in none of {_STARTS} frames two cameras saw a person: give masks that show one"
             )
         return best
+
+
+def spread_over(frames: Sequence[int], count: int) -> list[int]:
+    """This many frames of all, evenly."""
+    picked = np.linspace(0, len(frames) - 1, min(count, len(frames)))
+    return [frames[int(k)] for k in picked]
 
 
 ReadPictures = Callable[[int], Mapping[str, Picture]]
@@ -228,11 +233,8 @@ def capture_by_colour(
     tracker = PersonPoseTracker(
         fit, LENIENT, shape_values(tree), None if shape is None else shape.values
     )
-    lengths = None if shape is None else shape.covariance
-    q = np.full((count, len(tree.model.position_names)), np.nan)
-    captured = PersonCapture(q, np.zeros(count), shape, fit.outlines, tree, q.copy())
-    distances = np.full(count, np.nan)
     places = {frame: k for k, frame in enumerate(masked)}
+    captured, distances = PersonCapture.begun(count, shape, fit), np.full(count, np.nan)
     state: TrackState | None = None
     colours: KnownColours = {}
     for frame in range(count):
@@ -244,18 +246,17 @@ def capture_by_colour(
             state = tracker.start(values)
             if last is not None and not last.is_lost:
                 state = replace(state, step=values - last.values)
-            captured.take(frame, known, place)
+            captured.q[frame], captured.shares[frame] = known.q[place], known.shares[place]
+            captured.deviations[frame] = known.deviations[place]
             colours = views.learned(fit, values, masked[frame])
         else:
             state, views = _followed(tracker, state, views, starts.get(frame))
-            if state is not None:
-                captured.shares[frame] = state.share
             if state is not None and state.is_lost:
+                captured.shares[frame] = state.share
                 state = replace(state, step=np.zeros(len(state.values)))
             elif state is not None:
                 colours = views.learned(fit, state.values)
-                captured.q[frame] = tracker.positions(state.values)
-                captured.deviations[frame] = tracker.deviations(state.values, views, lengths)
+                captured.note(frame, tracker, state, views)
                 distances[frame] = tracker.distance_by_colour(state.values, views)
         if on_frame is not None:
             on_frame(frame)

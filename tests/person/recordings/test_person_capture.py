@@ -81,14 +81,14 @@ class TestShape:
 class TestCapture:
     def test_no_frame(self, person, cameras):
         with pytest.raises(SettingsError, match="one frame"):
-            capture_person(person.pose_tree(), cameras, lambda k: {}, 0)
+            capture_person(person.pose_tree(), cameras, lambda k: {}, [])
 
     def test_nobody_in_any_frame(self, person, cameras):
         def read(_):
             return {name: np.zeros((240, 320), dtype=bool) for name in cameras}
 
         with pytest.raises(SettingsError, match="two cameras"):
-            capture_person(person.pose_tree(), cameras, read, 2)
+            capture_person(person.pose_tree(), cameras, read, [0, 1])
 
     @pytest.mark.slow
     def test_real_person_of_unknown_proportions(self, person, shared_data):
@@ -98,7 +98,7 @@ class TestCapture:
         def read(k):
             return {name: scene.read(name, frames[k]) for name in scene.cameras}
 
-        captured = capture_person(person.pose_tree(), scene.cameras, read, len(frames))
+        captured = capture_person(person.pose_tree(), scene.cameras, read, range(len(frames)))
         landmarks = load_landmarks(person.path)
         truth = {}
         with (scene.path / "joint_centres.csv").open() as stream:

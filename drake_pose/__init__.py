@@ -34,8 +34,10 @@ if TYPE_CHECKING:
     from drake_pose.search.grid.beam_search import BeamSearch
     from drake_pose.silhouette.pictures.scenes import Scene, load_scene
     from drake_pose.systems.estimators.camera_registration import CameraRegistration
-    from drake_pose.systems.estimators.silhouette_matcher import SilhouetteMatcher
-    from drake_pose.systems.estimators.silhouette_tracker import SilhouetteTracker
+    from drake_pose.systems.estimators.silhouette_matcher import (
+        SilhouetteMatcher,
+        SilhouetteTracker,
+    )
     from drake_pose.systems.estimators.truncated_ekf import TruncatedEkf
     from drake_pose.systems.person.person_tracker import PersonTracker
     from drake_pose.systems.pictures.silhouette_camera import SilhouetteCamera
@@ -60,7 +62,7 @@ _HOMES = {
     "SceneRegistration": "jobs.registration.register",
     "SilhouetteCamera": "systems.pictures.silhouette_camera",
     "SilhouetteMatcher": "systems.estimators.silhouette_matcher",
-    "SilhouetteTracker": "systems.estimators.silhouette_tracker",
+    "SilhouetteTracker": "systems.estimators.silhouette_matcher",
     "TruncatedEkf": "systems.estimators.truncated_ekf",
     "View": "search.estimates",
     "audit_scene": "jobs.registration.audit",

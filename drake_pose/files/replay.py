@@ -14,8 +14,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 from drake_pose.body.model import ArticulatedModel
 from drake_pose.body.tree.link_graph import PlantKinematics
 from drake_pose.camera.models import Camera, PinholeCamera
-from drake_pose.systems.bodies.posed_geometry import add_posed_plant
-from drake_pose.systems.bodies.skin import add_meshcat_skin
+from drake_pose.systems.bodies import add_meshcat_skin, add_posed_plant
 
 _BODY_PATH = "visualizer"
 _CAMERA_COLOUR = Rgba(0.0, 0.45, 0.70, 1.0)

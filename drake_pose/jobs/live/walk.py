@@ -32,7 +32,7 @@ from drake_pose.person.date.walking_motion import make_motion
 from drake_pose.person.shape import tracker_of_person
 from drake_pose.systems.person.live_capture import LiveSensors, add_person_tracker
 from drake_pose.systems.ports import evaluate
-from drake_pose.systems.walk.walk import KEYS, build_walk
+from drake_pose.systems.walk import KEYS, build_walk
 
 Array = NDArray[np.float64]
 

@@ -23,7 +23,7 @@ from drake_pose.person.date.capture import CaptureSetup
 from drake_pose.person.date.faces import head_angles
 from drake_pose.person.date.features import expect_features
 from drake_pose.person.date.skeleton import FEATURES, LIMBS
-from drake_pose.systems.bodies.posed_geometry import add_avatar
+from drake_pose.systems.bodies import add_avatar
 from drake_pose.systems.date.stages import (
     FaceDirectionFinder,
     FeatureFinder,

@@ -28,12 +28,14 @@ from drake_pose.registration.online_registration import OnlineRegistration
 from drake_pose.search.estimates import PoseEstimate
 from drake_pose.search.scoring import PoseSearch
 from drake_pose.silhouette.pictures.scenes import Scene
-from drake_pose.systems.bodies.posed_geometry import add_posed_plant
-from drake_pose.systems.bodies.skin import add_meshcat_skin, add_skin
+from drake_pose.systems.bodies import add_meshcat_skin, add_posed_plant, add_skin
 from drake_pose.systems.estimators.camera_registration import CameraRegistration
 from drake_pose.systems.estimators.mask_player import MaskPlayer
-from drake_pose.systems.estimators.silhouette_matcher import SilhouetteMatcher, camera_port
-from drake_pose.systems.estimators.silhouette_tracker import SilhouetteTracker
+from drake_pose.systems.estimators.silhouette_matcher import (
+    SilhouetteMatcher,
+    SilhouetteTracker,
+    camera_port,
+)
 from drake_pose.systems.pictures.camera_rig import add_sensors
 from drake_pose.systems.ports import connect_same
 

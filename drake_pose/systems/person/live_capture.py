@@ -18,7 +18,7 @@ from drake_pose.fit.contour_fit import ContourFit
 from drake_pose.person.pose_tracker import PersonPoseTracker
 from drake_pose.person.views import EDGE_POINTS, SilhouetteView, edge_spacing, see_silhouette
 from drake_pose.silhouette.segmentation.background import Background
-from drake_pose.systems.bodies.posed_geometry import add_avatar
+from drake_pose.systems.bodies import add_avatar
 from drake_pose.systems.person.person_tracker import PersonTracker
 from drake_pose.systems.pictures.camera_rig import build_camera_rig
 from drake_pose.systems.pictures.person_region import PersonRegion, connect_images

@@ -17,7 +17,7 @@ from drake_pose.fit.contour_fit import inlier_ratio_of
 from drake_pose.person.pose_tracker import PersonPoseTracker, TrackState
 from drake_pose.person.recordings.persons_in_view import keep_views
 from drake_pose.person.views import ColourViews, FrameViews, SilhouetteView, shows_somebody
-from drake_pose.systems.bodies.posed_geometry import body_poses
+from drake_pose.systems.bodies import body_poses
 from drake_pose.systems.colour_images import ColourPorts
 from drake_pose.systems.ports import MemorySystem, require_different, require_period
 

@@ -18,7 +18,7 @@ from drake_pose.camera.drake import camera_to_drake
 from drake_pose.camera.models import Camera, PinholeCamera
 from drake_pose.errors import CameraError, UnknownNameError
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask
-from drake_pose.systems.bodies.posed_geometry import add_posed_plant
+from drake_pose.systems.bodies import add_posed_plant
 from drake_pose.systems.colour_images import colour_image_to_picture
 
 _RENDERER = "rig_renderer"

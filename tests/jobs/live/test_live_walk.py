@@ -12,7 +12,7 @@ from drake_pose.jobs.live.scene import load_live_scene
 from drake_pose.jobs.live.settings import LiveSettings
 from drake_pose.jobs.live.walk import SETTLE, walk_live
 from drake_pose.person.date.walk_commands import SPEED
-from drake_pose.systems.walk.garden import START
+from drake_pose.systems.walk import START
 from tests.cli import CliRunner
 from tests.jobs.live_scenes import RATE_HZ, absent, standing, write_studio
 

@@ -28,7 +28,7 @@ from drake_pose.jobs.live.walk import (
     walk,
 )
 from drake_pose.person.date.walk_commands import SPEED
-from drake_pose.systems.walk.garden import START
+from drake_pose.systems.walk import START
 from tests.cli import CliRunner
 
 

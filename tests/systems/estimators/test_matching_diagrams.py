@@ -20,8 +20,11 @@ from drake_pose.silhouette.pictures.masks import write_mask
 from drake_pose.silhouette.pictures.scenes import load_scene
 from drake_pose.systems.estimators.diagrams import build_recorded_matching, build_simulated_matching
 from drake_pose.systems.estimators.mask_player import MaskPlayer
-from drake_pose.systems.estimators.silhouette_matcher import STATISTICS, SilhouetteMatcher
-from drake_pose.systems.estimators.silhouette_tracker import SilhouetteTracker
+from drake_pose.systems.estimators.silhouette_matcher import (
+    STATISTICS,
+    SilhouetteMatcher,
+    SilhouetteTracker,
+)
 from tests.search.bodies import box_link, front_camera, joint, load_body, swinging_chain
 
 PERIOD = 0.1

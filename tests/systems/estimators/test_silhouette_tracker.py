@@ -18,7 +18,7 @@ from drake_pose.search.settings import PaperSearchSettings
 from drake_pose.silhouette.pictures.label_images import label_image_to_mask, mask_to_label_image
 from drake_pose.silhouette.pictures.label_renderer import LabelRenderer
 from drake_pose.systems.estimators.diagrams import add_simulated_cameras, build_simulated_matching
-from drake_pose.systems.estimators.silhouette_tracker import TRACK, SilhouetteTracker
+from drake_pose.systems.estimators.silhouette_matcher import TRACK, SilhouetteTracker
 from drake_pose.systems.pictures.silhouette_camera import SilhouetteCamera
 from tests.filtering.measurements.test_contour import pinhole
 from tests.search.bodies import forked_body, front_camera

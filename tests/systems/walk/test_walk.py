@@ -11,14 +11,16 @@ from drake_pose.body.formats.packages import bundled_model
 from drake_pose.body.model import load_model
 from drake_pose.errors import SettingsError, UnknownNameError
 from drake_pose.person.date.walk_commands import BODY_RADIUS, SPEED, TURN_RATE
-from drake_pose.systems.walk.garden import (
+from drake_pose.systems.walk import (
     HALF_SIZE,
+    KEYS,
     START,
+    Walker,
+    build_walk,
     garden_objects,
     garden_obstacles,
     walker_transform,
 )
-from drake_pose.systems.walk.walk import KEYS, Walker, build_walk
 
 PERIOD = 1 / 30
 # How far the thigh is lifted on the way through three steps [rad], left positive.

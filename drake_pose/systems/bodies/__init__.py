@@ -1,1 +1,0 @@
-"""Bodies in a diagram's SceneGraph that stand as given positions say, with their skin."""

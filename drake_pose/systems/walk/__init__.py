@@ -1,1 +1,0 @@
-"""The walk-through: a captured person walks through a garden by gestures."""

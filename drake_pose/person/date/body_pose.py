@@ -253,7 +253,9 @@ def estimate_pose(
             found[1:] = search_limb(
                 limb, R_WT, found[0], end, outward, found[1], last_angles, cameras, regions, search
             )
-        aimed[limb.positions] = limb_angles(limb, R_aimed, own_root, *found[1:], last_angles)
+        aimed[limb.positions] = limb_angles(
+            limb, R_aimed, own_root, found[1], found[2], last_angles
+        )
         # Where limits forbid that, the hand or foot counts more than the elbow or knee.
         aimed = move_limb(skeleton, aimed, name, found[2])
         limbs[name] = found

@@ -12,6 +12,7 @@ import numpy as np
 
 from drake_pose.arrays import Array, Integers
 from drake_pose.body.model import ArticulatedModel
+from drake_pose.body.parsed_model import ParsedModel
 from drake_pose.body.surfaces.mesh import TriangleMesh
 from drake_pose.body.tree.tree_kinematics import TreeKinematics
 from drake_pose.errors import ModelError
@@ -223,7 +224,7 @@ def _limb(kinematics: TreeKinematics, nodes: Mapping[str, int], name: str) -> Li
     )
 
 
-def _axes(model: ArticulatedModel, positions: Sequence[int], name: str) -> Integers:
+def _axes(model: ParsedModel, positions: Sequence[int], name: str) -> Integers:
     """The axes 0, 1, 2 that the positions' names end with."""
     letters = [model.position_names[i].rsplit("_", 1)[-1] for i in positions]
     if any(letter not in _AXES for letter in letters):
@@ -244,7 +245,7 @@ def _offset(X_WA: Array, X_WB: Array) -> Array:
     return np.asarray(X_WA[:3, :3].T @ (X_WB[:3, 3] - X_WA[:3, 3]))
 
 
-def _end_middle(model: ArticulatedModel, lower: str, end: str) -> Array:
+def _end_middle(model: ParsedModel, lower: str, end: str) -> Array:
     """(3,) the middle of a hand or foot in the frame of the segment before it."""
     if end not in model.link_meshes:
         raise ModelError(f"{model.path}: there must be a link '{end}' with visual geometry")

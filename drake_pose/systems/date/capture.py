@@ -262,7 +262,9 @@ def _add_images(
     builder: DiagramBuilder, setup: CaptureSetup
 ) -> tuple[dict[str, HorizontalImage], dict[str, list[InputPort]]]:
     """One HorizontalImage a camera, the face camera's last, and the images that they want."""
-    images, wanted, face = {}, {}, setup.face_camera
+    images: dict[str, HorizontalImage] = {}
+    wanted: dict[str, list[InputPort]] = {}
+    face = setup.face_camera
     for camera in [*setup.cameras.values(), *([] if face is None else [face])]:
         name = camera.name
         image = HorizontalImage(camera, setup.backgrounds.get(name), setup.settings.skin)

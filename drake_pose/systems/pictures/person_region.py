@@ -53,7 +53,7 @@ class PersonRegion(PortedSystem):
                 f"its background {width} x {height}"
             )
         self._camera, self._background = camera, background
-        self.wanted = ("label_image",) if background is None else ("color_image",)
+        self.wanted: tuple[str, ...] = ("label_image",) if background is None else ("color_image",)
         self.add_input("color_image", ImageRgba8U(*size))
         self.add_input("label_image", ImageLabel16I(*size))
         self.picture = self.add_cache("picture", self._picture)
@@ -64,7 +64,9 @@ class PersonRegion(PortedSystem):
         image = self.given(context, "color_image")
         if image is None or not image.size():
             return None
-        return self._of_size(colour_image_to_picture(image), "color image")
+        picture = colour_image_to_picture(image)
+        self._require_size(picture, "color image")
+        return picture
 
     def _region(self, context: Context) -> Mask | None:
         """Where the person is (H, W); None while the camera has stopped."""
@@ -83,7 +85,7 @@ class PersonRegion(PortedSystem):
             )
         return person_region(picture, self._background)
 
-    def _of_size(self, image: NDArray[np.generic], kind: str) -> NDArray[np.generic]:
+    def _require_size(self, image: NDArray[np.generic], kind: str) -> None:
         camera = self._camera
         if image.shape[:2] != (camera.height, camera.width):
             raise CameraError(
@@ -91,7 +93,6 @@ class PersonRegion(PortedSystem):
                 f"pixels (width x height), but it was calibrated with {camera.width} x "
                 f"{camera.height}"
             )
-        return image
 
 
 def connect_images(

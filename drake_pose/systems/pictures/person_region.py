@@ -72,9 +72,11 @@ class PersonRegion(PortedSystem):
         """Where the person is (H, W); None while the camera has stopped."""
         image = self.given(context, "label_image")
         if image is not None:
-            return (
-                self._of_size(label_image_to_mask(image), "label image") if image.size() else None
-            )
+            if not image.size():
+                return None
+            mask = label_image_to_mask(image)
+            self._require_size(mask, "label image")
+            return mask
         picture = self.picture.Eval(context)
         if picture is None:
             return None

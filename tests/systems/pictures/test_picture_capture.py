@@ -209,7 +209,7 @@ class TestEye:
         rig.set_positions(context, q)
         image = rig.diagram.GetOutputPort(f"{kind}_image_camera_0").Eval(context)
         own = sensor.CreateDefaultContext()
-        sensor.get_input_port().FixValue(own, image)
+        sensor.GetInputPort(f"{kind}_image").FixValue(own, image)
         found = sensor.GetOutputPort("silhouette").Eval(own)
         if kind == "label":
             region = rig.mask(context, "camera_0")
@@ -222,13 +222,13 @@ class TestEye:
 
     def test_nothing_shown_is_none(self, rig):
         _, camera, _, background = rig
-        for sensor, image in (
-            (SilhouetteSensor(camera), ImageLabel16I()),
-            (SilhouetteSensor(camera, background), ImageRgba8U()),
+        for sensor, kind, image in (
+            (SilhouetteSensor(camera), "label", ImageLabel16I()),
+            (SilhouetteSensor(camera, background), "color", ImageRgba8U()),
         ):
             context = sensor.CreateDefaultContext()
             assert sensor.GetOutputPort("silhouette").Eval(context) is None
-            sensor.get_input_port().FixValue(context, image)
+            sensor.GetInputPort(f"{kind}_image").FixValue(context, image)
             assert sensor.GetOutputPort("silhouette").Eval(context) is None
 
     def test_nobody_shown_is_an_empty_region(self, rig):
@@ -236,7 +236,7 @@ class TestEye:
         sensor = SilhouetteSensor(camera)
         context = sensor.CreateDefaultContext()
         empty = np.zeros((camera.height, camera.width), dtype=bool)
-        sensor.get_input_port().FixValue(context, mask_to_label_image(empty))
+        sensor.GetInputPort("label_image").FixValue(context, mask_to_label_image(empty))
         found = sensor.GetOutputPort("silhouette").Eval(context)
         assert not found.region.any()
         assert len(found.edge.uv) == 0

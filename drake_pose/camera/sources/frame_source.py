@@ -10,7 +10,10 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drake_pose.camera.picture_files import Mask, Picture
+import cv2
+import numpy as np
+
+from drake_pose.camera.picture_files import Mask, Picture, mask_of_picture
 from drake_pose.errors import SettingsError
 
 KINDS = ("folder", "video", "device")
@@ -64,6 +67,11 @@ class SourceSpecification:
     def gives_masks(self) -> bool:
         """Whether the source delivers masks of the person instead of pictures."""
         return self.background is None
+
+    def seen(self, picture: Picture) -> Picture | Mask:
+        """The picture red, green, blue, or the mask, of one (H, W, 3) blue, green, red."""
+        rgb = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+        return mask_of_picture(rgb) if self.gives_masks else rgb
 
     def wrong_size(self, picture: Picture | Mask) -> str:
         """What is wrong with a picture's size; "" where it is the calibrated one."""

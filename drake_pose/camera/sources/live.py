@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from contextlib import suppress
 
 import cv2
-import numpy as np
 
-from drake_pose.camera.picture_files import mask_of_picture
 from drake_pose.camera.sources.frame_source import (
     Clock,
     FrameSource,
@@ -80,40 +79,37 @@ class DeviceSource(FrameSource):
     def _open(self) -> cv2.VideoCapture | None:
         """The camera, asked for pictures of the calibrated size."""
         given = self.specification
-        try:
-            if not given.location.isdigit():
-                capture = cv2.VideoCapture(given.location)
-                return capture if capture.isOpened() else None
-            capture = cv2.VideoCapture(int(given.location))
+        by_number = given.location.isdigit()
+        with suppress(cv2.error):
+            capture = cv2.VideoCapture(int(given.location) if by_number else given.location)
             if not capture.isOpened():
                 return None
-            capture.set(cv2.CAP_PROP_FRAME_WIDTH, given.width)
-            capture.set(cv2.CAP_PROP_FRAME_HEIGHT, given.height)
-            if given.rate_hz is not None:
-                capture.set(cv2.CAP_PROP_FPS, given.rate_hz)
-        except cv2.error:
-            return None
-        return capture
+            if by_number:
+                capture.set(cv2.CAP_PROP_FRAME_WIDTH, given.width)
+                capture.set(cv2.CAP_PROP_FRAME_HEIGHT, given.height)
+                if given.rate_hz is not None:
+                    capture.set(cv2.CAP_PROP_FPS, given.rate_hz)
+            return capture
+        return None
 
     def _keep_newest(self, capture: cv2.VideoCapture, count: int) -> int:
         """Reads until the camera fails or is not wanted; the number of pictures in all."""
         while not self.ended:
-            try:
+            found, picture = False, None
+            with suppress(cv2.error):
                 found, picture = capture.read()
-            except cv2.error:
-                return count
             if not found or picture is None:
                 return count
             time = self._clock() + self.specification.offset
-            rgb = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-            if wrong := self.specification.wrong_size(rgb):
+            if wrong := self.specification.wrong_size(picture):
                 self.report(f"'{self.specification.location}' {wrong}")
                 self._stop.set()
                 return count
-            seen = mask_of_picture(rgb) if self.specification.gives_masks else rgb
             if self._failed:
                 self.report(f"'{self.specification.location}' answers again")
                 self._failed = False
-            self._newest.append(TimedPicture(time, f"{count:06d}", seen))
+            self._newest.append(
+                TimedPicture(time, f"{count:06d}", self.specification.seen(picture))
+            )
             count += 1
         return count

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import abc
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Generator, Mapping
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from drake_pose.camera.picture_files import (
-    list_pictures,
-    mask_of_picture,
-    read_person_mask,
-    read_picture,
-)
+from drake_pose.camera.picture_files import list_pictures, read_person_mask, read_picture
 from drake_pose.camera.sources.frame_source import FrameSource, SourceSpecification, TimedPicture
 from drake_pose.csv_files import read_csv
 from drake_pose.errors import SceneError
@@ -27,7 +21,12 @@ _NUMBER = re.compile(r"(\d+)$")
 
 
 class RecordedSource(FrameSource):
-    """Pictures that wait to be read, one of them read ahead, so that the end is known.
+    """Pictures of a folder or a video, one of them read ahead, so that the end is known.
+
+    A folder has pictures or masks `<frame>.png` or `.jpg`; their times are those of its
+    `timestamps.csv` (frame, time [s]). Without it the frames follow each other in the order of
+    their names at the given rate, and frames of the same name in the folders `beside` are of the
+    same time; a number in a name means nothing. A video's masks are white on the person.
 
     Raises SceneError: names the folder or file; no picture, or the first is of another size.
     """
@@ -35,7 +34,9 @@ class RecordedSource(FrameSource):
     def __init__(self, specification: SourceSpecification) -> None:
         super().__init__(specification)
         self._ahead: TimedPicture | None = None
-        self._pictures = self._all()
+        self._own_rate: float | None = None
+        is_folder = specification.kind == "folder"
+        self._pictures = self._of_folder() if is_folder else self._of_video()
         self._ahead = self._advance()
         if self._ahead is None:
             raise SceneError(
@@ -43,18 +44,20 @@ class RecordedSource(FrameSource):
                 f"camera '{specification.camera}'"
             )
 
-    @abc.abstractmethod
-    def _all(self) -> Iterator[tuple[Path, TimedPicture]]:
-        """The pictures that can be read, and the file of each."""
-
     @property
     def ended(self) -> bool:
         """Whether all pictures were read."""
         return self._ahead is None
 
+    @property
+    def rate_hz(self) -> float | None:
+        """The given rate, or that of the time stamps or of the video."""
+        return self.specification.rate_hz or self._own_rate
+
     def close(self) -> None:
         """Lets go of the file."""
         self._ahead = None
+        self._pictures.close()
 
     def _read(self) -> TimedPicture | None:
         taken = self._ahead
@@ -73,41 +76,25 @@ class RecordedSource(FrameSource):
             self.drop(f"{path}: {wrong}")
         return None
 
-
-class FolderSource(RecordedSource):
-    """Pictures or masks `<frame>.png` or `.jpg` of a folder.
-
-    Their times are those of `timestamps.csv` (frame, time [s]) in that folder. Without it the
-    frames follow each other in the order of their names at the given rate, and frames of the same
-    name in the folders `beside` are of the same time; a number in a name means nothing.
-    """
-
-    def __init__(self, specification: SourceSpecification) -> None:
-        self._times: list[float] = []
-        super().__init__(specification)
-
-    @property
-    def rate_hz(self) -> float | None:
-        """The given rate, or that of the time stamps."""
-        steps = np.diff(self._times)
-        steps = steps[steps > 0]
-        return self.specification.rate_hz or (1.0 / float(np.median(steps)) if len(steps) else None)
-
-    def _all(self) -> Iterator[tuple[Path, TimedPicture]]:
+    def _of_folder(self) -> Generator[tuple[Path, TimedPicture]]:
+        """The pictures that can be read, and the file of each."""
         given, folder = self.specification, Path(self.specification.location)
         files = find_picture_files(folder, given.camera)
         stamped = folder / TIME_STAMPS
-        times = read_time_stamps(stamped) if stamped.is_file() else self._counted(folder, files)
+        times = read_time_stamps(stamped) if stamped.is_file() else _counted(given, files)
         for what, where, frames in (
             ("picture", folder, [frame for frame in times if frame not in files]),
             ("time", stamped, [frame for frame in files if frame not in times]),
         ):
             if frames:
                 self.drop(f"{where}: has no {what} of {_listed(frames)}", len(frames))
-        self._times = [time for frame, time in times.items() if frame in files]
-        if not self._times:
+        timed = [frame for frame in times if frame in files]
+        if not timed:
             raise SceneError(f"{stamped}: has no time of any picture in {folder}")
-        for frame in [frame for frame in times if frame in files]:
+        steps = np.diff([times[frame] for frame in timed])
+        if np.any(steps > 0):
+            self._own_rate = 1.0 / float(np.median(steps[steps > 0]))
+        for frame in timed:
             try:
                 read = read_person_mask if given.gives_masks else read_picture
                 seen = read(files[frame], SceneError)
@@ -116,69 +103,56 @@ class FolderSource(RecordedSource):
                 continue
             yield files[frame], TimedPicture(times[frame] + given.offset, frame, seen)
 
-    def _counted(self, folder: Path, files: dict[str, Path]) -> dict[str, float]:
-        """The frames' times by their rate."""
-        given = self.specification
-        if given.rate_hz is None:
-            raise SceneError(
-                f"{folder}: has no {TIME_STAMPS} (frame,time), so the source of camera "
-                f"'{given.camera}' needs rate_hz, its pictures a second"
-            )
-        names = set(files)
-        for other in given.beside:
-            names |= set(find_picture_files(Path(other), given.camera))
-        ordered = sorted(names)
-        if ordered != sorted(names, key=_by_number):
-            raise SceneError(
-                f"{folder}: the frames' names are numbers of different lengths, so their "
-                f"order is unclear; fill them with zeros (0009, 0010) or give a {TIME_STAMPS}"
-            )
-        return {frame: k / given.rate_hz for k, frame in enumerate(ordered)}
-
-
-class VideoSource(RecordedSource):
-    """A video file's pictures, or masks, white on the person."""
-
-    def __init__(self, specification: SourceSpecification) -> None:
-        path = specification.location
-        if not Path(path).is_file():
-            raise SceneError(f"{path}: no such video file of camera '{specification.camera}'")
-        self._capture = cv2.VideoCapture(path)
-        if not self._capture.isOpened():
+    def _of_video(self) -> Generator[tuple[Path, TimedPicture]]:
+        """The pictures of a video, each with the video's name."""
+        given, count = self.specification, 0
+        path = Path(given.location)
+        if not path.is_file():
+            raise SceneError(f"{path}: no such video file of camera '{given.camera}'")
+        capture = cv2.VideoCapture(str(path))
+        if not capture.isOpened():
             raise SceneError(
                 f"{path}: not a video that OpenCV can read, though the source of camera "
-                f"'{specification.camera}'"
+                f"'{given.camera}'"
             )
-        super().__init__(specification)
+        self._own_rate = float(capture.get(cv2.CAP_PROP_FPS)) or None
+        try:
+            while True:
+                found, picture = capture.read()
+                if not found or picture is None:
+                    break
+                time = 1e-3 * capture.get(cv2.CAP_PROP_POS_MSEC)
+                if given.rate_hz is not None:
+                    time = count / given.rate_hz
+                seen = given.seen(picture)
+                yield path, TimedPicture(time + given.offset, f"{count:06d}", seen)
+                count += 1
+            promised = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+            if 0 < count < promised:
+                reason = f"{given.location}: ends after {count} of {promised} pictures"
+                self.drop(reason, promised - count)
+        finally:
+            capture.release()
 
-    @property
-    def rate_hz(self) -> float | None:
-        """The given rate, or the file's own."""
-        own = float(self._capture.get(cv2.CAP_PROP_FPS))
-        return self.specification.rate_hz or (own if own > 0 else None)
 
-    def close(self) -> None:
-        """Lets go of the file."""
-        super().close()
-        self._capture.release()
-
-    def _all(self) -> Iterator[tuple[Path, TimedPicture]]:
-        given, count = self.specification, 0
-        while True:
-            found, picture = self._capture.read()
-            if not found or picture is None:
-                break
-            time = 1e-3 * self._capture.get(cv2.CAP_PROP_POS_MSEC)
-            if given.rate_hz is not None:
-                time = count / given.rate_hz
-            rgb = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-            seen = mask_of_picture(rgb) if given.gives_masks else rgb
-            yield Path(given.location), TimedPicture(time + given.offset, f"{count:06d}", seen)
-            count += 1
-        promised = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        if 0 < count < promised:
-            reason = f"{given.location}: ends after {count} of {promised} pictures"
-            self.drop(reason, promised - count)
+def _counted(given: SourceSpecification, files: Mapping[str, Path]) -> dict[str, float]:
+    """The times of a folder's frames by their rate."""
+    folder = Path(given.location)
+    if given.rate_hz is None:
+        raise SceneError(
+            f"{folder}: has no {TIME_STAMPS} (frame,time), so the source of camera "
+            f"'{given.camera}' needs rate_hz, its pictures a second"
+        )
+    names = set(files)
+    for other in given.beside:
+        names |= set(find_picture_files(Path(other), given.camera))
+    ordered = sorted(names)
+    if ordered != sorted(names, key=_by_number):
+        raise SceneError(
+            f"{folder}: the frames' names are numbers of different lengths, so their "
+            f"order is unclear; fill them with zeros (0009, 0010) or give a {TIME_STAMPS}"
+        )
+    return {frame: k / given.rate_hz for k, frame in enumerate(ordered)}
 
 
 def find_picture_files(folder: Path, camera: str) -> dict[str, Path]:

@@ -14,12 +14,7 @@ from drake_pose.camera.models import Camera
 from drake_pose.camera.picture_files import Picture, read_picture
 from drake_pose.camera.sources.frame_source import Clock, FrameSource, SourceSpecification
 from drake_pose.camera.sources.live import DeviceSource
-from drake_pose.camera.sources.recorded import (
-    TIME_STAMPS,
-    FolderSource,
-    VideoSource,
-    find_picture_files,
-)
+from drake_pose.camera.sources.recorded import TIME_STAMPS, RecordedSource, find_picture_files
 from drake_pose.errors import CameraError, SceneError, SettingsError
 from drake_pose.yaml_files import read_yaml
 
@@ -77,7 +72,7 @@ def open_source(specification: SourceSpecification, clock: Clock = time.monotoni
     """
     if specification.live:
         return DeviceSource(specification, clock)
-    return (FolderSource if specification.kind == "folder" else VideoSource)(specification)
+    return RecordedSource(specification)
 
 
 def load_background_pictures(specification: SourceSpecification) -> list[Picture]:
